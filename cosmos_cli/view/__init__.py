@@ -1,0 +1,1 @@
+"""What a running scenario looks like on a terminal."""

@@ -1,0 +1,52 @@
+"""The runtime's error tree. Blame is in the type: the user's file, the user's plug-in, a peer, the machine, ourselves."""
+
+from __future__ import annotations
+
+
+class MadnsError(Exception):
+    """Any failure that the runtime foresees; its text says what was expected, what came, and what to do."""
+
+
+class ConfigurationError(MadnsError):
+    """A configuration or launch document is not what it should be; the user's file is to blame."""
+
+
+class PluginError(MadnsError):
+    """A plug-in cannot be found, does not keep its contract, or raised."""
+
+
+class MissingExtraError(MadnsError):
+    """An optional dependency is not installed; the message names the command that installs it."""
+
+    def __init__(self, module: str, extra: str) -> None:
+        super().__init__(
+            f"{module} is not installed here; install it with: pip install 'cosmos-madns[{extra}]'"
+        )
+        self.module = module
+        self.extra = extra
+
+
+class PeerError(MadnsError):
+    """The other side did not do what was agreed."""
+
+
+class DeadlineExpired(PeerError):
+    """A wait ended without an answer; the message names whom it waited for."""
+
+    def __init__(self, what: str, waited_s: float, missing: tuple[str, ...]) -> None:
+        super().__init__(f"{', '.join(missing)}: no {what} in {waited_s:g} s")
+        self.what = what
+        self.waited_s = waited_s
+        self.missing = missing
+
+
+class MessageTooLarge(MadnsError):
+    """A message does not fit its class of service; the sender's plug-in is to blame."""
+
+
+class MachineError(MadnsError):
+    """The machine refuses something: a taken port, a full disk, a missing permission."""
+
+
+class IllegalTransition(MadnsError):
+    """An event that the current state does not allow; the runtime itself is to blame."""

@@ -1,0 +1,1 @@
+"""State of health of a machine and of a process."""

@@ -1,0 +1,1 @@
+"""The contracts of simulations and the registry that finds plug-ins by name."""

@@ -1,0 +1,1 @@
+"""Streams of records: their schemas and the writer that never blocks a tick."""

@@ -1,0 +1,94 @@
+"""
+Schemas of record streams.
+
+A stream is one JSON Lines file. Line 1 is the schema; every other line is a record: an array in the
+order of the fields (fast streams) or an object (events); the last line of a stream that was closed
+properly is {"end": {"records": N, "dropped": N}}. A file without that line was cut.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One value of a record: its name (unit last), the unit's symbol and its kind."""
+
+    name: str
+    unit: str = ""
+    kind: Literal["float", "int", "str", "bool", "json"] = "float"
+
+
+@dataclass(frozen=True, slots=True)
+class StreamSchema:
+    """One stream: file name without suffix, its fields, and the shape of its records."""
+
+    name: str
+    fields: tuple[Field, ...]
+    shape: Literal["array", "object"] = "array"
+
+    def header(self, *, run: str, source: str, t0_utc: str | None) -> dict[str, Any]:
+        """
+        Return line 1 of the file.
+
+        Args:
+            run: Name of the run.
+            source: Who records: host, an agent's or a machine's name.
+            t0_utc: Simulated time zero in UTC (ISO 8601), None while it is not known.
+        """
+        return {
+            "schema": SCHEMA_VERSION,
+            "stream": self.name,
+            "shape": self.shape,
+            "fields": [{"name": f.name, "unit": f.unit, "kind": f.kind} for f in self.fields],
+            "run": run,
+            "source": source,
+            "t0_utc": t0_utc,
+        }
+
+
+TICKS = StreamSchema(
+    "ticks",
+    (
+        Field("tick", "", "int"),
+        Field("lateness_us", "us", "int"),
+        Field("margin_us", "us", "int"),
+        Field("missed", "", "int"),
+    ),
+)
+"""Every tick of an agent: wake-up minus deadline, time left when the step ended, ticks skipped before it."""
+
+CLOCK = StreamSchema(
+    "clock",
+    (
+        Field("t_s", "s"),
+        Field("offset_us", "us"),
+        Field("drift_ppm", "1e-6"),
+        Field("uncertainty_us", "us"),
+        Field("round_trip_us", "us"),
+    ),
+)
+"""An agent's estimate of the host's clock minus its own."""
+
+EVENTS = StreamSchema(
+    "events",
+    (Field("t_s", "s"), Field("utc", "", "str"), Field("event", "", "str")),
+    shape="object",
+)
+"""State changes, losses, deadlines broken, and who was the cause."""
+
+LOG = StreamSchema(
+    "log",
+    (
+        Field("t_s", "s"),
+        Field("utc", "", "str"),
+        Field("level", "", "str"),
+        Field("text", "", "str"),
+    ),
+    shape="object",
+)
+"""What was worth a sentence, as loud as recording.verbosity lets through."""

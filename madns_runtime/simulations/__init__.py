@@ -1,0 +1,1 @@
+"""Simulations shipped with the framework; nothing outside this package imports it."""

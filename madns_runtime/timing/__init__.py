@@ -1,0 +1,1 @@
+"""Pacing, clocks and the estimate of the offset between two of them."""
