@@ -1,0 +1,349 @@
+"""
+An agent's side of a run, pure: datagrams and now_s in, datagrams and events out.
+
+Owns the link to the host, the agent's state machine, the estimate of the host's clock and every
+deadline. The composition root feeds it and carries out what its events say.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from madns_runtime.config import Timeouts
+from madns_runtime.protocol.codec import MalformedMessage, decode_message, encode_message
+from madns_runtime.protocol.delivery import BrokenDeadline
+from madns_runtime.protocol.link import Link, LinkLimits
+from madns_runtime.protocol.messages import (
+    AgentStopped,
+    EmergencyShutdown,
+    Expelled,
+    Hello,
+    Message,
+    Ping,
+    Pong,
+    Service,
+    SimulationComplete,
+    SimulationData,
+    SimulationReady,
+    SimulationSetup,
+    SimulationStart,
+    SystemStop,
+)
+from madns_runtime.protocol.states import AGENT_LIVE, AgentEvent, AgentState, agent_machine
+from madns_runtime.timing.clocksync import ClockEstimate
+
+PING_INTERVAL_S = 0.25
+PING_INTERVAL_FIRST_S = 0.02
+PINGS_FIRST = 12
+"""The first exchanges follow closely, so that a clock estimate stands before T0."""
+STALL_S = 1.0
+"""A session that was not called for this long was itself frozen, and blames nobody for silence."""
+LINGER_S = 1.0
+"""How long an agent waits at the end for its last words to be acknowledged."""
+PLUGIN_CHANNEL = 1
+
+
+@dataclass(frozen=True, slots=True)
+class SetupReceived:
+    """Initial data came: set up the simulation, then call `setup_finished`."""
+
+    initial: Any
+
+
+@dataclass(frozen=True, slots=True)
+class StartReceived:
+    """Simulated time zero is *t0_host_s* on the host's clock."""
+
+    t0_host_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class DataReceived:
+    """The host's half sent this."""
+
+    payload: Any
+
+
+@dataclass(frozen=True, slots=True)
+class StopReceived:
+    """Close the records, then call `records_closed`."""
+
+
+@dataclass(frozen=True, slots=True)
+class EmergencyDeclared:
+    """End now: close the records, then call `records_closed`."""
+
+    who: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class ExpelledFromRun:
+    """The host had declared this agent lost; this session is over, a new incarnation may join."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class ClockEstimated:
+    """A clock exchange came in; `AgentSession.clock` has changed."""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionEnded:
+    """Nothing more is to be sent or awaited."""
+
+
+AgentSessionEvent = (
+    SetupReceived
+    | StartReceived
+    | DataReceived
+    | StopReceived
+    | EmergencyDeclared
+    | ExpelledFromRun
+    | ClockEstimated
+    | SessionEnded
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AgentIdentity:
+    """Who an agent is on the wire; *incarnation* is random, new at every start."""
+
+    name: str
+    index: int
+    incarnation: int
+    runtime_version: str
+    pid: int
+
+
+class AgentSession:
+    """
+    One agent's conversation with the host.
+
+    Args:
+        identity: Who speaks.
+        run_key: Secret of the run, 32 bytes.
+        session: The run on the wire, 8 bytes.
+        timeouts: The run's deadlines.
+        report: Called for every ping; what it returns is shown to the operator.
+        now_s: Present time of the local monotonic clock.
+        limits: Bounds of the link.
+    """
+
+    def __init__(
+        self,
+        identity: AgentIdentity,
+        *,
+        run_key: bytes,
+        session: bytes,
+        timeouts: Timeouts,
+        report: Callable[[], Mapping[str, Any]],
+        now_s: float,
+        limits: LinkLimits | None = None,
+    ) -> None:
+        self.identity = identity
+        self.clock = ClockEstimate()
+        self.link = Link.for_agent(
+            run_key,
+            session,
+            identity.index,
+            identity.incarnation,
+            limits=limits or LinkLimits(),
+        )
+        self._timeouts = timeouts
+        self._report = report
+        self._machine = agent_machine()
+        self._events: deque[AgentSessionEvent] = deque()
+        self._heard_s: float | None = None
+        self._handled_s = now_s
+        self._ping_due_s = now_s
+        self._ping_count = 0
+        self._state_deadline_s: float | None = (
+            now_s + timeouts.agents_ready_s + timeouts.host_setup_s + timeouts.agent_setup_s
+        )
+        self._started_s = now_s
+        self.malformed_count = 0
+        self._send(
+            Hello(identity.name, identity.runtime_version, identity.pid), Service.SYNC, now_s
+        )
+
+    @property
+    def state(self) -> AgentState:
+        """Where this agent stands."""
+        return self._machine.state
+
+    # What the composition root reports ------------------------------------------------------
+
+    def setup_finished(self, now_s: float) -> None:
+        """Say that the agent's half is set up; the host's start is awaited."""
+        self._machine.fire(AgentEvent.SETUP_FINISHED)
+        self._state_deadline_s = now_s + self._timeouts.agent_setup_s + self._timeouts.silence_s
+        self._heard_s = now_s
+        self._send(SimulationReady(), Service.SYNC, now_s)
+
+    def run_finished(self, summary: Mapping[str, Any], now_s: float) -> None:
+        """Say that the simulated time is over; the host's stop is awaited."""
+        self._machine.fire(AgentEvent.RUN_FINISHED)
+        timeouts = self._timeouts
+        self._state_deadline_s = now_s + timeouts.complete_s + timeouts.shutdown_s
+        self._send(SimulationComplete(summary), Service.SYNC, now_s)
+
+    def records_closed(self, records: Mapping[str, Any], now_s: float) -> None:
+        """Say that the records are on disk; the session ends when that is acknowledged."""
+        self._machine.fire(AgentEvent.RECORDS_CLOSED)
+        self._send(AgentStopped(records), Service.SYNC, now_s)
+        self._machine.fire(AgentEvent.STOPPED_SAID)
+        self._state_deadline_s = now_s + LINGER_S
+
+    def emergency(self, reason: str, now_s: float) -> None:
+        """Declare an emergency and tell the host; no effect when already ending."""
+        if self._machine.allows(AgentEvent.EMERGENCY):
+            self._send(EmergencyShutdown(self.identity.name, reason), Service.SYNC, now_s)
+            self._enter_emergency(self.identity.name, reason)
+
+    def send(
+        self, payload: Any, service: Service, now_s: float, *, deadline_s: float | None = None
+    ) -> None:
+        """
+        Send a plug-in's message to the host's half; *deadline_s* on the local clock, SYNC only.
+
+        Raises:
+            MessageTooLarge: It does not fit its class of service.
+            SendQueueFull: The host has not taken what was sent before.
+        """
+        body = encode_message(SimulationData(payload))
+        self.link.send(body, service, now_s, channel=PLUGIN_CHANNEL, deadline_s=deadline_s)
+
+    # Datagrams and time ------------------------------------------------------------------------
+
+    def receive_datagram(self, data: bytes, now_s: float) -> None:
+        """Take one datagram; whatever is wrong with it is counted."""
+        link = self.link
+        if not link.receive_datagram(data, now_s):
+            return
+        self._heard_s = now_s
+        while (received := link.next_message()) is not None:
+            try:
+                message = decode_message(received.body)
+            except MalformedMessage:
+                self.malformed_count += 1
+                continue
+            self._receive(message, now_s)
+
+    def datagrams_to_send(self, now_s: float) -> list[bytes]:
+        """Return what is to be sent to the host now."""
+        return self.link.datagrams_to_send(now_s)
+
+    def get_timer(self) -> float | None:
+        """Return when `handle_timer` wants to be called, at the latest."""
+        if self.state is AgentState.EXIT:
+            return None
+        times = (self.link.get_timer(), self._ping_due_s, self._state_deadline_s)
+        return min(t for t in times if t is not None)
+
+    def handle_timer(self, now_s: float) -> None:
+        """Do what is due. Received datagrams must have been handed in before."""
+        if self.state is AgentState.EXIT:
+            return
+        if now_s - self._handled_s > STALL_S and self._heard_s is not None:
+            self._heard_s = max(self._heard_s, now_s - self._timeouts.silence_s / 2)
+        self._handled_s = now_s
+        self.link.handle_timer(now_s)
+        if now_s >= self._ping_due_s:
+            self._ping(now_s)
+        self._check_deadlines(now_s)
+
+    def next_event(self) -> AgentSessionEvent | None:
+        """Return the oldest event not yet taken."""
+        return self._events.popleft() if self._events else None
+
+    def next_broken_deadline(self) -> BrokenDeadline | None:
+        """Return a SYNC message of this side that broke its deadline, once each."""
+        return self.link.next_broken_deadline()
+
+    # Inside --------------------------------------------------------------------------------------
+
+    def _send(self, message: Message, service: Service, now_s: float) -> None:
+        self.link.send(encode_message(message), service, now_s)
+
+    def _receive(self, message: Message, now_s: float) -> None:
+        if isinstance(message, SimulationData):
+            self._events.append(DataReceived(message.payload))
+        elif isinstance(message, Pong):
+            self.clock.add_exchange(
+                message.t_agent_s, message.t_host_received_s, message.t_host_sent_s, now_s
+            )
+            self._events.append(ClockEstimated())
+        elif isinstance(message, SimulationSetup):
+            self._move(AgentEvent.SETUP_RECEIVED, SetupReceived(message.initial))
+            self._state_deadline_s = None  # the agent's own work now; the host times it
+        elif isinstance(message, SimulationStart):
+            self._move(AgentEvent.START_RECEIVED, StartReceived(message.t0_host_s))
+            self._state_deadline_s = None  # from here on, the host's silence is the limit
+        elif isinstance(message, SystemStop):
+            self._move(AgentEvent.STOP_RECEIVED, StopReceived())
+        elif isinstance(message, EmergencyShutdown):
+            self._enter_emergency(message.who, message.reason)
+        elif isinstance(message, Expelled):
+            self._expelled(message.reason)
+        else:
+            self.malformed_count += 1  # a message that only agents send
+
+    def _move(self, event: AgentEvent, outcome: AgentSessionEvent) -> None:
+        if self._machine.allows(event):
+            self._machine.fire(event)
+            self._events.append(outcome)
+        else:
+            self.malformed_count += 1
+
+    def _enter_emergency(self, who: str, reason: str) -> None:
+        if self._machine.allows(AgentEvent.EMERGENCY):
+            self._machine.fire(AgentEvent.EMERGENCY)
+            self._state_deadline_s = None
+            self._events.append(EmergencyDeclared(who, reason))
+
+    def _expelled(self, reason: str) -> None:
+        if self._machine.allows(AgentEvent.EMERGENCY):
+            self._machine.fire(AgentEvent.EMERGENCY)
+            self._state_deadline_s = None
+            self._events.append(ExpelledFromRun(reason))
+
+    def _ping(self, now_s: float) -> None:
+        self._ping_count += 1
+        first = self._ping_count <= PINGS_FIRST
+        self._ping_due_s = now_s + (PING_INTERVAL_FIRST_S if first else PING_INTERVAL_S)
+        self._send(Ping(now_s, self._report()), Service.BEST, now_s)
+
+    def _check_deadlines(self, now_s: float) -> None:
+        state = self.state
+        if state is AgentState.WAITING_SERVER_STOP:
+            deadline_s = self._state_deadline_s
+            if self.link.is_flushed or (deadline_s is not None and now_s >= deadline_s):
+                self._machine.fire(AgentEvent.SERVER_STOPPED)
+                self._events.append(SessionEnded())
+            return
+        if state not in AGENT_LIVE:
+            return
+        if self._heard_s is None and now_s - self._started_s > self._timeouts.agents_ready_s:
+            waited_s = self._timeouts.agents_ready_s
+            self._lose_host(
+                f"host: no answer to HELLO in {waited_s:g} s; is its address and UDP port reachable"
+                " from here?"
+            )
+        elif self._state_deadline_s is not None and now_s >= self._state_deadline_s:
+            self._lose_host(f"host: no order to go on from {state.value} before its deadline")
+        elif self._heard_s is not None and now_s - self._heard_s > self._silence_limit_s(state):
+            self._lose_host(f"host: silent for {self._silence_limit_s(state):g} s")
+
+    def _silence_limit_s(self, state: AgentState) -> float:
+        # While it sets up its own half the host may be busy; afterwards it answers pings at once.
+        if state is AgentState.AGENT_READY:
+            return self._timeouts.silence_s + self._timeouts.host_setup_s
+        return self._timeouts.silence_s
+
+    def _lose_host(self, reason: str) -> None:
+        self._enter_emergency(self.identity.name, reason)
