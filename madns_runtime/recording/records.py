@@ -2,8 +2,10 @@
 Schemas of record streams.
 
 A stream is one JSON Lines file. Line 1 is the schema; every other line is a record: an array in the
-order of the fields (fast streams) or an object (events); the last line of a stream that was closed
-properly is {"end": {"records": N, "dropped": N}}. A file without that line was cut.
+order of the fields (fast streams) or an object (events). Two more lines are no records, and each has a
+single key: {"t0_utc": "..."} follows as soon as simulated time zero is known, where line 1 was written
+before it was; the last line of a stream that was closed properly is
+{"end": {"records": N, "dropped": N, "not_finite": N}}. A file without that line was cut.
 """
 
 from __future__ import annotations
@@ -92,3 +94,64 @@ LOG = StreamSchema(
     shape="object",
 )
 """What was worth a sentence, as loud as recording.verbosity lets through."""
+
+HEALTH = StreamSchema(
+    "health",
+    (
+        Field("utc", "", "str"),
+        Field("monotonic_s", "s"),
+        Field("cpu_percent", "%"),
+        Field("cpu_percent_by_core", "%", "json"),
+        Field("core_temperature_c", "degC"),
+        Field("throttled_bits", "", "int"),
+        Field("throttling", "", "json"),
+        Field("ram_total_bytes", "B", "int"),
+        Field("ram_used_bytes", "B", "int"),
+        Field("ram_free_bytes", "B", "int"),
+        Field("ram_percent", "%"),
+        Field("disk_total_bytes", "B", "int"),
+        Field("disk_used_bytes", "B", "int"),
+        Field("disk_free_bytes", "B", "int"),
+        Field("disk_percent", "%"),
+        Field("disk_reads", "", "int"),
+        Field("disk_writes", "", "int"),
+        Field("disk_read_bytes", "B", "int"),
+        Field("disk_written_bytes", "B", "int"),
+        Field("disk_read_time_ms", "ms", "int"),
+        Field("disk_write_time_ms", "ms", "int"),
+        Field("network_sent_bytes", "B", "int"),
+        Field("network_received_bytes", "B", "int"),
+        Field("network_sent_packets", "", "int"),
+        Field("network_received_packets", "", "int"),
+        Field("network_errors", "", "int"),
+        Field("network_drops", "", "int"),
+        Field("loopback_bytes", "B", "int"),
+        Field("network_sent_bytes_per_s", "B/s"),
+        Field("network_received_bytes_per_s", "B/s"),
+        Field("disk_read_bytes_per_s", "B/s"),
+        Field("disk_written_bytes_per_s", "B/s"),
+        Field("udp_sockets", "", "int"),
+        Field("tcp_connections", "", "int"),
+        Field("load_1min", ""),
+        Field("load_5min", ""),
+        Field("load_15min", ""),
+        Field("process_uptime_s", "s"),
+        Field("board_uptime_s", "s"),
+    ),
+)
+"""State of health of one machine (thesis A.1.4). Counters run from the machine's start; what a machine
+does not offer is null. It keeps the wall clock's time and the machine's own monotonic one, for the
+process that samples it knows no simulated time."""
+
+PROCESS = StreamSchema(
+    "process",
+    (
+        Field("t_s", "s"),
+        Field("cpu_percent", "%"),
+        Field("rss_bytes", "B", "int"),
+        Field("major_faults", "", "int"),
+        Field("voluntary_switches", "", "int"),
+        Field("involuntary_switches", "", "int"),
+    ),
+)
+"""What a process of the run uses: CPU since its last record, memory, and counters since its start."""

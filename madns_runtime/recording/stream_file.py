@@ -1,0 +1,268 @@
+"""
+One stream's file: joined lines go out in plain write calls, and a partial write is continued, never repeated.
+
+No buffer of Python's lies between: what a write call took survives kill -9. Two threads share an
+object: the loop appends to `lines` and owns `overflowed` and `not_finite`; the writer thread owns the
+rest. Under that rule no lock is needed: appending to a list and cutting off its head are each atomic.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import orjson
+
+from madns_runtime.errors import MachineError, PluginError
+from madns_runtime.recording.records import StreamSchema
+
+LINES_PER_WRITE_MAX = 1024
+LINE_OVERHEAD_BYTES = 56
+"""What a waiting line costs beside its text: the bytes object and its place in the list."""
+SUFFIX_MAX = 10_000
+NAME_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+CONTROL_KEYS = ("end", "t0_utc")
+
+
+def check_schema(schema: StreamSchema) -> None:
+    """
+    Check that a stream of this schema can be a file that is read back.
+
+    Raises:
+        PluginError: Its name is no file name, it has no fields, or two of one name.
+    """
+    if not NAME_PATTERN.fullmatch(schema.name):
+        raise PluginError(
+            f"stream {schema.name!r}: expected a name of letters, digits, - and _, at most 64"
+        )
+    names = [field.name for field in schema.fields]
+    if not names or len(set(names)) != len(names):
+        raise PluginError(f"stream {schema.name}: expected fields with distinct names, got {names}")
+    if schema.shape == "object" and len(names) == 1 and names[0] in CONTROL_KEYS:
+        raise PluginError(f"stream {schema.name}: a single field may not be named {names[0]}")
+
+
+def create_file(directory: Path, name: str, suffix: str) -> tuple[Path, int]:
+    """
+    Create the stream's file under the first name that is still free, and return its path and descriptor.
+
+    Raises:
+        MachineError: The directory takes no new file.
+    """
+    for path in _candidates(directory, name, suffix):
+        try:
+            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
+            return path, os.open(path, flags, 0o644)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise MachineError(f"{path}: cannot record there: {error.strerror}") from error
+    raise MachineError(f"{directory}: holds {SUFFIX_MAX} files of stream {name}; clear it out")
+
+
+def _candidates(directory: Path, name: str, suffix: str) -> Iterator[Path]:
+    stem, first = (name, int(suffix)) if suffix.isdecimal() else (name, 1)
+    if suffix and not suffix.isdecimal():
+        stem = f"{name}.{suffix}"
+    for number in range(first, first + SUFFIX_MAX):
+        yield directory / (f"{stem}.jsonl" if number == 1 else f"{stem}.{number}.jsonl")
+
+
+class StreamFile:
+    """One open stream: what waits, what was written, and how its values become a line."""
+
+    __slots__ = (
+        "_control_left",
+        "_descriptor",
+        "_has_t0",
+        "_pending",
+        "_pending_cost",
+        "_whole_bytes",
+        "bytes_written",
+        "direct",
+        "freed_bytes",
+        "lines",
+        "not_finite",
+        "overflowed",
+        "path",
+        "schema",
+        "unwritten",
+        "width",
+        "written",
+    )
+
+    def __init__(self, schema: StreamSchema, path: Path, descriptor: int) -> None:
+        self.schema = schema
+        self.path = path
+        self.width = len(schema.fields)
+        self.direct: tuple[type, ...] = (tuple, list) if schema.shape == "array" else ()
+        """Types of values that need no rearranging before they are encoded."""
+        self.lines: list[bytes] = []
+        self.overflowed = 0
+        self.not_finite = 0
+        self.written = 0
+        self.unwritten = 0
+        self.bytes_written = 0
+        self.freed_bytes = 0
+        """Buffered bytes that have left the buffer, ever."""
+        self._descriptor = descriptor
+        self._pending: bytes = b""
+        self._pending_cost = 0
+        self._control_left = 0
+        self._whole_bytes = 0
+        self._has_t0 = False
+
+    @property
+    def dropped(self) -> int:
+        """Records that will never be in the file."""
+        return self.overflowed + self.unwritten
+
+    # What follows is called by the loop's thread.
+
+    def arrange(self, values: Any) -> Any:
+        """
+        Return *values* in the stream's shape.
+
+        Raises:
+            PluginError: The number of values, or a name among them, is not the schema's.
+        """
+        if isinstance(values, Mapping):
+            return self._arrange_mapping(values)
+        if isinstance(values, np.ndarray):
+            values = values.tolist() if values.ndim else (values.item(),)
+        elif isinstance(values, str | bytes) or not isinstance(values, Sequence):
+            raise PluginError(
+                f"stream {self.schema.name}: expected one value a field, got {type(values).__name__}"
+            )
+        if len(values) != self.width:
+            raise self.width_error(len(values))
+        if self.schema.shape == "array":
+            return list(values)
+        return {f.name: value for f, value in zip(self.schema.fields, values, strict=True)}
+
+    def _arrange_mapping(self, values: Mapping[str, Any]) -> Any:
+        names = [field.name for field in self.schema.fields]
+        missing = [name for name in names if name not in values]
+        # An event carries details of its own beside the fields; an array has no room for them.
+        is_array = self.schema.shape == "array"
+        unknown = sorted(set(values) - set(names)) if is_array else []
+        if missing or unknown:
+            raise PluginError(
+                f"stream {self.schema.name}: "
+                + "; ".join(
+                    f"{what} {', '.join(which)}"
+                    for what, which in (("missing", missing), ("unknown", unknown))
+                    if which
+                )
+            )
+        return [values[name] for name in names] if is_array else dict(values)
+
+    def width_error(self, got: int) -> PluginError:
+        """Return the error for a record of *got* values."""
+        names = ", ".join(field.name for field in self.schema.fields)
+        return PluginError(
+            f"stream {self.schema.name}: expected {self.width} values ({names}), got {got}"
+        )
+
+    # What follows is called by the writer thread, or once it has ended.
+
+    def write_waiting(self, header: bytes, t0_line: bytes | None) -> None:
+        """
+        Write all that waits at this moment.
+
+        Args:
+            header: Line 1, used if none was written yet.
+            t0_line: The line that states simulated time zero; None while it is unknown.
+
+        Raises:
+            OSError: The file takes no more for now; the rest waits, and the next call goes on
+                where this one stopped, be it within a line.
+        """
+        self._write_pending()
+        control = []
+        if not self.bytes_written:
+            control.append(header)
+        elif t0_line is not None and not self._has_t0:
+            control.append(t0_line)
+        self._has_t0 = t0_line is not None
+        left = len(self.lines)
+        while control or left > 0:
+            count = min(left, LINES_PER_WRITE_MAX)
+            self._take(control, count)
+            control = []
+            left -= count
+            self._write_pending()
+
+    def _take(self, control: list[bytes], count: int) -> None:
+        lines = self.lines[:count]
+        del self.lines[:count]
+        text = b"".join(lines)
+        self._pending = b"".join((*control, text)) if control else text
+        self._pending_cost = len(text) + LINE_OVERHEAD_BYTES * len(lines)
+        self._control_left = len(control)
+
+    def _write_pending(self) -> None:
+        while self._pending:
+            count = os.write(self._descriptor, self._pending)
+            self._account(self._pending[:count])
+            self._pending = self._pending[count:]
+        self.freed_bytes += self._pending_cost
+        self._pending_cost = 0
+
+    def _account(self, taken: bytes) -> None:
+        whole = taken.rfind(b"\n") + 1
+        if whole:
+            self._whole_bytes = self.bytes_written + whole
+        lines = taken.count(b"\n")
+        control = min(lines, self._control_left)
+        self._control_left -= control
+        self.written += lines - control
+        self.bytes_written += len(taken)
+
+    def finish(self) -> list[OSError]:
+        """Give up what the disk did not take, end the file on a whole line, say the counts in it, close it."""
+        errors: list[OSError] = []
+        records_left = self._pending.count(b"\n") - self._control_left
+        self.unwritten += len(self.lines) + max(0, records_left)
+        self.lines.clear()
+        self._pending = b""
+        counts = {
+            "records": self.written,
+            "dropped": self.dropped,
+            "not_finite": self.not_finite,
+        }
+        end = orjson.dumps({"end": counts}, option=orjson.OPT_APPEND_NEWLINE)
+        for step in (self._cut_to_whole_line, lambda: self._write_end(end), self._sync):
+            try:
+                step()
+            except OSError as error:
+                errors.append(error)
+        os.close(self._descriptor)
+        return errors
+
+    def _cut_to_whole_line(self) -> None:
+        if self.bytes_written > self._whole_bytes:
+            os.ftruncate(self._descriptor, self._whole_bytes)
+            self.bytes_written = self._whole_bytes
+
+    def _write_end(self, end: bytes) -> None:
+        """Write the end line whole or not at all; not into a file that has no line 1."""
+        if not self.bytes_written:
+            return
+        try:
+            left = end
+            while left:
+                count = os.write(self._descriptor, left)
+                self.bytes_written += count
+                left = left[count:]
+            self._whole_bytes = self.bytes_written
+        except OSError:
+            self._cut_to_whole_line()
+            raise
+
+    def _sync(self) -> None:
+        os.fsync(self._descriptor)
