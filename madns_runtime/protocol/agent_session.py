@@ -15,7 +15,7 @@ from typing import Any
 from madns_runtime.config import Timeouts
 from madns_runtime.protocol.codec import MalformedMessage, decode_message, encode_message
 from madns_runtime.protocol.delivery import BrokenDeadline
-from madns_runtime.protocol.link import Link, LinkLimits
+from madns_runtime.protocol.link import Link
 from madns_runtime.protocol.messages import (
     AgentStopped,
     EmergencyShutdown,
@@ -33,6 +33,7 @@ from madns_runtime.protocol.messages import (
     SystemStop,
 )
 from madns_runtime.protocol.states import AGENT_LIVE, AgentEvent, AgentState, agent_machine
+from madns_runtime.protocol.wire import Wire
 from madns_runtime.timing.clocksync import ClockEstimate
 
 PING_INTERVAL_S = 0.25
@@ -126,33 +127,29 @@ class AgentSession:
 
     Args:
         identity: Who speaks.
-        run_key: Secret of the run, 32 bytes.
-        session: The run on the wire, 8 bytes.
+        wire: The run's secret and the bounds of the link.
         timeouts: The run's deadlines.
         report: Called for every ping; what it returns is shown to the operator.
         now_s: Present time of the local monotonic clock.
-        limits: Bounds of the link.
     """
 
     def __init__(
         self,
         identity: AgentIdentity,
+        wire: Wire,
         *,
-        run_key: bytes,
-        session: bytes,
         timeouts: Timeouts,
         report: Callable[[], Mapping[str, Any]],
         now_s: float,
-        limits: LinkLimits | None = None,
     ) -> None:
         self.identity = identity
         self.clock = ClockEstimate()
         self.link = Link.for_agent(
-            run_key,
-            session,
+            wire.run_key,
+            wire.session,
             identity.index,
             identity.incarnation,
-            limits=limits or LinkLimits(),
+            limits=wire.limits,
         )
         self._timeouts = timeouts
         self._report = report

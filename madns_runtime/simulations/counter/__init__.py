@@ -1,1 +1,14 @@
+"""The counting benchmark (thesis, section 6.1): how long a packet takes to the host and back."""
 
+from __future__ import annotations
+
+from madns_runtime.plugin.api import Simulation
+from madns_runtime.simulations.counter.parameters import CounterParameters
+
+simulation = Simulation(
+    name="counter",
+    parameters=CounterParameters,
+    host="madns_runtime.simulations.counter.host:CounterHost",
+    agent="madns_runtime.simulations.counter.agent:CounterAgent",
+    demand="madns_runtime.simulations.counter.demand:demand",
+)

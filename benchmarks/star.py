@@ -1,0 +1,277 @@
+"""
+The counting benchmark beside a bare UDP echo star of the same shape, measured in the same run.
+
+    python benchmarks/star.py [--seconds 20] [--shapes 24x100,93x100] [--json]
+
+The bare star is the least that Python can do: one echo process, one process an agent, no seal, no
+acknowledgement, no records; both stars stagger their agents, run under the same scheduling policy
+and alternate, so that what else the machine does hits both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import shutil
+import socket
+import statistics
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from madns_runtime.health.probe import pss_bytes
+from madns_runtime.processes import list_processes
+
+PACKET = struct.Struct("<Id")
+PACKET_BYTES = 64
+RECEIVE_BUFFER_BYTES = 4 * 1024 * 1024
+FIFO_PRIORITY = 10
+ROOT = Path(__file__).parents[1]
+
+
+def main() -> None:
+    """Measure every shape and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser.add_argument("--seconds", type=float, default=20.0, help="length of each measurement")
+    parser.add_argument("--shapes", default="24x100,93x100", help="agents x Hz, comma-separated")
+    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
+    arguments = parser.parse_args()
+    rows = []
+    for shape in arguments.shapes.split(","):
+        agents, hz = (int(part) for part in shape.split("x"))
+        # Bare before and after: the median of the two stands beside ours.
+        before = bare_star(agents, hz, arguments.seconds / 2)
+        ours = cosmos_star(agents, hz, arguments.seconds)
+        after = bare_star(agents, hz, arguments.seconds / 2)
+        bare = {key: statistics.fmean((before[key], after[key])) for key in before}
+        rows.append({"agents": agents, "hz": hz, "bare": bare, "cosmos": ours})
+    if arguments.json:
+        print(json.dumps(rows, indent=2))
+    else:
+        print_table(rows)
+
+
+def print_table(rows: list[dict]) -> None:
+    """Print both stars' figures and their ratios."""
+    figures = [
+        ("round trip p50, us", "rtt_p50_us"),
+        ("round trip p99, us", "rtt_p99_us"),
+        ("lateness p50, us", "late_p50_us"),
+        ("lateness p99, us", "late_p99_us"),
+        ("ticks due", "due"),
+        ("ticks missed", "missed"),
+        ("packets lost", "lost"),
+        ("host CPU, % of a core", "host_cpu_percent"),
+        ("all agents' CPU, %", "agents_cpu_percent"),
+        ("an agent's memory, MB PSS", "agent_pss_mb"),
+        ("recorded, B an agent tick", "bytes_per_tick"),
+    ]
+    for row in rows:
+        print(f"\n{row['agents']} agents, {row['hz']} Hz")
+        print(f"  {'':28}{'bare UDP':>12}{'cosmos':>12}{'ratio':>8}")
+        for label, key in figures:
+            bare, ours = row["bare"].get(key), row["cosmos"].get(key)
+            ratio = f"{ours / bare:8.2f}" if bare and ours is not None else ""
+            left = f"{bare:12.1f}" if bare is not None else f"{'-':>12}"
+            right = f"{ours:12.1f}" if ours is not None else f"{'-':>12}"
+            print(f"  {label:28}{left}{right}{ratio}")
+
+
+# The bare star ------------------------------------------------------------------------------------
+
+
+def bare_star(agents: int, hz: int, seconds: float) -> dict[str, float]:
+    """Run one echo process and *agents* pinging ones; return their figures."""
+    server = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+    server.bind(("127.0.0.1", 0))
+    address = server.getsockname()
+    with tempfile.TemporaryDirectory() as directory:
+        t0_s = time.monotonic() + 0.5
+        echo = fork(lambda: echo_until(server, t0_s + seconds + 0.5, Path(directory, "host")))
+        server.close()
+        children = [
+            fork(
+                lambda i=i: bare_agent(
+                    address, (t0_s + i / agents / hz, hz, int(seconds * hz)), Path(directory, str(i))
+                )
+            )
+            for i in range(agents)
+        ]
+        time.sleep(max(0.0, t0_s + seconds * 0.7 - time.monotonic()))
+        pss = [pss_bytes(pid) for pid in children]
+        for pid in (*children, echo):
+            os.waitpid(pid, 0)
+        loaded = [np.load(Path(directory, f"{i}.npz")) for i in range(agents)]
+        round_trips = np.concatenate([one["rtt_us"] for one in loaded])
+        lateness = np.concatenate([one["late_us"] for one in loaded])
+        host_cpu_s = float(np.load(Path(directory, "host.npz"))["cpu_s"])
+        agents_cpu_s = sum(float(one["cpu_s"]) for one in loaded)
+    due = agents * int(seconds * hz)
+    return {
+        "rtt_p50_us": float(np.percentile(round_trips, 50)),
+        "rtt_p99_us": float(np.percentile(round_trips, 99)),
+        "late_p50_us": float(np.percentile(lateness, 50)),
+        "late_p99_us": float(np.percentile(lateness, 99)),
+        "due": due,
+        "missed": due - len(lateness),
+        "lost": len(lateness) - len(round_trips),
+        "host_cpu_percent": 100 * host_cpu_s / seconds,
+        "agents_cpu_percent": 100 * agents_cpu_s / seconds,
+        "agent_pss_mb": statistics.fmean(p for p in pss if p) / 1e6,
+    }
+
+
+def fork(work) -> int:
+    """Run *work* in a child with the policy that an agent's loop has; return its pid."""
+    pid = os.fork()
+    if pid:
+        return pid
+    try:
+        take_fifo()
+        work()
+    finally:
+        os._exit(0)
+
+
+def take_fifo() -> None:
+    """Ask for SCHED_FIFO, as agents do."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+    except PermissionError:
+        return
+
+
+def echo_until(server: socket.socket, end_s: float, path: Path) -> None:
+    """Return every datagram to its sender."""
+    server.settimeout(0.2)
+    while time.monotonic() < end_s:
+        try:
+            data, address = server.recvfrom(2048)
+        except TimeoutError:
+            continue
+        server.sendto(data, address)
+    np.savez(path, cpu_s=cpu_seconds())
+
+
+def bare_agent(address: tuple[str, int], pace: tuple[float, int, int], path: Path) -> None:
+    """Send one datagram a tick on absolute deadlines and time its return."""
+    t0_s, hz, ticks = pace
+    client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    client.connect(address)
+    round_trips, lateness = [], []
+    k = 0
+    while k < ticks:
+        deadline_s = t0_s + k / hz
+        wait_s = deadline_s - time.monotonic()
+        if wait_s > 0:
+            time.sleep(wait_s)
+        sent_s = time.monotonic()
+        lateness.append(1e6 * (sent_s - deadline_s))
+        client.send(PACKET.pack(k, sent_s).ljust(PACKET_BYTES, b"\0"))
+        k += 1
+        client.settimeout(max(1e-4, t0_s + k / hz - time.monotonic()))
+        try:
+            while PACKET.unpack_from(client.recv(2048))[0] != k - 1:
+                pass
+            round_trips.append(1e6 * (time.monotonic() - sent_s))
+        except TimeoutError:
+            pass
+        k = max(k, int((time.monotonic() - t0_s) * hz))  # whole periods overslept are missed
+    np.savez(path, rtt_us=round_trips, late_us=lateness, cpu_s=cpu_seconds())
+
+
+def cpu_seconds() -> float:
+    """Return the CPU time of this process."""
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_utime + usage.ru_stime
+
+
+# Ours ---------------------------------------------------------------------------------------------
+
+
+def cosmos_star(agents: int, hz: int, seconds: float) -> dict[str, float]:
+    """Run the counter simulation through `cosmos run`; return its figures."""
+    directory = Path(tempfile.mkdtemp(prefix="cosmos-star-"))
+    environment = {**os.environ, "COSMOS_STATE_DIR": str(directory / "state")}
+    scenario = directory / "star.yaml"
+    scenario.write_text(
+        f"name: star\nsimulation: counter\nagents: {{count: {agents}, tick_hz: {hz}}}\n"
+        f"time: {{duration_s: {seconds}}}\nhealth: {{period_s: 5}}\n"
+        "deadline: {max_miss_ratio: 1}\n",
+        encoding="utf-8",
+    )
+    command = [
+        sys.executable, "-m", "cosmos_cli.app", "run", str(scenario),
+        "--runs", str(directory / "runs"), "--json", "--quiet", "--no-report",
+    ]  # fmt: skip
+    run = subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, cwd=ROOT)
+    os.environ["COSMOS_STATE_DIR"] = environment["COSMOS_STATE_DIR"]
+    cpu, pss = watch(run, seconds)
+    output = run.communicate(timeout=120)[0]
+    result = json.loads(output)
+    evidence = directory / "runs" / result["run"]
+    ticks = [np.array(read_records(p)) for p in evidence.glob("agents/*/ticks.jsonl")]
+    trips = [np.array(read_records(p)) for p in evidence.glob("agents/*/round_trips.jsonl")]
+    lateness = np.concatenate([t[:, 1] for t in ticks])
+    round_trips = np.concatenate([t[:, 2] for t in trips])
+    recorded = sum(p.stat().st_size for p in evidence.glob("agents/**/*.jsonl"))
+    shutil.rmtree(directory)
+    return {
+        "rtt_p50_us": float(np.percentile(round_trips, 50)),
+        "rtt_p99_us": float(np.percentile(round_trips, 99)),
+        "late_p50_us": float(np.percentile(lateness, 50)),
+        "late_p99_us": float(np.percentile(lateness, 99)),
+        "due": agents * int(seconds * hz),
+        "missed": result["timing"]["missed"],
+        "lost": len(lateness) - len(round_trips),
+        "host_cpu_percent": cpu["host"],
+        "agents_cpu_percent": cpu["agent"],
+        "agent_pss_mb": pss / 1e6,
+        "bytes_per_tick": recorded / len(lateness),
+    }
+
+
+def read_records(path: Path) -> list[list[float]]:
+    """Return a stream's records without its first and last line."""
+    with path.open("rb") as lines:
+        return [json.loads(line) for line in lines if line.startswith(b"[")]
+
+
+def watch(run: subprocess.Popen, seconds: float) -> tuple[dict[str, float], float]:
+    """Sample CPU over the middle of the run, and memory near its end."""
+    deadline_s = time.monotonic() + 60
+    while time.monotonic() < deadline_s:
+        roles = [p.role for p in list_processes()]
+        if "host" in roles and "agent" in roles:
+            break
+        time.sleep(0.2)
+    time.sleep(2.0 + 0.1 * seconds)
+    processes = list_processes()
+    first, began_s = {p.pid: process_cpu_s(p.pid) for p in processes}, time.monotonic()
+    time.sleep(0.6 * seconds)
+    spent_s = time.monotonic() - began_s
+    cpu = {"host": 0.0, "agent": 0.0}
+    for process in processes:
+        if process.role in cpu:
+            used_s = process_cpu_s(process.pid) - first[process.pid]
+            cpu[process.role] += 100 * used_s / spent_s
+    pss = [pss_bytes(p.pid) for p in processes if p.role == "agent"]
+    return cpu, statistics.fmean(p for p in pss if p)
+
+
+def process_cpu_s(pid: int) -> float:
+    """Return the CPU time of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+if __name__ == "__main__":
+    main()

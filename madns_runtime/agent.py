@@ -1,0 +1,60 @@
+"""
+The agent side's process: `madns-agent` starts a machine's agents and watches over them.
+
+Started by `cosmos run`, which writes an AgentLaunch to standard input and reads events from standard
+output; by hand with --launch SOCKET, from which the same comes. It ends by itself when that line
+closes, and its agents end when it does.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+
+from madns_runtime.config import AgentLaunch, from_mapping
+from madns_runtime.errors import ConfigurationError, MachineError, MadnsError
+from madns_runtime.processes import register
+from madns_runtime.reactor.lines import read_launch
+from madns_runtime.supervisor import Supervisor
+
+USAGE = "usage: madns-agent [--launch SOCKET]"
+
+
+def main() -> None:
+    """Entry point of `madns-agent`."""
+    code = 1
+    try:
+        fds = _open_line(sys.argv[1:])
+        document, pending = read_launch(fds[0])
+        launch = from_mapping(AgentLaunch, document)
+        with register(launch.config.run, "supervisor", launch.machine, launch.directory):
+            code = Supervisor(launch, fds, pending).run()
+    except MadnsError as error:
+        sys.stderr.write(f"madns-agent: {error}\n")
+    sys.stderr.flush()
+    os._exit(code)  # no plug-in's thread may hold the process
+
+
+def _open_line(arguments: list[str]) -> tuple[int, int]:
+    """Return where commands come from and events go to."""
+    if not arguments:
+        out_fd = os.dup(1)
+        os.dup2(2, 1)  # what a plug-in prints must not mix with the events
+        return 0, out_fd
+    if len(arguments) != 2 or arguments[0] != "--launch":
+        raise ConfigurationError(USAGE)
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        connection.connect(arguments[1])
+    except OSError as error:
+        raise MachineError(
+            f"cannot reach the run at {arguments[1]}: {error.strerror}; is `cosmos run --manual`"
+            " still waiting?"
+        ) from error
+    fd = connection.detach()
+    return fd, fd
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,431 @@
+"""One agent inside a loop: its socket, its session, its pace, its half of the simulation, its records."""
+
+from __future__ import annotations
+
+import os
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from madns_runtime import __version__
+from madns_runtime.config import AgentLaunch
+from madns_runtime.context import RunContext, describe_exception
+from madns_runtime.errors import MadnsError
+from madns_runtime.health.probe import process_usage
+from madns_runtime.plugin.api import HOST, AgentSimulation, Tick
+from madns_runtime.protocol import agent_session as told
+from madns_runtime.protocol.agent_session import AgentIdentity, AgentSession
+from madns_runtime.protocol.link import LinkLimits
+from madns_runtime.protocol.messages import Service
+from madns_runtime.protocol.states import AgentState
+from madns_runtime.protocol.wire import Wire
+from madns_runtime.reactor.reactor import Reactor, Timer
+from madns_runtime.reactor.udp import UdpSocket
+from madns_runtime.recording.records import CLOCK, EVENTS, LOG, PROCESS, TICKS
+from madns_runtime.recording.writer import Recorder
+from madns_runtime.timing.clock import utc_now_iso
+from madns_runtime.timing.rate import Pacer, stagger
+
+T = TypeVar("T")
+
+DRAIN_S = 0.1
+"""After the last tick's period an agent listens this much longer for what is still under way."""
+CLOCK_RECORD_INTERVAL_S = 1.0
+AGENT_RECEIVE_BUFFER_BYTES = 1024 * 1024
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Program:
+    """What every agent of a process runs, loaded once."""
+
+    simulation: type[AgentSimulation]
+    parameters: Any
+
+
+class AgentRunner:
+    """
+    Runs one agent in a loop that others may share.
+
+    Args:
+        name: The agent's name.
+        launch: The run.
+        program: What it runs.
+        reactor: The loop.
+        on_ended: Called once, with whether it ended as the host ordered, and why not.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        launch: AgentLaunch,
+        program: Program,
+        *,
+        reactor: Reactor,
+        on_ended: Callable[[str, bool, str], None],
+    ) -> None:
+        config = launch.config
+        self.name = name
+        self._config = config
+        self._program = program
+        self._reactor = reactor
+        self._on_ended = on_ended
+        self._index = config.agents.resolved_names().index(name)
+        self._recorder = Recorder(
+            Path(launch.directory) / "agents" / name,
+            run=config.run,
+            source=name,
+            settings=config.recording,
+        )
+        for schema in (TICKS, CLOCK, EVENTS, LOG, PROCESS):
+            self._recorder.open_stream(schema)
+        self._socket = UdpSocket.connect(
+            launch.host_address,
+            launch.host_port,
+            receive_buffer_bytes=AGENT_RECEIVE_BUFFER_BYTES,
+        )
+        self._session = AgentSession(
+            AgentIdentity(
+                name=name,
+                index=self._index + 1,
+                incarnation=int.from_bytes(os.urandom(4)),
+                runtime_version=__version__,
+                pid=os.getpid(),
+            ),
+            Wire(
+                run_key=bytes.fromhex(launch.run_key_hex),
+                session=bytes.fromhex(launch.session_hex),
+                limits=LinkLimits(receive_window_bytes=self._socket.receive_buffer_bytes // 4),
+            ),
+            timeouts=config.timeouts,
+            report=self._report,
+            now_s=reactor.now_s(),
+        )
+        self._simulation = program.simulation()
+        self._simulation_name = type(self._simulation).__name__
+        self._pacer: Pacer | None = None
+        self._t0_host_s: float | None = None
+        self._step = self._simulation.step
+        self._period_s = 1.0 / config.agents.tick_hz
+        self._first: tuple[float, float] | None = None
+        self._newest: tuple[float, float] | None = None
+        self._session_timer: Timer | None = None
+        self._tick_timer: Timer | None = None
+        self._clock_recorded_s = 0.0
+        self._scheduling: dict[str, Any] = {}
+        self._usage_timer: Timer | None = None
+        self._outcome: tuple[bool, str] = (False, "did not end")
+        self._is_closed = False
+
+    def start(self) -> None:
+        """Begin: says hello at once."""
+        self._recorder.start()
+        self._event("start", pid=os.getpid())
+        if self._socket.warning:
+            self._recorder.log("warning", self._socket.warning, None)
+        self._reactor.add_reader(self._socket.fileno(), self._readable)
+        self._pump()
+
+    def set_scheduling(self, grant: Mapping[str, Any]) -> None:
+        """Take note of what the kernel granted to the loop."""
+        self._scheduling = dict(grant)
+        self._event("scheduling", **self._scheduling)
+        if grant.get("warning"):
+            self._recorder.log("warning", str(grant["warning"]), None)
+
+    def emergency(self, reason: str) -> None:
+        """End at once, keep the records, tell the host."""
+        self._session.emergency(reason, self._reactor.now_s())
+        self._pump()
+
+    # The loop's callbacks ----------------------------------------------------------------------
+
+    def _readable(self) -> None:
+        now_s = self._reactor.now_s
+        receive = self._session.receive_datagram
+        for data, _ in self._socket.receive_all():
+            receive(data, now_s())
+        self._pump()
+
+    def _session_due(self) -> None:
+        self._session_timer = None
+        # What waits in the socket is heard before the host is blamed for silence.
+        for data, _ in self._socket.receive_all():
+            self._session.receive_datagram(data, self._reactor.now_s())
+        self._session.handle_timer(self._reactor.now_s())
+        self._pump()
+
+    def _pump(self) -> None:
+        """Carry out the session's events, send what is due, arm its timer."""
+        session = self._session
+        while (event := session.next_event()) is not None:
+            self._handle(event)
+        if self._is_closed:
+            return
+        self._send_datagrams()
+        due_s = session.get_timer()
+        timer = self._session_timer
+        if due_s is not None and (timer is None or due_s < timer.when_s):
+            if timer is not None:
+                timer.cancel()
+            self._session_timer = self._reactor.call_at(due_s, self._session_due)
+
+    def _send_datagrams(self) -> None:
+        send = self._socket.send
+        for data in self._session.datagrams_to_send(self._reactor.now_s()):
+            send(data)
+
+    def _handle(self, event: told.AgentSessionEvent) -> None:
+        if isinstance(event, told.DataReceived):
+            self._call("receive", self._simulation.receive, event.payload)
+        elif isinstance(event, told.ClockEstimated):
+            self._record_clock()
+        elif isinstance(event, told.SetupReceived):
+            self._set_up(event.initial)
+        elif isinstance(event, told.StartReceived):
+            self._start_run(event.t0_host_s)
+        elif isinstance(event, told.StopReceived):
+            self._outcome = (True, "")
+            self._close_records()
+        elif isinstance(event, told.EmergencyDeclared):
+            self._end_early(f"{event.who}: {event.reason}")
+        elif isinstance(event, told.ExpelledFromRun):
+            self._end_early(f"expelled by the host: {event.reason}")
+        else:
+            self._close()
+
+    # Carrying out ------------------------------------------------------------------------------
+
+    def _set_up(self, initial: Any) -> None:
+        self._event("state", state=self._session.state.value)
+        context = RunContext(
+            name=self.name,
+            config=self._config,
+            parameters=self._program.parameters,
+            recorder=self._recorder,
+            now_s=self._simulated_s,
+            send=self._send,
+        )
+        self._call("setup", self._simulation.setup, context, initial)
+        if self._session.state is AgentState.SIMULATION_SETUP:
+            self._session.setup_finished(self._reactor.now_s())
+
+    def _start_run(self, t0_host_s: float) -> None:
+        self._t0_host_s = t0_host_s
+        agents = self._config.agents
+        phase_s = 0.0
+        if agents.phase == "staggered":
+            phase_s = stagger(self._index, agents.count, agents.tick_hz)
+        self._pacer = Pacer(
+            tick_hz=agents.tick_hz,
+            phase_s=phase_s,
+            duration_s=self._config.time.duration_s,
+            tolerance_s=self._config.deadline.tolerance_ms * 1e-3,
+        )
+        now_s = self._simulated_s()
+        self._recorder.set_t0(utc_now_iso(-now_s))
+        self._event("state", state=self._session.state.value, phase_s=phase_s)
+        if now_s > 0:
+            self._pacer.skip_to(now_s)
+        self._arm_tick()
+        process_usage()
+        self._record_usage()
+
+    def _arm_tick(self) -> None:
+        pacer = self._pacer
+        if pacer is None:
+            return
+        deadline_s = pacer.next_deadline_s()
+        if deadline_s is None:
+            end_s = self._config.time.duration_s + DRAIN_S
+            self._tick_timer = self._reactor.call_at(self._local_s(end_s), self._finish_run)
+        else:
+            self._tick_timer = self._reactor.call_at(self._local_s(deadline_s), self._tick)
+
+    def _tick(self) -> None:
+        pacer = self._pacer
+        if pacer is None or self._session.state is not AgentState.RUN_SIMULATION:
+            return
+        began_s = self._simulated_s()
+        timing = pacer.begin(began_s)
+        if timing is not None:
+            if self._first is None:
+                self._first = (timing.t_s, began_s)
+            self._newest = (timing.t_s, began_s)
+            tick = Tick(
+                timing.index, timing.t_s, self._period_s, timing.lateness_s, timing.missed
+            )
+            try:
+                self._step(tick)
+            except Exception as error:  # noqa: BLE001 - a plug-in may raise anything
+                self._plugin_failed("step", error)
+                self._pump()
+                return
+            margin_s = pacer.end(self._simulated_s())
+            self._recorder.record(
+                "ticks",
+                (
+                    timing.index,
+                    int(timing.lateness_s * 1e6),
+                    int(margin_s * 1e6),
+                    timing.missed,
+                ),
+            )
+            self._send_datagrams()
+        self._arm_tick()
+        self._pump_if_due()
+
+    def _pump_if_due(self) -> None:
+        """Arm the session's timer anew if what was sent wants an earlier one."""
+        due_s = self._session.get_timer()
+        timer = self._session_timer
+        if due_s is not None and timer is not None and due_s < timer.when_s:
+            timer.cancel()
+            self._session_timer = self._reactor.call_at(due_s, self._session_due)
+
+    def _finish_run(self) -> None:
+        if self._pacer is None or self._session.state is not AgentState.RUN_SIMULATION:
+            return
+        self._pacer.finish(self._simulated_s())
+        summary = self._call("finish", self._simulation.finish)
+        if self._session.state is AgentState.RUN_SIMULATION:
+            self._session.run_finished(self._summary(summary), self._reactor.now_s())
+        self._pump()
+
+    def _summary(self, simulation: Any) -> dict[str, Any]:
+        clock, now_s = self._session.clock, self._reactor.now_s()
+        return {
+            "ticks": dict(self._pacer.summary()) if self._pacer else {},
+            "rtf": self._real_time_factor(),
+            "clock": {
+                "offset_us": clock.offset_s(now_s) * 1e6,
+                "drift_ppm": clock.drift_ppm,
+                "uncertainty_us": clock.uncertainty_s(now_s) * 1e6,
+            }
+            if clock.is_valid
+            else None,
+            "scheduling": self._scheduling,
+            "simulation": dict(simulation) if isinstance(simulation, Mapping) else {},
+        }
+
+    def _real_time_factor(self) -> float | None:
+        """Simulated seconds per wall second between the first and the newest tick."""
+        if self._first is None or self._newest is None or self._newest[1] <= self._first[1]:
+            return None
+        return round(
+            (self._newest[0] - self._first[0]) / (self._newest[1] - self._first[1]), 9
+        )
+
+    def _end_early(self, reason: str) -> None:
+        self._outcome = (False, reason)
+        for timer in (self._tick_timer, self._usage_timer):
+            if timer is not None:
+                timer.cancel()
+        self._event("emergency", reason=reason)
+        self._recorder.log("critical", f"emergency shutdown: {reason}", self._t_s_or_none())
+        self._close_records()
+
+    def _close_records(self) -> None:
+        self._event("end", state=self._session.state.value)
+        messages = self._session.link.counters.to_mapping()
+        counts = self._recorder.close(self._config.timeouts.shutdown_s)
+        self._session.records_closed(
+            {**counts.to_mapping(), "messages": messages}, self._reactor.now_s()
+        )
+
+    def _close(self) -> None:
+        self._is_closed = True
+        self._send_datagrams()
+        for timer in (self._session_timer, self._tick_timer, self._usage_timer):
+            if timer is not None:
+                timer.cancel()
+        self._reactor.remove_reader(self._socket.fileno())
+        self._socket.close()
+        self._on_ended(self.name, *self._outcome)
+
+    # Records ---------------------------------------------------------------------------------------
+
+    def _record_clock(self) -> None:
+        t_s = self._t_s_or_none()
+        now_s = self._reactor.now_s()
+        if t_s is None or now_s - self._clock_recorded_s < CLOCK_RECORD_INTERVAL_S:
+            return
+        if self._session.state is not AgentState.RUN_SIMULATION:
+            return
+        self._clock_recorded_s = now_s
+        clock = self._session.clock
+        self._recorder.record(
+            "clock",
+            (
+                round(t_s, 3),
+                round(clock.offset_s(now_s) * 1e6, 1),
+                round(clock.drift_ppm, 3),
+                round(clock.uncertainty_s(now_s) * 1e6, 1),
+                round(clock.round_trip_s_min * 1e6, 1),
+            ),
+        )
+
+    def _record_usage(self) -> None:
+        if self._session.state is not AgentState.RUN_SIMULATION:
+            return
+        self._recorder.record("process", (round(self._simulated_s(), 3), *process_usage()))
+        due_s = self._reactor.now_s() + self._config.health.period_s
+        self._usage_timer = self._reactor.call_at(due_s, self._record_usage)
+
+    def _event(self, event: str, **values: Any) -> None:
+        t_s = self._t_s_or_none()
+        rounded = None if t_s is None else round(t_s, 6)
+        self._recorder.record(
+            "events", {"t_s": rounded, "utc": utc_now_iso(), "event": event, **values}
+        )
+
+    def _report(self) -> Mapping[str, Any]:
+        report: dict[str, Any] = {"dropped": self._recorder.dropped_count}
+        if self._pacer is not None:
+            summary = self._pacer.live_summary()
+            report.update(
+                ticks=summary["run"],
+                missed=summary["missed"],
+                late_p50_us=summary["lateness_us_p50"],
+                late_p99_us=summary["lateness_us_p99"],
+                rtf=self._real_time_factor(),
+                lost=self._session.link.counters.to_mapping()["best"]["lost"],
+            )
+        return report
+
+    # Towards the simulation ------------------------------------------------------------------------
+
+    def _simulated_s(self) -> float:
+        if self._t0_host_s is None:
+            return float("-inf")
+        return self._session.clock.to_host_s(self._reactor.now_s()) - self._t0_host_s
+
+    def _t_s_or_none(self) -> float | None:
+        return None if self._t0_host_s is None else self._simulated_s()
+
+    def _local_s(self, t_s: float) -> float:
+        t0_s = self._t0_host_s
+        if t0_s is None:
+            raise MadnsError("simulated time has not begun")
+        return self._session.clock.to_local_s(t0_s + t_s)
+
+    def _send(self, to: str, message: Any, service: Service, *, deadline_s: float | None) -> None:
+        if to != HOST:
+            raise MadnsError(f"an agent sends to {HOST!r}, not to {to!r}")
+        due_s = None if deadline_s is None else self._local_s(deadline_s)
+        self._session.send(message, service, self._reactor.now_s(), deadline_s=due_s)
+
+    def _call(self, name: str, method: Callable[..., T], *arguments: Any) -> T | None:
+        """Call the plug-in; whatever it raises ends this agent with its name on it."""
+        try:
+            return method(*arguments)
+        except Exception as error:  # noqa: BLE001 - a plug-in may raise anything
+            self._plugin_failed(name, error)
+            return None
+
+    def _plugin_failed(self, name: str, error: Exception) -> None:
+        text = "".join(traceback.format_exception(error))
+        self._recorder.log("critical", text, self._t_s_or_none())
+        reason = describe_exception(error, f"{self._simulation_name}.{name}")
+        self._session.emergency(reason, self._reactor.now_s())

@@ -1,0 +1,98 @@
+"""What plug-ins see of the framework: the implementation of `plugin.api`'s contexts."""
+
+from __future__ import annotations
+
+import traceback
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from madns_runtime.config import RunConfig
+from madns_runtime.errors import PluginError
+from madns_runtime.protocol.messages import Service
+from madns_runtime.recording.records import Field, StreamSchema
+from madns_runtime.recording.writer import Recorder
+
+FRAMEWORK_STREAMS = frozenset({"ticks", "clock", "events", "log", "health", "process"})
+
+
+class Sender(Protocol):
+    """How a context's `send` reaches the session."""
+
+    def __call__(
+        self, to: str, message: Any, service: Service, *, deadline_s: float | None
+    ) -> None:
+        """Send *message*; *deadline_s* is simulated time."""
+
+
+class RunContext:
+    """
+    Either half's view of the run.
+
+    Args:
+        name: host, or the agent's name.
+        config: The run.
+        parameters: The simulation's, parsed.
+        recorder: Where its streams go.
+        now_s: Returns the simulated time.
+        send: Takes messages.
+    """
+
+    def __init__(  # noqa: PLR0913 - the collaborators of a seam, all keyword-only
+        self,
+        *,
+        name: str,
+        config: RunConfig,
+        parameters: Any,
+        recorder: Recorder,
+        now_s: Callable[[], float],
+        send: Sender,
+    ) -> None:
+        self.name = name
+        self.agents = config.agents.resolved_names()
+        self.parameters = parameters
+        self.tick_hz = config.agents.tick_hz
+        self.duration_s = config.time.duration_s
+        self.base_directory = Path(config.base_directory)
+        self.random = np.random.default_rng([config.seed, zlib.crc32(name.encode())])
+        self.now_s = now_s
+        self.record = recorder.record
+        self._recorder = recorder
+        self._send = send
+
+    def send(
+        self,
+        to: str,
+        message: Any,
+        service: Service = Service.RELIABLE,
+        *,
+        deadline_s: float | None = None,
+    ) -> None:
+        """Send *message*; see `plugin.api.Context.send`."""
+        self._send(to, message, service, deadline_s=deadline_s)
+
+    def open_stream(self, name: str, fields: Sequence[Field]) -> None:
+        """Declare a record stream; see `plugin.api.Context.open_stream`."""
+        if name in FRAMEWORK_STREAMS:
+            raise PluginError(f"stream {name!r} belongs to the framework; choose another name")
+        self._recorder.open_stream(StreamSchema(name, tuple(fields)))
+
+    def log(self, level: str, text: str) -> None:
+        """Log a sentence; see `plugin.api.Context.log`."""
+        self._recorder.log(level, text, self.now_s())
+
+
+class JobContext(RunContext):
+    """The host's view: it can also hand long work to the executor."""
+
+    submit: Callable[..., int]
+
+
+def describe_exception(error: BaseException, doing: str) -> str:
+    """Return one line: which call of a plug-in raised what, and in which file and line."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+    return f"{doing} raised {type(error).__name__}: {error}{place}"

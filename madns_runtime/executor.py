@@ -1,0 +1,132 @@
+"""Who does the host's long work: a `concurrent.futures.Executor`, and its results as events of the loop."""
+
+from __future__ import annotations
+
+import importlib
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from typing import Any, cast
+
+from madns_runtime.config import ExecutorSettings
+from madns_runtime.errors import ConfigurationError
+from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.reactor.scheduling import die_with_parent
+
+JOBS_MAX = 10_000
+"""Jobs submitted and not yet taken back."""
+
+
+def make_executor(settings: ExecutorSettings) -> Executor:
+    """
+    Return the executor that *settings* name, its workers already running.
+
+    Call it before any thread is started: the workers of the process pool are forked.
+
+    Raises:
+        ConfigurationError: The kind is unknown, or what it names is no executor.
+    """
+    if settings.kind == "process":
+        return _process_pool(settings.workers)
+    if settings.kind == "thread":
+        return ThreadPoolExecutor(settings.workers, thread_name_prefix="executor")
+    module_name, _, attribute = settings.kind.partition(":")
+    if not attribute:
+        raise ConfigurationError(
+            f"executor.kind: expected process, thread or module:callable, got {settings.kind!r}"
+        )
+    try:
+        factory = getattr(importlib.import_module(module_name), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ConfigurationError(f"executor.kind: cannot load {settings.kind}: {error}") from error
+    executor = factory()
+    if not (hasattr(executor, "submit") and hasattr(executor, "shutdown")):
+        raise ConfigurationError(
+            f"executor.kind: {settings.kind} returned {type(executor).__name__}, which is no"
+            " concurrent.futures.Executor"
+        )
+    return cast("Executor", executor)
+
+
+def _process_pool(workers: int) -> ProcessPoolExecutor:
+    pool = ProcessPoolExecutor(
+        workers,
+        mp_context=multiprocessing.get_context("fork"),
+        initializer=_start_worker,
+        initargs=(os.getpid(),),
+    )
+    pool.submit(_nothing).result(timeout=30.0)  # forks every worker now, while no thread runs
+    return pool
+
+
+def _start_worker(parent: int) -> None:
+    # A pool's worker holds both ends of its pipe, so its parent's death would leave it waiting for ever.
+    die_with_parent()
+    if os.getppid() != parent:
+        os._exit(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.set_wakeup_fd(-1)
+
+
+def _nothing() -> None:
+    """Do nothing: the first job makes the pool fork its workers."""
+
+
+class JobRunner:
+    """
+    Hands functions to an executor and their results to the loop.
+
+    Args:
+        reactor: The loop in which *on_done* is called.
+        executor: Who works.
+        on_done: Called with the job's number and its finished future.
+    """
+
+    def __init__(
+        self,
+        reactor: Reactor,
+        executor: Executor,
+        on_done: Callable[[int, Future[Any]], None],
+    ) -> None:
+        self._reactor = reactor
+        self._executor = executor
+        self._on_done = on_done
+        self._pending: dict[int, Future[Any]] = {}
+        self._submitted_count = 0
+
+    @property
+    def pending_count(self) -> int:
+        """Jobs whose result has not been taken."""
+        return len(self._pending)
+
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> int:
+        """
+        Start a job and return its number.
+
+        Raises:
+            ConfigurationError: More than JOBS_MAX are waiting.
+        """
+        if len(self._pending) >= JOBS_MAX:
+            raise ConfigurationError(f"more than {JOBS_MAX} jobs are waiting in the executor")
+        self._submitted_count += 1
+        job = self._submitted_count
+        future = self._executor.submit(function, *arguments)
+        self._pending[job] = future
+        future.add_done_callback(lambda _: self._reactor.call_soon_threadsafe(lambda: self._done(job)))
+        return job
+
+    def close(self) -> None:
+        """Let go of every job and end the workers, also one that is deep in its work."""
+        self._pending.clear()
+        workers = list((getattr(self._executor, "_processes", None) or {}).values())
+        self._executor.shutdown(wait=False, cancel_futures=True)
+        for worker in workers:
+            worker.kill()
+
+    def _done(self, job: int) -> None:
+        future = self._pending.pop(job, None)
+        if future is not None and not future.cancelled():
+            self._on_done(job, future)

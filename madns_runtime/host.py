@@ -1,0 +1,412 @@
+"""
+The host process: one loop that joins socket, session, simulation, executor and records.
+
+Started by `cosmos run`, which writes a HostLaunch to standard input and reads events from standard
+output. It ends by itself when that line closes.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any, TypeVar
+
+from madns_runtime.config import HostLaunch, from_mapping
+from madns_runtime.context import JobContext, describe_exception
+from madns_runtime.errors import MadnsError
+from madns_runtime.executor import JobRunner, make_executor
+from madns_runtime.health.sampler import start_sampler, stop_sampler
+from madns_runtime.host_result import HostReport, progress_report
+from madns_runtime.plugin.api import HOST
+from madns_runtime.plugin.registry import load_half, parse_parameters, resolve
+from madns_runtime.processes import register
+from madns_runtime.protocol import host_session as told
+from madns_runtime.protocol.host_session import HostSession, Phase
+from madns_runtime.protocol.link import LinkLimits
+from madns_runtime.protocol.messages import Service
+from madns_runtime.protocol.states import HOST_LIVE, HostState
+from madns_runtime.protocol.wire import Wire
+from madns_runtime.reactor.lines import OperatorLink, read_launch
+from madns_runtime.reactor.reactor import Reactor, Timer
+from madns_runtime.reactor.scheduling import apply as apply_scheduling
+from madns_runtime.reactor.scheduling import freeze_garbage
+from madns_runtime.reactor.udp import UdpSocket
+from madns_runtime.recording.records import EVENTS, LOG
+from madns_runtime.recording.writer import Recorder
+from madns_runtime.timing.clock import utc_now_iso
+
+T = TypeVar("T")
+
+PROGRESS_INTERVAL_S = 0.5
+FLUSH_TIMEOUT_S = 5.0
+PSEUDO_NEVER_S = 1e9
+
+
+class HostRuntime:
+    """
+    One run, seen from the host.
+
+    Args:
+        launch: What to run.
+        fds: Where the operator's commands come from and events go to.
+        pending: What had already come behind the launch document.
+    """
+
+    def __init__(self, launch: HostLaunch, fds: tuple[int, int], pending: bytes) -> None:
+        config = launch.config
+        self._config = config
+        self._names = config.agents.resolved_names()
+        base = Path(config.base_directory)
+        descriptor = resolve(config.simulation, base)
+        parameters = parse_parameters(descriptor, config.parameters)
+        self._simulation = load_half(descriptor, "host", base)()
+        self._simulation_name = type(self._simulation).__name__
+        directory = Path(launch.directory)
+        self._sampler = start_sampler(
+            directory,
+            run=config.run,
+            machine=HOST,
+            settings=config.health,
+            recording=config.recording,
+        )
+        executor = make_executor(config.executor)  # both fork: before every thread
+        self._reactor = Reactor()
+        self._jobs = JobRunner(self._reactor, executor, self._job_done)
+        self._recorder = Recorder(
+            directory, run=config.run, source=HOST, settings=config.recording
+        )
+        self._recorder.open_stream(EVENTS)
+        self._recorder.open_stream(LOG)
+        self._operator = OperatorLink(
+            self._reactor,
+            fds,
+            on_command=self._command,
+            on_gone=lambda: self._end("operator", "the operator's process is gone", "aborted"),
+            pending=pending,
+        )
+        self._socket = UdpSocket.bind(
+            config.network.address,
+            config.network.port,
+            receive_buffer_bytes=config.network.receive_buffer_bytes,
+        )
+        limits = LinkLimits(
+            receive_window_bytes=window_bytes(self._socket.receive_buffer_bytes, len(self._names))
+        )
+        self._session = HostSession(
+            self._names,
+            Wire(
+                run_key=bytes.fromhex(launch.run_key_hex),
+                session=bytes.fromhex(launch.session_hex),
+                limits=limits,
+            ),
+            timeouts=config.timeouts,
+            on_agent_loss=config.on_agent_loss,
+            now_s=self._reactor.now_s(),
+        )
+        self._context = JobContext(
+            name=HOST,
+            config=config,
+            parameters=parameters,
+            recorder=self._recorder,
+            now_s=self._simulated_s,
+            send=self._send,
+        )
+        self._context.submit = self._jobs.submit
+        self._report = HostReport(config.time.duration_s)
+        self._t0_s = PSEUDO_NEVER_S
+        self._session_timer: Timer | None = None
+        self._plugin_timer: Timer | None = None
+        self._awaits_jobs = False
+        self._state = self._session.state
+
+    def run(self) -> int:
+        """Run to the end and return the process's exit code."""
+        config = self._config
+        self._reactor.on_signal(
+            signal.SIGTERM, lambda: self._end("operator", "SIGTERM", "interrupted")
+        )
+        self._reactor.on_signal(signal.SIGINT, lambda: None)  # a terminal's Ctrl-C is the operator's
+        self._recorder.start()
+        self._report.scheduling = apply_scheduling(config.scheduling, is_host=True).to_mapping()
+        for warning in filter(None, (self._socket.warning, self._report.scheduling.get("warning"))):
+            self._log("warning", str(warning))
+        self._reactor.add_reader(self._socket.fileno(), self._readable)
+        address, port = self._socket.address[:2]
+        self._operator.emit({"event": "listening", "address": address, "port": port})
+        self._operator.emit({"event": "state", "state": self._state.value})
+        self._reactor.call_at(self._reactor.now_s() + PROGRESS_INTERVAL_S, self._progress)
+        self._pump()
+        self._reactor.run()
+        return self._close()
+
+    # The loop's callbacks ----------------------------------------------------------------------
+
+    def _readable(self) -> None:
+        now_s = self._reactor.now_s
+        receive = self._session.receive_datagram
+        for data, address in self._socket.receive_all():
+            receive(data, address, now_s())
+        self._pump()
+
+    def _session_due(self) -> None:
+        self._session_timer = None
+        # What waits in the socket is heard before anybody is blamed for silence.
+        for data, address in self._socket.receive_all():
+            self._session.receive_datagram(data, address, self._reactor.now_s())
+        self._session.handle_timer(self._reactor.now_s())
+        self._pump()
+
+    def _pump(self) -> None:
+        """Carry out the session's events, send what is due, arm its timer."""
+        session, now_s = self._session, self._reactor.now_s
+        while (event := session.next_event()) is not None:
+            self._handle(event)
+        for data, address in session.datagrams_to_send(now_s()):
+            self._socket.send(data, address)
+        while (broken := session.next_broken_deadline()) is not None:
+            agent, deadline = broken
+            self._event("sync_deadline_broken", agent=agent, detail=str(deadline))
+        if session.state is not self._state:
+            self._state = session.state
+            self._event("state", state=self._state.value)
+            self._operator.emit({"event": "state", "state": self._state.value})
+        if self._state is HostState.EXIT:
+            self._reactor.stop()
+            return
+        due_s = session.get_timer()
+        timer = self._session_timer
+        if due_s is not None and (timer is None or due_s < timer.when_s):
+            if timer is not None:
+                timer.cancel()
+            self._session_timer = self._reactor.call_at(due_s, self._session_due)
+
+    def _handle(self, event: told.HostSessionEvent) -> None:
+        if isinstance(event, told.DataReceived):
+            self._call("receive", self._simulation.receive, event.agent, event.payload)
+        elif isinstance(event, told.AgentMoved):
+            self._agent_moved(event)
+        elif isinstance(event, told.AgentsReady):
+            self._set_up()
+        elif isinstance(event, told.AgentsSimulationReady):
+            self._start()
+        elif isinstance(event, told.AgentLost):
+            self._agent_lost(event)
+        elif isinstance(event, told.AgentRejoining):
+            self._send_setup(event.agent)
+        elif isinstance(event, told.AgentRejoined):
+            self._log("info", f"{event.agent} has rejoined at t = {self._simulated_s():.2f} s")
+            self._event("agent_rejoined", agent=event.agent)
+            self._call("agent_rejoined", self._simulation.agent_rejoined, event.agent)
+        elif isinstance(event, told.AgentsComplete):
+            self._complete()
+        elif isinstance(event, told.EmergencyDeclared):
+            self._emergency(event)
+        else:
+            self._agents_stopped(event.missing)
+
+    # Carrying out ------------------------------------------------------------------------------
+
+    def _set_up(self) -> None:
+        self._call("setup", self._simulation.setup, self._context)
+        self._awaits_jobs = True
+        self._continue_setup()
+
+    def _continue_setup(self) -> None:
+        """Once every job that set-up submitted is done, the agents get their initial data."""
+        if not self._awaits_jobs or self._jobs.pending_count:
+            return
+        self._awaits_jobs = False
+        if self._session.state is not HostState.SIMULATION_SETUP:
+            return
+        initial = {}
+        for agent in self._session.agents_in(Phase.READY):
+            initial[agent] = self._call("initial_data", self._simulation.initial_data, agent)
+            if self._session.state is not HostState.SIMULATION_SETUP:
+                return  # it raised
+        self._session.setup_finished(initial, self._reactor.now_s())
+
+    def _send_setup(self, agent: str) -> None:
+        initial = self._call("initial_data", self._simulation.initial_data, agent)
+        if self._session.state in HOST_LIVE:
+            self._session.send_setup(agent, initial, self._reactor.now_s())
+
+    def _start(self) -> None:
+        now_s = self._reactor.now_s()
+        lead_s = self._config.timeouts.start_lead_s
+        freeze_garbage()
+        self._t0_s = self._reactor.now_s() + lead_s
+        self._report.t0_utc = utc_now_iso(lead_s)
+        self._recorder.set_t0(self._report.t0_utc)
+        self._session.start(self._t0_s, self._config.time.duration_s, now_s)
+        self._call("start", self._simulation.start, -lead_s)
+        self._plugin_due()
+
+    def _plugin_due(self) -> None:
+        self._plugin_timer = None
+        if self._session.state is not HostState.SIMULATION_START:
+            return
+        next_s = self._call("timer", self._simulation.timer, self._simulated_s())
+        self._arm_plugin(next_s)
+        self._pump()
+
+    def _arm_plugin(self, next_s: float | None) -> None:
+        if next_s is not None and self._session.state is HostState.SIMULATION_START:
+            self._plugin_timer = self._reactor.call_at(self._t0_s + next_s, self._plugin_due)
+
+    def _job_done(self, job: int, future: Future[Any]) -> None:
+        error = future.exception()
+        if error is not None:
+            reason = describe_exception(error, f"{self._simulation_name}: job {job}")
+            self._session.emergency(HOST, reason, self._reactor.now_s())
+        else:
+            self._call("result", self._simulation.result, job, future.result())
+        self._continue_setup()
+        self._pump()
+
+    def _complete(self) -> None:
+        self._report.completed(self._simulated_s())
+        self._report.simulation = self._finish_simulation()
+        if self._session.state is HostState.SIMULATION_COMPLETE:
+            self._session.order_stop(self._reactor.now_s())
+
+    def _finish_simulation(self) -> Mapping[str, Any]:
+        summary = self._call("finish", self._simulation.finish)
+        return dict(summary) if isinstance(summary, Mapping) else {}
+
+    def _emergency(self, event: told.EmergencyDeclared) -> None:
+        self._report.fail(event.who, event.reason)
+        self._event("emergency", who=event.who, reason=event.reason)
+        self._log("critical", f"emergency shutdown: {event.who}: {event.reason}")
+
+    def _agents_stopped(self, missing: tuple[str, ...]) -> None:
+        if missing:
+            self._log("error", f"{', '.join(missing)}: no word that records are closed")
+            self._event("not_stopped", agents=list(missing))
+        self._jobs.close()
+        stop_sampler(self._sampler, timeout_s=2.0)
+        self._session.cleaned_up()
+        now_s = self._reactor.now_s()
+        self._event("end", state=self._session.state.value)
+        self._report.records = self._recorder.close(self._config.timeouts.shutdown_s).to_mapping()
+        self._session.records_closed(now_s)
+
+    def _agent_moved(self, event: told.AgentMoved) -> None:
+        peer = self._session.peers[event.agent]
+        moved = {
+            "agent": event.agent,
+            "state": event.phase.value,
+            "reason": event.reason,
+            "incarnation": len(peer.incarnations_seen),
+        }
+        self._event("agent", **moved)
+        self._operator.emit({"event": "agent", **moved})
+
+    def _agent_lost(self, event: told.AgentLost) -> None:
+        self._report.lost[event.agent] = event.reason
+        self._log("error", f"{event.agent} is lost: {event.reason}")
+        if self._config.on_agent_loss == "continue":
+            self._call("agent_lost", self._simulation.agent_lost, event.agent, event.reason)
+
+    # Towards the operator -----------------------------------------------------------------------
+
+    def _command(self, command: Mapping[str, Any]) -> None:
+        if command.get("command") == "stop":
+            reason = str(command.get("reason", "stopped by the operator"))
+            self._end("operator", reason, str(command.get("status", "interrupted")))
+        elif command.get("command") == "agent_exited":
+            agent, how = str(command.get("agent")), str(command.get("how"))
+            self._session.agent_exited(agent, how, self._reactor.now_s())
+            self._pump()
+
+    def _end(self, who: str, reason: str, status: str) -> None:
+        if self._session.state in HOST_LIVE:
+            self._report.ending_status = status
+            self._session.emergency(who, reason, self._reactor.now_s())
+            self._pump()
+
+    def _progress(self) -> None:
+        self._reactor.call_at(self._reactor.now_s() + PROGRESS_INTERVAL_S, self._progress)
+        report = progress_report(self._session, self._simulated_s(), self._config.time.duration_s)
+        self._operator.emit(report)
+        if (problem := self._recorder.problem) is not None and not self._report.problem_told:
+            self._report.problem_told = True
+            self._log("error", f"host: records are being lost: {problem}")
+
+    def _log(self, level: str, text: str) -> None:
+        t_s = self._simulated_s()
+        self._recorder.log(level, text, t_s if self._t0_s < PSEUDO_NEVER_S else None)
+        self._operator.emit({"event": "log", "level": level, "source": HOST, "text": text})
+
+    def _event(self, event: str, **values: Any) -> None:
+        t_s = round(self._simulated_s(), 6) if self._t0_s < PSEUDO_NEVER_S else None
+        if self._session.state not in (HostState.WAITING_SERVER_STOP, HostState.EXIT):
+            self._recorder.record(
+                "events", {"t_s": t_s, "utc": utc_now_iso(), "event": event, **values}
+            )
+
+    # Towards the simulation ------------------------------------------------------------------------
+
+    def _simulated_s(self) -> float:
+        return self._reactor.now_s() - self._t0_s
+
+    def _send(self, to: str, message: Any, service: Service, *, deadline_s: float | None) -> None:
+        if to not in self._session.peers:
+            raise MadnsError(f"no agent is called {to!r}")
+        due_s = None if deadline_s is None else deadline_s + self._t0_s
+        self._session.send(to, message, service, self._reactor.now_s(), deadline_s=due_s)
+
+    def _call(self, name: str, method: Callable[..., T], *arguments: Any) -> T | None:
+        """Call the plug-in; whatever it raises ends the run with its name on it."""
+        try:
+            return method(*arguments)
+        except Exception as error:  # noqa: BLE001 - a plug-in may raise anything
+            reason = describe_exception(error, f"{self._simulation_name}.{name}")
+            self._recorder.log("critical", format_traceback(error), self._simulated_s())
+            self._session.emergency(HOST, reason, self._reactor.now_s())
+            return None
+
+    def _close(self) -> int:
+        result = self._report.result(self._session)
+        self._operator.emit({"event": "finished", "result": result})
+        self._operator.flush(FLUSH_TIMEOUT_S)
+        self._operator.close()
+        self._socket.close()
+        self._reactor.close()
+        return 0 if result["status"] == "complete" else 1
+
+
+def window_bytes(receive_buffer_bytes: int, peers: int) -> int:
+    """Return the window granted to each of *peers*, so that all together fit the socket's buffer."""
+    # The kernel charges a small datagram with more than its bytes: half the buffer is kept for that.
+    return max(4 * 1400, receive_buffer_bytes // 2 // max(1, peers))
+
+
+def format_traceback(error: BaseException) -> str:
+    """Return an exception's traceback as text."""
+    import traceback
+
+    return "".join(traceback.format_exception(error))
+
+
+def main() -> None:
+    """Entry point of `madns-host`."""
+    out_fd = os.dup(1)
+    os.dup2(2, 1)  # what a plug-in prints must not mix with the events
+    try:
+        document, pending = read_launch(0)
+        launch = from_mapping(HostLaunch, document)
+        with register(launch.config.run, "host", HOST, launch.directory):
+            code = HostRuntime(launch, (0, out_fd), pending).run()
+    except MadnsError as error:
+        sys.stderr.write(f"madns-host: {error}\n")
+        code = 1
+    sys.stderr.flush()
+    os._exit(code)  # no executor's or plug-in's thread may hold the process
+
+
+if __name__ == "__main__":
+    main()

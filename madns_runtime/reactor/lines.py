@@ -1,0 +1,166 @@
+"""
+JSON lines to and from whoever started this process; when that side closes, it is gone.
+
+The first line that comes in is the launch document; it may hold a secret and is never echoed.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import orjson
+
+from madns_runtime.errors import ConfigurationError
+from madns_runtime.reactor.reactor import Reactor
+
+LINE_BYTES_MAX = 64 * 1024 * 1024
+"""A launch document with the parameters of thousands of agents fits; a runaway peer does not."""
+LAUNCH_TIMEOUT_S = 30.0
+OUT_BYTES_MAX = 4 * 1024 * 1024
+"""What may wait for an operator who does not read; more is dropped, oldest first, and counted."""
+READ_BYTES = 65_536
+
+
+def read_launch(fd: int) -> tuple[dict[str, Any], bytes]:
+    """
+    Read the launch document: the first line on *fd*.
+
+    Returns:
+        The document, and what had already come behind it.
+
+    Raises:
+        ConfigurationError: It did not come in time, is cut, or is no JSON object.
+    """
+    deadline_s = time.monotonic() + LAUNCH_TIMEOUT_S
+    data = b""
+    while b"\n" not in data:
+        left_s = deadline_s - time.monotonic()
+        if left_s <= 0 or not select.select([fd], [], [], left_s)[0]:
+            raise ConfigurationError(
+                f"no launch document within {LAUNCH_TIMEOUT_S:g} s: this program is started by"
+                " `cosmos run`, which writes it to standard input"
+            )
+        chunk = os.read(fd, READ_BYTES)
+        if not chunk or len(data) > LINE_BYTES_MAX:
+            raise ConfigurationError("the launch document on standard input is empty, cut or too long")
+        data += chunk
+    line, rest = data.split(b"\n", 1)
+    try:
+        document = orjson.loads(line)
+    except orjson.JSONDecodeError as error:
+        raise ConfigurationError(f"the launch document is not JSON: {error}") from None
+    if not isinstance(document, dict):
+        raise ConfigurationError("the launch document is not a JSON object")
+    return document, rest
+
+
+class OperatorLink:
+    """
+    The line to the operator, inside the loop.
+
+    Args:
+        reactor: The loop.
+        read_fd: Where commands come from; its end means that the operator is gone.
+        write_fd: Where events go to.
+        on_command: Called with each command.
+        on_gone: Called once when the operator's end closes.
+    """
+
+    def __init__(
+        self,
+        reactor: Reactor,
+        fds: tuple[int, int],
+        *,
+        on_command: Callable[[Mapping[str, Any]], None],
+        on_gone: Callable[[], None],
+        pending: bytes = b"",
+    ) -> None:
+        self._reactor = reactor
+        self._read_fd, self._write_fd = fds
+        self._on_command = on_command
+        self._on_gone = on_gone
+        self._in = b""
+        self._out: deque[bytes] = deque()
+        self._out_bytes = 0
+        self.dropped_count = 0
+        self.is_gone = False
+        os.set_blocking(self._read_fd, False)
+        os.set_blocking(self._write_fd, False)
+        reactor.add_reader(self._read_fd, self._readable)
+        if pending:
+            self._take(pending)
+
+    def emit(self, event: Mapping[str, Any]) -> None:
+        """Send one event; never blocks."""
+        line = orjson.dumps(event, option=orjson.OPT_SERIALIZE_NUMPY) + b"\n"
+        self._out.append(line)
+        self._out_bytes += len(line)
+        self._write()
+        while self._out_bytes > OUT_BYTES_MAX and len(self._out) > 1:
+            # The first may be half written, so the second oldest goes.
+            first = self._out.popleft()
+            self._out_bytes -= len(self._out.popleft())
+            self._out.appendleft(first)
+            self.dropped_count += 1
+
+    def flush(self, timeout_s: float) -> bool:
+        """Write what waits; False if the operator did not take it in time."""
+        deadline_s = time.monotonic() + timeout_s
+        while self._out and not self.is_gone:
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0 or not select.select([], [self._write_fd], [], left_s)[1]:
+                return False
+            self._write()
+        return not self._out
+
+    def close(self) -> None:
+        """Stop listening; the descriptors stay open."""
+        if not self.is_gone:
+            self._reactor.remove_reader(self._read_fd)
+
+    def _write(self) -> None:
+        while self._out:
+            line = self._out[0]
+            try:
+                count = os.write(self._write_fd, line)
+            except BlockingIOError:
+                return
+            except OSError:
+                self._out.clear()
+                self._out_bytes = 0
+                return
+            self._out_bytes -= count
+            if count < len(line):
+                self._out[0] = line[count:]
+                return
+            self._out.popleft()
+
+    def _readable(self) -> None:
+        try:
+            data = os.read(self._read_fd, READ_BYTES)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if data:
+            self._take(data)
+            return
+        self._reactor.remove_reader(self._read_fd)
+        self.is_gone = True
+        self._on_gone()
+
+    def _take(self, data: bytes) -> None:
+        *lines, self._in = (self._in + data).split(b"\n")
+        self._in = self._in[:LINE_BYTES_MAX]
+        for line in lines:
+            try:
+                command = orjson.loads(line)
+            except orjson.JSONDecodeError:
+                continue
+            if isinstance(command, dict):
+                self._on_command(command)

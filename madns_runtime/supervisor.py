@@ -1,0 +1,357 @@
+"""
+A machine's agents: forked from one preloaded parent, watched, restarted, and never left behind.
+
+The parent holds the write end of a life line; every child polls its read end and ends when it closes.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import orjson
+
+from madns_runtime.agent_runner import AgentRunner, Program
+from madns_runtime.config import AgentLaunch
+from madns_runtime.errors import MadnsError
+from madns_runtime.health.sampler import start_sampler, stop_sampler
+from madns_runtime.health.stress import start_stress, stop_stress
+from madns_runtime.plugin.registry import load_half, parse_parameters, resolve
+from madns_runtime.processes import register
+from madns_runtime.reactor.lines import OperatorLink
+from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.reactor.scheduling import apply as apply_scheduling
+from madns_runtime.reactor.scheduling import freeze_garbage
+
+RESTART_DELAY_S = 0.2
+KILL_GRACE_S = 2.0
+FLUSH_TIMEOUT_S = 2.0
+REASON_BYTES_MAX = 2048
+"""A reason is written in one piece, so that those of two children never mix."""
+
+
+@dataclass(slots=True)
+class Child:
+    """One process of agents."""
+
+    agents: tuple[str, ...]
+    pid: int
+    incarnation: int
+    reason: str | None = None
+
+
+class Supervisor:
+    """
+    Runs a machine's agents until they have ended or the operator is gone.
+
+    Args:
+        launch: Which agents, and where the host is.
+        fds: Where the operator's commands come from and events go to.
+        pending: What had already come behind the launch document.
+    """
+
+    def __init__(self, launch: AgentLaunch, fds: tuple[int, int], pending: bytes) -> None:
+        config = launch.config
+        self._launch = launch
+        base = Path(config.base_directory)
+        descriptor = resolve(config.simulation, base)
+        # Loaded before the forks: the children share the parent's pages.
+        self._simulation = load_half(descriptor, "agent", base)
+        self._parameters = parse_parameters(descriptor, config.parameters)
+        machine_directory = Path(launch.directory) / "machines" / launch.machine
+        self._sampler = start_sampler(
+            machine_directory,
+            run=config.run,
+            machine=launch.machine,
+            settings=config.health,
+            recording=config.recording,
+        )
+        self._stress = start_stress(config.health.stress_workers)
+        self._life_read_fd, self._life_write_fd = os.pipe()
+        self._reason_read_fd, self._reason_write_fd = os.pipe()
+        self._children: dict[int, Child] = {}
+        self._restarts: dict[tuple[str, ...], int] = {}
+        self._is_ending = False
+        self._failed = False
+        gc.collect()
+        gc.freeze()
+        self._to_fork = _groups(launch.agents, config.agents.per_process)
+        started = [self._fork(agents, incarnation=1) for agents in self._to_fork]
+        self._reactor = Reactor()
+        self._operator = OperatorLink(
+            self._reactor,
+            fds,
+            on_command=self._command,
+            on_gone=lambda: self._end("the operator's process is gone"),
+            pending=pending,
+        )
+        for child in started:
+            self._tell_started(child)
+
+    def run(self) -> int:
+        """Run to the end and return the process's exit code: 0 if every agent ended as ordered."""
+        reactor = self._reactor
+        reactor.on_signal(signal.SIGCHLD, self._reap)
+        reactor.on_signal(signal.SIGTERM, lambda: self._end("SIGTERM"))
+        reactor.on_signal(signal.SIGINT, lambda: None)  # a terminal's Ctrl-C is the operator's
+        reactor.add_reader(self._reason_read_fd, self._read_reasons)
+        self._reap()
+        reactor.run()
+        return self._close()
+
+    # Children --------------------------------------------------------------------------------------
+
+    def _fork(self, agents: tuple[str, ...], *, incarnation: int) -> Child:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        pid = os.fork()
+        if pid == 0:
+            self._run_child(agents)
+        child = Child(agents, pid, incarnation)
+        self._children[pid] = child
+        return child
+
+    def _run_child(self, agents: tuple[str, ...]) -> None:
+        """Run as a child, and never return."""
+        code = 1
+        try:
+            _leave_parent(keep={self._life_read_fd, self._reason_write_fd})
+            process = AgentProcess(
+                self._launch,
+                agents,
+                Program(simulation=self._simulation, parameters=self._parameters),
+                life_fd=self._life_read_fd,
+            )
+            with register(
+                self._launch.config.run, "agent", ",".join(agents), self._launch.directory
+            ):
+                reasons = process.run()
+            code = 1 if reasons else 0
+            self._write_reasons(reasons)
+        except MadnsError as error:
+            self._write_reasons({agent: str(error) for agent in agents})
+        except BaseException as error:  # noqa: BLE001 - the last frame of a process; it is told below
+            self._write_reasons({agent: f"{type(error).__name__}: {error}" for agent in agents})
+            sys.excepthook(type(error), error, error.__traceback__)
+        finally:
+            sys.stderr.flush()
+            os._exit(code)
+
+    def _write_reasons(self, reasons: Mapping[str, str]) -> None:
+        for agent, reason in reasons.items():
+            text = reason[: REASON_BYTES_MAX // 4]
+            line = orjson.dumps({"pid": os.getpid(), "agent": agent, "reason": text}) + b"\n"
+            os.write(self._reason_write_fd, line)
+
+    def _read_reasons(self) -> None:
+        for line in os.read(self._reason_read_fd, 65_536).splitlines():
+            told = orjson.loads(line)
+            child = self._children.get(told["pid"])
+            if child is not None:
+                child.reason = f"{told['agent']}: {told['reason']}" if child.reason is None else child.reason
+
+    def _reap(self) -> None:
+        while self._children:
+            try:
+                pid, status = os.waitpid(-1, os.WNOHANG)
+            except ChildProcessError:
+                break
+            if pid == 0:
+                break
+            child = self._children.get(pid)
+            if child is not None:
+                self._child_ended(child, status)
+        if not self._children and not self._to_fork:
+            self._reactor.stop()
+
+    def _child_ended(self, child: Child, status: int) -> None:
+        code = os.waitstatus_to_exitcode(status)
+        if code != 0:
+            _drain(self._reason_read_fd, self._read_reasons)
+        del self._children[child.pid]
+        signal_name = signal.Signals(-code).name if code < 0 else None
+        how = _how(code, signal_name, child.reason)
+        restarts = self._restarts.get(child.agents, 0)
+        will_restart = (
+            code != 0
+            and not self._is_ending
+            and self._launch.config.on_agent_loss == "continue"
+            and restarts < self._launch.config.agents.restarts_max
+        )
+        self._failed = self._failed or code != 0
+        for agent in child.agents:
+            self._operator.emit(
+                {
+                    "event": "exited",
+                    "agent": agent,
+                    "pid": child.pid,
+                    "code": code if code >= 0 else None,
+                    "signal": signal_name,
+                    "how": how,
+                    "will_restart": will_restart,
+                }
+            )
+        if will_restart:
+            self._restarts[child.agents] = restarts + 1
+            self._to_fork.append(child.agents)
+            due_s = self._reactor.now_s() + RESTART_DELAY_S
+            self._reactor.call_at(due_s, lambda: self._restart(child))
+
+    def _restart(self, child: Child) -> None:
+        if child.agents in self._to_fork:
+            self._to_fork.remove(child.agents)
+        if self._is_ending:
+            self._reap()
+            return
+        self._tell_started(self._fork(child.agents, incarnation=child.incarnation + 1))
+
+    def _tell_started(self, child: Child) -> None:
+        if child.agents in self._to_fork:
+            self._to_fork.remove(child.agents)
+        for agent in child.agents:
+            self._operator.emit(
+                {
+                    "event": "started",
+                    "agent": agent,
+                    "pid": child.pid,
+                    "incarnation": child.incarnation,
+                }
+            )
+
+    # The end ---------------------------------------------------------------------------------------
+
+    def _command(self, command: Mapping[str, Any]) -> None:
+        if command.get("command") == "stop":
+            self._end(str(command.get("reason", "stopped by the operator")))
+
+    def _end(self, reason: str) -> None:
+        """Close the life line; who does not end by it in time is killed."""
+        if self._is_ending:
+            return
+        self._is_ending = True
+        self._to_fork.clear()
+        os.close(self._life_write_fd)
+        grace_s = self._launch.config.timeouts.shutdown_s + KILL_GRACE_S
+        self._reactor.call_at(self._reactor.now_s() + grace_s, self._kill)
+        self._operator.emit({"event": "log", "level": "info", "text": f"ending: {reason}"})
+        if not self._children:
+            self._reactor.stop()
+
+    def _kill(self) -> None:
+        for child in self._children.values():
+            os.kill(child.pid, signal.SIGKILL)
+            names = ", ".join(child.agents)
+            text = f"{names} did not end in time and was killed"
+            self._operator.emit({"event": "log", "level": "error", "text": text})
+
+    def _close(self) -> int:
+        if not self._is_ending:
+            os.close(self._life_write_fd)
+        stop_stress(self._stress, timeout_s=2.0)
+        stop_sampler(self._sampler, timeout_s=2.0)
+        self._operator.emit({"event": "finished"})
+        self._operator.flush(FLUSH_TIMEOUT_S)
+        self._operator.close()
+        self._reactor.close()
+        return 1 if self._failed else 0
+
+
+class AgentProcess:
+    """
+    The agents of one process in their loop.
+
+    Args:
+        launch: The run.
+        agents: Names of this process's agents.
+        program: What they run.
+        life_fd: Closes when the supervisor is gone.
+    """
+
+    def __init__(
+        self, launch: AgentLaunch, agents: Sequence[str], program: Program, *, life_fd: int
+    ) -> None:
+        self._reactor = Reactor()
+        self._launch = launch
+        self._agents = agents
+        self._program = program
+        self._life_fd = life_fd
+        self._runners: dict[str, AgentRunner] = {}
+        self._reasons: dict[str, str] = {}
+
+    def run(self) -> dict[str, str]:
+        """Run every agent to its end; returns why, for each that did not end as ordered."""
+        reactor = self._reactor
+        reactor.on_signal(signal.SIGTERM, lambda: self._end("SIGTERM"))
+        reactor.on_signal(signal.SIGINT, lambda: None)
+        reactor.add_reader(self._life_fd, self._life_ended)
+        runners = [self._make_runner(name) for name in self._agents]
+        for runner in runners:
+            runner.start()
+        # The recorders' threads run already and keep the normal policy; only the loop is raised.
+        grant = apply_scheduling(self._launch.config.scheduling, is_host=False).to_mapping()
+        for runner in runners:
+            runner.set_scheduling(grant)
+        freeze_garbage()
+        reactor.run()
+        reactor.close()
+        return self._reasons
+
+    def _make_runner(self, name: str) -> AgentRunner:
+        runner = AgentRunner(
+            name, self._launch, self._program, reactor=self._reactor, on_ended=self._ended
+        )
+        self._runners[name] = runner
+        return runner
+
+    def _life_ended(self) -> None:
+        self._reactor.remove_reader(self._life_fd)
+        self._end("the operator's side is gone")
+
+    def _end(self, reason: str) -> None:
+        for runner in list(self._runners.values()):
+            runner.emergency(reason)
+
+    def _ended(self, name: str, as_ordered: bool, reason: str) -> None:
+        del self._runners[name]
+        if not as_ordered:
+            self._reasons[name] = reason
+        if not self._runners:
+            self._reactor.stop()
+
+
+def _groups(agents: Sequence[str], per_process: int) -> list[tuple[str, ...]]:
+    return [tuple(agents[i : i + per_process]) for i in range(0, len(agents), per_process)]
+
+
+def _leave_parent(keep: set[int]) -> None:
+    """Make a forked child independent of its parent's descriptors and signals."""
+    signal.set_wakeup_fd(-1)
+    for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_DFL)
+    null_fd = os.open(os.devnull, os.O_RDWR)
+    os.dup2(null_fd, 0)
+    first = 3
+    for fd in (*sorted(keep), 1 << 20):
+        os.closerange(first, fd)
+        first = fd + 1
+
+
+def _drain(fd: int, read: Any) -> None:
+    import select
+
+    while select.select([fd], [], [], 0)[0]:
+        read()
+
+
+def _how(code: int, signal_name: str | None, reason: str | None) -> str:
+    if signal_name is not None:
+        return f"killed by {signal_name}"
+    if reason is not None:
+        return reason
+    return "ended" if code == 0 else f"exit code {code}"
