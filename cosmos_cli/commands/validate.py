@@ -1,0 +1,46 @@
+"""`cosmos validate`: check scenarios without running them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cosmos_cli.console import Console, JsonOption, QuietOption, SetOption
+from cosmos_cli.errors import Fault, InputError
+from cosmos_cli.models.loading import ScenarioFile, load_scenario
+
+
+def validate(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Scenario files.")],
+    set_: SetOption = None,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Check scenario files and show every fault with its line and column."""
+    console = Console(json=json, quiet=quiet)
+    faults: list[Fault] = []
+    found: list[ScenarioFile] = []
+    for path in files:
+        try:
+            scenario_file = load_scenario(path, set_ or ())
+        except InputError as error:
+            faults += error.faults
+        else:
+            found.append(scenario_file)
+            console.data(f"{path}: ok: {_summary(scenario_file)}")
+    if faults:
+        raise InputError(faults=faults)
+    console.print_json({"valid": True, "scenarios": [_result(item) for item in found]})
+
+
+def _summary(item: ScenarioFile) -> str:
+    scenario = item.scenario
+    agents = f"{scenario.agents.count} agent{'s' if scenario.agents.count > 1 else ''}"
+    rate = f"at {scenario.agents.tick_hz:g} Hz for {scenario.time.duration_s:g} s"
+    return f"{scenario.name}, {agents} of {scenario.simulation} {rate}"
+
+
+def _result(item: ScenarioFile) -> dict[str, object]:
+    return {"file": str(item.path), "scenario": item.to_mapping()}

@@ -1,0 +1,133 @@
+"""
+How the command line speaks: stdout is data, stderr is talk.
+
+Streams are looked up at each call, so that tests and pipes may replace them. Rich is imported only
+for a table on a terminal.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, TextIO
+
+import typer
+
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print the result as JSON on stdout, nothing else.")
+]
+QuietOption = Annotated[
+    bool, typer.Option("--quiet", "-q", help="Say nothing on stderr but errors.")
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Replace a value of the scenario, such as agents.count=5. Repeatable.",
+    ),
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One column of a table: its heading, and whether its cells are numbers."""
+
+    heading: str
+    is_number: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Console:
+    """What a command was asked to print, and how."""
+
+    json: bool = False
+    """The result goes to stdout as JSON; lines meant for eyes are left out."""
+    quiet: bool = False
+
+    def data(self, text: str) -> None:
+        """Print a line of the result on stdout; left out under --json."""
+        if not self.json:
+            _write(sys.stdout, text)
+
+    def say(self, text: str) -> None:
+        """Print a line of talk on stderr; left out under --quiet."""
+        if not self.quiet:
+            _write(sys.stderr, text)
+
+    def warn(self, text: str) -> None:
+        """Print a warning on stderr; left out under --quiet."""
+        if not self.quiet:
+            _write(sys.stderr, f"{paint('warning', 'yellow', sys.stderr)}: {text}")
+
+    def print_json(self, value: Any) -> None:
+        """Print *value* as JSON on stdout if --json was asked for."""
+        if self.json:
+            print_json(value)
+
+    def table(self, columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
+        """Print a table on stdout: framed on a terminal, aligned plain lines elsewhere."""
+        if self.json:
+            return
+        if is_terminal(sys.stdout):
+            _rich_table(columns, rows)
+        else:
+            _write(sys.stdout, "\n".join(aligned(columns, rows)))
+
+
+def print_json(value: Any) -> None:
+    """Print *value* as JSON on stdout."""
+    _write(sys.stdout, json.dumps(value, indent=2, allow_nan=False))
+
+
+def print_error(text: str, *, bare: bool = False) -> None:
+    """Print an error on stderr, whatever was asked for; *bare* without the word "error"."""
+    _write(sys.stderr, text if bare else f"{paint('error', 'red', sys.stderr)}: {text}")
+
+
+def aligned(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return one aligned line a row, headings first; numbers to the right."""
+    cells = [[column.heading for column in columns], *[list(row) for row in rows]]
+    widths = [max(len(row[index]) for row in cells) for index in range(len(columns))]
+    lines = []
+    for row in cells:
+        padded = [
+            cell.rjust(width) if column.is_number else cell.ljust(width)
+            for cell, width, column in zip(row, widths, columns, strict=True)
+        ]
+        lines.append("  ".join(padded).rstrip())
+    return lines
+
+
+def is_terminal(stream: TextIO) -> bool:
+    """Tell whether a person looks at *stream* through a terminal that can do more than plain lines."""
+    return stream.isatty() and os.environ.get("TERM") != "dumb"
+
+
+def paint(text: str, colour: str, stream: TextIO) -> str:
+    """Return *text* in red, yellow or green, if *stream* is a terminal and NO_COLOR is not set."""
+    codes: Mapping[str, str] = {"red": "31", "green": "32", "yellow": "33"}
+    if os.environ.get("NO_COLOR") or not is_terminal(stream):
+        return text
+    return f"\x1b[{codes[colour]}m{text}\x1b[0m"
+
+
+def _write(stream: TextIO, text: str) -> None:
+    stream.write(text + "\n")
+    stream.flush()
+
+
+def _rich_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
+    from rich.console import Console as RichConsole
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table()
+    for column in columns:
+        table.add_column(column.heading, justify="right" if column.is_number else "left")
+    for row in rows:
+        table.add_row(*[Text(cell) for cell in row])
+    RichConsole().print(table)

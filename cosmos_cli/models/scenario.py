@@ -1,0 +1,176 @@
+"""
+The scenario: what to simulate. Its sections are the runtime's own dataclasses, validated here.
+
+A setting thus has one home, `madns_runtime.config`; what a single field cannot say is in `cross_faults`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from madns_runtime.config import (
+    Agents,
+    Deadline,
+    ExecutorSettings,
+    Health,
+    Network,
+    Recording,
+    RunConfig,
+    Scheduling,
+    Timeouts,
+    TimeSettings,
+)
+
+NAME_PATTERN = "^[a-z0-9][a-z0-9-]*$"
+AGENT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+RESERVED_NAMES = ("host",)
+EXECUTOR_KINDS = ("process", "thread")
+
+SectionFault = tuple[tuple[str | int, ...], str]
+"""The path within the scenario, and what is wrong there."""
+
+
+class Scenario(BaseModel):
+    """What to simulate. The scenario says nothing about machines: those are the inventory's."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+    name: Annotated[str, Field(pattern=NAME_PATTERN, max_length=64)]
+    """Name of the scenario; runs are named after it: lower-case letters, digits and hyphens."""
+    description: str = ""
+    """What the scenario is for, in a sentence."""
+    simulation: Annotated[str, Field(min_length=1)]
+    """A registered simulation, module:attribute, or ./file.py:attribute beside this file."""
+    agents: Agents
+    """How many agents, their names and their rate."""
+    time: TimeSettings = TimeSettings()
+    """How simulated time passes, and for how long."""
+    deadline: Deadline = Deadline()
+    """The real-time budget that a run is judged by."""
+    network: Network = Network()
+    """Where the host listens."""
+    timeouts: Timeouts = Timeouts()
+    """The end of every wait."""
+    scheduling: Scheduling = Scheduling()
+    """What is asked of the kernel for the loops."""
+    recording: Recording = Recording()
+    """How records reach the disk."""
+    health: Health = Health()
+    """State of health of the machines."""
+    executor: ExecutorSettings = ExecutorSettings()
+    """Who does the host's long work."""
+    on_agent_loss: Literal["abort", "continue"] = "abort"
+    """Whether the run ends when an agent is lost, or goes on without it."""
+    seed: Annotated[int, Field(ge=0)] = 0
+    """Seed of every random number in the run."""
+    parameters: dict[str, Any] = {}
+    """The simulation's own settings."""
+
+    def run_config(
+        self, *, run: str, base_directory: Path, parameters: Mapping[str, Any] | None = None
+    ) -> RunConfig:
+        """
+        Return what host and agents are told.
+
+        Args:
+            run: Name of the run, such as 0007-iridium10.
+            base_directory: Folder of the scenario file.
+            parameters: The simulation's parameters with defaults filled in; those of the file if None.
+        """
+        return RunConfig(
+            run=run,
+            scenario=self.name,
+            simulation=self.simulation,
+            base_directory=str(base_directory),
+            agents=self.agents,
+            time=self.time,
+            deadline=self.deadline,
+            network=self.network,
+            timeouts=self.timeouts,
+            scheduling=self.scheduling,
+            recording=self.recording,
+            health=self.health,
+            executor=self.executor,
+            on_agent_loss=self.on_agent_loss,
+            seed=self.seed,
+            parameters=dict(self.parameters if parameters is None else parameters),
+        )
+
+
+def cross_faults(scenario: Scenario, *, skip: frozenset[str] = frozenset()) -> list[SectionFault]:
+    """
+    Return what no single field can know to be wrong.
+
+    Args:
+        scenario: The scenario.
+        skip: Top-level keys with faults of their own: checks that need them are left out.
+    """
+    return [
+        fault
+        for needed, check in _CHECKS
+        if not skip.intersection(needed)
+        for fault in check(scenario)
+    ]
+
+
+def _names(scenario: Scenario) -> Iterator[SectionFault]:
+    agents = scenario.agents
+    if agents.names and len(agents.names) != agents.count:
+        text = f"expected {agents.count} names (agents.count), got {len(agents.names)}"
+        yield ("agents", "names"), text
+    seen: dict[str, int] = {}
+    for index, name in enumerate(agents.names):
+        path = ("agents", "names", index)
+        if name.lower() in RESERVED_NAMES:
+            yield path, f"{name!r} is reserved; give the agent another name"
+        elif not AGENT_NAME.fullmatch(name):
+            text = "expected letters, digits, '.', '_' or '-' (a folder is named after the agent)"
+            yield path, f"{text}, got {name!r}"
+        elif name.lower() in seen:
+            yield (
+                path,
+                f"expected unique names, got {name!r} again (first at [{seen[name.lower()]}])",
+            )
+        seen.setdefault(name.lower(), index)
+
+
+def _processes(scenario: Scenario) -> Iterator[SectionFault]:
+    agents = scenario.agents
+    if agents.per_process > agents.count:
+        text = f"expected <= agents.count ({agents.count}), got {agents.per_process}"
+        yield ("agents", "per_process"), text
+
+
+def _duration(scenario: Scenario) -> Iterator[SectionFault]:
+    period_s = 1 / scenario.agents.tick_hz
+    if scenario.time.duration_s < period_s:
+        text = f"expected at least one tick ({period_s:g} s at {scenario.agents.tick_hz:g} Hz)"
+        yield ("time", "duration_s"), f"{text}, got {scenario.time.duration_s:g}"
+
+
+def _restarts(scenario: Scenario) -> Iterator[SectionFault]:
+    if scenario.agents.restarts_max and scenario.on_agent_loss == "abort":
+        text = f"expected 0 with on_agent_loss: abort, got {scenario.agents.restarts_max}"
+        yield ("agents", "restarts_max"), f"{text}; say on_agent_loss: continue"
+
+
+def _executor(scenario: Scenario) -> Iterator[SectionFault]:
+    kind = scenario.executor.kind
+    module, _, attribute = kind.partition(":")
+    is_path = attribute.isidentifier() and all(part.isidentifier() for part in module.split("."))
+    if kind not in EXECUTOR_KINDS and not is_path:
+        yield ("executor", "kind"), f"expected process, thread or module:callable, got {kind!r}"
+
+
+_CHECKS: tuple[tuple[frozenset[str], Callable[[Scenario], Iterator[SectionFault]]], ...] = (
+    (frozenset({"agents"}), _names),
+    (frozenset({"agents"}), _processes),
+    (frozenset({"agents", "time"}), _duration),
+    (frozenset({"agents", "on_agent_loss"}), _restarts),
+    (frozenset({"executor"}), _executor),
+)

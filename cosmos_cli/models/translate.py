@@ -1,0 +1,226 @@
+"""Pydantic's errors as faults in the person's terms: where, what was expected, what came."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, Union
+
+from cosmos_cli.errors import Fault
+from cosmos_cli.models.document import Document, Path, did_you_mean, kind_of
+from cosmos_cli.models.scenario import NAME_PATTERN
+
+_EXPECTED = {
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "dataclass_type": "a mapping",
+    "dict_type": "a mapping",
+    "float_parsing": "a number",
+    "float_type": "a number",
+    "frozen_set_type": "a list",
+    "int_from_float": "a whole number",
+    "int_parsing": "a whole number",
+    "int_type": "a whole number",
+    "list_type": "a list",
+    "mapping_type": "a mapping",
+    "model_type": "a mapping",
+    "none_required": "nothing",
+    "path_type": "a path",
+    "set_type": "a list",
+    "string_type": "a text",
+    "tuple_type": "a list",
+}
+_LIMITS = {
+    "greater_than": ("> ", "gt"),
+    "greater_than_equal": (">= ", "ge"),
+    "less_than": ("< ", "lt"),
+    "less_than_equal": ("<= ", "le"),
+    "multiple_of": ("a multiple of ", "multiple_of"),
+    "literal_error": ("", "expected"),
+    "enum": ("", "expected"),
+    "string_pattern_mismatch": ("a text like ", "pattern"),
+    "union_tag_invalid": ("", "expected_tags"),
+}
+_PATTERNS = {NAME_PATTERN: "lower-case letters, digits and hyphens"}
+_MISSING = ("missing", "missing_argument", "missing_keyword_only_argument")
+_UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Located:
+    """One error of pydantic at its place in the document."""
+
+    path: Path
+    """Only steps that are in the document, but for a missing key."""
+    branch: Path
+    """Where a union was entered, and the label of its member; empty outside of unions."""
+    error: Mapping[str, Any]
+
+
+def faults_of(
+    document: Document, errors: Sequence[Any], model: Any, *, below: Path = ()
+) -> list[Fault]:
+    """
+    Return pydantic's errors as faults.
+
+    Args:
+        document: Where the validated value came from.
+        errors: Of `ValidationError.errors()`.
+        model: The type that was validated; tells what keys are known.
+        below: Path of the validated value within the document.
+    """
+    located = [_located(document, below, error) for error in errors]
+    return [_fault(document, item, model, below) for item in _likeliest(located)]
+
+
+def _located(document: Document, below: Path, error: Mapping[str, Any]) -> Located:
+    """Follow pydantic's location through the values; labels of union members are no keys."""
+    value = _value_at(document, below)
+    path = below
+    branch: Path = ()
+    steps = list(error["loc"])
+    for index, step in enumerate(steps):
+        if _holds(value, step):
+            path, value = (*path, step), value[step]
+        elif error["type"] in _MISSING and index == len(steps) - 1:
+            path = (*path, step)
+        else:
+            branch = (*path, str(step))
+    return Located(path, branch, error)
+
+
+def _holds(value: Any, step: str | int) -> bool:
+    if isinstance(value, list):
+        return isinstance(step, int) and step < len(value)
+    return isinstance(value, dict) and step in value
+
+
+def _value_at(document: Document, path: Path) -> Any:
+    value: Any = document.value
+    for step in path:
+        value = value[step]
+    return value
+
+
+def _likeliest(located: Sequence[Located]) -> Iterator[Located]:
+    """Of a union's members, keep the errors of the one that was probably meant: it got furthest."""
+    members: dict[Path, dict[Path, list[Located]]] = {}
+    for item in located:
+        if not item.branch:
+            yield item
+        else:
+            members.setdefault(item.branch[:-1], {}).setdefault(item.branch, []).append(item)
+    for group in members.values():
+        yield from min(group.values(), key=_distance)
+
+
+def _distance(errors: Sequence[Located]) -> tuple[int, int]:
+    decisive = sum(
+        item.error["type"] in ("literal_error", *_UNKNOWN) or item.path == item.branch[:-1]
+        for item in errors
+    )
+    return decisive, len(errors)
+
+
+def _fault(document: Document, item: Located, model: Any, below: Path) -> Fault:
+    kind, path = item.error["type"], item.path
+    context = item.error.get("ctx", {})
+    if kind in _MISSING:
+        about = _about(model, path[len(below) :])
+        return document.missing(path, f"missing{about}")
+    if kind in _UNKNOWN:
+        known = known_keys(model, path[len(below) : -1])
+        text = f"unknown key{did_you_mean(str(path[-1]), known)}"
+        return document.fault(path, text, at_key=True)
+    return document.fault(path, _text(kind, context, item.error, _got(document, path, item.error)))
+
+
+def _got(document: Document, path: Path, error: Mapping[str, Any]) -> str:
+    value = error["input"]
+    written = document.texts.get(path)
+    return written if written and not isinstance(value, str) else kind_of(value)
+
+
+def _text(kind: str, context: Mapping[str, Any], error: Mapping[str, Any], got: str) -> str:
+    if kind in _EXPECTED:
+        return f"expected {_EXPECTED[kind]}, got {got}"
+    if kind == "string_pattern_mismatch" and context["pattern"] in _PATTERNS:
+        return f"expected {_PATTERNS[context['pattern']]}, got {got}"
+    if kind in _LIMITS:
+        prefix, key = _LIMITS[kind]
+        limit = context.get(key, "")
+        expected = f"{limit:.15g}" if isinstance(limit, float) else str(limit).replace("'", "")
+        if kind == "literal_error" and isinstance(error["input"], str):
+            options = expected.replace(" or ", ", ").split(", ")
+            hint = did_you_mean(error["input"], options)
+            got += hint if hint.startswith(",") else ""
+        return f"expected {prefix}{expected}, got {got}"
+    if kind in ("string_too_short", "too_short"):
+        return f"expected at least {context.get('min_length')} {_unit(kind)}, got {got}"
+    if kind in ("string_too_long", "too_long"):
+        return f"expected at most {context.get('max_length')} {_unit(kind)}, got {got}"
+    message = str(context.get("error") or error["msg"])
+    return f"{message[:1].lower()}{message[1:]}, got {got}"
+
+
+def _unit(kind: str) -> str:
+    return "characters" if kind.startswith("string") else "items"
+
+
+def known_keys(model: Any, path: Path) -> list[str]:
+    """Return the keys that *model* knows at *path*, all members of a union together."""
+    keys: dict[str, None] = {}
+    for kind in _types_at(model, path):
+        keys.update(dict.fromkeys(_fields(kind)))
+    return list(keys)
+
+
+def _about(model: Any, path: Path) -> str:
+    """Return what kind of value is missing, if that is plain."""
+    names = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}
+    found = [names[kind] for kind in _types_at(model, path) if kind in names]
+    return f"; expected {' or '.join(found)}" if found else ""
+
+
+def _types_at(model: Any, path: Path) -> list[Any]:
+    kinds = _members(model)
+    for step in path:
+        inner = []
+        for kind in kinds:
+            inner += _members(_inside(kind, step))
+        kinds = inner
+    return kinds
+
+
+def _members(kind: Any) -> list[Any]:
+    if kind is None:
+        return []
+    origin = typing.get_origin(kind)
+    if origin is Annotated:
+        return _members(typing.get_args(kind)[0])
+    if origin in (Union, types.UnionType):
+        return [member for option in typing.get_args(kind) for member in _members(option)]
+    return [kind]
+
+
+def _inside(kind: Any, step: str | int) -> Any:
+    if isinstance(step, str) and _fields(kind):
+        return _fields(kind).get(step)
+    arguments = typing.get_args(kind)
+    if isinstance(step, int) and arguments:
+        return arguments[0]
+    return arguments[1] if len(arguments) > 1 else None
+
+
+def _fields(kind: Any) -> dict[str, Any]:
+    if not isinstance(kind, type):
+        return {}
+    if dataclasses.is_dataclass(kind):
+        hints = typing.get_type_hints(kind, include_extras=True)
+        return {item.name: hints[item.name] for item in dataclasses.fields(kind) if item.init}
+    if hasattr(kind, "model_fields"):
+        hints = typing.get_type_hints(kind, include_extras=True)
+        return {name: hints[name] for name in kind.model_fields}
+    return {}

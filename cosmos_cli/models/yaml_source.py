@@ -1,0 +1,287 @@
+"""
+YAML text to nodes that know their place, by the core rules of YAML 1.2.
+
+So `no` is a string, 1e3 a number, 12:30 a string and 010 is ten, unlike in PyYAML's own reading
+(YAML 1.1). The parser's events are composed here and not by PyYAML, whose C composer recurses
+without a bound: a file of 200,000 brackets would end the process.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from cosmos_cli.errors import Fault, InputError
+
+FILE_BYTES_MAX = 4 * 1024 * 1024
+DEPTH_MAX = 64
+DIGITS_MAX = 300
+
+_PARSER: Any = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
+_TAG = "tag:yaml.org,2002:"
+_INTEGER = re.compile(r"[-+]?[0-9]+")
+_OCTAL = re.compile(r"0o[0-7]+")
+_HEXADECIMAL = re.compile(r"0x[0-9a-fA-F]+")
+_FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
+_POWER = re.compile(r"[-+]?[0-9]+[eE]\+?[0-9]+")
+_NOT_FINITE = re.compile(r"[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)")
+_WORDS: dict[str, bool | None] = {
+    "": None,
+    "~": None,
+    "null": None,
+    "Null": None,
+    "NULL": None,
+    "true": True,
+    "True": True,
+    "TRUE": True,
+    "false": False,
+    "False": False,
+    "FALSE": False,
+}
+_UNPRINTABLE = re.compile("[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+Scalar = str | int | float | bool | None
+
+
+@dataclass(slots=True, eq=False)
+class Node:
+    """A scalar, a list of nodes, or a list of pairs of nodes, and where it starts (counted from 1)."""
+
+    value: Scalar | list[Node] | list[tuple[Node, Node]]
+    line: int
+    column: int
+    is_mapping: bool = False
+    text: str = ""
+    """A scalar as it is written."""
+    is_plain: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """The text of a file, and the name it is shown by."""
+
+    label: str
+    text: str
+    lines: tuple[str, ...]
+
+    @classmethod
+    def of(cls, label: str, text: str) -> Source:
+        """Make a source; the lines are what carets stand under."""
+        return cls(label, text, tuple(re.split(r"\r\n|\r|\n", text)))
+
+    def fault(self, text: str, *, line: int, column: int, path: str = "") -> Fault:
+        """Return a fault at a place of this source."""
+        source = self.lines[line - 1] if 0 < line <= len(self.lines) else ""
+        return Fault(text=text, path=path, file=self.label, line=line, column=column, source=source)
+
+
+def read_source(path: Path) -> Source:
+    """
+    Read a file that a person wrote.
+
+    Raises:
+        InputError: It is missing, unreadable, too large, or no UTF-8 text.
+    """
+    label = str(path)
+    try:
+        with path.open("rb") as file:
+            raw = file.read(FILE_BYTES_MAX + 1)
+    except FileNotFoundError:
+        raise _whole(label, f"no such file{_similar(path)}") from None
+    except IsADirectoryError:
+        raise _whole(label, "expected a file, got a folder") from None
+    except OSError as error:
+        raise _whole(label, f"cannot be read: {error.strerror}") from error
+    if len(raw) > FILE_BYTES_MAX:
+        raise _whole(label, f"expected at most {FILE_BYTES_MAX} bytes, got more")
+    if b"\0" in raw:
+        raise _whole(label, "expected UTF-8 text, got binary data")
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise _whole(
+            label, f"expected UTF-8 text, got byte 0x{raw[error.start]:02x} in line {line}"
+        ) from None
+    return Source.of(label, text)
+
+
+def _whole(label: str, text: str) -> InputError:
+    return InputError(faults=[Fault(text=text, file=label)])
+
+
+def _similar(path: Path) -> str:
+    import difflib
+
+    try:
+        names = [entry.name for entry in path.parent.iterdir()]
+    except OSError:
+        return ""
+    close = difflib.get_close_matches(path.name, names, n=1)
+    return f", did you mean {path.parent / close[0]}?" if close else ""
+
+
+def compose(source: Source) -> Node | None:
+    """
+    Return the root node of the one document in *source*; None if there is none.
+
+    Raises:
+        InputError: It is not valid YAML, has a second document, or nests deeper than DEPTH_MAX.
+    """
+    bad = _UNPRINTABLE.search(source.text)
+    if bad:
+        line = source.text.count("\n", 0, bad.start()) + 1
+        column = bad.start() - (source.text.rfind("\n", 0, bad.start()) + 1) + 1
+        text = f"expected text, got the control character U+{ord(bad.group()):04X}"
+        raise InputError(faults=[source.fault(text, line=line, column=column)])
+    try:
+        return _Composer(source).document()
+    except yaml.MarkedYAMLError as error:
+        raise InputError(faults=[_syntax_fault(source, error)]) from None
+    except yaml.YAMLError as error:
+        raise _whole(source.label, f"not valid YAML: {error}") from None
+
+
+class _Composer:
+    def __init__(self, source: Source) -> None:
+        self.source = source
+        self.anchors: dict[str, Node] = {}
+        self.events: Iterator[Any] = yaml.parse(source.text, Loader=_PARSER)
+
+    def document(self) -> Node | None:
+        next(self.events)  # the start of the stream
+        if isinstance(next(self.events), yaml.StreamEndEvent):
+            return None
+        root = self.node(next(self.events), 0)
+        next(self.events)  # the end of the document
+        event = next(self.events)
+        if not isinstance(event, yaml.StreamEndEvent):
+            raise self.error("expected one document, a second one starts here", event)
+        return root
+
+    def node(self, event: Any, depth: int) -> Node:
+        if depth > DEPTH_MAX:
+            raise self.error(f"expected at most {DEPTH_MAX} levels of nesting", event)
+        if isinstance(event, yaml.AliasEvent):
+            if event.anchor not in self.anchors:
+                raise self.error(f"no anchor &{event.anchor} stands above", event)
+            return self.anchors[event.anchor]
+        node = Node([], event.start_mark.line + 1, event.start_mark.column + 1)
+        if isinstance(event, yaml.ScalarEvent):
+            self.scalar(node, event)
+        elif isinstance(event, yaml.SequenceStartEvent):
+            self.expect_tag(event, "seq")
+            node.value = [self.node(item, depth + 1) for item in self.until(yaml.SequenceEndEvent)]
+        else:
+            self.expect_tag(event, "map")
+            node.is_mapping = True
+            node.value = [
+                (self.node(key, depth + 1), self.node(next(self.events), depth + 1))
+                for key in self.until(yaml.MappingEndEvent)
+            ]
+        if event.anchor:  # set last: a node that holds itself finds no anchor
+            self.anchors[event.anchor] = node
+        return node
+
+    def until(self, end: type) -> Iterator[Any]:
+        for event in self.events:
+            if isinstance(event, end):
+                return
+            yield event
+
+    def expect_tag(self, event: Any, tag: str) -> None:
+        if event.tag not in (None, "!", _TAG + tag):
+            raise self.error(_tag_text(event.tag), event)
+
+    def scalar(self, node: Node, event: Any) -> None:
+        node.text = event.value
+        node.is_plain = event.style in (None, "")
+        if event.tag in ("!", _TAG + "str") or (event.tag is None and not event.implicit[0]):
+            node.value = event.value
+            return
+        try:
+            node.value = resolve_scalar(event.value)
+        except ValueError as error:
+            raise self.error(str(error), event) from None
+        if event.tag is None:
+            return
+        names = {bool: "bool", int: "int", float: "float", type(None): "null"}
+        if event.tag == _TAG + "float" and isinstance(node.value, int):
+            node.value = float(node.value)
+        if event.tag != _TAG + names.get(type(node.value), "str"):
+            raise self.error(_tag_text(event.tag), event)
+
+    def error(self, text: str, event: Any) -> InputError:
+        mark = event.start_mark
+        return InputError(
+            faults=[self.source.fault(text, line=mark.line + 1, column=mark.column + 1)]
+        )
+
+
+def _tag_text(tag: str) -> str:
+    return f"expected a plain value, got the tag {tag.replace(_TAG, '!!')}"
+
+
+def resolve_scalar(text: str) -> Scalar:
+    """
+    Return what an unquoted scalar means.
+
+    A power of ten without a fraction, such as 4e6, is a whole number.
+
+    Raises:
+        ValueError: It is a number, but not a finite one of reasonable length.
+    """
+    if text in _WORDS:
+        return _WORDS[text]
+    if _INTEGER.fullmatch(text):
+        if len(text) > DIGITS_MAX:
+            raise ValueError(f"expected a number of at most {DIGITS_MAX} digits")
+        return int(text, 10)
+    if _OCTAL.fullmatch(text):
+        return int(text[2:], 8)
+    if _HEXADECIMAL.fullmatch(text):
+        return int(text[2:], 16)
+    if _NOT_FINITE.fullmatch(text):
+        raise ValueError(f"expected a finite number, got {text}")
+    if _FLOAT.fullmatch(text):
+        number = float(text)
+        if number in (float("inf"), float("-inf")):
+            raise ValueError(f"expected a finite number, got {text}")
+        return int(number) if _POWER.fullmatch(text) and abs(number) < 2**53 else number
+    return text
+
+
+def _syntax_fault(source: Source, error: yaml.MarkedYAMLError) -> Fault:
+    """Say in plain words what the parser's terms mean."""
+    context, problem = error.context or "", error.problem or "not understood"
+    mark = error.problem_mark or error.context_mark
+    start = error.context_mark or mark
+    if mark is None:
+        return Fault(text=f"not valid YAML: {problem}", file=source.label)
+    line = source.lines[mark.line] if mark.line < len(source.lines) else ""
+    text = f"not valid YAML: {problem}"
+    if line[mark.column : mark.column + 1] == "\t" or line[: mark.column].strip(" ").startswith(
+        "\t"
+    ):
+        text = "expected spaces, got a tab: YAML is indented with spaces"
+    elif "quoted scalar" in context:
+        mark, text = start, "this quoted text is never closed"
+    elif "flow sequence" in context:
+        mark, text = start, "this list is never closed: expected ',' or ']'"
+    elif "flow mapping" in context:
+        mark, text = start, "this mapping is never closed: expected ',' or '}'"
+    elif "mapping values are not allowed" in problem:
+        text = "a second ': ' on this line: put the text in quotes, or check the indentation"
+    elif "could not find expected ':'" in problem:
+        mark, text = start, "expected `key: value`, got no ':' after the key"
+    elif "cannot start any token" in problem:
+        text = f"{line[mark.column : mark.column + 1]!r} cannot start a value: put it in quotes"
+    elif "block mapping" in context and "block end" in problem:
+        text = "expected a key at the indentation of its neighbours"
+    assert mark is not None
+    return source.fault(text, line=mark.line + 1, column=mark.column + 1)
