@@ -1,0 +1,1 @@
+"""Starting a run's processes, watching over them, and leaving none behind."""

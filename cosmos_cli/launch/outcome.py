@@ -1,0 +1,72 @@
+"""What the operator is asked to start, and what it hands back: plain values."""
+
+from __future__ import annotations
+
+import dataclasses
+import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+from cosmos_cli.launch.deadlines import MANUAL_READY_S
+from cosmos_cli.launch.events import AgentChanged, Progress
+from madns_runtime.config import RunConfig
+
+RUN_KEY_BYTES = 32
+SESSION_BYTES = 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LaunchRequest:
+    """One run on this machine."""
+
+    config: RunConfig
+    directory: Path
+    """The run directory; it exists."""
+    machines: Mapping[str, tuple[str, ...]]
+    """Each machine's agents; all machines are this one until boards are reached over SSH."""
+    manual: tuple[str, ...] = ()
+    """Agents that a person starts by hand; they are in nobody's list of *machines*' children."""
+    run_key_hex: str = field(default_factory=lambda: secrets.token_hex(RUN_KEY_BYTES), repr=False)
+    session_hex: str = field(default_factory=lambda: secrets.token_hex(SESSION_BYTES))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LaunchOutcome:
+    """How it ended, for the collector to judge."""
+
+    host_result: Mapping[str, Any] | None
+    """What the host said at its end; None if it could not."""
+    interruption: Literal["no", "clean", "at once"] = "no"
+    problems: tuple[str, ...] = ()
+    """What did not go as it should, each a sentence that names who and why."""
+    leftovers: tuple[int, ...] = ()
+    """Processes that even SIGKILL did not end."""
+
+
+class View(Protocol):
+    """Where the operator's talk goes."""
+
+    def say(self, text: str, level: str = "info") -> None:
+        """Show a sentence."""
+
+    def state(self, state: str) -> None:
+        """The host is in another state."""
+
+    def agent(self, change: AgentChanged) -> None:
+        """An agent has come further."""
+
+    def progress(self, progress: Progress) -> None:
+        """Show how the run fares."""
+
+    def close(self) -> None:
+        """Leave the terminal as it was; harmless when repeated."""
+
+
+def with_manual_agents(config: RunConfig, manual: tuple[str, ...]) -> RunConfig:
+    """Return *config* with time enough to start agents by hand."""
+    if not manual or config.timeouts.agents_ready_s >= MANUAL_READY_S:
+        return config
+    timeouts = dataclasses.replace(config.timeouts, agents_ready_s=MANUAL_READY_S)
+    return dataclasses.replace(config, timeouts=timeouts)
