@@ -1,0 +1,552 @@
+"""
+One peer's conversation: messages in, datagrams out, and the other way round.
+
+The owner moves the datagrams and keeps the time:
+
+    link.receive_datagram(data, now_s)        for what the socket gave; then
+    link.next_message()                       until None
+    link.handle_timer(now_s)                  when `get_timer()` has come
+    link.datagrams_to_send(now_s)             after any of these and after `send`
+
+Both sides use the same class. Nothing here gives a peer up: the owner decides that by its silence.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+from madns_runtime.errors import MadnsError, MessageTooLarge
+from madns_runtime.protocol.counters import LinkCounters
+from madns_runtime.protocol.deadlines import BrokenDeadline, DeadlineWatch
+from madns_runtime.protocol.delivery import (
+    CHANNEL_MAX,
+    FRAGMENT_BYTES_MAX,
+    FRAME,
+    FRAME_BYTES,
+    MESSAGE_BYTES_MAX,
+    MESSAGES_QUEUED_MAX,
+    WINDOW_FRAGMENTS_MAX,
+    WINDOW_FRAGMENTS_MIN,
+    Fragment,
+    Received,
+    ReceiveStream,
+    SendStream,
+)
+from madns_runtime.protocol.messages import Service
+from madns_runtime.protocol.recovery import (
+    ACK_DELAY_MAX_S,
+    ACK_DELAY_UNIT_S,
+    ACK_DELAY_UNITS_MAX,
+    Pacer,
+    RoundTrip,
+)
+from madns_runtime.protocol.seal import (
+    DATAGRAM_BYTES_MAX,
+    HEADER_BYTES,
+    MAC_BYTES,
+    PAYLOAD_BYTES_MAX,
+    PREFIX_BYTES,
+    REST,
+    ReceivedPackets,
+    Role,
+    Seal,
+    derive_keys,
+)
+
+__all__ = [
+    "BEST_BYTES_MAX",
+    "MESSAGE_BYTES_MAX",
+    "BrokenDeadline",
+    "Link",
+    "LinkLimits",
+    "Received",
+    "SendQueueFull",
+]
+
+BEST_BYTES_MAX: Final = FRAGMENT_BYTES_MAX
+"""The longest body of a BEST message: one datagram."""
+
+_BEST: Final = 0
+_SYNC: Final = 2
+_PROBE: Final = 8  # contents bit beside 1 << service
+_ELICITING: Final = 1 << Service.RELIABLE | 1 << Service.SYNC | _PROBE
+_AT_ONCE: Final = 1 << Service.SYNC | _PROBE
+_SENT_TIMES: Final = 256
+_NEVER: Final = float("inf")
+
+
+class SendQueueFull(MadnsError):
+    """The peer takes messages more slowly than the plug-in sends them; the message was not queued."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkLimits:
+    """Bounds of one link."""
+
+    receive_window_bytes: int = 64 * 1024
+    """What the peer may have under way to us: the socket's receive buffer divided by the peers.
+    Counted in whole datagrams, three quarters for RELIABLE, one for SYNC, at least 4 each."""
+    send_queue_bytes_max: int = 32 * 1024 * 1024
+    """Messages of each stream that wait or are not acknowledged."""
+    best_queue_max: int = 256
+    """BEST messages between two calls, in either direction; newer ones push out older ones."""
+    pace_bytes_per_s: float = 8e6
+    """Rate of RELIABLE datagrams beyond a burst."""
+    pace_burst_bytes: int = 16 * DATAGRAM_BYTES_MAX
+
+    def get_windows(self) -> tuple[int, int]:
+        """Return the windows of RELIABLE and SYNC in fragments."""
+        total = self.receive_window_bytes // DATAGRAM_BYTES_MAX
+        sync = min(max(total // 4, WINDOW_FRAGMENTS_MIN), WINDOW_FRAGMENTS_MAX)
+        reliable = min(max(total - sync, WINDOW_FRAGMENTS_MIN), WINDOW_FRAGMENTS_MAX)
+        return reliable, sync
+
+
+class Link:
+    """One peer's conversation."""
+
+    __slots__ = (
+        "_ack_due_s",
+        "_ack_seen",
+        "_best_newest",
+        "_best_next",
+        "_best_ready",
+        "_best_to_send",
+        "_carried",
+        "_carrier",
+        "_chunks",
+        "_contents",
+        "_eliciting_unacked",
+        "_in",
+        "_largest_at_s",
+        "_limits",
+        "_now_s",
+        "_out",
+        "_pacer",
+        "_packet_number",
+        "_packets",
+        "_ready",
+        "_room",
+        "_round_trip",
+        "_seal",
+        "_sent_times",
+        "_watch",
+        "counters",
+        "last_received_s",
+    )
+
+    def __init__(self, *, seal: Seal, limits: LinkLimits = LinkLimits()) -> None:  # noqa: B008 - frozen
+        self._seal = seal
+        self._limits = limits
+        self.counters = counters = LinkCounters()
+        self.last_received_s: float | None = None
+        """When the peer's newest datagram was accepted; None before the first."""
+        self._round_trip = RoundTrip()
+        self._pacer = Pacer(limits.pace_bytes_per_s, limits.pace_burst_bytes)
+        self._watch = DeadlineWatch(counters)
+        reliable_window, sync_window = limits.get_windows()
+        self._out = (
+            SendStream(Service.RELIABLE, self._round_trip, counters.reliable),
+            SendStream(Service.SYNC, self._round_trip, counters.sync),
+        )
+        self._in = (
+            ReceiveStream(Service.RELIABLE, reliable_window, counters.reliable),
+            ReceiveStream(Service.SYNC, sync_window, counters.sync),
+        )
+        self._ready: deque[Received] = deque()
+        self._best_ready: deque[Received] = deque(maxlen=limits.best_queue_max)
+        self._best_to_send: deque[bytes] = deque(maxlen=limits.best_queue_max)
+        self._best_next: dict[int, int] = {}  # by channel: number of the next message to send
+        self._best_newest: dict[int, int] = {}  # by channel: number of the newest received
+        self._now_s = -_NEVER
+        self._packet_number = 0
+        self._sent_times = [-_NEVER] * _SENT_TIMES
+        self._ack_seen = 0
+        self._packets = ReceivedPackets()
+        self._largest_at_s = 0.0
+        self._eliciting_unacked = 0
+        self._ack_due_s = _NEVER
+        # The datagram being filled.
+        self._chunks: list[bytes] = []
+        self._room = PAYLOAD_BYTES_MAX
+        self._contents = 0
+        self._carried: list[Fragment] = []
+        self._carrier: SendStream | None = None
+
+    @classmethod
+    def for_agent(
+        cls,
+        run_key: bytes,
+        session: bytes,
+        agent_index: int,
+        incarnation: int,
+        *,
+        limits: LinkLimits = LinkLimits(),  # noqa: B008 - frozen
+    ) -> Link:
+        """Return the agent's end of a conversation; see `seal.derive_keys` for the arguments."""
+        return cls(
+            seal=_seal(run_key, session, agent_index, incarnation, Role.AGENT), limits=limits
+        )
+
+    @classmethod
+    def for_host(
+        cls,
+        run_key: bytes,
+        session: bytes,
+        agent_index: int,
+        incarnation: int,
+        *,
+        limits: LinkLimits = LinkLimits(),  # noqa: B008 - frozen
+    ) -> Link:
+        """Return the host's end of a conversation; see `seal.derive_keys` for the arguments."""
+        return cls(seal=_seal(run_key, session, agent_index, incarnation, Role.HOST), limits=limits)
+
+    # What the owner asks.
+
+    @property
+    def srtt_s(self) -> float | None:
+        """Smoothed round trip, s, without the peer's delay; None before the first."""
+        return self._round_trip.srtt_s
+
+    @property
+    def is_flushed(self) -> bool:
+        """Whether nothing reliable is queued or unacknowledged."""
+        return self._out[0].is_flushed and self._out[1].is_flushed
+
+    @property
+    def queued_bytes(self) -> int:
+        """Bytes of both streams that wait or are not acknowledged."""
+        return self._out[0].queued_bytes + self._out[1].queued_bytes
+
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of both streams received and not finished to messages."""
+        return self._in[0].held_bytes + self._in[1].held_bytes
+
+    @property
+    def peer_prefix(self) -> bytes:
+        """The first bytes of every datagram from this peer: a key to find the link by."""
+        return self._seal.peer_prefix
+
+    # Sending.
+
+    def send(
+        self,
+        body: bytes,
+        service: Service,
+        now_s: float,
+        *,
+        channel: int = 0,
+        deadline_s: float | None = None,
+    ) -> None:
+        """
+        Queue a message.
+
+        Args:
+            body: The message.
+            service: Its class of service.
+            now_s: This side's monotonic time.
+            channel: 0 to 255; of BEST messages the newest of each channel wins, the streams carry it.
+            deadline_s: SYNC only: by when the acknowledgement must be here, on the clock of *now_s*.
+
+        Raises:
+            MessageTooLarge: BEST messages must fit one datagram (BEST_BYTES_MAX), others MESSAGE_BYTES_MAX.
+            SendQueueFull: The stream's queue has no room left for it.
+            ValueError: The channel is out of bounds.
+        """
+        self._now_s = now_s
+        if not 0 <= channel <= CHANNEL_MAX:
+            raise ValueError(f"expected a channel of 0 to {CHANNEL_MAX}, got {channel}")
+        if service == _BEST:
+            self._send_best(body, channel)
+            return
+        stream = self._out[service - 1]
+        self._check_queue(stream, len(body))
+        if deadline_s is not None and service == _SYNC:
+            self._watch.add(stream.counters.sent, deadline_s, now_s, (channel, body))
+        stream.push(body, channel)
+
+    def _send_best(self, body: bytes, channel: int) -> None:
+        if len(body) > BEST_BYTES_MAX:
+            raise MessageTooLarge(
+                f"a BEST message must fit one datagram: expected at most {BEST_BYTES_MAX} bytes, "
+                f"got {len(body)}; send it RELIABLE or make it smaller"
+            )
+        number = self._best_next.get(channel, 0)
+        self._best_next[channel] = number + 1
+        queue = self._best_to_send
+        counters = self.counters.best
+        if len(queue) == queue.maxlen:
+            counters.dropped += 1
+        queue.append(FRAME.pack(_BEST, channel, len(body), number) + body)
+        counters.sent += 1
+
+    def _check_queue(self, stream: SendStream, size: int) -> None:
+        limit = self._limits.send_queue_bytes_max
+        if size > MESSAGE_BYTES_MAX or size > limit:
+            raise MessageTooLarge(
+                f"expected a message of at most {min(limit, MESSAGE_BYTES_MAX)} bytes, got {size}; "
+                "send it in parts"
+            )
+        if stream.queued_bytes + size > limit or stream.is_full:
+            self.counters.send_queue_full += 1
+            raise SendQueueFull(
+                f"{stream.queued_bytes} bytes wait for the peer already (at most {limit} bytes and "
+                f"{MESSAGES_QUEUED_MAX} messages may); send less, or BEST what may be lost"
+            )
+
+    def datagrams_to_send(self, now_s: float) -> list[bytes]:
+        """Return what is to be sent now, in this order: acknowledgement, SYNC, BEST, RELIABLE."""
+        self._now_s = now_s
+        datagrams: list[bytes] = []
+        reliable, sync = self._out
+        if sync.has_output or sync.is_probe_due:
+            self._fill(sync, now_s, datagrams)
+        best = self._best_to_send
+        if best:
+            for frame in best:
+                if len(frame) > self._room:
+                    datagrams.append(self._close(now_s))
+                self._chunks.append(frame)
+                self._room -= len(frame)
+            self._contents |= 1 << _BEST
+            best.clear()
+        if reliable.is_probe_due or (reliable.has_output and now_s >= self._pacer.opens_at_s):
+            if self._carrier is not None:
+                datagrams.append(self._close(now_s))
+            self._fill(reliable, now_s, datagrams)
+        if self._contents or (not datagrams and now_s >= self._ack_due_s):
+            datagrams.append(self._close(now_s))
+        reliable.arm_probe(now_s)
+        sync.arm_probe(now_s)
+        return datagrams
+
+    def _fill(self, stream: SendStream, now_s: float, datagrams: list[bytes]) -> None:
+        """Put all fragments that may go into datagrams; the last one may stay open."""
+        pacer = None if stream is self._out[1] else self._pacer
+        bit = 1 << (1 if pacer else _SYNC)
+        if stream.is_probe_due:
+            stream.is_probe_due = False
+            self._contents |= _PROBE
+        while pacer is None or now_s >= pacer.opens_at_s:
+            fragment = stream.take(self._room)
+            if fragment is None:
+                if not stream.has_output:
+                    return
+                datagrams.append(self._close(now_s))
+                continue
+            frame = fragment.frame
+            self._chunks.append(frame)
+            self._room -= len(frame)
+            self._carried.append(fragment)
+            self._carrier = stream
+            self._contents |= bit
+            if pacer is not None:
+                pacer.spend(len(frame), now_s)
+
+    def _close(self, now_s: float) -> bytes:
+        """Seal the datagram being filled and begin the next."""
+        packet_number = self._packet_number + 1
+        self._packet_number = packet_number
+        packets = self._packets
+        reliable, sync = self._in
+        reliable.advertised = reliable.limit
+        sync.advertised = sync.limit
+        delay = int((now_s - self._largest_at_s) / ACK_DELAY_UNIT_S)
+        rest = REST.pack(
+            packet_number,
+            packets.largest,
+            packets.ack_bits,
+            reliable.next_expected,
+            sync.next_expected,
+            reliable.limit - reliable.next_expected,
+            sync.limit - sync.next_expected,
+            0 if delay < 0 else min(delay, ACK_DELAY_UNITS_MAX),
+            self._contents,
+            0,
+        )
+        datagram = self._seal.close(rest, b"".join(self._chunks))
+        self._sent_times[packet_number % _SENT_TIMES] = now_s
+        carrier = self._carrier
+        if carrier is not None:
+            carrier.record(packet_number, now_s, self._carried)
+            self._carrier = None
+            self._carried = []
+        self._chunks.clear()
+        self._room = PAYLOAD_BYTES_MAX
+        self._contents = 0
+        self._eliciting_unacked = 0
+        self._ack_due_s = _NEVER
+        self.counters.datagrams_sent += 1
+        self.counters.bytes_sent += len(datagram)
+        return datagram
+
+    # Receiving.
+
+    def receive_datagram(self, data: bytes, now_s: float) -> bool:
+        """
+        Take a datagram.
+
+        Returns:
+            False if it was refused and counted: not from this peer, changed, repeated or malformed.
+        """
+        self._now_s = now_s
+        fault = self._seal.find_fault(data) or self._accept(data, now_s)
+        if fault is None:
+            return True
+        self.counters.refused[fault] += 1
+        return False
+
+    def _accept(self, data: bytes, now_s: float) -> str | None:
+        """Take a datagram that is the peer's; return why not, if not, having changed nothing."""
+        (
+            packet_number,
+            ack,
+            ack_bits,
+            reliable_next,
+            sync_next,
+            reliable_granted,
+            sync_granted,
+            ack_delay,
+            contents,
+            _,
+        ) = REST.unpack_from(data, PREFIX_BYTES)
+        packets = self._packets
+        if not packets.is_new(packet_number):
+            return "replay"
+        reliable, sync = self._out
+        if (
+            ack > self._packet_number
+            or reliable_next > reliable.next_number
+            or sync_next > sync.next_number
+        ):
+            return "malformed"
+        frames = self._parse(data)
+        if frames is None:
+            return "malformed"
+
+        is_gap = packet_number != packets.largest + 1
+        packets.add(packet_number)
+        if packets.largest == packet_number:
+            self._largest_at_s = now_s
+        self.last_received_s = now_s
+        counters = self.counters
+        counters.datagrams_received += 1
+        counters.bytes_received += len(data)
+        if ack > self._ack_seen:
+            self._measure(ack, ack_delay, now_s)
+        reliable.advance(reliable_next, reliable_granted)
+        if sync.advance(sync_next, sync_granted):
+            self._watch.acknowledge(counters.sync.acknowledged, now_s)
+        for stream in self._out:
+            if stream.is_listening:
+                stream.acknowledge(ack, ack_bits, now_s)
+            stream.arm_probe(now_s)
+        if contents & _ELICITING:
+            self._owe_ack(now_s, at_once=is_gap or bool(contents & _AT_ONCE))
+        for kind, channel, number, payload in frames:
+            if kind:
+                self._in[kind - 1].accept(number, payload, self._ready)
+            else:
+                self._receive_best(channel, number, payload)
+        return None
+
+    def _parse(self, data: bytes) -> list[tuple[int, int, int, bytes]] | None:
+        """Return the frames (service, channel, number, payload), None if any is malformed."""
+        frames = []
+        offset = HEADER_BYTES
+        end = len(data) - MAC_BYTES
+        while offset < end:
+            start = offset + FRAME_BYTES
+            if start > end:
+                return None
+            kind, channel, length, number = FRAME.unpack_from(data, offset)
+            offset = start + length
+            if offset > end or kind > _SYNC:
+                return None
+            # A peer that sends beyond what it was granted would make us hold more than we bound.
+            if kind and number >= self._in[kind - 1].limit:
+                return None
+            frames.append((kind, channel, number, data[start:offset]))
+        return frames
+
+    def _measure(self, ack: int, ack_delay: int, now_s: float) -> None:
+        """Take a round trip from the newest packet acknowledged."""
+        self._ack_seen = ack
+        if ack_delay < ACK_DELAY_UNITS_MAX and self._packet_number - ack < _SENT_TIMES:
+            sample_s = now_s - self._sent_times[ack % _SENT_TIMES] - ack_delay * ACK_DELAY_UNIT_S
+            self._round_trip.add(sample_s if sample_s > 0 else 0.0)
+
+    def _owe_ack(self, now_s: float, *, at_once: bool) -> None:
+        self._eliciting_unacked += 1
+        if at_once or self._eliciting_unacked >= 2:
+            self._ack_due_s = now_s
+        elif self._ack_due_s > now_s + ACK_DELAY_MAX_S:
+            self._ack_due_s = now_s + ACK_DELAY_MAX_S
+
+    def _receive_best(self, channel: int, number: int, payload: bytes) -> None:
+        counters = self.counters.best
+        ahead = number - self._best_newest.get(channel, -1)
+        if ahead <= 0:
+            if ahead == 0:
+                counters.duplicates += 1
+            else:
+                # It was counted as lost when a newer one came.
+                counters.late += 1
+                counters.lost -= 1
+            return
+        counters.lost += ahead - 1
+        counters.received += 1
+        self._best_newest[channel] = number
+        ready = self._best_ready
+        if len(ready) == ready.maxlen:
+            counters.dropped += 1
+        ready.append(Received(Service.BEST, channel, payload))
+
+    def next_message(self) -> Received | None:
+        """Return the next message received, the streams' in their order; None if there is none."""
+        if self._ready:
+            message = self._ready.popleft()
+            if self._in[message.service - 1].deliver():
+                self._ack_due_s = self._now_s
+            return message
+        if self._best_ready:
+            return self._best_ready.popleft()
+        return None
+
+    # Time.
+
+    def get_timer(self) -> float | None:
+        """Return when to call `handle_timer` and `datagrams_to_send`, None for never."""
+        reliable, sync = self._out
+        if self._best_to_send or sync.has_output or sync.is_probe_due or reliable.is_probe_due:
+            return self._now_s
+        timer_s = min(
+            self._ack_due_s, reliable.get_timer(), sync.get_timer(), self._watch.get_timer()
+        )
+        if reliable.has_output:
+            timer_s = min(timer_s, max(self._pacer.opens_at_s, self._now_s))
+        return None if timer_s == _NEVER else timer_s
+
+    def handle_timer(self, now_s: float) -> None:
+        """Do what is due by now; `datagrams_to_send` has the outcome."""
+        self._now_s = now_s
+        for stream in self._out:
+            stream.expire(now_s)
+        self._watch.expire(now_s)
+
+    def next_broken_deadline(self) -> BrokenDeadline | None:
+        """Return the next SYNC message that broke its deadline, each once."""
+        return self._watch.next_broken()
+
+    def abandon(self) -> None:
+        """Give the peer up: what it has not acknowledged is counted as lost and forgotten."""
+        for stream in self._out:
+            stream.abandon()
+
+
+def _seal(run_key: bytes, session: bytes, agent_index: int, incarnation: int, role: Role) -> Seal:
+    keys = derive_keys(run_key, session, agent_index, incarnation)
+    return Seal(keys, role, session=session, agent_index=agent_index, incarnation=incarnation)

@@ -1,0 +1,197 @@
+"""
+The seal of a datagram: who sent it, that nobody changed it, and that it was not seen before.
+
+A datagram is HEADER (64 bytes), frames, MAC (16 bytes). The header's first 16 bytes, its prefix, name
+the conversation and stay the same in all datagrams of one direction; then come the packet number, the
+acknowledgements and the windows granted. The MAC is keyed BLAKE2b over everything before it.
+
+Every conversation has its own pair of keys, one a direction, derived from the run key, the session,
+the agent and the agent's incarnation (drawn anew whenever its process starts). A packet number is
+therefore never used twice with one key, and nothing that an earlier process sent is valid for a later.
+"""
+
+from __future__ import annotations
+
+import hmac
+from dataclasses import dataclass
+from enum import IntEnum
+from hashlib import blake2b
+from struct import Struct
+from typing import Final, NamedTuple
+
+from madns_runtime.protocol.messages import VERSION
+
+DATAGRAM_BYTES_MAX: Final = 1400
+MAC_BYTES: Final = 16
+KEY_BYTES: Final = 32
+SESSION_BYTES: Final = 8
+AGENT_INDEX_MAX: Final = 65_535
+INCARNATION_MAX: Final = 2**32 - 1
+REPLAY_WINDOW_PACKETS: Final = 1024
+
+PREFIX: Final = Struct("<BBHI8s")
+"""version, role of the sender, agent index, incarnation, session."""
+REST: Final = Struct("<QQQQQHHHBB")
+"""packet number; largest packet received and the 64 before it; next fragment expected, RELIABLE then
+SYNC; fragments granted beyond these, RELIABLE then SYNC; time between receiving that largest packet and
+this datagram in ACK_DELAY_UNIT_S; contents; zero."""
+PREFIX_BYTES: Final = PREFIX.size
+HEADER_BYTES: Final = PREFIX.size + REST.size
+OVERHEAD_BYTES: Final = HEADER_BYTES + MAC_BYTES
+PAYLOAD_BYTES_MAX: Final = DATAGRAM_BYTES_MAX - OVERHEAD_BYTES
+
+_PEEK: Final = Struct("<BBHI8sQ")
+_REPLAY_MASK: Final = (1 << REPLAY_WINDOW_PACKETS) - 1
+_ACK_MASK: Final = (1 << 64) - 1
+
+
+class Role(IntEnum):
+    """The sender of a datagram."""
+
+    AGENT = 0
+    HOST = 1
+
+
+@dataclass(frozen=True, slots=True)
+class LinkKeys:
+    """The MAC keys of one conversation, 32 bytes a direction."""
+
+    up: bytes
+    """Agent to host."""
+    down: bytes
+    """Host to agent."""
+
+    def __repr__(self) -> str:
+        """Show no key: representations end up in logs."""
+        return "LinkKeys(...)"
+
+
+def derive_keys(run_key: bytes, session: bytes, agent_index: int, incarnation: int) -> LinkKeys:
+    """
+    Derive the two keys of one agent's conversation with the host.
+
+    Args:
+        run_key: Secret of the run, 32 to 64 bytes.
+        session: Public number of the run, 8 bytes.
+        agent_index: 1 to 65535.
+        incarnation: Drawn by the agent's process at its start, 32 bits.
+
+    Raises:
+        ValueError: An argument is out of bounds.
+    """
+    if not KEY_BYTES <= len(run_key) <= 64:
+        raise ValueError(f"expected a run key of 32 to 64 bytes, got {len(run_key)}")
+    context = _pack_prefix(session, agent_index, incarnation, Role.AGENT)
+    return LinkKeys(
+        up=blake2b(context, digest_size=KEY_BYTES, key=run_key, person=b"madns link up").digest(),
+        down=blake2b(
+            context, digest_size=KEY_BYTES, key=run_key, person=b"madns link down"
+        ).digest(),
+    )
+
+
+def _pack_prefix(session: bytes, agent_index: int, incarnation: int, role: Role) -> bytes:
+    if len(session) != SESSION_BYTES:
+        raise ValueError(f"expected a session of {SESSION_BYTES} bytes, got {len(session)}")
+    if not 1 <= agent_index <= AGENT_INDEX_MAX:
+        raise ValueError(f"expected an agent index of 1 to {AGENT_INDEX_MAX}, got {agent_index}")
+    if not 0 <= incarnation <= INCARNATION_MAX:
+        raise ValueError(f"expected an incarnation of 32 bits, got {incarnation}")
+    return PREFIX.pack(VERSION, role, agent_index, incarnation, session)
+
+
+class Header(NamedTuple):
+    """What a datagram claims about itself. Nothing of it is proven before its MAC is."""
+
+    version: int
+    role: int
+    agent_index: int
+    incarnation: int
+    session: bytes
+    packet_number: int
+
+    @staticmethod
+    def peek(datagram: bytes) -> Header | None:
+        """Return the claims of a datagram, None if it is too short or too long to be one."""
+        if OVERHEAD_BYTES <= len(datagram) <= DATAGRAM_BYTES_MAX:
+            return Header._make(_PEEK.unpack_from(datagram))
+        return None
+
+
+peek = Header.peek
+
+
+class Seal:
+    """One side's end of a conversation: seals what it sends, checks what it receives."""
+
+    __slots__ = ("_receive_mac", "_send_mac", "agent_index", "incarnation", "peer_prefix", "prefix")
+
+    def __init__(
+        self, keys: LinkKeys, role: Role, *, session: bytes, agent_index: int, incarnation: int
+    ) -> None:
+        is_agent = role is Role.AGENT
+        peer = Role.HOST if is_agent else Role.AGENT
+        self.agent_index = agent_index
+        self.incarnation = incarnation
+        self.prefix = _pack_prefix(session, agent_index, incarnation, role)
+        self.peer_prefix = _pack_prefix(session, agent_index, incarnation, peer)
+        send_key, receive_key = (keys.up, keys.down) if is_agent else (keys.down, keys.up)
+        # Copying a hash that has taken its key already is faster than keying a new one.
+        self._send_mac = blake2b(digest_size=MAC_BYTES, key=send_key)
+        self._receive_mac = blake2b(digest_size=MAC_BYTES, key=receive_key)
+
+    def close(self, rest: bytes, payload: bytes) -> bytes:
+        """Return the datagram of a packed header rest (see REST) and the frames behind it."""
+        body = self.prefix + rest + payload
+        mac = self._send_mac.copy()
+        mac.update(body)
+        return body + mac.digest()
+
+    def find_fault(self, datagram: bytes) -> str | None:
+        """Return why a datagram is not from the peer of this conversation, None if it is."""
+        size = len(datagram)
+        if size > DATAGRAM_BYTES_MAX:
+            return "oversize"
+        if size < OVERHEAD_BYTES:
+            return "short"
+        if datagram[:PREFIX_BYTES] != self.peer_prefix:
+            return "version" if datagram[0] != VERSION else "sender"
+        mac = self._receive_mac.copy()
+        mac.update(datagram[:-MAC_BYTES])
+        if not hmac.compare_digest(mac.digest(), datagram[-MAC_BYTES:]):
+            return "mac"
+        return None
+
+
+class ReceivedPackets:
+    """Packet numbers received: a sliding bitmap that refuses repeats and feeds the acknowledgements."""
+
+    __slots__ = ("_bits", "largest")
+
+    def __init__(self) -> None:
+        self.largest = 0
+        """0 while none was received: packet numbers start at 1."""
+        self._bits = 0  # bit i: largest - i was received
+
+    def is_new(self, packet_number: int) -> bool:
+        """Return whether a packet is neither repeated nor older than the window."""
+        age = self.largest - packet_number
+        if age < 0:
+            return True
+        return age < REPLAY_WINDOW_PACKETS and not (self._bits >> age) & 1 and packet_number > 0
+
+    def add(self, packet_number: int) -> None:
+        """Note a new packet."""
+        ahead = packet_number - self.largest
+        if ahead <= 0:
+            self._bits |= 1 << -ahead
+            return
+        # A far jump must not shift by as many bits as a peer likes.
+        shifted = self._bits << ahead if ahead < REPLAY_WINDOW_PACKETS else 0
+        self._bits = (shifted | 1) & _REPLAY_MASK
+        self.largest = packet_number
+
+    @property
+    def ack_bits(self) -> int:
+        """Which of the 64 packets before the largest were received; bit 0 is the one just before."""
+        return (self._bits >> 1) & _ACK_MASK
