@@ -1,0 +1,247 @@
+"""
+The machine's register of what runs on it: one small file a process, believed only as far as the kernel agrees.
+
+A pid alone says nothing, for the kernel gives it out again: an entry holds the start time and the boot
+as well, and a process is signalled through a descriptor that cannot come to mean another.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import platform
+import re
+import signal
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Self
+
+import orjson
+
+Role = Literal["operator", "host", "supervisor", "agent"]
+
+FILE_BYTES_MAX = 16_384
+_FILE_NAME = re.compile(r"\.?(\d+)-(\d+)-\d+\.json")
+_serials = itertools.count()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProcessEntry:
+    """One process of a run on this machine."""
+
+    run: str
+    role: Role
+    name: str
+    pid: int
+    start_ticks: int
+    """When it started, in clock ticks since boot (field 22 of /proc/<pid>/stat)."""
+    boot_id: str
+    node: str
+    """The machine's own name: a home directory may be shared by many."""
+    run_directory: str
+    utc: str
+
+
+class Registration:
+    """An entry of this process; `remove` it at the end, or use it as a context manager. Redo it after a fork."""
+
+    def __init__(self, entry: ProcessEntry, path: Path | None, problem: str | None) -> None:
+        self.entry = entry
+        self.problem = problem
+        """Why the entry could not be written; None if it was."""
+        self._path = path
+
+    def remove(self) -> None:
+        """Take the entry out; in a forked process, whose entry it is not, do nothing."""
+        if self._path is not None and os.getpid() == self.entry.pid:
+            with contextlib.suppress(OSError):
+                self._path.unlink(missing_ok=True)
+            self._path = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.remove()
+
+
+def state_directory() -> Path:
+    """Return where the register is: COSMOS_STATE_DIR, XDG_STATE_HOME/cosmos or ~/.local/state/cosmos, processes."""
+    own = os.environ.get("COSMOS_STATE_DIR")
+    if own:
+        return Path(own) / "processes"
+    shared = os.environ.get("XDG_STATE_HOME")
+    base = Path(shared) if shared else Path(os.path.expanduser("~")) / ".local/state"
+    return base / "cosmos/processes"
+
+
+def register(run: str, role: Role, name: str, run_directory: str | Path) -> Registration:
+    """
+    Enter this process into the machine's register.
+
+    A directory that cannot be written is no reason to fail: `Registration.problem` says so.
+
+    Args:
+        run: Name of the run.
+        role: operator, host, supervisor or agent.
+        name: host, the machine's or the agent's name.
+        run_directory: Where the run's evidence goes.
+    """
+    pid = os.getpid()
+    entry = ProcessEntry(
+        run=run,
+        role=role,
+        name=name,
+        pid=pid,
+        start_ticks=read_start_ticks(pid) or 0,
+        boot_id=read_boot_id(),
+        node=platform.node(),
+        run_directory=str(run_directory),
+        utc=datetime.now(UTC).isoformat(timespec="seconds"),
+    )
+    directory = state_directory()
+    path = directory / f"{pid}-{entry.start_ticks}-{next(_serials)}.json"
+    try:
+        directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+        _write_whole(path, orjson.dumps(asdict(entry)))
+    except OSError as error:
+        problem = (
+            f"{directory}: cannot note process {pid} ({role} {name}) there: {error.strerror}; "
+            "`cosmos ps` and `cosmos down` will not see it; COSMOS_STATE_DIR names another place"
+        )
+        return Registration(entry, None, problem)
+    return Registration(entry, path, None)
+
+
+def list_processes() -> list[ProcessEntry]:
+    """Return the living processes of the register, by run, role and name; entries of dead ones are removed."""
+    entries = [entry for path in _files() if (entry := _check(path)) is not None]
+    return sorted(entries, key=lambda entry: (entry.run, entry.role, entry.name, entry.pid))
+
+
+def is_running(entry: ProcessEntry) -> bool:
+    """Return whether the entry's process lives: same pid, same start, same boot."""
+    return entry.boot_id == read_boot_id() and read_start_ticks(entry.pid) == entry.start_ticks
+
+
+def end_process(entry: ProcessEntry, number: int = signal.SIGTERM) -> bool:
+    """
+    Signal the entry's process, if it is still the one that was entered.
+
+    Returns:
+        False if it had ended already.
+
+    Raises:
+        PermissionError: It belongs to another user.
+    """
+    if not hasattr(os, "pidfd_open"):
+        return is_running(entry) and _signal(entry.pid, number)
+    try:
+        descriptor = os.pidfd_open(entry.pid)
+    except ProcessLookupError:
+        return False
+    except OSError:  # An old kernel or a sandbox without the call.
+        return is_running(entry) and _signal(entry.pid, number)
+    try:
+        # Verified after the descriptor was opened: from here on it means this process and no other.
+        if not is_running(entry):
+            return False
+        signal.pidfd_send_signal(descriptor, number)
+    except ProcessLookupError:
+        return False
+    finally:
+        os.close(descriptor)
+    return True
+
+
+def read_start_ticks(pid: int) -> int | None:
+    """Return when a process started, in clock ticks since boot; None if it has ended (a zombie has)."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_bytes()
+    except OSError:
+        return None
+    # The name, in parentheses, may hold spaces and parentheses; state is the field after it, the third.
+    values = text[text.rfind(b")") + 1 :].split()
+    if len(values) < 20 or values[0] in (b"Z", b"X", b"x"):
+        return None
+    return int(values[19])
+
+
+def read_boot_id() -> str:
+    """Return what names this boot of the machine; empty where the kernel does not say."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
+
+
+def _signal(pid: int, number: int) -> bool:
+    try:
+        os.kill(pid, number)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def _write_whole(path: Path, text: bytes) -> None:
+    """Write a file that is there in full or not at all."""
+    draft = path.with_name(f".{path.name}")
+    try:
+        draft.write_bytes(text)
+        draft.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            draft.unlink(missing_ok=True)
+        raise
+
+
+def _files() -> Iterator[Path]:
+    try:
+        paths = sorted(state_directory().iterdir())
+    except OSError:
+        return
+    yield from (path for path in paths if _FILE_NAME.fullmatch(path.name))
+
+
+def _check(path: Path) -> ProcessEntry | None:
+    """Return the entry of a living process; remove the file of one that is known to be dead."""
+    match = _FILE_NAME.fullmatch(path.name)
+    if match is None:
+        return None
+    entry = _read_entry(path)
+    if entry is not None and entry.node != platform.node():
+        return None  # Of another machine that shares this directory: not ours to judge.
+    is_dead = read_start_ticks(int(match[1])) != int(match[2])
+    if is_dead or (entry is not None and not is_running(entry)):
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
+        return None
+    return None if path.name.startswith(".") else entry
+
+
+def _read_entry(path: Path) -> ProcessEntry | None:
+    try:
+        if path.stat().st_uid != os.geteuid():
+            return None  # What another user wrote must not tell us whom to signal.
+        with path.open("rb") as file:
+            values = orjson.loads(file.read(FILE_BYTES_MAX))
+    except (OSError, orjson.JSONDecodeError):
+        return None
+    if not isinstance(values, dict):
+        return None
+    wanted = {
+        field.name: int if field.name in ("pid", "start_ticks") else str
+        for field in fields(ProcessEntry)
+    }
+    if not all(isinstance(values.get(name), kind) for name, kind in wanted.items()):
+        return None
+    return ProcessEntry(**{name: values[name] for name in wanted})
