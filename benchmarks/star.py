@@ -22,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -100,7 +101,9 @@ def bare_star(agents: int, hz: int, seconds: float) -> dict[str, float]:
         children = [
             fork(
                 lambda i=i: bare_agent(
-                    address, (t0_s + i / agents / hz, hz, int(seconds * hz)), Path(directory, str(i))
+                    address,
+                    (t0_s + i / agents / hz, hz, int(seconds * hz)),
+                    Path(directory, str(i)),
                 )
             )
             for i in range(agents)
@@ -129,7 +132,7 @@ def bare_star(agents: int, hz: int, seconds: float) -> dict[str, float]:
     }
 
 
-def fork(work) -> int:
+def fork(work: Callable[[], None]) -> int:
     """Run *work* in a child with the policy that an agent's loop has; return its pid."""
     pid = os.fork()
     if pid:

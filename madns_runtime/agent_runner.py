@@ -25,7 +25,7 @@ from madns_runtime.reactor.reactor import Reactor, Timer
 from madns_runtime.reactor.udp import UdpSocket
 from madns_runtime.recording.records import CLOCK, EVENTS, LOG, PROCESS, TICKS
 from madns_runtime.recording.writer import Recorder
-from madns_runtime.timing.clock import utc_now_iso
+from madns_runtime.timing.clock import utc_at_iso, utc_now_iso
 from madns_runtime.timing.rate import Pacer, stagger
 
 T = TypeVar("T")
@@ -224,7 +224,7 @@ class AgentRunner:
             tolerance_s=self._config.deadline.tolerance_ms * 1e-3,
         )
         now_s = self._simulated_s()
-        self._recorder.set_t0(utc_now_iso(-now_s))
+        self._recorder.set_t0(utc_at_iso(-now_s))
         self._event("state", state=self._session.state.value, phase_s=phase_s)
         if now_s > 0:
             self._pacer.skip_to(now_s)
@@ -253,9 +253,7 @@ class AgentRunner:
             if self._first is None:
                 self._first = (timing.t_s, began_s)
             self._newest = (timing.t_s, began_s)
-            tick = Tick(
-                timing.index, timing.t_s, self._period_s, timing.lateness_s, timing.missed
-            )
+            tick = Tick(timing.index, timing.t_s, self._period_s, timing.lateness_s, timing.missed)
             try:
                 self._step(tick)
             except Exception as error:  # noqa: BLE001 - a plug-in may raise anything
@@ -313,9 +311,7 @@ class AgentRunner:
         """Simulated seconds per wall second between the first and the newest tick."""
         if self._first is None or self._newest is None or self._newest[1] <= self._first[1]:
             return None
-        return round(
-            (self._newest[0] - self._first[0]) / (self._newest[1] - self._first[1]), 9
-        )
+        return round((self._newest[0] - self._first[0]) / (self._newest[1] - self._first[1]), 9)
 
     def _end_early(self, reason: str) -> None:
         self._outcome = (False, reason)
@@ -383,7 +379,7 @@ class AgentRunner:
     def _report(self) -> Mapping[str, Any]:
         report: dict[str, Any] = {"dropped": self._recorder.dropped_count}
         if self._pacer is not None:
-            summary = self._pacer.live_summary()
+            summary = self._pacer.summary()
             report.update(
                 ticks=summary["run"],
                 missed=summary["missed"],

@@ -37,7 +37,7 @@ from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.udp import UdpSocket
 from madns_runtime.recording.records import EVENTS, LOG
 from madns_runtime.recording.writer import Recorder
-from madns_runtime.timing.clock import utc_now_iso
+from madns_runtime.timing.clock import utc_at_iso, utc_now_iso
 
 T = TypeVar("T")
 
@@ -76,9 +76,7 @@ class HostRuntime:
         executor = make_executor(config.executor)  # both fork: before every thread
         self._reactor = Reactor()
         self._jobs = JobRunner(self._reactor, executor, self._job_done)
-        self._recorder = Recorder(
-            directory, run=config.run, source=HOST, settings=config.recording
-        )
+        self._recorder = Recorder(directory, run=config.run, source=HOST, settings=config.recording)
         self._recorder.open_stream(EVENTS)
         self._recorder.open_stream(LOG)
         self._operator = OperatorLink(
@@ -129,7 +127,9 @@ class HostRuntime:
         self._reactor.on_signal(
             signal.SIGTERM, lambda: self._end("operator", "SIGTERM", "interrupted")
         )
-        self._reactor.on_signal(signal.SIGINT, lambda: None)  # a terminal's Ctrl-C is the operator's
+        self._reactor.on_signal(
+            signal.SIGINT, lambda: None
+        )  # a terminal's Ctrl-C is the operator's
         self._recorder.start()
         self._report.scheduling = apply_scheduling(config.scheduling, is_host=True).to_mapping()
         for warning in filter(None, (self._socket.warning, self._report.scheduling.get("warning"))):
@@ -239,7 +239,7 @@ class HostRuntime:
         lead_s = self._config.timeouts.start_lead_s
         freeze_garbage()
         self._t0_s = self._reactor.now_s() + lead_s
-        self._report.t0_utc = utc_now_iso(lead_s)
+        self._report.t0_utc = utc_at_iso(lead_s)
         self._recorder.set_t0(self._report.t0_utc)
         self._session.start(self._t0_s, self._config.time.duration_s, now_s)
         self._call("start", self._simulation.start, -lead_s)

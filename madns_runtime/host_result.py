@@ -39,11 +39,11 @@ class HostReport:
 
     def result(self, session: HostSession) -> dict[str, Any]:
         """Return the result as the operator's side expects it."""
-        agents = {name: _agent_result(peer, self.lost.get(name)) for name, peer in session.peers.items()}
-        if self._reason is None:
-            status = "complete"
-        else:
-            status = self.ending_status or "failed"
+        agents = {
+            name: _agent_result(peer, self.lost.get(name)) for name, peer in session.peers.items()
+        }
+        ended = self.ending_status or "failed"
+        status = "complete" if self._reason is None else ended
         return {
             "status": status,
             "who": self._who,
@@ -132,7 +132,9 @@ def progress_report(session: HostSession, t_s: float, duration_s: float) -> dict
     reports = [peer.report for peer in session.peers.values() if peer.report]
     factors = [r["rtf"] for r in reports if r.get("rtf") is not None]
     uplink_lost = sum(
-        peer.link.counters.to_mapping()["best"]["lost"] for peer in session.peers.values() if peer.link
+        peer.link.counters.to_mapping()["best"]["lost"]
+        for peer in session.peers.values()
+        if peer.link
     )
     ready = (Phase.READY, Phase.SETTING_UP, Phase.SIMULATION_READY)
     return {
@@ -146,7 +148,9 @@ def progress_report(session: HostSession, t_s: float, duration_s: float) -> dict
         "ticks": sum(r.get("ticks", 0) for r in reports),
         "missed": sum(r.get("missed", 0) for r in reports),
         "lateness_us_p50": _median([r["late_p50_us"] for r in reports if "late_p50_us" in r]),
-        "lateness_us_p99": max((r["late_p99_us"] for r in reports if "late_p99_us" in r), default=None),
+        "lateness_us_p99": max(
+            (r["late_p99_us"] for r in reports if "late_p99_us" in r), default=None
+        ),
         "lost_messages": uplink_lost + sum(r.get("lost", 0) for r in reports),
         "records_dropped": sum(r.get("dropped", 0) for r in reports),
     }

@@ -14,7 +14,7 @@ from typing import Any
 
 from madns_runtime.config import Timeouts
 from madns_runtime.protocol.codec import MalformedMessage, decode_message, encode_message
-from madns_runtime.protocol.delivery import BrokenDeadline
+from madns_runtime.protocol.deadlines import BrokenDeadline
 from madns_runtime.protocol.link import Link
 from madns_runtime.protocol.messages import (
     AgentStopped,
@@ -220,7 +220,7 @@ class AgentSession:
     def receive_datagram(self, data: bytes, now_s: float) -> None:
         """Take one datagram; whatever is wrong with it is counted."""
         link = self.link
-        if not link.receive_datagram(data, now_s):
+        if self.state is AgentState.EXIT or not link.receive_datagram(data, now_s):
             return
         self._heard_s = now_s
         while (received := link.next_message()) is not None:

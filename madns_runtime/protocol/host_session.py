@@ -17,7 +17,7 @@ from typing import Any, Literal
 from madns_runtime.config import Timeouts
 from madns_runtime.errors import DeadlineExpired
 from madns_runtime.protocol.codec import MalformedMessage, decode_message, encode_message
-from madns_runtime.protocol.delivery import BrokenDeadline
+from madns_runtime.protocol.deadlines import BrokenDeadline
 from madns_runtime.protocol.link import Link
 from madns_runtime.protocol.messages import (
     AgentStopped,
