@@ -1,1 +1,22 @@
+"""
+COSMoS: the simulation of satellite constellations on MADNS.
 
+This file names the parts and imports none of them, so that `cosmos validate` stays quick and an
+agent's board needs neither scipy nor sgp4.
+"""
+
+from __future__ import annotations
+
+from madns_runtime.plugin.api import Simulation
+from madns_runtime.simulations.constellation.parameters import ConstellationParameters
+
+_HERE = "madns_runtime.simulations.constellation"
+
+simulation = Simulation(
+    name="constellation",
+    parameters=ConstellationParameters,
+    host=f"{_HERE}.host:ConstellationHost",
+    agent=f"{_HERE}.agent:ConstellationAgent",
+    demand=f"{_HERE}.demand:estimate_demand",
+    check=f"{_HERE}.check:find_faults",
+)

@@ -1,0 +1,82 @@
+"""
+Faults of a constellation scenario that bounds cannot tell, found before anything is launched.
+
+Imports neither scipy nor sgp4: `cosmos validate` answers at once.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+from madns_runtime.errors import ConfigurationError
+from madns_runtime.simulations.constellation.messages import KNOTS_MAX
+from madns_runtime.simulations.constellation.parameters import (
+    ConstellationParameters,
+    ElementSetSatellites,
+    ScipyPropagator,
+)
+from madns_runtime.simulations.constellation.truth.fleet import choose
+
+
+def find_faults(
+    parameters: ConstellationParameters, agents: int, base_directory: Path
+) -> list[str]:
+    """
+    Return every fault as a line that starts with the dotted parameter name and a colon.
+
+    Args:
+        parameters: Of the scenario, within their bounds.
+        agents: Number of agents, each of which needs a satellite.
+        base_directory: Folder of the scenario.
+    """
+    faults: list[str] = []
+    try:
+        choose(parameters, agents, Path(base_directory))
+    except ConfigurationError as error:
+        faults += str(error).splitlines()
+    faults += _propagator_faults(parameters)
+    faults += _segment_faults(parameters)
+    faults += _missing_libraries(parameters)
+    return faults
+
+
+def _propagator_faults(parameters: ConstellationParameters) -> list[str]:
+    propagator = parameters.propagator
+    if isinstance(propagator, ScipyPropagator):
+        faults = []
+        if "two_body" not in propagator.forces:
+            faults.append("parameters.propagator.forces: expected two_body among them")
+        if len(set(propagator.forces)) < len(propagator.forces):
+            faults.append("parameters.propagator.forces: expected every force once")
+        return faults
+    if isinstance(parameters.satellites, ElementSetSatellites):
+        return []
+    return [
+        "parameters.propagator.kind: sgp4 needs element sets, give satellites.elements; "
+        "patterns and Keplerian elements need kind: scipy"
+    ]
+
+
+def _segment_faults(parameters: ConstellationParameters) -> list[str]:
+    knot_s, buffer_s = parameters.segments.knot_s, parameters.segments.buffer_s
+    intervals = buffer_s / 2.0 / knot_s
+    if intervals < 0.5 or abs(intervals - round(intervals)) > 1e-6:
+        return [
+            "parameters.segments.knot_s: expected half of buffer_s to be a whole number of knots, "
+            f"got {buffer_s / 2.0:g} s and {knot_s:g} s"
+        ]
+    if 2 * intervals + 1 > KNOTS_MAX:
+        return [f"parameters.segments.buffer_s: expected at most {KNOTS_MAX} knots in a buffer"]
+    return []
+
+
+def _missing_libraries(parameters: ConstellationParameters) -> list[str]:
+    wanted = {parameters.propagator.kind: "parameters.propagator.kind"}
+    if isinstance(parameters.satellites, ElementSetSatellites):
+        wanted["sgp4"] = "parameters.satellites.elements"
+    return [
+        f"{field}: {library} is not installed here; install it with: pip install 'cosmos-madns[host]'"
+        for library, field in wanted.items()
+        if importlib.util.find_spec(library) is None
+    ]

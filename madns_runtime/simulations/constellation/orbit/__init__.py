@@ -1,0 +1,1 @@
+"""Pure orbit mathematics that both halves share: numbers in, numbers out; no clock, no files."""

@@ -1,0 +1,87 @@
+"""
+Element sets through SGP4: the one place that imports sgp4.
+
+SGP4's constants are WGS-72, those that the sets were fitted with, whatever gravity model numerical
+propagation uses. Output is TEME, turned from km into m.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from madns_runtime.errors import ConfigurationError, MissingExtraError
+from madns_runtime.simulations.constellation.orbit.constants import SECONDS_PER_DAY
+from madns_runtime.simulations.constellation.truth.element_sets import ElementSet
+
+try:
+    from sgp4 import omm
+    from sgp4.api import SGP4_ERRORS, WGS72, Satrec, SatrecArray
+except ImportError as error:
+    raise MissingExtraError("sgp4", "host") from error
+
+_J2000_UTC = datetime(2000, 1, 1, 12, tzinfo=UTC)
+_J2000_JD = 2_451_545.0
+
+
+def julian_date(moment_utc: datetime) -> tuple[float, float]:
+    """Return the Julian date as whole and part of a day, so that microseconds are kept."""
+    passed = moment_utc - _J2000_UTC
+    return _J2000_JD + passed.days, (passed.seconds + passed.microseconds * 1e-6) / SECONDS_PER_DAY
+
+
+def to_satrec(element_set: ElementSet) -> Satrec:
+    """Return sgp4's record of an element set."""
+    if element_set.lines is not None:
+        return Satrec.twoline2rv(*element_set.lines, WGS72)
+    fields = dict(element_set.omm)
+    # sgp4 keeps catalogue numbers in five characters; longer ones change no orbit and are left out.
+    if not fields["NORAD_CAT_ID"].isdigit() or int(fields["NORAD_CAT_ID"]) > 339_999:
+        fields["NORAD_CAT_ID"] = "0"
+    record = Satrec()
+    omm.initialize(record, fields, WGS72)
+    # sgp4 2.27 takes an OMM's epoch as days since 1949 in one float: 0.3 us, or 2 mm of orbit, are lost.
+    record.jdsatepoch, record.jdsatepochF = julian_date(element_set.epoch_utc)
+    return record
+
+
+@lru_cache(maxsize=2)
+def _fleet_records(element_sets: tuple[ElementSet, ...]) -> SatrecArray:
+    """Cached, since a worker gets the same fleet with every window."""
+    return SatrecArray([to_satrec(element_set) for element_set in element_sets])
+
+
+def sgp4_states(
+    element_sets: tuple[ElementSet, ...], epoch_utc: datetime, t_s: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """
+    Return the states of a fleet by SGP4.
+
+    Args:
+        element_sets: N sets.
+        epoch_utc: UTC of t_s = 0.
+        t_s: Times, shape (K,), s.
+
+    Returns:
+        States, shape (N, K, 6), m and m/s, TEME.
+
+    Raises:
+        ConfigurationError: A set cannot be propagated to a time; names the satellites and why.
+
+    Accuracy: the verification vectors that the sgp4 package ships, to their last printed digit.
+    """
+    whole, part = julian_date(epoch_utc)
+    fractions = part + np.asarray(t_s, dtype=np.float64) / SECONDS_PER_DAY
+    errors, r_km, v_km_s = _fleet_records(element_sets).sgp4(
+        np.full(fractions.shape, whole), fractions
+    )
+    if errors.any():
+        bad = {
+            element_sets[int(n)].name: SGP4_ERRORS.get(int(errors[n, k]), str(errors[n, k]))
+            for n, k in np.argwhere(errors)
+        }
+        raise ConfigurationError("\n".join(f"{name}: SGP4: {why}" for name, why in bad.items()))
+    return np.concatenate((r_km, v_km_s), axis=2) * 1000.0
