@@ -1,7 +1,7 @@
 """
 A look at the machine and at the own process: the only place that asks the kernel how they fare.
 
-Every look is cheap (files of /proc and /sys, no walk over processes or sockets); what a machine does not
+Every look is cheap (small files of /proc and /sys, no walk over processes or sockets); what a machine does not
 offer is None, never an error.
 """
 
@@ -68,8 +68,8 @@ class Probe:
             disk_space=_read_disk_space(self._directory),
             disk=_read_disk(),
             network=_read_network(),
-            udp_sockets=self._count_sockets("udp"),
-            tcp_connections=self._count_sockets("tcp"),
+            udp_sockets=self._count_sockets("UDP"),
+            tcp_connections=self._count_sockets("TCP"),
             load=_read_load(),
             process_uptime_s=now_s - self._started_s,
             board_uptime_s=_read_board_uptime_s(),
@@ -87,13 +87,21 @@ class Probe:
         return parse_throttled(text) if text else None
 
     def _count_sockets(self, protocol: str) -> int | None:
-        """Count both address families by their lines: psutil would look at every process's descriptors."""
-        count = None
-        for name in (protocol, f"{protocol}6"):
-            with contextlib.suppress(OSError):
-                lines = (self._proc_net / name).read_bytes().count(b"\n")
-                count = (count or 0) + max(0, lines - 1)
-        return count
+        """
+        Return the open sockets of both address families, protocol UDP or TCP.
+
+        From the kernel's own counts: the lists in /proc/net/tcp take 8 ms to walk, however few they hold,
+        and psutil looks at every process's descriptors besides.
+        """
+        text = (_read_text(self._proc_net / "sockstat") or "") + (
+            _read_text(self._proc_net / "sockstat6") or ""
+        )
+        counts = [
+            int(words[2])
+            for words in (line.split() for line in text.splitlines())
+            if words[:2] in ([f"{protocol}:", "inuse"], [f"{protocol}6:", "inuse"])
+        ]
+        return sum(counts) if counts else None
 
 
 class ProcessUsage:
