@@ -14,46 +14,41 @@ Both sides use the same class. Nothing here gives a peer up: the owner decides t
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 from typing import Final
 
-from madns_runtime.errors import MadnsError, MessageTooLarge
+from madns_runtime.errors import MessageTooLarge
+from madns_runtime.protocol.acks import ReceivedPackets
+from madns_runtime.protocol.best import BEST_BYTES_MAX, BestReceiver, BestSender
 from madns_runtime.protocol.counters import LinkCounters
 from madns_runtime.protocol.deadlines import BrokenDeadline, DeadlineWatch
 from madns_runtime.protocol.delivery import (
     CHANNEL_MAX,
-    FRAGMENT_BYTES_MAX,
     FRAME,
     FRAME_BYTES,
     MESSAGE_BYTES_MAX,
-    MESSAGES_QUEUED_MAX,
-    WINDOW_FRAGMENTS_MAX,
-    WINDOW_FRAGMENTS_MIN,
-    Fragment,
     Received,
     ReceiveStream,
-    SendStream,
 )
+from madns_runtime.protocol.limits import LinkLimits, SendQueueFull
 from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.recovery import (
-    ACK_DELAY_MAX_S,
     ACK_DELAY_UNIT_S,
     ACK_DELAY_UNITS_MAX,
+    PACE_QUANTUM_S,
     Pacer,
     RoundTrip,
 )
 from madns_runtime.protocol.seal import (
-    DATAGRAM_BYTES_MAX,
     HEADER_BYTES,
     MAC_BYTES,
     PAYLOAD_BYTES_MAX,
     PREFIX_BYTES,
     REST,
-    ReceivedPackets,
     Role,
     Seal,
     derive_keys,
 )
+from madns_runtime.protocol.sending import MESSAGES_QUEUED_MAX, Fragment, SendStream
 
 __all__ = [
     "BEST_BYTES_MAX",
@@ -65,11 +60,8 @@ __all__ = [
     "SendQueueFull",
 ]
 
-BEST_BYTES_MAX: Final = FRAGMENT_BYTES_MAX
-"""The longest body of a BEST message: one datagram."""
-
-_BEST: Final = 0
-_SYNC: Final = 2
+_BEST: Final = int(Service.BEST)
+_SYNC: Final = int(Service.SYNC)
 _PROBE: Final = 8  # contents bit beside 1 << service
 _ELICITING: Final = 1 << Service.RELIABLE | 1 << Service.SYNC | _PROBE
 _AT_ONCE: Final = 1 << Service.SYNC | _PROBE
@@ -77,50 +69,18 @@ _SENT_TIMES: Final = 256
 _NEVER: Final = float("inf")
 
 
-class SendQueueFull(MadnsError):
-    """The peer takes messages more slowly than the plug-in sends them; the message was not queued."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LinkLimits:
-    """Bounds of one link."""
-
-    receive_window_bytes: int = 64 * 1024
-    """What the peer may have under way to us: the socket's receive buffer divided by the peers.
-    Counted in whole datagrams, three quarters for RELIABLE, one for SYNC, at least 4 each."""
-    send_queue_bytes_max: int = 32 * 1024 * 1024
-    """Messages of each stream that wait or are not acknowledged."""
-    best_queue_max: int = 256
-    """BEST messages between two calls, in either direction; newer ones push out older ones."""
-    pace_bytes_per_s: float = 8e6
-    """Rate of RELIABLE datagrams beyond a burst."""
-    pace_burst_bytes: int = 16 * DATAGRAM_BYTES_MAX
-
-    def get_windows(self) -> tuple[int, int]:
-        """Return the windows of RELIABLE and SYNC in fragments."""
-        total = self.receive_window_bytes // DATAGRAM_BYTES_MAX
-        sync = min(max(total // 4, WINDOW_FRAGMENTS_MIN), WINDOW_FRAGMENTS_MAX)
-        reliable = min(max(total - sync, WINDOW_FRAGMENTS_MIN), WINDOW_FRAGMENTS_MAX)
-        return reliable, sync
-
-
 class Link:
     """One peer's conversation."""
 
     __slots__ = (
-        "_ack_due_s",
         "_ack_seen",
-        "_best_newest",
-        "_best_next",
-        "_best_ready",
-        "_best_to_send",
+        "_best_in",
+        "_best_out",
         "_carried",
         "_carrier",
         "_chunks",
         "_contents",
-        "_eliciting_unacked",
         "_in",
-        "_largest_at_s",
         "_limits",
         "_now_s",
         "_out",
@@ -156,18 +116,13 @@ class Link:
             ReceiveStream(Service.SYNC, sync_window, counters.sync),
         )
         self._ready: deque[Received] = deque()
-        self._best_ready: deque[Received] = deque(maxlen=limits.best_queue_max)
-        self._best_to_send: deque[bytes] = deque(maxlen=limits.best_queue_max)
-        self._best_next: dict[int, int] = {}  # by channel: number of the next message to send
-        self._best_newest: dict[int, int] = {}  # by channel: number of the newest received
+        self._best_out = BestSender(limits.best_queue_max, counters.best)
+        self._best_in = BestReceiver(limits.best_queue_max, counters.best)
         self._now_s = -_NEVER
         self._packet_number = 0
-        self._sent_times = [-_NEVER] * _SENT_TIMES
+        self._sent_times = [-_NEVER] * _SENT_TIMES  # of the newest packets, by number
         self._ack_seen = 0
         self._packets = ReceivedPackets()
-        self._largest_at_s = 0.0
-        self._eliciting_unacked = 0
-        self._ack_due_s = _NEVER
         # The datagram being filled.
         self._chunks: list[bytes] = []
         self._room = PAYLOAD_BYTES_MAX
@@ -260,28 +215,13 @@ class Link:
         if not 0 <= channel <= CHANNEL_MAX:
             raise ValueError(f"expected a channel of 0 to {CHANNEL_MAX}, got {channel}")
         if service == _BEST:
-            self._send_best(body, channel)
+            self._best_out.push(body, channel)
             return
         stream = self._out[service - 1]
         self._check_queue(stream, len(body))
         if deadline_s is not None and service == _SYNC:
             self._watch.add(stream.counters.sent, deadline_s, now_s, (channel, body))
         stream.push(body, channel)
-
-    def _send_best(self, body: bytes, channel: int) -> None:
-        if len(body) > BEST_BYTES_MAX:
-            raise MessageTooLarge(
-                f"a BEST message must fit one datagram: expected at most {BEST_BYTES_MAX} bytes, "
-                f"got {len(body)}; send it RELIABLE or make it smaller"
-            )
-        number = self._best_next.get(channel, 0)
-        self._best_next[channel] = number + 1
-        queue = self._best_to_send
-        counters = self.counters.best
-        if len(queue) == queue.maxlen:
-            counters.dropped += 1
-        queue.append(FRAME.pack(_BEST, channel, len(body), number) + body)
-        counters.sent += 1
 
     def _check_queue(self, stream: SendStream, size: int) -> None:
         limit = self._limits.send_queue_bytes_max
@@ -304,7 +244,7 @@ class Link:
         reliable, sync = self._out
         if sync.has_output or sync.is_probe_due:
             self._fill(sync, now_s, datagrams)
-        best = self._best_to_send
+        best = self._best_out.queue
         if best:
             for frame in best:
                 if len(frame) > self._room:
@@ -317,7 +257,7 @@ class Link:
             if self._carrier is not None:
                 datagrams.append(self._close(now_s))
             self._fill(reliable, now_s, datagrams)
-        if self._contents or (not datagrams and now_s >= self._ack_due_s):
+        if self._contents or (not datagrams and now_s >= self._packets.ack_due_s):
             datagrams.append(self._close(now_s))
         reliable.arm_probe(now_s)
         sync.arm_probe(now_s)
@@ -354,7 +294,6 @@ class Link:
         reliable, sync = self._in
         reliable.advertised = reliable.limit
         sync.advertised = sync.limit
-        delay = int((now_s - self._largest_at_s) / ACK_DELAY_UNIT_S)
         rest = REST.pack(
             packet_number,
             packets.largest,
@@ -363,7 +302,7 @@ class Link:
             sync.next_expected,
             reliable.limit - reliable.next_expected,
             sync.limit - sync.next_expected,
-            0 if delay < 0 else min(delay, ACK_DELAY_UNITS_MAX),
+            packets.settle_ack(now_s),
             self._contents,
             0,
         )
@@ -377,8 +316,6 @@ class Link:
         self._chunks.clear()
         self._room = PAYLOAD_BYTES_MAX
         self._contents = 0
-        self._eliciting_unacked = 0
-        self._ack_due_s = _NEVER
         self.counters.datagrams_sent += 1
         self.counters.bytes_sent += len(datagram)
         return datagram
@@ -427,10 +364,7 @@ class Link:
         if frames is None:
             return "malformed"
 
-        is_gap = packet_number != packets.largest + 1
-        packets.add(packet_number)
-        if packets.largest == packet_number:
-            self._largest_at_s = now_s
+        is_in_order = packets.add(packet_number, now_s)
         self.last_received_s = now_s
         counters = self.counters
         counters.datagrams_received += 1
@@ -445,12 +379,12 @@ class Link:
                 stream.acknowledge(ack, ack_bits, now_s)
             stream.arm_probe(now_s)
         if contents & _ELICITING:
-            self._owe_ack(now_s, at_once=is_gap or bool(contents & _AT_ONCE))
+            packets.owe_ack(now_s, at_once=not is_in_order or bool(contents & _AT_ONCE))
         for kind, channel, number, payload in frames:
             if kind:
                 self._in[kind - 1].accept(number, payload, self._ready)
             else:
-                self._receive_best(channel, number, payload)
+                self._best_in.accept(channel, number, payload)
         return None
 
     def _parse(self, data: bytes) -> list[tuple[int, int, int, bytes]] | None:
@@ -479,55 +413,34 @@ class Link:
             sample_s = now_s - self._sent_times[ack % _SENT_TIMES] - ack_delay * ACK_DELAY_UNIT_S
             self._round_trip.add(sample_s if sample_s > 0 else 0.0)
 
-    def _owe_ack(self, now_s: float, *, at_once: bool) -> None:
-        self._eliciting_unacked += 1
-        if at_once or self._eliciting_unacked >= 2:
-            self._ack_due_s = now_s
-        elif self._ack_due_s > now_s + ACK_DELAY_MAX_S:
-            self._ack_due_s = now_s + ACK_DELAY_MAX_S
-
-    def _receive_best(self, channel: int, number: int, payload: bytes) -> None:
-        counters = self.counters.best
-        ahead = number - self._best_newest.get(channel, -1)
-        if ahead <= 0:
-            if ahead == 0:
-                counters.duplicates += 1
-            else:
-                # It was counted as lost when a newer one came.
-                counters.late += 1
-                counters.lost -= 1
-            return
-        counters.lost += ahead - 1
-        counters.received += 1
-        self._best_newest[channel] = number
-        ready = self._best_ready
-        if len(ready) == ready.maxlen:
-            counters.dropped += 1
-        ready.append(Received(Service.BEST, channel, payload))
-
     def next_message(self) -> Received | None:
         """Return the next message received, the streams' in their order; None if there is none."""
         if self._ready:
             message = self._ready.popleft()
             if self._in[message.service - 1].deliver():
-                self._ack_due_s = self._now_s
+                self._packets.ack_due_s = self._now_s
             return message
-        if self._best_ready:
-            return self._best_ready.popleft()
-        return None
+        best = self._best_in.ready
+        return best.popleft() if best else None
 
     # Time.
 
     def get_timer(self) -> float | None:
         """Return when to call `handle_timer` and `datagrams_to_send`, None for never."""
         reliable, sync = self._out
-        if self._best_to_send or sync.has_output or sync.is_probe_due or reliable.is_probe_due:
+        if self._best_out.queue or sync.has_output or sync.is_probe_due or reliable.is_probe_due:
             return self._now_s
         timer_s = min(
-            self._ack_due_s, reliable.get_timer(), sync.get_timer(), self._watch.get_timer()
+            self._packets.ack_due_s,
+            reliable.get_timer(),
+            sync.get_timer(),
+            self._watch.get_timer(),
         )
         if reliable.has_output:
-            timer_s = min(timer_s, max(self._pacer.opens_at_s, self._now_s))
+            opens_at_s = self._pacer.opens_at_s
+            timer_s = min(
+                timer_s, self._now_s if opens_at_s <= self._now_s else opens_at_s + PACE_QUANTUM_S
+            )
         return None if timer_s == _NEVER else timer_s
 
     def handle_timer(self, now_s: float) -> None:

@@ -1,5 +1,5 @@
 """
-The seal of a datagram: who sent it, that nobody changed it, and that it was not seen before.
+The seal of a datagram: who sent it, and that nobody changed it.
 
 A datagram is HEADER (64 bytes), frames, MAC (16 bytes). The header's first 16 bytes, its prefix, name
 the conversation and stay the same in all datagrams of one direction; then come the packet number, the
@@ -27,7 +27,6 @@ KEY_BYTES: Final = 32
 SESSION_BYTES: Final = 8
 AGENT_INDEX_MAX: Final = 65_535
 INCARNATION_MAX: Final = 2**32 - 1
-REPLAY_WINDOW_PACKETS: Final = 1024
 
 PREFIX: Final = Struct("<BBHI8s")
 """version, role of the sender, agent index, incarnation, session."""
@@ -41,8 +40,6 @@ OVERHEAD_BYTES: Final = HEADER_BYTES + MAC_BYTES
 PAYLOAD_BYTES_MAX: Final = DATAGRAM_BYTES_MAX - OVERHEAD_BYTES
 
 _PEEK: Final = Struct("<BBHI8sQ")
-_REPLAY_MASK: Final = (1 << REPLAY_WINDOW_PACKETS) - 1
-_ACK_MASK: Final = (1 << 64) - 1
 
 
 class Role(IntEnum):
@@ -161,37 +158,3 @@ class Seal:
         if not hmac.compare_digest(mac.digest(), datagram[-MAC_BYTES:]):
             return "mac"
         return None
-
-
-class ReceivedPackets:
-    """Packet numbers received: a sliding bitmap that refuses repeats and feeds the acknowledgements."""
-
-    __slots__ = ("_bits", "largest")
-
-    def __init__(self) -> None:
-        self.largest = 0
-        """0 while none was received: packet numbers start at 1."""
-        self._bits = 0  # bit i: largest - i was received
-
-    def is_new(self, packet_number: int) -> bool:
-        """Return whether a packet is neither repeated nor older than the window."""
-        age = self.largest - packet_number
-        if age < 0:
-            return True
-        return age < REPLAY_WINDOW_PACKETS and not (self._bits >> age) & 1 and packet_number > 0
-
-    def add(self, packet_number: int) -> None:
-        """Note a new packet."""
-        ahead = packet_number - self.largest
-        if ahead <= 0:
-            self._bits |= 1 << -ahead
-            return
-        # A far jump must not shift by as many bits as a peer likes.
-        shifted = self._bits << ahead if ahead < REPLAY_WINDOW_PACKETS else 0
-        self._bits = (shifted | 1) & _REPLAY_MASK
-        self.largest = packet_number
-
-    @property
-    def ack_bits(self) -> int:
-        """Which of the 64 packets before the largest were received; bit 0 is the one just before."""
-        return (self._bits >> 1) & _ACK_MASK
