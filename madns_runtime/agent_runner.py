@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import traceback
 from collections.abc import Callable, Mapping
@@ -21,7 +22,7 @@ from madns_runtime.protocol.link import LinkLimits
 from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.states import AgentState
 from madns_runtime.protocol.wire import Wire
-from madns_runtime.reactor.reactor import Reactor, Timer
+from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.udp import UdpSocket
 from madns_runtime.recording.records import CLOCK, EVENTS, LOG, PROCESS, TICKS
 from madns_runtime.recording.writer import Recorder
@@ -40,7 +41,7 @@ AGENT_RECEIVE_BUFFER_BYTES = 1024 * 1024
 class Program:
     """What every agent of a process runs, loaded once."""
 
-    simulation: type[AgentSimulation]
+    simulation: Callable[[], AgentSimulation]
     parameters: Any
 
 
@@ -110,11 +111,13 @@ class AgentRunner:
         self._period_s = 1.0 / config.agents.tick_hz
         self._first: tuple[float, float] | None = None
         self._newest: tuple[float, float] | None = None
-        self._session_timer: Timer | None = None
-        self._tick_timer: Timer | None = None
+        # Infinite is never: each timer is made once and moved.
+        self._session_timer = reactor.call_at(math.inf, self._session_due)
+        self._tick_timer = reactor.call_at(math.inf, self._tick)
+        self._end_timer = reactor.call_at(math.inf, self._finish_run)
+        self._usage_timer = reactor.call_at(math.inf, self._record_usage)
         self._clock_recorded_s = 0.0
         self._scheduling: dict[str, Any] = {}
-        self._usage_timer: Timer | None = None
         self._outcome: tuple[bool, str] = (False, "did not end")
         self._is_closed = False
 
@@ -149,7 +152,6 @@ class AgentRunner:
         self._pump()
 
     def _session_due(self) -> None:
-        self._session_timer = None
         # What waits in the socket is heard before the host is blamed for silence.
         for data, _ in self._socket.receive_all():
             self._session.receive_datagram(data, self._reactor.now_s())
@@ -161,20 +163,18 @@ class AgentRunner:
         session = self._session
         while (event := session.next_event()) is not None:
             self._handle(event)
+        while (broken := session.next_broken_deadline()) is not None:
+            self._event("sync_deadline_broken", late_s=broken.late_s)
         if self._is_closed:
             return
         self._send_datagrams()
-        due_s = session.get_timer()
-        timer = self._session_timer
-        if due_s is not None and (timer is None or due_s < timer.when_s):
-            if timer is not None:
-                timer.cancel()
-            self._session_timer = self._reactor.call_at(due_s, self._session_due)
 
     def _send_datagrams(self) -> None:
-        send = self._socket.send
-        for data in self._session.datagrams_to_send(self._reactor.now_s()):
+        session, send = self._session, self._socket.send
+        for data in session.datagrams_to_send(self._reactor.now_s()):
             send(data)
+        due_s = session.get_timer()
+        self._session_timer.reschedule(math.inf if due_s is None else due_s)
 
     def _handle(self, event: told.AgentSessionEvent) -> None:
         if isinstance(event, told.DataReceived):
@@ -239,9 +239,9 @@ class AgentRunner:
         deadline_s = pacer.next_deadline_s()
         if deadline_s is None:
             end_s = self._config.time.duration_s + DRAIN_S
-            self._tick_timer = self._reactor.call_at(self._local_s(end_s), self._finish_run)
+            self._end_timer.reschedule(self._local_s(end_s))
         else:
-            self._tick_timer = self._reactor.call_at(self._local_s(deadline_s), self._tick)
+            self._tick_timer.reschedule(self._local_s(deadline_s))
 
     def _tick(self) -> None:
         pacer = self._pacer
@@ -272,15 +272,6 @@ class AgentRunner:
             )
             self._send_datagrams()
         self._arm_tick()
-        self._pump_if_due()
-
-    def _pump_if_due(self) -> None:
-        """Arm the session's timer anew if what was sent wants an earlier one."""
-        due_s = self._session.get_timer()
-        timer = self._session_timer
-        if due_s is not None and timer is not None and due_s < timer.when_s:
-            timer.cancel()
-            self._session_timer = self._reactor.call_at(due_s, self._session_due)
 
     def _finish_run(self) -> None:
         if self._pacer is None or self._session.state is not AgentState.RUN_SIMULATION:
@@ -315,9 +306,8 @@ class AgentRunner:
 
     def _end_early(self, reason: str) -> None:
         self._outcome = (False, reason)
-        for timer in (self._tick_timer, self._usage_timer):
-            if timer is not None:
-                timer.cancel()
+        for timer in (self._tick_timer, self._end_timer, self._usage_timer):
+            timer.cancel()
         self._event("emergency", reason=reason)
         self._recorder.log("critical", f"emergency shutdown: {reason}", self._t_s_or_none())
         self._close_records()
@@ -333,9 +323,8 @@ class AgentRunner:
     def _close(self) -> None:
         self._is_closed = True
         self._send_datagrams()
-        for timer in (self._session_timer, self._tick_timer, self._usage_timer):
-            if timer is not None:
-                timer.cancel()
+        for timer in (self._session_timer, self._tick_timer, self._end_timer, self._usage_timer):
+            timer.cancel()
         self._reactor.remove_reader(self._socket.fileno())
         self._socket.close()
         self._on_ended(self.name, *self._outcome)
@@ -365,9 +354,9 @@ class AgentRunner:
     def _record_usage(self) -> None:
         if self._session.state is not AgentState.RUN_SIMULATION:
             return
-        self._recorder.record("process", (round(self._simulated_s(), 3), *process_usage()))
+        self._recorder.record("process", process_usage(round(self._simulated_s(), 3)))
         due_s = self._reactor.now_s() + self._config.health.period_s
-        self._usage_timer = self._reactor.call_at(due_s, self._record_usage)
+        self._usage_timer.reschedule(due_s)
 
     def _event(self, event: str, **values: Any) -> None:
         t_s = self._t_s_or_none()
@@ -377,7 +366,7 @@ class AgentRunner:
         )
 
     def _report(self) -> Mapping[str, Any]:
-        report: dict[str, Any] = {"dropped": self._recorder.dropped_count}
+        report: dict[str, Any] = {"dropped": self._recorder.counts().dropped}
         if self._pacer is not None:
             summary = self._pacer.summary()
             report.update(
@@ -386,7 +375,7 @@ class AgentRunner:
                 late_p50_us=summary["lateness_us_p50"],
                 late_p99_us=summary["lateness_us_p99"],
                 rtf=self._real_time_factor(),
-                lost=self._session.link.counters.to_mapping()["best"]["lost"],
+                lost=self._session.link.counters.best.lost,
             )
         return report
 

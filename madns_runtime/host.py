@@ -7,9 +7,11 @@ output. It ends by itself when that line closes.
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import sys
+import traceback
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from pathlib import Path
@@ -31,7 +33,7 @@ from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.states import HOST_LIVE, HostState
 from madns_runtime.protocol.wire import Wire
 from madns_runtime.reactor.lines import OperatorLink, read_launch
-from madns_runtime.reactor.reactor import Reactor, Timer
+from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import apply as apply_scheduling
 from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.udp import UdpSocket
@@ -43,7 +45,6 @@ T = TypeVar("T")
 
 PROGRESS_INTERVAL_S = 0.5
 FLUSH_TIMEOUT_S = 5.0
-PSEUDO_NEVER_S = 1e9
 
 
 class HostRuntime:
@@ -115,9 +116,11 @@ class HostRuntime:
         )
         self._context.submit = self._jobs.submit
         self._report = HostReport(config.time.duration_s)
-        self._t0_s = PSEUDO_NEVER_S
-        self._session_timer: Timer | None = None
-        self._plugin_timer: Timer | None = None
+        self._t0_s: float | None = None
+        # Infinite is never: each timer is made once and moved.
+        self._session_timer = self._reactor.call_at(math.inf, self._session_due)
+        self._plugin_timer = self._reactor.call_at(math.inf, self._plugin_due)
+        self._progress_timer = self._reactor.call_at(math.inf, self._progress)
         self._awaits_jobs = False
         self._state = self._session.state
 
@@ -138,7 +141,7 @@ class HostRuntime:
         address, port = self._socket.address[:2]
         self._operator.emit({"event": "listening", "address": address, "port": port})
         self._operator.emit({"event": "state", "state": self._state.value})
-        self._reactor.call_at(self._reactor.now_s() + PROGRESS_INTERVAL_S, self._progress)
+        self._progress_timer.reschedule(self._reactor.now_s() + PROGRESS_INTERVAL_S)
         self._pump()
         self._reactor.run()
         return self._close()
@@ -153,7 +156,6 @@ class HostRuntime:
         self._pump()
 
     def _session_due(self) -> None:
-        self._session_timer = None
         # What waits in the socket is heard before anybody is blamed for silence.
         for data, address in self._socket.receive_all():
             self._session.receive_datagram(data, address, self._reactor.now_s())
@@ -167,9 +169,6 @@ class HostRuntime:
             self._handle(event)
         for data, address in session.datagrams_to_send(now_s()):
             self._socket.send(data, address)
-        while (broken := session.next_broken_deadline()) is not None:
-            agent, deadline = broken
-            self._event("sync_deadline_broken", agent=agent, detail=str(deadline))
         if session.state is not self._state:
             self._state = session.state
             self._event("state", state=self._state.value)
@@ -178,11 +177,7 @@ class HostRuntime:
             self._reactor.stop()
             return
         due_s = session.get_timer()
-        timer = self._session_timer
-        if due_s is not None and (timer is None or due_s < timer.when_s):
-            if timer is not None:
-                timer.cancel()
-            self._session_timer = self._reactor.call_at(due_s, self._session_due)
+        self._session_timer.reschedule(math.inf if due_s is None else due_s)
 
     def _handle(self, event: told.HostSessionEvent) -> None:
         if isinstance(event, told.DataReceived):
@@ -205,6 +200,8 @@ class HostRuntime:
             self._complete()
         elif isinstance(event, told.EmergencyDeclared):
             self._emergency(event)
+        elif isinstance(event, told.SyncDeadlineBroken):
+            self._event("sync_deadline_broken", agent=event.agent, late_s=event.broken.late_s)
         else:
             self._agents_stopped(event.missing)
 
@@ -220,14 +217,12 @@ class HostRuntime:
         if not self._awaits_jobs or self._jobs.pending_count:
             return
         self._awaits_jobs = False
-        if self._session.state is not HostState.SIMULATION_SETUP:
-            return
-        initial = {}
-        for agent in self._session.agents_in(Phase.READY):
-            initial[agent] = self._call("initial_data", self._simulation.initial_data, agent)
-            if self._session.state is not HostState.SIMULATION_SETUP:
-                return  # it raised
-        self._session.setup_finished(initial, self._reactor.now_s())
+        initial = {
+            agent: self._call("initial_data", self._simulation.initial_data, agent)
+            for agent in self._session.agents_in(Phase.READY)
+        }
+        if self._session.state is HostState.SIMULATION_SETUP:  # unless one of the calls raised
+            self._session.setup_finished(initial, self._reactor.now_s())
 
     def _send_setup(self, agent: str) -> None:
         initial = self._call("initial_data", self._simulation.initial_data, agent)
@@ -246,16 +241,12 @@ class HostRuntime:
         self._plugin_due()
 
     def _plugin_due(self) -> None:
-        self._plugin_timer = None
         if self._session.state is not HostState.SIMULATION_START:
             return
         next_s = self._call("timer", self._simulation.timer, self._simulated_s())
-        self._arm_plugin(next_s)
+        if next_s is not None and self._t0_s is not None:
+            self._plugin_timer.reschedule(self._t0_s + next_s)
         self._pump()
-
-    def _arm_plugin(self, next_s: float | None) -> None:
-        if next_s is not None and self._session.state is HostState.SIMULATION_START:
-            self._plugin_timer = self._reactor.call_at(self._t0_s + next_s, self._plugin_due)
 
     def _job_done(self, job: int, future: Future[Any]) -> None:
         error = future.exception()
@@ -329,34 +320,38 @@ class HostRuntime:
             self._pump()
 
     def _progress(self) -> None:
-        self._reactor.call_at(self._reactor.now_s() + PROGRESS_INTERVAL_S, self._progress)
-        report = progress_report(self._session, self._simulated_s(), self._config.time.duration_s)
+        self._progress_timer.reschedule(self._reactor.now_s() + PROGRESS_INTERVAL_S)
+        report = progress_report(self._session, self._t_s_or_none(), self._config.time.duration_s)
         self._operator.emit(report)
         if (problem := self._recorder.problem) is not None and not self._report.problem_told:
             self._report.problem_told = True
             self._log("error", f"host: records are being lost: {problem}")
 
     def _log(self, level: str, text: str) -> None:
-        t_s = self._simulated_s()
-        self._recorder.log(level, text, t_s if self._t0_s < PSEUDO_NEVER_S else None)
+        self._recorder.log(level, text, self._t_s_or_none())
         self._operator.emit({"event": "log", "level": level, "source": HOST, "text": text})
 
     def _event(self, event: str, **values: Any) -> None:
-        t_s = round(self._simulated_s(), 6) if self._t0_s < PSEUDO_NEVER_S else None
         if self._session.state not in (HostState.WAITING_SERVER_STOP, HostState.EXIT):
             self._recorder.record(
-                "events", {"t_s": t_s, "utc": utc_now_iso(), "event": event, **values}
+                "events",
+                {"t_s": self._t_s_or_none(), "utc": utc_now_iso(), "event": event, **values},
             )
 
     # Towards the simulation ------------------------------------------------------------------------
 
     def _simulated_s(self) -> float:
-        return self._reactor.now_s() - self._t0_s
+        return -math.inf if self._t0_s is None else self._reactor.now_s() - self._t0_s
+
+    def _t_s_or_none(self) -> float | None:
+        return None if self._t0_s is None else round(self._simulated_s(), 6)
 
     def _send(self, to: str, message: Any, service: Service, *, deadline_s: float | None) -> None:
         if to not in self._session.peers:
             raise MadnsError(f"no agent is called {to!r}")
-        due_s = None if deadline_s is None else deadline_s + self._t0_s
+        due_s = None
+        if deadline_s is not None and self._t0_s is not None:
+            due_s = self._t0_s + deadline_s
         self._session.send(to, message, service, self._reactor.now_s(), deadline_s=due_s)
 
     def _call(self, name: str, method: Callable[..., T], *arguments: Any) -> T | None:
@@ -365,7 +360,9 @@ class HostRuntime:
             return method(*arguments)
         except Exception as error:  # noqa: BLE001 - a plug-in may raise anything
             reason = describe_exception(error, f"{self._simulation_name}.{name}")
-            self._recorder.log("critical", format_traceback(error), self._simulated_s())
+            self._recorder.log(
+                "critical", "".join(traceback.format_exception(error)), self._t_s_or_none()
+            )
             self._session.emergency(HOST, reason, self._reactor.now_s())
             return None
 
@@ -385,13 +382,6 @@ def window_bytes(receive_buffer_bytes: int, peers: int) -> int:
     return max(4 * 1400, receive_buffer_bytes // 2 // max(1, peers))
 
 
-def format_traceback(error: BaseException) -> str:
-    """Return an exception's traceback as text."""
-    import traceback
-
-    return "".join(traceback.format_exception(error))
-
-
 def main() -> None:
     """Entry point of `madns-host`."""
     out_fd = os.dup(1)
@@ -399,7 +389,7 @@ def main() -> None:
     try:
         document, pending = read_launch(0)
         launch = from_mapping(HostLaunch, document)
-        with register(launch.config.run, "host", HOST, launch.directory):
+        with register(launch.config.run, "host", HOST, Path(launch.directory).parent):
             code = HostRuntime(launch, (0, out_fd), pending).run()
     except MadnsError as error:
         sys.stderr.write(f"madns-host: {error}\n")

@@ -127,19 +127,15 @@ def _worst_rtf(agents: Iterable[Mapping[str, Any]]) -> float | None:
     return max(factors, key=lambda rtf: abs(rtf - 1.0)) if factors else None
 
 
-def progress_report(session: HostSession, t_s: float, duration_s: float) -> dict[str, Any]:
+def progress_report(session: HostSession, t_s: float | None, duration_s: float) -> dict[str, Any]:
     """Return the progress event: what the agents' newest reports say."""
     reports = [peer.report for peer in session.peers.values() if peer.report]
     factors = [r["rtf"] for r in reports if r.get("rtf") is not None]
-    uplink_lost = sum(
-        peer.link.counters.to_mapping()["best"]["lost"]
-        for peer in session.peers.values()
-        if peer.link
-    )
+    uplink_lost = sum(peer.link.counters.best.lost for peer in session.peers.values() if peer.link)
     ready = (Phase.READY, Phase.SETTING_UP, Phase.SIMULATION_READY)
     return {
         "event": "progress",
-        "t_s": round(min(t_s, duration_s), 3) if t_s > -1e6 else None,
+        "t_s": None if t_s is None else round(min(t_s, duration_s), 3),
         "rtf": max(factors, key=lambda rtf: abs(rtf - 1.0)) if factors else None,
         "ready": len(session.agents_in(*ready)),
         "running": len(session.agents_in(Phase.RUNNING)),

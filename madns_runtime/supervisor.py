@@ -154,18 +154,14 @@ class Supervisor:
             told = orjson.loads(line)
             child = self._children.get(told["pid"])
             if child is not None:
-                child.reason = f"{told['agent']}: {told['reason']}" if child.reason is None else child.reason
+                child.reason = (
+                    f"{told['agent']}: {told['reason']}" if child.reason is None else child.reason
+                )
 
     def _reap(self) -> None:
-        while self._children:
-            try:
-                pid, status = os.waitpid(-1, os.WNOHANG)
-            except ChildProcessError:
-                break
-            if pid == 0:
-                break
-            child = self._children.get(pid)
-            if child is not None:
+        for child in list(self._children.values()):
+            pid, status = os.waitpid(child.pid, os.WNOHANG)
+            if pid:
                 self._child_ended(child, status)
         if not self._children and not self._to_fork:
             self._reactor.stop()

@@ -134,6 +134,14 @@ class EmergencyDeclared:
     reason: str
 
 
+@dataclass(frozen=True, slots=True)
+class SyncDeadlineBroken:
+    """A SYNC message to *agent* was not there by its deadline."""
+
+    agent: str
+    broken: BrokenDeadline
+
+
 HostSessionEvent = (
     AgentsReady
     | AgentsSimulationReady
@@ -145,6 +153,7 @@ HostSessionEvent = (
     | AgentsComplete
     | AgentsStopped
     | EmergencyDeclared
+    | SyncDeadlineBroken
 )
 
 
@@ -338,6 +347,8 @@ class HostSession:
             if link is None or address is None:
                 continue
             out.extend((data, address) for data in link.datagrams_to_send(now_s))
+            while (broken := link.next_broken_deadline()) is not None:
+                self._events.append(SyncDeadlineBroken(peer.name, broken))
             due_s = link.get_timer()
             if due_s is not None and due_s < peer.timer_s:
                 peer.timer_s = due_s
@@ -371,13 +382,6 @@ class HostSession:
     def next_event(self) -> HostSessionEvent | None:
         """Return the oldest event not yet taken."""
         return self._events.popleft() if self._events else None
-
-    def next_broken_deadline(self) -> tuple[str, BrokenDeadline] | None:
-        """Return a SYNC message to an agent that broke its deadline, once each."""
-        for name, peer in self.peers.items():
-            if peer.link is not None and (broken := peer.link.next_broken_deadline()) is not None:
-                return name, broken
-        return None
 
     # Inside: one agent -----------------------------------------------------------------------------
 

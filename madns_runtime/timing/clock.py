@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Protocol
 
 
@@ -52,4 +52,10 @@ class ManualClock:
 
 def utc_now_iso() -> str:
     """Return the wall time as ISO 8601 in UTC with microseconds and Z; for records, never for deadlines."""
-    return datetime.now(UTC).isoformat(timespec="microseconds").replace("+00:00", "Z")
+    return utc_at_iso(0.0)
+
+
+def utc_at_iso(in_s: float) -> str:
+    """Return the wall time *in_s* seconds from now (negative: ago) in the form of `utc_now_iso`."""
+    utc = datetime.now(UTC) + timedelta(seconds=in_s)
+    return utc.isoformat(timespec="microseconds").replace("+00:00", "Z")
