@@ -1,0 +1,456 @@
+import errno
+import json
+import os
+import random
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from madns_runtime.config import Recording
+from madns_runtime.errors import MachineError, PluginError
+from madns_runtime.recording import stream_file
+from madns_runtime.recording.reader import read_stream
+from madns_runtime.recording.records import EVENTS, LOG, TICKS, Field, StreamSchema
+from madns_runtime.recording.writer import Recorder
+
+PAIR = StreamSchema("pair", (Field("number", "", "int"), Field("value_m", "m")))
+
+
+def make_recorder(directory, *, echo=None, **values):
+    chosen = Recording(**{"flush_interval_s": 0.05, **values})
+    return Recorder(directory, run="0001-test", source="a", settings=chosen, log_echo=echo)
+
+
+def read_lines(path):
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_file_has_schema_first_then_records_then_end(tmp_path):
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(TICKS)
+    recorder.start()
+    recorder.record("ticks", (0, 12, 900, 0))
+    recorder.record("ticks", [1, 13, 901, 0])
+    counts = recorder.close(30)
+
+    header, *records, end = read_lines(tmp_path / "ticks.jsonl")
+    assert header == TICKS.header(run="0001-test", source="a", t0_utc=None)
+    assert records == [[0, 12, 900, 0], [1, 13, 901, 0]]
+    assert end == {"end": {"records": 2, "dropped": 0, "not_finite": 0}}
+    assert (counts.written, counts.dropped, counts.errors) == (2, 0, ())
+    assert counts.bytes == (tmp_path / "ticks.jsonl").stat().st_size
+
+
+def test_stream_without_records_has_schema_and_end(tmp_path):
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(TICKS)
+    recorder.close(30)
+
+    assert ["schema", "end"] == [next(iter(line)) for line in read_lines(tmp_path / "ticks.jsonl")]
+
+
+def test_first_line_carries_t0_where_it_is_known_in_time(tmp_path):
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(TICKS)
+    recorder.set_t0("2026-01-02T03:04:05Z")
+    recorder.close(30)
+
+    header, _ = read_lines(tmp_path / "ticks.jsonl")
+    assert header["t0_utc"] == "2026-01-02T03:04:05Z"
+
+
+def test_later_t0_is_a_line_of_its_own_in_every_stream_once(tmp_path):
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(TICKS)
+    recorder.open_stream(EVENTS)
+    recorder.start()
+    wait_until(lambda: all(s.bytes for s in recorder.counts().streams.values()))
+    recorder.set_t0("2026-01-02T03:04:05Z")
+    recorder.record("ticks", (0, 0, 0, 0))
+    recorder.close(30)
+
+    for name in ("ticks", "events"):
+        lines = read_lines(tmp_path / f"{name}.jsonl")
+        assert lines[0]["t0_utc"] is None
+        assert lines.count({"t0_utc": "2026-01-02T03:04:05Z"}) == 1
+        assert read_stream(tmp_path / f"{name}.jsonl").state.t0_utc == "2026-01-02T03:04:05Z"
+
+
+def test_t0_line_is_no_record_in_the_counts(tmp_path):
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(TICKS)
+    recorder.start()
+    wait_until(lambda: recorder.counts().bytes)
+    recorder.set_t0("2026-01-02T03:04:05Z")
+
+    assert recorder.close(30).written == 0
+
+
+@pytest.mark.parametrize(
+    ("existing", "suffix", "expected"),
+    [
+        ([], "", "ticks.jsonl"),
+        (["ticks.jsonl"], "", "ticks.2.jsonl"),
+        (["ticks.jsonl", "ticks.2.jsonl"], "", "ticks.3.jsonl"),
+        (["ticks.jsonl"], "2", "ticks.2.jsonl"),
+        (["ticks.2.jsonl"], "2", "ticks.3.jsonl"),
+        ([], "b", "ticks.b.jsonl"),
+        (["ticks.b.jsonl"], "b", "ticks.b.2.jsonl"),
+    ],
+)
+def test_existing_file_is_left_alone(tmp_path, existing, suffix, expected):
+    for name in existing:
+        (tmp_path / name).write_text("precious")
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(TICKS, suffix=suffix)
+    counts = recorder.close(30)
+
+    assert counts.streams["ticks"].file == expected
+    assert read_lines(tmp_path / expected)[0]["stream"] == "ticks"
+    assert all((tmp_path / name).read_text() == "precious" for name in existing)
+
+
+@pytest.mark.parametrize("name", ["../ticks", "a/b", "", ".hidden", "a.b", "x" * 65])
+def test_stream_name_that_is_no_file_name_is_refused(tmp_path, name):
+    recorder = make_recorder(tmp_path)
+
+    with pytest.raises(PluginError, match="expected a name"):
+        recorder.open_stream(StreamSchema(name, (Field("x"),)))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_stream_declared_twice_is_refused(tmp_path):
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(PAIR)
+
+    with pytest.raises(PluginError, match="stream pair: declared twice"):
+        recorder.open_stream(PAIR)
+
+
+@pytest.mark.parametrize(
+    "fields", [(), (Field("x"), Field("x"))], ids=["no fields", "two of one name"]
+)
+def test_unfit_fields_are_refused(tmp_path, fields):
+    with pytest.raises(PluginError, match="distinct names"):
+        make_recorder(tmp_path).open_stream(StreamSchema("s", fields))
+
+
+def test_single_field_that_reads_as_another_kind_of_line_is_refused(tmp_path):
+    schema = StreamSchema("s", (Field("end", "", "int"),), shape="object")
+
+    with pytest.raises(PluginError, match="may not be named end"):
+        make_recorder(tmp_path).open_stream(schema)
+
+
+def test_directory_that_cannot_be_made_is_the_machines_fault(tmp_path):
+    (tmp_path / "file").write_text("")
+
+    with pytest.raises(MachineError, match="cannot record there"):
+        make_recorder(tmp_path / "file" / "below")
+
+
+def test_stream_that_cannot_be_created_is_the_machines_fault(tmp_path):
+    recorder = make_recorder(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+
+    with pytest.raises(MachineError, match=r"ticks\.jsonl: cannot record there"):
+        recorder.open_stream(TICKS)
+
+
+def test_unknown_stream_is_named_with_the_known_ones(tmp_path):
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(PAIR)
+
+    with pytest.raises(PluginError, match=r"unknown stream 'pear'; declared are: pair"):
+        recorder.record("pear", (1, 2.0))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ((1,), r"stream pair: expected 2 values \(number, value_m\), got 1"),
+        ((1, 2.0, 3.0), "got 3"),
+        (np.zeros(3), "got 3"),
+        ({"number": 1}, "missing value_m"),
+        ({"number": 1, "value_m": 2.0, "extra": 3, "more": 4}, "unknown extra, more"),
+        ("ab", "expected one value a field, got str"),
+        ((1, object()), "stream pair: value 1: object has no JSON form"),
+        ((1 << 70, 1.0), "stream pair: value 0"),
+        ({"number": 1, "value_m": b"x"}, "value 1: bytes has no JSON form"),
+    ],
+)
+def test_unfit_values_are_refused_by_name(tmp_path, values, message):
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(PAIR)
+
+    with pytest.raises(PluginError, match=message):
+        recorder.record("pair", values)
+    assert recorder.close(30).written == 0
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        (1, 2.5),
+        [1, 2.5],
+        {"value_m": 2.5, "number": 1},
+        (np.int32(1), np.float64(2.5)),
+        np.array([1, 2.5]),
+        np.array([1, 0, 2.5, 0])[::2],
+    ],
+    ids=repr,
+)
+def test_numbers_of_any_make_are_the_same_record(tmp_path, values):
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(PAIR)
+    recorder.record("pair", values)
+    recorder.close(30)
+
+    assert read_lines(tmp_path / "pair.jsonl")[1] == [1, 2.5]
+
+
+def test_array_within_a_record_is_a_list(tmp_path):
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(StreamSchema("state", (Field("t_s", "s"), Field("r_m", "m", "json"))))
+    recorder.record("state", (0.5, np.arange(6.0).reshape(2, 3)[:, ::2]))
+    recorder.close(30)
+
+    assert read_lines(tmp_path / "state.jsonl")[1] == [0.5, [[0.0, 2.0], [3.0, 5.0]]]
+
+
+def test_event_carries_details_beside_its_fields(tmp_path):
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(EVENTS)
+    event = {"t_s": 1.0, "utc": "u", "event": "lost", "agent": "a-7"}
+    recorder.record("events", event)
+    recorder.record("events", (2.0, "u", "end"))
+    recorder.close(30)
+
+    expected = [event, {"t_s": 2.0, "utc": "u", "event": "end"}]
+    assert read_lines(tmp_path / "events.jsonl")[1:-1] == expected
+
+
+def test_event_without_a_field_is_refused(tmp_path):
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(EVENTS)
+
+    with pytest.raises(PluginError, match="stream events: missing utc, event"):
+        recorder.record("events", {"t_s": 1.0})
+
+
+def test_values_that_are_not_finite_are_null_and_counted(tmp_path):
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(StreamSchema("s", (Field("a"), Field("b", "", "json"))))
+    recorder.record("s", (float("nan"), [1.0, float("inf"), np.float32("-inf")]))
+    recorder.record("s", (None, "null"))
+    recorder.record("s", (1.0, {"x": np.array([np.nan, 2.0, np.inf]), "i": np.array([1])}))
+    counts = recorder.close(30)
+
+    assert counts.not_finite == 5
+    assert read_lines(tmp_path / "s.jsonl")[-1]["end"]["not_finite"] == 5
+    assert read_lines(tmp_path / "s.jsonl")[1] == [None, [1.0, None, None]]
+
+
+def test_what_does_not_fit_the_buffer_is_counted(tmp_path):
+    recorder = make_recorder(tmp_path, buffer_bytes=65_536)
+    recorder.open_stream(PAIR)
+    recorder.open_stream(EVENTS)
+    for number in range(2000):
+        recorder.record("pair", (number, 0.5))
+    recorder.record("events", (0.0, "u", "e"))
+    counts = recorder.close(30)
+
+    pair = counts.streams["pair"]
+    assert pair.written + pair.dropped == 2000
+    assert 0 < pair.dropped < 2000
+    assert (counts.streams["events"].written, counts.streams["events"].dropped) == (0, 1)
+    lines = read_lines(tmp_path / "pair.jsonl")
+    assert lines[1:-1] == [[number, 0.5] for number in range(pair.written)]
+    assert lines[-1]["end"] == {"records": pair.written, "dropped": pair.dropped, "not_finite": 0}
+
+
+def test_written_records_make_room_in_the_buffer(tmp_path):
+    recorder = make_recorder(tmp_path, buffer_bytes=65_536)
+    recorder.open_stream(PAIR)
+    recorder.start()
+    for number in range(5000):
+        recorder.record("pair", (number, 0.5))
+        if number % 250 == 0:
+            wait_until(lambda n=number: recorder.counts().written > n)
+
+    assert recorder.close(30).to_mapping()["written"] == 5000
+
+
+def test_record_after_close_is_dropped(tmp_path):
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(PAIR)
+    recorder.close(30)
+    recorder.record("pair", (1, 2.0))
+
+    assert recorder.counts().dropped == 1
+
+
+def test_closing_twice_gives_the_same_counts(tmp_path):
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(PAIR)
+    recorder.record("pair", (1, 2.0))
+
+    assert recorder.close(30) == recorder.close(30)
+
+
+def test_counts_are_a_plain_mapping(tmp_path):
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(PAIR)
+    recorder.record("pair", (1, 2.0))
+    mapping = recorder.close(30).to_mapping()
+
+    size = (tmp_path / "pair.jsonl").stat().st_size
+    stream = {"file": "pair.jsonl", "written": 1, "dropped": 0, "not_finite": 0, "bytes": size}
+    totals = {"written": 1, "dropped": 0, "not_finite": 0, "bytes": size, "errors": []}
+    assert mapping == {**totals, "streams": {"pair": stream}}
+
+
+@pytest.mark.parametrize(
+    ("verbosity", "expected"),
+    [
+        (0, []),
+        (1, ["critical"]),
+        (2, ["critical", "error"]),
+        (3, ["critical", "error", "warning"]),
+        (4, ["critical", "error", "warning", "info"]),
+        (5, ["critical", "error", "warning", "info", "debug"]),
+    ],
+)
+def test_verbosity_decides_what_is_logged_and_echoed(tmp_path, verbosity, expected):
+    echoed = []
+    recorder = make_recorder(
+        tmp_path, verbosity=verbosity, echo=lambda level, text: echoed.append((level, text))
+    )
+    recorder.open_stream(LOG)
+    for level in ("critical", "error", "warning", "info", "debug"):
+        recorder.log(level, f"a {level}", 1.5)
+    recorder.close(30)
+
+    records = read_lines(tmp_path / "log.jsonl")[1:-1]
+    assert [record["level"] for record in records] == expected
+    assert echoed == [(level, f"a {level}") for level in expected]
+    assert all(record["t_s"] == 1.5 and record["utc"].endswith("+00:00") for record in records)
+
+
+def test_unknown_level_is_refused(tmp_path):
+    with pytest.raises(PluginError, match="unknown log level 'warn'; expected one of critical"):
+        make_recorder(tmp_path).log("warn", "x", None)
+
+
+def test_log_takes_text_that_is_no_unicode(tmp_path):
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(LOG)
+    recorder.log("error", "no such file: \udcff", None)
+    recorder.close(30)
+
+    assert read_lines(tmp_path / "log.jsonl")[1]["text"] == "no such file: \\udcff"
+
+
+def test_close_returns_in_time_though_the_disk_hangs(tmp_path, monkeypatch):
+    is_released = threading.Event()
+    monkeypatch.setattr(stream_file.os, "write", lambda fd, data: is_released.wait(60) and 0)
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(PAIR)
+    try:
+        counts = recorder.close(0.1)
+    finally:
+        monkeypatch.undo()
+        is_released.set()
+
+    assert "records not on disk after 0.1 s" in counts.errors[0]
+    recorder.close(30)
+
+
+def test_failing_disk_is_told_first_and_latest_and_not_tried_without_pause(tmp_path, monkeypatch):
+    calls = []
+
+    def refuse(fd, data):
+        calls.append(len(data))
+        raise OSError(errno.EIO if len(calls) == 1 else errno.EDQUOT, f"refusal {len(calls)}")
+
+    recorder = make_recorder(tmp_path, buffer_bytes=65_536)
+    recorder.open_stream(PAIR)
+    monkeypatch.setattr(stream_file.os, "write", refuse)
+    recorder.start()
+    started_s = time.monotonic()
+    while len(calls) < 4:
+        recorder.record("pair", (1, 0.5))
+        assert time.monotonic() < started_s + 60
+    tries, elapsed_s = len(calls), time.monotonic() - started_s
+    problem = recorder.problem
+    counts = recorder.close(30)
+
+    assert tries <= elapsed_s / 0.05 + 3
+    assert "refusal 1" in problem
+    assert "pair.jsonl" in problem
+    assert f"latest of {len(calls)}: " in counts.errors[1]
+    assert counts.written == 0
+    assert counts.dropped > 0
+
+
+class _Disk:
+    """Stands in for os.write: takes seeded amounts, refuses now and then."""
+
+    def __init__(self, seed, refusal):
+        self._random = random.Random(seed)
+        self._refusal = refusal
+        self._write = os.write
+
+    def __call__(self, fd, data):
+        if self._random.random() < self._refusal:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return self._write(fd, bytes(data[: self._random.randint(1, len(data))]))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**32),
+    refusal=st.sampled_from([0.0, 0.2, 0.6]),
+    batches=st.lists(st.integers(0, 30), min_size=1, max_size=8),
+)
+def test_partial_writes_neither_cut_nor_repeat_a_line(tmp_path_factory, seed, refusal, batches):
+    path = Path(tmp_path_factory.mktemp("disk")) / "pair.jsonl"
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    file = stream_file.StreamFile(PAIR, path, descriptor)
+    header, t0 = b'{"schema":1,"stream":"pair"}\n', b'{"t0_utc":"u"}\n'
+    recorded = 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stream_file.os, "write", _Disk(seed, refusal))
+        for index, count in enumerate(batches):
+            file.lines.extend(b"[%d,0.5]\n" % n for n in range(recorded, recorded + count))
+            recorded += count
+            try:
+                file.write_waiting(header, t0 if index else None)
+            except OSError:
+                continue
+    file.finish()
+
+    text = path.read_bytes()
+    assert text.endswith(b"\n") or not text
+    lines = [json.loads(line) for line in text.splitlines()]
+    records = [line for line in lines if isinstance(line, list)]
+    assert records == [[number, 0.5] for number in range(file.written)]
+    assert file.written + file.dropped == recorded
+    assert lines[:1] == ([json.loads(header)] if text else [])
+    assert lines.count({"t0_utc": "u"}) <= 1
+    if lines:
+        end = {"records": file.written, "dropped": file.dropped, "not_finite": 0}
+        assert lines[-1] == {"end": end}
+    assert file.bytes_written == len(text)
+
+
+def wait_until(condition, deadline_s=60.0):
+    end_s = time.monotonic() + deadline_s
+    while not condition():
+        assert time.monotonic() < end_s, "condition not met in time"
+        time.sleep(0.005)
