@@ -7,6 +7,7 @@ of the run lives: first they are asked to stop, then `Reaper` ends them.
 
 from __future__ import annotations
 
+import os
 import selectors
 import signal
 import time
@@ -162,6 +163,8 @@ class Operator:
             for name in names:
                 if name in self._request.manual:
                     self._open_seat(name, self._agent_launch(machine, (name,), listening))
+        if self._request.nice:  # after the children, who would inherit it
+            os.nice(self._request.nice)
 
     def _start(
         self, name: str, arguments: tuple[str, ...], folder: str, *, launch: Mapping[str, Any]
@@ -328,7 +331,7 @@ class Operator:
         now_s = time.monotonic()
         self._deadlines.set("stop", now_s + grace_s, self._tell_stop)
         limit_s = grace_s + self._timeouts.shutdown_s + END_MARGIN_S
-        late = f"has not ended within {limit_s:g} s of the host's end"
+        late = f"has not ended within {limit_s:g} s of the end of the run"
         for name, child in self._children.items():
             if name != HOST or self._has_host_finished:
                 self._reaper.expect_end(child, now_s + limit_s, late)

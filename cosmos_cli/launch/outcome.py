@@ -28,6 +28,8 @@ class LaunchRequest:
     """Each machine's agents; all machines are this one until boards are reached over SSH."""
     manual: tuple[str, ...] = ()
     """Agents that a person starts by hand; they are in nobody's list of *machines*' children."""
+    nice: int = 0
+    """How much the operator steps back behind its children once they are started."""
     run_key_hex: str = field(default_factory=lambda: secrets.token_hex(RUN_KEY_BYTES), repr=False)
     session_hex: str = field(default_factory=lambda: secrets.token_hex(SESSION_BYTES))
 

@@ -1,5 +1,5 @@
 """
-Progress as two lines that stay at the foot of a terminal, with talk scrolling above.
+Progress as three lines that stay at the foot of a terminal, with talk scrolling above.
 
 Drawn only when something new has come and at most four times a second: on two processors every
 redraw is time that agents could need. No thread draws.
@@ -22,7 +22,7 @@ from cosmos_cli.view import words
 
 REDRAW_INTERVAL_S = 0.25
 WAITING_LINES_MAX = 200
-BAR_WIDTH = 30
+BAR_WIDTH = 20
 STYLES = {"critical": "bold red", "error": "red", "warning": "yellow", "debug": "dim"}
 URGENT_LEVELS = frozenset({"critical", "error", "warning", "manual"})
 
@@ -123,17 +123,19 @@ class LiveView:
             Text(self._state),
             ProgressBar(self._duration_s, words.simulated_s(progress), width=BAR_WIDTH),
             Text(words.clock_words(progress, self._duration_s)),
-            Text(words.rtf_words(progress)),
         )
         style = "yellow" if words.has_trouble(progress) else ""
-        foot = Table.grid(padding=(0, 2))
-        foot.add_row(
-            Text(words.agent_words(progress), style),
-            Text(words.tick_words(progress)),
-            Text(words.lateness_words(progress)),
-            Text(words.loss_words(progress), style),
+        agents = (words.agent_words(progress), words.loss_words(progress))
+        timing = (
+            words.rtf_words(progress),
+            words.tick_words(progress),
+            words.lateness_words(progress),
         )
-        return Group(head, foot)
+        return Group(
+            head,
+            Text("  ".join(agents), style, no_wrap=True, overflow="ellipsis"),
+            Text("  ".join(timing), no_wrap=True, overflow="ellipsis"),
+        )
 
     def _safely(self, action: Callable[[], object]) -> None:
         """Do something to the terminal; one that was closed must not end the run."""

@@ -14,6 +14,7 @@ STATE_WORDS: Mapping[str, str] = {
     "SIMULATION_COMPLETE": "complete",
     "BEGIN_SHUTDOWN": "shutting down",
     "EMERGENCY_SHUTDOWN": "emergency shutdown",
+    "COLLECTING": "collecting",
 }
 """States that are worth a line; the rest of shutdown passes in a blink."""
 

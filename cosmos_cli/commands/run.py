@@ -1,0 +1,67 @@
+"""`cosmos run`: launch a scenario, watch it, shut it down, collect and judge it."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cosmos_cli.console import Console, JsonOption, QuietOption, SetOption
+from cosmos_cli.errors import CosmosError, ExitCode
+from cosmos_cli.launch.execute import RunOptions, execute
+from cosmos_cli.models.loading import load_scenario
+from cosmos_cli.rundir import runs_root
+from cosmos_cli.view.factory import make_view
+
+
+class CollectionInterrupted(CosmosError):
+    """The run is over, but its operator did not wait for the verdict."""
+
+    exit_code = ExitCode.INTERRUPTED
+    kind = "interrupted"
+
+
+def run(
+    scenario: Annotated[Path, typer.Argument(metavar="SCENARIO", help="Scenario file.")],
+    set_: SetOption = None,
+    duration_s: Annotated[
+        float | None,
+        typer.Option(
+            "--duration", metavar="S", help="Simulated time, s; as --set time.duration_s."
+        ),
+    ] = None,
+    runs: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", envvar="COSMOS_RUNS", help="Folder of all runs; ./runs."),
+    ] = None,
+    manual: Annotated[
+        list[str] | None,
+        typer.Option(metavar="AGENT", help="Print the command that starts this agent by hand."),
+    ] = None,
+    report: Annotated[
+        bool, typer.Option("--report/--no-report", help="Write report.html at the end.")
+    ] = True,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Run a scenario on this computer, in real time, and end with a verdict."""
+    console = Console(json=json, quiet=quiet)
+    overrides = list(set_ or ())
+    if duration_s is not None:
+        overrides.append(f"time.duration_s={duration_s!r}")
+    options = RunOptions(
+        runs=runs_root(runs), manual=tuple(dict.fromkeys(manual or ())), has_report=report
+    )
+    checked = load_scenario(scenario, overrides)
+    try:
+        summary = execute(checked, options, partial(make_view, quiet=quiet))
+    except KeyboardInterrupt:
+        raise CollectionInterrupted(
+            f"interrupted while collecting; the records are in {options.runs.resolve()}: `cosmos"
+            " collect last` judges and packages them"
+        ) from None
+    console.print_json(dict(summary.document))
+    console.data(summary.last_line)
+    raise typer.Exit(int(summary.exit_code))
