@@ -51,7 +51,7 @@ def test_stream_without_records_has_schema_and_end(tmp_path):
     recorder.open_stream(TICKS)
     recorder.close(30)
 
-    assert ["schema", "end"] == [next(iter(line)) for line in read_lines(tmp_path / "ticks.jsonl")]
+    assert [next(iter(line)) for line in read_lines(tmp_path / "ticks.jsonl")] == ["schema", "end"]
 
 
 def test_first_line_carries_t0_where_it_is_known_in_time(tmp_path):
