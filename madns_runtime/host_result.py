@@ -81,8 +81,8 @@ def _messages(peer: Peer, agent_side: Mapping[str, Any] | None) -> dict[str, Any
     """
     Join both ends' counters of an agent's link.
 
-    What one end sent and the other never had is lost: that also finds a loss at the very end, which
-    no gap shows. Without the agent's own count only what the host saw is told.
+    What one end sent in a stream and the other never had is lost. Without the agent's own count only
+    what the host saw is told.
     """
     host_side: Mapping[str, Any] = peer.link.counters.to_mapping() if peer.link else {}
     joined: dict[str, Any] = {}
@@ -91,7 +91,10 @@ def _messages(peer: Peer, agent_side: Mapping[str, Any] | None) -> dict[str, Any
         down: Mapping[str, Any] = host_side.get(service, {})
         sent = up.get("sent", 0) + down.get("sent", 0)
         received = up.get("received", 0) + down.get("received", 0)
-        if agent_side is None:
+        if service == "best":
+            # What the receivers missed between two that came, and what a full queue pushed out.
+            lost = sum(side.get(name, 0) for side in (up, down) for name in ("lost", "dropped"))
+        elif agent_side is None:
             lost = down.get("lost", 0)
         else:
             lost = max(0, up.get("sent", 0) - down.get("received", 0)) + max(
