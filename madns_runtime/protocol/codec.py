@@ -31,6 +31,7 @@ _ARRAY_EXT: Final = 1
 _DIMENSIONS: Final = tuple(Struct(f"<B{count}I") for count in range(ARRAY_DIMENSIONS_MAX + 1))
 _FLOAT64: Final = np.dtype("<f8")
 _SCALARS: Final = frozenset({type(None), bool, int, float, str, bytes})
+_UNTRUSTED_BYTES: Final = 1024
 _INTEGER_EXACT_MAX: Final = 2**53
 
 
@@ -182,6 +183,8 @@ def unpack(data: bytes) -> Any:
     """
     items_max = min(len(data), ITEMS_MAX)
     try:
+        if len(data) > _UNTRUSTED_BYTES:
+            _check_complete(data)
         value = msgpack.unpackb(
             data,
             ext_hook=_decode_ext,
@@ -190,10 +193,25 @@ def unpack(data: bytes) -> Any:
             timestamp=1,  # as a float: no type that `pack` does not know
         )
     except (ValueError, TypeError, OverflowError, RecursionError, MemoryError) as error:
-        raise MalformedMessage(f"not a packed value: {error}") from error
+        raise MalformedMessage(f"not a packed value: {error!r}") from error
     if type(value) not in _SCALARS:
         _check_decoded(value, 0)
     return value
+
+
+def _check_complete(data: bytes) -> None:
+    """
+    Refuse bytes that announce more items than they hold, before anything is made of them.
+
+    Lists are allocated at their announced length: a thousand headers inside each other would take
+    100 MB. Short bodies cannot announce enough to matter.
+    """
+    unpacker = msgpack.Unpacker(max_buffer_size=len(data))
+    unpacker.feed(data)
+    try:
+        unpacker.skip()
+    except msgpack.OutOfData as error:
+        raise ValueError("the bytes end early") from error
 
 
 def _check_decoded(value: object, depth: int) -> None:
