@@ -39,8 +39,9 @@ COMMANDS = (
     "collect",
     "report",
 )
-CLICK_ERROR: Any = typer.BadParameter.__mro__[2]
-"""Base of all usage errors. Typer carries its own click since 0.2x, so click's own class would not match."""
+USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
+CLICK_ERROR: Any = USAGE_ERROR.__mro__[1]
+"""Base of all errors of usage. Typer carries its own click since 0.2x, so click's own class would not match."""
 
 
 class LazyGroup(typer.core.TyperGroup):
@@ -65,7 +66,7 @@ class LazyGroup(typer.core.TyperGroup):
 
             close = difflib.get_close_matches(args[0], COMMANDS, n=1)
             hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(COMMANDS)}"
-            raise typer.BadParameter(f"no command {args[0]!r}; {hint}", ctx=ctx)
+            raise USAGE_ERROR(f"no command {args[0]!r}; {hint}", ctx)
         return super().resolve_command(ctx, args)
 
 
@@ -91,18 +92,23 @@ def make_app() -> typer.Typer:
     return app
 
 
+def _print_version(is_wanted: bool) -> None:
+    if is_wanted:
+        from madns_runtime import __version__
+
+        typer.echo(f"cosmos {__version__}")
+        raise typer.Exit
+
+
 def cosmos(
-    version: bool = typer.Option(False, "--version", is_eager=True, help="Print the version."),
+    version: bool = typer.Option(
+        False, "--version", is_eager=True, callback=_print_version, help="Print the version."
+    ),
     debug: bool = typer.Option(
         False, "--debug", envvar="COSMOS_DEBUG", help="Show the traceback of an unexpected error."
     ),
 ) -> None:
     """Test the flight software of satellite constellations and other swarms in real time."""
-    if version:
-        from madns_runtime import __version__
-
-        typer.echo(f"cosmos {__version__}")
-        raise typer.Exit
     if debug:
         os.environ["COSMOS_DEBUG"] = "1"
 

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.document import Document, apply_overrides, parse_override, read_document
 from cosmos_cli.models.document import Path as ValuePath
+from cosmos_cli.models.parameters import adapter_of
 from cosmos_cli.models.scenario import Scenario, cross_faults
 from cosmos_cli.models.translate import faults_of
 from cosmos_cli.models.yaml_source import read_source
@@ -114,24 +115,21 @@ def _order(fault: Fault) -> tuple[bool, int, int]:
 def _scenario(document: Document) -> tuple[Scenario | None, list[Fault]]:
     """Return the scenario, and faults; sections without faults are checked against each other anyway."""
     try:
-        scenario = _validate(Scenario, document.value)
+        scenario = _validate_scenario(document.value)
     except ValidationError as error:
         errors = error.errors(include_url=False)
         faults = faults_of(document, errors, Scenario)
         broken = frozenset(str(item["loc"][0]) for item in errors)
         rest = {key: value for key, value in document.value.items() if key not in broken}
         spared = {key: value for key, value in _PLACEHOLDERS.items() if key in broken}
-        partial = _validate(Scenario, rest | spared)
+        partial = _validate_scenario(rest | spared)
         return None, faults + _cross(document, partial, broken)
     return scenario, _cross(document, scenario, frozenset())
 
 
-def _validate(kind: Any, value: Any) -> Any:
+def _validate_scenario(value: Any) -> Scenario:
     """Validate as JSON and strictly: no text passes for a number, yet a list does for a tuple."""
-    text = json.dumps(value)
-    if isinstance(kind, type) and issubclass(kind, Scenario):
-        return kind.model_validate_json(text, strict=True)
-    return TypeAdapter(kind).validate_json(text, strict=True)
+    return Scenario.model_validate_json(json.dumps(value), strict=True)
 
 
 def _cross(document: Document, scenario: Scenario, broken: frozenset[str]) -> list[Fault]:
@@ -160,7 +158,8 @@ def _parameters(document: Document, simulation: Simulation) -> tuple[Any, list[F
     if not isinstance(value, Mapping):
         return None, []  # the model has said so already
     try:
-        return _validate(simulation.parameters, value), []
+        adapter = adapter_of(simulation.parameters)
+        return adapter.validate_json(json.dumps(value), strict=True), []
     except ValidationError as error:
         if "parameters" not in document.value:
             document.value["parameters"] = {}

@@ -241,9 +241,8 @@ def _checked(descriptor: Any, where: str, module: ModuleType) -> Simulation:
             f"{where}: expected a madns_runtime.plugin.api.Simulation, got {type(descriptor).__name__}"
         )
     faults = []
-    if not (
-        isinstance(descriptor.parameters, type) and dataclasses.is_dataclass(descriptor.parameters)
-    ):
+    parameters: Any = descriptor.parameters
+    if not (isinstance(parameters, type) and dataclasses.is_dataclass(parameters)):
         faults.append("parameters: expected a dataclass (the class itself)")
     parts: dict[str, Any] = {}
     for part in ("agent", "host", "demand", "check"):

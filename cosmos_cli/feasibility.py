@@ -1,0 +1,233 @@
+"""
+The four inequalities of a real-time run (thesis 2.5.4, equations 2.7-2.10), with margins and limits. Pure.
+
+Two things differ from the thesis's own figures. Sizes are encoded sizes in bytes, and what travels is
+counted with the datagrams' overhead: its table 2.2 gives S_b as 100 x 6 x 64 bits, which is 4,800
+bytes and not the 38,400 of table 2.3. And inequality 2.8 is taken for several maneuvers that reach
+the host at once, by default one of every agent: as written, for one alone, it has no limit in agents.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from madns_runtime.plugin.api import Demand
+
+DATAGRAM_BYTES_MAX = 1400
+SEAL_BYTES = 60
+"""Header and keyed MAC of a datagram, and the headers of its frames."""
+IP_UDP_BYTES = 28
+BITS_PER_BYTE = 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Resources:
+    """What host and network offer."""
+
+    workers: int
+    """N_p: processes that propagate."""
+    bandwidth_bytes_s: float
+    """B_n: of the host's own link, one direction taken for both."""
+    latency_s: float
+    """T_n: one way."""
+    maneuvers_at_once: int | None = None
+    """Maneuvers that reach the host at one instant at worst; None for one of every agent."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inequality:
+    """One inequality at the planned number of agents."""
+
+    number: str
+    """Of the thesis's equation."""
+    name: str
+    formula: str
+    left: float
+    relation: Literal["<=", ">="]
+    right: float
+    unit: str
+    breaks_at: float
+    """The smallest number of agents at which it does not hold; infinity if it always does."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether it is fulfilled."""
+        return self.margin >= 0
+
+    @property
+    def margin(self) -> float:
+        """What is left, in the unit of both sides; negative if it does not hold."""
+        return self.right - self.left if self.relation == "<=" else self.left - self.right
+
+    @property
+    def load(self) -> float:
+        """The smaller side's share of the larger allowed one: 1 is the limit, 0 no load."""
+        used, allowed = sorted_sides(self)
+        if used == 0:
+            return 0.0
+        return used / allowed if allowed > 0 else math.inf
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values; null stands for infinity."""
+        return {
+            "equation": self.number,
+            "name": self.name,
+            "formula": self.formula,
+            "left": finite(self.left),
+            "relation": self.relation,
+            "right": finite(self.right),
+            "unit": self.unit,
+            "margin": finite(self.margin),
+            "holds": self.holds,
+            "breaks_at_agents": finite(self.breaks_at),
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Feasibility:
+    """All four, for one number of agents."""
+
+    agents: int
+    inequalities: tuple[Inequality, ...]
+    measured: bool
+    """Whether compute times were measured on this machine; else they are declared."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether all are fulfilled."""
+        return all(item.holds for item in self.inequalities)
+
+    @property
+    def binding(self) -> Inequality:
+        """The one that limits the number of agents first; among equals the one with the highest load."""
+        return min(self.inequalities, key=lambda item: (item.holds, item.breaks_at, -item.load))
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values for --json."""
+        return {
+            "agents": self.agents,
+            "holds": self.holds,
+            "binding": self.binding.number,
+            "compute_times": "measured" if self.measured else "declared",
+            "inequalities": [item.to_mapping() for item in self.inequalities],
+        }
+
+
+def judge(demand: Demand, resources: Resources, *, agents: int, tick_hz: float) -> Feasibility:
+    """
+    Evaluate the four inequalities.
+
+    Args:
+        demand: What the simulation asks for, a single agent's.
+        resources: What host and network offer.
+        agents: N_a.
+        tick_hz: R_a.
+    """
+    return Feasibility(
+        agents=agents,
+        inequalities=(
+            _asynchronous(demand, resources, agents),
+            _synchronous(demand, resources, agents),
+            _lead(demand, tick_hz),
+            _bandwidth(demand, resources, agents),
+        ),
+        measured=demand.measured,
+    )
+
+
+def _asynchronous(demand: Demand, resources: Resources, agents: int) -> Inequality:
+    per_agent_s = demand.batch_compute_s / resources.workers
+    return Inequality(
+        number="2.7",
+        name="asynchronous: every agent's batch within its buffer",
+        formula="T_p(S_b) N_a / N_p + T_n <= T_bi",
+        left=per_agent_s * agents + resources.latency_s,
+        relation="<=",
+        right=demand.buffer_s,
+        unit="s",
+        breaks_at=_first_beyond(per_agent_s, demand.buffer_s - resources.latency_s),
+    )
+
+
+def _synchronous(demand: Demand, resources: Resources, agents: int) -> Inequality:
+    at_once = resources.maneuvers_at_once
+    rounds = math.ceil(min(at_once or agents, agents) / resources.workers)
+    wait_s = demand.lead_s - 2 * resources.latency_s
+    rounds_beyond = _first_beyond(demand.sync_compute_s, wait_s)
+    agents_beyond = (rounds_beyond - 1) * resources.workers + 1
+    if at_once is not None and agents_beyond > at_once:
+        agents_beyond = math.inf
+    return Inequality(
+        number="2.8",
+        name="synchronous: a maneuver's states before it begins",
+        formula="T_p(S_sync) ceil(n / N_p) + 2 T_n <= T_m - T_s",
+        left=demand.sync_compute_s * rounds + 2 * resources.latency_s,
+        relation="<=",
+        right=demand.lead_s,
+        unit="s",
+        breaks_at=agents_beyond,
+    )
+
+
+def _lead(demand: Demand, tick_hz: float) -> Inequality:
+    period_s = 1 / tick_hz
+    holds = demand.lead_s >= period_s
+    return Inequality(
+        number="2.9",
+        name="synchronous: a maneuver at least a tick ahead",
+        formula="T_m - T_s >= 1 / R_a",
+        left=demand.lead_s,
+        relation=">=",
+        right=period_s,
+        unit="s",
+        breaks_at=math.inf if holds else 1,
+    )
+
+
+def _bandwidth(demand: Demand, resources: Resources, agents: int) -> Inequality:
+    planned = sum(wire_bytes(flow.message_bytes) * flow.rate_hz for flow in demand.flows)
+    unplanned = wire_bytes(demand.sync_bytes) * demand.sync_rate_hz
+    return Inequality(
+        number="2.10",
+        name="network: all messages within the bandwidth",
+        formula="N_a (sum S_Di R_Di + N_sync S_sync) <= B_n",
+        left=agents * (planned + unplanned),
+        relation="<=",
+        right=resources.bandwidth_bytes_s,
+        unit="B/s",
+        breaks_at=_first_beyond(planned + unplanned, resources.bandwidth_bytes_s),
+    )
+
+
+def wire_bytes(message_bytes: int) -> int:
+    """Return the bytes that a message of so many encoded bytes costs on the wire, all headers included."""
+    if message_bytes <= 0:
+        return 0
+    datagrams = math.ceil(message_bytes / (DATAGRAM_BYTES_MAX - SEAL_BYTES))
+    return message_bytes + datagrams * (SEAL_BYTES + IP_UDP_BYTES)
+
+
+def _first_beyond(each: float, allowed: float) -> float:
+    """Return the smallest whole n >= 1 with n * each > allowed; infinity if there is none."""
+    if allowed < each:
+        return 1
+    if each <= 0 or math.isinf(allowed):
+        return math.inf
+    count = math.floor(allowed / each)
+    while count * each <= allowed:  # rounding of the division may be one off
+        count += 1
+    while count > 1 and (count - 1) * each > allowed:
+        count -= 1
+    return count
+
+
+def sorted_sides(item: Inequality) -> tuple[float, float]:
+    """Return the side that should be smaller, then the one that should be larger."""
+    return (item.left, item.right) if item.relation == "<=" else (item.right, item.left)
+
+
+def finite(value: float) -> float | None:
+    """Return *value*, or None for infinity, which JSON does not know."""
+    return value if math.isfinite(value) else None

@@ -1,0 +1,41 @@
+"""
+A simulation's parameters class, validated as strictly as the scenario itself.
+
+Pydantic ignores unknown keys of a plain dataclass. A plug-in's author should not have to know that,
+so a class that says nothing about it is told to refuse them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from typing import Any
+
+from pydantic import TypeAdapter
+
+from madns_runtime.config import FORBID_EXTRA
+
+_CONFIG = "__pydantic_config__"
+
+
+def adapter_of(parameters: type) -> TypeAdapter[Any]:
+    """
+    Return the validator of a parameters class.
+
+    Raises:
+        TypeError: A field's type is none that a scenario can hold.
+    """
+    _forbid_extra(parameters, set())
+    return TypeAdapter(parameters)
+
+
+def _forbid_extra(kind: Any, seen: set[Any]) -> None:
+    for argument in typing.get_args(kind):
+        _forbid_extra(argument, seen)
+    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)) or kind in seen:
+        return
+    seen.add(kind)
+    if _CONFIG not in vars(kind):
+        setattr(kind, _CONFIG, FORBID_EXTRA)
+    for hint in typing.get_type_hints(kind, include_extras=True).values():
+        _forbid_extra(hint, seen)
