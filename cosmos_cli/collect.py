@@ -1,0 +1,209 @@
+"""
+The end of a run: what was recorded is gathered, judged, reported and packaged.
+
+`finish_run` does it for the run that just ended, `collect_run` again for any run, also one whose host
+or operator was killed. Both may be repeated: what is recorded is only read. Whatever cannot be
+written, as on a full disk, is named in the verdict; run.json and the manifest come last, in the space
+that the reserve kept free.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import datetime
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cosmos_cli.bundle import pack_run
+from cosmos_cli.errors import ExitCode, InputError, RunFailedError
+from cosmos_cli.expectation import Expected, find_missing
+from cosmos_cli.gather import Gathered, Progress, gather
+from cosmos_cli.manifest import build_manifest
+from cosmos_cli.report.html import write_report
+from cosmos_cli.rundir import RunDirectory, write_json
+from cosmos_cli.runjson import Evidence
+from cosmos_cli.statistics import clock_statistics, round_trip_statistics, tick_statistics
+from cosmos_cli.tables import open_tables
+from cosmos_cli.verdict import Verdict
+from madns_runtime.processes import ProcessEntry, list_processes
+
+LIVING_SHOWN_MAX = 5
+LivingProcesses = Callable[[], Sequence[ProcessEntry]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunEnd:
+    """How a run ended, as the launcher saw it."""
+
+    result: Mapping[str, Any] | None
+    """What the host reported at its end; None if it could not."""
+    interrupted: bool = False
+    """Whether the operator ended it."""
+    problems: tuple[str, ...] = ()
+    """What did not go as it should, each starting with who; a machine's ends the command with 3."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunSummary:
+    """A judged run."""
+
+    run: RunDirectory
+    verdict: Verdict
+    document: Mapping[str, Any]
+    """run.json."""
+
+    @property
+    def exit_code(self) -> ExitCode:
+        """What the command ends with."""
+        return self.verdict.exit_code
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """One line a source whose data are not all there."""
+        return tuple(self.document["data"]["missing"])
+
+    @property
+    def last_line(self) -> str:
+        """The verdict, and where the evidence lies."""
+        return f"{self.verdict.text} | {self.run.path}"
+
+
+def say_nothing(what: str, share: float) -> None:
+    """Be the progress of those who want none."""
+
+
+def finish_run(
+    run: RunDirectory, end: RunEnd, expected: Expected, *, progress: Progress = say_nothing
+) -> RunSummary:
+    """
+    Gather, judge, report and package a run whose processes have ended.
+
+    Args:
+        run: The run; `begin_run` wrote its run.json and plan.json.
+        end: How it ended.
+        expected: Who should have recorded what.
+        progress: Called with what is being done and how far it is, 0 to 1.
+
+    Raises:
+        MachineError: A record stream cannot be read.
+        RunFailedError: Not even run.json can be written.
+    """
+    if end.result is not None:
+        # On a full disk the summary below still tells what matters of it.
+        with contextlib.suppress(OSError):
+            write_json(run.result_json, end.result)
+    config = run.read_config()
+    gathered = gather(run, config.agents.tick_hz if config else None, progress)
+    evidence = _evidence(run, gathered, end, expected)
+    return _conclude(run, gathered, evidence, progress)
+
+
+def collect_run(
+    run: RunDirectory,
+    *,
+    progress: Progress = say_nothing,
+    processes: LivingProcesses = list_processes,
+) -> RunSummary:
+    """
+    Gather, judge, report and package a run again: finished, cut off, or its host killed.
+
+    Raises:
+        InputError: Processes of the run still live; the message names them.
+        MachineError: A record stream cannot be read.
+        RunFailedError: Not even run.json can be written.
+    """
+    _refuse_living(run, processes())
+    before = run.read_json(run.run_json) or {}
+    problems = before.get("problems")
+    end = RunEnd(
+        result=run.read_json(run.result_json),
+        interrupted=before.get("status") == "interrupted",
+        problems=tuple(map(str, problems)) if isinstance(problems, list) else (),
+    )
+    return finish_run(run, end, Expected.read(run), progress=progress)
+
+
+def _refuse_living(run: RunDirectory, processes: Sequence[ProcessEntry]) -> None:
+    living = [
+        f"{entry.role} {entry.name} (pid {entry.pid})"
+        for entry in processes
+        if Path(entry.run_directory).resolve().is_relative_to(run.path)
+    ]
+    if living:
+        shown = ", ".join(living[:LIVING_SHOWN_MAX])
+        more = (
+            f" and {len(living) - LIVING_SHOWN_MAX} more" if len(living) > LIVING_SHOWN_MAX else ""
+        )
+        raise InputError(
+            f"{run.name} is still running: {shown}{more}; wait for its end, or end it with: cosmos down"
+        )
+
+
+def _evidence(run: RunDirectory, gathered: Gathered, end: RunEnd, expected: Expected) -> Evidence:
+    tables = open_tables(run.tables)
+    missing = find_missing(expected, gathered.scans, end.result)
+    return Evidence(
+        run=run.name,
+        started=run.read_json(run.run_json) or {},
+        config=run.read_config(),
+        expected=expected,
+        result=end.result,
+        interrupted=end.interrupted,
+        problems=end.problems,
+        scans=gathered.scans,
+        ticks=tick_statistics(tables.get("ticks")),
+        round_trip_ms=round_trip_statistics(tables),
+        clock=clock_statistics(tables.get("clock")),
+        missing=(*missing, *gathered.faults),
+    )
+
+
+def _conclude(
+    run: RunDirectory, gathered: Gathered, evidence: Evidence, progress: Progress
+) -> RunSummary:
+    progress("writing the report", 0.0)
+    _, document = evidence.judged()
+    evidence = _attempt(evidence, run.report_html, lambda: write_report(run, document))
+    # From here on what matters most is written, and the reserve makes room for it.
+    run.free_reserve()
+    summary = _write_summary(run, gathered, evidence)
+    progress("packing", 0.0)
+    packed = _attempt(evidence, run.bundle, lambda: pack_run(run, _start_s(document)))
+    if packed is not evidence:
+        summary = _write_summary(run, gathered, packed)
+    progress("packing", 1.0)
+    return summary
+
+
+def _attempt(evidence: Evidence, path: Path, write: Callable[[], object]) -> Evidence:
+    """Return *evidence*, with one more gap if the file cannot be written."""
+    try:
+        write()
+    except OSError as error:
+        gap = f"{path.name}: not written: {error.strerror or error}"
+        return dataclasses.replace(evidence, missing=(*evidence.missing, gap))
+    return evidence
+
+
+def _write_summary(run: RunDirectory, gathered: Gathered, evidence: Evidence) -> RunSummary:
+    verdict, document = evidence.judged()
+    try:
+        write_json(run.run_json, document)
+        write_json(run.manifest_json, build_manifest(run, gathered.by_path()))
+    except OSError as error:
+        raise RunFailedError(
+            f"{run.path}: the summary cannot be written: {error.strerror or error}; the verdict was: "
+            f"{verdict.text}; make room and repeat with: cosmos collect {run.path}"
+        ) from error
+    return RunSummary(run=run, verdict=verdict, document=document)
+
+
+def _start_s(document: Mapping[str, Any]) -> int:
+    """Return the run's start in seconds since 1970; 0 if it is not known."""
+    try:
+        return int(datetime.datetime.fromisoformat(str(document["started_utc"])).timestamp())
+    except ValueError:
+        return 0

@@ -1,0 +1,123 @@
+"""What a run must have recorded, and what of it is missing, cut or dropped. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import PurePath
+from typing import Any
+
+from cosmos_cli.rundir import RunDirectory
+from cosmos_cli.streams import StreamScan
+from madns_runtime.config import RunConfig
+from madns_runtime.recording.records import CLOCK, EVENTS, HEALTH, LOG, PROCESS, TICKS
+
+AGENT_STREAMS = tuple(schema.name for schema in (TICKS, CLOCK, EVENTS, LOG, PROCESS))
+HOST_STREAMS = tuple(schema.name for schema in (EVENTS, LOG))
+MACHINE_STREAMS = (HEALTH.name,)
+FAULTS_SHOWN_MAX = 3
+HOST = "host"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Expected:
+    """Who should have recorded, and which streams at least; a simulation's own are in the summaries."""
+
+    agents: tuple[str, ...] = ()
+    machines: tuple[str, ...] = ()
+    agent_streams: tuple[str, ...] = AGENT_STREAMS
+    host_streams: tuple[str, ...] = HOST_STREAMS
+    machine_streams: tuple[str, ...] = MACHINE_STREAMS
+
+    @classmethod
+    def of(cls, config: RunConfig, machines: Iterable[str]) -> Expected:
+        """Return what a run of this configuration on these machines must have recorded."""
+        return cls(agents=config.agents.resolved_names(), machines=tuple(machines))
+
+    @classmethod
+    def read(cls, run: RunDirectory) -> Expected:
+        """Return what plan.json promises; of an unreadable plan nothing but the host's own records."""
+        config, plan = run.read_config(), run.read_json(run.plan_json) or {}
+        machines = plan.get("machines")
+        names = tuple(machines) if isinstance(machines, Mapping) else ()
+        return cls.of(config, names) if config else cls(machines=names)
+
+
+def find_missing(
+    expected: Expected, scans: Sequence[StreamScan], result: Mapping[str, Any] | None
+) -> list[str]:
+    """
+    Return one line a source whose data are not all there, each starting with its name.
+
+    Args:
+        expected: Who should have recorded what.
+        scans: What is there.
+        result: What the host reported; None if it could not, which is itself a gap.
+    """
+    agents = mapping_at(result, "agents")
+    faults: dict[str, list[str]] = {HOST: [] if result is not None else ["no result"]}
+    _check_source(faults, HOST, _streams_of(scans, HOST), expected.host_streams, result)
+    for name in expected.agents:
+        found = [scan for scan in scans if scan.file.role == "agent" and scan.file.source == name]
+        _check_source(faults, name, found, expected.agent_streams, mapping_at(agents, name))
+    for name in expected.machines:
+        found = [scan for scan in scans if scan.file.role == "machine" and scan.file.source == name]
+        _check_source(faults, name, found, expected.machine_streams, None)
+    _check_uninvited(faults, scans, expected)
+    return [f"{name}: {_listed(found)}" for name, found in faults.items() if found]
+
+
+def mapping_at(mapping: Mapping[str, Any] | None, *keys: str) -> Mapping[str, Any]:
+    """Return the mapping under nested keys; an empty one if any is missing or something else."""
+    value: Any = mapping
+    for key in keys:
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return value if isinstance(value, Mapping) else {}
+
+
+def _streams_of(scans: Sequence[StreamScan], role: str) -> list[StreamScan]:
+    return [scan for scan in scans if scan.file.role == role]
+
+
+def _check_source(
+    faults: dict[str, list[str]],
+    name: str,
+    scans: Sequence[StreamScan],
+    streams: Sequence[str],
+    summary: Mapping[str, Any] | None,
+) -> None:
+    found = faults.setdefault(name, [])
+    if not scans:
+        found.append("no records")
+        return
+    have = {scan.file.stream for scan in scans}
+    paths = {scan.file.path.name for scan in scans}
+    reported = mapping_at(summary, "records", "streams")
+    for stream in dict.fromkeys((*streams, *map(str, reported))):
+        counts = mapping_at(reported, stream)
+        file = PurePath(str(counts.get("file", ""))).name
+        if stream not in have or (file and file not in paths):
+            found.append(f"{stream} is missing")
+    errors = mapping_at(summary, "records").get("errors")
+    why = f" ({errors[0]})" if isinstance(errors, Sequence) and errors else ""
+    found.extend(_told(scan) + why for scan in scans if scan.fault)
+
+
+def _check_uninvited(
+    faults: dict[str, list[str]], scans: Sequence[StreamScan], expected: Expected
+) -> None:
+    """Judge also what a source recorded that no plan names: a plan may be lost, its data are not."""
+    known = {HOST, *expected.agents, *expected.machines}
+    for scan in scans:
+        if scan.file.source not in known and scan.fault:
+            faults.setdefault(scan.file.source, []).append(_told(scan))
+
+
+def _told(scan: StreamScan) -> str:
+    life = f" of incarnation {scan.file.incarnation}" if scan.file.incarnation > 1 else ""
+    return f"{scan.file.stream}{life} {scan.fault}"
+
+
+def _listed(items: Sequence[str]) -> str:
+    rest = len(items) - FAULTS_SHOWN_MAX
+    return ", ".join(items[:FAULTS_SHOWN_MAX]) + (f" and {rest} more" if rest > 0 else "")

@@ -1,0 +1,192 @@
+"""run.json: what is promised to scripts, put together from evidence. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import orjson
+
+from cosmos_cli.expectation import Expected, mapping_at
+from cosmos_cli.rundir import SCHEMA
+from cosmos_cli.statistics import TickStatistics, TickTotals, tick_totals
+from cosmos_cli.streams import StreamScan
+from cosmos_cli.verdict import Facts, Limits, Verdict, is_number, judge, plugin_checks
+from madns_runtime.config import RunConfig
+
+SERVICES = ("best", "reliable", "sync")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """All that a summary is made of."""
+
+    run: str
+    started: Mapping[str, Any]
+    """run.json as it was written at the start, or as it is."""
+    config: RunConfig | None
+    expected: Expected
+    result: Mapping[str, Any] | None
+    """What the host reported; None if it could not."""
+    scans: Sequence[StreamScan]
+    ticks: TickStatistics
+    round_trip_ms: Mapping[str, Any] = field(default_factory=dict)
+    clock: Mapping[str, float] = field(default_factory=dict)
+    interrupted: bool = False
+    problems: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
+
+    def judged(self) -> tuple[Verdict, dict[str, Any]]:
+        """Return the verdict and run.json."""
+        totals = self._totals()
+        verdict = judge(self._facts(totals), self._limits())
+        return verdict, _plain(self._document(verdict, totals))
+
+    def _totals(self) -> TickTotals:
+        agents = mapping_at(self.result, "agents")
+        names = tuple(dict.fromkeys((*self.expected.agents, *self.ticks.agents)))
+        due_each = None
+        if self.config is not None and self.result and self.result.get("status") == "complete":
+            due_each = int(self.config.time.duration_s * self.config.agents.tick_hz)
+        counters = {name: mapping_at(agents, name, "ticks") for name in names}
+        return tick_totals(self.ticks.agents, counters, agents=names, due_each=due_each)
+
+    def _limits(self) -> Limits:
+        if self.config is None:
+            return Limits()
+        return Limits(
+            miss_ratio_max=self.config.deadline.max_miss_ratio,
+            rtf_tolerance=self.config.time.rtf_tolerance,
+        )
+
+    def _facts(self, totals: TickTotals) -> Facts:
+        result = self.result or {}
+        messages = mapping_at(result, "messages")
+        of_machines = tuple(text for text in self.problems if self._is_of_machine(text))
+        return Facts(
+            host_status=_text(result.get("status")),
+            who=_text(result.get("who")),
+            reason=_text(result.get("reason")),
+            interrupted=self.interrupted,
+            lost_agents=self._lost(),
+            machine_problems=of_machines,
+            problems=tuple(text for text in self.problems if text not in of_machines),
+            missing=self.missing,
+            miss_ratio=totals.miss_ratio,
+            overrun_ratio=totals.overrun_ratio,
+            rtf=_number(result.get("rtf")),
+            reliable_lost=_count(messages, "reliable", "lost"),
+            sync_lost=_count(messages, "sync", "lost"),
+            sync_deadlines_broken=_count(messages, "sync", "deadlines_broken"),
+            records_dropped=sum(scan.dropped for scan in self.scans),
+            records_truncated=sum(scan.truncated for scan in self.scans),
+            plugin_checks=tuple(self._plugin_checks()),
+        )
+
+    def _plugin_checks(self) -> list[Any]:
+        agents = mapping_at(self.result, "agents")
+        of_agents = [mapping_at(agents, name, "simulation") for name in agents]
+        return plugin_checks([mapping_at(self.result, "simulation")]) + plugin_checks(of_agents)
+
+    def _lost(self) -> tuple[str, ...]:
+        lost = (self.result or {}).get("lost")
+        return tuple(map(str, lost)) if isinstance(lost, Sequence | Mapping) else ()
+
+    def _is_of_machine(self, problem: str) -> bool:
+        return any(problem.startswith((f"{name}:", f"{name} (")) for name in self.expected.machines)
+
+    def _document(self, verdict: Verdict, totals: TickTotals) -> dict[str, Any]:
+        result = self.result or {}
+        config = self.config
+        return {
+            "schema": SCHEMA,
+            "run": self.run,
+            "scenario": config.scenario if config else self.started.get("scenario"),
+            "status": verdict.status,
+            "exit_code": int(verdict.exit_code),
+            "verdict": verdict.text,
+            "who": verdict.who,
+            "reason": verdict.reason,
+            "agents": self._agents(),
+            "started_utc": self.started.get("started_utc"),
+            "t0_utc": result.get("t0_utc"),
+            "duration_s": result.get("duration_s"),
+            "rtf": result.get("rtf"),
+            "seed": config.seed if config else self.started.get("seed"),
+            "versions": self.started.get("versions", {}),
+            "timing": self._timing(totals),
+            "messages": {name: mapping_at(result, "messages", name) for name in SERVICES},
+            "round_trip_ms": self.round_trip_ms,
+            "clock": self.clock,
+            "records": self._records(),
+            "data": {"complete": not self.missing, "missing": list(self.missing)},
+            "problems": list(self.problems),
+            "checks": [check.to_mapping() for check in verdict.checks],
+            "scheduling": result.get("scheduling", {}),
+            "simulation": self._simulation(),
+        }
+
+    def _agents(self) -> dict[str, Any]:
+        agents = mapping_at(self.result, "agents")
+        restarted = {
+            name: agent["incarnations"]
+            for name in agents
+            if is_number((agent := mapping_at(agents, name)).get("incarnations"))
+            and agent["incarnations"] > 1
+        }
+        count = len(self.expected.agents) or len(self.ticks.agents)
+        return {"count": count, "lost": list(self._lost()), "incarnations": restarted}
+
+    def _timing(self, totals: TickTotals) -> dict[str, Any]:
+        return {
+            "ticks": totals.due,
+            "missed": totals.missed,
+            "miss_ratio": totals.miss_ratio,
+            "overrun_errors": totals.overrun_errors,
+            "lateness_ms": self.ticks.lateness_ms,
+            "margin_ms": self.ticks.margin_ms,
+        }
+
+    def _records(self) -> dict[str, int]:
+        return {
+            "written": sum(scan.records for scan in self.scans),
+            "dropped": sum(scan.dropped for scan in self.scans),
+            "truncated": sum(scan.truncated for scan in self.scans),
+            "damaged": sum(scan.damaged for scan in self.scans),
+            "bytes": sum(scan.size_bytes for scan in self.scans),
+        }
+
+    def _simulation(self) -> dict[str, Any]:
+        agents = mapping_at(self.result, "agents")
+        own = {name: mapping_at(agents, name, "simulation") for name in agents}
+        return {"host": mapping_at(self.result, "simulation"), "agents": own}
+
+
+def _plain(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what JSON holds of a document: a plug-in's summary may carry NaN, arrays, tuples."""
+    data = orjson.dumps(
+        document, default=_last_resort, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_NON_STR_KEYS
+    )
+    return orjson.loads(data)  # type: ignore[no-any-return]
+
+
+def _last_resort(value: Any) -> Any:
+    return dict(value) if isinstance(value, Mapping) else str(value)
+
+
+def _text(value: object) -> str | None:
+    return value if isinstance(value, str) else None
+
+
+def _number(value: object) -> float | None:
+    return float(value) if is_number(value) else None
+
+
+def _count(messages: Mapping[str, Any], service: str, name: str) -> int | None:
+    """Return a count; None if the class was not reported at all, 0 if it never counted anything."""
+    counts = messages.get(service)
+    if not isinstance(counts, Mapping):
+        return None
+    value = counts.get(name, 0)
+    return int(value) if is_number(value) else None

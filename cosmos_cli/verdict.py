@@ -1,0 +1,200 @@
+"""
+The verdict on a run: facts in, checks, status and exit code out. Pure; no file, no clock.
+
+A run is green only when it completed, every machine answered, all data are there and every check
+holds: what could not be measured counts as not held.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeGuard
+
+from cosmos_cli.errors import ExitCode
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckResult:
+    """One line of the verdict; got is None when it could not be measured."""
+
+    name: str
+    limit: float
+    got: float | None
+    passed: bool
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the check as run.json holds it."""
+        return {"name": self.name, "limit": self.limit, "got": self.got, "passed": self.passed}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """What the scenario allows."""
+
+    miss_ratio_max: float = 1e-3
+    rtf_tolerance: float = 1e-3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Facts:
+    """All that a verdict depends on."""
+
+    host_status: str | None
+    """What the host said of itself; None when it ended without saying anything."""
+    who: str | None = None
+    reason: str | None = None
+    interrupted: bool = False
+    lost_agents: tuple[str, ...] = ()
+    machine_problems: tuple[str, ...] = ()
+    """One line a machine that could not be reached or failed, each starting with its name."""
+    problems: tuple[str, ...] = ()
+    """What else did not go as it should, such as a process that had to be killed."""
+    missing: tuple[str, ...] = ()
+    """One line a source whose data are missing, cut or dropped, each starting with its name."""
+    miss_ratio: float | None = None
+    overrun_ratio: float | None = None
+    rtf: float | None = None
+    reliable_lost: int | None = None
+    sync_lost: int | None = None
+    sync_deadlines_broken: int | None = None
+    records_dropped: int = 0
+    records_truncated: int = 0
+    plugin_checks: tuple[CheckResult, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """What is said of a run."""
+
+    status: str
+    exit_code: ExitCode
+    text: str
+    """One line for people: who and why."""
+    who: str | None
+    reason: str | None
+    checks: tuple[CheckResult, ...]
+
+    @property
+    def broken(self) -> tuple[CheckResult, ...]:
+        """The checks that do not hold."""
+        return tuple(check for check in self.checks if not check.passed)
+
+
+def judge(facts: Facts, limits: Limits) -> Verdict:
+    """Judge a run: 130 before 1, then 3, 5, 4, and 0 only when there is nothing to say."""
+    checks = run_checks(facts, limits)
+    status = run_status(facts)
+    who, reason = facts.who, facts.reason
+    if facts.host_status is None and status != "interrupted":
+        who, reason = who or "host", reason or "it ended without a result; was it killed?"
+    code, text = _conclude(facts, status, checks, _blame(who, reason))
+    return Verdict(
+        status=status, exit_code=code, text=text, who=who, reason=reason, checks=tuple(checks)
+    )
+
+
+def run_status(facts: Facts) -> str:
+    """Return complete, failed, aborted or interrupted."""
+    if facts.interrupted or facts.host_status == "interrupted":
+        return "interrupted"
+    if facts.host_status in ("complete", "failed", "aborted"):
+        return facts.host_status
+    return "failed"
+
+
+def run_checks(facts: Facts, limits: Limits) -> list[CheckResult]:
+    """Return every check of the framework, then those of the simulation."""
+    rtf_error = None if facts.rtf is None else abs(facts.rtf - 1.0)
+    checks = [
+        at_most("agents.lost", 0, len(facts.lost_agents)),
+        at_most("deadline.miss_ratio", limits.miss_ratio_max, facts.miss_ratio),
+        at_most("deadline.overrun_ratio", limits.miss_ratio_max, facts.overrun_ratio),
+        at_most("time.rtf", limits.rtf_tolerance, rtf_error),
+        at_most("messages.reliable.lost", 0, facts.reliable_lost),
+        at_most("messages.sync.lost", 0, facts.sync_lost),
+        at_most("messages.sync.deadlines_broken", 0, facts.sync_deadlines_broken),
+        at_most("records.dropped", 0, facts.records_dropped),
+        at_most("records.truncated", 0, facts.records_truncated),
+    ]
+    return checks + list(facts.plugin_checks)
+
+
+def at_most(name: str, limit: float, got: float | None) -> CheckResult:
+    """Return the check that *got* was measured and is not above *limit*."""
+    # The comparison is written so that a NaN does not pass.
+    return CheckResult(name=name, limit=limit, got=got, passed=got is not None and got <= limit)
+
+
+def plugin_checks(summaries: Sequence[Mapping[str, Any]], *, prefix: str = "") -> list[CheckResult]:
+    """
+    Return the plug-in's own checks over the host's or all agents' summaries, the worst of each name.
+
+    Worst is a check that did not pass, then the one with the largest excess over its limit. A check
+    that is no proper `Check` mapping is a broken one: a verdict must not depend on a typing slip.
+    """
+    worst: dict[str, CheckResult] = {}
+    for summary in summaries:
+        listed = summary.get("checks")
+        for item in listed if isinstance(listed, Sequence) else ():
+            check = _parse_check(item, prefix)
+            known = worst.get(check.name)
+            if known is None or _badness(check) > _badness(known):
+                worst[check.name] = check
+    return list(worst.values())
+
+
+def _parse_check(item: Any, prefix: str) -> CheckResult:
+    mapping = item if isinstance(item, Mapping) else {}
+    name = prefix + str(mapping.get("name", "unnamed check"))
+    limit, got, passed = (mapping.get(key) for key in ("limit", "got", "passed"))
+    if is_number(limit) and is_number(got) and isinstance(passed, bool):
+        return CheckResult(name=name, limit=limit, got=got, passed=passed)
+    return CheckResult(name=name, limit=limit if is_number(limit) else 0, got=None, passed=False)
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Tell whether a value from a file is a finite number; JSON knows no other, msgpack does."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _badness(check: CheckResult) -> tuple[bool, float]:
+    excess = float("inf") if check.got is None else abs(check.got - check.limit)
+    return (not check.passed, excess if not check.passed else -excess)
+
+
+def _blame(who: str | None, reason: str | None) -> str:
+    if who and reason:
+        return f"{who}: {reason}"
+    return who or reason or "no reason was given"
+
+
+def _conclude(
+    facts: Facts, status: str, checks: Sequence[CheckResult], blame: str
+) -> tuple[ExitCode, str]:
+    if status == "interrupted":
+        return ExitCode.INTERRUPTED, f"INTERRUPTED by {facts.who or 'the operator'}"
+    if status != "complete":
+        return ExitCode.RUN_FAILED, f"{status.upper()}: {blame}"
+    if facts.machine_problems:
+        return ExitCode.MACHINES, f"MACHINES FAILED: {_listed(facts.machine_problems)}"
+    if facts.missing:
+        return ExitCode.DATA_INCOMPLETE, f"DATA INCOMPLETE: {_listed(facts.missing)}"
+    broken = [check for check in checks if not check.passed]
+    if broken:
+        return ExitCode.BUDGET_BROKEN, f"CHECK BROKEN: {_listed([_told(c) for c in broken])}"
+    if facts.problems:
+        return ExitCode.MACHINES, f"NOT CLEAN: {_listed(facts.problems)}"
+    return ExitCode.OK, f"PASSED: {len(checks)} checks hold"
+
+
+def _told(check: CheckResult) -> str:
+    got = "not measured" if check.got is None else f"{check.got:g}"
+    return f"{check.name} {got} (limit {check.limit:g})"
+
+
+def _listed(items: Sequence[str], shown_max: int = 3) -> str:
+    rest = len(items) - shown_max
+    more = f"; and {rest} more" if rest > 0 else ""
+    return "; ".join(items[:shown_max]) + more

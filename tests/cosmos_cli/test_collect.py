@@ -1,0 +1,320 @@
+import tarfile
+
+import orjson
+import pyarrow.parquet as pq
+import pytest
+import zstandard
+from synthetic_run import SyntheticRun, make_config
+
+from cosmos_cli.collect import RunEnd, collect_run, finish_run
+from cosmos_cli.errors import InputError
+from madns_runtime.processes import ProcessEntry
+
+
+def finish(made, **changes):
+    return finish_run(made.run, RunEnd(result=made.result(**changes)), made.expected)
+
+
+def read(path):
+    return orjson.loads(path.read_bytes())
+
+
+def failed_checks(summary):
+    return [check["name"] for check in summary.document["checks"] if not check["passed"]]
+
+
+def test_whole_run_is_green_and_leaves_all_its_evidence(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+
+    summary = finish(made)
+
+    assert summary.exit_code == 0, summary.verdict.text
+    document = read(made.run.run_json)
+    assert document == summary.document
+    assert document["status"] == "complete"
+    assert document["timing"]["ticks"] == 400
+    assert document["timing"]["missed"] == 0
+    assert document["records"]["truncated"] == 0
+    assert document["data"] == {"complete": True, "missing": []}
+    assert document["round_trip_ms"]["count"] == 400
+    assert made.run.report_html.exists()
+    assert made.run.bundle.exists()
+    assert not made.run.reserve.exists()
+
+
+def test_run_json_holds_every_promised_key(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+
+    document = finish(made).document
+
+    promised = (
+        "schema run scenario status exit_code agents started_utc duration_s rtf seed versions timing "
+        "messages round_trip_ms clock records checks simulation"
+    )
+    assert set(promised.split()) <= set(document)
+    assert {"count", "lost"} <= set(document["agents"])
+    assert {"ticks", "missed", "miss_ratio", "lateness_ms", "margin_ms"} <= set(document["timing"])
+    assert {"p50", "p99", "p999", "max"} <= set(document["timing"]["lateness_ms"])
+    assert {"sent", "received", "lost"} <= set(document["messages"]["reliable"])
+    assert {"offset_us_max", "uncertainty_us_max"} <= set(document["clock"])
+    assert {"written", "dropped", "truncated"} <= set(document["records"])
+
+
+def test_killed_agent_under_continue_makes_data_incomplete_and_is_named(tmp_path):
+    made = SyntheticRun(tmp_path, make_config(3)).write()
+    made.kill("agent-02")
+    result = made.result(lost=["agent-02"])
+    result["agents"]["agent-02"] = {"state": "lost", "reason": "no sign of life for 2.5 s"}
+
+    summary = finish_run(made.run, RunEnd(result=result), made.expected)
+
+    assert summary.exit_code == 5
+    assert len(summary.missing) == 1
+    assert summary.missing[0].startswith("agent-02: ")
+    assert "cut after" in summary.missing[0]
+    assert summary.document["agents"]["lost"] == ["agent-02"]
+    assert {"agents.lost", "records.truncated", "deadline.miss_ratio"} <= set(
+        failed_checks(summary)
+    )
+
+
+def test_agent_without_records_is_named(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    for path in (made.run.path / "agents/agent-01").iterdir():
+        path.unlink()
+
+    summary = finish(made)
+
+    assert summary.exit_code == 5
+    assert summary.missing == ("agent-01: no records",)
+
+
+def test_stream_that_an_agent_reported_and_that_is_not_there_is_named(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    made.stream("agent-02", "round_trips").unlink()
+
+    summary = finish(made)
+
+    assert summary.exit_code == 5
+    assert summary.missing == ("agent-02: round_trips is missing",)
+
+
+def test_damaged_line_is_counted_and_the_rest_is_kept(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    path = made.stream("agent-01", "ticks")
+    lines = path.read_bytes().split(b"\n")
+    lines[50] = lines[50][:7]
+    path.write_bytes(b"\n".join(lines))
+
+    summary = finish(made)
+
+    assert summary.exit_code == 5
+    assert summary.missing == ("agent-01: ticks 1 damaged line(s)",)
+    entry = read(made.run.manifest_json)["files"]["agents/agent-01/ticks.jsonl"]
+    assert entry["records"] == made.ticks - 1
+    assert entry["lost"] == 1
+    assert entry["truncated"] is True
+    assert pq.read_metadata(made.run.tables / "ticks.parquet").num_rows == 2 * made.ticks - 1
+
+
+def test_records_that_the_recorder_dropped_make_data_incomplete_and_say_why(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    path = made.stream("agent-01", "ticks")
+    end = orjson.dumps({"end": {"records": made.ticks, "dropped": 17, "not_finite": 0}})
+    path.write_bytes(b"\n".join([*path.read_bytes().split(b"\n")[:-2], end, b""]))
+    made.records["agent-01"]["errors"] = ["ticks.jsonl: No space left on device"]
+
+    summary = finish(made)
+
+    assert summary.exit_code == 5
+    assert "17 records were dropped" in summary.missing[0]
+    assert "No space left on device" in summary.missing[0]
+    assert summary.document["records"]["dropped"] == 17
+
+
+def test_host_that_ended_without_a_result_fails_the_run_and_collect_says_data_incomplete(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    for path in (made.run.path / "host").iterdir():
+        made.cut(path, path.stat().st_size - 3)
+
+    summary = finish_run(made.run, RunEnd(result=None), made.expected)
+
+    assert summary.exit_code == 1
+    assert summary.verdict.text.startswith("FAILED: host: ")
+    assert summary.missing[0].startswith("host: no result")
+    again = collect_run(made.run, processes=lambda: [])
+    assert again.missing == summary.missing
+    assert made.run.bundle.exists()
+
+
+def test_run_directory_that_was_cut_off_at_once_is_still_collected(tmp_path):
+    made = SyntheticRun(tmp_path)
+
+    summary = collect_run(made.run, processes=lambda: [])
+
+    assert summary.exit_code == 1
+    assert {line.split(":")[0] for line in summary.missing} == {
+        "host",
+        "agent-01",
+        "agent-02",
+        "loopback",
+    }
+
+
+def test_later_incarnation_is_in_the_table_and_its_predecessor_is_named_as_cut(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    made.kill("agent-01")
+    made.write_agent("agent-01", first=150)
+
+    summary = finish(made)
+
+    assert summary.exit_code == 5
+    table = pq.read_table(made.run.tables / "ticks.parquet", columns=["agent", "incarnation"])
+    rows = table.filter(pq.filters_to_expression([("agent", "==", "agent-01")])).to_pydict()
+    assert set(rows["incarnation"]) == {1, 2}
+    assert rows["incarnation"].count(2) == 50
+    assert "agents/agent-01/ticks.2.jsonl" in read(made.run.manifest_json)["files"]
+
+
+def test_interrupted_run_ends_with_130_also_when_it_is_collected_again(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+
+    first = finish_run(
+        made.run, RunEnd(result=made.result(status="aborted"), interrupted=True), made.expected
+    )
+    second = collect_run(made.run, processes=lambda: [])
+
+    assert (first.exit_code, second.exit_code) == (130, 130)
+    assert second.document["status"] == "interrupted"
+
+
+def test_collecting_twice_gives_the_same_summary_and_the_same_package(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    first = finish(made)
+    package = made.run.bundle.read_bytes()
+
+    second = collect_run(made.run, processes=lambda: [])
+
+    assert second.document == first.document
+    assert made.run.bundle.read_bytes() == package
+
+
+def test_collect_refuses_while_a_process_of_the_run_lives(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    living = ProcessEntry(
+        run=made.run.name,
+        role="agent",
+        name="agent-02",
+        pid=4242,
+        start_ticks=1,
+        boot_id="x",
+        node="n",
+        run_directory=str(made.run.path),
+        utc="",
+    )
+
+    with pytest.raises(InputError, match=r"agent agent-02 \(pid 4242\)"):
+        collect_run(made.run, processes=lambda: [living])
+
+
+def test_problem_of_a_machine_ends_with_3_and_names_it(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+
+    summary = finish_run(
+        made.run,
+        RunEnd(result=made.result(), problems=("loopback: supervisor was killed by signal 9",)),
+        made.expected,
+    )
+
+    assert summary.exit_code == 3
+    assert "loopback: supervisor" in summary.verdict.text
+
+
+def test_missed_ticks_break_the_deadline_check(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    result = made.result()
+    for agent in result["agents"].values():
+        agent["ticks"] |= {"due": made.ticks + 2, "missed": 2}
+
+    summary = finish_run(made.run, RunEnd(result=result), made.expected)
+
+    assert summary.exit_code == 4
+    assert failed_checks(summary) == ["deadline.miss_ratio"]
+    assert summary.document["timing"]["missed"] == 4
+
+
+def test_broken_check_of_a_plug_in_is_judged_by_its_worst_agent(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    result = made.result()
+    check = {"name": "counter.lost", "limit": 0, "got": 3, "passed": False}
+    result["agents"]["agent-02"]["simulation"]["checks"] = [check]
+
+    summary = finish_run(made.run, RunEnd(result=result), made.expected)
+
+    assert summary.exit_code == 4
+    assert check in summary.document["checks"]
+
+
+def test_manifest_lists_every_file_with_its_hash_but_not_the_reserve(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+
+    finish(made)
+
+    files = read(made.run.manifest_json)["files"]
+    assert {"run.json", "plan.json", "result.json", "report.html", "tables/ticks.parquet"} <= set(
+        files
+    )
+    assert not any("reserve" in name for name in files)
+    assert all(len(entry["sha256"]) == 64 for entry in files.values())
+    ticks = files["agents/agent-01/ticks.jsonl"]
+    assert (ticks["records"], ticks["lost"], ticks["closed"]) == (made.ticks, 0, True)
+
+
+def test_package_holds_the_run_under_its_name(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+
+    finish(made)
+
+    with made.run.bundle.open("rb") as raw:
+        stream = zstandard.ZstdDecompressor().stream_reader(raw)
+        with tarfile.open(fileobj=stream, mode="r|") as archive:
+            members = [(m.name, m.mode, m.uid) for m in archive]
+    names = [name for name, _, _ in members]
+    assert names == sorted(names)
+    assert {f"{made.run.name}/run.json", f"{made.run.name}/manifest.json"} <= set(names)
+    assert all((mode, uid) == (0o644, 0) for _, mode, uid in members)
+
+
+def test_full_disk_still_gets_a_summary_that_names_what_is_not_written(tmp_path, monkeypatch):
+    made = SyntheticRun(tmp_path).write()
+
+    def refuse(*_arguments, **_more):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("cosmos_cli.gather.TableWriter", refuse)
+    monkeypatch.setattr("cosmos_cli.collect.write_report", refuse)
+    monkeypatch.setattr("cosmos_cli.collect.pack_run", refuse)
+
+    summary = finish(made)
+
+    assert summary.exit_code == 5
+    text = "\n".join(read(made.run.run_json)["data"]["missing"])
+    assert "tables/ticks.parquet: not written" in text
+    assert "report.html: not written" in text
+    assert f"{made.run.bundle.name}: not written" in text
+    assert made.run.manifest_json.exists()
+
+
+def test_progress_tells_of_every_long_step(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    told = []
+
+    finish_run(
+        made.run,
+        RunEnd(result=made.result()),
+        made.expected,
+        progress=lambda what, share: told.append((what.split()[0], share)),
+    )
+
+    assert {"reading", "writing", "packing"} <= {what for what, _ in told}
+    assert all(0 <= share <= 1 for _, share in told)
