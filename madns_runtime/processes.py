@@ -218,6 +218,8 @@ def _check(path: Path) -> ProcessEntry | None:
     if match is None:
         return None
     entry = _read_entry(path)
+    if entry is not None and (entry.pid, entry.start_ticks) != (int(match[1]), int(match[2])):
+        entry = None  # Not written by the process that the file is named after.
     if entry is not None and entry.node != platform.node():
         return None  # Of another machine that shares this directory: not ours to judge.
     is_dead = read_start_ticks(int(match[1])) != int(match[2])

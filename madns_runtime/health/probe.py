@@ -7,7 +7,6 @@ offer is None, never an error.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import resource
 import time

@@ -78,13 +78,14 @@ class StreamFile:
     __slots__ = (
         "_control_left",
         "_descriptor",
-        "_has_t0",
         "_pending",
         "_pending_cost",
         "_whole_bytes",
         "bytes_written",
         "direct",
         "freed_bytes",
+        "has_header",
+        "has_t0",
         "lines",
         "not_finite",
         "overflowed",
@@ -109,12 +110,15 @@ class StreamFile:
         self.bytes_written = 0
         self.freed_bytes = 0
         """Buffered bytes that have left the buffer, ever."""
+        self.has_header = False
+        """Whether line 1 is written, or about to be."""
+        self.has_t0 = False
+        """Whether the file states simulated time zero, or is about to."""
         self._descriptor = descriptor
         self._pending: bytes = b""
         self._pending_cost = 0
         self._control_left = 0
         self._whole_bytes = 0
-        self._has_t0 = False
 
     @property
     def dropped(self) -> int:
@@ -170,40 +174,35 @@ class StreamFile:
 
     # What follows is called by the writer thread, or once it has ended.
 
-    def write_waiting(self, header: bytes, t0_line: bytes | None) -> None:
+    def write_waiting(self, head: bytes, *, has_t0: bool) -> None:
         """
         Write all that waits at this moment.
 
         Args:
-            header: Line 1, used if none was written yet.
-            t0_line: The line that states simulated time zero; None while it is unknown.
+            head: A line that comes first and is no record; empty for none.
+            has_t0: Whether simulated time zero is stated by that line or one before it.
 
         Raises:
             OSError: The file takes no more for now; the rest waits, and the next call goes on
                 where this one stopped, be it within a line.
         """
         self._write_pending()
-        control = []
-        if not self.bytes_written:
-            control.append(header)
-        elif t0_line is not None and not self._has_t0:
-            control.append(t0_line)
-        self._has_t0 = t0_line is not None
         left = len(self.lines)
-        while control or left > 0:
+        while head or left > 0:
             count = min(left, LINES_PER_WRITE_MAX)
-            self._take(control, count)
-            control = []
+            self._take(head, count)
+            self.has_header = True
+            self.has_t0 = has_t0
+            head = b""
             left -= count
             self._write_pending()
 
-    def _take(self, control: list[bytes], count: int) -> None:
-        lines = self.lines[:count]
+    def _take(self, head: bytes, count: int) -> None:
+        text = b"".join(self.lines[:count])
         del self.lines[:count]
-        text = b"".join(lines)
-        self._pending = b"".join((*control, text)) if control else text
-        self._pending_cost = len(text) + LINE_OVERHEAD_BYTES * len(lines)
-        self._control_left = len(control)
+        self._pending = head + text if head else text
+        self._pending_cost = len(text) + LINE_OVERHEAD_BYTES * count
+        self._control_left = 1 if head else 0
 
     def _write_pending(self) -> None:
         while self._pending:

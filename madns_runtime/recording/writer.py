@@ -301,20 +301,25 @@ class Recorder:
 
     def _flush(self) -> bool:
         t0_utc = self._t0_utc
-        t0_line = None
-        if t0_utc is not None:
-            t0_line = orjson.dumps({"t0_utc": t0_utc}, option=orjson.OPT_APPEND_NEWLINE)
         is_well = True
         files = self._files.values()
         for file in files:
-            header = file.schema.header(run=self._run, source=self._source, t0_utc=t0_utc)
             try:
-                file.write_waiting(orjson.dumps(header, None, _ENCODING), t0_line)
+                file.write_waiting(self._head(file, t0_utc), has_t0=t0_utc is not None)
             except OSError as error:
                 self._troubles.add(_describe(file, error))
                 is_well = False
         self._freed_bytes = sum(file.freed_bytes for file in files)
         return is_well
+
+    def _head(self, file: StreamFile, t0_utc: str | None) -> bytes:
+        """Return what the file still lacks at its head: line 1, or the line that states T0, or nothing."""
+        if not file.has_header:
+            header = file.schema.header(run=self._run, source=self._source, t0_utc=t0_utc)
+            return orjson.dumps(header, None, _ENCODING)
+        if t0_utc is not None and not file.has_t0:
+            return orjson.dumps({"t0_utc": t0_utc}, None, _ENCODING)
+        return b""
 
 
 class _Troubles:

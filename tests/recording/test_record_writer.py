@@ -429,8 +429,9 @@ def test_partial_writes_neither_cut_nor_repeat_a_line(tmp_path_factory, seed, re
         for index, count in enumerate(batches):
             file.lines.extend(b"[%d,0.5]\n" % n for n in range(recorded, recorded + count))
             recorded += count
+            head = header if not file.has_header else t0 if index and not file.has_t0 else b""
             try:
-                file.write_waiting(header, t0 if index else None)
+                file.write_waiting(head, has_t0=head == t0 or file.has_t0)
             except OSError:
                 continue
     file.finish()
