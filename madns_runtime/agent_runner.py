@@ -181,6 +181,8 @@ class AgentRunner:
             self._call("receive", self._simulation.receive, event.payload)
         elif isinstance(event, told.ClockEstimated):
             self._record_clock()
+        elif isinstance(event, told.StateEntered):
+            self._event("state", state=event.state.value)
         elif isinstance(event, told.SetupReceived):
             self._set_up(event.initial)
         elif isinstance(event, told.StartReceived):
@@ -198,7 +200,6 @@ class AgentRunner:
     # Carrying out ------------------------------------------------------------------------------
 
     def _set_up(self, initial: Any) -> None:
-        self._event("state", state=self._session.state.value)
         context = RunContext(
             name=self.name,
             config=self._config,
@@ -225,7 +226,7 @@ class AgentRunner:
         )
         now_s = self._simulated_s()
         self._recorder.set_t0(utc_at_iso(-now_s))
-        self._event("state", state=self._session.state.value, phase_s=phase_s)
+        self._event("phase", phase_s=phase_s)
         if now_s > 0:
             self._pacer.skip_to(now_s)
         self._arm_tick()
@@ -260,6 +261,8 @@ class AgentRunner:
                 self._plugin_failed("step", error)
                 self._pump()
                 return
+            # What the step sent leaves before anything else is done.
+            self._send_datagrams()
             margin_s = pacer.end(self._simulated_s())
             self._recorder.record(
                 "ticks",
@@ -270,7 +273,6 @@ class AgentRunner:
                     timing.missed,
                 ),
             )
-            self._send_datagrams()
         self._arm_tick()
 
     def _finish_run(self) -> None:
@@ -313,7 +315,7 @@ class AgentRunner:
         self._close_records()
 
     def _close_records(self) -> None:
-        self._event("end", state=self._session.state.value)
+        self._event("end")
         messages = self._session.link.counters.to_mapping()
         counts = self._recorder.close(self._config.timeouts.shutdown_s)
         self._session.records_closed(

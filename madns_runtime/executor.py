@@ -115,7 +115,9 @@ class JobRunner:
         job = self._submitted_count
         future = self._executor.submit(function, *arguments)
         self._pending[job] = future
-        future.add_done_callback(lambda _: self._reactor.call_soon_threadsafe(lambda: self._done(job)))
+        future.add_done_callback(
+            lambda _: self._reactor.call_soon_threadsafe(lambda: self._done(job))
+        )
         return job
 
     def close(self) -> None:

@@ -122,7 +122,6 @@ class HostRuntime:
         self._plugin_timer = self._reactor.call_at(math.inf, self._plugin_due)
         self._progress_timer = self._reactor.call_at(math.inf, self._progress)
         self._awaits_jobs = False
-        self._state = self._session.state
 
     def run(self) -> int:
         """Run to the end and return the process's exit code."""
@@ -140,7 +139,7 @@ class HostRuntime:
         self._reactor.add_reader(self._socket.fileno(), self._readable)
         address, port = self._socket.address[:2]
         self._operator.emit({"event": "listening", "address": address, "port": port})
-        self._operator.emit({"event": "state", "state": self._state.value})
+        self._operator.emit({"event": "state", "state": self._session.state.value})
         self._progress_timer.reschedule(self._reactor.now_s() + PROGRESS_INTERVAL_S)
         self._pump()
         self._reactor.run()
@@ -169,11 +168,7 @@ class HostRuntime:
             self._handle(event)
         for data, address in session.datagrams_to_send(now_s()):
             self._socket.send(data, address)
-        if session.state is not self._state:
-            self._state = session.state
-            self._event("state", state=self._state.value)
-            self._operator.emit({"event": "state", "state": self._state.value})
-        if self._state is HostState.EXIT:
+        if session.state is HostState.EXIT:
             self._reactor.stop()
             return
         due_s = session.get_timer()
@@ -182,6 +177,9 @@ class HostRuntime:
     def _handle(self, event: told.HostSessionEvent) -> None:
         if isinstance(event, told.DataReceived):
             self._call("receive", self._simulation.receive, event.agent, event.payload)
+        elif isinstance(event, told.StateEntered):
+            self._event("state", state=event.state.value)
+            self._operator.emit({"event": "state", "state": event.state.value})
         elif isinstance(event, told.AgentMoved):
             self._agent_moved(event)
         elif isinstance(event, told.AgentsReady):
@@ -281,7 +279,7 @@ class HostRuntime:
         stop_sampler(self._sampler, timeout_s=2.0)
         self._session.cleaned_up()
         now_s = self._reactor.now_s()
-        self._event("end", state=self._session.state.value)
+        self._event("end")
         self._report.records = self._recorder.close(self._config.timeouts.shutdown_s).to_mapping()
         self._session.records_closed(now_s)
 

@@ -48,6 +48,13 @@ PLUGIN_CHANNEL = 1
 
 
 @dataclass(frozen=True, slots=True)
+class StateEntered:
+    """The agent is in another state now."""
+
+    state: AgentState
+
+
+@dataclass(frozen=True, slots=True)
 class SetupReceived:
     """Initial data came: set up the simulation, then call `setup_finished`."""
 
@@ -99,7 +106,8 @@ class SessionEnded:
 
 
 AgentSessionEvent = (
-    SetupReceived
+    StateEntered
+    | SetupReceived
     | StartReceived
     | DataReceived
     | StopReceived
@@ -177,23 +185,23 @@ class AgentSession:
 
     def setup_finished(self, now_s: float) -> None:
         """Say that the agent's half is set up; the host's start is awaited."""
-        self._machine.fire(AgentEvent.SETUP_FINISHED)
+        self._fire(AgentEvent.SETUP_FINISHED)
         self._state_deadline_s = now_s + self._timeouts.agent_setup_s + self._timeouts.silence_s
         self._heard_s = now_s
         self._send(SimulationReady(), Service.SYNC, now_s)
 
     def run_finished(self, summary: Mapping[str, Any], now_s: float) -> None:
         """Say that the simulated time is over; the host's stop is awaited."""
-        self._machine.fire(AgentEvent.RUN_FINISHED)
+        self._fire(AgentEvent.RUN_FINISHED)
         timeouts = self._timeouts
         self._state_deadline_s = now_s + timeouts.complete_s + timeouts.shutdown_s
         self._send(SimulationComplete(summary), Service.SYNC, now_s)
 
     def records_closed(self, records: Mapping[str, Any], now_s: float) -> None:
         """Say that the records are on disk; the session ends when that is acknowledged."""
-        self._machine.fire(AgentEvent.RECORDS_CLOSED)
+        self._fire(AgentEvent.RECORDS_CLOSED)
         self._send(AgentStopped(records), Service.SYNC, now_s)
-        self._machine.fire(AgentEvent.STOPPED_SAID)
+        self._fire(AgentEvent.STOPPED_SAID)
         self._state_deadline_s = now_s + LINGER_S
 
     def emergency(self, reason: str, now_s: float) -> None:
@@ -264,6 +272,9 @@ class AgentSession:
 
     # Inside --------------------------------------------------------------------------------------
 
+    def _fire(self, event: AgentEvent) -> None:
+        self._events.append(StateEntered(self._machine.fire(event)))
+
     def _send(self, message: Message, service: Service, now_s: float) -> None:
         self.link.send(encode_message(message), service, now_s)
 
@@ -292,20 +303,20 @@ class AgentSession:
 
     def _move(self, event: AgentEvent, outcome: AgentSessionEvent) -> None:
         if self._machine.allows(event):
-            self._machine.fire(event)
+            self._fire(event)
             self._events.append(outcome)
         else:
             self.malformed_count += 1
 
     def _enter_emergency(self, who: str, reason: str) -> None:
         if self._machine.allows(AgentEvent.EMERGENCY):
-            self._machine.fire(AgentEvent.EMERGENCY)
+            self._fire(AgentEvent.EMERGENCY)
             self._state_deadline_s = None
             self._events.append(EmergencyDeclared(who, reason))
 
     def _expelled(self, reason: str) -> None:
         if self._machine.allows(AgentEvent.EMERGENCY):
-            self._machine.fire(AgentEvent.EMERGENCY)
+            self._fire(AgentEvent.EMERGENCY)
             self._state_deadline_s = None
             self._events.append(ExpelledFromRun(reason))
 
@@ -320,7 +331,7 @@ class AgentSession:
         if state is AgentState.WAITING_SERVER_STOP:
             deadline_s = self._state_deadline_s
             if self.link.is_flushed or (deadline_s is not None and now_s >= deadline_s):
-                self._machine.fire(AgentEvent.SERVER_STOPPED)
+                self._fire(AgentEvent.SERVER_STOPPED)
                 self._events.append(SessionEnded())
             return
         if state not in AGENT_LIVE:

@@ -66,6 +66,13 @@ class Phase(Enum):
 
 
 @dataclass(frozen=True, slots=True)
+class StateEntered:
+    """The host is in another state now."""
+
+    state: HostState
+
+
+@dataclass(frozen=True, slots=True)
 class AgentsReady:
     """Every agent has said hello: set up the host's half, then call `setup_finished`."""
 
@@ -143,7 +150,8 @@ class SyncDeadlineBroken:
 
 
 HostSessionEvent = (
-    AgentsReady
+    StateEntered
+    | AgentsReady
     | AgentsSimulationReady
     | AgentMoved
     | AgentLost
@@ -230,7 +238,7 @@ class HostSession:
 
     def setup_finished(self, initial: Mapping[str, Any], now_s: float) -> None:
         """Send each agent its initial data (by name); their readiness is awaited."""
-        self._machine.fire(HostEvent.SETUP_FINISHED)
+        self._fire(HostEvent.SETUP_FINISHED)
         self._enter(now_s, self._timeouts.agent_setup_s)
         for name, data in initial.items():
             if self.peers[name].phase is Phase.READY:
@@ -246,7 +254,7 @@ class HostSession:
 
     def start(self, t0_host_s: float, duration_s: float, now_s: float) -> None:
         """Tell every agent that simulated time zero is *t0_host_s* on the host's monotonic clock."""
-        self._machine.fire(HostEvent.AGENTS_SIMULATION_READY)
+        self._fire(HostEvent.AGENTS_SIMULATION_READY)
         self._t0_host_s = t0_host_s
         self._enter(now_s, t0_host_s - now_s + duration_s + self._timeouts.complete_s)
         for peer in self.peers.values():
@@ -256,7 +264,7 @@ class HostSession:
 
     def order_stop(self, now_s: float) -> None:
         """Tell every agent to flush its records and end."""
-        self._machine.fire(HostEvent.STOP_ORDERED)
+        self._fire(HostEvent.STOP_ORDERED)
         self._enter(now_s, self._timeouts.shutdown_s)
         for peer in self.peers.values():
             if peer.phase is Phase.COMPLETE:
@@ -267,7 +275,7 @@ class HostSession:
         """Declare an emergency and tell every agent; no effect when already ending."""
         if not self._machine.allows(HostEvent.EMERGENCY):
             return
-        self._machine.fire(HostEvent.EMERGENCY)
+        self._fire(HostEvent.EMERGENCY)
         self._enter(now_s, self._timeouts.shutdown_s)
         self._events.append(EmergencyDeclared(who, reason))
         for peer in self.peers.values():
@@ -283,11 +291,11 @@ class HostSession:
 
     def cleaned_up(self) -> None:
         """Simulation and executor are closed."""
-        self._machine.fire(HostEvent.CLEANED_UP)
+        self._fire(HostEvent.CLEANED_UP)
 
     def records_closed(self, now_s: float) -> None:
         """The host's records are on disk; the session lingers for its last acknowledgements."""
-        self._machine.fire(HostEvent.RECORDS_CLOSED)
+        self._fire(HostEvent.RECORDS_CLOSED)
         self._enter(now_s, LINGER_S)
 
     def send(
@@ -512,6 +520,9 @@ class HostSession:
 
     # Inside: all agents ---------------------------------------------------------------------------
 
+    def _fire(self, event: HostEvent) -> None:
+        self._events.append(StateEntered(self._machine.fire(event)))
+
     def _enter(self, now_s: float, deadline_s: float) -> None:
         self._entered_s = now_s
         self._state_deadline_s = now_s + deadline_s
@@ -523,13 +534,13 @@ class HostSession:
         """Move on when nobody is waited for any more."""
         state = self.state
         if state is HostState.HOST_STARTUP and self._all_in(Phase.READY):
-            self._machine.fire(HostEvent.AGENTS_READY)
+            self._fire(HostEvent.AGENTS_READY)
             self._enter(now_s, self._timeouts.host_setup_s)
             self._events.append(AgentsReady())
         elif state is HostState.HOST_SIMULATION_READY and self._all_in(Phase.SIMULATION_READY):
             self._events.append(AgentsSimulationReady())
         elif state is HostState.SIMULATION_START and self._all_in(Phase.COMPLETE):
-            self._machine.fire(HostEvent.AGENTS_COMPLETE)
+            self._fire(HostEvent.AGENTS_COMPLETE)
             self._enter(now_s, self._timeouts.shutdown_s)
             self._events.append(AgentsComplete())
         elif state in (HostState.BEGIN_SHUTDOWN, HostState.EMERGENCY_SHUTDOWN) and self._all_in(
@@ -538,7 +549,7 @@ class HostSession:
             self._stop(now_s, ())
 
     def _stop(self, now_s: float, missing: tuple[str, ...]) -> None:
-        self._machine.fire(HostEvent.AGENTS_STOPPED)
+        self._fire(HostEvent.AGENTS_STOPPED)
         self._enter(now_s, self._timeouts.shutdown_s)
         self._events.append(AgentsStopped(missing))
 
@@ -581,7 +592,7 @@ class HostSession:
         elif state in (HostState.BEGIN_SHUTDOWN, HostState.EMERGENCY_SHUTDOWN):
             self._stop(now_s, self._not_stopped())
         elif state is HostState.WAITING_SERVER_STOP:
-            self._machine.fire(HostEvent.SERVER_STOPPED)
+            self._fire(HostEvent.SERVER_STOPPED)
 
     def _not_stopped(self) -> tuple[str, ...]:
         settled = (Phase.STOPPED, Phase.LOST, Phase.ABSENT)

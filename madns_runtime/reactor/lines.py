@@ -47,7 +47,9 @@ def read_launch(fd: int) -> tuple[dict[str, Any], bytes]:
             )
         chunk = os.read(fd, READ_BYTES)
         if not chunk or len(data) > LINE_BYTES_MAX:
-            raise ConfigurationError("the launch document on standard input is empty, cut or too long")
+            raise ConfigurationError(
+                "the launch document on standard input is empty, cut or too long"
+            )
         data += chunk
     line, rest = data.split(b"\n", 1)
     try:

@@ -245,7 +245,7 @@ def test_swarm_survives_a_lost_agent_and_takes_it_back():
 
     assert w.host_event(h.AgentLost) == h.AgentLost("agent-2", "killed by SIGKILL")
     assert w.host_event(h.AgentRejoined) == h.AgentRejoined("agent-2")
-    assert w.agent_events["agent-2"][-1] == a.SessionEnded()
+    assert a.SessionEnded() in w.agent_events["agent-2"]
     assert w.host.peers["agent-2"].summary == {"ok": "agent-2"}
     assert w.host_event(h.EmergencyDeclared) is None
     assert w.host.state is HostState.EXIT
