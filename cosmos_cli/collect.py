@@ -35,18 +35,6 @@ LivingProcesses = Callable[[], Sequence[ProcessEntry]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RunEnd:
-    """How a run ended, as the launcher saw it."""
-
-    result: Mapping[str, Any] | None
-    """What the host reported at its end; None if it could not."""
-    interrupted: bool = False
-    """Whether the operator ended it."""
-    problems: tuple[str, ...] = ()
-    """What did not go as it should, each starting with who; a machine's ends the command with 3."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RunSummary:
     """A judged run."""
 
@@ -75,26 +63,35 @@ def say_nothing(what: str, share: float) -> None:
     """Be the progress of those who want none."""
 
 
-def finish_run(
-    run: RunDirectory, end: RunEnd, expected: Expected, *, progress: Progress = say_nothing
+def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; three are optional and by name
+    run: RunDirectory,
+    result: Mapping[str, Any] | None,
+    expected: Expected,
+    *,
+    interrupted: bool = False,
+    problems: Sequence[str] = (),
+    progress: Progress = say_nothing,
 ) -> RunSummary:
     """
     Gather, judge, report and package a run whose processes have ended.
 
     Args:
         run: The run; `begin_run` wrote its run.json and plan.json.
-        end: How it ended.
+        result: What the host reported at its end; None if it could not.
         expected: Who should have recorded what.
+        interrupted: Whether the operator ended it.
+        problems: What did not go as it should, each starting with who; a machine's ends with 3.
         progress: Called with what is being done and how far it is, 0 to 1.
 
     Raises:
         MachineError: A record stream cannot be read.
         RunFailedError: Not even run.json can be written.
     """
-    if end.result is not None:
+    end = _RunEnd(result, interrupted, tuple(problems))
+    if result is not None:
         # On a full disk the summary below still tells what matters of it.
         with contextlib.suppress(OSError):
-            write_json(run.result_json, end.result)
+            write_json(run.result_json, result)
     config = run.read_config()
     gathered = gather(run, config.agents.tick_hz if config else None, progress)
     evidence = _evidence(run, gathered, end, expected)
@@ -118,12 +115,14 @@ def collect_run(
     _refuse_living(run, processes())
     before = run.read_json(run.run_json) or {}
     problems = before.get("problems")
-    end = RunEnd(
-        result=run.read_json(run.result_json),
+    return finish_run(
+        run,
+        run.read_json(run.result_json),
+        Expected.read(run),
         interrupted=before.get("status") == "interrupted",
         problems=tuple(map(str, problems)) if isinstance(problems, list) else (),
+        progress=progress,
     )
-    return finish_run(run, end, Expected.read(run), progress=progress)
 
 
 def _refuse_living(run: RunDirectory, processes: Sequence[ProcessEntry]) -> None:
@@ -142,7 +141,14 @@ def _refuse_living(run: RunDirectory, processes: Sequence[ProcessEntry]) -> None
         )
 
 
-def _evidence(run: RunDirectory, gathered: Gathered, end: RunEnd, expected: Expected) -> Evidence:
+@dataclass(frozen=True, slots=True)
+class _RunEnd:
+    result: Mapping[str, Any] | None
+    interrupted: bool
+    problems: tuple[str, ...]
+
+
+def _evidence(run: RunDirectory, gathered: Gathered, end: _RunEnd, expected: Expected) -> Evidence:
     tables = open_tables(run.tables)
     missing = find_missing(expected, gathered.scans, end.result)
     return Evidence(

@@ -6,13 +6,13 @@ import pytest
 import zstandard
 from synthetic_run import SyntheticRun, make_config
 
-from cosmos_cli.collect import RunEnd, collect_run, finish_run
+from cosmos_cli.collect import collect_run, finish_run
 from cosmos_cli.errors import InputError
 from madns_runtime.processes import ProcessEntry
 
 
 def finish(made, **changes):
-    return finish_run(made.run, RunEnd(result=made.result(**changes)), made.expected)
+    return finish_run(made.run, made.result(**changes), made.expected)
 
 
 def read(path):
@@ -66,7 +66,7 @@ def test_killed_agent_under_continue_makes_data_incomplete_and_is_named(tmp_path
     result = made.result(lost=["agent-02"])
     result["agents"]["agent-02"] = {"state": "lost", "reason": "no sign of life for 2.5 s"}
 
-    summary = finish_run(made.run, RunEnd(result=result), made.expected)
+    summary = finish_run(made.run, result, made.expected)
 
     assert summary.exit_code == 5
     assert len(summary.missing) == 1
@@ -137,7 +137,7 @@ def test_host_that_ended_without_a_result_fails_the_run_and_collect_says_data_in
     for path in (made.run.path / "host").iterdir():
         made.cut(path, path.stat().st_size - 3)
 
-    summary = finish_run(made.run, RunEnd(result=None), made.expected)
+    summary = finish_run(made.run, None, made.expected)
 
     assert summary.exit_code == 1
     assert summary.verdict.text.startswith("FAILED: host: ")
@@ -179,9 +179,7 @@ def test_later_incarnation_is_in_the_table_and_its_predecessor_is_named_as_cut(t
 def test_interrupted_run_ends_with_130_also_when_it_is_collected_again(tmp_path):
     made = SyntheticRun(tmp_path).write()
 
-    first = finish_run(
-        made.run, RunEnd(result=made.result(status="aborted"), interrupted=True), made.expected
-    )
+    first = finish_run(made.run, made.result(status="aborted"), made.expected, interrupted=True)
     second = collect_run(made.run, processes=lambda: [])
 
     assert (first.exit_code, second.exit_code) == (130, 130)
@@ -222,8 +220,9 @@ def test_problem_of_a_machine_ends_with_3_and_names_it(tmp_path):
 
     summary = finish_run(
         made.run,
-        RunEnd(result=made.result(), problems=("loopback: supervisor was killed by signal 9",)),
+        made.result(),
         made.expected,
+        problems=("loopback: supervisor was killed by signal 9",),
     )
 
     assert summary.exit_code == 3
@@ -236,7 +235,7 @@ def test_missed_ticks_break_the_deadline_check(tmp_path):
     for agent in result["agents"].values():
         agent["ticks"] |= {"due": made.ticks + 2, "missed": 2}
 
-    summary = finish_run(made.run, RunEnd(result=result), made.expected)
+    summary = finish_run(made.run, result, made.expected)
 
     assert summary.exit_code == 4
     assert failed_checks(summary) == ["deadline.miss_ratio"]
@@ -249,7 +248,7 @@ def test_broken_check_of_a_plug_in_is_judged_by_its_worst_agent(tmp_path):
     check = {"name": "counter.lost", "limit": 0, "got": 3, "passed": False}
     result["agents"]["agent-02"]["simulation"]["checks"] = [check]
 
-    summary = finish_run(made.run, RunEnd(result=result), made.expected)
+    summary = finish_run(made.run, result, made.expected)
 
     assert summary.exit_code == 4
     assert check in summary.document["checks"]
@@ -311,7 +310,7 @@ def test_progress_tells_of_every_long_step(tmp_path):
 
     finish_run(
         made.run,
-        RunEnd(result=made.result()),
+        made.result(),
         made.expected,
         progress=lambda what, share: told.append((what.split()[0], share)),
     )
