@@ -385,7 +385,7 @@ class AgentRunner:
 
     def _simulated_s(self) -> float:
         if self._t0_host_s is None:
-            return float("-inf")
+            return -self._config.timeouts.start_lead_s
         return self._session.clock.to_host_s(self._reactor.now_s()) - self._t0_host_s
 
     def _t_s_or_none(self) -> float | None:

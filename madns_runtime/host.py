@@ -339,7 +339,9 @@ class HostRuntime:
     # Towards the simulation ------------------------------------------------------------------------
 
     def _simulated_s(self) -> float:
-        return -math.inf if self._t0_s is None else self._reactor.now_s() - self._t0_s
+        if self._t0_s is None:
+            return -self._config.timeouts.start_lead_s
+        return self._reactor.now_s() - self._t0_s
 
     def _t_s_or_none(self) -> float | None:
         return None if self._t0_s is None else round(self._simulated_s(), 6)

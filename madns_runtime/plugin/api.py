@@ -55,7 +55,7 @@ class Context(Protocol):
     """Seeded from the run's seed and `name`."""
 
     def now_s(self) -> float:
-        """Return the simulated time, s; negative before T0."""
+        """Return the simulated time, s: negative before T0; -timeouts.start_lead_s before that is set."""
 
     def send(
         self,
