@@ -229,7 +229,7 @@ class Pacer:
             "lateness_us_p50": self._lateness.percentile_us(50),
             "lateness_us_p99": self._lateness.percentile_us(99),
             "lateness_us_max": self._lateness.max_us,
-            "margin_us_min": math.floor(self._margin_s_min * 1e6) if has_margin else None,
+            "margin_us_min": round(self._margin_s_min * 1e6) if has_margin else None,
         }
 
     def _deadline_of(self, index: int) -> float:
@@ -299,16 +299,15 @@ def stagger(
     """
     Return the phase of agent *index* of *count*, in [0, 1 / tick_hz), s.
 
-    The phases of all agents divide the period evenly. Neighbours by index get phases about a golden
-    section apart, so that the few agents of one machine, which follow each other in the list, are
-    spread over the period as well.
+    The phases of all agents divide the period evenly. They follow the order of the golden section's
+    multiples, so that the few agents of one machine, which are neighbours by index, are spread over
+    the period as well.
     """
     if phase == "aligned" or count <= 1:
         return 0.0
-    stride = max(1, round(count * GOLDEN_FRACTION))
-    while math.gcd(stride, count) != 1:
-        stride += 1
-    return (index * stride % count) / count / tick_hz
+    position = index * GOLDEN_FRACTION % 1.0
+    rank = sum(other * GOLDEN_FRACTION % 1.0 < position for other in range(count))
+    return rank / count / tick_hz
 
 
 def _count_ticks(tick_hz: float, duration_s: float) -> int:
