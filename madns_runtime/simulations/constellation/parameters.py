@@ -93,7 +93,7 @@ class ScipyPropagator:
     """Relative tolerance of a step, held for every vehicle by itself however many there are."""
     atol_m: Annotated[float, Ge(1e-9), Le(1)] = 1e-6
     """Absolute tolerance of a step in position, m; in velocity a thousandth of it a second."""
-    step_s_max: Annotated[float, Gt(0)] = 60.0
+    step_s_max: Annotated[float, Gt(0)] = 30.0
     """Longest step, s: values between steps are interpolated, and long steps would spoil them."""
 
 

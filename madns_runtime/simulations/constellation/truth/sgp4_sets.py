@@ -71,12 +71,13 @@ def sgp4_states(
     Raises:
         ConfigurationError: A set cannot be propagated to a time; names the satellites and why.
 
-    Accuracy: the verification vectors that the sgp4 package ships, to their last printed digit.
+    Accuracy: within 1.2e-7 km of the verification vectors that the sgp4 package ships.
     """
     whole, part = julian_date(epoch_utc)
-    fractions = part + np.asarray(t_s, dtype=np.float64) / SECONDS_PER_DAY
+    # Whole days stay apart from the rest, which would lose digits beside them.
+    days, rest_s = np.divmod(np.asarray(t_s, dtype=np.float64), SECONDS_PER_DAY)
     errors, r_km, v_km_s = _fleet_records(element_sets).sgp4(
-        np.full(fractions.shape, whole), fractions
+        whole + days, part + rest_s / SECONDS_PER_DAY
     )
     if errors.any():
         bad = {

@@ -1,0 +1,142 @@
+"""A context without a runtime: a clock moved by hand, records in lists, jobs run when told."""
+
+from collections import defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from madns_runtime.config import from_mapping
+from madns_runtime.plugin.api import Tick
+from madns_runtime.protocol.codec import pack, unpack
+from madns_runtime.simulations.constellation.agent import ConstellationAgent
+from madns_runtime.simulations.constellation.host import ConstellationHost
+from madns_runtime.simulations.constellation.parameters import ConstellationParameters
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+WALKER = {"walker": "86.4:66/6/2", "altitude_km": 780.0}
+IRIDIUM = {"elements": "data/iridium10.tle"}
+
+
+def parameters(satellites=WALKER, **rest):
+    return from_mapping(ConstellationParameters, {"satellites": satellites, **rest})
+
+
+@dataclass
+class FakeContext:
+    name: str
+    agents: tuple
+    parameters: ConstellationParameters
+    tick_hz: float = 10.0
+    duration_s: float = 60.0
+    base_directory: Path = SCENARIOS
+    clock_s: float = -1.0
+    sent: list = field(default_factory=list)
+    records: dict = field(default_factory=lambda: defaultdict(list))
+    streams: dict = field(default_factory=dict)
+    logs: list = field(default_factory=list)
+    jobs: list = field(default_factory=list)
+
+    def now_s(self):
+        return self.clock_s
+
+    def send(self, to, message, service=None, *, deadline_s=None):
+        self.sent.append((self.clock_s, to, unpack(pack(message))))
+
+    def open_stream(self, name, fields):
+        self.streams[name] = tuple(fields)
+
+    def record(self, stream, values):
+        assert len(values) == len(self.streams[stream])
+        self.records[stream].append(tuple(values))
+
+    def log(self, level, text):
+        self.logs.append((level, text))
+
+    def submit(self, function, *arguments):
+        self.jobs.append((function, arguments))
+        return len(self.jobs)
+
+
+class Star:
+    """One host and its agents on one simulated clock; messages take *delay_s(sent_s, agent)*, None loses one."""
+
+    def __init__(self, params, count=3, *, duration_s=60.0, tick_hz=10.0, delay_s=None):
+        names = tuple(f"agent-{n:02d}" for n in range(1, count + 1))
+        settings = {"duration_s": duration_s, "tick_hz": tick_hz}
+        self.context = FakeContext("host", names, params, **settings)
+        self.delay_s = delay_s or (lambda sent_s, agent: 0.005)
+        self.job_s = 0.01
+        self.host = ConstellationHost()
+        self.host.setup(self.context)
+        self._done = 0
+        self._run_jobs(all_now=True)
+        self.contexts = {name: FakeContext(name, names, params, **settings) for name in names}
+        self.agents = {}
+        for name in names:
+            self.join(name)
+        self._mail = []
+        self._read = 0
+        self._due_jobs = []
+
+    def join(self, name):
+        initial = unpack(pack(self.host.initial_data(name)))
+        self.contexts[name].clock_s = self.context.clock_s
+        agent = ConstellationAgent()
+        agent.setup(self.contexts[name], initial)
+        self.agents[name] = agent
+
+    def run(self, until_s, *, from_s=0.0, step_s=0.01):
+        """Move the clock; agents tick at their rate, the timer is called when it asked for it."""
+        timer_s = from_s
+        if from_s == 0.0:
+            self.host.start(0.0)
+        ratio = round(1.0 / self.context.tick_hz / step_s)
+        for index in range(round(from_s / step_s), round(until_s / step_s)):
+            t_s = index * step_s
+            self.context.clock_s = t_s
+            for context in self.contexts.values():
+                context.clock_s = t_s
+            self._run_jobs()
+            while timer_s is not None and timer_s <= t_s:
+                timer_s = self.host.timer(t_s)
+                assert timer_s is None or timer_s > t_s
+            self._deliver(t_s)
+            if index % ratio == 0:
+                tick = Tick(index // ratio, t_s, ratio * step_s, 0.0, 0)
+                for agent in self.agents.values():
+                    agent.step(tick)
+
+    def summaries(self):
+        return {name: agent.finish() for name, agent in self.agents.items()}
+
+    def underruns(self):
+        return sum(s["underruns"] for s in self.summaries().values())
+
+    def _run_jobs(self, *, all_now=False):
+        while self._done < len(self.context.jobs):
+            if not all_now:
+                if not self._due_jobs:
+                    self._due_jobs.append(self.context.clock_s + self.job_s)
+                if self.context.clock_s < self._due_jobs[0]:
+                    return
+                self._due_jobs.clear()
+            function, arguments = self.context.jobs[self._done]
+            self._done += 1
+            self.host.result(self._done, function(*arguments))
+
+    def _deliver(self, t_s):
+        for sent_s, to, message in self.context.sent[self._read :]:
+            delay_s = self.delay_s(sent_s, to)
+            if delay_s is not None:
+                self._mail.append((sent_s + delay_s, to, message))
+        self._read = len(self.context.sent)
+        due = [mail for mail in self._mail if mail[0] <= t_s]
+        self._mail = [mail for mail in self._mail if mail[0] > t_s]
+        for _, to, message in sorted(due, key=lambda mail: mail[0]):
+            if to in self.agents:
+                self.agents[to].receive(message)
+
+
+def state_rows(star, name):
+    return np.array(star.contexts[name].records["state"])

@@ -1,0 +1,211 @@
+"""Element sets: the four syntaxes agree, and a bad file is named with its line."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from constellation_fakes import SCENARIOS
+
+from madns_runtime.errors import ConfigurationError
+from madns_runtime.simulations.constellation.truth.element_sets import (
+    read_element_sets,
+    tle_checksum,
+)
+from madns_runtime.simulations.constellation.truth.sgp4_sets import julian_date, sgp4_states
+
+DATA = SCENARIOS / "data"
+TLE = (DATA / "iridium10.tle").read_text()
+CSV = (DATA / "iridium10.csv").read_text()
+JSON = (DATA / "iridium10.json").read_text()
+XML = (DATA / "iridium10.xml").read_text()
+EPOCH = datetime(2017, 3, 7, 13, 32, 57, tzinfo=UTC)
+
+
+def faults_of(path, text):
+    path.write_text(text)
+    with pytest.raises(ConfigurationError) as caught:
+        read_element_sets(path)
+    return [line.removeprefix(f"{path}:") for line in str(caught.value).splitlines()]
+
+
+@pytest.mark.parametrize("suffix", ["csv", "json", "xml"])
+def test_omm_gives_the_positions_of_the_tle_it_was_made_from(suffix):
+    t_s = np.arange(0.0, 14_401.0, 600.0)
+    expected = sgp4_states(read_element_sets(DATA / "iridium10.tle"), EPOCH, t_s)
+
+    sets = read_element_sets(DATA / f"iridium10.{suffix}")
+
+    assert [s.name for s in sets] == [s.name for s in read_element_sets(DATA / "iridium10.tle")]
+    # Kepler's equation inside SGP4 ends at 1e-12 rad.
+    assert np.abs(sgp4_states(sets, EPOCH, t_s) - expected)[..., :3].max() < 1e-5
+
+
+@pytest.mark.parametrize("text", [TLE, CSV, JSON, XML], ids=["tle", "csv", "json", "xml"])
+def test_a_file_without_a_telling_suffix_is_told_by_its_content(tmp_path, text):
+    path = tmp_path / "sets.txt"
+    path.write_text(text)
+
+    assert len(read_element_sets(path)) == 10
+
+
+def test_epochs_are_exact_to_the_microsecond():
+    for suffix in ("tle", "csv", "json", "xml"):
+        first = read_element_sets(DATA / f"iridium10.{suffix}")[0]
+
+        assert first.epoch_utc == datetime(2017, 3, 7, 7, 18, 54, 808_992, tzinfo=UTC)
+
+
+def test_tle_works_without_names_with_comments_and_with_windows_line_ends(tmp_path):
+    lines = TLE.splitlines()
+    path = tmp_path / "sets.tle"
+    path.write_text("# comment\r\n" + "\r\n".join(lines[1:3] + ["", "0 " + lines[3], *lines[4:6]]))
+
+    assert [s.name for s in read_element_sets(path)] == ["24792", "IRIDIUM 7"]
+
+
+def test_a_wrong_checksum_is_named_with_its_line(tmp_path):
+    lines = TLE.splitlines()
+    lines[4] = lines[4].replace("17066", "17067")
+
+    assert faults_of(tmp_path / "a.tle", "\n".join(lines)) == [
+        "5: checksum: expected 7, got '6'; the line is damaged"
+    ]
+
+
+def test_every_fault_of_a_file_is_reported_at_once(tmp_path):
+    lines = TLE.splitlines()
+    lines[1] = lines[1][:60]
+    lines[5] = lines[5].replace("24793", "24799")[:68]
+    lines[5] += str(tle_checksum(lines[5]))
+    del lines[-1]
+
+    faults = faults_of(tmp_path / "a.tle", "\n".join(lines))
+
+    assert faults == [
+        "2: expected 69 columns, got 60",
+        "6: expected catalogue number 24793, got 24799",
+        "29: expected line 2 of a TLE to follow, the file ends",
+    ]
+
+
+@pytest.mark.parametrize("missing", [0, 1, 2])
+def test_no_lost_tle_line_goes_unnoticed(tmp_path, missing):
+    lines = TLE.splitlines()
+    del lines[12 + missing]
+    path = tmp_path / "a.tle"
+    path.write_text("\n".join(lines))
+
+    if missing == 0:
+        # Only the name is gone: the set flies under its number.
+        assert read_element_sets(path)[4].name == "24796"
+    else:
+        assert faults_of(path, "\n".join(lines))
+
+
+def test_a_number_that_is_none_is_named_with_line_and_field(tmp_path):
+    text = CSV.replace("86.4011", "polar", 1)
+
+    assert faults_of(tmp_path / "a.csv", text) == [
+        "3: INCLINATION: expected a number within [0, 180], got 'polar'"
+    ]
+
+
+def test_a_missing_column_is_named(tmp_path):
+    assert faults_of(tmp_path / "a.csv", CSV.replace("BSTAR", "B*", 1)) == [
+        "1: expected the columns of an OMM, missing BSTAR"
+    ]
+
+
+def test_json_faults_carry_the_line_of_their_set(tmp_path):
+    text = JSON.replace('"ECCENTRICITY": 0.0002196', '"ECCENTRICITY": 1.2', 1)
+
+    assert faults_of(tmp_path / "a.json", text) == [
+        "4: ECCENTRICITY: expected a number within [0, 1], got '1.2'"
+    ]
+
+
+def test_broken_json_and_xml_are_named_with_their_place(tmp_path):
+    assert faults_of(tmp_path / "a.json", "[\n{,") == [
+        "2:2: Expecting property name enclosed in double quotes"
+    ]
+    assert faults_of(tmp_path / "a.xml", "<ndm>\n<omm></ndm>")[0].startswith("2:")
+
+
+def test_elements_of_another_theory_or_frame_are_refused(tmp_path):
+    text = XML.replace("<MEAN_ELEMENT_THEORY>SGP4", "<MEAN_ELEMENT_THEORY>DSST", 1).replace(
+        "<REF_FRAME>TEME", "<REF_FRAME>GCRF", 1
+    )
+
+    assert faults_of(tmp_path / "a.xml", text) == [
+        "4: REF_FRAME: expected TEME, got 'GCRF'",
+        "4: MEAN_ELEMENT_THEORY: expected SGP4, got 'DSST'",
+    ]
+
+
+def test_an_epoch_without_microseconds_is_read_and_one_with_a_zone_is_not(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(CSV.replace("2017-03-07T07:18:54.808992", "2017-03-07T07:18:54"))
+    assert read_element_sets(path)[0].epoch_utc == datetime(2017, 3, 7, 7, 18, 54, tzinfo=UTC)
+
+    assert "EPOCH" in faults_of(path, CSV.replace("54.808992", "54.808992+02:00"))[0]
+
+
+def test_six_digit_catalogue_numbers_are_flown(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(CSV.replace("24792", "799500100"))
+
+    states = sgp4_states(read_element_sets(path), EPOCH, np.zeros(1))
+
+    assert np.isfinite(states).all()
+
+
+@pytest.mark.parametrize("name", ["a.tle", "a.csv", "a.json", "a.xml", "a.txt"])
+def test_an_empty_file_is_refused(tmp_path, name):
+    assert faults_of(tmp_path / name, "")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ConfigurationError, match=r"nowhere\.tle: no such file"):
+        read_element_sets(tmp_path / "nowhere.tle")
+
+
+def test_a_folder_or_a_binary_file_is_refused(tmp_path):
+    with pytest.raises(ConfigurationError, match="cannot be read"):
+        read_element_sets(tmp_path)
+    (tmp_path / "a.tle").write_bytes(b"\xff\xfe\x00\x01")
+    with pytest.raises(ConfigurationError, match="cannot be read"):
+        read_element_sets(tmp_path / "a.tle")
+
+
+def test_a_long_list_of_faults_is_cut(tmp_path):
+    faults = faults_of(tmp_path / "a.tle", "x" * 30 + "\n" + ("y" * 30 + "\n") * 100)
+
+    assert len(faults) == 21
+    assert faults[-1].endswith("and 81 more")
+
+
+def test_a_set_that_sgp4_cannot_propagate_is_named():
+    sets = read_element_sets(DATA / "iridium10.csv")
+    fields = dict(sets[3].omm) | {"BSTAR": "1e3"}
+    broken = type(sets[3])(
+        name="WRECK", epoch_utc=sets[3].epoch_utc, omm=tuple(sorted(fields.items()))
+    )
+
+    with pytest.raises(ConfigurationError, match="WRECK: SGP4: "):
+        sgp4_states((*sets[:3], broken), EPOCH, np.arange(3.0))
+
+
+def test_julian_dates_are_those_of_the_almanac():
+    assert julian_date(datetime(2000, 1, 1, 12, tzinfo=UTC)) == (2_451_545.0, 0.0)
+    assert sum(julian_date(datetime(1957, 10, 4, 19, 26, 24, tzinfo=UTC))) == 2_436_116.31
+    whole, part = julian_date(datetime(2017, 3, 7, 12, 0, 0, 1, tzinfo=UTC))
+    assert (whole, part) == (2_457_820.0, 1e-6 / 86_400.0)
+
+
+def test_sources_are_named_for_every_data_file():
+    sources = (DATA / "SOURCES.md").read_text()
+
+    for path in Path(DATA).iterdir():
+        if path.name != "SOURCES.md":
+            assert path.name in sources or path.suffix in sources
