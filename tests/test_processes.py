@@ -93,6 +93,7 @@ def test_entry_of_an_earlier_boot_is_removed(register_directory):
     assert not path.exists()
 
 
+@pytest.mark.process
 def test_entry_whose_pid_was_given_out_again_is_removed_and_not_signalled(
     register_directory, child
 ):
@@ -106,6 +107,7 @@ def test_entry_whose_pid_was_given_out_again_is_removed_and_not_signalled(
     assert child.poll() is None
 
 
+@pytest.mark.process
 def test_entry_of_a_dead_process_is_removed(register_directory, child):
     entry, path = enter(register_directory, pid=child.pid, start_ticks=read_start_ticks(child.pid))
     assert list_processes() == [entry]
@@ -117,6 +119,7 @@ def test_entry_of_a_dead_process_is_removed(register_directory, child):
     assert not path.exists()
 
 
+@pytest.mark.process
 def test_zombie_has_ended(register_directory, child):
     entry, _ = enter(register_directory, pid=child.pid, start_ticks=read_start_ticks(child.pid))
     child.kill()
@@ -170,6 +173,7 @@ def test_files_that_are_no_entries_are_left_alone(register_directory):
     assert (register_directory / "notes.txt").read_text() == "mine"
 
 
+@pytest.mark.process
 def test_entry_of_a_pid_that_is_not_its_file_names_is_not_believed(register_directory, child):
     entry, path = enter(register_directory)
     other = {"pid": child.pid, "start_ticks": read_start_ticks(child.pid)}

@@ -19,9 +19,10 @@ from typing import Any
 
 import orjson
 
+from madns_runtime.reactor import libc
+
 REPORT_BYTES_MAX = 32_768
 """A report must fit a pipe, so that writing it never waits for a reader."""
-PR_SET_PDEATHSIG = 1
 _KILL_WAIT_S = 2.0
 
 
@@ -151,7 +152,10 @@ def _prepare(parent: int, nice: int) -> int:
     signal.signal(signal.SIGTERM, lambda *_: None)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.set_wakeup_fd(signal_write, warn_on_full_buffer=False)
-    _die_with_parent(signal.SIGTERM)
+    # SIGTERM, not SIGKILL: a sampler closes its records even when nobody is left to ask for it. Where the
+    # kernel has no such signal, the life pipe is what remains.
+    with contextlib.suppress(OSError, AttributeError):
+        libc.prctl(libc.PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != parent:
         os._exit(1)
     with contextlib.suppress(OSError, AttributeError):
@@ -162,15 +166,6 @@ def _prepare(parent: int, nice: int) -> int:
     os.dup2(null, 0)
     os.close(null)
     return signal_read
-
-
-def _die_with_parent(number: int) -> None:
-    """Ask the kernel for a signal when the parent dies; where it cannot, the life pipe is what remains."""
-    if sys.platform != "linux":
-        return
-    import ctypes  # Loaded in the child alone: loops have no use for its memory.
-
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number, 0, 0, 0)
 
 
 def _read_to_end(fd: int, timeout_s: float) -> bytes | None:

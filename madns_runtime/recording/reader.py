@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from madns_runtime.errors import MachineError
 from madns_runtime.recording.stream_file import CONTROL_KEYS
 
-BLOCK_BYTES = 1 << 20
+BLOCK_BYTES = 1 << 17
+"""Small enough that its text and values stay in the processor's cache: eight times as much took twice the time."""
 LINE_BYTES_MAX = 64 << 20
 """A longer line is none of ours; it is skipped and counted as damaged."""
 _COMMA = ord(",")
