@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import select
@@ -94,10 +95,8 @@ class EpollPoller:
 
     def unregister(self, fd: int) -> None:
         """Watch *fd* no more; one that was closed has left by itself."""
-        try:
+        with contextlib.suppress(OSError):
             self._epoll.unregister(fd)
-        except (FileNotFoundError, OSError):
-            return
 
     def wait(self, until_s: float) -> list[int]:
         """Wait for descriptors until *until_s*; see `Poller`."""
@@ -131,10 +130,8 @@ class SelectorPoller:
 
     def unregister(self, fd: int) -> None:
         """Watch *fd* no more."""
-        try:
+        with contextlib.suppress(KeyError, ValueError, OSError):
             self._selector.unregister(fd)
-        except (KeyError, ValueError, OSError):
-            return
 
     def wait(self, until_s: float) -> list[int]:
         """Wait for descriptors until *until_s*; see `Poller`."""
