@@ -63,5 +63,5 @@ def run(
             " collect last` judges and packages them"
         ) from None
     console.print_json(dict(summary.document))
-    console.data(summary.last_line)
+    (console.say if json else console.data)(summary.last_line)
     raise typer.Exit(int(summary.exit_code))

@@ -105,13 +105,6 @@ def _finish(prepared: _Prepared, outcome: LaunchOutcome, view: View) -> RunSumma
     from cosmos_cli.collect import finish_run
     from cosmos_cli.expectation import Expected
 
-    told: list[str] = []
-
-    def progress(what: str, share: float) -> None:
-        if what not in told:
-            told.append(what)
-            view.say(what)
-
     view.state("COLLECTING")
     return finish_run(
         prepared.run,
@@ -119,7 +112,7 @@ def _finish(prepared: _Prepared, outcome: LaunchOutcome, view: View) -> RunSumma
         Expected.of(prepared.config, prepared.plan.agents_by_machine),
         interrupted=outcome.interruption != "no",
         problems=outcome.problems,
-        progress=progress,
+        progress=view.work,
     )
 
 

@@ -62,6 +62,9 @@ class View(Protocol):
     def progress(self, progress: Progress) -> None:
         """Show how the run fares."""
 
+    def work(self, what: str, share: float) -> None:
+        """Show what is done with the records after the run, and how far it is, 0 to 1."""
+
     def close(self) -> None:
         """Leave the terminal as it was; harmless when repeated."""
 

@@ -85,6 +85,12 @@ class LiveView:
         if self._is_due():
             self._draw()
 
+    def work(self, what: str, share: float) -> None:
+        """Show what is done with the records, and how far it is."""
+        self._state = f"{words.work_words(what)} {share:.0%}"
+        if self._is_due():
+            self._draw()
+
     def close(self) -> None:
         """Leave the last picture and give the terminal back."""
         if self._live.is_started:

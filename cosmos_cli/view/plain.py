@@ -7,7 +7,7 @@ from typing import TextIO
 
 from cosmos_cli.console import paint
 from cosmos_cli.launch.events import AgentChanged, Progress
-from cosmos_cli.view.words import progress_line, state_words
+from cosmos_cli.view.words import progress_line, state_words, work_words
 
 PROGRESS_INTERVAL_S = 10.0
 LOUD_LEVELS = frozenset({"error", "critical", "manual"})
@@ -30,6 +30,7 @@ class PlainView:
         self._duration_s = duration_s
         self._now_s = now_s
         self._shown_s: float | None = None
+        self._work: str | None = None
         self._is_broken = False
 
     def say(self, text: str, level: str = "info") -> None:
@@ -58,6 +59,13 @@ class PlainView:
             self._shown_s = now_s
             self._write(progress_line(progress, self._duration_s))
 
+    def work(self, what: str, share: float) -> None:
+        """Write each stage of the work once."""
+        stage = work_words(what)
+        if stage != self._work:
+            self._work = stage
+            self._write(stage)
+
     def close(self) -> None:
         """Leave nothing behind; there is nothing."""
 
@@ -83,4 +91,7 @@ class SilentView(PlainView):
         """Say nothing."""
 
     def progress(self, progress: Progress) -> None:
+        """Say nothing."""
+
+    def work(self, what: str, share: float) -> None:
         """Say nothing."""

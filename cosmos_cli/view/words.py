@@ -69,6 +69,11 @@ def loss_words(progress: Progress) -> str:
     return text
 
 
+def work_words(what: str) -> str:
+    """Return the stage of the work after a run, without the file that it is at."""
+    return "reading the records" if what.startswith("reading ") else what
+
+
 def has_trouble(progress: Progress) -> bool:
     """Tell whether something was lost that should not be."""
     return bool(progress.lost or progress.lost_messages or progress.records_dropped)

@@ -69,8 +69,6 @@ def host(line: Line) -> int:
     line.say("listening", address="127.0.0.1", port=40001)
     line.say("state", state="SIMULATION_SETUP")
     line.say("state", state="SIMULATION_START")
-    if FAKE.get("leaves_worker"):
-        subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     for index in range(FAKE.get("noise", 0)):
         os.write(line.write_fd, b"this is no event %d\n" % index)
     os.write(line.write_fd, FAKE.get("raw", "").encode())
@@ -78,7 +76,8 @@ def host(line: Line) -> int:
     status, reason = "complete", None
     while time.monotonic() - started_s < FAKE.get("runs_s", 0.3):
         t_s = time.monotonic() - started_s
-        line.say("progress", t_s=t_s, rtf=1.0, ready=2, running=2, ticks=int(100 * t_s))
+        if not FAKE.get("is_silent"):
+            line.say("progress", t_s=t_s, rtf=1.0, running=2, ticks=int(100 * t_s))
         for command in pending + line.commands(0.05):
             note(f"told {json.dumps(command)}")
             if command["command"] == "stop" and not FAKE.get("ignores_stop"):
@@ -92,6 +91,9 @@ def host(line: Line) -> int:
         if status != "complete":
             break
         if FAKE.get("killed_after_s", 1e9) < t_s:
+            if FAKE.get("leaves_worker"):
+                worker = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+                note(f"worker {worker.pid}")
             sys.stderr.write("last words of the host\n")
             sys.stderr.flush()
             os.kill(os.getpid(), signal.SIGKILL)
