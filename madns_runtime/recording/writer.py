@@ -9,20 +9,19 @@ and a recorder does not survive a fork: make one in the child.
 from __future__ import annotations
 
 import logging
-import math
 import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import orjson
 
 from madns_runtime.config import Recording
 from madns_runtime.errors import MachineError, PluginError
+from madns_runtime.recording.counts import RecordCounts, StreamCounts
+from madns_runtime.recording.encoding import ENCODING, count_not_finite, explain_refusal, to_plain
 from madns_runtime.recording.records import LOG, StreamSchema
 from madns_runtime.recording.stream_file import (
     LINE_OVERHEAD_BYTES,
@@ -44,70 +43,8 @@ LEVELS = {
 VERBOSITY_LEVELS = (logging.CRITICAL + 1, 50, 40, 30, 20, 10)
 """The least level that recording.verbosity 0 to 5 lets through, as logging numbers them."""
 
-_ENCODING = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
-
 LogEcho = Callable[[str, str], None]
 """Takes level and text of each sentence that was loud enough to be logged."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StreamCounts:
-    """What became of one stream's records."""
-
-    file: str
-    written: int
-    dropped: int
-    not_finite: int
-    bytes: int
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the counts as a plain mapping."""
-        return {
-            "file": self.file,
-            "written": self.written,
-            "dropped": self.dropped,
-            "not_finite": self.not_finite,
-            "bytes": self.bytes,
-        }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecordCounts:
-    """What became of all records of a recorder, and what went wrong on the way."""
-
-    streams: Mapping[str, StreamCounts]
-    errors: tuple[str, ...] = ()
-
-    @property
-    def written(self) -> int:
-        """Records that a write call has taken."""
-        return sum(counts.written for counts in self.streams.values())
-
-    @property
-    def dropped(self) -> int:
-        """Records that will never be in a file."""
-        return sum(counts.dropped for counts in self.streams.values())
-
-    @property
-    def not_finite(self) -> int:
-        """NaN and infinite values, which became null."""
-        return sum(counts.not_finite for counts in self.streams.values())
-
-    @property
-    def bytes(self) -> int:
-        """Bytes in all files."""
-        return sum(counts.bytes for counts in self.streams.values())
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return totals, errors and every stream's counts as plain mappings."""
-        return {
-            "written": self.written,
-            "dropped": self.dropped,
-            "not_finite": self.not_finite,
-            "bytes": self.bytes,
-            "errors": list(self.errors),
-            "streams": {name: counts.to_mapping() for name, counts in self.streams.items()},
-        }
 
 
 class Recorder:
@@ -207,11 +144,11 @@ class Recorder:
         elif len(values) != file.width:
             raise file.width_error(len(values))
         try:
-            line = orjson.dumps(values, _plain, _ENCODING)
+            line = orjson.dumps(values, to_plain, ENCODING)
         except TypeError as error:
-            raise _encoding_error(stream, values, error) from error
+            raise explain_refusal(stream, values, error) from error
         if b"null" in line:
-            file.not_finite += _count_not_finite(values)
+            file.not_finite += count_not_finite(values)
         queued_bytes = self._queued_bytes + len(line) + LINE_OVERHEAD_BYTES
         waiting_bytes = queued_bytes - self._freed_bytes
         if waiting_bytes > self._limit_bytes or self._is_closing:
@@ -316,9 +253,9 @@ class Recorder:
         """Return what the file still lacks at its head: line 1, or the line that states T0, or nothing."""
         if not file.has_header:
             header = file.schema.header(run=self._run, source=self._source, t0_utc=t0_utc)
-            return orjson.dumps(header, None, _ENCODING)
+            return orjson.dumps(header, None, ENCODING)
         if t0_utc is not None and not file.has_t0:
-            return orjson.dumps({"t0_utc": t0_utc}, None, _ENCODING)
+            return orjson.dumps({"t0_utc": t0_utc}, None, ENCODING)
         return b""
 
 
@@ -355,39 +292,3 @@ def _schedule_normally() -> None:
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         except OSError:
             return  # It stays as it is; the loop records what scheduling it was granted.
-
-
-def _plain(value: Any) -> Any:
-    """Return what orjson does not know by itself in a form that it does."""
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, Mapping):
-        return dict(value)
-    if isinstance(value, Sequence) and not isinstance(value, bytes | bytearray | memoryview):
-        return list(value)
-    raise TypeError(f"{type(value).__name__} has no JSON form")
-
-
-def _count_not_finite(value: Any) -> int:
-    if isinstance(value, float | np.floating):
-        return 0 if math.isfinite(value) else 1
-    if isinstance(value, np.ndarray):
-        is_float = np.issubdtype(value.dtype, np.floating)
-        return int(np.count_nonzero(~np.isfinite(value))) if is_float else 0
-    if isinstance(value, Mapping):
-        return sum(_count_not_finite(item) for item in value.values())
-    if isinstance(value, list | tuple):
-        return sum(_count_not_finite(item) for item in value)
-    return 0
-
-
-def _encoding_error(stream: str, values: Any, error: TypeError) -> PluginError:
-    items = values.items() if isinstance(values, Mapping) else enumerate(values)
-    for name, value in items:
-        try:
-            orjson.dumps(value, _plain, _ENCODING)
-        except TypeError as cause:
-            return PluginError(f"stream {stream}: value {name}: {cause.__cause__ or cause}")
-    return PluginError(f"stream {stream}: {error}")
