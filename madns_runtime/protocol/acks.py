@@ -70,7 +70,7 @@ class ReceivedPackets:
         self._eliciting += 1
         if at_once or self._eliciting >= ELICITING_PACKETS_MAX:
             self.ack_due_s = now_s
-        elif self.ack_due_s > now_s + ACK_DELAY_MAX_S:
+        else:
             self.ack_due_s = now_s + ACK_DELAY_MAX_S
 
     def settle_ack(self, now_s: float) -> int:

@@ -7,7 +7,7 @@ See delivery.py for the other half and for what a stream is. When a packet is lo
 from __future__ import annotations
 
 from collections import deque
-from typing import Final
+from typing import Final, NamedTuple
 
 from madns_runtime.protocol.acks import ACK_BITS
 from madns_runtime.protocol.counters import ClassCounters
@@ -24,6 +24,9 @@ FRAGMENT_BYTES_MIN: Final = 256
 """A long message does not start in less room than this: a new datagram is cheaper."""
 MESSAGES_QUEUED_MAX: Final = 65_536
 """Bound of the messages waiting in one stream: short ones cost more than their bytes."""
+FAST_RESENDS_MAX: Final = 3
+"""A fragment sent again more often than this waits longer each time, whatever later packets arrive: it may
+be the path that takes no large datagrams."""
 LOST_PACKETS_MAX: Final = 128
 """Lost packets remembered, to notice that they were not lost."""
 
@@ -34,13 +37,22 @@ _NEVER: Final = float("inf")
 class Fragment:
     """A piece of a stream with its frame header, and the packet that carried it last."""
 
-    __slots__ = ("frame", "is_acknowledged", "number", "packet")
+    __slots__ = ("frame", "is_acknowledged", "number", "packet", "resends")
 
     def __init__(self, number: int, frame: bytes) -> None:
         self.number = number
         self.frame = frame
         self.packet = 0
+        self.resends = 0
         self.is_acknowledged = False
+
+
+class Packet(NamedTuple):
+    """What became of fragments: sent when, together with which, and when it may be held to be lost."""
+
+    sent_s: float
+    fragments: list[Fragment]
+    kept_until_s: float
 
 
 class SendStream:
@@ -86,7 +98,7 @@ class SendStream:
         self._offset = 0  # of the first pending message: bytes cut already
         self._ends: deque[int] = deque()  # last fragment of every unacknowledged message
         self._unacknowledged: dict[int, Fragment] = {}
-        self._sent: dict[int, tuple[float, list[Fragment]]] = {}  # packets in flight, oldest first
+        self._sent: dict[int, Packet] = {}  # packets in flight, oldest first
         self._lost: dict[int, list[Fragment]] = {}  # packets held to be lost, oldest first
         self._resend: deque[Fragment] = deque()
         self._ack = 0
@@ -133,6 +145,7 @@ class SendStream:
             if len(fragment.frame) > room:
                 return None
             resend.popleft()
+            fragment.resends += 1
             self.counters.resent += 1
             return fragment
         if not self._pending or self.next_number >= self._limit:
@@ -178,9 +191,15 @@ class SendStream:
 
     def record(self, packet_number: int, now_s: float, fragments: list[Fragment]) -> None:
         """Note which fragments a packet carried."""
+        resends = 0
         for fragment in fragments:
             fragment.packet = packet_number
-        self._sent[packet_number] = (now_s, fragments)
+            if fragment.resends > resends:
+                resends = fragment.resends
+        kept_until_s = now_s
+        if resends > FAST_RESENDS_MAX:
+            kept_until_s += self._round_trip.get_resend_delay(resends - FAST_RESENDS_MAX)
+        self._sent[packet_number] = Packet(now_s, fragments, kept_until_s)
 
     def advance(self, next_expected: int, granted: int) -> bool:
         """
@@ -220,7 +239,7 @@ class SendStream:
         sent = self._sent
         while sent:
             packet_number = next(iter(sent))
-            for fragment in sent[packet_number][1]:
+            for fragment in sent[packet_number].fragments:
                 if not fragment.is_acknowledged:
                     return
             del sent[packet_number]
@@ -234,20 +253,25 @@ class SendStream:
         reorder_delay_s = self._round_trip.reorder_delay_s
         arrived: list[int] = []
         lost: list[int] = []
-        self._loss_at_s = _NEVER
-        for packet_number, (sent_s, _) in self._sent.items():
+        loss_at_s = _NEVER
+        for packet_number, packet in self._sent.items():
             age = ack - packet_number
             if age < 0:
                 break
             if age == 0 or (age <= ACK_BITS and (ack_bits >> (age - 1)) & 1):
                 arrived.append(packet_number)
-            elif age >= REORDER_PACKETS or now_s >= sent_s + reorder_delay_s:
+                continue
+            lost_at_s = packet.kept_until_s
+            if age < REORDER_PACKETS and packet.sent_s + reorder_delay_s > lost_at_s:
+                lost_at_s = packet.sent_s + reorder_delay_s
+            if lost_at_s <= now_s:
                 lost.append(packet_number)
-            elif sent_s + reorder_delay_s < self._loss_at_s:
-                self._loss_at_s = sent_s + reorder_delay_s
+            elif lost_at_s < loss_at_s:
+                loss_at_s = lost_at_s
+        self._loss_at_s = loss_at_s
         for packet_number in arrived:
             self._backoff = 0
-            for fragment in self._sent.pop(packet_number)[1]:
+            for fragment in self._sent.pop(packet_number).fragments:
                 if not fragment.is_acknowledged:
                     self._settle(fragment)
         for packet_number in lost:
@@ -257,7 +281,7 @@ class SendStream:
         self._prune()
 
     def _lose(self, packet_number: int) -> None:
-        fragments = self._sent.pop(packet_number)[1]
+        fragments = self._sent.pop(packet_number).fragments
         self._resend.extend(f for f in fragments if not f.is_acknowledged)
         self._lost[packet_number] = fragments
         if len(self._lost) > LOST_PACKETS_MAX:
@@ -285,7 +309,7 @@ class SendStream:
 
     def _get_resend_at(self) -> float:
         """Return when the oldest packet in flight is held to be lost: one a delay, whatever is in flight."""
-        sent_s = next(iter(self._sent.values()))[0]
+        sent_s = next(iter(self._sent.values())).sent_s
         since_s = sent_s if sent_s > self._expired_s else self._expired_s
         return since_s + self._round_trip.get_resend_delay(self._backoff)
 
