@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from madns_runtime.plugin.api import Demand
+from madns_runtime.protocol.delivery import FRAGMENT_BYTES_MAX, FRAME_BYTES
+from madns_runtime.protocol.seal import OVERHEAD_BYTES
 
-DATAGRAM_BYTES_MAX = 1400
-SEAL_BYTES = 60
-"""Header and keyed MAC of a datagram, and the headers of its frames."""
+DATAGRAM_OVERHEAD_BYTES = OVERHEAD_BYTES + FRAME_BYTES
+"""Header and keyed MAC of a datagram, and the header of the one frame in it."""
 IP_UDP_BYTES = 28
 BITS_PER_BYTE = 8
 
@@ -205,8 +206,8 @@ def wire_bytes(message_bytes: int) -> int:
     """Return the bytes that a message of so many encoded bytes costs on the wire, all headers included."""
     if message_bytes <= 0:
         return 0
-    datagrams = math.ceil(message_bytes / (DATAGRAM_BYTES_MAX - SEAL_BYTES))
-    return message_bytes + datagrams * (SEAL_BYTES + IP_UDP_BYTES)
+    datagrams = math.ceil(message_bytes / FRAGMENT_BYTES_MAX)
+    return message_bytes + datagrams * (DATAGRAM_OVERHEAD_BYTES + IP_UDP_BYTES)
 
 
 def _first_beyond(each: float, allowed: float) -> float:

@@ -1,0 +1,152 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cosmos_cli.errors import InputError
+from cosmos_cli.models.document import apply_overrides, dotted, parse_override, read_document
+from cosmos_cli.models.yaml_source import Source
+
+
+def read(text):
+    return read_document(Source.of("a.yaml", text))
+
+
+def faults_of(text):
+    with pytest.raises(InputError) as caught:
+        read(text)
+    return [(fault.line, fault.column, fault.path, fault.text) for fault in caught.value.faults]
+
+
+def test_duplicate_keys_are_all_named_with_their_first():
+    text = "a: 1\nb: {c: 1, c: 2}\na: 3\n"
+
+    assert faults_of(text) == [
+        (2, 11, "b.c", "duplicate key; the first stands in line 2"),
+        (3, 1, "a", "duplicate key; the first stands in line 1"),
+    ]
+
+
+def test_keys_that_are_no_text_are_refused():
+    assert faults_of("1: a\n? [x]\n: b\n") == [
+        (1, 1, "", "expected a text as key, got 1: put it in quotes"),
+        (2, 3, "", "expected a text as key, got a list"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "a.yaml: expected a mapping, got an empty file"),
+        ("# only a comment\n", "a.yaml: expected a mapping, got an empty file"),
+        ("- a\n", "a.yaml:1:1: expected a mapping (key: value), got a list\n    - a\n    ^"),
+        ("text\n", "a.yaml:1:1: expected a mapping (key: value), got 'text'\n    text\n    ^"),
+    ],
+)
+def test_top_level_must_be_a_mapping(text, message):
+    with pytest.raises(InputError) as caught:
+        read(text)
+
+    assert str(caught.value) == message
+
+
+def test_aliases_and_merge_keys_are_unfolded_and_own_keys_win():
+    document = read(
+        "base: &base {x: 1, y: 2}\nmore: &more {y: 3, z: 4}\n"
+        "use:\n  <<: [*base, *more]\n  x: 5\nagain: *base\n"
+    )
+
+    assert document.value["use"] == {"y": 2, "z": 4, "x": 5}
+    assert document.value["again"] == {"x": 1, "y": 2}
+    assert document.fault(("use", "x"), "").line == 5
+    assert document.fault(("use", "z"), "").line == 2
+
+
+def test_merge_of_something_else_is_refused():
+    assert faults_of("a:\n  <<: 3\n") == [
+        (2, 7, "a", "expected a mapping or a list of mappings after <<")
+    ]
+
+
+def test_alias_bomb_is_refused():
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 9)]
+
+    ((_, _, _, text),) = faults_of("\n".join(lines))
+
+    assert text == "expected at most 200000 values, aliases unfolded"
+
+
+def test_missing_path_is_placed_at_the_key_above():
+    fault = read("x: 1\nagents:\n  tick_hz: 3\n").missing(("agents", "count"), "missing")
+
+    assert (fault.line, fault.column, fault.path) == (2, 1, "agents.count")
+
+
+def apply(text, *overrides):
+    document = read(text)
+    faults = apply_overrides(document, overrides)
+    return document, [fault.render() for fault in faults]
+
+
+def test_overrides_replace_make_and_append():
+    document, faults = apply(
+        "a: {b: 1}\nl: [1, 2]\nn:\n",
+        "a.b=2", "a.c.d=x", "l[0]=7", "l.2=8", "n.k=true", "m=[1, {z: 2}]", "m[1].z=3", "e=",
+    )  # fmt: skip
+
+    assert faults == []
+    assert document.value == {
+        "a": {"b": 2, "c": {"d": "x"}},
+        "l": [7, 2, 8],
+        "n": {"k": True},
+        "m": [1, {"z": 3}],
+        "e": None,
+    }
+
+
+def test_faults_below_an_override_name_the_option():
+    document, _ = apply("a: {b: {c: 1}}\n", "a.b={c: 2}")
+
+    assert document.fault(("a", "b", "c"), "wrong").render() == "--set a.b: a.b.c: wrong"
+    assert document.fault(("a", "b"), "wrong").render() == "--set a.b: wrong"
+    assert document.fault(("a",), "wrong").render().startswith("a.yaml:1:4: a: wrong")
+
+
+def test_later_override_wins():
+    document, _ = apply("a: 1\n", "a=2", "a=3")
+
+    assert document.value == {"a": 3}
+
+
+def test_all_bad_overrides_are_named():
+    _, faults = apply(
+        "l: [1]\ns: x\n", "novalue", "a..b=1", "=1", "l[5]=1", "l.x=1", "s.t=1", "q=[1", "q={a: 1, a: 2}"
+    )
+
+    assert faults == [
+        "--set novalue: expected KEY=VALUE, such as agents.count=5",
+        "--set a..b: expected a dotted path, such as agents.names[0]",
+        "--set =1: expected a dotted path, such as agents.names[0]",
+        "--set l[5]: l has 1 items: got the index 5",
+        "--set l.x: l is a list: expected an index, got x",
+        "--set s.t: s is 'x' and has nothing inside",
+        "--set q: this list is never closed: expected ',' or ']'",
+        "--set q: duplicate key; the first stands in line 1",
+    ]
+
+
+STEP = st.from_regex(r"[a-z_][a-z0-9_-]{0,8}", fullmatch=True) | st.integers(0, 50)
+
+
+@given(head=st.from_regex(r"[a-z_]{1,8}", fullmatch=True), tail=st.lists(STEP, max_size=5))
+def test_dotted_paths_are_read_back(head, tail):
+    path = (head, *tail)
+
+    assert parse_override(f"{dotted(path)}=1") == (dotted(path), path, 1)
+
+
+@given(st.integers() | st.booleans() | st.text("abcxyz -", min_size=1).map(lambda t: f'"{t}"'))
+def test_override_values_are_typed_as_in_the_file(value):
+    text = str(value).lower() if isinstance(value, bool) else str(value)
+
+    assert parse_override(f"k={text}")[2] == read(f"k: {text}").value["k"]

@@ -1,0 +1,192 @@
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cosmos_cli.errors import InputError
+from cosmos_cli.models.yaml_source import DEPTH_MAX, Source, compose, read_source, resolve_scalar
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("no", "no"),
+        ("yes", "yes"),
+        ("on", "on"),
+        ("true", True),
+        ("False", False),
+        ("", None),
+        ("~", None),
+        ("null", None),
+        ("nil", "nil"),
+        ("12", 12),
+        ("-12", -12),
+        ("+7", 7),
+        ("010", 10),
+        ("0o10", 8),
+        ("0xff", 255),
+        ("1_000", "1_000"),
+        ("12:30", "12:30"),
+        ("12:30:00", "12:30:00"),
+        ("2024-01-01", "2024-01-01"),
+        ("1.5", 1.5),
+        (".5", 0.5),
+        ("1.", 1.0),
+        ("1e-3", 1e-3),
+        ("1.5E+2", 150.0),
+        ("1e", "1e"),
+        ("=", "="),
+    ],
+)
+def test_scalars_follow_yaml_1_2(text, value):
+    resolved = resolve_scalar(text)
+
+    assert (resolved, type(resolved)) == (value, type(value))
+
+
+@pytest.mark.parametrize(("text", "value"), [("1e3", 1000), ("4e6", 4_000_000), ("-2E+1", -20)])
+def test_power_of_ten_is_a_whole_number(text, value):
+    resolved = resolve_scalar(text)
+
+    assert (resolved, type(resolved)) == (value, int)
+
+
+@pytest.mark.parametrize("text", [".inf", "-.INF", ".nan", "1e999", "9" * 400])
+def test_numbers_that_are_not_finite_or_too_long_are_refused(text):
+    with pytest.raises(ValueError, match="expected a"):
+        resolve_scalar(text)
+
+
+@given(st.integers(-(10**30), 10**30))
+def test_whole_numbers_come_back_as_they_were_written(number):
+    assert resolve_scalar(str(number)) == number
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False))
+def test_numbers_come_back_as_they_were_written(number):
+    assert math.isclose(float(resolve_scalar(repr(number))), number, rel_tol=0, abs_tol=0)
+
+
+def fault_of(text):
+    with pytest.raises(InputError) as caught:
+        compose(Source.of("a.yaml", text))
+    (fault,) = caught.value.faults
+    return fault
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "message"),
+    [
+        ("a: 'x\nb: 1\n", (1, 4), "this quoted text is never closed"),
+        ('a: "x\n', (1, 4), "this quoted text is never closed"),
+        ("a: 1\nb: [1,\nc: 2\n", (2, 4), "this list is never closed"),
+        ("a: {b: 1\n", (1, 4), "this mapping is never closed"),
+        ("a:\n\tb: 1\n", (2, 1), "expected spaces, got a tab"),
+        ("a: b: c\n", (1, 5), "a second ': ' on this line"),
+        ("a: 1\n b: 2\n", (2, 3), "a second ': ' on this line"),
+        ("a: 1\nbc\n", (2, 1), "expected `key: value`, got no ':' after the key"),
+        ("a: @x\n", (1, 4), "'@' cannot start a value: put it in quotes"),
+        ("a: *x\n", (1, 4), "no anchor &x stands above"),
+        ("a: &x [*x]\n", (1, 8), "no anchor &x stands above"),
+        ("a: !thing 3\n", (1, 4), "expected a plain value, got the tag !thing"),
+        ("a: !!python/object:os.x 3\n", (1, 4), "expected a plain value, got the tag !!python"),
+        ("a: 1\n---\nb: 1\n", (2, 1), "expected one document, a second one starts here"),
+        ("a: .inf\n", (1, 4), "expected a finite number, got .inf"),
+        ("a: 1\nb: \x07\n", (2, 4), "got the control character U+0007"),
+    ],
+)
+def test_faults_of_syntax_have_a_place_and_plain_words(text, place, message):
+    fault = fault_of(text)
+
+    assert (fault.line, fault.column) == place
+    assert message in fault.text
+    assert fault.file == "a.yaml"
+
+
+@pytest.mark.parametrize("text", ["[" * 200_000, "- " * 5000, "{a: " * 3000])
+def test_deep_nesting_is_refused_and_does_not_end_the_process(text):
+    assert f"at most {DEPTH_MAX} levels" in fault_of(text).text
+
+
+def test_explicit_tags_of_the_core_schema_are_understood():
+    node = compose(Source.of("a", "[!!str 3, !!int 3, !!float 3, ! 3]"))
+
+    assert [item.value for item in node.value] == ["3", 3, 3.0, "3"]
+    assert isinstance(node.value[2].value, float)
+
+
+def test_empty_text_has_no_document():
+    assert compose(Source.of("a", "# nothing\n")) is None
+
+
+@given(st.text(max_size=200))
+def test_any_text_is_read_or_refused_with_a_place(text):
+    try:
+        compose(Source.of("a.yaml", text))
+    except InputError as error:
+        assert all(fault.file == "a.yaml" for fault in error.faults)
+
+
+def whole_fault(path):
+    with pytest.raises(InputError) as caught:
+        read_source(path)
+    return str(caught.value)
+
+
+def test_missing_file_suggests_a_similar_one(tmp_path):
+    (tmp_path / "iridium10.yaml").write_text("a: 1\n")
+
+    message = whole_fault(tmp_path / "iridum10.yaml")
+
+    assert message == (
+        f"{tmp_path}/iridum10.yaml: no such file, did you mean {tmp_path}/iridium10.yaml?"
+    )
+
+
+def test_missing_folder_is_told_apart_from_nothing(tmp_path):
+    assert whole_fault(tmp_path / "no" / "a.yaml") == f"{tmp_path}/no/a.yaml: no such file"
+
+
+def test_folder_is_refused(tmp_path):
+    assert whole_fault(tmp_path) == f"{tmp_path}: expected a file, got a folder"
+
+
+def test_unreadable_file_says_why(tmp_path, monkeypatch):
+    path = tmp_path / "a.yaml"
+    path.write_text("a: 1\n")
+    monkeypatch.setattr(type(path), "open", _deny)
+
+    assert whole_fault(path) == f"{path}: cannot be read: Permission denied"
+
+
+def _deny(*_arguments, **_options):
+    raise PermissionError(13, "Permission denied")
+
+
+def test_binary_file_is_refused(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_bytes(b"PK\x03\x04\0\0")
+
+    assert whole_fault(path) == f"{path}: expected UTF-8 text, got binary data"
+
+
+def test_other_encoding_is_refused_with_its_line(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_bytes("a: 1\nb: größe\n".encode("latin-1"))
+
+    assert whole_fault(path) == f"{path}: expected UTF-8 text, got byte 0xf6 in line 2"
+
+
+def test_byte_order_mark_is_no_text(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_bytes(b"\xef\xbb\xbfa: 1\n")
+
+    assert read_source(path).text == "a: 1\n"
+
+
+def test_huge_file_is_refused(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_bytes(b"#" * (4 * 1024 * 1024 + 1))
+
+    assert "expected at most 4194304 bytes" in whole_fault(path)

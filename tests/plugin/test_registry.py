@@ -1,0 +1,311 @@
+import dataclasses
+import pickle  # noqa: TID251 - shows that executor workers can find a file's functions again
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from madns_runtime.errors import ConfigurationError, MissingExtraError, PluginError
+from madns_runtime.plugin import registry
+from madns_runtime.plugin.api import Simulation
+
+PLUGIN = """
+    from __future__ import annotations
+    from dataclasses import dataclass
+    from madns_runtime.plugin.api import AgentSimulation, HostSimulation, Simulation
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Parameters:
+        gain: float = 2.0
+        marks: tuple[int, ...] = ()
+
+    class Host(HostSimulation):
+        pass
+
+    class Agent(AgentSimulation):
+        pass
+
+    def work(x):
+        return x + 1
+
+    simulation = Simulation(name="p", parameters=Parameters, agent=":Agent", host=":Host")
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write_file(text, name="plugin.py"):
+        path = tmp_path / name
+        path.write_text(textwrap.dedent(text))
+        return path
+
+    yield write_file
+    for name in [n for n, m in sys.modules.items() if str(tmp_path) in str(getattr(m, "__file__", ""))]:
+        del sys.modules[name]
+
+
+def refusal(spec, base):
+    with pytest.raises(PluginError) as caught:
+        registry.resolve(spec, base)
+    return str(caught.value)
+
+
+def half_refusal(write, tmp_path, body):
+    write(PLUGIN + textwrap.indent(textwrap.dedent(body), "    "))
+    descriptor = registry.resolve("./plugin.py:simulation", tmp_path)
+    with pytest.raises(PluginError) as caught:
+        registry.load_half(descriptor, "agent", tmp_path)
+    return str(caught.value)
+
+
+def test_registered_name_is_found(tmp_path):
+    descriptor = registry.resolve("counter", tmp_path)
+
+    assert descriptor.name == "counter"
+    assert {"counter", "constellation"} <= set(registry.registered_names())
+
+
+def test_module_and_attribute_are_found(tmp_path):
+    by_module = registry.resolve("madns_runtime.simulations.counter:simulation", tmp_path)
+
+    assert by_module == registry.resolve("counter", tmp_path)
+
+
+def test_unknown_name_lists_known_ones_and_the_closest(tmp_path):
+    message = refusal("conter", tmp_path)
+
+    assert message.startswith("no simulation named 'conter', did you mean counter?")
+    assert "installed are constellation, counter" in message
+
+
+def test_name_of_a_file_beside_the_scenario_tells_how_files_are_written(write, tmp_path):
+    write(PLUGIN, "rover.py")
+
+    assert "a file's simulation is written ./rover.py:simulation" in refusal("rover", tmp_path)
+    assert "a file's simulation is written ./rover.py:simulation" in refusal("rover.py", tmp_path)
+
+
+def test_file_beside_the_scenario_is_found_and_its_parts_are_named_in_full(write, tmp_path):
+    path = write(PLUGIN)
+
+    descriptor = registry.resolve("./plugin.py:simulation", tmp_path)
+
+    assert isinstance(descriptor, Simulation)
+    assert descriptor.agent == f"{registry.module_name(path)}:Agent"
+    assert registry.load_half(descriptor, "agent", tmp_path).__name__ == "Agent"
+    assert registry.load_half(descriptor, "host", tmp_path).__name__ == "Host"
+
+
+def test_file_is_loaded_once_and_its_functions_can_be_found_by_name(write, tmp_path):
+    write(PLUGIN)
+
+    first = registry.resolve("./plugin.py:simulation", tmp_path)
+    second = registry.resolve("./plugin.py:simulation", tmp_path)
+
+    work = registry.load_function("./plugin.py:work", tmp_path)
+    assert first.parameters is second.parameters
+    assert pickle.loads(pickle.dumps(work)) is work
+
+
+def test_files_of_one_name_in_two_folders_are_two_modules(tmp_path):
+    paths = [tmp_path / folder / "plugin.py" for folder in ("a", "b")]
+
+    assert len({registry.module_name(path) for path in paths}) == 2
+
+
+def test_module_name_is_the_same_in_every_process(tmp_path):
+    path = tmp_path / "my-plugin.py"
+    code = (
+        "from pathlib import Path; from madns_runtime.plugin.registry import module_name;"
+        f"print(module_name(Path({str(path)!r})))"
+    )
+
+    other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+    assert other.stdout.strip() == registry.module_name(path)
+    assert registry.module_name(path).isidentifier()
+
+
+def test_missing_file_is_named(tmp_path):
+    assert str(tmp_path / "no.py") in refusal("./no.py:simulation", tmp_path)
+
+
+def test_syntax_error_is_shown_with_file_and_line(write, tmp_path):
+    path = write("x = 1\ndef broken(:\n")
+
+    assert refusal("./plugin.py:simulation", tmp_path).startswith(f"{path}:2: SyntaxError: ")
+
+
+def test_error_while_loading_is_shown_with_the_line_of_the_file(write, tmp_path):
+    path = write("def inner():\n    return 1 / 0\n\n\ninner()\n")
+
+    message = refusal("./plugin.py:simulation", tmp_path)
+
+    assert message == f"{path}:2: ZeroDivisionError: division by zero"
+
+
+def test_file_that_failed_is_read_again_after_a_repair(write, tmp_path):
+    write("raise ValueError('not yet')\n")
+    refusal("./plugin.py:simulation", tmp_path)
+    write(PLUGIN)
+
+    assert registry.resolve("./plugin.py:simulation", tmp_path).name == "p"
+
+
+def test_missing_module_in_a_file_is_shown_with_its_line(write, tmp_path):
+    path = write("import os\nimport no_such_module_at_all\n")
+
+    message = refusal("./plugin.py:simulation", tmp_path)
+
+    assert message == f"{path}:2: No module named 'no_such_module_at_all'"
+
+
+def test_missing_extra_names_the_command_that_installs_it(write, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "scipy", None)  # import then says that it is not there
+    write(
+        """
+        try:
+            import scipy
+        except ModuleNotFoundError:
+            raise ModuleNotFoundError("No module named 'scipy'", name="scipy")
+        """
+    )
+
+    with pytest.raises(MissingExtraError) as caught:
+        registry.resolve("./plugin.py:simulation", tmp_path)
+
+    assert "pip install 'cosmos-madns[host]'" in str(caught.value)
+
+
+def test_missing_attribute_suggests_the_closest(write, tmp_path):
+    write(PLUGIN)
+
+    message = refusal("./plugin.py:simulaton", tmp_path)
+
+    assert "has no 'simulaton', did you mean simulation?" in message
+
+
+@pytest.mark.parametrize("spec", ["a b:", ":simulation", "./plugin.py:", "x:y-z"])
+def test_malformed_spec_is_refused(spec, tmp_path):
+    assert "expected module:attribute or ./file.py:attribute" in refusal(spec, tmp_path)
+
+
+def test_something_else_than_a_descriptor_is_refused(write, tmp_path):
+    write(PLUGIN)
+
+    message = refusal("./plugin.py:Agent", tmp_path)
+
+    assert "expected a madns_runtime.plugin.api.Simulation, got" in message
+
+
+def test_every_fault_of_a_descriptor_is_named(write, tmp_path):
+    write(PLUGIN + "    bad = Simulation(name='p', parameters=3, agent='Agent', host='Host')\n")
+
+    message = refusal("./plugin.py:bad", tmp_path)
+
+    assert "parameters: expected a dataclass" in message
+    assert "agent: expected 'module:name' or ':name', got 'Agent'" in message
+    assert "host: expected" in message
+
+
+def test_agent_without_the_methods_of_the_contract_is_refused(write, tmp_path):
+    message = half_refusal(
+        write,
+        tmp_path,
+        """
+        class Agent:
+            def setup(self, context, initial): pass
+            def receive(self, message): pass
+        """,
+    )
+
+    assert "no method step()" in message
+    assert "no method finish()" in message
+    assert "subclass AgentSimulation to inherit what is not needed" in message
+
+
+def test_method_with_other_parameters_is_refused(write, tmp_path):
+    message = half_refusal(
+        write,
+        tmp_path,
+        """
+        class Agent(AgentSimulation):
+            def step(self): pass
+        """,
+    )
+
+    assert "step() must take (self, tick)" in message
+
+
+def test_class_with_arguments_is_refused(write, tmp_path):
+    message = half_refusal(
+        write,
+        tmp_path,
+        """
+        class Agent(AgentSimulation):
+            def __init__(self, name): pass
+        """,
+    )
+
+    assert "it must be made without arguments" in message
+
+
+def test_function_in_place_of_a_class_is_refused(write, tmp_path):
+    message = half_refusal(write, tmp_path, "def Agent(): pass\n")
+
+    assert "expected a class, got function" in message
+
+
+def test_simulation_without_a_host_half_gets_an_idle_one(tmp_path):
+    descriptor = Simulation(name="x", parameters=object, agent="m:A")
+
+    host = registry.load_half(descriptor, "host", tmp_path)()
+
+    assert host.timer(0.0) is None
+    assert host.initial_data("agent-01") == {}
+
+
+@pytest.mark.parametrize("role", ["host", "agent"])
+def test_shipped_counter_keeps_the_contract(role, tmp_path):
+    descriptor = registry.resolve("counter", tmp_path)
+
+    assert isinstance(registry.load_half(descriptor, role, tmp_path)(), object)
+
+
+def test_parameters_are_built_from_a_plain_mapping(write, tmp_path):
+    write(PLUGIN)
+    descriptor = registry.resolve("./plugin.py:simulation", tmp_path)
+
+    parameters = registry.parse_parameters(descriptor, {"gain": 3, "marks": [1, 2]})
+
+    assert dataclasses.asdict(parameters) == {"gain": 3.0, "marks": (1, 2)}
+
+
+def test_unknown_parameter_is_refused_by_the_runtime_too(write, tmp_path):
+    write(PLUGIN)
+    descriptor = registry.resolve("./plugin.py:simulation", tmp_path)
+
+    with pytest.raises(ConfigurationError, match="parameters: unknown gian"):
+        registry.parse_parameters(descriptor, {"gian": 3})
+
+
+def test_resolving_a_registered_simulation_imports_neither_numpy_nor_the_halves():
+    code = (
+        "import sys; from pathlib import Path; from madns_runtime.plugin.registry import resolve;"
+        "resolve('counter', Path()); resolve('constellation', Path());"
+        "print([m for m in ('numpy', 'scipy', 'sgp4', 'pydantic', 'yaml') if m in sys.modules])"
+    )
+
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+    assert result.stdout.strip() == "[]"
+
+
+def test_registry_needs_only_a_path_to_find_a_file(write, tmp_path):
+    write(PLUGIN)
+
+    by_absolute_path = registry.resolve(f"{tmp_path / 'plugin.py'}:simulation", Path("/"))
+
+    assert by_absolute_path.name == "p"
