@@ -58,6 +58,11 @@ class Located:
     """Where a union was entered, and the label of its member; empty outside of unions."""
     error: Mapping[str, Any]
 
+    @property
+    def member(self) -> str:
+        """The label of the union's member; empty outside of unions."""
+        return str(self.branch[-1]) if self.branch else ""
+
 
 def faults_of(
     document: Document, errors: Sequence[Any], model: Any, *, below: Path = ()
@@ -131,7 +136,7 @@ def _fault(document: Document, item: Located, model: Any, below: Path) -> Fault:
         about = _about(model, path[len(below) :])
         return document.missing(path, f"missing{about}")
     if kind in _UNKNOWN:
-        known = known_keys(model, path[len(below) : -1])
+        known = known_keys(model, path[len(below) : -1], member=item.member)
         text = f"unknown key{did_you_mean(str(path[-1]), known)}"
         return document.fault(path, text, at_key=True)
     return document.fault(path, _text(kind, context, item.error, _got(document, path, item.error)))
@@ -169,12 +174,11 @@ def _unit(kind: str) -> str:
     return "characters" if kind.startswith("string") else "items"
 
 
-def known_keys(model: Any, path: Path) -> list[str]:
-    """Return the keys that *model* knows at *path*, all members of a union together."""
-    keys: dict[str, None] = {}
-    for kind in _types_at(model, path):
-        keys.update(dict.fromkeys(_fields(kind)))
-    return list(keys)
+def known_keys(model: Any, path: Path, *, member: str = "") -> list[str]:
+    """Return the keys that *model* knows at *path*: of the union's *member*, or of all members together."""
+    kinds = _types_at(model, path)
+    meant = [kind for kind in kinds if getattr(kind, "__name__", "") == member]
+    return list(dict.fromkeys(key for kind in meant or kinds for key in _fields(kind)))
 
 
 def _about(model: Any, path: Path) -> str:

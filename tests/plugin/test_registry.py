@@ -42,7 +42,9 @@ def write(tmp_path):
         return path
 
     yield write_file
-    for name in [n for n, m in sys.modules.items() if str(tmp_path) in str(getattr(m, "__file__", ""))]:
+    for name in [
+        n for n, m in sys.modules.items() if str(tmp_path) in str(getattr(m, "__file__", ""))
+    ]:
         del sys.modules[name]
 
 
@@ -298,7 +300,9 @@ def test_resolving_a_registered_simulation_imports_neither_numpy_nor_the_halves(
         "print([m for m in ('numpy', 'scipy', 'sgp4', 'pydantic', 'yaml') if m in sys.modules])"
     )
 
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
 
     assert result.stdout.strip() == "[]"
 

@@ -120,7 +120,15 @@ def test_later_override_wins():
 
 def test_all_bad_overrides_are_named():
     _, faults = apply(
-        "l: [1]\ns: x\n", "novalue", "a..b=1", "=1", "l[5]=1", "l.x=1", "s.t=1", "q=[1", "q={a: 1, a: 2}"
+        "l: [1]\ns: x\n",
+        "novalue",
+        "a..b=1",
+        "=1",
+        "l[5]=1",
+        "l.x=1",
+        "s.t=1",
+        "q=[1",
+        "q={a: 1, a: 2}",
     )
 
     assert faults == [

@@ -1,0 +1,366 @@
+"""Golden texts: what a person sees for each kind of mistake, to the letter."""
+
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from cosmos_cli.errors import InputError
+from cosmos_cli.models.loading import load_scenario
+from madns_runtime.config import RunConfig, from_mapping, to_mapping
+
+MINIMAL = "name: a\nsimulation: counter\nagents: {count: 3}\n"
+
+PLUGIN = """
+from __future__ import annotations
+from dataclasses import dataclass
+from typing import Annotated, Literal
+from annotated_types import Ge, Gt
+from madns_runtime.plugin.api import AgentSimulation, Simulation
+
+@dataclass(frozen=True, kw_only=True)
+class Slow:
+    kind: Literal["slow"]
+    delay_s: Annotated[float, Gt(0)] = 1.0
+
+@dataclass(frozen=True, kw_only=True)
+class Quick:
+    kind: Literal["quick"]
+    steps: int = 1
+
+@dataclass(frozen=True, kw_only=True)
+class Parameters:
+    mass_kg: Annotated[float, Gt(0)]
+    files: tuple[str, ...] = ()
+    method: Slow | Quick = Quick(kind="quick")
+    spare: int | None = None
+
+def check(parameters, agents, base_directory):
+    faults = [
+        f"files[{i}]: no such file {name}"
+        for i, name in enumerate(parameters.files)
+        if not (base_directory / name).is_file()
+    ]
+    if parameters.mass_kg > agents:
+        faults.append("mass_kg: expected at most one a agent")
+    if parameters.spare == 0:
+        faults.append("parameters.method.steps: expected more with spare: 0")
+    if parameters.spare == 1:
+        faults.append("spare and mass_kg do not fit together")
+    return faults
+
+class Agent(AgentSimulation):
+    pass
+
+simulation = Simulation(name="p", parameters=Parameters, agent=":Agent", check=":check")
+"""
+
+
+@pytest.fixture
+def see(tmp_path, monkeypatch):
+    """Return what a person sees for the text of a scenario."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "p.py").write_text(PLUGIN)
+
+    def refused(text, *overrides):
+        Path("a.yaml").write_text(textwrap.dedent(text))
+        with pytest.raises(InputError) as caught:
+            load_scenario(Path("a.yaml"), overrides)
+        return str(caught.value)
+
+    return refused
+
+
+def golden(text):
+    return textwrap.dedent(text).strip("\n")
+
+
+def test_every_fault_of_a_file_is_shown_at_once_in_order(see):
+    shown = see(
+        """\
+        name: Iridium10
+        simulation: conter
+        agents: {count: 10.5, tick_hz: 10, tickhz: 3}
+        time: {mode: lockstep, duration_s: no}
+        deadline:
+          tolerance_ms: -1
+        executor: {kind: proces}
+        sed: 3
+        """
+    )
+
+    assert shown == golden(
+        """
+        a.yaml:1:7: name: expected lower-case letters, digits and hyphens, got 'Iridium10'
+            name: Iridium10
+                  ^
+        a.yaml:2:13: simulation: no simulation named 'conter', did you mean counter?; installed are constellation, counter
+            simulation: conter
+                        ^
+        a.yaml:3:17: agents.count: expected a whole number, got 10.5
+            agents: {count: 10.5, tick_hz: 10, tickhz: 3}
+                            ^
+        a.yaml:3:36: agents.tickhz: unknown key, did you mean tick_hz?
+            agents: {count: 10.5, tick_hz: 10, tickhz: 3}
+                                               ^
+        a.yaml:4:14: time.mode: expected realtime, got 'lockstep'
+            time: {mode: lockstep, duration_s: no}
+                         ^
+        a.yaml:4:36: time.duration_s: expected a number, got 'no'
+            time: {mode: lockstep, duration_s: no}
+                                               ^
+        a.yaml:6:17: deadline.tolerance_ms: expected >= 0, got -1
+              tolerance_ms: -1
+                            ^
+        a.yaml:7:18: executor.kind: expected process, thread or module:callable, got 'proces'
+            executor: {kind: proces}
+                             ^
+        a.yaml:8:1: sed: unknown key, did you mean seed?
+            sed: 3
+            ^
+        """
+    )
+
+
+def test_missing_keys_are_placed_at_what_lacks_them(see):
+    assert see("name: a\nagents:\n  tick_hz: 3\n") == golden(
+        """
+        a.yaml:1:1: simulation: missing; expected a text
+            name: a
+            ^
+        a.yaml:2:1: agents.count: missing; expected a whole number
+            agents:
+            ^
+        """
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "shown"),
+    [
+        ("agents: {count: 0}", "a.yaml:3:17: agents.count: expected >= 1, got 0"),
+        ("agents: {count: 1e4}", "a.yaml:3:17: agents.count: expected <= 5000, got 1e4"),
+        ("agents: {count: '3'}", "a.yaml:3:17: agents.count: expected a whole number, got '3'"),
+        ("agents: {count: yes}", "a.yaml:3:17: agents.count: expected a whole number, got 'yes'"),
+        ("agents: {count: true}", "a.yaml:3:17: agents.count: expected a whole number, got true"),
+        ("agents: {count: }", "a.yaml:3:17: agents.count: expected a whole number, got nothing"),
+        ("agents: 3", "a.yaml:3:9: agents: expected a mapping, got 3"),
+        ("agents: [3]", "a.yaml:3:9: agents: expected a mapping, got a list"),
+        (
+            "agents: {count: 3, phase: stagered}",
+            "a.yaml:3:27: agents.phase: expected staggered or aligned, got 'stagered', "
+            "did you mean staggered?",
+        ),
+        (
+            "agents: {count: 3, names: [a, 2, c]}",
+            "a.yaml:3:31: agents.names[1]: expected a text, got 2",
+        ),
+        (
+            "agents: {count: 3, names: abc}",
+            "a.yaml:3:27: agents.names: expected a list, got 'abc'",
+        ),
+        (
+            "agents: {count: 3, tick_hz: 12:30}",
+            "a.yaml:3:29: agents.tick_hz: expected a number, got '12:30'",
+        ),
+        (
+            "agents: {count: 3, xyz: 1}",
+            "a.yaml:3:20: agents.xyz: unknown key; known here: count, tick_hz, names, phase, "
+            "per_process, restarts_max",
+        ),
+        (
+            "agents: {count: 3, names: [a, b]}",
+            "a.yaml:3:27: agents.names: expected 3 names (agents.count), got 2",
+        ),
+        (
+            "agents: {count: 3, names: [a, Host, c]}",
+            "a.yaml:3:31: agents.names[1]: 'Host' is reserved; give the agent another name",
+        ),
+        (
+            "agents: {count: 3, names: [a, b, A]}",
+            "a.yaml:3:34: agents.names[2]: expected unique names, got 'A' again (first at [0])",
+        ),
+        (
+            "agents: {count: 1, names: [../x]}",
+            "a.yaml:3:28: agents.names[0]: expected letters, digits, '.', '_' or '-' "
+            "(a folder is named after the agent), got '../x'",
+        ),
+        (
+            "agents: {count: 3, per_process: 4}",
+            "a.yaml:3:33: agents.per_process: expected <= agents.count (3), got 4",
+        ),
+        (
+            "agents: {count: 3, restarts_max: 2}",
+            "a.yaml:3:34: agents.restarts_max: expected 0 with on_agent_loss: abort, got 2; "
+            "say on_agent_loss: continue",
+        ),
+        (
+            "agents: {count: 3, tick_hz: 0.01}",
+            "a.yaml:1:1: time.duration_s: expected at least one tick (100 s at 0.01 Hz), got 60",
+        ),
+    ],
+)
+def test_each_mistake_has_its_sentence(see, line, shown):
+    text = f"name: a\nsimulation: counter\n{line}\n"
+
+    assert see(text).split("\n")[0] == shown
+    assert see(text).count("\n") == 2  # one fault: the sentence, the source, the caret
+
+
+def test_sections_without_faults_are_checked_against_each_other_even_if_another_is_broken(see):
+    shown = see("name: a\nsimulation: counter\nagents: {count: 2, names: [b]}\nseed: x\n")
+
+    assert [line.split(" ")[1] for line in shown.splitlines() if line.startswith("a.yaml")] == [
+        "agents.names:",
+        "seed:",
+    ]
+
+
+PLUGGED = "name: a\nsimulation: ./p.py:simulation\nagents: {count: 3}\n"
+
+
+def test_faults_of_parameters_have_their_place(see):
+    shown = see(
+        PLUGGED
+        + "parameters:\n  mass_kg: 0\n  files: [x, 3]\n  spare: 1.5\n  filse: []\n"
+        + "  method: {kind: slow, delay_s: -1, steps: 3}\n"
+    )
+
+    assert shown == golden(
+        """
+        a.yaml:5:12: parameters.mass_kg: expected > 0, got 0
+              mass_kg: 0
+                       ^
+        a.yaml:6:14: parameters.files[1]: expected a text, got 3
+              files: [x, 3]
+                         ^
+        a.yaml:7:10: parameters.spare: expected a whole number, got 1.5
+              spare: 1.5
+                     ^
+        a.yaml:8:3: parameters.filse: unknown key, did you mean files?
+              filse: []
+              ^
+        a.yaml:9:33: parameters.method.delay_s: expected > 0, got -1
+              method: {kind: slow, delay_s: -1, steps: 3}
+                                            ^
+        a.yaml:9:37: parameters.method.steps: unknown key; known here: kind, delay_s, steps
+              method: {kind: slow, delay_s: -1, steps: 3}
+                                                ^
+        """
+    )
+
+
+def test_missing_parameters_are_placed_at_the_section_or_the_file(see):
+    assert see(PLUGGED).startswith("a.yaml:1:1: parameters.mass_kg: missing; expected a number\n")
+    assert see(PLUGGED + "parameters: {spare: 2}\n").startswith(
+        "a.yaml:4:1: parameters.mass_kg: missing; expected a number\n"
+    )
+
+
+def test_faults_that_the_simulation_finds_have_their_place(see):
+    shown = see(PLUGGED + "parameters:\n  mass_kg: 9\n  files: [p.py, no.tle]\n  spare: 0\n")
+
+    assert shown == golden(
+        """
+        a.yaml:4:1: parameters.method.steps: expected more with spare: 0
+            parameters:
+            ^
+        a.yaml:5:12: parameters.mass_kg: expected at most one a agent
+              mass_kg: 9
+                       ^
+        a.yaml:6:17: parameters.files[1]: no such file no.tle
+              files: [p.py, no.tle]
+                            ^
+        """
+    )
+
+
+def test_fault_of_the_simulation_without_a_name_stands_at_parameters(see):
+    shown = see(PLUGGED + "parameters: {mass_kg: 1, spare: 1}\n")
+
+    assert shown.startswith("a.yaml:4:1: parameters: spare and mass_kg do not fit together\n")
+
+
+def test_fault_in_the_plugin_file_is_shown_with_both_places(see):
+    Path("broken.py").write_text("x = 1\nx.nothing\n")
+
+    shown = see("name: a\nsimulation: ./broken.py:simulation\nagents: {count: 3}\n")
+
+    assert shown.startswith("a.yaml:2:13: simulation: ")
+    assert "broken.py:2: AttributeError: 'int' object has no attribute 'nothing'" in shown
+
+
+def test_faults_of_overrides_name_the_option_and_come_last(see):
+    shown = see(
+        "name: a\nsimulation: counter\nagents: {count: 3}\nseed: x\n",
+        "agents.count=-1", "agents.tickhz=3", "parameters.service=bets", "nonsense",
+    )  # fmt: skip
+
+    assert shown == golden(
+        """
+        a.yaml:4:7: seed: expected a whole number, got 'x'
+            seed: x
+                  ^
+        --set nonsense: expected KEY=VALUE, such as agents.count=5
+        --set agents.count: expected >= 1, got -1
+        --set agents.tickhz: unknown key, did you mean tick_hz?
+        --set parameters.service: expected best, reliable or sync, got 'bets', did you mean best?
+        """
+    )
+
+
+def test_long_lines_are_shown_around_the_caret(see):
+    names = ", ".join(f"agent-{i}" for i in range(40))
+
+    shown = see(f"name: a\nsimulation: counter\nagents: {{count: 41, names: [{names}, /]}}\n")
+
+    source, caret = shown.splitlines()[-2:]
+    assert len(source) <= 110
+    assert source[caret.index("^")] == "/"
+
+
+def load(tmp_path, text, *overrides):
+    path = tmp_path / "a.yaml"
+    path.write_text(text)
+    return load_scenario(path, overrides)
+
+
+def test_right_scenario_is_read_with_overrides_and_defaults(tmp_path):
+    found = load(tmp_path, MINIMAL, "agents.tick_hz=100", "parameters.service=reliable")
+
+    assert found.scenario.agents.tick_hz == 100.0
+    assert found.scenario.deadline.tolerance_ms == 5.0
+    assert found.parameters.service == "reliable"
+    assert found.base_directory == tmp_path
+    assert found.text == MINIMAL
+
+
+def test_run_config_holds_everything_and_survives_the_journey(tmp_path):
+    found = load(tmp_path, MINIMAL)
+
+    config = found.run_config("0001-a")
+
+    assert (config.run, config.scenario, config.simulation) == ("0001-a", "a", "counter")
+    assert config.parameters == {"service": "best", "payload_bytes": 0}
+    assert from_mapping(RunConfig, to_mapping(config)) == config
+
+
+def test_scenario_written_out_in_full_is_read_back_the_same(tmp_path):
+    import yaml
+
+    found = load(tmp_path, MINIMAL, "agents.names=[x, y, z]")
+
+    again = load(tmp_path, yaml.safe_dump(found.to_mapping()))
+
+    assert again.scenario.agents == found.scenario.agents
+    assert again.to_mapping() == found.to_mapping()
+
+
+def test_thousand_agents_with_names_are_read(tmp_path):
+    names = ", ".join(f"sat-{i}" for i in range(1000))
+
+    found = load(
+        tmp_path, f"name: a\nsimulation: counter\nagents: {{count: 1000, names: [{names}]}}\n"
+    )
+
+    assert found.scenario.agents.names[999] == "sat-999"

@@ -1,0 +1,70 @@
+import json
+from pathlib import Path
+
+import jsonschema
+import pytest
+import yaml
+
+from cosmos_cli.models.document import read_document
+from cosmos_cli.models.schema import schema_text
+from cosmos_cli.models.yaml_source import read_source
+from madns_runtime.plugin.registry import resolve
+
+ROOT = Path(__file__).parents[3]
+KEPT = ROOT / "scenarios/scenario.schema.json"
+SHIPPED = ("counter", "constellation")
+
+
+@pytest.fixture(scope="module")
+def validator():
+    schema = json.loads(KEPT.read_text())
+    jsonschema.Draft202012Validator.check_schema(schema)
+    return jsonschema.Draft202012Validator(schema)
+
+
+def test_kept_schema_is_current():
+    current = schema_text({name: resolve(name, ROOT).parameters for name in SHIPPED})
+
+    assert KEPT.read_text() == current, (
+        "write it with: cosmos schema -o scenarios/scenario.schema.json"
+    )
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "scenarios").glob("*.yaml")), ids=lambda p: p.name)
+def test_shipped_scenarios_fulfil_the_schema(validator, path):
+    validator.validate(read_document(read_source(path)).value)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"sed": 1},
+        {"agents": {"count": 0}},
+        {"agents": {"count": 1, "hz": 3}},
+        {"name": "Big"},
+        {"parameters": {"servce": "best"}},
+        {"parameters": {"service": "bets"}},
+        {"simulation": "conter"},
+        {"simulation": "constellation", "parameters": {}},
+    ],
+    ids=str,
+)
+def test_schema_refuses_what_the_models_refuse(validator, change):
+    scenario = {"name": "a", "simulation": "counter", "agents": {"count": 1}}
+
+    assert validator.is_valid(scenario)
+    assert not validator.is_valid(scenario | change)
+
+
+def test_schema_accepts_a_file_beside_the_scenario_with_any_parameters(validator):
+    text = "{name: a, simulation: './p.py:simulation', agents: {count: 1}, parameters: {x: [1]}}"
+
+    assert validator.is_valid(yaml.safe_load(text))
+
+
+def test_descriptions_reach_the_schema(validator):
+    agents = validator.schema["$defs"]["Agents"]["properties"]
+
+    assert agents["tick_hz"]["description"] == "Rate of every agent's loop, Hz."
+    assert validator.schema["properties"]["seed"]["description"]
+    assert validator.schema["additionalProperties"] is False
