@@ -24,8 +24,6 @@ class OperatorSignals:
         self._before: dict[int, object] = {}
         self._wakeup_before = -1
         self._is_raising = False
-        self.stops: list[signal.Signals] = []
-        """Stop signals so far, in order."""
 
     def __enter__(self) -> OperatorSignals:
         for number in (*STOP_SIGNALS, signal.SIGCHLD):
@@ -53,9 +51,7 @@ class OperatorSignals:
         """Return the stop signals that came since the last call; others only wake."""
         with contextlib.suppress(BlockingIOError):
             numbers = self._reader.recv(4096)
-            came = [signal.Signals(n) for n in numbers if n in STOP_SIGNALS]
-            self.stops += came
-            return came
+            return [signal.Signals(n) for n in numbers if n in STOP_SIGNALS]
         return []
 
     def raise_from_now(self) -> None:

@@ -1,0 +1,223 @@
+"""`cosmos run` as a person meets it: what it prints where, what it leaves, what it ends with."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+import yaml
+
+from cosmos_cli.app import run as cosmos
+
+DRIVER = Path(__file__).with_name("launch_driver.py")
+PATIENCE_S = 120.0
+SCENARIO = """\
+# A comment that a person wrote.
+name: tiny
+simulation: counter
+agents: {count: 2, tick_hz: 20}
+time: {duration_s: 1}
+"""
+
+
+@pytest.fixture
+def scenario(tmp_path: Path) -> Path:
+    path = tmp_path / "tiny.yaml"
+    path.write_text(SCENARIO)
+    return path
+
+
+@pytest.fixture
+def environment(tmp_path: Path) -> Iterator[dict[str, str]]:
+    """Yield an environment of its own, and see to it that nothing lives afterwards."""
+    marker = str(tmp_path / "state")
+    yield {
+        **os.environ,
+        "COSMOS_STATE_DIR": marker,
+        "COSMOS_RUNS": str(tmp_path / "runs"),
+        "COSMOS_FAKE_NOTES": str(tmp_path / "notes"),
+    }
+    survivors = [process for process in psutil.process_iter() if _is_marked(process, marker)]
+    assert survivors == []
+
+
+def _is_marked(process: psutil.Process, marker: str) -> bool:
+    try:
+        is_dead = process.status() == psutil.STATUS_ZOMBIE
+        return not is_dead and process.environ().get("COSMOS_STATE_DIR") == marker
+    except psutil.Error:
+        return False
+
+
+def start(environment: dict[str, str], *arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, str(DRIVER), "cosmos", "run", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+
+
+def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    out, err = process.communicate(timeout=PATIENCE_S)
+    return process.returncode, out, err
+
+
+def wait_for_note(environment: dict[str, str], text: str) -> None:
+    notes = Path(environment["COSMOS_FAKE_NOTES"])
+    until_s = time.monotonic() + PATIENCE_S
+    while not (notes.exists() and text in notes.read_text()):
+        assert time.monotonic() < until_s, f"no note {text!r}"
+        time.sleep(0.02)
+
+
+def run_json(environment: dict[str, str]) -> dict[str, object]:
+    (path,) = Path(environment["COSMOS_RUNS"]).glob("*/run.json")
+    return dict(json.loads(path.read_text()))
+
+
+@pytest.mark.process
+def test_real_run_passes_and_says_where_the_evidence_lies(
+    environment: dict[str, str], scenario: Path
+) -> None:
+    process = subprocess.run(
+        [sys.executable, "-m", "cosmos_cli.app", "run", str(scenario), "--json"],
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=PATIENCE_S,
+    )
+
+    # Whether the budget holds depends on the machine that tests; that the run ended well does not.
+    document = json.loads(process.stdout)
+    assert process.returncode in (0, 4), process.stderr
+    assert document == run_json(environment)
+    assert document["status"] == "complete"
+    assert document["exit_code"] == process.returncode
+    assert document["agents"]["lost"] == []
+    last_line = process.stderr.splitlines()[-1]
+    assert last_line.endswith(f"| {Path(environment['COSMOS_RUNS']) / '0001-tiny'}")
+
+
+@pytest.mark.process
+def test_ctrl_c_ends_with_130_and_a_collected_run(
+    environment: dict[str, str], scenario: Path
+) -> None:
+    environment["COSMOS_FAKE"] = json.dumps({"host": {"runs_s": 60}})
+    process = start(environment, str(scenario))
+    wait_for_note(environment, "launched [")
+    process.send_signal(signal.SIGINT)
+
+    code, out, err = finish(process)
+
+    directory = Path(environment["COSMOS_RUNS"]) / "0001-tiny"
+    assert code == 130, err
+    assert out.startswith("INTERRUPTED")
+    assert out.endswith(f"| {directory}\n")
+    assert run_json(environment)["status"] == "interrupted"
+    assert run_json(environment)["exit_code"] == 130
+    assert directory.with_name("0001-tiny.tar.zst").exists()
+
+
+@pytest.mark.process
+def test_second_ctrl_c_still_collects_what_is_on_disk(
+    environment: dict[str, str], scenario: Path
+) -> None:
+    stuck = {"runs_s": 60, "ignores_stop": True, "ignores_sigterm": True}
+    environment["COSMOS_FAKE"] = json.dumps({"host": stuck})
+    process = start(environment, str(scenario))
+    wait_for_note(environment, "launched [")
+    process.send_signal(signal.SIGINT)
+    wait_for_note(environment, "told")
+    process.send_signal(signal.SIGINT)
+
+    code, _, err = finish(process)
+
+    assert code == 130, err
+    assert run_json(environment)["status"] == "interrupted"
+
+
+@pytest.mark.process
+def test_killed_host_fails_the_run_and_names_it(
+    environment: dict[str, str], scenario: Path
+) -> None:
+    environment["COSMOS_FAKE"] = json.dumps({"host": {"runs_s": 60, "killed_after_s": 0.2}})
+
+    code, out, err = finish(start(environment, str(scenario)))
+
+    assert code == 1
+    assert out.startswith("FAILED")
+    assert "was killed by SIGKILL before the run was over" in err
+    assert "last words of the host" in err
+
+
+@pytest.mark.process
+def test_quiet_run_prints_the_verdict_alone(environment: dict[str, str], scenario: Path) -> None:
+    _, out, err = finish(start(environment, str(scenario), "--quiet"))
+
+    assert err == ""
+    assert len(out.splitlines()) == 1
+
+
+@pytest.mark.process
+def test_closed_standard_output_does_not_cost_the_evidence(
+    environment: dict[str, str], scenario: Path
+) -> None:
+    process = start(environment, str(scenario))
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.close()
+    process.stderr.close()
+
+    process.wait(PATIENCE_S)
+
+    assert run_json(environment)["status"] == "complete"
+
+
+@pytest.mark.process
+def test_scenario_is_kept_as_it_was_run(environment: dict[str, str], scenario: Path) -> None:
+    finish(start(environment, str(scenario)))
+    finish(start(environment, str(scenario), "--set", "seed=7", "--duration", "2.5"))
+
+    runs = Path(environment["COSMOS_RUNS"])
+    assert (runs / "0001-tiny" / "scenario.yaml").read_text() == SCENARIO
+    text = (runs / "0002-tiny" / "scenario.yaml").read_text()
+    resolved = yaml.safe_load(text)
+    assert "#   --set seed=7\n#   --set time.duration_s=2.5\n" in text
+    assert (resolved["seed"], resolved["time"]["duration_s"]) == (7, 2.5)
+    plan = json.loads((runs / "0002-tiny" / "plan.json").read_text())
+    assert plan["config"]["seed"] == 7
+
+
+def test_unknown_manual_agent_is_bad_input_and_makes_no_run(
+    scenario: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = tmp_path / "runs"
+
+    code = cosmos(["run", str(scenario), "--runs", str(runs), "--manual", "agent-9"])
+
+    assert code == 2
+    assert (
+        "--manual agent-9: no such agent; there are agent-01, agent-02" in capsys.readouterr().err
+    )
+    assert not runs.exists()
+
+
+def test_faulty_scenario_is_bad_input_and_makes_no_run(
+    scenario: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = tmp_path / "runs"
+
+    code = cosmos(["run", str(scenario), "--runs", str(runs), "--duration", "-1"])
+
+    assert code == 2
+    assert "time.duration_s" in capsys.readouterr().err
+    assert not runs.exists()
