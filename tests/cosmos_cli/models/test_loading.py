@@ -243,7 +243,7 @@ def test_faults_of_parameters_have_their_place(see):
         a.yaml:9:33: parameters.method.delay_s: expected > 0, got -1
               method: {kind: slow, delay_s: -1, steps: 3}
                                             ^
-        a.yaml:9:37: parameters.method.steps: unknown key; known here: kind, delay_s, steps
+        a.yaml:9:37: parameters.method.steps: unknown key; known here: kind, delay_s
               method: {kind: slow, delay_s: -1, steps: 3}
                                                 ^
         """

@@ -1,0 +1,342 @@
+"""The commands that start nothing: init, validate, schema, plan, inventory; and how errors leave."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cosmos_cli import app
+from cosmos_cli.commands.init import render
+from cosmos_cli.errors import ExitCode, RunFailedError
+from madns_runtime.errors import MachineError, PluginError
+
+ROOT = Path(__file__).parents[3]
+SCENARIO = "name: a\nsimulation: counter\nagents: {count: 3}\n"
+TEMPLATES = ("benchmark", "constellation", "plugin")
+
+
+@pytest.fixture
+def cosmos(tmp_path, monkeypatch, capsys):
+    """Return a function that runs the command line in an empty folder: (exit code, stdout, stderr)."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("COSMOS_DEBUG", "COSMOS_INVENTORY", "NO_COLOR"):
+        monkeypatch.delenv(name, raising=False)
+    (tmp_path / "a.yaml").write_text(SCENARIO)
+
+    def run(*arguments):
+        code = app.run([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return run
+
+
+def test_validate_says_what_was_found(cosmos):
+    assert cosmos("validate", "a.yaml") == (
+        0,
+        "a.yaml: ok: a, 3 agents of counter at 10 Hz for 60 s\n",
+        "",
+    )
+
+
+def test_validate_shows_the_faults_of_all_files(cosmos):
+    Path("b.yaml").write_text(SCENARIO + "sed: 1\n")
+    Path("c.yaml").write_text(SCENARIO + "seed: -1\n")
+
+    code, out, err = cosmos("validate", "b.yaml", "a.yaml", "c.yaml")
+
+    assert code == ExitCode.BAD_INPUT
+    assert out.startswith("a.yaml: ok")
+    assert err == (
+        "b.yaml:4:1: sed: unknown key, did you mean seed?\n    sed: 1\n    ^\n"
+        "c.yaml:4:7: seed: expected >= 0, got -1\n    seed: -1\n          ^\n"
+    )
+
+
+def test_validate_json_holds_the_whole_scenario(cosmos):
+    code, out, err = cosmos("validate", "a.yaml", "--json", "--set", "seed=7")
+
+    result = json.loads(out)
+    assert (code, err, result["valid"]) == (0, "", True)
+    assert result["scenarios"][0]["scenario"]["seed"] == 7
+    assert result["scenarios"][0]["scenario"]["deadline"]["tolerance_ms"] == 5.0
+
+
+def test_faults_are_json_on_stdout_too(cosmos):
+    code, out, err = cosmos("validate", "a.yaml", "--json", "--set", "seed=x")
+
+    result = json.loads(out)
+    assert code == result["exit_code"] == 2
+    assert result["error"]["kind"] == "input"
+    assert result["error"]["faults"] == [
+        {
+            "file": None,
+            "line": None,
+            "column": None,
+            "path": "seed",
+            "override": "seed",
+            "message": "expected a whole number, got 'x'",
+        }
+    ]
+    assert err == "--set seed: expected a whole number, got 'x'\n"
+
+
+def test_schema_is_printed_written_and_checked(cosmos):
+    _, out, _ = cosmos("schema")
+    assert cosmos("schema", "-o", "s.json")[0] == 0
+    assert Path("s.json").read_text() == out
+    assert cosmos("schema", "-o", "s.json", "--check")[0] == 0
+
+    Path("s.json").write_text("{}")
+    code, _, err = cosmos("schema", "-o", "s.json", "--check")
+
+    assert code == ExitCode.BAD_INPUT
+    assert err == "error: s.json: is not current; write it with: cosmos schema --output s.json\n"
+
+
+def test_schema_that_cannot_be_written_says_why(cosmos):
+    assert cosmos("schema", "-o", "no/s.json") == (
+        2,
+        "",
+        "error: no/s.json: No such file or directory\n",
+    )
+
+
+def test_plan_shows_placement_and_inequalities(cosmos):
+    code, out, err = cosmos("plan", "a.yaml", "--latency-ms", "0.5")
+
+    lines = out.splitlines()
+    assert (code, err) == (0, "")
+    assert lines[1].split() == [
+        "loopback",
+        "127.0.0.1",
+        "3",
+        "3",
+        "agent-01,",
+        "agent-02,",
+        "agent-03",
+    ]
+    assert [line.split()[0] for line in lines[4:8]] == ["2.7", "2.8", "2.9", "2.10"]
+    assert "T_n = 0.5 ms (given)" in lines[8]
+    assert lines[9].startswith("3 agents keep real time; 2.10 binds first, at ")
+
+
+def test_plan_of_an_impossible_run_ends_with_4(cosmos):
+    code, out, _ = cosmos("plan", "a.yaml", "--bandwidth-mbit", "0.001")
+
+    assert code == ExitCode.BUDGET_BROKEN
+    assert out.splitlines()[-1] == "3 agents cannot keep real time: inequality 2.10 is broken"
+
+
+def test_plan_over_an_inventory_as_json(cosmos):
+    tower = ROOT / "inventory/tower.yaml"
+
+    code, out, _ = cosmos("plan", "a.yaml", "-i", tower, "--json", "--workers", "2")
+
+    result = json.loads(out)
+    assert code == 0
+    assert list(result["plan"]["machines"]) == ["pi01", "pi02", "pi03"]
+    assert len(result["plan"]["idle"]) == 21
+    assert result["resources"]["latency_source"] == "assumed"
+    assert result["resources"]["workers"] == 2
+    assert result["feasibility"]["holds"] is True
+
+
+def test_plan_without_a_latency_measures_loopback(cosmos):
+    _, out, _ = cosmos("plan", "a.yaml", "--json")
+
+    resources = json.loads(out)["resources"]
+    assert resources["latency_source"] == "measured on loopback"
+    assert 0 < resources["latency_s"] < 0.05
+
+
+def test_plan_of_a_simulation_that_does_not_tell_its_demand(cosmos):
+    cosmos("init", "rover", "--template", "plugin")
+
+    code, out, _ = cosmos("plan", "rover.yaml")
+
+    assert code == 0
+    assert "does not say what it asks for" in out
+
+
+def test_inventory_lists_machines(cosmos):
+    code, out, _ = cosmos("inventory", "-i", ROOT / "inventory/tower.yaml")
+
+    lines = out.splitlines()
+    assert code == 0
+    assert lines[0].split() == ["machine", "address", "connection", "user", "groups"]
+    assert lines[22].split() == ["pi22", "pi22", "ssh", "pi", "all,", "hwil,", "tower"]
+    assert lines[-1] == "24 machines"
+
+
+@pytest.mark.parametrize("template", TEMPLATES)
+def test_templates_validate_as_they_are(cosmos, template):
+    code, out, err = cosmos("init", "my-sim", "--template", template, "-d", "new")
+
+    assert code == 0
+    assert "new/my-sim.yaml" in out.splitlines()
+    assert err == "next: cosmos validate new/my-sim.yaml; then cosmos run new/my-sim.yaml\n"
+    assert cosmos("validate", "new/my-sim.yaml")[0] == 0
+
+
+@pytest.mark.parametrize("template", TEMPLATES)
+def test_templates_leave_no_placeholder(template):
+    files = render(template, "my-sim")
+
+    assert all("@NAME@" not in text and "@NAME@" not in str(path) for path, text in files.items())
+
+
+def test_init_overwrites_nothing(cosmos):
+    Path("rover.py").write_text("mine\n")
+
+    code, _, err = cosmos("init", "rover", "--template", "plugin")
+
+    assert code == ExitCode.BAD_INPUT
+    assert err.startswith("error: rover.py exists already and is left as it is")
+    assert Path("rover.py").read_text() == "mine\n"
+    assert not Path("rover.yaml").exists()
+
+
+@pytest.mark.parametrize("name", ["Rover", "../x", "a b", "-x"])
+def test_init_refuses_names_that_no_scenario_can_have(cosmos, name):
+    code, _, _ = cosmos("init", "--", name)
+
+    assert code == ExitCode.BAD_INPUT
+    assert os.listdir() == ["a.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["vlidate"], "error: no command 'vlidate'; did you mean validate?\nsee `cosmos --help`\n"),
+        (["validate"], "error: Missing argument 'FILE...'.\nsee `cosmos validate --help`\n"),
+        (["validate", "--jsn"], "see `cosmos validate --help`\n"),
+        (["schema", "--check"], "--check needs --output FILE: the file to check"),
+        (["plan", "a.yaml", "--workers", "0"], "see `cosmos plan --help`\n"),
+    ],
+)
+def test_wrong_usage_ends_with_2_and_says_what_is_right(cosmos, arguments, text):
+    code, out, err = cosmos(*arguments)
+
+    assert (code, out) == (ExitCode.BAD_INPUT, "")
+    assert text in err
+
+
+def test_wrong_usage_is_json_too(cosmos):
+    code, out, _ = cosmos("validate", "--json")
+
+    assert code == 2
+    assert json.loads(out)["error"]["kind"] == "usage"
+
+
+def fail_with(monkeypatch, error):
+    def broken(name):
+        raise error
+
+    monkeypatch.setattr(app, "load_command", broken)
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "text"),
+    [
+        (RunFailedError("agent-01 is lost"), 1, "error: agent-01 is lost\n"),
+        (PluginError("no such plug-in"), 2, "error: no such plug-in\n"),
+        (MachineError("port 47000 is taken"), 3, "error: port 47000 is taken\n"),
+    ],
+)
+def test_foreseen_errors_have_their_exit_codes(cosmos, monkeypatch, error, code, text):
+    fail_with(monkeypatch, error)
+
+    assert cosmos("validate", "a.yaml") == (code, "", text)
+
+
+def test_unexpected_error_names_the_file_with_its_traceback(cosmos, monkeypatch):
+    fail_with(monkeypatch, ZeroDivisionError("by nought"))
+
+    code, _, err = cosmos("validate", "a.yaml")
+
+    assert code == 1
+    assert err.startswith("error: unexpected ZeroDivisionError: by nought\n")
+    assert "Traceback" not in err
+    saved = Path(err.strip().rpartition(" ")[2])
+    assert "ZeroDivisionError: by nought" in saved.read_text()
+    saved.unlink()
+
+
+def test_unexpected_error_shows_its_traceback_when_asked(cosmos, monkeypatch):
+    fail_with(monkeypatch, ZeroDivisionError("by nought"))
+    monkeypatch.setenv("COSMOS_DEBUG", "1")
+
+    _, _, err = cosmos("validate", "a.yaml")
+
+    assert err.startswith("Traceback")
+
+
+def command(*arguments, **options):
+    return subprocess.run(
+        [sys.executable, "-m", "cosmos_cli.app", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        **options,
+    )
+
+
+@pytest.mark.process
+def test_real_process_validates_and_ends_with_its_code(tmp_path):
+    (tmp_path / "a.yaml").write_text(SCENARIO)
+
+    good = command("validate", "a.yaml", cwd=tmp_path)
+    bad = command("validate", "a.yaml", "--set", "seed=-1", cwd=tmp_path)
+
+    assert (good.returncode, good.stderr) == (0, "")
+    assert (bad.returncode, bad.stderr) == (2, "--set seed: expected >= 0, got -1\n")
+
+
+@pytest.mark.process
+def test_closed_pipe_is_no_error_to_talk_about():
+    reader, writer = os.pipe()
+    os.close(reader)
+    process = subprocess.run(
+        [sys.executable, "-m", "cosmos_cli.app", "schema"],
+        stdout=writer,
+        stderr=subprocess.PIPE,
+        timeout=60,
+        check=False,
+    )
+    os.close(writer)
+
+    assert process.stderr == b""
+    assert process.returncode == 1
+
+
+@pytest.mark.process
+def test_validate_imports_only_what_it_needs(tmp_path):
+    (tmp_path / "a.yaml").write_text(SCENARIO)
+    code = (
+        "import sys; from cosmos_cli import app; app.run(['validate', 'a.yaml']);"
+        "print([m for m in ('numpy', 'scipy', 'rich', 'pyarrow', 'fabric', 'asyncio') if m in sys.modules])"
+    )
+
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+
+    assert result.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.process
+def test_help_and_version():
+    assert command("--version").stdout.startswith("cosmos 0.")
+    assert "validate" in command("--help").stdout
+    assert command("validate", "--help").returncode == 0
+
+
+def test_interrupt_ends_with_130_and_no_traceback(cosmos, monkeypatch):
+    fail_with(monkeypatch, KeyboardInterrupt())
+
+    assert cosmos("validate", "a.yaml") == (ExitCode.INTERRUPTED, "", "")
