@@ -120,6 +120,7 @@ class AgentRunner:
         self._scheduling: dict[str, Any] = {}
         self._outcome: tuple[bool, str] = (False, "did not end")
         self._is_closed = False
+        self._is_recording = True
 
     def start(self) -> None:
         """Begin: says hello at once."""
@@ -316,6 +317,7 @@ class AgentRunner:
 
     def _close_records(self) -> None:
         self._event("end")
+        self._is_recording = False
         messages = self._session.link.counters.to_mapping()
         counts = self._recorder.close(self._config.timeouts.shutdown_s)
         self._session.records_closed(
@@ -361,6 +363,8 @@ class AgentRunner:
         self._usage_timer.reschedule(due_s)
 
     def _event(self, event: str, **values: Any) -> None:
+        if not self._is_recording:
+            return
         t_s = self._t_s_or_none()
         rounded = None if t_s is None else round(t_s, 6)
         self._recorder.record(
