@@ -118,7 +118,21 @@ def _likeliest(located: Sequence[Located]) -> Iterator[Located]:
         else:
             members.setdefault(item.branch[:-1], {}).setdefault(item.branch, []).append(item)
     for group in members.values():
-        yield from min(group.values(), key=_distance)
+        choice = _common_choice(list(group.values()))
+        yield from [choice] if choice else min(group.values(), key=_distance)
+
+
+def _common_choice(members: Sequence[Sequence[Located]]) -> Located | None:
+    """Return one error for a key that every member knows and whose value none of them has, such as `kind`."""
+    found = [
+        [item for item in member if item.error["type"] == "literal_error"] for member in members
+    ]
+    if len(members) < 2 or not all(found) or len({errors[0].path for errors in found}) > 1:
+        return None
+    first = found[0][0]
+    options = [str(errors[0].error["ctx"]["expected"]) for errors in found]
+    context = {"expected": " or ".join(dict.fromkeys(options))}
+    return Located(first.path, (), {**first.error, "ctx": context})
 
 
 def _distance(errors: Sequence[Located]) -> tuple[int, int]:

@@ -275,6 +275,8 @@ def _syntax_fault(source: Source, error: yaml.MarkedYAMLError) -> Fault:
         mark, text = start, "this list is never closed: expected ',' or ']'"
     elif "flow mapping" in context:
         mark, text = start, "this mapping is never closed: expected ',' or '}'"
+    elif "expected node content" in problem:
+        text = "expected a value, or the bracket that closes what was opened before"
     elif "mapping values are not allowed" in problem:
         text = "a second ': ' on this line: put the text in quotes, or check the indentation"
     elif "could not find expected ':'" in problem:

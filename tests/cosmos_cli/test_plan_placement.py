@@ -12,7 +12,11 @@ from cosmos_cli.plan import make_plan
 
 def scenario(count, per_process=1):
     return Scenario.model_validate(
-        {"name": "s", "simulation": "counter", "agents": {"count": count, "per_process": per_process}}
+        {
+            "name": "s",
+            "simulation": "counter",
+            "agents": {"count": count, "per_process": per_process},
+        }
     )
 
 

@@ -364,3 +364,13 @@ def test_thousand_agents_with_names_are_read(tmp_path):
     )
 
     assert found.scenario.agents.names[999] == "sat-999"
+
+
+def test_choice_that_no_member_of_a_union_knows_lists_those_of_all(see):
+    shown = see(PLUGGED + "parameters: {mass_kg: 1, method: {kind: quik, steps: 2, x: 1}}\n")
+
+    assert shown.splitlines()[0] == (
+        "a.yaml:4:41: parameters.method.kind: expected slow or quick, got 'quik', "
+        "did you mean quick?"
+    )
+    assert len(shown.splitlines()) == 3

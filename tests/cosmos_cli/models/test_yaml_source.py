@@ -86,6 +86,7 @@ def fault_of(text):
         ("a: b: c\n", (1, 5), "a second ': ' on this line"),
         ("a: 1\n b: 2\n", (2, 3), "a second ': ' on this line"),
         ("a: 1\nbc\n", (2, 1), "expected `key: value`, got no ':' after the key"),
+        ("a: [\n", (2, 1), "expected a value, or the bracket that closes what was opened before"),
         ("a: @x\n", (1, 4), "'@' cannot start a value: put it in quotes"),
         ("a: *x\n", (1, 4), "no anchor &x stands above"),
         ("a: &x [*x]\n", (1, 8), "no anchor &x stands above"),
