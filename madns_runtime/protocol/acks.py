@@ -71,7 +71,8 @@ class ReceivedPackets:
         if at_once or self._eliciting >= ELICITING_PACKETS_MAX:
             self.ack_due_s = now_s
         else:
-            self.ack_due_s = now_s + ACK_DELAY_MAX_S
+            # It may be due earlier already, to tell of a window.
+            self.ack_due_s = min(self.ack_due_s, now_s + ACK_DELAY_MAX_S)
 
     def settle_ack(self, now_s: float) -> int:
         """Note that a datagram acknowledges everything; return the delay that its header tells."""
