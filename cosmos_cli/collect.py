@@ -63,13 +63,14 @@ def say_nothing(what: str, share: float) -> None:
     """Be the progress of those who want none."""
 
 
-def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; three are optional and by name
+def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; four are optional and by name
     run: RunDirectory,
     result: Mapping[str, Any] | None,
     expected: Expected,
     *,
     interrupted: bool = False,
     problems: Sequence[str] = (),
+    has_report: bool = True,
     progress: Progress = say_nothing,
 ) -> RunSummary:
     """
@@ -81,6 +82,7 @@ def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; three 
         expected: Who should have recorded what.
         interrupted: Whether the operator ended it.
         problems: What did not go as it should, each starting with who; a machine's ends with 3.
+        has_report: Whether report.html is written; `cosmos report` can do it later.
         progress: Called with what is being done and how far it is, 0 to 1.
 
     Raises:
@@ -95,7 +97,7 @@ def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; three 
     config = run.read_config()
     gathered = gather(run, config.agents.tick_hz if config else None, progress)
     evidence = _evidence(run, gathered, end, expected)
-    return _conclude(run, gathered, evidence, progress)
+    return _conclude(run, gathered, evidence, has_report=has_report, progress=progress)
 
 
 def collect_run(
@@ -168,11 +170,17 @@ def _evidence(run: RunDirectory, gathered: Gathered, end: _RunEnd, expected: Exp
 
 
 def _conclude(
-    run: RunDirectory, gathered: Gathered, evidence: Evidence, progress: Progress
+    run: RunDirectory,
+    gathered: Gathered,
+    evidence: Evidence,
+    *,
+    has_report: bool,
+    progress: Progress,
 ) -> RunSummary:
-    progress("writing the report", 0.0)
     _, document = evidence.judged()
-    evidence = _attempt(evidence, run.report_html, lambda: write_report(run, document))
+    if has_report:
+        progress("writing the report", 0.0)
+        evidence = _attempt(evidence, run.report_html, lambda: write_report(run, document))
     # From here on what matters most is written, and the reserve makes room for it.
     run.free_reserve()
     summary = _write_summary(run, gathered, evidence)

@@ -69,7 +69,8 @@ def execute(
                 view.say(own.problem, "warning")
             outcome = Operator(request, view, signals).run()
             signals.raise_from_now()
-            return _finish(prepared, outcome, view)
+            has_report = options.has_report and outcome.interruption != "at once"
+            return _finish(prepared, outcome, has_report=has_report, view=view)
         finally:
             view.close()
 
@@ -100,7 +101,9 @@ def scenario_text(scenario: ScenarioFile) -> str:
     return f"# {scenario.path.name}, with its defaults and:{changes}\n{resolved}"
 
 
-def _finish(prepared: _Prepared, outcome: LaunchOutcome, view: View) -> RunSummary:
+def _finish(
+    prepared: _Prepared, outcome: LaunchOutcome, *, has_report: bool, view: View
+) -> RunSummary:
     # Imported late: the tables' library is large, and the run need not wait for it.
     from cosmos_cli.collect import finish_run
     from cosmos_cli.expectation import Expected
@@ -112,6 +115,7 @@ def _finish(prepared: _Prepared, outcome: LaunchOutcome, view: View) -> RunSumma
         Expected.of(prepared.config, prepared.plan.agents_by_machine),
         interrupted=outcome.interruption != "no",
         problems=outcome.problems,
+        has_report=has_report,
         progress=view.work,
     )
 

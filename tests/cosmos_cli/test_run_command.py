@@ -142,8 +142,22 @@ def test_second_ctrl_c_still_collects_what_is_on_disk(
 
     code, _, err = finish(process)
 
+    directory = Path(environment["COSMOS_RUNS"]) / "0001-tiny"
     assert code == 130, err
     assert run_json(environment)["status"] == "interrupted"
+    assert not (directory / "report.html").exists()
+    assert (directory / "manifest.json").exists()
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(("option", "is_written"), [("--report", True), ("--no-report", False)])
+def test_report_is_written_unless_it_is_not_wanted(
+    environment: dict[str, str], scenario: Path, option: str, is_written: bool
+) -> None:
+    finish(start(environment, str(scenario), option))
+
+    directory = Path(environment["COSMOS_RUNS"]) / "0001-tiny"
+    assert (directory / "report.html").exists() is is_written
 
 
 @pytest.mark.process
