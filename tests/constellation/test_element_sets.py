@@ -121,7 +121,7 @@ def test_json_faults_carry_the_line_of_their_set(tmp_path):
     text = JSON.replace('"ECCENTRICITY": 0.0002196', '"ECCENTRICITY": 1.2', 1)
 
     assert faults_of(tmp_path / "a.json", text) == [
-        "4: ECCENTRICITY: expected a number within [0, 1], got '1.2'"
+        "4: ECCENTRICITY: expected a number within [0, 0.9999], got '1.2'"
     ]
 
 

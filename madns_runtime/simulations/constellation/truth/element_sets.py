@@ -37,7 +37,7 @@ BOOKKEEPING = {
 """OMM fields that change no orbit, and what stands for them where they are missing."""
 NUMBERS = {
     "MEAN_MOTION": (1e-3, 20.0),
-    "ECCENTRICITY": (0.0, 0.999999999),
+    "ECCENTRICITY": (0.0, 0.9999),
     "INCLINATION": (0.0, 180.0),
     "RA_OF_ASC_NODE": (-360.0, 360.0),
     "ARG_OF_PERICENTER": (-360.0, 360.0),

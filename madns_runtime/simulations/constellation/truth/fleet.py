@@ -7,7 +7,7 @@ From a scenario's parameters to a fleet: who flies, from which epoch, in which s
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -68,23 +68,19 @@ def choose(parameters: ConstellationParameters, count: int, base_directory: Path
     Raises:
         ConfigurationError: One line a fault, each starting with the dotted parameter name.
     """
-    satellites = parameters.satellites
-    epoch = parse_epoch(parameters.epoch_utc)
-    if isinstance(satellites, ElementSetSatellites):
-        return _choose_sets(satellites, count, base_directory, epoch)
-    if isinstance(satellites, WalkerSatellites):
-        orbits = _walker_orbits(satellites, parameters)
-        field = "walker"
-    else:
-        orbits = _keplerian_orbits(satellites, parameters)
-        field = "keplerian"
-    if len(orbits) < count:
-        raise _too_few(field, len(orbits), count)
-    return Choice(
-        names=tuple(name for name, _ in orbits[:count]),
-        epoch_utc=epoch or EPOCH_WITHOUT_SETS,
-        orbits=tuple(elements for _, elements in orbits[:count]),
-    )
+    faults = []
+    epoch = None
+    try:
+        epoch = parse_epoch(parameters.epoch_utc)
+    except ConfigurationError as error:
+        faults.append(str(error))
+    try:
+        chosen = _choose_satellites(parameters, count, base_directory)
+    except ConfigurationError as error:
+        faults.append(str(error))
+    if faults:
+        raise ConfigurationError("\n".join(faults))
+    return chosen if epoch is None else replace(chosen, epoch_utc=epoch)
 
 
 def load_fleet(parameters: ConstellationParameters, count: int, base_directory: Path) -> Fleet:
@@ -134,9 +130,27 @@ def parse_epoch(text: str | None) -> datetime | None:
     return moment.astimezone(UTC)
 
 
-def _choose_sets(
-    satellites: ElementSetSatellites, count: int, base_directory: Path, epoch: datetime | None
+def _choose_satellites(
+    parameters: ConstellationParameters, count: int, base_directory: Path
 ) -> Choice:
+    """Return the satellites with the epoch that stands if the scenario names none."""
+    satellites = parameters.satellites
+    if isinstance(satellites, ElementSetSatellites):
+        return _choose_sets(satellites, count, base_directory)
+    if isinstance(satellites, WalkerSatellites):
+        orbits, field = _walker_orbits(satellites, parameters), "walker"
+    else:
+        orbits, field = _keplerian_orbits(satellites, parameters), "keplerian"
+    if len(orbits) < count:
+        raise _too_few(field, len(orbits), count)
+    return Choice(
+        names=tuple(name for name, _ in orbits[:count]),
+        epoch_utc=EPOCH_WITHOUT_SETS,
+        orbits=tuple(elements for _, elements in orbits[:count]),
+    )
+
+
+def _choose_sets(satellites: ElementSetSatellites, count: int, base_directory: Path) -> Choice:
     try:
         sets = read_element_sets(base_directory / satellites.elements)
     except ConfigurationError as error:
@@ -151,7 +165,7 @@ def _choose_sets(
     chosen = sets[:count]
     return Choice(
         names=tuple(s.name for s in chosen),
-        epoch_utc=epoch or _whole_second(max(s.epoch_utc for s in chosen)),
+        epoch_utc=_whole_second(max(s.epoch_utc for s in chosen)),
         element_sets=chosen,
     )
 
