@@ -1,8 +1,8 @@
 """
 An agent's half of the constellation: one vehicle that looks up its truth every tick and records it.
 
-Needs numpy and nothing of the host's side. A tick costs about 3 us besides recording, 8 us with elements; values are rounded to 0.1 mm
-and 0.1 um/s, which keeps a tick's records near 91 B at 10 Hz.
+Needs numpy and nothing of the host's side. A tick costs about 3 us besides recording, 8 us with
+elements; values are rounded to 0.1 mm and 0.1 um/s, which keeps a tick's records near 91 B at 10 Hz.
 """
 
 from __future__ import annotations
