@@ -19,7 +19,7 @@ from madns_runtime.protocol.link import (
     SendQueueFull,
 )
 from madns_runtime.protocol.messages import Service
-from madns_runtime.protocol.recovery import Pacer, RoundTrip
+from madns_runtime.protocol.recovery import ACK_DELAY_MAX_S, Pacer, RoundTrip
 from madns_runtime.protocol.seal import (
     DATAGRAM_BYTES_MAX,
     HEADER_BYTES,
@@ -666,6 +666,26 @@ def test_reading_some_of_the_messages_grants_nothing_yet():
     assert host.next_message() is not None
 
     assert host.get_timer() == 1.0
+
+
+def test_news_of_a_grant_are_not_put_off_by_the_next_packet():
+    agent, host = make_pair()
+    host.send(b"grants all", BEST, 1.0)
+    deliver(host.datagrams_to_send(1.0), agent, 1.0)
+    agent.send(bytes(20_000), RELIABLE, 1.0)
+    for _ in range(5):
+        agent.send(bytes(1200), RELIABLE, 1.0)
+    deliver(agent.datagrams_to_send(1.0), host, 1.0)
+    deliver(host.datagrams_to_send(1.0), agent, 1.0)
+    deliver(agent.datagrams_to_send(1.1), host, 1.1)
+    deliver(host.datagrams_to_send(1.1), agent, 1.1)
+    assert len(read(host)) == 6
+    assert host.get_timer() == 1.1
+
+    agent.send(b"x", RELIABLE, 1.101)
+    deliver(agent.datagrams_to_send(1.101), host, 1.101)
+
+    assert host.get_timer() <= 1.101
 
 
 def test_sender_without_a_grant_asks_for_one():
