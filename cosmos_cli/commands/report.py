@@ -1,0 +1,45 @@
+"""`cosmos report`: what a run recorded, on the terminal or as one HTML file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cosmos_cli.commands.collect import RunArgument
+from cosmos_cli.commands.runs import RunsOption
+from cosmos_cli.console import Console, JsonOption, QuietOption
+from cosmos_cli.errors import CosmosError, InputError
+from cosmos_cli.rundir import find_run, runs_root
+
+
+def report(
+    run: RunArgument = "last",
+    html: Annotated[
+        Path | None,
+        typer.Option("--html", metavar="FILE", help="Write the report with its figures to FILE."),
+    ] = None,
+    folder: RunsOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Show what a run recorded: verdict, checks, tables; with figures in report.html of the run."""
+    from cosmos_cli.report.build import build_sections, open_source
+    from cosmos_cli.report.html import write_report
+    from cosmos_cli.report.terminal import print_report
+
+    console = Console(json=as_json, quiet=quiet)
+    found = find_run(runs_root(folder), run)
+    document = found.read_json(found.run_json)
+    if document is None or document.get("status") == "running":
+        raise InputError(f"{found.name} is not collected yet; do that with: cosmos collect {run}")
+    console.print_json(document)
+    if html is not None:
+        try:
+            console.say(f"report written to {write_report(found, document, html)}")
+        except OSError as error:
+            raise CosmosError(f"{html}: cannot be written: {error.strerror or error}") from error
+    elif not as_json:
+        print_report(console, document, build_sections(open_source(found, document)))
+        console.say(f"with figures: {found.report_html}")

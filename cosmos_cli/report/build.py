@@ -1,0 +1,130 @@
+"""The report's content: from a run's tables and summary to sections."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from cosmos_cli.expectation import mapping_at
+from cosmos_cli.report.figures import FIGURES, TEXT_STREAMS, Chapter, chapter_of
+from cosmos_cli.report.model import Block, Heading, Remark, Section, TableBlock
+from cosmos_cli.report.source import Source
+from cosmos_cli.rundir import RunDirectory
+from cosmos_cli.statistics import tick_statistics
+from cosmos_cli.tables import TableReader, open_tables
+
+SENTENCES_MAX = 60
+LEVELS_TOLD = ("critical", "error", "warning")
+QUIET_EVENTS = 40
+"""A source with more events than this is told by its last ones."""
+
+
+def open_source(run: RunDirectory, document: Mapping[str, Any]) -> Source:
+    """Open what a run's report is made from."""
+    config = run.read_config()
+    tables = open_tables(run.tables)
+    return Source(
+        document=document,
+        tables=tables,
+        tick_hz=config.agents.tick_hz if config else None,
+        ticks=tick_statistics(tables.get("ticks")),
+    )
+
+
+def build_sections(source: Source) -> list[Section]:
+    """Return the report's sections: known streams in the order of `FIGURES`, then others, then words."""
+    sections: dict[str, list[Block]] = {}
+    for table, chapter in _chapters(source.tables):
+        sections.setdefault(chapter.title, []).extend(_build(table, chapter, source))
+    built = [Section(title=title, blocks=blocks) for title, blocks in sections.items() if blocks]
+    return [*built, *_words(source)]
+
+
+def _chapters(tables: Mapping[str, TableReader]) -> Iterator[tuple[TableReader, Chapter]]:
+    order = [name for name in FIGURES if name in tables]
+    order += [name for name in tables if name not in FIGURES and name not in TEXT_STREAMS]
+    # What the simulation recorded comes before what the framework knows of machines and clocks.
+    late = ("machine_health", "process", "clock")
+    for name in sorted(order, key=lambda name: name in late):
+        yield tables[name], chapter_of(tables[name])
+
+
+def _build(table: TableReader, chapter: Chapter, source: Source) -> list[Block]:
+    try:
+        return chapter.build(table, source)
+    except Exception as error:  # noqa: BLE001 - a figure of anybody's stream must not cost a run its report
+        text = f"The figures of {table.name} could not be drawn: {type(error).__name__}: {error}"
+        return [Remark(text=text)]
+
+
+def _words(source: Source) -> list[Section]:
+    rows = [row for name in ("host_log", "log") for row in _sentences(source, name)]
+    rows.sort(key=lambda row: str(row[0]))
+    if not rows:
+        return []
+    note = f"The first {SENTENCES_MAX} of {len(rows)}." if len(rows) > SENTENCES_MAX else ""
+    headings = [
+        Heading(text=text, is_number=False) for text in ("UTC", "who", "level", "what was said")
+    ]
+    table = TableBlock(
+        title="Warnings and errors", headings=headings, rows=rows[:SENTENCES_MAX], note=note
+    )
+    return [Section(title="What was said", blocks=[table])]
+
+
+def _sentences(source: Source, name: str) -> Iterator[list[object]]:
+    table = source.tables.get(name)
+    if table is None or not table.has("utc", "level", "text"):
+        return
+    for who, columns in table.each(("utc", "level", "text")):
+        for utc, level, text in zip(*columns.values(), strict=True):
+            if level in LEVELS_TOLD:
+                yield [utc, who, level, text]
+
+
+def figures_of(document: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Return the handful of numbers that tell most of a run: name, value, remark."""
+    timing, round_trip = mapping_at(document, "timing"), mapping_at(document, "round_trip_ms")
+    lateness = mapping_at(timing, "lateness_ms")
+    records, agents = mapping_at(document, "records"), mapping_at(document, "agents")
+    reliable = mapping_at(document, "messages", "reliable")
+    sync = mapping_at(document, "messages", "sync")
+    best = mapping_at(document, "messages", "best")
+    lost = agents.get("lost") or ()
+    return [
+        ("agents", _number(agents.get("count")), f"{len(lost)} lost"),
+        ("real-time factor", _number(document.get("rtf"), ".6f"), "simulated per wall second"),
+        (
+            "ticks missed",
+            _number(timing.get("missed")),
+            f"of {_number(timing.get('ticks'))}",
+        ),
+        (
+            "lateness p99",
+            f"{_number(lateness.get('p99'), '.3g')} ms",
+            f"max {_number(lateness.get('max'), '.3g')} ms",
+        ),
+        (
+            "round trip p50",
+            f"{_number(round_trip.get('p50'), '.3g')} ms",
+            f"p99 {_number(round_trip.get('p99'), '.3g')} ms ({round_trip.get('stream', 'none')})",
+        ),
+        (
+            "messages lost",
+            f"{_number(reliable.get('lost'))} + {_number(sync.get('lost'))}",
+            f"reliable + sync; telemetry {_number(best.get('lost'))}",
+        ),
+        (
+            "records",
+            _number(records.get("written")),
+            f"{_number(records.get('dropped'))} dropped, {_number(records.get('truncated'))} streams cut",
+        ),
+    ]
+
+
+def _number(value: object, form: str = "") -> str:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return "–"
+    if form:
+        return format(value, form)
+    return f"{value:,}".replace(",", "\u202f")

@@ -1,0 +1,405 @@
+"""Figures of a constellation: orbits, elements, r and v, angular momentum, energy (thesis, appendix D)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosmos_cli.report.figures.generic import generic_blocks
+from cosmos_cli.report.model import Block, Choice, Figure, Remark, TableBlock, Trace, headings
+from cosmos_cli.report.sampling import Floats, evenly
+from cosmos_cli.report.source import Source
+from cosmos_cli.report.style import (
+    ACCENT,
+    PALETTE,
+    WARM,
+    base_layout,
+    grid_layout,
+    groups_of_agents,
+    layout,
+    line,
+)
+from cosmos_cli.tables import TableReader
+
+EARTH_RADIUS_KM = 6378.137
+MU_KM3_S2 = 398600.4418
+"""For drawing whole orbits only; physics is the simulation's business."""
+POINTS_MAX, POINTS_MIN, POINTS_ALL = 400, 100, 14_000
+ORBIT_POINTS = 120
+ONE_TRACE_EACH_MAX = 24
+POSITION = tuple(re.compile(rf"^{axis}(_[a-z0-9]+)??_(k?m)$") for axis in "xyz")
+VELOCITY = tuple(re.compile(rf"^v{axis}(_[a-z0-9]+)??_(k?m)_s$") for axis in "xyz")
+GROUP = "satellite"
+
+
+def state_blocks(table: TableReader, source: Source) -> list[Block]:
+    """Return the orbits in space, and position, velocity and angular momentum of a satellite to choose."""
+    names = _state_fields(table)
+    if names is None:
+        return generic_blocks(table, source)
+    states = {agent: _read_state(table, source, agent, names) for agent in table.sources}
+    states = {agent: state for agent, state in states.items() if len(state[0])}
+    if not states:
+        return [Remark(text="No state was recorded.")]
+    frame = _frame(names[0][0])
+    return [
+        _orbits(states, frame),
+        _vectors(
+            states,
+            f"Position and velocity{frame}",
+            lambda t, r, v: _components(t, (r, "xyz", 1), (v, "xyz", 2)),
+            ("position, km", "velocity, km/s"),
+        ),
+        _vectors(
+            states,
+            f"Specific angular momentum{frame}",
+            lambda t, r, v: _components(t, (np.cross(r, v), "xyz", 1)),
+            ("h, km²/s",),
+        ),
+    ]
+
+
+def elements_blocks(table: TableReader, source: Source) -> list[Block]:
+    """Return the elements of a satellite to choose, and what they were at the end of all."""
+    fields = [
+        f for f in table.fields if f.kind in ("float", "int") and f.name not in ("t_s", "tick")
+    ]
+    if not table.rows or not fields:
+        return [Remark(text="No elements were recorded.")]
+    titles = [f"{_element_name(f.name)}{_told_unit(f.unit)}" for f in fields]
+    figure_layout, height_px = grid_layout(titles, x_title="simulated time, s")
+    points = _points(len(table.sources))
+    choices, rows = [], []
+    for agent in table.sources:
+        t_s, _ = source.time_of(table, agent)
+        chosen = evenly(len(t_s), points)
+        shared, traces = t_s[chosen], []
+        columns = [source.values(table, agent, f.name) * _scale(f.unit) for f in fields]
+        for number, values in enumerate(columns, start=1):
+            axes: Trace = {"xaxis": f"x{number}", "yaxis": f"y{number}"}
+            traces.append(line(shared, values[chosen], titles[number - 1], **axes))
+        choices.append(Choice(name=_satellite(source, agent), traces=traces))
+        rows.append([_satellite(source, agent), *(_last(values) for values in columns)])
+    return [
+        Figure(
+            title="Classical orbital elements, osculating",
+            choices=choices,
+            layout=figure_layout,
+            height_px=height_px,
+            group=GROUP,
+        ),
+        TableBlock(title="Elements at the end", headings=headings("satellite", *titles), rows=rows),
+    ]
+
+
+def invariants_blocks(table: TableReader, source: Source) -> list[Block]:
+    """Return what a model without losses must conserve: drift of all satellites, energy of one to choose."""
+    if not table.rows or not table.has("t_s", "agent", "energy_drift"):
+        return generic_blocks(table, source)
+    columns = table.read("host", [field.name for field in table.fields])
+    agents = columns["agent"].astype(str)
+    by_agent = {name: np.flatnonzero(agents == name) for name in dict.fromkeys(agents.tolist())}
+    numbers = {
+        name: values.astype(np.float64) for name, values in columns.items() if name != "agent"
+    }
+    blocks: list[Block] = []
+    for name, title in (
+        ("energy_drift", "Relative drift of the specific orbital energy"),
+        ("momentum_z_drift", "Relative drift of the angular momentum about the pole"),
+    ):
+        if name in numbers:
+            blocks.append(_drift(numbers, by_agent, name, title))
+    if "energy_j_kg" in numbers:
+        blocks.append(_energy(source, numbers, by_agent))
+    blocks.append(_drift_table(source, numbers, by_agent))
+    return blocks
+
+
+def _drift(
+    numbers: dict[str, Floats], by_agent: dict[str, NDArray[np.int64]], name: str, title: str
+) -> Figure:
+    choices = []
+    for label, group in groups_of_agents(tuple(by_agent)):
+        traces = [
+            line(numbers["t_s"][rows], numbers[name][rows], agent, index, mode="lines+markers")
+            | {"marker": {"size": 4}}
+            for index, agent in enumerate(group)
+            for rows in [by_agent[agent]]
+        ]
+        choices.append(Choice(name=label, traces=traces))
+    figure_layout = layout("simulated time, s", "relative", showlegend=True)
+    figure_layout["yaxis"] |= {"exponentformat": "power"}
+    return Figure(
+        title=title,
+        note="Against its value at simulated time zero; one point a vehicle and window of truth.",
+        choices=choices,
+        layout=figure_layout,
+        group="agents",
+    )
+
+
+def _energy(
+    source: Source, numbers: dict[str, Floats], by_agent: dict[str, NDArray[np.int64]]
+) -> Figure:
+    choices = []
+    for agent, rows in by_agent.items():
+        energy = numbers["energy_j_kg"][rows]
+        trace = line(numbers["t_s"][rows], (energy - energy[0]), "E − E₀", mode="lines+markers")
+        name = f"{_satellite(source, agent)}"
+        trace["hovertemplate"] = f"%{{x:.0f}} s: E₀ %{{y:+.3g}} J/kg, E₀ = {energy[0]:.9g} J/kg"
+        choices.append(Choice(name=name, traces=[trace]))
+    figure_layout = layout("simulated time, s", "E − E₀, J/kg")
+    figure_layout["yaxis"] |= {"exponentformat": "power"}
+    return Figure(
+        title="Specific orbital energy against its first value",
+        note="Kinetic and potential energy, with every force of the model that has a potential.",
+        choices=choices,
+        layout=figure_layout,
+        group=GROUP,
+    )
+
+
+def _drift_table(
+    source: Source, numbers: dict[str, Floats], by_agent: dict[str, NDArray[np.int64]]
+) -> TableBlock:
+    wanted = [
+        (name, title)
+        for name, title in (
+            ("energy_j_kg", "energy at the end, J/kg"),
+            ("energy_drift", "energy drift, worst"),
+            ("momentum_z_drift", "momentum drift, worst"),
+        )
+        if name in numbers
+    ]
+    rows = []
+    for agent, index in by_agent.items():
+        cells: list[object] = [_satellite(source, agent)]
+        for name, _ in wanted:
+            values = numbers[name][index]
+            cells.append(_last(values) if name == "energy_j_kg" else _worst(values))
+        rows.append(cells)
+    titles = [title for _, title in wanted]
+    return TableBlock(
+        title="Conserved quantities", headings=headings("satellite", *titles), rows=rows
+    )
+
+
+BuildTraces = Callable[[Floats, Floats, Floats], list[Trace]]
+State = tuple[Floats, Floats, Floats, str]
+"""Time, s, shape (N,); position, km, and velocity, km/s, shape (N, 3); the satellite's label."""
+
+
+def _state_fields(table: TableReader) -> tuple[list[str], list[str]] | None:
+    names = [field.name for field in table.fields]
+    found: list[list[str]] = []
+    for patterns in (POSITION, VELOCITY):
+        matches = [next((n for n in names if pattern.match(n)), None) for pattern in patterns]
+        if None in matches:
+            return None
+        found.append([name for name in matches if name is not None])
+    return found[0], found[1]
+
+
+def _read_state(
+    table: TableReader, source: Source, agent: str, names: tuple[list[str], list[str]]
+) -> State:
+    t_s, _ = source.time_of(table, agent)
+    chosen = evenly(len(t_s), _points(len(table.sources)))
+    km = [1.0 if "_km" in names[part][0] else 1e-3 for part in (0, 1)]
+    r_km, v_km_s = (
+        np.column_stack([source.values(table, agent, n)[chosen] for n in names[part]]) * km[part]
+        for part in (0, 1)
+    )
+    return t_s[chosen], r_km, v_km_s, _satellite(source, agent)
+
+
+def _frame(field_name: str) -> str:
+    match = POSITION[0].match(field_name)
+    return f" ({match[1][1:].upper()})" if match and match[1] else ""
+
+
+def _points(sources: int) -> int:
+    return min(max(POINTS_ALL // max(sources, 1), POINTS_MIN), POINTS_MAX)
+
+
+def _satellite(source: Source, agent: str) -> str:
+    name = source.agent_summary(agent).get("satellite")
+    return f"{agent} · {name}" if isinstance(name, str) and name else agent
+
+
+def _vectors(
+    states: dict[str, State], title: str, build: BuildTraces, titles: Sequence[str]
+) -> Figure:
+    figure_layout, height_px = grid_layout(
+        titles, columns=1, row_px=200, x_title="simulated time, s"
+    )
+    for number in range(1, len(titles) + 1):
+        figure_layout[f"yaxis{number}"] |= {"exponentformat": "none", "separatethousands": True}
+    figure_layout["showlegend"] = True
+    figure_layout["margin"] = {"l": 64, "r": 16, "t": 52, "b": 44}
+    figure_layout["legend"] = {
+        "orientation": "h",
+        "y": 1,
+        "yanchor": "bottom",
+        "x": 1,
+        "xanchor": "right",
+    }
+    choices = [
+        Choice(name=label, traces=build(t_s, r_km, v_km_s))
+        for t_s, r_km, v_km_s, label in states.values()
+    ]
+    return Figure(
+        title=title, choices=choices, layout=figure_layout, height_px=height_px, group=GROUP
+    )
+
+
+def _components(t_s: Floats, *vectors: tuple[Floats, str, int]) -> list[Trace]:
+    traces = []
+    for values, letters, number in vectors:
+        axes = {"xaxis": f"x{number}", "yaxis": f"y{number}", "showlegend": number == 1}
+        for index, letter in enumerate(letters):
+            traces.append(line(t_s, values[:, index], letter, index, **axes))
+        norm = line(t_s, np.linalg.norm(values, axis=1), "magnitude", 3, **axes)
+        norm["line"] = {"width": 1.3, "color": PALETTE[3], "dash": "dot"}
+        traces.append(norm)
+    return traces
+
+
+def _orbits(states: dict[str, State], frame: str) -> Figure:
+    is_small = len(states) <= ONE_TRACE_EACH_MAX
+    flown = [_scatter3d(s[1], PALETTE[i % 5], 5, s[3]) for i, s in enumerate(states.values())]
+    ellipses = [_ellipse(s[1][-1], s[2][-1]) for s in states.values()]
+    ends = np.array([s[1][-1] for s in states.values()])
+    labels = [s[3] for s in states.values()]
+    whole = _scatter3d(_with_gaps(ellipses), "#98a6b5", 1, "osculating orbits")
+    whole["hoverinfo"] = "skip"
+    points = _scatter3d(ends, WARM, 1, "satellites at the end")
+    points |= {"mode": "markers", "marker": {"size": 3.5, "color": WARM}, "text": labels}
+    points["hovertemplate"] = "%{text}<extra></extra>"
+    if not is_small:
+        flown = [_scatter3d(_with_gaps([s[1] for s in states.values()]), ACCENT, 4, "flown")]
+    hidden = {"visible": False, "showspikes": False}
+    scene = {
+        "xaxis": hidden,
+        "yaxis": hidden,
+        "zaxis": hidden,
+        "aspectmode": "data",
+        "camera": {"eye": {"x": 0.92, "y": 0.92, "z": 0.5}},
+    }
+    return Figure(
+        title=f"Orbits{frame}",
+        note="What was flown in colour, the orbit that it belongs to in grey, the Earth to scale. Drag to turn.",
+        choices=[Choice(name="", traces=[*_earth(), whole, *flown, points])],
+        layout=base_layout(scene=scene, showlegend=False, margin={"l": 0, "r": 0, "t": 0, "b": 0}),
+        height_px=560,
+    )
+
+
+def _scatter3d(points_km: Floats, colour: str, width: float, name: str) -> Trace:
+    return {
+        "type": "scatter3d",
+        "mode": "lines",
+        "name": name,
+        "x": points_km[:, 0].copy(),
+        "y": points_km[:, 1].copy(),
+        "z": points_km[:, 2].copy(),
+        "line": {"width": width, "color": colour},
+        "hovertemplate": f"{name}<extra></extra>",
+    }
+
+
+def _with_gaps(pieces: Sequence[Floats]) -> Floats:
+    gap = np.full((1, 3), np.nan)
+    return np.concatenate([part for piece in pieces for part in (piece, gap)])
+
+
+def _ellipse(r_km: Floats, v_km_s: Floats) -> Floats:
+    """Return the whole two-body orbit through a state, shape (ORBIT_POINTS, 3), km; empty if it is open."""
+    h = np.cross(r_km, v_km_s)
+    distance = np.linalg.norm(r_km)
+    e = np.cross(v_km_s, h) / MU_KM3_S2 - r_km / distance
+    eccentricity = np.linalg.norm(e)
+    if not np.isfinite(eccentricity) or eccentricity >= 1.0 or not np.any(h):
+        return np.empty((0, 3))
+    towards = e / eccentricity if eccentricity > 1e-8 else r_km / distance
+    across = np.cross(h / np.linalg.norm(h), towards)
+    anomaly = np.linspace(0.0, 2 * np.pi, ORBIT_POINTS)
+    radius = (h @ h) / MU_KM3_S2 / (1 + eccentricity * np.cos(anomaly))
+    orbit: Floats = radius[:, None] * (
+        np.cos(anomaly)[:, None] * towards + np.sin(anomaly)[:, None] * across
+    )
+    return orbit
+
+
+def _earth() -> list[Trace]:
+    """Return a calm sphere and its graticule."""
+    longitude, latitude = np.linspace(0, 2 * np.pi, 61), np.linspace(-np.pi / 2, np.pi / 2, 31)
+    x = EARTH_RADIUS_KM * np.outer(np.cos(latitude), np.cos(longitude))
+    y = EARTH_RADIUS_KM * np.outer(np.cos(latitude), np.sin(longitude))
+    z = EARTH_RADIUS_KM * np.outer(np.sin(latitude), np.ones_like(longitude))
+    sphere: Trace = {
+        "type": "surface",
+        "x": x.round(0).tolist(),
+        "y": y.round(0).tolist(),
+        "z": z.round(0).tolist(),
+        "surfacecolor": np.zeros_like(z).tolist(),
+        "colorscale": [[0, "#cfdeea"], [1, "#cfdeea"]],
+        "showscale": False,
+        "hoverinfo": "skip",
+        "lighting": {"ambient": 0.94, "diffuse": 0.12, "specular": 0.0, "roughness": 1.0},
+        "contours": {axis: {"highlight": False} for axis in "xyz"},
+    }
+    meridians = [_circle(longitude=np.radians(d)) for d in range(0, 180, 30)]
+    parallels = [_circle(latitude=np.radians(d)) for d in range(-60, 61, 30)]
+    graticule = _scatter3d(_with_gaps([*meridians, *parallels]), "#a9bfd1", 1, "graticule")
+    graticule["hoverinfo"] = "skip"
+    return [sphere, graticule]
+
+
+def _circle(longitude: float | None = None, latitude: float | None = None) -> Floats:
+    angle = np.linspace(0, 2 * np.pi, 73)
+    radius = EARTH_RADIUS_KM * 1.003
+    if longitude is not None:
+        flat = np.cos(angle)
+        points = [flat * np.cos(longitude), flat * np.sin(longitude), np.sin(angle)]
+    else:
+        ring, height = np.cos(latitude or 0.0), np.sin(latitude or 0.0)
+        points = [ring * np.cos(angle), ring * np.sin(angle), np.full_like(angle, height)]
+    return radius * np.column_stack(points)
+
+
+ELEMENT_NAMES = {
+    "a": "semi-major axis",
+    "e": "eccentricity",
+    "i": "inclination",
+    "raan": "node",
+    "argp": "argument of perigee",
+    "mean_anomaly": "mean anomaly",
+    "true_anomaly": "true anomaly",
+}
+
+
+def _element_name(field_name: str) -> str:
+    stem = re.sub(r"_(deg|rad|k?m)$", "", field_name)
+    return ELEMENT_NAMES.get(stem, stem.replace("_", " "))
+
+
+def _scale(unit: str) -> float:
+    return 1e-3 if unit == "m" else 1.0
+
+
+def _told_unit(unit: str) -> str:
+    return {"m": ", km", "1": "", "": "", "deg": ", °"}.get(unit, f", {unit}")
+
+
+def _last(values: Floats) -> float | None:
+    finite = values[np.isfinite(values)]
+    return float(finite[-1]) if finite.size else None
+
+
+def _worst(values: Floats) -> float | None:
+    finite = np.abs(values[np.isfinite(values)])
+    return float(finite.max()) if finite.size else None

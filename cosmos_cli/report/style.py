@@ -1,0 +1,177 @@
+"""How figures look: colours, axes, traces. Calm, light, printable."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosmos_cli.report.model import Trace
+
+INK, MUTED, GRID = "#1f2933", "#667085", "#e9edf2"
+ACCENT, WARM, BAD = "#2b5c8a", "#c4692b", "#b42318"
+PALETTE = ("#2b5c8a", "#c4692b", "#3d8361", "#7d5a9b", "#b08c2e")
+"""Five that stay apart on paper and for most colour-blind eyes: a group of agents is five, as in the thesis."""
+GROUP_SIZE = len(PALETTE)
+NAMES_SHOWN_MAX = 40
+FONT = "Inter, 'Segoe UI', 'Helvetica Neue', Arial, sans-serif"
+
+
+def axis(title: str = "", **more: Any) -> dict[str, Any]:
+    """Return an axis with the house's lines and lettering."""
+    return {
+        "title": {"text": title, "standoff": 8, "font": {"size": 12, "color": MUTED}},
+        "gridcolor": GRID,
+        "linecolor": "#cbd2d9",
+        "zeroline": False,
+        "tickfont": {"size": 11, "color": MUTED},
+        "automargin": True,
+        **more,
+    }
+
+
+def layout(x_title: str = "", y_title: str = "", **more: Any) -> dict[str, Any]:
+    """Return the layout of a plain figure with one pair of axes."""
+    return base_layout(xaxis=axis(x_title, showgrid=False), yaxis=axis(y_title)) | more
+
+
+def base_layout(**more: Any) -> dict[str, Any]:
+    """Return what all figures share."""
+    return {
+        "font": {"family": FONT, "size": 12, "color": INK},
+        "margin": {"l": 60, "r": 16, "t": 30, "b": 44},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "rgba(0,0,0,0)",
+        "hovermode": "closest",
+        "legend": {
+            "orientation": "h",
+            "y": 1.02,
+            "yanchor": "bottom",
+            "x": 0,
+            "font": {"size": 11},
+        },
+        "bargap": 0.25,
+        "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": "#b3bfcc", "activecolor": ACCENT},
+        **more,
+    }
+
+
+def log_axis(low: float, high: float) -> dict[str, Any]:
+    """Return what makes an axis logarithmic: ticks at 1, 2, 5 of each decade if there are few, else at 1."""
+    decades = np.log10(max(high, 1e-12) / max(low, 1e-12))
+    return {"type": "log", "dtick": "D2" if decades < 2.5 else 1}
+
+
+def line(x: NDArray[Any], y: NDArray[Any], name: str, index: int = 0, **more: Any) -> Trace:
+    """Return a line in the colour of its place among five."""
+    return {
+        "type": "scatter",
+        "mode": "lines",
+        "name": name,
+        "x": x,
+        "y": y,
+        "line": {"width": 1.3, "color": PALETTE[index % len(PALETTE)]},
+        **more,
+    }
+
+
+def envelope_lines(x: NDArray[Any], curves: Mapping[str, NDArray[Any]]) -> list[Trace]:
+    """Return the curves of a `TimeEnvelope`: the largest behind, the median in front."""
+    colours = {"max": "#e2a49a", "p99": WARM, "p50": ACCENT}
+    return [
+        line(x, curves[name], name, line={"width": 1.5, "color": colour})
+        for name, colour in colours.items()
+    ]
+
+
+def bars(names: Sequence[str], values: Sequence[float | None], **more: Any) -> Trace:
+    """Return a bar a name."""
+    return {
+        "type": "bar",
+        "x": list(names),
+        "y": list(values),
+        "marker": {"color": ACCENT},
+        "showlegend": False,
+        "hovertemplate": "%{x}: %{y:.4g}<extra></extra>",
+        **more,
+    }
+
+
+def bar_grid(
+    names: Sequence[str], quantities: Mapping[str, Sequence[float | None]], columns: int = 2
+) -> tuple[list[Trace], dict[str, Any], int]:
+    """
+    Return small bar charts, one a quantity, as traces, layout and height in pixels.
+
+    Args:
+        names: What the bars stand for, the same in every chart.
+        quantities: Title of each chart, and its bars.
+        columns: Charts side by side.
+    """
+    traces = [
+        bars(names, values, xaxis=f"x{index}", yaxis=f"y{index}")
+        for index, values in enumerate(quantities.values(), start=1)
+    ]
+    figure_layout, height_px = grid_layout(tuple(quantities), columns=columns, row_px=190)
+    for index in range(1, len(quantities) + 1):
+        # The charts stand in columns over the same names: the lowest one's serve all.
+        is_lowest = index + columns > len(quantities)
+        shown = is_lowest and len(names) <= NAMES_SHOWN_MAX
+        figure_layout[f"xaxis{index}"] |= {"type": "category", "showticklabels": shown}
+        figure_layout[f"xaxis{index}"] |= {
+            "showgrid": False,
+            "tickangle": -90 if len(names) > 6 else 0,
+        }
+        figure_layout[f"yaxis{index}"] |= {"rangemode": "tozero"}
+    return traces, figure_layout, height_px
+
+
+def grid_layout(
+    titles: Sequence[str], *, columns: int = 2, row_px: int = 170, x_title: str = ""
+) -> tuple[dict[str, Any], int]:
+    """Return the layout of a grid of plots, axes numbered from 1 row by row, and its height in pixels."""
+    rows = -(-len(titles) // columns)
+    gap_x, gap_y = 0.09, 0.32 / max(rows, 1) if rows > 1 else 0.0
+    width, height = (1 - gap_x * (columns - 1)) / columns, (1 - gap_y * (rows - 1)) / rows
+    result = base_layout(showlegend=False, annotations=[])
+    for index, title in enumerate(titles):
+        row, column = divmod(index, columns)
+        x0, y1 = column * (width + gap_x), 1 - row * (height + gap_y)
+        bottom = index + columns >= len(titles)
+        number = index + 1
+        result[f"xaxis{number}"] = axis(
+            x_title if bottom else "", domain=[x0, x0 + width], anchor=f"y{number}", showgrid=False
+        )
+        result[f"yaxis{number}"] = axis(domain=[max(y1 - height, 0), y1], anchor=f"x{number}")
+        result["annotations"].append(_plot_title(title, x0, y1))
+    return result, 60 + rows * row_px
+
+
+def groups_of_agents(names: Sequence[str]) -> list[tuple[str, list[str]]]:
+    """Return the names in groups of five, each with the label of its choice."""
+    groups = [list(names[start : start + GROUP_SIZE]) for start in range(0, len(names), GROUP_SIZE)]
+    return [(g[0] if len(g) == 1 else f"{g[0]} … {g[-1]}", g) for g in groups]
+
+
+def as_array(values: NDArray[Any]) -> NDArray[np.float64]:
+    """Return a column as floats; what is no number becomes NaN."""
+    if values.dtype.kind in "fiub":
+        return values.astype(np.float64)
+    numbers = [v if isinstance(v, int | float) else np.nan for v in values.tolist()]
+    return np.array(numbers, dtype=np.float64)
+
+
+def _plot_title(text: str, x: float, y: float) -> dict[str, Any]:
+    return {
+        "text": text,
+        "xref": "paper",
+        "yref": "paper",
+        "x": x,
+        "y": y,
+        "xanchor": "left",
+        "yanchor": "bottom",
+        "showarrow": False,
+        "font": {"size": 12, "color": INK},
+    }

@@ -1,0 +1,58 @@
+"""The report for a terminal: the verdict, the checks and the tables, no figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from cosmos_cli.console import Column, Console
+from cosmos_cli.expectation import mapping_at
+from cosmos_cli.report.build import figures_of
+from cosmos_cli.report.model import Remark, Section, TableBlock, format_cell
+
+CHECK_COLUMNS = (
+    Column("check"),
+    Column("measured", is_number=True),
+    Column("limit", is_number=True),
+    Column(""),
+)
+
+
+def print_report(
+    console: Console, document: Mapping[str, Any], sections: Sequence[Section]
+) -> None:
+    """Print a run's report on stdout."""
+    console.data(f"{document.get('run')}: {document.get('verdict')}")
+    console.data("")
+    for name, value, remark in figures_of(document):
+        console.data(f"  {name:<18}{value:>14}   {remark}")
+    console.data("")
+    console.table(CHECK_COLUMNS, [_check_row(check) for check in document.get("checks", ())])
+    for line in mapping_at(document, "data").get("missing", ()):
+        console.data(f"missing: {line}")
+    for section in sections:
+        _print_section(console, section)
+
+
+def _print_section(console: Console, section: Section) -> None:
+    told = [block for block in section.blocks if isinstance(block, TableBlock | Remark)]
+    if not told:
+        return
+    console.data(f"\n{section.title}")
+    for block in told:
+        if isinstance(block, Remark):
+            console.data(block.text)
+            continue
+        console.data(f"\n{block.title}")
+        columns = [Column(h.text, is_number=h.is_number) for h in block.headings]
+        console.table(columns, [[format_cell(cell) for cell in row] for row in block.rows])
+
+
+def _check_row(check: Mapping[str, Any]) -> list[str]:
+    got = check.get("got")
+    return [
+        str(check.get("name")),
+        "not measured" if got is None else format_cell(got),
+        format_cell(check.get("limit")),
+        "holds" if check.get("passed") is True else "BROKEN",
+    ]
