@@ -9,18 +9,10 @@ from typing import Annotated
 import typer
 
 from cosmos_cli.console import Console, JsonOption, QuietOption, SetOption
-from cosmos_cli.errors import CosmosError, ExitCode
 from cosmos_cli.launch.execute import RunOptions, execute
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.rundir import runs_root
 from cosmos_cli.view.factory import make_view
-
-
-class CollectionInterrupted(CosmosError):
-    """The run is over, but its operator did not wait for the verdict."""
-
-    exit_code = ExitCode.INTERRUPTED
-    kind = "interrupted"
 
 
 def run(
@@ -55,13 +47,7 @@ def run(
         runs=runs_root(runs), manual=tuple(dict.fromkeys(manual or ())), has_report=report
     )
     checked = load_scenario(scenario, overrides)
-    try:
-        summary = execute(checked, options, partial(make_view, quiet=quiet))
-    except KeyboardInterrupt:
-        raise CollectionInterrupted(
-            f"interrupted while collecting; the records are in {options.runs.resolve()}: `cosmos"
-            " collect last` judges and packages them"
-        ) from None
+    summary = execute(checked, options, partial(make_view, quiet=quiet))
     console.print_json(dict(summary.document))
     (console.say if json else console.data)(summary.last_line)
     raise typer.Exit(int(summary.exit_code))

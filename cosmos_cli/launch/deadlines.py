@@ -12,6 +12,8 @@ MARGIN_S = 10.0
 """The host has its own deadlines and names who missed them; the operator's come this much later."""
 HOST_SILENCE_S = 20.0
 """A running host reports twice a second; one that is silent for this long is taken for hung."""
+STALL_S = 5.0
+"""A turn of the loop that took this long means that the operator was stopped (Ctrl-Z), not its children."""
 MANUAL_READY_S = 600.0
 """Time to start an agent by hand."""
 
@@ -30,6 +32,10 @@ class Deadlines:
         """Forget deadlines; unknown ones do no harm."""
         for name in names:
             self._due.pop(name, None)
+
+    def postpone(self, by_s: float) -> None:
+        """Move all: for time in which the operator itself was stopped and could not look."""
+        self._due = {name: (at_s + by_s, action) for name, (at_s, action) in self._due.items()}
 
     def wait_s(self, now_s: float) -> float | None:
         """Return the time until the next one, 0 if it is due, None if there is none."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import yaml
 
-from cosmos_cli.errors import InputError
+from cosmos_cli.errors import CosmosError, ExitCode, InputError
 from cosmos_cli.launch.operator import Operator
 from cosmos_cli.launch.outcome import LaunchOutcome, LaunchRequest, View, with_manual_agents
 from cosmos_cli.launch.signals import OperatorSignals
@@ -24,6 +24,13 @@ if TYPE_CHECKING:
 
 OPERATOR_NICE = 5
 """What the operator draws and collects can wait; agents on the same processors cannot."""
+
+
+class CollectionInterrupted(CosmosError):
+    """The run is over, but its operator did not wait for the verdict."""
+
+    exit_code = ExitCode.INTERRUPTED
+    kind = "interrupted"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,7 +57,7 @@ def execute(
 
     Raises:
         InputError: An option does not fit the scenario, or no run directory can be made.
-        KeyboardInterrupt: Collection was interrupted; what is on disk can be collected again.
+        CollectionInterrupted: What is on disk can be collected again.
     """
     prepared = _prepare(scenario, options)
     request = LaunchRequest(
@@ -71,6 +78,11 @@ def execute(
             signals.raise_from_now()
             has_report = options.has_report and outcome.interruption != "at once"
             return _finish(prepared, outcome, has_report=has_report, view=view)
+        except KeyboardInterrupt:
+            raise CollectionInterrupted(
+                f"interrupted while collecting; the records are on disk, judge and package them with:"
+                f" cosmos collect {run.path}"
+            ) from None
         finally:
             view.close()
 
@@ -87,8 +99,11 @@ def _prepare(scenario: ScenarioFile, options: RunOptions) -> _Prepared:
     _check_manual(options.manual, plan)
     run = create_run(options.runs, scenario.scenario.name)
     config = with_manual_agents(scenario.run_config(run.name), options.manual)
-    begin_run(run, config, plan.to_mapping())
-    (run.path / "scenario.yaml").write_text(scenario_text(scenario), encoding="utf-8")
+    try:
+        begin_run(run, config, plan.to_mapping())
+        (run.path / "scenario.yaml").write_text(scenario_text(scenario), encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{run.path}: cannot write there: {error.strerror or error}") from error
     return _Prepared(run, config, plan)
 
 

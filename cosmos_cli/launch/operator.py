@@ -21,6 +21,7 @@ from cosmos_cli.launch.deadlines import (
     HOST_SILENCE_S,
     LISTEN_TIMEOUT_S,
     MARGIN_S,
+    STALL_S,
     Deadlines,
     state_limit_s,
 )
@@ -107,7 +108,8 @@ class Operator:
     # The loop -------------------------------------------------------------------------------------
 
     def _turn(self) -> None:
-        wait_s = self._deadlines.wait_s(time.monotonic())
+        turned_s = time.monotonic()
+        wait_s = self._deadlines.wait_s(turned_s)
         timeout_s = SELECT_MAX_S if wait_s is None else min(wait_s, SELECT_MAX_S)
         for key, mask in self._selector.select(timeout_s):
             # An earlier callback of this round may have closed this one's descriptor.
@@ -116,7 +118,10 @@ class Operator:
         for name, child in list(self._children.items()):
             if name not in self._exited and child.returncode() is not None:
                 self._child_exited(child)
-        self._deadlines.fire(time.monotonic())
+        now_s = time.monotonic()
+        if now_s - turned_s > STALL_S:
+            self._deadlines.postpone(now_s - turned_s)
+        self._deadlines.fire(now_s)
 
     def _is_over(self) -> bool:
         return not self._seats and all(map(self._reaper.has_ended, self._children.values()))
@@ -170,12 +175,17 @@ class Operator:
         self, name: str, arguments: tuple[str, ...], folder: str, *, launch: Mapping[str, Any]
     ) -> None:
         stderr = self._request.directory / folder / "stderr.txt"
-        self._children[name] = Child(
-            Program(name=name, arguments=arguments, stderr=stderr),
-            self._selector,
-            launch=launch,
-            on_line=partial(self._said, name),
-        )
+        try:
+            self._children[name] = Child(
+                Program(name=name, arguments=arguments, stderr=stderr),
+                self._selector,
+                launch=launch,
+                on_line=partial(self._said, name),
+            )
+        except OSError as error:
+            reason = f"{name} cannot be started: {error}"
+            self._problem(reason)
+            self._ask_host_to_stop("failed", reason)
 
     def _agent_launch(
         self, machine: str, agents: tuple[str, ...], listening: Listening
@@ -284,8 +294,17 @@ class Operator:
         """Nobody is left whom the host could wait for."""
         t = self._timeouts
         limit_s = t.silence_s + t.complete_s + t.shutdown_s + MARGIN_S
-        action = partial(self._give_up_on_host, f"has gone on without agents for {limit_s:g} s")
+        reason = f"the host has gone on without agents for {limit_s:g} s"
+        action = partial(self._ask_host_to_stop, "failed", reason)
         self._deadlines.set("alone", time.monotonic() + limit_s, action)
+
+    def _ask_host_to_stop(self, status: str, reason: str) -> None:
+        host = self._children.get(HOST)
+        if host is None or self._is_closing:
+            return
+        host.channel.send({"command": "stop", "reason": reason, "status": status})
+        limit_s = self._timeouts.shutdown_s + MARGIN_S
+        self._limit_phase(limit_s, "has not stopped within {:g} s of being told to")
 
     def _give_up_on_host(self, what: str) -> None:
         host = self._children[HOST]
@@ -376,14 +395,8 @@ class Operator:
     def _interrupt(self, number: signal.Signals) -> None:
         self._interruption = "clean"
         self._view.say("stopping; press Ctrl-C again to end at once", "warning")
-        if self._is_closing:
-            return
         by = "the operator" if number is signal.SIGINT else number.name
-        self._children[HOST].channel.send(
-            {"command": "stop", "reason": f"interrupted by {by}", "status": "interrupted"}
-        )
-        limit_s = self._timeouts.shutdown_s + MARGIN_S
-        self._limit_phase(limit_s, "has not stopped within {:g} s of being told to")
+        self._ask_host_to_stop("interrupted", f"interrupted by {by}")
 
     def _end_at_once(self) -> None:
         self._interruption = "at once"

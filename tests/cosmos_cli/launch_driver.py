@@ -47,7 +47,7 @@ def run_operator(directory: Path) -> None:
         simulation="counter",
         base_directory=".",
         agents=Agents(count=2),
-        timeouts=Timeouts(shutdown_s=float(os.environ.get("COSMOS_SHUTDOWN_S", "10"))),
+        timeouts=Timeouts(**json.loads(os.environ["COSMOS_TIMEOUTS"])),
     )
     config = with_manual_agents(config, manual)
     request = LaunchRequest(

@@ -82,7 +82,7 @@ def host(line: Line) -> int:
             note(f"told {json.dumps(command)}")
             if command["command"] == "stop" and not FAKE.get("ignores_stop"):
                 status, reason = command["status"], command["reason"]
-            if command["command"] == "agent_exited":
+            if command["command"] == "agent_exited" and not FAKE.get("ignores_exits"):
                 status, reason = "failed", f"{command['agent']}: {command['how']}"
         pending = []
         if line.is_gone:

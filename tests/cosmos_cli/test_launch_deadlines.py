@@ -60,6 +60,17 @@ def test_overdue_deadline_is_waited_for_no_longer() -> None:
     assert deadlines.wait_s(5.0) == 0.0
 
 
+def test_time_in_which_the_operator_was_stopped_does_not_count() -> None:
+    deadlines, done = Deadlines(), []
+    deadlines.set("a", 1.0, lambda: done.append("a"))
+
+    deadlines.postpone(10.0)
+    deadlines.fire(10.9)
+
+    assert done == []
+    assert deadlines.wait_s(10.0) == 1.0
+
+
 def test_limit_of_a_state_is_the_hosts_own_and_a_margin() -> None:
     states = (
         "HOST_STARTUP",

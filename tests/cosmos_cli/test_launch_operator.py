@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import secrets
 import shlex
 import signal
@@ -47,8 +48,8 @@ class Launched:
         *,
         host: dict[str, Any] | None = None,
         agents: dict[str, Any] | None = None,
-        constants: dict[str, float] | None = None,
-        shutdown_s: float = 10,
+        constants: dict[str, Any] | None = None,
+        timeouts: dict[str, float] | None = None,
         manual: str = "",
         stderr: int | None = None,
     ) -> None:
@@ -57,7 +58,7 @@ class Launched:
             "COSMOS_FAKE": json.dumps({"host": host or {}, "agents": agents or {}}),
             "COSMOS_FAKE_NOTES": str(self.notes_file),
             "COSMOS_CONSTANTS": json.dumps({**QUICK, **(constants or {})}),
-            "COSMOS_SHUTDOWN_S": str(shutdown_s),
+            "COSMOS_TIMEOUTS": json.dumps(timeouts or {}),
             "COSMOS_MANUAL": manual,
             # Reversed, so that a search of environments for the key finds only a leak.
             "COSMOS_TEST_KEY_REVERSED": self.key[::-1],
@@ -201,15 +202,16 @@ def test_killed_agent_is_told_to_the_host(launched: Launched) -> None:
 def test_killed_supervisor_is_reported_and_each_of_its_agents_told_to_the_host(
     launched: Launched,
 ) -> None:
-    launched.start(host={"runs_s": 30}, agents={"killed_after_s": 0.1})
+    launched.start(host={"runs_s": 2, "ignores_exits": True}, agents={"killed_after_s": 0.1})
 
     outcome = launched.outcome()
 
-    assert outcome["host_result"]["status"] == "failed"
-    assert "supervisor agents@loopback" in outcome["host_result"]["reason"]
     assert "was killed by SIGKILL before its agents agent-01, agent-02" in outcome["problems"][0]
     told = [line for line in launched.notes.splitlines() if "agent_exited" in line]
-    assert ["agent-01" in told[0], "agent-02" in told[1]] == [True, True]
+    assert [re.findall("agent-..|killed by SIGKILL", line) for line in told] == [
+        ["agent-01", "killed by SIGKILL"],
+        ["agent-02", "killed by SIGKILL"],
+    ]
 
 
 def test_children_that_heed_neither_stop_nor_sigterm_are_killed_and_named(
@@ -218,7 +220,7 @@ def test_children_that_heed_neither_stop_nor_sigterm_are_killed_and_named(
     launched.start(
         host={"stays": True, "ignores_sigterm": True},
         agents={"ignores_stop": True, "ignores_life_line": True, "ignores_sigterm": True},
-        shutdown_s=0.3,
+        timeouts={"shutdown_s": 0.3},
     )
 
     outcome = launched.outcome()
@@ -315,7 +317,7 @@ def test_second_hangup_of_a_closing_terminal_is_no_second_word(launched: Launche
 def test_host_that_ignores_the_stop_is_ended_after_its_deadline(launched: Launched) -> None:
     launched.start(
         host={"runs_s": 60, "ignores_stop": True},
-        shutdown_s=0.5,
+        timeouts={"shutdown_s": 0.5},
         constants={"operator.MARGIN_S": 0.5},
     )
     launched.wait_for_note("launched [")
@@ -329,7 +331,9 @@ def test_host_that_ignores_the_stop_is_ended_after_its_deadline(launched: Launch
 
 def test_interrupt_before_the_host_listens_starts_no_agents(launched: Launched) -> None:
     launched.start(
-        host={"silent_start": True}, shutdown_s=0.5, constants={"operator.MARGIN_S": 0.1}
+        host={"silent_start": True},
+        timeouts={"shutdown_s": 0.5},
+        constants={"operator.MARGIN_S": 0.1},
     )
     launched.wait_for_note("launched")
     launched.signal(signal.SIGINT)
@@ -350,6 +354,40 @@ def test_children_end_by_themselves_when_the_operator_is_killed(launched: Launch
     launched.wait_for(lambda: not any(map(is_alive, launched.pids())), "end of the children")
 
     assert launched.notes.count("life line gone") == 2
+
+
+def test_program_that_cannot_be_started_ends_the_run_and_is_named(launched: Launched) -> None:
+    launched.start(constants={"children.AGENT_PROGRAM": ["/nonexistent/python"]})
+
+    outcome = launched.outcome()
+
+    assert outcome["host_result"]["status"] == "failed"
+    assert "agents@loopback cannot be started" in outcome["problems"][0]
+    assert "/nonexistent/python" in outcome["host_result"]["reason"]
+
+
+def test_host_that_cannot_be_started_is_named(launched: Launched) -> None:
+    launched.start(constants={"children.HOST_PROGRAM": ["/nonexistent/python"]})
+
+    outcome = launched.outcome()
+
+    assert outcome["host_result"] is None
+    assert "host cannot be started" in outcome["problems"][0]
+
+
+def test_host_that_goes_on_without_agents_is_told_to_stop(launched: Launched) -> None:
+    launched.start(
+        host={"runs_s": 60, "ignores_exits": True},
+        agents={"killed_after_s": 0.1},
+        timeouts={"silence_s": 0.25, "complete_s": 0.25, "shutdown_s": 1},
+        constants={"operator.MARGIN_S": 1},
+    )
+
+    outcome = launched.outcome()
+
+    # silence_s, complete_s, shutdown_s and the margin are 2.5 s.
+    assert outcome["host_result"]["status"] == "failed"
+    assert outcome["host_result"]["reason"] == "the host has gone on without agents for 2.5 s"
 
 
 def test_closed_standard_error_does_not_end_the_run(launched: Launched) -> None:
