@@ -162,7 +162,7 @@ def test_j2_turns_the_node_at_the_authoritys_rate(rate):
     assert slope == pytest.approx(rate["node_deg_day"], rel=0.0044)
 
 
-def test_j2_turns_the_node_of_iridium_as_observed():
+def test_j2_turns_the_node_of_iridium_at_about_the_stated_rate():
     about = J2_RATES["about_780_km_86_4_deg"]
     knots_s = np.arange(0.0, 86_401.0, 60.0)
     states = j2_orbit(780.0, 86.4, knots_s).tolist()
