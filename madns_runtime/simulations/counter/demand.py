@@ -13,7 +13,11 @@ from madns_runtime.simulations.counter.parameters import CounterParameters
 def demand(
     parameters: CounterParameters, agents: int, tick_hz: float, base_directory: Path
 ) -> Demand:
-    """Return the terms of inequalities 2.7-2.10: every tick is a synchronous exchange without work."""
+    """
+    Return the terms of inequalities 2.7-2.10: every tick is a synchronous exchange without work.
+
+    Its packets are the planned flows, so no further synchronous rate is added to the bandwidth.
+    """
     packet = [2**31, 2**32, bytes(parameters.payload_bytes)]
     size_bytes = len(encode_message(SimulationData(packet)))
     return Demand(
@@ -26,7 +30,7 @@ def demand(
         batch_compute_s=0.0,
         sync_bytes=size_bytes,
         sync_compute_s=0.0,
-        sync_rate_hz=tick_hz,
+        sync_rate_hz=0.0,
         lead_s=1.0 / tick_hz,
         measured=False,
     )

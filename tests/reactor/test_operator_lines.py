@@ -1,0 +1,119 @@
+"""The line to the operator: commands in, events out, and the end of either side felt."""
+
+import os
+
+import pytest
+
+from madns_runtime.errors import ConfigurationError
+from madns_runtime.reactor import lines
+from madns_runtime.reactor.lines import OperatorLink, read_launch
+from madns_runtime.reactor.reactor import Reactor
+
+pytestmark = pytest.mark.process
+
+
+@pytest.fixture
+def pipes():
+    ends = [*os.pipe(), *os.pipe()]
+    yield ends
+    for fd in ends:
+        try:
+            os.close(fd)
+        except OSError:
+            continue
+
+
+@pytest.fixture
+def reactor():
+    made = Reactor()
+    yield made
+    made.close()
+
+
+def link(reactor, pipes, commands, gone, pending=b""):
+    return OperatorLink(
+        reactor,
+        (pipes[0], pipes[3]),
+        on_command=commands.append,
+        on_gone=lambda: (gone.append(True), reactor.stop()),
+        pending=pending,
+    )
+
+
+def test_launch_document_is_the_first_line_and_the_rest_is_kept(pipes):
+    os.write(pipes[1], b'{"a": 1}\n{"command": "stop"}\n{"comm')
+
+    document, rest = read_launch(pipes[0])
+
+    assert document == {"a": 1}
+    assert rest == b'{"command": "stop"}\n{"comm'
+
+
+@pytest.mark.parametrize(
+    ("written", "expected"),
+    [(b'{"a": 1}', "cut"), (b"", "empty"), (b"nonsense\n", "not JSON"), (b"[1]\n", "not a JSON")],
+)
+def test_broken_launch_document_is_refused(pipes, written, expected):
+    os.write(pipes[1], written)
+    os.close(pipes[1])
+
+    with pytest.raises(ConfigurationError, match=expected):
+        read_launch(pipes[0])
+
+
+def test_launch_document_that_never_comes_has_a_deadline(pipes, monkeypatch):
+    monkeypatch.setattr(lines, "LAUNCH_TIMEOUT_S", 0.05)
+
+    with pytest.raises(ConfigurationError, match="no launch document"):
+        read_launch(pipes[0])
+
+
+def test_commands_come_whole_in_whatever_pieces_and_garbage_is_passed_over(reactor, pipes):
+    commands, gone = [], []
+    link(reactor, pipes, commands, gone, pending=b'{"command": "a"}\n{"comm')
+    os.write(pipes[1], b'and": "b"}\nno json\n[1]\n{"command": "c"}\n')
+    os.close(pipes[1])
+
+    reactor.run()
+
+    assert commands == [{"command": "a"}, {"command": "b"}, {"command": "c"}]
+    assert gone == [True]
+
+
+def test_events_are_lines_of_json(reactor, pipes):
+    made = link(reactor, pipes, [], [])
+
+    made.emit({"event": "state", "state": "EXIT"})
+
+    assert os.read(pipes[2], 4096) == b'{"event":"state","state":"EXIT"}\n'
+
+
+def test_operator_who_does_not_read_costs_the_oldest_events_and_they_are_counted(
+    reactor, pipes, monkeypatch
+):
+    monkeypatch.setattr(lines, "OUT_BYTES_MAX", 200_000)
+    made = link(reactor, pipes, [], [])
+    for number in range(400):
+        made.emit({"event": "log", "number": number, "text": "x" * 1000})
+
+    assert made.dropped_count > 0
+    assert not made.flush(0.01)
+    text = b""
+    while not made.flush(0.05):
+        text += os.read(pipes[2], 1 << 20)
+    os.close(pipes[3])
+    while chunk := os.read(pipes[2], 1 << 20):
+        text += chunk
+    numbers = [int(line.split(b'"number":')[1].split(b",")[0]) for line in text.splitlines()]
+    assert len(numbers) == 400 - made.dropped_count
+    assert numbers == sorted(numbers)
+    assert numbers[-1] == 399
+
+
+def test_events_to_an_operator_who_is_gone_are_no_error(reactor, pipes):
+    made = link(reactor, pipes, [], [])
+    os.close(pipes[2])
+
+    made.emit({"event": "log"})
+
+    assert made.flush(1.0)
