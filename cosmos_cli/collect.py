@@ -178,9 +178,12 @@ def _conclude(
     progress: Progress,
 ) -> RunSummary:
     _, document = evidence.judged()
+    # The verdict first: whoever loses patience with the report or kills it here still has that.
+    with contextlib.suppress(OSError):
+        write_json(run.run_json, document)
     if has_report:
         progress("writing the report", 0.0)
-        evidence = _attempt(evidence, run.report_html, lambda: write_report(run, document))
+        evidence = _with_report(run, evidence, document)
     # From here on what matters most is written, and the reserve makes room for it.
     run.free_reserve()
     summary = _write_summary(run, gathered, evidence)
@@ -190,6 +193,16 @@ def _conclude(
         summary = _write_summary(run, gathered, packed)
     progress("packing", 1.0)
     return summary
+
+
+def _with_report(run: RunDirectory, evidence: Evidence, document: Mapping[str, Any]) -> Evidence:
+    try:
+        return _attempt(evidence, run.report_html, lambda: write_report(run, document))
+    except Exception as error:  # noqa: BLE001 - a defect of the report must not cost a run its verdict
+        problem = (
+            f"report.html: not written: {type(error).__name__}: {error}; please report this defect"
+        )
+        return dataclasses.replace(evidence, problems=(*evidence.problems, problem))
 
 
 def _attempt(evidence: Evidence, path: Path, write: Callable[[], object]) -> Evidence:

@@ -75,7 +75,9 @@ class _Page:
 
     def data(self) -> str:
         """Return the figures as JSON that may stand inside a script element."""
-        text = orjson.dumps({"figures": self.figures, "arrays": self._arrays}).decode()
+        text = orjson.dumps(
+            {"figures": self.figures, "arrays": self._arrays}, option=orjson.OPT_SERIALIZE_NUMPY
+        ).decode()
         return text.replace("<", "\\u003c")
 
     def _block(self, block: Figure | TableBlock | Remark) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,6 +17,7 @@ PALETTE = ("#2b5c8a", "#c4692b", "#3d8361", "#7d5a9b", "#b08c2e")
 """Five that stay apart on paper and for most colour-blind eyes: a group of agents is five, as in the thesis."""
 GROUP_SIZE = len(PALETTE)
 NAMES_SHOWN_MAX = 40
+DECADES_FINE_MAX = 3
 FONT = "Inter, 'Segoe UI', 'Helvetica Neue', Arial, sans-serif"
 
 
@@ -59,9 +61,16 @@ def base_layout(**more: Any) -> dict[str, Any]:
 
 
 def log_axis(low: float, high: float) -> dict[str, Any]:
-    """Return what makes an axis logarithmic: ticks at 1, 2, 5 of each decade if there are few, else at 1."""
-    decades = np.log10(max(high, 1e-12) / max(low, 1e-12))
-    return {"type": "log", "dtick": "D2" if decades < 2.5 else 1}
+    """
+    Return what makes an axis logarithmic.
+
+    Ticks stand at 1, 2, 5 of each decade if there are few decades, else at 1; plotly's own would show
+    a 200 as a small 2.
+    """
+    first, last = math.floor(math.log10(max(low, 1e-12))), math.ceil(math.log10(max(high, 1e-12)))
+    steps = (1, 2, 5) if last - first <= DECADES_FINE_MAX else (1,)
+    ticks = [step * 10.0**decade for decade in range(first, last + 1) for step in steps]
+    return {"type": "log", "tickvals": ticks, "ticktext": [f"{tick:g}" for tick in ticks]}
 
 
 def line(x: NDArray[Any], y: NDArray[Any], name: str, index: int = 0, **more: Any) -> Trace:

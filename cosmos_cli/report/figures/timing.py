@@ -13,6 +13,7 @@ from cosmos_cli.tables import TableReader
 
 LATENESS_US_MIN = 1.0
 HISTOGRAM_BINS = 90
+BINS_PER_DECADE = 30
 
 
 def tick_blocks(table: TableReader, source: Source) -> list[Block]:
@@ -62,7 +63,9 @@ def _lateness_histogram(table: TableReader, source: Source) -> Figure:
     low_us, high_us = _range(table, source, "lateness_us")
     low_us = max(low_us, LATENESS_US_MIN)
     high_us = max(high_us, 2 * low_us)
-    histogram = Histogram(np.geomspace(low_us, high_us, HISTOGRAM_BINS + 1))
+    # Lateness is recorded in whole microseconds: narrower bins would only show that.
+    bins = int(np.clip(BINS_PER_DECADE * np.log10(high_us / low_us), 10, HISTOGRAM_BINS))
+    histogram = Histogram(np.geomspace(low_us, high_us, bins + 1))
     for name in table.sources:
         histogram.add(source.values(table, name, "lateness_us"))
     figure_layout = layout("lateness, µs", "ticks", bargap=0.05)
@@ -78,7 +81,8 @@ def _lateness_histogram(table: TableReader, source: Source) -> Figure:
 
 def _margin_histogram(table: TableReader, source: Source) -> Figure:
     low_us, high_us = _range(table, source, "margin_us")
-    edges = np.linspace(low_us, max(high_us, low_us + 1.0), HISTOGRAM_BINS + 1) / 1000.0
+    bins = int(np.clip((high_us - low_us) / 2.0, 10, HISTOGRAM_BINS))
+    edges = np.linspace(low_us, max(high_us, low_us + 1.0), bins + 1) / 1000.0
     histogram = Histogram(edges)
     for name in table.sources:
         margin_ms = source.values(table, name, "margin_us") / 1000.0
