@@ -42,7 +42,6 @@ from cosmos_cli.launch.manual import ManualSeat
 from cosmos_cli.launch.outcome import LaunchOutcome, LaunchRequest, View
 from cosmos_cli.launch.reaper import Reaper
 from cosmos_cli.launch.signals import OperatorSignals
-from madns_runtime.config import AgentLaunch, HostLaunch, to_mapping
 
 STOP_GRACE_S = 2.0
 """From the host's end until supervisors are told to stop: agents that follow the host need less."""
@@ -146,28 +145,23 @@ class Operator:
     # Starting -------------------------------------------------------------------------------------
 
     def _start_host(self) -> None:
-        request = self._request
-        launch = HostLaunch(
-            config=request.config,
-            run_key_hex=request.run_key_hex,
-            session_hex=request.session_hex,
-            directory=str(request.directory / HOST),
-        )
-        self._start(HOST, children.HOST_PROGRAM, HOST, launch=to_mapping(launch))
+        self._start(HOST, children.HOST_PROGRAM, HOST, launch=self._request.host_launch())
         self._limit_phase(LISTEN_TIMEOUT_S, "has not listened within {:g} s")
 
     def _start_agents(self, listening: Listening) -> None:
+        launch_of = partial(
+            self._request.agent_launch, address=listening.address, port=listening.port
+        )
         for machine, names in self._request.machines.items():
             started = tuple(name for name in names if name not in self._request.manual)
             if started:
                 child = f"agents@{machine}"
                 self._machines[child] = machine
-                launch = self._agent_launch(machine, started, listening)
-                folder = f"machines/{machine}"
-                self._start(child, children.AGENT_PROGRAM, folder, launch=launch)
+                launch = launch_of(machine, started)
+                self._start(child, children.AGENT_PROGRAM, f"machines/{machine}", launch=launch)
             for name in names:
                 if name in self._request.manual:
-                    self._open_seat(name, self._agent_launch(machine, (name,), listening))
+                    self._open_seat(name, launch_of(machine, (name,)))
         if self._request.nice:  # after the children, who would inherit it
             os.nice(self._request.nice)
 
@@ -186,22 +180,6 @@ class Operator:
             reason = f"{name} cannot be started: {error}"
             self._problem(reason)
             self._ask_host_to_stop("failed", reason)
-
-    def _agent_launch(
-        self, machine: str, agents: tuple[str, ...], listening: Listening
-    ) -> dict[str, Any]:
-        request = self._request
-        launch = AgentLaunch(
-            config=request.config,
-            run_key_hex=request.run_key_hex,
-            session_hex=request.session_hex,
-            machine=machine,
-            agents=agents,
-            host_address=listening.address,
-            host_port=listening.port,
-            directory=str(request.directory),
-        )
-        return to_mapping(launch)
 
     def _open_seat(self, agent: str, launch: Mapping[str, Any]) -> None:
         seat = ManualSeat(

@@ -11,7 +11,7 @@ from typing import Any, Literal, Protocol
 
 from cosmos_cli.launch.deadlines import MANUAL_READY_S
 from cosmos_cli.launch.events import AgentChanged, Progress
-from madns_runtime.config import RunConfig
+from madns_runtime.config import AgentLaunch, HostLaunch, RunConfig, to_mapping
 
 RUN_KEY_BYTES = 32
 SESSION_BYTES = 8
@@ -32,6 +32,32 @@ class LaunchRequest:
     """How much the operator steps back behind its children once they are started."""
     run_key_hex: str = field(default_factory=lambda: secrets.token_hex(RUN_KEY_BYTES), repr=False)
     session_hex: str = field(default_factory=lambda: secrets.token_hex(SESSION_BYTES))
+
+    def host_launch(self) -> dict[str, Any]:
+        """Return the host's launch line; it holds the run key."""
+        launch = HostLaunch(
+            config=self.config,
+            run_key_hex=self.run_key_hex,
+            session_hex=self.session_hex,
+            directory=str(self.directory / "host"),
+        )
+        return to_mapping(launch)
+
+    def agent_launch(
+        self, machine: str, agents: tuple[str, ...], *, address: str, port: int
+    ) -> dict[str, Any]:
+        """Return the launch line of a supervisor of *agents*, told where the host listens; it holds the run key."""
+        launch = AgentLaunch(
+            config=self.config,
+            run_key_hex=self.run_key_hex,
+            session_hex=self.session_hex,
+            machine=machine,
+            agents=agents,
+            host_address=address,
+            host_port=port,
+            directory=str(self.directory),
+        )
+        return to_mapping(launch)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
