@@ -10,13 +10,13 @@ import importlib.util
 from pathlib import Path
 
 from madns_runtime.errors import ConfigurationError
-from madns_runtime.simulations.constellation.messages import KNOTS_MAX
 from madns_runtime.simulations.constellation.parameters import (
+    KNOTS_MAX,
     ConstellationParameters,
     ElementSetSatellites,
     ScipyPropagator,
 )
-from madns_runtime.simulations.constellation.truth.fleet import choose
+from madns_runtime.simulations.constellation.truth.choice import choose
 
 
 def find_faults(

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from madns_runtime.errors import PluginError
+from madns_runtime.simulations.constellation.parameters import KNOTS_MAX
 
 SEGMENT = "segment"
-KNOTS_MAX = 100_000
-"""Knots in one segment: more is a mistake, not a plan."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -17,6 +17,8 @@ from annotated_types import Ge, Gt, Le, Lt, MinLen
 from madns_runtime.config import FORBID_EXTRA
 
 SATELLITES_MAX = 5000
+KNOTS_MAX = 100_000
+"""Knots in one segment: more is a mistake, not a plan."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
