@@ -9,6 +9,7 @@ import typer
 
 from cosmos_cli.console import Column, Console, JsonOption, QuietOption
 from cosmos_cli.rundir import RunDirectory, list_runs, runs_root
+from madns_runtime.processes import list_processes
 
 RunsOption = Annotated[
     Path | None,
@@ -34,7 +35,8 @@ def runs(
     """List the runs, oldest first."""
     console = Console(json=as_json, quiet=quiet)
     root = runs_root(folder)
-    found = [_entry(run) for run in list_runs(root)]
+    living = {Path(entry.run_directory).resolve() for entry in list_processes()}
+    found = [_entry(run, is_living=run.path in living) for run in list_runs(root)]
     console.print_json(found)
     if found:
         console.table(COLUMNS, [_row(entry) for entry in found])
@@ -42,10 +44,12 @@ def runs(
         console.say(f"{root}: no runs yet; make one with: cosmos run SCENARIO")
 
 
-def _entry(run: RunDirectory) -> dict[str, Any]:
+def _entry(run: RunDirectory, *, is_living: bool) -> dict[str, Any]:
     document = run.read_json(run.run_json) or {}
     agents = document.get("agents")
     status = document.get("status", "unknown") if run.path.is_dir() else "packed"
+    if status == "running" and not is_living:
+        status = "cut off"
     return {
         "run": run.name,
         "path": str(run.path if run.path.is_dir() else run.bundle),

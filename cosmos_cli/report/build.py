@@ -15,8 +15,7 @@ from cosmos_cli.tables import TableReader, open_tables
 
 SENTENCES_MAX = 60
 LEVELS_TOLD = ("critical", "error", "warning")
-QUIET_EVENTS = 40
-"""A source with more events than this is told by its last ones."""
+OF_MACHINES = ("machine_health", "host_health", "process", "clock")
 
 
 def open_source(run: RunDirectory, document: Mapping[str, Any]) -> Source:
@@ -44,8 +43,7 @@ def _chapters(tables: Mapping[str, TableReader]) -> Iterator[tuple[TableReader, 
     order = [name for name in FIGURES if name in tables]
     order += [name for name in tables if name not in FIGURES and name not in TEXT_STREAMS]
     # What the simulation recorded comes before what the framework knows of machines and clocks.
-    late = ("machine_health", "process", "clock")
-    for name in sorted(order, key=lambda name: name in late):
+    for name in sorted(order, key=lambda name: name in OF_MACHINES):
         yield tables[name], chapter_of(tables[name])
 
 

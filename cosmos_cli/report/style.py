@@ -28,6 +28,8 @@ def axis(title: str = "", **more: Any) -> dict[str, Any]:
         "gridcolor": GRID,
         "linecolor": "#cbd2d9",
         "zeroline": False,
+        "exponentformat": "power",
+        "minexponent": 5,
         "tickfont": {"size": 11, "color": MUTED},
         "automargin": True,
         **more,
@@ -55,6 +57,7 @@ def base_layout(**more: Any) -> dict[str, Any]:
             "font": {"size": 11},
         },
         "bargap": 0.25,
+        "separators": ".\u202f",
         "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": "#b3bfcc", "activecolor": ACCENT},
         **more,
     }

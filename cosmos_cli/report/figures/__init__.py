@@ -37,6 +37,7 @@ FIGURES: dict[str, Chapter] = {
     "elements": Chapter("Orbits", elements_blocks),
     "host_invariants": Chapter("Health of the model", invariants_blocks),
     "machine_health": Chapter("State of health", health_blocks),
+    "host_health": Chapter("State of health of the host", health_blocks),
     "process": Chapter("Processes", process_blocks),
     "clock": Chapter("Clock", clock_blocks),
 }

@@ -147,10 +147,9 @@ def _energy(
     choices = []
     for agent, rows in by_agent.items():
         energy = numbers["energy_j_kg"][rows]
-        trace = line(numbers["t_s"][rows], (energy - energy[0]), "E − E₀", mode="lines+markers")
-        name = f"{_satellite(source, agent)}"
+        trace = line(numbers["t_s"][rows], energy - energy[0], "E − E₀", mode="lines+markers")
         trace["hovertemplate"] = f"%{{x:.0f}} s: E₀ %{{y:+.3g}} J/kg, E₀ = {energy[0]:.9g} J/kg"
-        choices.append(Choice(name=name, traces=[trace]))
+        choices.append(Choice(name=_satellite(source, agent), traces=[trace]))
     figure_layout = layout("simulated time, s", "E − E₀, J/kg")
     figure_layout["yaxis"] |= {"exponentformat": "power"}
     return Figure(
@@ -168,7 +167,7 @@ def _drift_table(
     wanted = [
         (name, title)
         for name, title in (
-            ("energy_j_kg", "energy at the end, J/kg"),
+            ("energy_j_kg", "energy at the end, MJ/kg"),
             ("energy_drift", "energy drift, worst"),
             ("momentum_z_drift", "momentum drift, worst"),
         )
@@ -179,7 +178,7 @@ def _drift_table(
         cells: list[object] = [_satellite(source, agent)]
         for name, _ in wanted:
             values = numbers[name][index]
-            cells.append(_last(values) if name == "energy_j_kg" else _worst(values))
+            cells.append(_megajoules(values) if name == "energy_j_kg" else _worst(values))
         rows.append(cells)
     titles = [title for _, title in wanted]
     return TableBlock(
@@ -398,6 +397,12 @@ def _told_unit(unit: str) -> str:
 def _last(values: Floats) -> float | None:
     finite = values[np.isfinite(values)]
     return float(finite[-1]) if finite.size else None
+
+
+def _megajoules(values: Floats) -> str | None:
+    """Return the last energy with all the figures by which satellites of one shell differ."""
+    last = _last(values)
+    return None if last is None else f"{last / 1e6:.6f}"
 
 
 def _worst(values: Floats) -> float | None:

@@ -20,7 +20,7 @@ BARS_FROM = 2
 def health_blocks(table: TableReader, source: Source) -> list[Block]:
     """Return CPU and temperature of each machine over time, their statistics, and what else weighs."""
     blocks: list[Block] = [
-        *_quantity(table, source, CPU, "CPU usage by machine", "%"),
+        *_quantity(table, source, CPU, f"CPU usage {_whose(table)}", "%"),
         *_temperature(table, source),
     ]
     if table.has("ram_percent"):
@@ -32,6 +32,10 @@ def health_blocks(table: TableReader, source: Source) -> list[Block]:
             table, source, "load_1min", title="Load, 1 min mean", unit="", from_zero=True
         )
     return blocks
+
+
+def _whose(table: TableReader) -> str:
+    return "of the host's machine" if table.role == "host" else "by machine"
 
 
 def process_blocks(table: TableReader, source: Source) -> list[Block]:
@@ -67,13 +71,13 @@ def _temperature(table: TableReader, source: Source) -> list[Block]:
     ]
     blocks: list[Block] = []
     if len(without) < len(table.sources):
-        blocks += _quantity(table, source, TEMPERATURE, "Core temperature by machine", "°C")
+        blocks += _quantity(table, source, TEMPERATURE, f"Core temperature {_whose(table)}", "°C")
     if without:
         shown = ", ".join(without[:8]) + (
             f" and {len(without) - 8} more" if len(without) > 8 else ""
         )
         verb = "has" if len(without) == 1 else "have"
-        blocks.append(Remark(text=f"{shown} {verb} no temperature sensor."))
+        blocks.append(Remark(text=f"{shown} {verb} no temperature sensor: nothing to draw."))
     return blocks
 
 

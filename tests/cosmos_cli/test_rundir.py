@@ -1,0 +1,147 @@
+import subprocess
+import sys
+import threading
+
+import orjson
+import pytest
+from synthetic_run import make_config
+
+from cosmos_cli.errors import InputError
+from cosmos_cli.rundir import (
+    RESERVE_BYTES,
+    begin_run,
+    create_run,
+    find_run,
+    list_runs,
+    runs_root,
+    write_atomically,
+)
+
+
+def test_runs_are_numbered_on(tmp_path):
+    names = [create_run(tmp_path, name).name for name in ("iridium10", "counter", "iridium10")]
+
+    assert names == ["0001-iridium10", "0002-counter", "0003-iridium10"]
+
+
+def test_number_of_a_packed_run_whose_directory_is_gone_is_not_used_again(tmp_path):
+    (tmp_path / "0006-old.tar.zst").touch()
+
+    assert create_run(tmp_path, "new").name == "0007-new"
+
+
+def test_number_has_more_digits_when_four_do_not_suffice(tmp_path):
+    (tmp_path / "9999-last").mkdir()
+
+    assert create_run(tmp_path, "x").name == "10000-x"
+
+
+def test_runs_that_start_at_once_each_get_a_number(tmp_path):
+    names = []
+    start = threading.Barrier(8)
+
+    def create(index):
+        start.wait()
+        names.append(create_run(tmp_path, f"scenario{index}").name)
+
+    threads = [threading.Thread(target=create, args=(i,)) for i in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+    assert sorted(int(name[:4]) for name in names) == list(range(1, 9))
+
+
+@pytest.mark.process
+def test_processes_that_start_runs_at_once_each_get_a_number(tmp_path):
+    code = "import sys; from cosmos_cli.rundir import create_run; from pathlib import Path\n"
+    code += "[create_run(Path(sys.argv[1]), 'p') for _ in range(10)]"
+    children = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path)]) for _ in range(3)]
+
+    assert [child.wait(60) for child in children] == [0, 0, 0]
+    assert [run.number for run in list_runs(tmp_path)] == list(range(1, 31))
+
+
+def test_scenario_name_cannot_leave_the_folder(tmp_path):
+    run = create_run(tmp_path / "runs", "../../etc/pass wd")
+
+    assert run.path.parent == (tmp_path / "runs").resolve()
+    assert run.name == "0001-etc-pass-wd"
+
+
+def test_new_run_holds_its_reserve(tmp_path):
+    run = create_run(tmp_path, "x")
+
+    assert run.reserve.stat().st_size == RESERVE_BYTES
+    assert run.reserve.stat().st_blocks * 512 >= RESERVE_BYTES
+    run.free_reserve()
+    run.free_reserve()
+    assert not run.reserve.exists()
+
+
+@pytest.mark.parametrize("which", ["2", "0002", "0002-b", "PATH", "last"])
+def test_run_is_found_by(tmp_path, which):
+    create_run(tmp_path, "a")
+    run = create_run(tmp_path, "b")
+
+    assert find_run(tmp_path, str(run.path) if which == "PATH" else which) == run
+
+
+@pytest.mark.parametrize("which", ["3", "nobody", "./nowhere", "../nowhere/x"])
+def test_run_that_is_not_there_is_bad_input_and_the_message_lists_the_last(tmp_path, which):
+    create_run(tmp_path, "a")
+
+    with pytest.raises(InputError, match=r"no such run"):
+        find_run(tmp_path, which)
+
+
+def test_unwritable_root_says_which_option_helps(tmp_path):
+    (tmp_path / "file").touch()
+
+    with pytest.raises(InputError, match="--runs or COSMOS_RUNS"):
+        create_run(tmp_path / "file", "x")
+
+
+def test_root_is_the_option_then_the_variable_then_runs(monkeypatch):
+    monkeypatch.setenv("COSMOS_RUNS", "/elsewhere")
+    assert str(runs_root("here")) == "here"
+    assert str(runs_root()) == "/elsewhere"
+    monkeypatch.delenv("COSMOS_RUNS")
+    assert str(runs_root()) == "runs"
+
+
+def test_run_json_says_running_from_the_start(tmp_path):
+    run = create_run(tmp_path, "x")
+
+    begin_run(run, make_config(3), {"machines": {"loopback": ["agent-01"]}})
+
+    document = run.read_json(run.run_json)
+    assert (document["status"], document["exit_code"]) == ("running", None)
+    assert document["seed"] == 7
+    assert document["versions"]["cosmos-madns"]
+    assert run.read_config() == make_config(3)
+
+
+def test_failed_replacement_leaves_the_old_file_and_no_rest(tmp_path, monkeypatch):
+    path = tmp_path / "run.json"
+    write_atomically(path, b"old")
+
+    def refuse(_descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("cosmos_cli.rundir.os.fsync", refuse)
+    with pytest.raises(OSError, match="No space"):
+        write_atomically(path, b"new")
+
+    assert path.read_bytes() == b"old"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["run.json"]
+
+
+def test_unreadable_json_is_none(tmp_path):
+    run = create_run(tmp_path, "x")
+    run.run_json.write_bytes(b'{"schema": 1,')
+
+    assert run.read_json(run.run_json) is None
+    run.run_json.write_bytes(orjson.dumps([1]))
+    assert run.read_json(run.run_json) is None

@@ -1,0 +1,155 @@
+import dataclasses
+import itertools
+import math
+
+import pytest
+
+from cosmos_cli.verdict import CheckResult, Facts, Limits, judge, plugin_checks
+
+GOOD = Facts(
+    host_status="complete",
+    miss_ratio=0.0,
+    overrun_ratio=0.0,
+    rtf=1.0,
+    reliable_lost=0,
+    sync_lost=0,
+    sync_deadlines_broken=0,
+)
+BROKEN_CHECK = CheckResult(name="counter.lost", limit=0, got=1, passed=False)
+
+
+def judged(**changes):
+    return judge(dataclasses.replace(GOOD, **changes), Limits())
+
+
+def test_nothing_wrong_is_green():
+    verdict = judged()
+
+    assert (verdict.exit_code, verdict.status, verdict.broken) == (0, "complete", ())
+    assert verdict.text.startswith("PASSED")
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "status"),
+    [
+        ({"interrupted": True}, 130, "interrupted"),
+        ({"host_status": "interrupted"}, 130, "interrupted"),
+        ({"host_status": "failed"}, 1, "failed"),
+        ({"host_status": "aborted"}, 1, "aborted"),
+        ({"host_status": None}, 1, "failed"),
+        ({"host_status": "who knows"}, 1, "failed"),
+        ({"machine_problems": ("pi07: unreachable",)}, 3, "complete"),
+        ({"missing": ("pi07: no records",)}, 5, "complete"),
+        ({"lost_agents": ("a",)}, 4, "complete"),
+        ({"miss_ratio": 2e-3}, 4, "complete"),
+        ({"miss_ratio": None}, 4, "complete"),
+        ({"overrun_ratio": 2e-3}, 4, "complete"),
+        ({"rtf": 1.002}, 4, "complete"),
+        ({"rtf": 0.998}, 4, "complete"),
+        ({"rtf": None}, 4, "complete"),
+        ({"rtf": math.nan}, 4, "complete"),
+        ({"reliable_lost": 1}, 4, "complete"),
+        ({"reliable_lost": None}, 4, "complete"),
+        ({"sync_lost": 1}, 4, "complete"),
+        ({"sync_deadlines_broken": 1}, 4, "complete"),
+        ({"records_dropped": 1}, 4, "complete"),
+        ({"records_truncated": 1}, 4, "complete"),
+        ({"plugin_checks": (BROKEN_CHECK,)}, 4, "complete"),
+        ({"problems": ("process 77 outlived SIGKILL",)}, 3, "complete"),
+    ],
+)
+def test_single_fault_has_its_exit_code(changes, code, status):
+    verdict = judged(**changes)
+
+    assert (verdict.exit_code, verdict.status) == (code, status)
+
+
+FAULTS = (
+    (130, {"interrupted": True}),
+    (1, {"host_status": "aborted"}),
+    (3, {"machine_problems": ("pi07: unreachable",)}),
+    (5, {"missing": ("pi07: no records",)}),
+    (4, {"miss_ratio": 0.5}),
+    (3, {"problems": ("process 77 outlived SIGKILL",)}),
+)
+
+
+@pytest.mark.parametrize(
+    "faults", [c for n in (2, 3, 6) for c in itertools.combinations(FAULTS, n)]
+)
+def test_of_several_faults_the_first_in_order_decides(faults):
+    changes = {key: value for _, fault in faults for key, value in fault.items()}
+
+    assert judged(**changes).exit_code == faults[0][0]
+
+
+def test_limits_themselves_still_hold():
+    facts = dataclasses.replace(GOOD, miss_ratio=0.25, overrun_ratio=0.25, rtf=1.5)
+
+    assert judge(facts, Limits(miss_ratio_max=0.25, rtf_tolerance=0.5)).exit_code == 0
+
+
+def test_text_names_who_and_why():
+    verdict = judged(host_status="aborted", who="agent-03", reason="killed by SIGKILL")
+
+    assert verdict.text == "ABORTED: agent-03: killed by SIGKILL"
+
+
+def test_host_that_said_nothing_is_named():
+    verdict = judged(host_status=None)
+
+    assert verdict.who == "host"
+    assert "without a result" in verdict.text
+
+
+def test_every_broken_check_is_told_with_its_limit():
+    verdict = judged(miss_ratio=0.01, rtf=1.5)
+
+    assert "deadline.miss_ratio 0.01 (limit 0.001)" in verdict.text
+    assert "time.rtf 0.5 (limit 0.001)" in verdict.text
+
+
+def test_many_faults_are_cut_short_in_the_text():
+    verdict = judged(missing=tuple(f"pi{i:02d}: no records" for i in range(24)))
+
+    assert verdict.text.endswith("pi02: no records; and 21 more")
+
+
+def test_worst_of_all_agents_counts_for_each_name():
+    summaries = [
+        {"checks": [{"name": "x", "limit": 5, "got": got, "passed": got <= 5}]}
+        for got in (1, 9, 7, 4)
+    ]
+
+    assert plugin_checks(summaries) == [CheckResult(name="x", limit=5, got=9, passed=False)]
+
+
+def test_worst_of_passing_checks_is_the_one_nearest_its_limit():
+    summaries = [
+        {"checks": [{"name": "x", "limit": 5, "got": got, "passed": True}]} for got in (1, 4, 2)
+    ]
+
+    assert plugin_checks(summaries)[0].got == 4
+
+
+@pytest.mark.parametrize(
+    "item",
+    [
+        {"name": "x", "limit": 1, "got": None, "passed": True},
+        {"name": "x", "limit": 1, "got": math.nan, "passed": True},
+        {"name": "x", "limit": 1, "got": "0", "passed": True},
+        {"name": "x", "limit": 1, "got": 0, "passed": "yes"},
+        {"name": "x", "got": 0, "passed": True},
+        "x",
+        None,
+    ],
+)
+def test_malformed_check_is_a_broken_one(item):
+    (check,) = plugin_checks([{"checks": [item]}])
+
+    assert (check.passed, check.got) == (False, None)
+
+
+@pytest.mark.parametrize("summary", [{}, {"checks": None}, {"checks": 3}])
+def test_summary_without_checks_has_none(summary):
+    assert plugin_checks([summary]) == []
