@@ -11,6 +11,9 @@ from __future__ import annotations
 import os
 import socket
 import sys
+import traceback
+
+import orjson
 
 from madns_runtime.config import AgentLaunch, from_mapping
 from madns_runtime.errors import ConfigurationError, MachineError, MadnsError
@@ -28,12 +31,26 @@ def main() -> None:
         fds = _open_line(sys.argv[1:])
         document, pending = read_launch(fds[0])
         launch = from_mapping(AgentLaunch, document)
-        with register(launch.config.run, "supervisor", launch.machine, launch.directory):
-            code = Supervisor(launch, fds, pending).run()
+        code = _supervise(launch, fds, pending)
     except MadnsError as error:
         sys.stderr.write(f"madns-agent: {error}\n")
+    except BaseException:  # noqa: BLE001 - the last frame of a process
+        traceback.print_exc()
     sys.stderr.flush()
     os._exit(code)  # no plug-in's thread may hold the process
+
+
+def _supervise(launch: AgentLaunch, fds: tuple[int, int], pending: bytes) -> int:
+    with register(launch.config.run, "supervisor", launch.machine, launch.directory):
+        try:
+            supervisor = Supervisor(launch, fds, pending)
+        except MadnsError as error:
+            # Whoever waits for these agents is told why they will never come.
+            for agent in launch.agents:
+                told = {"event": "exited", "agent": agent, "pid": os.getpid(), "code": 1}
+                os.write(fds[1], orjson.dumps({**told, "how": str(error)}) + b"\n")
+            raise
+        return supervisor.run()
 
 
 def _open_line(arguments: list[str]) -> tuple[int, int]:

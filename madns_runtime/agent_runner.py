@@ -258,7 +258,7 @@ class AgentRunner:
             tick = Tick(timing.index, timing.t_s, self._period_s, timing.lateness_s, timing.missed)
             try:
                 self._step(tick)
-            except Exception as error:  # noqa: BLE001 - a plug-in may raise anything
+            except (Exception, SystemExit) as error:  # noqa: BLE001 - a plug-in may raise anything
                 self._plugin_failed("step", error)
                 self._pump()
                 return
@@ -411,11 +411,11 @@ class AgentRunner:
         """Call the plug-in; whatever it raises ends this agent with its name on it."""
         try:
             return method(*arguments)
-        except Exception as error:  # noqa: BLE001 - a plug-in may raise anything
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - a plug-in may raise anything
             self._plugin_failed(name, error)
             return None
 
-    def _plugin_failed(self, name: str, error: Exception) -> None:
+    def _plugin_failed(self, name: str, error: BaseException) -> None:
         text = "".join(traceback.format_exception(error))
         self._recorder.log("critical", text, self._t_s_or_none())
         reason = describe_exception(error, f"{self._simulation_name}.{name}")

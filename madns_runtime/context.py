@@ -92,7 +92,26 @@ class JobContext(RunContext):
 
 
 def describe_exception(error: BaseException, doing: str) -> str:
-    """Return one line: which call of a plug-in raised what, and in which file and line."""
+    """
+    Return one line: which call of a plug-in raised what, and in which file and line.
+
+    The place is the innermost line of the plug-in's own folder, not that of a library which it called.
+
+    Args:
+        error: What was caught, one call above the plug-in.
+        doing: The call, such as FleetHost.setup.
+    """
     frames = traceback.extract_tb(error.__traceback__)
-    place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
-    return f"{doing} raised {type(error).__name__}: {error}{place}"
+    place = ""
+    if frames:
+        home = Path(frames[min(1, len(frames) - 1)].filename).parent
+        own = [frame for frame in frames[1:] if _is_below(Path(frame.filename), home)]
+        frame = own[-1] if own else frames[-1]
+        place = f" ({Path(frame.filename).name}:{frame.lineno})"
+    text = f": {error}" if str(error) else ""
+    return f"{doing} raised {type(error).__name__}{text}{place}"
+
+
+def _is_below(path: Path, home: Path) -> bool:
+    # A virtual environment may lie beside a plug-in.
+    return path.is_relative_to(home) and "site-packages" not in path.relative_to(home).parts

@@ -11,7 +11,8 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPool
 from typing import Any, cast
 
 from madns_runtime.config import ExecutorSettings
-from madns_runtime.errors import ConfigurationError
+from madns_runtime.context import describe_exception
+from madns_runtime.errors import ConfigurationError, PluginError
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import die_with_parent
 
@@ -75,6 +76,29 @@ def _nothing() -> None:
     """Do nothing: the first job makes the pool fork its workers."""
 
 
+class JobFailed(PluginError):
+    """
+    A submitted function raised; the text says which, what and where.
+
+    It travels back instead of the exception itself, whose traceback stays in the worker and which may
+    not even be picklable.
+    """
+
+
+def run_job(function: Callable[..., Any], *arguments: Any) -> Any:
+    """
+    Do one job, in a worker.
+
+    Raises:
+        JobFailed: The function raised.
+    """
+    try:
+        return function(*arguments)
+    except (Exception, SystemExit) as error:  # a plug-in may raise anything
+        name = getattr(function, "__qualname__", repr(function))
+        raise JobFailed(describe_exception(error, name)) from error
+
+
 class JobRunner:
     """
     Hands functions to an executor and their results to the loop.
@@ -113,7 +137,7 @@ class JobRunner:
             raise ConfigurationError(f"more than {JOBS_MAX} jobs are waiting in the executor")
         self._submitted_count += 1
         job = self._submitted_count
-        future = self._executor.submit(function, *arguments)
+        future = self._executor.submit(run_job, function, *arguments)
         self._pending[job] = future
         future.add_done_callback(
             lambda _: self._reactor.call_soon_threadsafe(lambda: self._done(job))

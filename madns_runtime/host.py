@@ -7,6 +7,7 @@ output. It ends by itself when that line closes.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import signal
@@ -17,11 +18,13 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, TypeVar
 
+import orjson
+
 from madns_runtime.config import HostLaunch, from_mapping
 from madns_runtime.context import JobContext, describe_exception
 from madns_runtime.errors import MadnsError
-from madns_runtime.executor import JobRunner, make_executor
-from madns_runtime.health.sampler import start_sampler, stop_sampler
+from madns_runtime.executor import JobFailed, JobRunner, make_executor
+from madns_runtime.health.sampler import SAMPLER_TIMEOUT_S, start_sampler, stop_sampler
 from madns_runtime.host_result import HostReport, progress_report
 from madns_runtime.plugin.api import HOST
 from madns_runtime.plugin.registry import load_half, parse_parameters, resolve
@@ -45,6 +48,8 @@ T = TypeVar("T")
 
 PROGRESS_INTERVAL_S = 0.5
 FLUSH_TIMEOUT_S = 5.0
+RESULT_FILE = "result.json"
+"""Beside the host's records: the result of a run whose operator is gone."""
 
 
 class HostRuntime:
@@ -66,7 +71,7 @@ class HostRuntime:
         parameters = parse_parameters(descriptor, config.parameters)
         self._simulation = load_half(descriptor, "host", base)()
         self._simulation_name = type(self._simulation).__name__
-        directory = Path(launch.directory)
+        self._directory = directory = Path(launch.directory)
         self._sampler = start_sampler(
             directory,
             run=config.run,
@@ -206,6 +211,8 @@ class HostRuntime:
     # Carrying out ------------------------------------------------------------------------------
 
     def _set_up(self) -> None:
+        if self._session.state is not HostState.SIMULATION_SETUP:
+            return  # an agent's last words came right behind its hello
         self._call("setup", self._simulation.setup, self._context)
         self._awaits_jobs = True
         self._continue_setup()
@@ -228,6 +235,8 @@ class HostRuntime:
             self._session.send_setup(agent, initial, self._reactor.now_s())
 
     def _start(self) -> None:
+        if self._session.state is not HostState.HOST_SIMULATION_READY:
+            return  # an agent's last words came right behind its readiness
         now_s = self._reactor.now_s()
         lead_s = self._config.timeouts.start_lead_s
         freeze_garbage()
@@ -249,8 +258,10 @@ class HostRuntime:
     def _job_done(self, job: int, future: Future[Any]) -> None:
         error = future.exception()
         if error is not None:
-            reason = describe_exception(error, f"{self._simulation_name}: job {job}")
-            self._session.emergency(HOST, reason, self._reactor.now_s())
+            doing = f"{self._simulation_name}: job {job}"
+            is_told = isinstance(error, JobFailed)
+            reason = f"{doing}: {error}" if is_told else describe_exception(error, doing)
+            self._plugin_failed(reason, error)
         else:
             self._call("result", self._simulation.result, job, future.result())
         self._continue_setup()
@@ -276,11 +287,12 @@ class HostRuntime:
             self._log("error", f"{', '.join(missing)}: no word that records are closed")
             self._event("not_stopped", agents=list(missing))
         self._jobs.close()
-        stop_sampler(self._sampler, timeout_s=2.0)
+        health = stop_sampler(self._sampler, timeout_s=SAMPLER_TIMEOUT_S)
         self._session.cleaned_up()
         now_s = self._reactor.now_s()
         self._event("end")
-        self._report.records = self._recorder.close(self._config.timeouts.shutdown_s).to_mapping()
+        counts = self._recorder.close(self._config.timeouts.shutdown_s)
+        self._report.records = {**counts.to_mapping(), "health": health}
         self._session.records_closed(now_s)
 
     def _agent_moved(self, event: told.AgentMoved) -> None:
@@ -358,22 +370,32 @@ class HostRuntime:
         """Call the plug-in; whatever it raises ends the run with its name on it."""
         try:
             return method(*arguments)
-        except Exception as error:  # noqa: BLE001 - a plug-in may raise anything
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - a plug-in may raise anything
             reason = describe_exception(error, f"{self._simulation_name}.{name}")
-            self._recorder.log(
-                "critical", "".join(traceback.format_exception(error)), self._t_s_or_none()
-            )
-            self._session.emergency(HOST, reason, self._reactor.now_s())
+            self._plugin_failed(reason, error)
             return None
+
+    def _plugin_failed(self, reason: str, error: BaseException) -> None:
+        text = "".join(traceback.format_exception(error))
+        self._recorder.log("critical", text, self._t_s_or_none())
+        self._session.emergency(HOST, reason, self._reactor.now_s())
 
     def _close(self) -> int:
         result = self._report.result(self._session)
+        if self._operator.is_gone:
+            self._leave(result)
         self._operator.emit({"event": "finished", "result": result})
         self._operator.flush(FLUSH_TIMEOUT_S)
         self._operator.close()
         self._socket.close()
         self._reactor.close()
         return 0 if result["status"] == "complete" else 1
+
+    def _leave(self, result: Mapping[str, Any]) -> None:
+        """Write the result where `cosmos collect` finds it: nobody else can."""
+        with contextlib.suppress(OSError):  # a full disk, say: then the records are all there is
+            path = self._directory / RESULT_FILE
+            path.write_bytes(orjson.dumps(result, option=orjson.OPT_SERIALIZE_NUMPY))
 
 
 def window_bytes(receive_buffer_bytes: int, peers: int) -> int:
@@ -392,10 +414,21 @@ def main() -> None:
         with register(launch.config.run, "host", HOST, Path(launch.directory).parent):
             code = HostRuntime(launch, (0, out_fd), pending).run()
     except MadnsError as error:
-        sys.stderr.write(f"madns-host: {error}\n")
-        code = 1
+        code = _fail(out_fd, str(error))
+    except BaseException as error:  # noqa: BLE001 - the last frame of a process; it is told below
+        traceback.print_exc()
+        code = _fail(out_fd, describe_exception(error, "madns-host"))
     sys.stderr.flush()
     os._exit(code)  # no executor's or plug-in's thread may hold the process
+
+
+def _fail(out_fd: int, reason: str) -> int:
+    """Tell the operator why there will be no run, or no more of it; returns the exit code."""
+    sys.stderr.write(f"madns-host: {reason}\n")
+    result = {"status": "failed", "who": HOST, "reason": reason}
+    with contextlib.suppress(OSError):  # nobody may be left to hear it
+        os.write(out_fd, orjson.dumps({"event": "finished", "result": result}) + b"\n")
+    return 1
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import orjson
 from madns_runtime.agent_runner import AgentRunner, Program
 from madns_runtime.config import AgentLaunch
 from madns_runtime.errors import MadnsError
-from madns_runtime.health.sampler import start_sampler, stop_sampler
+from madns_runtime.health.sampler import SAMPLER_TIMEOUT_S, start_sampler, stop_sampler
 from madns_runtime.health.stress import start_stress, stop_stress
 from madns_runtime.plugin.registry import load_half, parse_parameters, resolve
 from madns_runtime.processes import register
@@ -232,6 +232,8 @@ class Supervisor:
             return
         self._is_ending = True
         self._to_fork.clear()
+        # A byte for each, so that they can tell an order from the death of this process.
+        os.write(self._life_write_fd, bytes(len(self._children)))
         os.close(self._life_write_fd)
         grace_s = self._launch.config.timeouts.shutdown_s + KILL_GRACE_S
         self._reactor.call_at(self._reactor.now_s() + grace_s, self._kill)
@@ -250,8 +252,8 @@ class Supervisor:
         if not self._is_ending:
             os.close(self._life_write_fd)
         stop_stress(self._stress, timeout_s=2.0)
-        stop_sampler(self._sampler, timeout_s=2.0)
-        self._operator.emit({"event": "finished"})
+        health = stop_sampler(self._sampler, timeout_s=SAMPLER_TIMEOUT_S)
+        self._operator.emit({"event": "finished", "health": health})
         self._operator.flush(FLUSH_TIMEOUT_S)
         self._operator.close()
         self._reactor.close()
@@ -273,6 +275,7 @@ class AgentProcess:
         self, launch: AgentLaunch, agents: Sequence[str], program: Program, *, life_fd: int
     ) -> None:
         self._reactor = Reactor()
+        self._supervisor_pid = os.getppid()
         self._launch = launch
         self._agents = agents
         self._program = program
@@ -307,7 +310,10 @@ class AgentProcess:
 
     def _life_ended(self) -> None:
         self._reactor.remove_reader(self._life_fd)
-        self._end("the operator's side is gone")
+        if os.read(self._life_fd, 1):
+            self._end("the operator's side is gone or has ended the run")
+        else:
+            self._end(f"its supervisor (pid {self._supervisor_pid}) is gone")
 
     def _end(self, reason: str) -> None:
         for runner in list(self._runners.values()):

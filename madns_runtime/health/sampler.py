@@ -21,6 +21,8 @@ from madns_runtime.recording.writer import Recorder
 NICENESS = 10
 """Added to the sampler's niceness: it waits for the loops, not they for it."""
 RECORDS_TIMEOUT_S = 5.0
+SAMPLER_TIMEOUT_S = RECORDS_TIMEOUT_S + 1.0
+"""How long whoever ends the sampler should wait for it: its records need their own time."""
 
 
 def start_sampler(

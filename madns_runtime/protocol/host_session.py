@@ -567,7 +567,8 @@ class HostSession:
             if peer.phase in (Phase.ABSENT, Phase.STOPPED, Phase.LOST):
                 continue
             limit_s = self._timeouts.silence_s
-            if peer.phase is Phase.SETTING_UP:
+            if self.state is HostState.HOST_SIMULATION_READY or peer.phase is Phase.SETTING_UP:
+                # Its half is being set up, or that of an agent which shares its process.
                 limit_s += self._timeouts.agent_setup_s
             if now_s - peer.heard_s > limit_s:
                 self._lose(peer, f"silent for {limit_s:g} s while {peer.phase.value}", now_s)
