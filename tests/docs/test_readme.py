@@ -1,0 +1,102 @@
+"""What the README tells a person to do, done."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text("utf-8")
+TESTED = re.findall(r"<!-- tested -->\n```sh\n(.*?)```", README, flags=re.S)
+
+
+def run(command, folder, **variables):
+    environment = {
+        **os.environ,
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+        "COSMOS_STATE_DIR": str(folder / "state"),
+        **variables,
+    }
+    return subprocess.run(
+        ["bash", "-ec", command],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=240,
+    )
+
+
+@pytest.mark.process
+def test_tutorial_runs_from_its_first_command_to_its_last(tmp_path):
+    for block in TESTED:
+        # A shared machine may miss ticks; what the tutorial shows is the way, not the verdict.
+        done = run(
+            block.replace(
+                "cosmos run ",
+                "cosmos run --set deadline.max_miss_ratio=1 --set time.rtf_tolerance=1 ",
+            ),
+            tmp_path,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+
+    assert len(TESTED) == 2
+    assert "rover" in done.stdout
+
+
+@pytest.mark.process
+def test_tutorials_broken_rover_fails_its_check_with_code_4(tmp_path):
+    assert run("cosmos init rover --template plugin --directory rover", tmp_path).returncode == 0
+    program = tmp_path / "rover" / "rover.py"
+    text = program.read_text("utf-8")
+    assert "GAIN_1_S = 1.5" in text
+    program.write_text(text.replace("GAIN_1_S = 1.5", "GAIN_1_S = 0.05"), "utf-8")
+
+    done = run("cosmos run rover/rover.yaml --no-report", tmp_path)
+
+    assert done.returncode == 4, done.stderr
+    assert "error_m" in done.stdout + done.stderr
+
+
+def test_readme_shows_the_scenario_as_it_is():
+    shown = re.search(r"```yaml\n# scenarios/iridium10.yaml\n(.*?)```", README, flags=re.S)
+
+    assert shown is not None
+    actual = yaml.safe_load((ROOT / "scenarios" / "iridium10.yaml").read_text("utf-8"))
+    assert yaml.safe_load(shown.group(1)) == actual
+
+
+def test_every_command_that_the_readme_names_exists(tmp_path):
+    named = set(re.findall(r"`cosmos ([a-z]+)", README))
+    done = run("cosmos --help", tmp_path, NO_COLOR="1", COLUMNS="200")
+
+    assert named
+    assert {name for name in named if not re.search(rf"\b{name}\b", done.stdout)} == set()
+
+
+def test_every_file_that_the_readme_links_to_exists():
+    linked = re.findall(r"\]\(([^)#]+)\)", README)
+
+    missing = [link for link in linked if "://" not in link and not (ROOT / link).exists()]
+    assert missing == []
+
+
+def test_make_has_the_readmes_two_targets():
+    for target in ("demo", "test"):
+        assert f"make {target}" in README
+        done = subprocess.run(
+            ["make", "-n", target], cwd=ROOT, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.process
+def test_every_shipped_scenario_is_valid(tmp_path):
+    for scenario in sorted((ROOT / "scenarios").glob("*.yaml")):
+        done = run(f"cosmos validate {scenario}", tmp_path)
+        assert done.returncode == 0, done.stderr
