@@ -1,0 +1,115 @@
+import json
+
+import pytest
+from synthetic_run import SyntheticRun
+
+from cosmos_cli import app
+from cosmos_cli.collect import finish_run
+
+
+@pytest.fixture(autouse=True)
+def own_register(tmp_path, monkeypatch):
+    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
+    monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
+
+
+@pytest.fixture
+def made(tmp_path):
+    return SyntheticRun(tmp_path / "runs").write()
+
+
+def finish(made):
+    return finish_run(made.run, made.result(), made.expected)
+
+
+def test_collect_prints_the_package_and_ends_with_0(made, capsys):
+    finish(made)
+
+    code = app.run(["collect", "1"])
+
+    out, err = capsys.readouterr()
+    assert code == 0
+    assert out == f"{made.run.bundle}\n"
+    assert "PASSED" in err.splitlines()[-1]
+    assert str(made.run.path) in err.splitlines()[-1]
+
+
+def test_collect_of_a_cut_off_run_ends_with_5_and_names_what_is_missing(made, capsys):
+    made.kill("agent-01")
+
+    code = app.run(["collect", "last"])
+
+    err = capsys.readouterr().err
+    assert code == 5
+    assert "host: no result" in err
+    assert "agent-01: " in err
+    assert made.run.bundle.exists()
+
+
+def test_collect_as_json_prints_run_json_alone(made, capsys):
+    finish(made)
+
+    assert app.run(["collect", "--json", "--quiet"]) == 0
+
+    out, err = capsys.readouterr()
+    assert json.loads(out) == made.run.read_json(made.run.run_json)
+    assert err == ""
+
+
+def test_runs_lists_what_was_run(made, capsys):
+    finish(made)
+    SyntheticRun(made.run.path.parent)
+
+    assert app.run(["runs", "--json"]) == 0
+
+    first, second = json.loads(capsys.readouterr().out)
+    assert (first["run"], first["status"], first["exit_code"]) == ("0001-synthetic", "complete", 0)
+    assert (second["run"], second["status"]) == ("0002-synthetic", "cut off")
+
+
+def test_runs_of_an_empty_folder_says_how_to_make_one(capsys):
+    assert app.run(["runs"]) == 0
+
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "cosmos run SCENARIO" in err
+
+
+def test_report_shows_verdict_checks_and_tables(made, capsys):
+    finish(made)
+
+    assert app.run(["report"]) == 0
+
+    out = capsys.readouterr().out
+    assert out.startswith("0001-synthetic: PASSED")
+    for text in (
+        "deadline.miss_ratio",
+        "Round trips by agent, ms",
+        "agent-02",
+        "p99.9",
+        "lateness",
+    ):
+        assert text in out
+    assert "no temperature sensor" in out
+
+
+def test_report_writes_html_where_it_is_told_to(made, tmp_path, capsys):
+    finish(made)
+    target = tmp_path / "here.html"
+
+    assert app.run(["report", "1", "--html", str(target)]) == 0
+
+    assert "PASSED" in target.read_text()
+    assert capsys.readouterr().out == ""
+
+
+def test_report_of_a_run_that_is_not_collected_says_what_to_do(made, capsys):
+    assert app.run(["report", "1"]) == 2
+
+    assert "cosmos collect 1" in capsys.readouterr().err
+
+
+def test_unknown_run_is_bad_input(made, capsys):
+    assert app.run(["collect", "9"]) == 2
+
+    assert "0001-synthetic" in capsys.readouterr().err
