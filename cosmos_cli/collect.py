@@ -119,7 +119,7 @@ def collect_run(
     problems = before.get("problems")
     return finish_run(
         run,
-        run.read_json(run.result_json),
+        run.read_json(run.result_json) or run.read_json(run.left_result_json),
         Expected.read(run),
         interrupted=before.get("status") == "interrupted",
         problems=tuple(map(str, problems)) if isinstance(problems, list) else (),

@@ -70,6 +70,11 @@ class RunDirectory:
         return self.path / "result.json"
 
     @property
+    def left_result_json(self) -> Path:
+        """The same, left by a host whose operator was gone."""
+        return self.path / "host/result.json"
+
+    @property
     def manifest_json(self) -> Path:
         """Every file with its size, hash and counts."""
         return self.path / "manifest.json"

@@ -88,7 +88,7 @@ def judge(facts: Facts, limits: Limits) -> Verdict:
     status = run_status(facts)
     who, reason = facts.who, facts.reason
     if facts.host_status is None and status != "interrupted":
-        who, reason = who or "host", reason or "it ended without a result; was it killed?"
+        who, reason = who or "host", reason or _why_no_result(facts.problems)
     code, text = _conclude(facts, status, checks, _blame(who, reason))
     return Verdict(
         status=status, exit_code=code, text=text, who=who, reason=reason, checks=tuple(checks)
@@ -168,6 +168,15 @@ def _blame(who: str | None, reason: str | None) -> str:
     if who and reason:
         return f"{who}: {reason}"
     return who or reason or "no reason was given"
+
+
+def _why_no_result(problems: Sequence[str]) -> str:
+    """Return what the operator saw of the host's end, as in: host (pid 7) was killed by SIGKILL."""
+    for problem in problems:
+        name, _, what = problem.partition(") ")
+        if name.startswith("host (pid ") and what:
+            return what
+    return "it ended without a result; was it killed?"
 
 
 def _conclude(
