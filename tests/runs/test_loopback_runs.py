@@ -1,0 +1,135 @@
+"""Whole runs on loopback agents: what they count, record and show, not how fast the machine was."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import orjson
+import pyarrow.parquet as pq
+import pytest
+
+from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
+
+pytestmark = pytest.mark.process
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+LOOSE = ("deadline.max_miss_ratio=1", "time.rtf_tolerance=1")
+"""A shared machine may miss ticks: these tests judge counts."""
+
+
+def run(tmp_path, scenario, *settings):
+    command = [sys.executable, "-m", "cosmos_cli.app", "run", str(scenario), "--json", "--quiet"]
+    command += ["--no-report", "--runs", str(tmp_path / "runs")]
+    for setting in (*LOOSE, *settings):
+        command += ["--set", setting]
+    done = subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=240,
+        env={**os.environ, "COSMOS_STATE_DIR": str(tmp_path / "state")},
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    result = json.loads(done.stdout)
+    return result, tmp_path / "runs" / result["run"]
+
+
+def records(path):
+    lines = [orjson.loads(line) for line in path.read_bytes().splitlines()]
+    return [line for line in lines if isinstance(line, list)]
+
+
+def test_ten_iridium_satellites_lose_nothing_and_record_little(tmp_path):
+    result, evidence = run(tmp_path, SCENARIOS / "iridium10.yaml", "time.duration_s=25")
+
+    messages = result["messages"]
+    assert messages["reliable"]["lost"] == messages["sync"]["lost"] == 0
+    agents = result["simulation"]["agents"]
+    assert len(agents) == 10
+    assert [a["underruns"] for a in agents.values()] == [0] * 10
+    assert all(a["segments"] >= 2 for a in agents.values())
+    assert result["simulation"]["host"]["energy_drift_max"] < 1e-12
+    recorded = sum(p.stat().st_size for p in evidence.glob("agents/*/*.jsonl"))
+    ticks = sum(len(records(p)) for p in evidence.glob("agents/*/ticks.jsonl"))
+    assert recorded / ticks <= 160
+
+
+def test_recorded_states_follow_the_recorded_energy(tmp_path):
+    result, evidence = run(tmp_path, SCENARIOS / "iridium10.yaml", "time.duration_s=2")
+
+    mu = GRAVITY_MODELS["EGM-96"].mu_m3_s2
+    table = pq.read_table(evidence / "tables" / "state.parquet").to_pydict()
+    names = ("x_teme_m", "y_teme_m", "z_teme_m", "vx_teme_m_s", "vy_teme_m_s", "vz_teme_m_s")
+    for values in zip(*(table[name] for name in names), strict=True):
+        radius_m = sum(x * x for x in values[:3]) ** 0.5
+        energy_j_kg = sum(v * v for v in values[3:]) / 2 - mu / radius_m
+        # Specific orbital energy includes the potential: about -27.9 MJ/kg at 780 km.
+        assert -mu / (2 * 7_080_000) < energy_j_kg < -mu / (2 * 7_230_000)
+    assert len(table["x_teme_m"]) == result["timing"]["ticks"] - result["timing"]["missed"]
+
+
+def test_sgp4_truth_serves_any_tick_rate(tmp_path):
+    settings = ("parameters.propagator={kind: sgp4}", "agents.tick_hz=33", "time.duration_s=3")
+    result, _ = run(tmp_path, SCENARIOS / "iridium10.yaml", *settings)
+
+    assert result["simulation"]["host"]["propagator"] == "sgp4"
+    served = sum(a["ticks_served"] for a in result["simulation"]["agents"].values())
+    assert served == result["timing"]["ticks"] - result["timing"]["missed"]
+
+
+@pytest.mark.parametrize("service", ["best", "reliable", "sync"])
+def test_counter_loses_nothing_in_any_class_of_service(tmp_path, service):
+    settings = (
+        "agents.count=24",
+        "time.duration_s=3",
+        f"parameters.service={service}",
+        "agents.per_process=6",
+    )
+    result, _ = run(tmp_path, SCENARIOS / "counter24.yaml", *settings)
+
+    agents = result["simulation"]["agents"]
+    assert len(agents) == 24
+    totals = {
+        name: sum(a[name] for a in agents.values())
+        for name in ("sent", "returned", "lost", "duplicated", "wrong_values")
+    }
+    ran = result["timing"]["ticks"] - result["timing"]["missed"]
+    assert totals == {
+        "sent": ran,
+        "returned": ran,
+        "lost": 0,
+        "duplicated": 0,
+        "wrong_values": 0,
+    }
+
+
+def test_stress_and_health_run_beside_the_agents(tmp_path):
+    settings = (
+        "agents.count=2",
+        "time.duration_s=2",
+        "health.stress_workers=1",
+        "health.period_s=0.5",
+    )
+    _, evidence = run(tmp_path, SCENARIOS / "counter24.yaml", *settings)
+
+    health = records(next(evidence.glob("machines/*/health.jsonl")))
+    assert len(health) >= 3
+    schema = json.loads(next(evidence.glob("machines/*/health.jsonl")).open().readline())
+    names = [field["name"] for field in schema["fields"]]
+    assert {"cpu_percent", "temperature_c", "throttled"} & set(names)
+
+
+def test_two_runs_at_once_do_not_meet(tmp_path):
+    command = [sys.executable, "-m", "cosmos_cli.app", "run", str(SCENARIOS / "counter24.yaml")]
+    command += ["--json", "--quiet", "--no-report", "--runs", str(tmp_path / "runs")]
+    for setting in (*LOOSE, "agents.count=2", "time.duration_s=2"):
+        command += ["--set", setting]
+    both = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+
+    results = [json.loads(one.communicate(timeout=120)[0]) for one in both]
+
+    assert [r["exit_code"] for r in results] == [0, 0]
+    assert {r["run"] for r in results} == {"0001-counter24", "0002-counter24"}
