@@ -75,12 +75,20 @@ class Distribution:
         self._values: Floats = np.empty(0)
         self._counts: NDArray[np.int64] = np.empty(0, dtype=np.int64)
 
-    def add(self, samples: NDArray[Any]) -> None:
-        """Take samples, shape (N,); what is not finite is left out."""
-        values, counts = np.unique(samples[np.isfinite(samples)], return_counts=True)
-        merged = np.concatenate((self._values, values.astype(np.float64)))
+    @classmethod
+    def of(cls, samples: NDArray[Any]) -> Distribution:
+        """Return the distribution of samples, shape (N,); what is not finite is left out."""
+        finite = samples if samples.dtype.kind in "iu" else samples[np.isfinite(samples)]
+        values, counts = np.unique(finite, return_counts=True)
+        made = cls()
+        made._values, made._counts = values.astype(np.float64), counts
+        return made
+
+    def add(self, other: Distribution) -> None:
+        """Take the samples of another distribution as well."""
+        merged = np.concatenate((self._values, other._values))
         self._values, place = np.unique(merged, return_inverse=True)
-        weights = np.concatenate((self._counts, counts))
+        weights = np.concatenate((self._counts, other._counts))
         self._counts = np.bincount(place, weights, len(self._values)).astype(np.int64)
 
     def summary(self, scale: float = 1.0) -> Summary | None:
@@ -118,9 +126,7 @@ class Distribution:
 
 def summarise(samples: NDArray[Any]) -> Summary | None:
     """Return the statistics of all finite samples, shape (N,); None if there are none."""
-    distribution = Distribution()
-    distribution.add(samples)
-    return distribution.summary()
+    return Distribution.of(samples).summary()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,21 +144,17 @@ def tick_statistics(table: TableReader | None) -> TickStatistics:
     lateness, margin = Distribution(), Distribution()
     if table is not None and table.has("lateness_us", "margin_us", "missed"):
         for name, columns in table.each(("lateness_us", "margin_us", "missed")):
-            late, left = columns["lateness_us"], columns["margin_us"]
+            late = Distribution.of(columns["lateness_us"])
+            left = Distribution.of(columns["margin_us"])
             lateness.add(late)
             margin.add(left)
             agents[name] = AgentTicks(
-                run=len(late),
+                run=len(columns["missed"]),
                 missed=int(np.nansum(columns["missed"])),
                 lateness_ms=_high_ms(late),
                 margin_ms=_low_ms(left),
             )
-    all_late, all_left = lateness.summary(1 / US_PER_MS), margin.summary(1 / US_PER_MS)
-    return TickStatistics(
-        agents=agents,
-        lateness_ms=all_late.high() if all_late else {},
-        margin_ms=all_left.low() if all_left else {},
-    )
+    return TickStatistics(agents=agents, lateness_ms=_high_ms(lateness), margin_ms=_low_ms(margin))
 
 
 def round_trip_table(tables: Mapping[str, TableReader]) -> TableReader | None:
@@ -171,7 +173,7 @@ def round_trip_statistics(tables: Mapping[str, TableReader]) -> dict[str, Any]:
         return {}
     distribution = Distribution()
     for _, columns in table.each((ROUND_TRIP,)):
-        distribution.add(columns[ROUND_TRIP])
+        distribution.add(Distribution.of(columns[ROUND_TRIP]))
     summary = distribution.summary(1 / US_PER_MS)
     return {"stream": table.name, **summary.to_mapping()} if summary else {}
 
@@ -241,13 +243,13 @@ def tick_totals(
     return TickTotals(due=due, run=run, overrun_errors=overruns)
 
 
-def _high_ms(samples_us: NDArray[Any]) -> dict[str, float]:
-    summary = summarise(samples_us / US_PER_MS)
+def _high_ms(samples_us: Distribution) -> dict[str, float]:
+    summary = samples_us.summary(1 / US_PER_MS)
     return summary.high() if summary else {}
 
 
-def _low_ms(samples_us: NDArray[Any]) -> dict[str, float]:
-    summary = summarise(samples_us / US_PER_MS)
+def _low_ms(samples_us: Distribution) -> dict[str, float]:
+    summary = samples_us.summary(1 / US_PER_MS)
     return summary.low() if summary else {}
 
 

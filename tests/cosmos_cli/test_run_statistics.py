@@ -14,7 +14,7 @@ def test_distribution_tells_what_numpy_tells_of_all_samples(parts):
     distribution = Distribution()
 
     for part in np.array_split(samples, parts):
-        distribution.add(part)
+        distribution.add(Distribution.of(part))
     summary = distribution.summary(1e-3)
 
     expected = np.percentile(samples, (50, 99, 99.9, 1, 0.1)) / 1000
