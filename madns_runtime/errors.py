@@ -30,16 +30,6 @@ class PeerError(MadnsError):
     """The other side did not do what was agreed."""
 
 
-class DeadlineExpired(PeerError):
-    """A wait ended without an answer; the message names whom it waited for."""
-
-    def __init__(self, what: str, waited_s: float, missing: tuple[str, ...]) -> None:
-        super().__init__(f"{', '.join(missing)}: no {what} in {waited_s:g} s")
-        self.what = what
-        self.waited_s = waited_s
-        self.missing = missing
-
-
 class MessageTooLarge(MadnsError):
     """A message does not fit its class of service; the sender's plug-in is to blame."""
 

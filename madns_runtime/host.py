@@ -47,6 +47,8 @@ from madns_runtime.timing.clock import utc_at_iso, utc_now_iso
 T = TypeVar("T")
 
 PROGRESS_INTERVAL_S = 0.5
+SLOW_CALL_S = 0.5
+"""A call of the plug-in that takes this long while the run is on is told: agents lose a silent host."""
 FLUSH_TIMEOUT_S = 5.0
 RESULT_FILE = "result.json"
 """Beside the host's records: the result of a run whose operator is gone."""
@@ -368,12 +370,21 @@ class HostRuntime:
 
     def _call(self, name: str, method: Callable[..., T], *arguments: Any) -> T | None:
         """Call the plug-in; whatever it raises ends the run with its name on it."""
+        began_s = self._reactor.now_s()
         try:
             return method(*arguments)
         except (Exception, SystemExit) as error:  # noqa: BLE001 - a plug-in may raise anything
             reason = describe_exception(error, f"{self._simulation_name}.{name}")
             self._plugin_failed(reason, error)
             return None
+        finally:
+            took_s = self._reactor.now_s() - began_s
+            if took_s > SLOW_CALL_S and self._session.state is HostState.SIMULATION_START:
+                self._log(
+                    "warning",
+                    f"{self._simulation_name}.{name} took {took_s:.1f} s, and the host stood still;"
+                    " hand long work to context.submit",
+                )
 
     def _plugin_failed(self, reason: str, error: BaseException) -> None:
         text = "".join(traceback.format_exception(error))

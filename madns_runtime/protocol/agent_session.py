@@ -338,20 +338,19 @@ class AgentSession:
             return
         if self._heard_s is None and now_s - self._started_s > self._timeouts.agents_ready_s:
             waited_s = self._timeouts.agents_ready_s
-            self._lose_host(
+            self.emergency(
                 f"host: no answer to HELLO in {waited_s:g} s; is its address and UDP port reachable"
-                " from here?"
+                " from here?",
+                now_s,
             )
         elif self._state_deadline_s is not None and now_s >= self._state_deadline_s:
-            self._lose_host(f"host: no order to go on from {state.value} before its deadline")
+            self.emergency(f"host: no order to go on from {state.value} before its deadline", now_s)
         elif self._heard_s is not None and now_s - self._heard_s > self._silence_limit_s(state):
-            self._lose_host(f"host: silent for {self._silence_limit_s(state):g} s")
+            # It is told as well: it may only have been stuck.
+            self.emergency(f"host: silent for {self._silence_limit_s(state):g} s", now_s)
 
     def _silence_limit_s(self, state: AgentState) -> float:
         # While it sets up its own half the host may be busy; afterwards it answers pings at once.
         if state is AgentState.AGENT_READY:
             return self._timeouts.silence_s + self._timeouts.host_setup_s
         return self._timeouts.silence_s
-
-    def _lose_host(self, reason: str) -> None:
-        self._enter_emergency(self.identity.name, reason)

@@ -15,7 +15,6 @@ from enum import Enum
 from typing import Any, Literal
 
 from madns_runtime.config import Timeouts
-from madns_runtime.errors import DeadlineExpired
 from madns_runtime.protocol.codec import MalformedMessage, decode_message, encode_message
 from madns_runtime.protocol.deadlines import BrokenDeadline
 from madns_runtime.protocol.link import Link
@@ -491,7 +490,9 @@ class HostSession:
 
     def _agent_stopped(self, peer: Peer, message: AgentStopped, now_s: float) -> None:
         peer.records = message.records
-        if peer.phase is not Phase.LOST:
+        if self.state in _BEFORE_STOP and peer.phase is not Phase.LOST:
+            self._lose(peer, "it stopped before it was told to", now_s)
+        elif peer.phase is not Phase.LOST:
             self._set_phase(peer, Phase.STOPPED)
         self._progress(now_s)
 
@@ -605,14 +606,16 @@ class HostSession:
         self._state_deadline_s = now_s + self._timeouts.silence_s
         if not missing:
             return
-        reason = str(DeadlineExpired(what, waited_s, missing))
+        reason = f"no {what} in {waited_s:g} s"
         if self._aborts:
             for name in missing:
                 self._set_phase(self.peers[name], Phase.LOST, reason)
+                self._events.append(AgentLost(name, reason))
             self.emergency(", ".join(missing), reason, now_s)
             return
         for name in missing:
-            self._lose(self.peers[name], f"no {what} in {waited_s:g} s", now_s)
+            self._lose(self.peers[name], reason, now_s)
 
 
+_BEFORE_STOP = tuple(state for state in HOST_LIVE if state is not HostState.BEGIN_SHUTDOWN)
 _UNFINISHED = (Phase.READY, Phase.SETTING_UP, Phase.SIMULATION_READY, Phase.RUNNING)
