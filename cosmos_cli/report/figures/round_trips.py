@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
@@ -11,10 +12,11 @@ from cosmos_cli.report.figures.grouped import grouped_lines
 from cosmos_cli.report.model import Block, Choice, Figure, Remark, TableBlock, headings
 from cosmos_cli.report.sampling import TimeEnvelope
 from cosmos_cli.report.source import Source
-from cosmos_cli.report.style import bar_grid, envelope_lines, layout
+from cosmos_cli.report.style import bar_grid, envelope_lines, layout, log_axis
 from cosmos_cli.statistics import ROUND_TRIP, Summary, summarise
 from cosmos_cli.tables import TableReader
 
+LOG_FROM = 20.0
 COUNTS = {"lost": "lost", "duplicated": "duplicated", "out_of_order": "out of order"}
 
 
@@ -29,7 +31,7 @@ def round_trip_blocks(table: TableReader, source: Source) -> list[Block]:
         for name in table.sources
         if (summary := summarise(source.values(table, name, ROUND_TRIP) / 1000.0))
     }
-    return [
+    time_series: list[Block] = [
         _envelope(table, source, by_agent),
         *grouped_lines(
             table,
@@ -40,9 +42,20 @@ def round_trip_blocks(table: TableReader, source: Source) -> list[Block]:
             note="Thinned to the smallest and largest of each stretch of time, so no peak is lost.",
             scale=1e-3,
         ),
-        _bars(source, by_agent),
-        _table(source, by_agent),
     ]
+    low_ms = max(min(summary.min for summary in by_agent.values()), 1e-3)
+    high_ms = max(summary.max for summary in by_agent.values())
+    if high_ms > LOG_FROM * low_ms:
+        # One late packet would press all others flat on a linear axis.
+        time_series = [_logarithmic(block, low_ms, high_ms) for block in time_series]
+    return [*time_series, _bars(source, by_agent), _table(source, by_agent)]
+
+
+def _logarithmic(block: Block, low: float, high: float) -> Block:
+    if not isinstance(block, Figure):
+        return block
+    y_axis = {**block.layout["yaxis"], **log_axis(low, high)}
+    return dataclasses.replace(block, layout={**block.layout, "yaxis": y_axis})
 
 
 def _envelope(table: TableReader, source: Source, by_agent: Mapping[str, Summary]) -> Figure:

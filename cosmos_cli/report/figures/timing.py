@@ -70,7 +70,7 @@ def _lateness_histogram(table: TableReader, source: Source) -> Figure:
         histogram.add(source.values(table, name, "lateness_us"))
     figure_layout = layout("lateness, µs", "ticks", bargap=0.05)
     figure_layout["xaxis"] |= log_axis(low_us, high_us)
-    figure_layout["yaxis"] |= {"type": "log", "dtick": 1}
+    figure_layout["yaxis"] |= log_axis(1, float(histogram.counts.max()))
     return Figure(
         title="Lateness of all ticks",
         note="Both axes are logarithmic; the leftmost bar also holds what is early or on time.",
@@ -90,7 +90,7 @@ def _margin_histogram(table: TableReader, source: Source) -> Figure:
     trace = _histogram_trace(histogram, "ms")
     trace["marker"] = {"color": [BAD if middle < 0 else ACCENT for middle in histogram.middles]}
     figure_layout = layout("margin, ms", "ticks", bargap=0.05)
-    figure_layout["yaxis"] |= {"type": "log", "dtick": 1}
+    figure_layout["yaxis"] |= log_axis(1, float(histogram.counts.max()))
     return Figure(
         title="Margin of all ticks",
         note="Time left when the step ended: right of zero is good.",
@@ -127,10 +127,12 @@ def _missed(source: Source) -> Block:
         return Remark(
             text=f"No tick was skipped between the recorded ones of {len(agents)} agent(s)."
         )
+    figure_layout = layout("", "ticks")
+    figure_layout["xaxis"] |= {"type": "category", "tickangle": -90}
     return Figure(
         title="Missed ticks by agent",
         choices=[Choice(name="", traces=[bars(list(agents), missed)])],
-        layout=layout("", "ticks"),
+        layout=figure_layout,
         height_px=240,
     )
 
