@@ -64,7 +64,7 @@ def find_missing(
         found = [scan for scan in scans if scan.file.role == "machine" and scan.file.source == name]
         _check_source(faults, name, found, expected.machine_streams, None)
     _check_uninvited(faults, scans, expected)
-    return [f"{name}: {_listed(found)}" for name, found in faults.items() if found]
+    return [_line(name, found, agents) for name, found in faults.items() if found]
 
 
 def mapping_at(mapping: Mapping[str, Any] | None, *keys: str) -> Mapping[str, Any]:
@@ -111,6 +111,13 @@ def _check_uninvited(
     for scan in scans:
         if scan.file.source not in known and scan.fault:
             faults.setdefault(scan.file.source, []).append(_told(scan))
+
+
+def _line(name: str, faults: Sequence[str], agents: Mapping[str, Any]) -> str:
+    """Say what is missing of a source, and first what happened to it if that is known."""
+    reason = mapping_at(agents, name).get("reason")
+    cause = f"{reason}: " if isinstance(reason, str) and reason else ""
+    return f"{name}: {cause}{_listed(faults)}"
 
 
 def _told(scan: StreamScan) -> str:

@@ -70,7 +70,7 @@ def test_killed_agent_under_continue_makes_data_incomplete_and_is_named(tmp_path
 
     assert summary.exit_code == 5
     assert len(summary.missing) == 1
-    assert summary.missing[0].startswith("agent-02: ")
+    assert summary.missing[0].startswith("agent-02: no sign of life for 2.5 s: ")
     assert "cut after" in summary.missing[0]
     assert summary.document["agents"]["lost"] == ["agent-02"]
     assert {"agents.lost", "records.truncated", "deadline.miss_ratio"} <= set(
