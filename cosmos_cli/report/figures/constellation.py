@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosmos_cli.report.figures.generic import generic_blocks
+from cosmos_cli.report.figures.orbit_scene import ellipse, orbit_figure
 from cosmos_cli.report.model import Block, Choice, Figure, Remark, TableBlock, Trace, headings
 from cosmos_cli.report.sampling import Floats, evenly
 from cosmos_cli.report.source import Source
 from cosmos_cli.report.style import (
-    ACCENT,
     PALETTE,
-    WARM,
-    base_layout,
     grid_layout,
     groups_of_agents,
     layout,
@@ -24,12 +22,7 @@ from cosmos_cli.report.style import (
 )
 from cosmos_cli.tables import TableReader
 
-EARTH_RADIUS_KM = 6378.137
-MU_KM3_S2 = 398600.4418
-"""For drawing whole orbits only; physics is the simulation's business."""
 POINTS_MAX, POINTS_MIN, POINTS_ALL = 400, 100, 14_000
-ORBIT_POINTS = 120
-ONE_TRACE_EACH_MAX = 24
 POSITION = tuple(re.compile(rf"^{axis}(_[a-z0-9]+)??_(k?m)$") for axis in "xyz")
 VELOCITY = tuple(re.compile(rf"^v{axis}(_[a-z0-9]+)??_(k?m)_s$") for axis in "xyz")
 GROUP = "satellite"
@@ -46,7 +39,11 @@ def state_blocks(table: TableReader, source: Source) -> list[Block]:
         return [Remark(text="No state was recorded.")]
     frame = _frame(names[0][0])
     return [
-        _orbits(states, frame),
+        orbit_figure(
+            {label: r_km for _, r_km, _, label in states.values()},
+            [ellipse(r_km[-1], v_km_s[-1]) for _, r_km, v_km_s, _ in states.values()],
+            f"Orbits{frame}",
+        ),
         _vectors(
             states,
             f"Position and velocity{frame}",
@@ -265,109 +262,6 @@ def _components(t_s: Floats, *vectors: tuple[Floats, str, int]) -> list[Trace]:
         norm["line"] = {"width": 1.3, "color": PALETTE[3], "dash": "dot"}
         traces.append(norm)
     return traces
-
-
-def _orbits(states: dict[str, State], frame: str) -> Figure:
-    is_small = len(states) <= ONE_TRACE_EACH_MAX
-    flown = [_scatter3d(s[1], PALETTE[i % 5], 5, s[3]) for i, s in enumerate(states.values())]
-    ellipses = [_ellipse(s[1][-1], s[2][-1]) for s in states.values()]
-    ends = np.array([s[1][-1] for s in states.values()])
-    labels = [s[3] for s in states.values()]
-    whole = _scatter3d(_with_gaps(ellipses), "#98a6b5", 1, "osculating orbits")
-    whole["hoverinfo"] = "skip"
-    points = _scatter3d(ends, WARM, 1, "satellites at the end")
-    points |= {"mode": "markers", "marker": {"size": 3.5, "color": WARM}, "text": labels}
-    points["hovertemplate"] = "%{text}<extra></extra>"
-    if not is_small:
-        flown = [_scatter3d(_with_gaps([s[1] for s in states.values()]), ACCENT, 4, "flown")]
-    hidden = {"visible": False, "showspikes": False}
-    scene = {
-        "xaxis": hidden,
-        "yaxis": hidden,
-        "zaxis": hidden,
-        "aspectmode": "data",
-        "camera": {"eye": {"x": 0.92, "y": 0.92, "z": 0.5}},
-    }
-    return Figure(
-        title=f"Orbits{frame}",
-        note="What was flown in colour, the orbit that it belongs to in grey, the Earth to scale. Drag to turn.",
-        choices=[Choice(name="", traces=[*_earth(), whole, *flown, points])],
-        layout=base_layout(scene=scene, showlegend=False, margin={"l": 0, "r": 0, "t": 0, "b": 0}),
-        height_px=560,
-    )
-
-
-def _scatter3d(points_km: Floats, colour: str, width: float, name: str) -> Trace:
-    return {
-        "type": "scatter3d",
-        "mode": "lines",
-        "name": name,
-        "x": points_km[:, 0].copy(),
-        "y": points_km[:, 1].copy(),
-        "z": points_km[:, 2].copy(),
-        "line": {"width": width, "color": colour},
-        "hovertemplate": f"{name}<extra></extra>",
-    }
-
-
-def _with_gaps(pieces: Sequence[Floats]) -> Floats:
-    gap = np.full((1, 3), np.nan)
-    return np.concatenate([part for piece in pieces for part in (piece, gap)])
-
-
-def _ellipse(r_km: Floats, v_km_s: Floats) -> Floats:
-    """Return the whole two-body orbit through a state, shape (ORBIT_POINTS, 3), km; empty if it is open."""
-    h = np.cross(r_km, v_km_s)
-    distance = np.linalg.norm(r_km)
-    e = np.cross(v_km_s, h) / MU_KM3_S2 - r_km / distance
-    eccentricity = np.linalg.norm(e)
-    if not np.isfinite(eccentricity) or eccentricity >= 1.0 or not np.any(h):
-        return np.empty((0, 3))
-    towards = e / eccentricity if eccentricity > 1e-8 else r_km / distance
-    across = np.cross(h / np.linalg.norm(h), towards)
-    anomaly = np.linspace(0.0, 2 * np.pi, ORBIT_POINTS)
-    radius = (h @ h) / MU_KM3_S2 / (1 + eccentricity * np.cos(anomaly))
-    orbit: Floats = radius[:, None] * (
-        np.cos(anomaly)[:, None] * towards + np.sin(anomaly)[:, None] * across
-    )
-    return orbit
-
-
-def _earth() -> list[Trace]:
-    """Return a calm sphere and its graticule."""
-    longitude, latitude = np.linspace(0, 2 * np.pi, 61), np.linspace(-np.pi / 2, np.pi / 2, 31)
-    x = EARTH_RADIUS_KM * np.outer(np.cos(latitude), np.cos(longitude))
-    y = EARTH_RADIUS_KM * np.outer(np.cos(latitude), np.sin(longitude))
-    z = EARTH_RADIUS_KM * np.outer(np.sin(latitude), np.ones_like(longitude))
-    sphere: Trace = {
-        "type": "surface",
-        "x": x.round(0).tolist(),
-        "y": y.round(0).tolist(),
-        "z": z.round(0).tolist(),
-        "surfacecolor": np.zeros_like(z).tolist(),
-        "colorscale": [[0, "#cfdeea"], [1, "#cfdeea"]],
-        "showscale": False,
-        "hoverinfo": "skip",
-        "lighting": {"ambient": 0.94, "diffuse": 0.12, "specular": 0.0, "roughness": 1.0},
-        "contours": {axis: {"highlight": False} for axis in "xyz"},
-    }
-    meridians = [_circle(longitude=np.radians(d)) for d in range(0, 180, 30)]
-    parallels = [_circle(latitude=np.radians(d)) for d in range(-60, 61, 30)]
-    graticule = _scatter3d(_with_gaps([*meridians, *parallels]), "#a9bfd1", 1, "graticule")
-    graticule["hoverinfo"] = "skip"
-    return [sphere, graticule]
-
-
-def _circle(longitude: float | None = None, latitude: float | None = None) -> Floats:
-    angle = np.linspace(0, 2 * np.pi, 73)
-    radius = EARTH_RADIUS_KM * 1.003
-    if longitude is not None:
-        flat = np.cos(angle)
-        points = [flat * np.cos(longitude), flat * np.sin(longitude), np.sin(angle)]
-    else:
-        ring, height = np.cos(latitude or 0.0), np.sin(latitude or 0.0)
-        points = [ring * np.cos(angle), ring * np.sin(angle), np.full_like(angle, height)]
-    return radius * np.column_stack(points)
 
 
 ELEMENT_NAMES = {
