@@ -87,8 +87,11 @@ def judge(facts: Facts, limits: Limits) -> Verdict:
     checks = run_checks(facts, limits)
     status = run_status(facts)
     who, reason = facts.who, facts.reason
-    if facts.host_status is None and status != "interrupted":
-        who, reason = who or "host", reason or _why_no_result(facts.problems)
+    if facts.host_status is None:
+        if status == "interrupted":
+            who, reason = who or "operator", reason or "ended at once, without waiting for the host"
+        else:
+            who, reason = who or "host", reason or _why_no_result(facts.problems)
     code, text = _conclude(facts, status, checks, _blame(who, reason))
     return Verdict(
         status=status, exit_code=code, text=text, who=who, reason=reason, checks=tuple(checks)
@@ -183,6 +186,8 @@ def _conclude(
     facts: Facts, status: str, checks: Sequence[CheckResult], blame: str
 ) -> tuple[ExitCode, str]:
     if status == "interrupted":
+        if facts.host_status in ("failed", "aborted"):  # it was ending already, and had a cause
+            return ExitCode.INTERRUPTED, f"INTERRUPTED by the operator, after {blame}"
         return ExitCode.INTERRUPTED, f"INTERRUPTED by {facts.who or 'the operator'}"
     if status != "complete":
         return ExitCode.RUN_FAILED, f"{status.upper()}: {blame}"

@@ -51,7 +51,7 @@ SLOW_CALL_S = 0.5
 """A call of the plug-in that takes this long while the run is on is told: agents lose a silent host."""
 FLUSH_TIMEOUT_S = 5.0
 RESULT_FILE = "result.json"
-"""Beside the host's records: the result of a run whose operator is gone."""
+"""Beside the host's records: the result of a run whose operator is gone, or may hang."""
 
 
 class HostRuntime:
@@ -129,13 +129,12 @@ class HostRuntime:
         self._plugin_timer = self._reactor.call_at(math.inf, self._plugin_due)
         self._progress_timer = self._reactor.call_at(math.inf, self._progress)
         self._awaits_jobs = False
+        self._is_terminated = False
 
     def run(self) -> int:
         """Run to the end and return the process's exit code."""
         config = self._config
-        self._reactor.on_signal(
-            signal.SIGTERM, lambda: self._end("operator", "SIGTERM", "interrupted")
-        )
+        self._reactor.on_signal(signal.SIGTERM, self._terminated)
         self._reactor.on_signal(
             signal.SIGINT, lambda: None
         )  # a terminal's Ctrl-C is the operator's
@@ -325,6 +324,11 @@ class HostRuntime:
             self._session.agent_exited(agent, how, self._reactor.now_s())
             self._pump()
 
+    def _terminated(self) -> None:
+        """End on SIGTERM, which does not come from the operator: it has a line of its own."""
+        self._is_terminated = True
+        self._end("host", "ended by SIGTERM", "interrupted")
+
     def _end(self, who: str, reason: str, status: str) -> None:
         if self._session.state in HOST_LIVE:
             self._report.ending_status = status
@@ -393,7 +397,7 @@ class HostRuntime:
 
     def _close(self) -> int:
         result = self._report.result(self._session)
-        if self._operator.is_gone:
+        if self._operator.is_gone or self._is_terminated:
             self._leave(result)
         self._operator.emit({"event": "finished", "result": result})
         self._operator.flush(FLUSH_TIMEOUT_S)

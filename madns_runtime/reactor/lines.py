@@ -95,7 +95,8 @@ class OperatorLink:
         os.set_blocking(self._write_fd, False)
         reactor.add_reader(self._read_fd, self._readable)
         if pending:
-            self._take(pending)
+            # In the loop, not here: whoever makes this link is not yet ready for commands.
+            reactor.call_at(reactor.now_s(), lambda: self._take(pending))
 
     def emit(self, event: Mapping[str, Any]) -> None:
         """Send one event; never blocks."""
