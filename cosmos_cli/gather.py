@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,12 +100,17 @@ def _open_writer(
         path = run.tables / f"{readable[0].table}.parquet"
         return TableWriter(path, plan_table(readable, tick_hz)), None
     except (OSError, pa.ArrowException) as error:
-        return None, f"not written: {error}"
+        return None, _not_written(error)
 
 
 def _give_up(writer: TableWriter, error: Exception) -> tuple[None, str]:
     writer.abandon()
-    return None, f"not written: {error}"
+    return None, _not_written(error)
+
+
+def _not_written(error: Exception) -> str:
+    number = getattr(error, "errno", None)
+    return f"not written: {os.strerror(number) if number else error}"
 
 
 def _close(writer: TableWriter | None) -> str | None:

@@ -106,7 +106,11 @@ class TableWriter:
         self._held: list[Columns] = []
         self._held_count = 0
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._writer = _open_writer(self._partial, self._schema)
+        try:
+            self._writer = _open_writer(self._partial, self._schema)
+        except OSError:
+            self._partial.unlink(missing_ok=True)  # a full disk takes a file, but nothing in it
+            raise
 
     def add(self, file: StreamFile, columns: Columns, count: int) -> None:
         """Take a batch of a file's records; a file's batches come one after the other."""

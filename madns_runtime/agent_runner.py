@@ -34,6 +34,8 @@ T = TypeVar("T")
 DRAIN_S = 0.1
 """After the last tick's period an agent listens this much longer for what is still under way."""
 CLOCK_RECORD_INTERVAL_S = 1.0
+PROBLEM_CHARACTERS_MAX = 200
+"""Of a recorder's trouble in a report, which must fit a datagram."""
 AGENT_RECEIVE_BUFFER_BYTES = 1024 * 1024
 
 
@@ -373,6 +375,8 @@ class AgentRunner:
 
     def _report(self) -> Mapping[str, Any]:
         report: dict[str, Any] = {"dropped": self._recorder.counts().dropped}
+        if (problem := self._recorder.problem) is not None:
+            report["problem"] = problem[:PROBLEM_CHARACTERS_MAX]
         if self._pacer is not None:
             summary = self._pacer.summary()
             report.update(

@@ -339,9 +339,13 @@ class HostRuntime:
         self._progress_timer.reschedule(self._reactor.now_s() + PROGRESS_INTERVAL_S)
         report = progress_report(self._session, self._t_s_or_none(), self._config.time.duration_s)
         self._operator.emit(report)
-        if (problem := self._recorder.problem) is not None and not self._report.problem_told:
-            self._report.problem_told = True
-            self._log("error", f"host: records are being lost: {problem}")
+        problems = {HOST: self._recorder.problem}
+        problems |= {name: peer.report.get("problem") for name, peer in self._session.peers.items()}
+        for name, problem in problems.items():
+            if problem and name not in self._report.problems_told:
+                self._report.problems_told.add(name)
+                whose = "" if name == HOST else f"{name}: "
+                self._log("error", f"{whose}records are being lost: {problem}")
 
     def _log(self, level: str, text: str) -> None:
         self._recorder.log(level, text, self._t_s_or_none())

@@ -23,7 +23,8 @@ class HostReport:
     scheduling: Mapping[str, Any] = field(default_factory=dict)
     ending_status: str | None = None
     """What an order of the operator makes of the run."""
-    problem_told: bool = False
+    problems_told: set[str] = field(default_factory=set)
+    """Whose trouble with its records has been told."""
     _who: str | None = None
     _reason: str | None = None
     _completed_s: float | None = None
