@@ -8,6 +8,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from time import monotonic
 from typing import Any, TypeVar
 
 from madns_runtime import __version__
@@ -18,6 +19,7 @@ from madns_runtime.health.probe import process_usage
 from madns_runtime.plugin.api import HOST, AgentSimulation, Tick
 from madns_runtime.protocol import agent_session as told
 from madns_runtime.protocol.agent_session import AgentIdentity, AgentSession
+from madns_runtime.protocol.codec import NO_DATA
 from madns_runtime.protocol.link import LinkLimits
 from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.states import AgentState
@@ -30,6 +32,8 @@ from madns_runtime.timing.clock import utc_at_iso, utc_now_iso
 from madns_runtime.timing.rate import Pacer, stagger
 
 T = TypeVar("T")
+
+BEST, SYNC = Service.BEST, Service.SYNC
 
 DRAIN_S = 0.1
 """After the last tick's period an agent listens this much longer for what is still under way."""
@@ -110,6 +114,8 @@ class AgentRunner:
         self._pacer: Pacer | None = None
         self._t0_host_s: float | None = None
         self._step = self._simulation.step
+        self._receive = self._simulation.receive
+        self._must_pump = False
         self._period_s = 1.0 / config.agents.tick_hz
         self._first: tuple[float, float] | None = None
         self._newest: tuple[float, float] | None = None
@@ -148,10 +154,18 @@ class AgentRunner:
     # The loop's callbacks ----------------------------------------------------------------------
 
     def _readable(self) -> None:
-        now_s = self._reactor.now_s
-        receive = self._session.receive_datagram
-        for data, _ in self._socket.receive_all():
-            receive(data, now_s())
+        # One datagram, and back to the loop, which looks for more: most often there is one.
+        data = self._socket.receive()
+        if data is None:
+            return
+        message = self._session.receive_data(data, monotonic())
+        if message is not NO_DATA:
+            try:
+                self._receive(message)
+            except (Exception, SystemExit) as error:  # noqa: BLE001 - a plug-in may raise anything
+                self._plugin_failed("receive", error)
+            if not self._must_pump:
+                return
         self._pump()
 
     def _session_due(self) -> None:
@@ -173,6 +187,7 @@ class AgentRunner:
         self._send_datagrams()
 
     def _send_datagrams(self) -> None:
+        self._must_pump = False
         session, send = self._session, self._socket.send
         for data in session.datagrams_to_send(self._reactor.now_s()):
             send(data)
@@ -264,8 +279,9 @@ class AgentRunner:
                 self._plugin_failed("step", error)
                 self._pump()
                 return
-            # What the step sent leaves before anything else is done.
-            self._send_datagrams()
+            if self._must_pump:
+                # What the step sent leaves before anything else is done.
+                self._send_datagrams()
             margin_s = pacer.end(self._simulated_s())
             self._recorder.record(
                 "ticks",
@@ -394,7 +410,7 @@ class AgentRunner:
     def _simulated_s(self) -> float:
         if self._t0_host_s is None:
             return -self._config.timeouts.start_lead_s
-        return self._session.clock.to_host_s(self._reactor.now_s()) - self._t0_host_s
+        return self._session.clock.to_host_s(monotonic()) - self._t0_host_s
 
     def _t_s_or_none(self) -> float | None:
         return None if self._t0_host_s is None else self._simulated_s()
@@ -405,11 +421,27 @@ class AgentRunner:
             raise MadnsError("simulated time has not begun")
         return self._session.clock.to_local_s(t0_s + t_s)
 
-    def _send(self, to: str, message: Any, service: Service, *, deadline_s: float | None) -> None:
+    def _send(
+        self,
+        to: str,
+        message: Any,
+        service: Service = Service.RELIABLE,
+        *,
+        deadline_s: float | None = None,
+    ) -> None:
         if to != HOST:
             raise MadnsError(f"an agent sends to {HOST!r}, not to {to!r}")
+        now_s = monotonic()
+        if service is BEST:
+            datagram = self._session.seal_data(message, now_s)
+            if datagram is not None:
+                self._socket.send(datagram)
+                return
         due_s = None if deadline_s is None else self._local_s(deadline_s)
-        self._session.send(message, service, self._reactor.now_s(), deadline_s=due_s)
+        self._session.send(message, service, now_s, deadline_s=due_s)
+        self._must_pump = True
+        if service is SYNC:
+            self._send_datagrams()
 
     def _call(self, name: str, method: Callable[..., T], *arguments: Any) -> T | None:
         """Call the plug-in; whatever it raises ends this agent with its name on it."""
@@ -420,6 +452,7 @@ class AgentRunner:
             return None
 
     def _plugin_failed(self, name: str, error: BaseException) -> None:
+        self._must_pump = True
         text = "".join(traceback.format_exception(error))
         self._recorder.log("critical", text, self._t_s_or_none())
         reason = describe_exception(error, f"{self._simulation_name}.{name}")

@@ -23,9 +23,14 @@ class Sender(Protocol):
     """How a context's `send` reaches the session."""
 
     def __call__(
-        self, to: str, message: Any, service: Service, *, deadline_s: float | None
+        self,
+        to: str,
+        message: Any,
+        service: Service = Service.RELIABLE,
+        *,
+        deadline_s: float | None = None,
     ) -> None:
-        """Send *message*; *deadline_s* is simulated time."""
+        """Send *message*; see `plugin.api.Context.send`."""
 
 
 class RunContext:
@@ -59,20 +64,10 @@ class RunContext:
         self.base_directory = Path(config.base_directory)
         self.random = np.random.default_rng([config.seed, zlib.crc32(name.encode())])
         self.now_s = now_s
+        # The framework's own methods, without a layer between: they are called every tick.
         self.record = recorder.record
+        self.send = send
         self._recorder = recorder
-        self._send = send
-
-    def send(
-        self,
-        to: str,
-        message: Any,
-        service: Service = Service.RELIABLE,
-        *,
-        deadline_s: float | None = None,
-    ) -> None:
-        """Send *message*; see `plugin.api.Context.send`."""
-        self._send(to, message, service, deadline_s=deadline_s)
 
     def open_stream(self, name: str, fields: Sequence[Field]) -> None:
         """Declare a record stream; see `plugin.api.Context.open_stream`."""

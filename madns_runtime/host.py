@@ -16,6 +16,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from pathlib import Path
+from time import monotonic
 from typing import Any, TypeVar
 
 import orjson
@@ -45,6 +46,8 @@ from madns_runtime.recording.writer import Recorder
 from madns_runtime.timing.clock import utc_at_iso, utc_now_iso
 
 T = TypeVar("T")
+
+BEST, SYNC = Service.BEST, Service.SYNC
 
 PROGRESS_INTERVAL_S = 0.5
 SLOW_CALL_S = 0.5
@@ -129,6 +132,7 @@ class HostRuntime:
         self._plugin_timer = self._reactor.call_at(math.inf, self._plugin_due)
         self._progress_timer = self._reactor.call_at(math.inf, self._progress)
         self._awaits_jobs = False
+        self._must_pump = False
         self._is_terminated = False
 
     def run(self) -> int:
@@ -154,10 +158,15 @@ class HostRuntime:
     # The loop's callbacks ----------------------------------------------------------------------
 
     def _readable(self) -> None:
-        now_s = self._reactor.now_s
-        receive = self._session.receive_datagram
-        for data, address in self._socket.receive_all():
-            receive(data, address, now_s())
+        # One datagram, and back to the loop, which looks for more: most often there is one.
+        received = self._socket.receive_from()
+        if received is None:
+            return
+        message = self._session.receive_data(*received, monotonic())
+        if message is not None:
+            self._call("receive", self._simulation.receive, *message)
+            if not self._must_pump:
+                return
         self._pump()
 
     def _session_due(self) -> None:
@@ -169,16 +178,20 @@ class HostRuntime:
 
     def _pump(self) -> None:
         """Carry out the session's events, send what is due, arm its timer."""
-        session, now_s = self._session, self._reactor.now_s
+        session = self._session
         while (event := session.next_event()) is not None:
             self._handle(event)
-        for data, address in session.datagrams_to_send(now_s()):
-            self._socket.send(data, address)
+        self._must_pump = False
+        self._send_datagrams()
         if session.state is HostState.EXIT:
             self._reactor.stop()
             return
         due_s = session.get_timer()
         self._session_timer.reschedule(math.inf if due_s is None else due_s)
+
+    def _send_datagrams(self) -> None:
+        for data, address in self._session.datagrams_to_send(monotonic()):
+            self._socket.send(data, address)
 
     def _handle(self, event: told.HostSessionEvent) -> None:
         if isinstance(event, told.DataReceived):
@@ -368,25 +381,42 @@ class HostRuntime:
     def _t_s_or_none(self) -> float | None:
         return None if self._t0_s is None else round(self._simulated_s(), 6)
 
-    def _send(self, to: str, message: Any, service: Service, *, deadline_s: float | None) -> None:
+    def _send(
+        self,
+        to: str,
+        message: Any,
+        service: Service = Service.RELIABLE,
+        *,
+        deadline_s: float | None = None,
+    ) -> None:
+        now_s = monotonic()
+        if service is BEST:
+            sealed = self._session.seal_data(to, message, now_s)
+            if sealed is not None:
+                self._socket.send(*sealed)
+                return
         if to not in self._session.peers:
             raise MadnsError(f"no agent is called {to!r}")
         due_s = None
         if deadline_s is not None and self._t0_s is not None:
             due_s = self._t0_s + deadline_s
-        self._session.send(to, message, service, self._reactor.now_s(), deadline_s=due_s)
+        self._session.send(to, message, service, now_s, deadline_s=due_s)
+        self._must_pump = True
+        if service is SYNC:
+            self._send_datagrams()
 
     def _call(self, name: str, method: Callable[..., T], *arguments: Any) -> T | None:
         """Call the plug-in; whatever it raises ends the run with its name on it."""
-        began_s = self._reactor.now_s()
+        began_s = monotonic()
         try:
             return method(*arguments)
         except (Exception, SystemExit) as error:  # noqa: BLE001 - a plug-in may raise anything
+            self._must_pump = True
             reason = describe_exception(error, f"{self._simulation_name}.{name}")
             self._plugin_failed(reason, error)
             return None
         finally:
-            took_s = self._reactor.now_s() - began_s
+            took_s = monotonic() - began_s
             if took_s > SLOW_CALL_S and self._session.state is HostState.SIMULATION_START:
                 self._log(
                     "warning",

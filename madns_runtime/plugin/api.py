@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from madns_runtime.protocol.messages import Service
 from madns_runtime.recording.records import Field
@@ -23,11 +23,10 @@ if TYPE_CHECKING:
 HOST = "host"
 
 
-@dataclass(frozen=True, slots=True)
-class Tick:
-    """One step of an agent's fixed-rate loop."""
+class Tick(NamedTuple):
+    """One step of an agent's fixed-rate loop. A tuple, because one is made for every tick."""
 
-    index: int
+    index: int  # type: ignore[assignment]  # hides tuple.index, which nobody asks of a tick
     """0 at simulated time zero; skipped ticks leave gaps."""
     t_s: float
     """Simulated time of the tick's deadline: index / tick_hz."""

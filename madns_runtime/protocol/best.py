@@ -38,28 +38,33 @@ class BestSender:
                 f"a BEST message must fit one datagram: expected at most {BEST_BYTES_MAX} bytes, "
                 f"got {len(body)}; send it RELIABLE or make it smaller"
             )
-        number = self._next.get(channel, 0)
-        self._next[channel] = number + 1
         if len(self.queue) == self.queue.maxlen:
             self._counters.dropped += 1
-        self.queue.append(FRAME.pack(_BEST, channel, len(body), number) + body)
+        self.queue.append(self.frame(body, channel))
+
+    def frame(self, body: bytes, channel: int) -> bytes:
+        """Return the next frame of a channel, which is not queued and must leave before all others."""
+        number = self._next.get(channel, 0)
+        self._next[channel] = number + 1
         self._counters.sent += 1
+        return FRAME.pack(_BEST, channel, len(body), number) + body
 
 
 class BestReceiver:
     """Messages that wait for the owner, and what is missing between them."""
 
-    __slots__ = ("_counters", "_newest", "ready")
+    __slots__ = ("_counters", "newest", "ready")
 
     def __init__(self, queue_max: int, counters: ClassCounters) -> None:
         self._counters = counters
-        self._newest: dict[int, int] = {}  # by channel
+        self.newest: dict[int, int] = {}
+        """Number of the newest message by channel."""
         self.ready: deque[Received] = deque(maxlen=queue_max)
 
     def accept(self, channel: int, number: int, body: bytes) -> None:
         """Take a message if it is newer than all before it."""
         counters = self._counters
-        ahead = number - self._newest.get(channel, -1)
+        ahead = number - self.newest.get(channel, -1)
         if ahead <= 0:
             if ahead == 0:
                 counters.duplicates += 1
@@ -70,7 +75,7 @@ class BestReceiver:
             return
         counters.lost += ahead - 1
         counters.received += 1
-        self._newest[channel] = number
+        self.newest[channel] = number
         if len(self.ready) == self.ready.maxlen:
             counters.dropped += 1
         self.ready.append(Received(Service.BEST, channel, body))

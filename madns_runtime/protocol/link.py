@@ -14,6 +14,7 @@ Both sides use the same class. Nothing here gives a peer up: the owner decides t
 from __future__ import annotations
 
 from collections import deque
+from struct import Struct
 from typing import Final
 
 from madns_runtime.errors import MessageTooLarge
@@ -34,6 +35,7 @@ from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.recovery import (
     ACK_DELAY_UNIT_S,
     ACK_DELAY_UNITS_MAX,
+    MEASURE_INTERVAL_S,
     PACE_QUANTUM_S,
     Pacer,
     RoundTrip,
@@ -67,6 +69,14 @@ _ELICITING: Final = 1 << Service.RELIABLE | 1 << Service.SYNC | _PROBE
 _AT_ONCE: Final = 1 << Service.SYNC | _PROBE
 _SENT_TIMES: Final = 256
 _NEVER: Final = float("inf")
+_BEST_ALONE: Final = 1 << Service.BEST
+_STREAMS: Final = slice(PREFIX_BYTES + 24, PREFIX_BYTES + 44)
+"""Where a header says how far either stream is and what is granted."""
+_ALONE: Final = Struct("<QQ28xHBxBBHQ")
+"""Of a datagram with one frame, behind its prefix: packet number, largest packet received, delay, contents,
+and the frame's service, channel, size and number."""
+_ALONE_AT: Final = HEADER_BYTES + FRAME_BYTES
+_ALONE_BYTES_MIN: Final = _ALONE_AT + MAC_BYTES
 
 
 class Link:
@@ -81,7 +91,9 @@ class Link:
         "_chunks",
         "_contents",
         "_in",
+        "_is_listening",
         "_limits",
+        "_measure_due_s",
         "_now_s",
         "_out",
         "_pacer",
@@ -92,6 +104,7 @@ class Link:
         "_round_trip",
         "_seal",
         "_sent_times",
+        "_streams_heard",
         "_watch",
         "counters",
         "last_received_s",
@@ -123,6 +136,10 @@ class Link:
         self._sent_times = [-_NEVER] * _SENT_TIMES  # of the newest packets, by number
         self._ack_seen = 0
         self._packets = ReceivedPackets()
+        # What `open_best` may rely on; the long way keeps it up to date.
+        self._streams_heard = b""
+        self._is_listening = False
+        self._measure_due_s = -_NEVER
         # The datagram being filled.
         self._chunks: list[bytes] = []
         self._room = PAYLOAD_BYTES_MAX
@@ -288,6 +305,20 @@ class Link:
 
     def _close(self, now_s: float) -> bytes:
         """Seal the datagram being filled and begin the next."""
+        datagram = self._seal_packet(b"".join(self._chunks), self._contents, now_s)
+        carrier = self._carrier
+        if carrier is not None:
+            carrier.record(self._packet_number, now_s, self._carried)
+            self._is_listening = True
+            self._carrier = None
+            self._carried = []
+        self._chunks.clear()
+        self._room = PAYLOAD_BYTES_MAX
+        self._contents = 0
+        return datagram
+
+    def _seal_packet(self, payload: bytes, contents: int, now_s: float) -> bytes:
+        """Return the next packet: *payload* behind a header with all acknowledgements, sealed."""
         packet_number = self._packet_number + 1
         self._packet_number = packet_number
         packets = self._packets
@@ -303,24 +334,69 @@ class Link:
             reliable.limit - reliable.next_expected,
             sync.limit - sync.next_expected,
             packets.settle_ack(now_s),
-            self._contents,
+            contents,
             0,
         )
-        datagram = self._seal.close(rest, b"".join(self._chunks))
+        datagram = self._seal.close(rest, payload)
         self._sent_times[packet_number % _SENT_TIMES] = now_s
-        carrier = self._carrier
-        if carrier is not None:
-            carrier.record(packet_number, now_s, self._carried)
-            self._carrier = None
-            self._carried = []
-        self._chunks.clear()
-        self._room = PAYLOAD_BYTES_MAX
-        self._contents = 0
-        self.counters.datagrams_sent += 1
-        self.counters.bytes_sent += len(datagram)
+        counters = self.counters
+        counters.datagrams_sent += 1
+        counters.bytes_sent += len(datagram)
         return datagram
 
+    def seal_best(self, body: bytes, now_s: float, *, channel: int) -> bytes | None:
+        """
+        Return the datagram of a BEST message that leaves at once, as most of a tick's do.
+
+        None, with nothing done, if the message must go through `send`: others wait before it, or it
+        is too long.
+        """
+        best = self._best_out
+        if best.queue or len(body) > BEST_BYTES_MAX:
+            return None
+        return self._seal_packet(best.frame(body, channel), _BEST_ALONE, now_s)
+
     # Receiving.
+
+    def open_best(self, data: bytes, now_s: float) -> bytes | None:
+        """
+        Return the body of the one BEST message in a datagram like most of a tick's.
+
+        That is one which follows the newest, says nothing new of either stream and finds none that
+        waits for acknowledgements: what `receive_datagram` does for it comes to little. For any
+        other datagram None, with nothing done, and `receive_datagram` must have it.
+        """
+        packets, best = self._packets, self._best_in
+        if (
+            self._is_listening
+            or best.ready
+            or data[_STREAMS] != self._streams_heard
+            or len(data) < _ALONE_BYTES_MIN
+        ):
+            return None
+        packet_number, ack, ack_delay, contents, kind, channel, size, number = _ALONE.unpack_from(
+            data, PREFIX_BYTES
+        )
+        if (
+            packet_number != packets.largest + 1
+            or contents != _BEST_ALONE
+            or kind != _BEST
+            or size != len(data) - _ALONE_BYTES_MIN
+            or number != best.newest.get(channel, -1) + 1
+            or ack > self._packet_number
+            or self._seal.find_fault(data) is not None
+        ):
+            return None
+        packets.add(packet_number, now_s)
+        self._now_s = self.last_received_s = now_s
+        counters = self.counters
+        counters.datagrams_received += 1
+        counters.bytes_received += len(data)
+        if now_s >= self._measure_due_s and ack > self._ack_seen:
+            self._measure(ack, ack_delay, now_s)
+        counters.best.received += 1
+        best.newest[channel] = number
+        return data[_ALONE_AT:-MAC_BYTES]
 
     def receive_datagram(self, data: bytes, now_s: float) -> bool:
         """
@@ -380,6 +456,8 @@ class Link:
             stream.arm_probe(now_s)
         if contents & _ELICITING:
             packets.owe_ack(now_s, at_once=not is_in_order or bool(contents & _AT_ONCE))
+        self._streams_heard = data[_STREAMS]
+        self._is_listening = reliable.is_listening or sync.is_listening
         for kind, channel, number, payload in frames:
             if kind:
                 self._in[kind - 1].accept(number, payload, self._ready)
@@ -409,6 +487,7 @@ class Link:
     def _measure(self, ack: int, ack_delay: int, now_s: float) -> None:
         """Take a round trip from the newest packet acknowledged."""
         self._ack_seen = ack
+        self._measure_due_s = now_s + MEASURE_INTERVAL_S
         if ack_delay < ACK_DELAY_UNITS_MAX and self._packet_number - ack < _SENT_TIMES:
             sample_s = now_s - self._sent_times[ack % _SENT_TIMES] - ack_delay * ACK_DELAY_UNIT_S
             self._round_trip.add(sample_s if sample_s > 0 else 0.0)

@@ -19,6 +19,8 @@ REORDER_PACKETS: Final = 3
 """A packet is lost when one sent this many later has arrived ..."""
 REORDER_DELAY_MIN_S: Final = 0.005
 """... or any later one has, and it was sent longer ago than this and than 9/8 of a round trip."""
+MEASURE_INTERVAL_S: Final = 0.1
+"""While no stream waits for an acknowledgement, one round trip in so long is enough."""
 PACE_QUANTUM_S: Final = 0.001
 """A pacing timer comes this much later than it could: several fragments a wake-up, not one."""
 

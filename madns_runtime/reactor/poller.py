@@ -86,6 +86,7 @@ class EpollPoller:
     def __init__(self) -> None:
         self._epoll = select.epoll()
         self._timer = TimerFd()
+        self._timer_fd = self._timer.fd
         self._armed_s = math.inf
         self._epoll.register(self._timer.fd, select.EPOLLIN | select.EPOLLET)
 
@@ -100,16 +101,20 @@ class EpollPoller:
 
     def wait(self, until_s: float) -> list[int]:
         """Wait for descriptors until *until_s*; see `Poller`."""
-        timeout_s = 0.0 if until_s <= time.monotonic() else -1.0
-        if timeout_s and until_s != self._armed_s:
-            self._timer.set(until_s)
-            self._armed_s = until_s
-        timer_fd = self._timer.fd
-        ready = [fd for fd, _ in self._epoll.poll(timeout_s, EVENTS_MAX)]
-        if timer_fd in ready:
-            ready.remove(timer_fd)
-            # It fired: the same deadline, should it come again, has to be set again.
-            self._armed_s = math.nan
+        timeout_s = -1.0
+        if until_s != self._armed_s:
+            if until_s <= time.monotonic():
+                timeout_s = 0.0
+            else:
+                self._timer.set(until_s)
+                self._armed_s = until_s
+        ready = []
+        for fd, _ in self._epoll.poll(timeout_s, EVENTS_MAX):
+            if fd == self._timer_fd:
+                # It fired: the same deadline, should it come again, has to be set again.
+                self._armed_s = math.nan
+            else:
+                ready.append(fd)
         return ready
 
     def close(self) -> None:

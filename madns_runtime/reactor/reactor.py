@@ -154,10 +154,14 @@ class Reactor:
             os.close(fd)
 
     def _turn(self) -> None:
-        self._run_timers()
-        if self._is_stopping:
-            return
-        until_s = 0.0 if self._always_readable else self._timers.earliest_s()
+        until_s = self._timers.earliest_s()
+        if until_s <= time.monotonic():
+            self._run_timers()
+            if self._is_stopping:
+                return
+            until_s = self._timers.earliest_s()
+        if self._always_readable:
+            until_s = 0.0
         self._added.clear()
         self._run_readers(self._poller.wait(until_s))
 

@@ -43,6 +43,9 @@ class UdpSocket:
     def __init__(self, handle: socket.socket, receive_buffer_bytes: int) -> None:
         self._socket = handle
         self._receive = handle.recvfrom
+        self._receive_bytes = handle.recv
+        self._send_bytes = handle.send
+        self._send_to = handle.sendto
         self._is_closed = False
         handle.setblocking(False)
         _ask_buffer(handle, SO_SNDBUFFORCE, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
@@ -125,6 +128,26 @@ class UdpSocket:
         """Return the descriptor, for `Reactor.add_reader`."""
         return self._socket.fileno()
 
+    def receive(self) -> bytes | None:
+        """Return one datagram of a connected socket's peer, None if none is waiting."""
+        try:
+            datagram = self._receive_bytes(DATAGRAM_BYTES_MAX)
+        except OSError as error:
+            self._note_receive(error)
+            return None
+        self.received += 1
+        return datagram
+
+    def receive_from(self) -> tuple[bytes, Address] | None:
+        """Return one datagram and its sender, None if none is waiting."""
+        try:
+            datagram = self._receive(DATAGRAM_BYTES_MAX)
+        except OSError as error:
+            self._note_receive(error)
+            return None
+        self.received += 1
+        return datagram
+
     def receive_all(self, limit: int = RECEIVE_BATCH_MAX) -> Iterator[tuple[bytes, Address]]:
         """
         Yield datagrams that are waiting, with their senders; at most *limit*, and never wait.
@@ -154,21 +177,15 @@ class UdpSocket:
             address: The receiver; None on a connected socket.
         """
         try:
-            self._send(data, address)
-        except BlockingIOError:
-            self.send_refused += 1
-            return False
-        except ConnectionRefusedError:
-            # The answer to an earlier datagram; reading it took this one's place.
-            self.peer_refused += 1
-            try:
-                self._send(data, address)
-            except OSError as error:
-                self._count(error)
-                return False
+            if address is None:
+                self._send_bytes(data)
+            else:
+                self._send_to(data, address)
         except OSError as error:
             self._count(error)
-            return False
+            # An answer to an earlier datagram: reading it took this one's place.
+            if not isinstance(error, ConnectionRefusedError) or not self._sent_again(data, address):
+                return False
         self.sent += 1
         return True
 
@@ -177,11 +194,20 @@ class UdpSocket:
         self._is_closed = True
         self._socket.close()
 
-    def _send(self, data: bytes, address: Address | None) -> None:
-        if address is None:
-            self._socket.send(data)
-        else:
-            self._socket.sendto(data, address)
+    def _sent_again(self, data: bytes, address: Address | None) -> bool:
+        try:
+            if address is None:
+                self._send_bytes(data)
+            else:
+                self._send_to(data, address)
+        except OSError as error:
+            self._count(error)
+            return False
+        return True
+
+    def _note_receive(self, error: OSError) -> None:
+        if not self._is_closed and not isinstance(error, BlockingIOError):
+            self._count(error)
 
     def _count(self, error: OSError) -> None:
         if isinstance(error, ConnectionRefusedError):

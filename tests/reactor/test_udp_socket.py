@@ -63,7 +63,7 @@ class StubbornHandle:
             raise answer
         return answer
 
-    send = sendto = recvfrom = _answer
+    send = sendto = recv = recvfrom = _answer
 
     def setblocking(self, flag):
         assert flag is False
