@@ -19,6 +19,7 @@ from madns_runtime.config import AgentLaunch, from_mapping
 from madns_runtime.errors import ConfigurationError, MachineError, MadnsError
 from madns_runtime.processes import register
 from madns_runtime.reactor.lines import read_launch
+from madns_runtime.reactor.scheduling import die_with_parent
 from madns_runtime.supervisor import Supervisor
 
 USAGE = "usage: madns-agent [--launch SOCKET]"
@@ -29,6 +30,8 @@ def main() -> None:
     code = 1
     try:
         fds = _open_line(sys.argv[1:])
+        if fds[0] == 0:
+            die_with_parent()  # until the loop runs: loading a plug-in may take for ever
         document, pending = read_launch(fds[0])
         launch = from_mapping(AgentLaunch, document)
         code = _supervise(launch, fds, pending)

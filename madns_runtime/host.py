@@ -39,8 +39,9 @@ from madns_runtime.protocol.wire import Wire
 from madns_runtime.reactor.lines import OperatorLink, read_launch
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import apply as apply_scheduling
-from madns_runtime.reactor.scheduling import freeze_garbage
+from madns_runtime.reactor.scheduling import die_with_parent, freeze_garbage, outlive_parent
 from madns_runtime.reactor.udp import UdpSocket
+from madns_runtime.reactor.watchdog import end_after_hang_up
 from madns_runtime.recording.records import EVENTS, LOG
 from madns_runtime.recording.writer import Recorder
 from madns_runtime.timing.clock import utc_at_iso, utc_now_iso
@@ -53,6 +54,8 @@ PROGRESS_INTERVAL_S = 0.5
 SLOW_CALL_S = 0.5
 """A call of the plug-in that takes this long while the run is on is told: agents lose a silent host."""
 FLUSH_TIMEOUT_S = 5.0
+HANG_GRACE_S = 2.0
+"""Beyond the time for shutdown: a loop that hangs in a plug-in, without an operator, ends by force."""
 RESULT_FILE = "result.json"
 """Beside the host's records: the result of a run whose operator is gone, or may hang."""
 
@@ -90,6 +93,7 @@ class HostRuntime:
         self._recorder = Recorder(directory, run=config.run, source=HOST, settings=config.recording)
         self._recorder.open_stream(EVENTS)
         self._recorder.open_stream(LOG)
+        self._line_fd = fds[0]
         self._operator = OperatorLink(
             self._reactor,
             fds,
@@ -138,6 +142,8 @@ class HostRuntime:
     def run(self) -> int:
         """Run to the end and return the process's exit code."""
         config = self._config
+        end_after_hang_up(self._line_fd, config.timeouts.shutdown_s + HANG_GRACE_S)
+        outlive_parent()
         self._reactor.on_signal(signal.SIGTERM, self._terminated)
         self._reactor.on_signal(
             signal.SIGINT, lambda: None
@@ -457,6 +463,7 @@ def main() -> None:
     """Entry point of `madns-host`."""
     out_fd = os.dup(1)
     os.dup2(2, 1)  # what a plug-in prints must not mix with the events
+    die_with_parent()  # until the loop runs: loading a plug-in may take for ever
     try:
         document, pending = read_launch(0)
         launch = from_mapping(HostLaunch, document)

@@ -27,10 +27,14 @@ from madns_runtime.processes import register
 from madns_runtime.reactor.lines import OperatorLink
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import apply as apply_scheduling
-from madns_runtime.reactor.scheduling import freeze_garbage
+from madns_runtime.reactor.scheduling import freeze_garbage, outlive_parent
+from madns_runtime.reactor.watchdog import end_after_hang_up
 
 RESTART_DELAY_S = 0.2
-KILL_GRACE_S = 2.0
+HANG_GRACE_S = 2.0
+"""Beyond the time for shutdown: an agent that hangs in its plug-in ends itself, and leaves its stack."""
+KILL_GRACE_S = 3.0
+"""Beyond the time for shutdown: one that cannot even do that is killed."""
 FLUSH_TIMEOUT_S = 2.0
 REASON_BYTES_MAX = 2048
 """A reason is written in one piece, so that those of two children never mix."""
@@ -96,6 +100,7 @@ class Supervisor:
 
     def run(self) -> int:
         """Run to the end and return the process's exit code: 0 if every agent ended as ordered."""
+        outlive_parent()
         reactor = self._reactor
         reactor.on_signal(signal.SIGCHLD, self._reap)
         reactor.on_signal(signal.SIGTERM, lambda: self._end("SIGTERM"))
@@ -181,6 +186,10 @@ class Supervisor:
             and restarts < self._launch.config.agents.restarts_max
         )
         self._failed = self._failed or code != 0
+        if self._is_ending and code > 0 and child.reason is None:
+            self._tell_killed(
+                child, f"; machines/{self._launch.machine}/stderr.txt shows where it hung"
+            )
         for agent in child.agents:
             self._operator.emit(
                 {
@@ -244,9 +253,11 @@ class Supervisor:
     def _kill(self) -> None:
         for child in self._children.values():
             os.kill(child.pid, signal.SIGKILL)
-            names = ", ".join(child.agents)
-            text = f"{names} did not end in time and was killed"
-            self._operator.emit({"event": "log", "level": "error", "text": text})
+            self._tell_killed(child)
+
+    def _tell_killed(self, child: Child, hint: str = "") -> None:
+        text = f"{', '.join(child.agents)} did not end in time and was killed{hint}"
+        self._operator.emit({"event": "log", "level": "error", "text": text})
 
     def _close(self) -> int:
         if not self._is_ending:
@@ -289,6 +300,7 @@ class AgentProcess:
         reactor.on_signal(signal.SIGTERM, lambda: self._end("SIGTERM"))
         reactor.on_signal(signal.SIGINT, lambda: None)
         reactor.add_reader(self._life_fd, self._life_ended)
+        end_after_hang_up(self._life_fd, self._launch.config.timeouts.shutdown_s + HANG_GRACE_S)
         runners = [self._make_runner(name) for name in self._agents]
         for runner in runners:
             runner.start()

@@ -147,6 +147,13 @@ def die_with_parent(parent_pid: int | None = None) -> bool:
     return is_armed
 
 
+def outlive_parent() -> None:
+    """Undo `die_with_parent`: from now on this process notices by itself, and ends in good order."""
+    if libc.IS_LINUX:
+        with contextlib.suppress(OSError):
+            libc.prctl(libc.PR_SET_PDEATHSIG, 0)
+
+
 def _set_fifo(priority: int) -> str | None:
     """Return why SCHED_FIFO was refused, or None."""
     if not libc.IS_LINUX:

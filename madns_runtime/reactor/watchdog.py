@@ -1,0 +1,30 @@
+"""
+The end of a process whose loop hangs in a plug-in while whoever started it is gone.
+
+A loop that runs notices by itself and ends in good order; only one that does not needs this.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import select
+import sys
+import threading
+
+
+def end_after_hang_up(fd: int, grace_s: float) -> None:
+    """
+    End this process by force *grace_s* after the other end of *fd* has closed.
+
+    The thread it starts sleeps in the kernel until then and reads nothing. Who was stuck, and where,
+    goes to standard error. The count-down needs no interpreter, so a call into C that never returns
+    does not outlive it either.
+    """
+
+    def watch() -> None:
+        poll = select.poll()
+        poll.register(fd, 0)  # a closed other end is told without being asked for
+        poll.poll()
+        faulthandler.dump_traceback_later(grace_s, exit=True, file=sys.__stderr__ or 2)
+
+    threading.Thread(target=watch, name="watchdog", daemon=True).start()
