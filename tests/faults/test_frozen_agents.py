@@ -1,0 +1,122 @@
+"""SIGSTOP on an agent: shortly, past its deadline, and thawed afterwards."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+
+import pytest
+from fault_harness import Laboratory, Run, check_ending
+
+from madns_runtime.recording.reader import read_stream
+
+pytestmark = pytest.mark.process
+
+SILENCE = ("--set", "timeouts.silence_s=2")
+LONG = ("--set", "time.duration_s=5")
+
+
+def freeze(laboratory: Laboratory, *arguments: str) -> tuple[Run, int]:
+    run = laboratory.start(*arguments)
+    run.wait_until_running()
+    pid = run.pid_of("agent-02")
+    os.kill(pid, signal.SIGSTOP)
+    return run, pid
+
+
+@pytest.mark.parametrize(
+    ("max_miss_ratio", "code", "verdict"),
+    [("1e-3", 4, "CHECK BROKEN: deadline.miss_ratio"), ("0.9", 0, "PASSED: ")],
+)
+def test_shortly_frozen_agent_costs_its_missed_ticks_only(
+    laboratory, max_miss_ratio, code, verdict
+):
+    run, pid = freeze(laboratory, "--set", f"deadline.max_miss_ratio={max_miss_ratio}")
+    time.sleep(0.5)
+    os.kill(pid, signal.SIGCONT)
+
+    document = check_ending(run, code, "complete", verdict)
+    assert document["agents"]["lost"] == []
+    ticks = json.loads((run.directory / "result.json").read_text())["agents"]["agent-02"]["ticks"]
+    # 20 ticks a second, and half a second at least.
+    assert ticks["missed"] >= 9
+    assert ticks["run"] + ticks["missed"] == ticks["due"] == 40
+    assert document["timing"]["missed"] >= ticks["missed"]
+
+
+def test_agent_frozen_past_its_deadline_aborts_the_run_and_closes_its_records_when_thawed(
+    laboratory,
+):
+    run, pid = freeze(laboratory, *SILENCE, *LONG)
+    run.wait_for_text("agent-02 is lost: silent for 2 s while running")
+    os.kill(pid, signal.SIGCONT)
+
+    document = check_ending(run, 1, "failed", "FAILED: agent-02: silent for 2 s while running")
+    assert document["agents"]["lost"] == ["agent-02"]
+    assert document["data"]["missing"] == []
+    events = (run.directory / "agents/agent-02/events.jsonl").read_text()
+    assert "agent-02: silent for 2 s while running" in events
+
+
+def test_agent_that_stays_frozen_is_killed_and_named(laboratory):
+    run, _ = freeze(laboratory, *SILENCE, *LONG, "--set", "timeouts.shutdown_s=1")
+
+    document = check_ending(
+        run,
+        1,
+        "failed",
+        "FAILED: agent-02: silent for 2 s while running",
+        "agent-02 did not end in time and was killed",
+    )
+    assert [line.split(":")[0] for line in document["data"]["missing"]] == ["agent-02"]
+
+
+def test_thawed_agent_is_expelled_and_the_others_complete(laboratory):
+    run, pid = freeze(laboratory, *SILENCE, *LONG, "--set", "on_agent_loss=continue")
+    run.wait_for_text("agent-02 is lost: silent for 2 s while running")
+    os.kill(pid, signal.SIGCONT)
+
+    # Its records are all there, but the run lacks a part of its flight.
+    document = check_ending(run, 4, "complete", "CHECK BROKEN: agents.lost 1 (limit 0)")
+    assert document["agents"]["lost"] == ["agent-02"]
+    events = (run.directory / "agents/agent-02/events.jsonl").read_text()
+    assert "expelled by the host: silent for 2 s while running" in events
+    assert read_stream(run.directory / "agents/agent-03/ticks.jsonl").state.recorded == 100
+
+
+def test_expelled_agent_rejoins_if_it_may_be_restarted(laboratory):
+    run, pid = freeze(
+        laboratory,
+        *SILENCE,
+        *LONG,
+        "--set",
+        "on_agent_loss=continue",
+        "--set",
+        "agents.restarts_max=1",
+    )
+    run.wait_for_text("agent-02 is lost: silent for 2 s while running")
+    os.kill(pid, signal.SIGCONT)
+
+    document = check_ending(run, 4, "complete", "agent-02 has rejoined at t = ")
+    assert document["agents"]["incarnations"] == {"agent-02": 2}
+    second = read_stream(run.directory / "agents/agent-02/ticks.2.jsonl")
+    ticks = [record[0] for record in second.records()]
+    assert ticks[0] > 50
+    assert ticks[-1] == 99
+
+
+def test_agent_that_stays_frozen_does_not_keep_the_others_from_completing(laboratory):
+    run, _ = freeze(
+        laboratory, *SILENCE, "--set", "on_agent_loss=continue", "--set", "timeouts.shutdown_s=1"
+    )
+
+    check_ending(
+        run,
+        5,
+        "complete",
+        "agent-02 is lost: silent for 2 s while running",
+        "agent-02 did not end in time and was killed",
+        "DATA INCOMPLETE: agent-02: ",
+    )

@@ -1,0 +1,257 @@
+"""kill -9 on each kind of process, at each time."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+from fault_harness import (
+    Laboratory,
+    Run,
+    check_ending,
+    check_evidence,
+    hang_on_import,
+    wait_until_ended,
+)
+from faulty_simulation import INIT_DELAY
+
+from madns_runtime.recording.reader import read_stream
+
+pytestmark = pytest.mark.process
+
+CONTINUE = ("--set", "on_agent_loss=continue")
+RESTART = (*CONTINUE, "--set", "agents.restarts_max=1")
+
+
+def kill(run: Run, name: str) -> int:
+    pid = run.pid_of(name)
+    os.kill(pid, signal.SIGKILL)
+    return pid
+
+
+def kill_before_hello(laboratory: Laboratory, *arguments: str) -> Run:
+    run = laboratory.start(*arguments, environment={INIT_DELAY: "0.7"})
+    kill(run, "agent-02")
+    return run
+
+
+def kill_in_setup(laboratory: Laboratory, *arguments: str) -> Run:
+    faults = {"side": "agent", "method": "setup", "action": "sleep", "sleep_s": 1.0}
+    run = laboratory.start(*arguments, faults=faults)
+    run.wait_for_text("agents are setting up")
+    kill(run, "agent-02")
+    return run
+
+
+def kill_in_run(laboratory: Laboratory, *arguments: str) -> Run:
+    run = laboratory.start(*arguments)
+    run.wait_until_running()
+    kill(run, "agent-02")
+    return run
+
+
+WHEN = pytest.mark.parametrize("start_and_kill", [kill_before_hello, kill_in_setup, kill_in_run])
+
+
+def first_tick(path: Path) -> int:
+    return int(next(read_stream(path).records())[0])
+
+
+@WHEN
+def test_killed_agent_aborts_the_run_and_is_named(laboratory, start_and_kill):
+    run = start_and_kill(laboratory)
+
+    document = check_ending(run, 1, "failed", "FAILED: agent-02: killed by SIGKILL")
+    assert (document["who"], document["reason"]) == ("agent-02", "killed by SIGKILL")
+    assert document["agents"]["lost"] == ["agent-02"]
+    # The others were told, and closed their records.
+    missing = document["data"]["missing"]
+    assert not any(
+        line.startswith(("agent-01", "agent-03", "host", "loopback")) for line in missing
+    )
+
+
+@WHEN
+def test_others_complete_without_the_killed_agent_if_the_policy_is_to_continue(
+    laboratory, start_and_kill
+):
+    run = start_and_kill(laboratory, *CONTINUE)
+
+    document = check_ending(
+        run, 5, "complete", "agent-02 is lost: killed by SIGKILL", "DATA INCOMPLETE: agent-02: "
+    )
+    assert document["agents"]["lost"] == ["agent-02"]
+    assert [line.split(":")[0] for line in document["data"]["missing"]] == ["agent-02"]
+    result = json.loads((run.directory / "result.json").read_text())
+    assert {name: agent["state"] for name, agent in result["agents"].items()} == {
+        "agent-01": "stopped",
+        "agent-02": "lost",
+        "agent-03": "stopped",
+    }
+    assert result["agents"]["agent-01"]["ticks"]["due"] == 40
+
+
+@WHEN
+def test_killed_agent_is_started_again_and_rejoins_at_the_present_time(laboratory, start_and_kill):
+    run = start_and_kill(laboratory, *RESTART)
+
+    # What the first life had begun to write is cut, and said to be; if it had not begun, 4 is right.
+    code = 4 if start_and_kill is kill_before_hello and run.finish() == 4 else 5
+    document = check_ending(run, code, "complete", "agent-02 is lost: killed by SIGKILL")
+    agents = run.directory / "agents"
+    result = json.loads((run.directory / "result.json").read_text())
+    assert result["agents"]["agent-02"]["state"] == "stopped"
+    assert all(line.startswith("agent-02: ") for line in document["data"]["missing"])
+    if start_and_kill is not kill_in_run:
+        return
+    assert document["agents"]["incarnations"] == {"agent-02": 2}
+    assert "agent-02 has rejoined at t = " in run.stderr
+    # The second life's streams are beside the first's, and begin where simulated time had come to.
+    assert first_tick(agents / "agent-02/ticks.jsonl") == 0
+    assert first_tick(agents / "agent-02/ticks.2.jsonl") > 8
+    assert first_tick(agents / "agent-02/waves.2.jsonl") > 8
+    assert read_stream(agents / "agent-01/ticks.jsonl").state.recorded == 40
+
+
+def test_last_agent_killed_ends_the_run_whatever_the_policy(laboratory):
+    run = laboratory.start(*CONTINUE, "--set", "agents.count=1")
+    run.wait_until_running()
+    kill(run, "agent-01")
+
+    check_ending(run, 1, "failed", "FAILED: agent-01: killed by SIGKILL")
+
+
+def test_killed_host_ends_the_run_and_what_is_there_can_be_collected(laboratory):
+    run = laboratory.start("--set", "time.duration_s=60")
+    run.wait_until_running()
+    pid = kill(run, "host")
+
+    check_ending(run, 1, "failed", "FAILED: host", f"host (pid {pid}) was killed by SIGKILL")
+    assert "SIGKILL" in run.document["reason"]
+    collected = laboratory.cosmos("collect", str(run.directory))
+    assert collected.returncode == 5, collected.stderr
+    assert "host: no result" in collected.stderr
+    assert "SIGKILL" in collected.stderr
+    check_evidence(run.directory, run.document)
+
+
+def test_agents_of_a_killed_host_end_by_themselves_with_their_records_closed(laboratory):
+    run = laboratory.start("--set", "time.duration_s=60")
+    run.wait_until_running()
+    agents = [run.pid_of(f"agent-0{number}") for number in (1, 2, 3)]
+    # Nobody may help them: the operator cannot notice.
+    run.signal(signal.SIGSTOP)
+    kill(run, "host")
+
+    wait_until_ended(laboratory, but=[run.process.pid])
+    for number in range(len(agents)):
+        folder = run.directory / f"agents/agent-0{number + 1}"
+        assert all(not read_stream(path).state.is_cut for path in folder.glob("*.jsonl"))
+        assert "host: silent for 2.5 s" in (folder / "events.jsonl").read_text()
+    run.signal(signal.SIGCONT)
+    check_ending(run, 1, "failed", "host", "was killed by SIGKILL")
+
+
+def test_nothing_survives_a_killed_operator_and_its_run_can_be_collected(laboratory):
+    run = laboratory.start("--set", "time.duration_s=60")
+    run.wait_until_running()
+    assert len(laboratory.living()) >= 6  # operator, host, supervisor, three agents
+    run.process.kill()
+
+    assert run.finish() == -signal.SIGKILL
+    wait_until_ended(laboratory)
+    collected = laboratory.cosmos("collect", "last")
+    # Host and agents had time to close their records: nothing is missing.
+    assert collected.returncode == 0, collected.stderr
+    document = run.document
+    assert (document["status"], document["exit_code"]) == ("aborted", 1)
+    assert (document["who"], document["reason"]) == ("operator", "the operator's process is gone")
+    assert "ABORTED: operator: the operator's process is gone" in collected.stderr
+    check_evidence(run.directory, document)
+    assert "no run lives" in laboratory.cosmos("ps").stderr
+    assert laboratory.leftovers() == []
+
+
+@pytest.mark.parametrize("side", ["host", "agent"])
+def test_not_even_a_process_stuck_in_a_plugin_survives_a_killed_operator(laboratory, side):
+    method = {"host": "timer", "agent": "step"}[side]
+    faults = {"side": side, "method": method, "action": "sleep", "sleep_s": 600.0}
+    run = laboratory.start(
+        *("--set", "time.duration_s=60", "--set", "timeouts.shutdown_s=1"), faults=faults
+    )
+    run.wait_until_running(then_s=1.0)
+    run.process.kill()
+    run.finish()
+
+    # The time for shutdown, and a grace of 2 s beyond it.
+    wait_until_ended(laboratory)
+    folder = "host" if side == "host" else "machines/loopback"
+    stack = (run.directory / folder / "stderr.txt").read_text()
+    assert f"in {method}\n" in stack
+    collected = laboratory.cosmos("collect", "last")
+    assert collected.returncode == 5
+    assert ("host: " if side == "host" else "agent-02: ") in collected.stderr
+
+
+@pytest.mark.parametrize("text", ["records go to", "waiting for agents", "agents are setting up"])
+def test_nothing_survives_an_operator_that_is_killed_before_the_run(laboratory, text):
+    faults = {"side": "agent", "method": "setup", "action": "sleep", "sleep_s": 1.0}
+    run = laboratory.start(faults=faults)
+    run.wait_for_text(text)
+    run.process.kill()
+    run.finish()
+
+    wait_until_ended(laboratory)
+
+
+def test_plugin_that_is_still_being_imported_does_not_survive_a_killed_operator(laboratory):
+    hang_on_import(laboratory)
+    run = laboratory.start()
+    run.pid_of("loopback")
+    run.process.kill()
+    run.finish()
+
+    wait_until_ended(laboratory)
+
+
+def test_collect_refuses_a_run_that_still_lives(laboratory):
+    run = laboratory.start("--set", "time.duration_s=60")
+    run.wait_until_running(0.0)
+    refused = laboratory.cosmos("collect", "last")
+
+    assert refused.returncode == 2
+    assert "is still running: " in refused.stderr
+    run.signal(signal.SIGTERM)
+    check_ending(run, 130, "interrupted")
+
+
+def test_killed_supervisor_ends_the_run_and_takes_its_agents_along(laboratory):
+    run = laboratory.start("--set", "time.duration_s=60")
+    run.wait_until_running()
+    pid = kill(run, "loopback")
+
+    document = check_ending(run, 1, "failed", f"agents@loopback (pid {pid}) was killed by SIGKILL")
+    assert document["who"].startswith("agent-0")
+    assert "supervisor" in document["reason"]
+    assert str(pid) in document["reason"]
+
+
+def test_killed_worker_ends_the_run_and_is_named(laboratory):
+    faults = {"side": "host", "method": "long job"}
+    run = laboratory.start("--set", "executor.kind=process", faults=faults)
+    host = run.pid_of("host")
+    run.wait_for_text("setting up")
+    workers = subprocess.run(
+        ["pgrep", "-P", str(host)], capture_output=True, text=True, check=True
+    ).stdout.split()
+    for worker in workers:
+        os.kill(int(worker), signal.SIGKILL)
+
+    document = check_ending(
+        run, 1, "failed", "FAILED: host: FaultyHost: job 1 raised BrokenProcessPool"
+    )
+    assert document["who"] == "host"
