@@ -5,17 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from madns_runtime.plugin.api import HOST, AgentContext, AgentSimulation, Tick
 from madns_runtime.protocol.messages import Service
 from madns_runtime.recording.records import Field
+from madns_runtime.simulations.counter.round_trips import RoundTrips
 
 IN_FLIGHT_MAX = 10_000
 """Packets whose return is still awaited; an older one counts as lost when it leaves."""
-ROUND_TRIPS_MAX = 20_000_000
-"""Round trips kept for the summary: 55 h at 100 Hz, 4 bytes each."""
-BLOCK = 4096
 
 
 class CounterAgent(AgentSimulation):
@@ -33,9 +29,9 @@ class CounterAgent(AgentSimulation):
         self._duplicated_count = 0
         self._reordered_count = 0
         self._wrong_count = 0
-        self._blocks: list[np.ndarray[Any, np.dtype[np.float32]]] = []
-        self._block = np.empty(BLOCK, dtype=np.float32)
-        self._fill = 0
+        self._returned_count = 0
+        self._round_trips = RoundTrips()
+        self._count_round_trip = self._round_trips.add
         context.open_stream(
             "round_trips",
             (
@@ -70,50 +66,27 @@ class CounterAgent(AgentSimulation):
             self._reordered_count += 1
         self._newest = max(self._newest, packet)
         self._value = max(self._value, value)
-        round_trip_s = now_s - sent_s
-        self._keep(round_trip_s)
-        self._context.record("round_trips", (packet, value, round(round_trip_s * 1e6)))
+        self._returned_count += 1
+        round_trip_us = round((now_s - sent_s) * 1e6)
+        self._count_round_trip(round_trip_us)
+        self._context.record("round_trips", (packet, value, round_trip_us))
 
     def finish(self) -> Mapping[str, Any]:
-        """Return the thesis's figures over all round trips, in microseconds."""
-        samples = np.concatenate([*self._blocks, self._block[: self._fill]]).astype(np.float64)
-        lost = self._sent_count - len(samples)
+        """Return the thesis's figures over all round trips, in whole microseconds."""
+        lost = self._sent_count - self._returned_count
         summary: dict[str, Any] = {
+            "service": self._service.name.lower(),
             "sent": self._sent_count,
-            "returned": len(samples),
+            "returned": self._returned_count,
             "lost": lost,
             "duplicated": self._duplicated_count,
             "out_of_order": self._reordered_count,
             "wrong_values": self._wrong_count,
-            "round_trip_us": _statistics(samples * 1e6) if len(samples) else None,
+            "round_trip_us": self._round_trips.statistics(),
+            "round_trips_left_out": self._round_trips.left_out,
         }
         summary["checks"] = [
             {"name": f"counter.{name}", "limit": 0, "got": got, "passed": got == 0}
             for name, got in (("lost", lost), ("wrong_values", self._wrong_count))
         ]
         return summary
-
-    def _keep(self, round_trip_s: float) -> None:
-        if self._fill == BLOCK:
-            if len(self._blocks) * BLOCK < ROUND_TRIPS_MAX:
-                self._blocks.append(self._block)
-            self._block = np.empty(BLOCK, dtype=np.float32)
-            self._fill = 0
-        self._block[self._fill] = round_trip_s
-        self._fill += 1
-
-
-def _statistics(samples_us: np.ndarray[Any, np.dtype[np.float64]]) -> dict[str, float]:
-    p50, p99, p999 = np.percentile(samples_us, (50, 99, 99.9))
-    low, high = samples_us.min(), samples_us.max()
-    figures = {
-        "mean": samples_us.mean(),
-        "sd": samples_us.std(),
-        "min": low,
-        "max": high,
-        "range": high - low,
-        "p50": p50,
-        "p99": p99,
-        "p999": p999,
-    }
-    return {name: round(float(value), 3) for name, value in figures.items()}
