@@ -25,6 +25,8 @@ import orjson
 Role = Literal["operator", "host", "supervisor", "agent"]
 
 FILE_BYTES_MAX = 16_384
+NAME_CHARACTERS_MAX = 200
+"""Of a process of many agents, whose name lists them all, so much is entered."""
 _FILE_NAME = re.compile(r"\.?(\d+)-(\d+)-\d+\.json")
 _serials = itertools.count()
 
@@ -93,14 +95,15 @@ def register(run: str, role: Role, name: str, run_directory: str | Path) -> Regi
     Args:
         run: Name of the run.
         role: operator, host, supervisor or agent.
-        name: host, the machine's or the agent's name.
+        name: host, the machine's or the agent's name; of several agents all, with commas, entered
+            shortened if they are many.
         run_directory: Where the run's evidence goes.
     """
     pid = os.getpid()
     entry = ProcessEntry(
         run=run,
         role=role,
-        name=name,
+        name=_shortened(name),
         pid=pid,
         start_ticks=read_start_ticks(pid) or 0,
         boot_id=read_boot_id(),
@@ -115,7 +118,7 @@ def register(run: str, role: Role, name: str, run_directory: str | Path) -> Regi
         _write_whole(path, orjson.dumps(asdict(entry)))
     except OSError as error:
         problem = (
-            f"{directory}: cannot note process {pid} ({role} {name}) there: {error.strerror}; "
+            f"{directory}: cannot note process {pid} ({role} {entry.name}) there: {error.strerror}; "
             "`cosmos ps` and `cosmos down` will not see it; COSMOS_STATE_DIR names another place"
         )
         return Registration(entry, None, problem)
@@ -182,6 +185,17 @@ def read_boot_id() -> str:
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except OSError:
         return ""
+
+
+def _shortened(name: str) -> str:
+    """Return of a long list its first and last and how many there are: an entry must stay readable."""
+    if len(name) <= NAME_CHARACTERS_MAX:
+        return name
+    names = name.split(",")
+    if len(names) == 1:
+        return f"{name[:NAME_CHARACTERS_MAX]} ..."
+    room = NAME_CHARACTERS_MAX // 3
+    return f"{names[0][:room]} ... {names[-1][-room:]} ({len(names)})"
 
 
 def _signal(pid: int, number: int) -> bool:

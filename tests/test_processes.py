@@ -68,6 +68,22 @@ def test_one_process_may_hold_many_entries_in_order_of_their_names():
         assert [entry.name for entry in list_processes()] == ["a", "b"]
 
 
+def test_process_of_many_agents_is_listed_by_its_first_and_last():
+    names = [f"agent-{number:04d}" for number in range(1, 1501)]
+    with register("r", "agent", ",".join(names), "/runs/1"):
+        listed = [entry.name for entry in list_processes()]
+
+    assert listed == ["agent-0001 ... agent-1500 (1500)"]
+
+
+def test_process_of_an_agent_with_an_endless_name_is_still_listed():
+    with register("r", "agent", "ä" * 20_000, "/runs/1"):
+        listed = [entry.name for entry in list_processes()]
+
+    assert len(listed) == 1
+    assert listed[0].endswith("ä ...")
+
+
 @pytest.mark.parametrize(
     ("variables", "expected"),
     [
