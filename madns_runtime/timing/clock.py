@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from datetime import UTC, datetime, timedelta
 from typing import Protocol
 
@@ -12,14 +11,6 @@ class Clock(Protocol):
 
     def now_s(self) -> float:
         """Return the present time, s."""
-
-
-class MonotonicClock:
-    """The machine's CLOCK_MONOTONIC, which timers and deadlines are set on."""
-
-    def now_s(self) -> float:
-        """Return the present time, s."""
-        return time.monotonic()
 
 
 class ManualClock:
