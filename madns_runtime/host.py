@@ -54,6 +54,7 @@ PROGRESS_INTERVAL_S = 0.5
 SLOW_CALL_S = 0.5
 """A call of the plug-in that takes this long while the run is on is told: agents lose a silent host."""
 FLUSH_TIMEOUT_S = 5.0
+OPERATOR_GONE = "the operator's process is gone"
 HANG_GRACE_S = 2.0
 """Beyond the time for shutdown: a loop that hangs in a plug-in, without an operator, ends by force."""
 RESULT_FILE = "result.json"
@@ -98,7 +99,7 @@ class HostRuntime:
             self._reactor,
             fds,
             on_command=self._command,
-            on_gone=lambda: self._end("operator", "the operator's process is gone", "aborted"),
+            on_gone=lambda: self._end("operator", OPERATOR_GONE, "aborted"),
             pending=pending,
         )
         self._socket = UdpSocket.bind(
@@ -298,9 +299,13 @@ class HostRuntime:
         return dict(summary) if isinstance(summary, Mapping) else {}
 
     def _emergency(self, event: told.EmergencyDeclared) -> None:
-        self._report.fail(event.who, event.reason)
-        self._event("emergency", who=event.who, reason=event.reason)
-        self._log("critical", f"emergency shutdown: {event.who}: {event.reason}")
+        who, reason = event.who, event.reason
+        if event.who in self._names and self._operator.has_hung_up():
+            # An agent that ended with its operator may be heard before the operator's own silence.
+            who, reason, self._report.ending_status = "operator", OPERATOR_GONE, "aborted"
+        self._report.fail(who, reason)
+        self._event("emergency", who=who, reason=reason)
+        self._log("critical", f"emergency shutdown: {who}: {reason}")
 
     def _agents_stopped(self, missing: tuple[str, ...]) -> None:
         if missing:

@@ -111,6 +111,12 @@ class OperatorLink:
             self._out.appendleft(first)
             self.dropped_count += 1
 
+    def has_hung_up(self) -> bool:
+        """Tell whether the operator's end is closed, before the loop has come to see it."""
+        poll = select.poll()
+        poll.register(self._read_fd, 0)
+        return self.is_gone or bool(poll.poll(0))
+
     def flush(self, timeout_s: float) -> bool:
         """Write what waits; False if the operator did not take it in time."""
         deadline_s = time.monotonic() + timeout_s
