@@ -225,6 +225,11 @@ class Run:
     def document(self) -> dict[str, Any]:
         return json.loads((self.directory / "run.json").read_text())  # type: ignore[no-any-return]
 
+    @property
+    def result(self) -> dict[str, Any]:
+        """What the host reported."""
+        return json.loads((self.directory / "result.json").read_text())  # type: ignore[no-any-return]
+
     def describe(self) -> str:
         """Return all that helps to understand a failed assertion."""
         errors = [

@@ -154,7 +154,7 @@ def test_agent_started_by_hand_joins_the_run(laboratory):
 
         assert by_hand.wait(PATIENCE_S) == 0
     assert document["agents"]["lost"] == []
-    assert read_stream(run.directory / "agents/agent-02/ticks.jsonl").state.recorded == 40
+    assert run.result["agents"]["agent-02"]["ticks"]["due"] == 40
     assert laboratory.leftovers() == []
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 from fault_harness import (
     PLUGIN,
@@ -104,7 +102,7 @@ def test_step_of_50_ms_on_one_tick_costs_accounted_ticks(laboratory, max_miss_ra
     )
 
     document = check_ending(run, code, "complete", verdict)
-    ticks = json.loads((run.directory / "result.json").read_text())["agents"]["agent-02"]["ticks"]
+    ticks = run.result["agents"]["agent-02"]["ticks"]
     # Tick 10 is in time, 11 to 14 cannot be run any more; a busy machine may cost others.
     assert ticks["missed"] >= 4
     assert ticks["run"] + ticks["missed"] == ticks["due"] == 100
@@ -113,8 +111,7 @@ def test_step_of_50_ms_on_one_tick_costs_accounted_ticks(laboratory, max_miss_ra
 
 def test_step_of_10_s_aborts_the_run_and_names_the_agent(laboratory):
     run = laboratory.start(
-        "--set",
-        "timeouts.shutdown_s=1",
+        *("--set", "time.duration_s=5", "--set", "timeouts.shutdown_s=1"),
         faults={"side": "agent", "method": "step", "action": "sleep", "sleep_s": 10.0},
     )
 
@@ -134,6 +131,7 @@ def test_step_of_10_s_aborts_the_run_and_names_the_agent(laboratory):
 
 def test_host_half_that_is_stuck_for_10_s_aborts_the_run_and_is_blamed(laboratory):
     run = laboratory.start(
+        *("--set", "time.duration_s=5"),
         faults={"side": "host", "method": "timer", "action": "sleep", "sleep_s": 10.0},
     )
 
