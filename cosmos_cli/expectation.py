@@ -13,7 +13,7 @@ from madns_runtime.config import RunConfig
 from madns_runtime.recording.records import CLOCK, EVENTS, HEALTH, LOG, PROCESS, TICKS
 
 AGENT_STREAMS = tuple(schema.name for schema in (TICKS, CLOCK, EVENTS, LOG, PROCESS))
-HOST_STREAMS = tuple(schema.name for schema in (EVENTS, LOG))
+HOST_STREAMS = tuple(schema.name for schema in (EVENTS, LOG, HEALTH))
 MACHINE_STREAMS = (HEALTH.name,)
 FAULTS_SHOWN_MAX = 3
 HOST = "host"
@@ -98,9 +98,18 @@ def _check_source(
         file = PurePath(str(counts.get("file", ""))).name
         if stream not in have or (file and file not in paths):
             found.append(f"{stream} is missing")
-    errors = mapping_at(summary, "records").get("errors")
-    why = f" ({errors[0]})" if isinstance(errors, Sequence) and errors else ""
+    errors = _errors_of(mapping_at(summary, "records"))
+    why = f" ({errors[0]})" if errors else ""
     found.extend(_told(scan) + why for scan in scans if scan.fault)
+    # A sampler is a process of its own: its trouble, such as having been killed, shows in its own report.
+    found.extend(
+        f"{HEALTH.name}: {text}" for text in _errors_of(mapping_at(summary, "records", HEALTH.name))
+    )
+
+
+def _errors_of(report: Mapping[str, Any]) -> list[str]:
+    errors = report.get("errors")
+    return [str(error) for error in errors] if isinstance(errors, list | tuple) else []
 
 
 def _check_uninvited(

@@ -73,6 +73,7 @@ class SyntheticRun:
         for name in self.names:
             self.write_agent(name, with_states=with_states)
         self.write_health(health_count)
+        self.write_health(health_count, folder="host", source="host")
         return self
 
     def recorder(self, folder: str, source: str, *schemas: StreamSchema) -> Recorder:
@@ -107,8 +108,15 @@ class SyntheticRun:
         recorder.record("events", {"t_s": 0.0, "utc": T0_UTC, "event": "AGENT_SIMULATION_START"})
         self.records[name] = recorder.close().to_mapping()
 
-    def write_health(self, count: int, temperature_c: float | None = None) -> None:
-        recorder = self.recorder(f"machines/{MACHINE}", MACHINE, HEALTH)
+    def write_health(
+        self,
+        count: int,
+        temperature_c: float | None = None,
+        *,
+        folder: str = f"machines/{MACHINE}",
+        source: str = MACHINE,
+    ) -> None:
+        recorder = self.recorder(folder, source, HEALTH)
         for index in range(count):
             values = dict.fromkeys((field.name for field in HEALTH.fields), None)
             values |= {

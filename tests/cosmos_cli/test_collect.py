@@ -99,6 +99,27 @@ def test_stream_that_an_agent_reported_and_that_is_not_there_is_named(tmp_path):
     assert summary.missing == ("agent-02: round_trips is missing",)
 
 
+def test_hosts_own_state_of_health_is_expected(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    (made.run.path / "host/health.jsonl").unlink()
+
+    summary = finish(made)
+
+    assert summary.exit_code == 5
+    assert summary.missing == ("host: health is missing",)
+
+
+def test_trouble_that_the_hosts_sampler_reports_is_a_gap(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    trouble = "process 77 had to be killed: no end in 6 s"
+    made.records["host"]["health"] = {"errors": [trouble]}
+
+    summary = finish(made)
+
+    assert summary.exit_code == 5
+    assert summary.missing == (f"host: health: {trouble}",)
+
+
 def test_damaged_line_is_counted_and_the_rest_is_kept(tmp_path):
     made = SyntheticRun(tmp_path).write()
     path = made.stream("agent-01", "ticks")
