@@ -30,8 +30,9 @@ from madns_runtime.host_result import HostReport, progress_report
 from madns_runtime.plugin.api import HOST
 from madns_runtime.plugin.registry import load_half, parse_parameters, resolve
 from madns_runtime.processes import register
-from madns_runtime.protocol import host_session as told
-from madns_runtime.protocol.host_session import HostSession, Phase
+from madns_runtime.protocol import host_events as told
+from madns_runtime.protocol.host_events import Phase
+from madns_runtime.protocol.host_session import HostSession
 from madns_runtime.protocol.link import LinkLimits
 from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.states import HOST_LIVE, HostState

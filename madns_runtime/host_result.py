@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from madns_runtime.protocol.host_session import HostSession, Peer, Phase
+from madns_runtime.protocol.host_events import Peer, Phase
+from madns_runtime.protocol.host_session import HostSession
 
 SERVICES = ("best", "reliable", "sync")
 

@@ -51,6 +51,8 @@ STALL_S = 1.0
 """A session that was not called for this long was itself frozen, and blames nobody for silence."""
 LINGER_S = 1.0
 """How long an agent waits at the end for its last words to be acknowledged."""
+HELD_MAX = 1024
+"""Messages that may wait for the agent's half to be set up."""
 PLUGIN_CHANNEL = 1
 
 
@@ -178,6 +180,8 @@ class AgentSession:
             now_s + timeouts.agents_ready_s + timeouts.host_setup_s + timeouts.agent_setup_s
         )
         self._started_s = now_s
+        self._held: list[DataReceived] = []
+        self.held_dropped_count = 0
         self.malformed_count = 0
         self._send(
             Hello(identity.name, identity.runtime_version, identity.pid), Service.SYNC, now_s
@@ -196,13 +200,16 @@ class AgentSession:
         self._state_deadline_s = now_s + self._timeouts.agent_setup_s + self._timeouts.silence_s
         self._heard_s = now_s
         self._send(SimulationReady(), Service.SYNC, now_s)
+        self._events.extend(self._held)
+        self._held.clear()
 
     def run_finished(self, summary: Mapping[str, Any], now_s: float) -> None:
         """Say that the simulated time is over; the host's stop is awaited."""
         self._fire(AgentEvent.RUN_FINISHED)
         timeouts = self._timeouts
         self._state_deadline_s = now_s + timeouts.complete_s + timeouts.shutdown_s
-        self._send(SimulationComplete(summary), Service.SYNC, now_s)
+        # Behind whatever the agent's half has sent: RELIABLE, so that it overtakes nothing.
+        self._send(SimulationComplete(summary), Service.RELIABLE, now_s)
 
     def records_closed(self, records: Mapping[str, Any], now_s: float) -> None:
         """Say that the records are on disk; the session ends when that is acknowledged."""
@@ -309,7 +316,7 @@ class AgentSession:
         self._events.append(StateEntered(self._machine.fire(event)))
 
     def _send(self, message: Message, service: Service, now_s: float) -> None:
-        self.link.send(encode_message(message), service, now_s)
+        self.link.send_urgent(encode_message(message), service, now_s)
 
     def _take(self, body: bytes, now_s: float) -> None:
         try:
@@ -321,7 +328,7 @@ class AgentSession:
 
     def _receive(self, message: Message, now_s: float) -> None:
         if isinstance(message, SimulationData):
-            self._events.append(DataReceived(message.payload))
+            self._take_data(message.payload)
         elif isinstance(message, Pong):
             self.clock.add_exchange(
                 message.t_agent_s, message.t_host_received_s, message.t_host_sent_s, now_s
@@ -341,6 +348,14 @@ class AgentSession:
             self._expelled(message.reason)
         else:
             self.malformed_count += 1  # a message that only agents send
+
+    def _take_data(self, payload: Any) -> None:
+        if self.state not in (AgentState.AGENT_READY, AgentState.SIMULATION_SETUP):
+            self._events.append(DataReceived(payload))
+        elif len(self._held) < HELD_MAX:
+            self._held.append(DataReceived(payload))  # until the agent's half can take it
+        else:
+            self.held_dropped_count += 1
 
     def _move(self, event: AgentEvent, outcome: AgentSessionEvent) -> None:
         if self._machine.allows(event):
@@ -394,4 +409,6 @@ class AgentSession:
         # While it sets up its own half the host may be busy; afterwards it answers pings at once.
         if state is AgentState.AGENT_READY:
             return self._timeouts.silence_s + self._timeouts.host_setup_s
+        if state is AgentState.SIMULATION_COMPLETE:
+            return self._timeouts.silence_s + self._timeouts.shutdown_s  # it makes its summary
         return self._timeouts.silence_s

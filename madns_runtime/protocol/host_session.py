@@ -10,10 +10,9 @@ from __future__ import annotations
 import heapq
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from enum import Enum
 from typing import Any, Literal
 
+from madns_runtime import __version__
 from madns_runtime.config import Timeouts
 from madns_runtime.protocol.codec import (
     NO_DATA,
@@ -23,7 +22,24 @@ from madns_runtime.protocol.codec import (
     encode_data,
     encode_message,
 )
-from madns_runtime.protocol.deadlines import BrokenDeadline
+from madns_runtime.protocol.host_events import (
+    Address,
+    AgentLost,
+    AgentMoved,
+    AgentRejoined,
+    AgentRejoining,
+    AgentsComplete,
+    AgentsReady,
+    AgentsSimulationReady,
+    AgentsStopped,
+    DataReceived,
+    EmergencyDeclared,
+    HostSessionEvent,
+    Peer,
+    Phase,
+    StateEntered,
+    SyncDeadlineBroken,
+)
 from madns_runtime.protocol.link import Link
 from madns_runtime.protocol.messages import (
     AgentStopped,
@@ -45,8 +61,6 @@ from madns_runtime.protocol.seal import PREFIX_BYTES, Header, peek
 from madns_runtime.protocol.states import HOST_LIVE, HostEvent, HostState, host_machine
 from madns_runtime.protocol.wire import Wire
 
-Address = tuple[Any, ...]
-
 CHECK_INTERVAL_S = 0.1
 """How often silence and deadlines are looked at."""
 STALL_S = 1.0
@@ -56,141 +70,6 @@ LINGER_S = 0.5
 INCARNATIONS_MAX = 128
 """Starts of one agent in one run; more are refused."""
 PLUGIN_CHANNEL = 1
-
-
-class Phase(Enum):
-    """How far one agent has come."""
-
-    ABSENT = "absent"
-    READY = "ready"
-    SETTING_UP = "setting-up"
-    SIMULATION_READY = "simulation-ready"
-    RUNNING = "running"
-    COMPLETE = "complete"
-    STOPPED = "stopped"
-    LOST = "lost"
-
-
-@dataclass(frozen=True, slots=True)
-class StateEntered:
-    """The host is in another state now."""
-
-    state: HostState
-
-
-@dataclass(frozen=True, slots=True)
-class AgentsReady:
-    """Every agent has said hello: set up the host's half, then call `setup_finished`."""
-
-
-@dataclass(frozen=True, slots=True)
-class AgentsSimulationReady:
-    """Every agent's half is set up: choose T0 and call `start`."""
-
-
-@dataclass(frozen=True, slots=True)
-class AgentMoved:
-    """An agent has reached another phase."""
-
-    agent: str
-    phase: Phase
-    reason: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class AgentLost:
-    """An agent is gone; under on_agent_loss: abort an emergency follows."""
-
-    agent: str
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class AgentRejoining:
-    """A new incarnation of an agent says hello in mid-run: answer with `send_setup`."""
-
-    agent: str
-
-
-@dataclass(frozen=True, slots=True)
-class AgentRejoined:
-    """An agent's new incarnation is set up and has T0."""
-
-    agent: str
-
-
-@dataclass(frozen=True, slots=True)
-class DataReceived:
-    """An agent's half sent this."""
-
-    agent: str
-    payload: Any
-
-
-@dataclass(frozen=True, slots=True)
-class AgentsComplete:
-    """Every agent that is left has run its simulated time: take the summary, call `order_stop`."""
-
-
-@dataclass(frozen=True, slots=True)
-class AgentsStopped:
-    """Every agent has flushed its records, or its deadline is over: clean up and end."""
-
-    missing: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class EmergencyDeclared:
-    """The run ends here; who declared it and why."""
-
-    who: str
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class SyncDeadlineBroken:
-    """A SYNC message to *agent* was not there by its deadline."""
-
-    agent: str
-    broken: BrokenDeadline
-
-
-HostSessionEvent = (
-    StateEntered
-    | AgentsReady
-    | AgentsSimulationReady
-    | AgentMoved
-    | AgentLost
-    | AgentRejoining
-    | AgentRejoined
-    | DataReceived
-    | AgentsComplete
-    | AgentsStopped
-    | EmergencyDeclared
-    | SyncDeadlineBroken
-)
-
-
-@dataclass(slots=True, kw_only=True)
-class Peer:
-    """What the host knows of one agent."""
-
-    name: str
-    index: int
-    phase: Phase = Phase.ABSENT
-    link: Link | None = None
-    address: Address | None = None
-    incarnation: int | None = None
-    incarnations_seen: set[int] = field(default_factory=set)
-    heard_s: float = 0.0
-    timer_s: float = float("inf")
-    rejoining: bool = False
-    loss_reason: str | None = None
-    report: Mapping[str, Any] = field(default_factory=dict)
-    summary: Mapping[str, Any] = field(default_factory=dict)
-    records: Mapping[str, Any] = field(default_factory=dict)
-    retired_counters: list[Mapping[str, Any]] = field(default_factory=list)
-    """Counters of the links of earlier incarnations."""
 
 
 class HostSession:
@@ -229,6 +108,7 @@ class HostSession:
         self._check_due_s = now_s
         self._handled_s = now_s
         self._t0_host_s: float | None = None
+        self._end_host_s = float("inf")
         self.refused: dict[str, int] = {"not_ours": 0, "unknown_agent": 0, "old_incarnation": 0}
         self.malformed_count = 0
 
@@ -263,6 +143,7 @@ class HostSession:
         """Tell every agent that simulated time zero is *t0_host_s* on the host's monotonic clock."""
         self._fire(HostEvent.AGENTS_SIMULATION_READY)
         self._t0_host_s = t0_host_s
+        self._end_host_s = t0_host_s + duration_s
         self._enter(now_s, t0_host_s - now_s + duration_s + self._timeouts.complete_s)
         for peer in self.peers.values():
             if peer.phase is Phase.SIMULATION_READY:
@@ -275,7 +156,8 @@ class HostSession:
         self._enter(now_s, self._timeouts.shutdown_s)
         for peer in self.peers.values():
             if peer.phase is Phase.COMPLETE:
-                self._send(peer, SystemStop(), Service.SYNC, now_s)
+                # Behind whatever the host's half has sent: RELIABLE, so that it overtakes nothing.
+                self._send(peer, SystemStop(), Service.RELIABLE, now_s)
         self._progress(now_s)
 
     def emergency(self, who: str, reason: str, now_s: float) -> None:
@@ -290,10 +172,16 @@ class HostSession:
                 self._send(peer, EmergencyShutdown(who, reason), Service.SYNC, now_s)
         self._progress(now_s)
 
-    def agent_exited(self, agent: str, how: str, now_s: float) -> None:
-        """Take the operator's word that an agent's process is gone, without waiting for silence."""
+    def agent_exited(self, agent: str, how: str, now_s: float, *, pid: int | None = None) -> None:
+        """
+        Take the operator's word that an agent's process is gone, without waiting for silence.
+
+        Word of another *pid* than the one that said hello is about an earlier incarnation.
+        """
         peer = self.peers.get(agent)
-        if peer is not None and peer.phase not in (Phase.LOST, Phase.STOPPED):
+        if peer is None or peer.phase in (Phase.LOST, Phase.STOPPED):
+            return
+        if pid is None or peer.pid is None or pid == peer.pid:
             self._lose(peer, how, now_s)
 
     def cleaned_up(self) -> None:
@@ -323,6 +211,7 @@ class HostSession:
         """
         peer = self.peers[agent]
         if peer.link is None or peer.phase in (Phase.LOST, Phase.STOPPED):
+            peer.not_sent += 1
             return False
         body = encode_data(payload)
         peer.link.send(body, service, now_s, channel=PLUGIN_CHANNEL, deadline_s=deadline_s)
@@ -402,6 +291,9 @@ class HostSession:
             link, address = peer.link, peer.address
             if link is None or address is None:
                 continue
+            while peer.pings:
+                t_agent_s, t_received_s = peer.pings.popleft()
+                self._send(peer, Pong(t_agent_s, t_received_s, now_s), Service.BEST, now_s)
             out.extend((data, address) for data in link.datagrams_to_send(now_s))
             while (broken := link.next_broken_deadline()) is not None:
                 self._events.append(SyncDeadlineBroken(peer.name, broken))
@@ -443,7 +335,7 @@ class HostSession:
 
     def _send(self, peer: Peer, message: Message, service: Service, now_s: float) -> None:
         if peer.link is not None:
-            peer.link.send(encode_message(message), service, now_s)
+            peer.link.send_urgent(encode_message(message), service, now_s)
             self._dirty.add(peer.index)
 
     def _set_phase(self, peer: Peer, phase: Phase, reason: str | None = None) -> None:
@@ -460,7 +352,8 @@ class HostSession:
     ) -> None:
         """Take the first datagram of an incarnation; it must prove that it holds the run key."""
         seen = peer.incarnations_seen
-        if header.incarnation in seen or len(seen) >= INCARNATIONS_MAX:
+        is_over = peer.phase in (Phase.COMPLETE, Phase.STOPPED)
+        if header.incarnation in seen or len(seen) >= INCARNATIONS_MAX or is_over:
             self.refused["old_incarnation"] += 1
             return
         wire = self._wire
@@ -478,6 +371,11 @@ class HostSession:
         peer.link, peer.address, peer.incarnation = link, address, header.incarnation
         peer.timer_s = float("inf")
         peer.heard_s = now_s
+        peer.pid, peer.loss_reason = None, None
+        peer.pings.clear()
+        if peer.phase is not Phase.ABSENT:
+            # Its hello may come behind a ping, if the first datagram was lost.
+            self._set_phase(peer, Phase.JOINING)
         self._dirty.add(peer.index)
         self._take_messages(peer, now_s)
 
@@ -500,14 +398,15 @@ class HostSession:
         elif isinstance(message, AgentStopped):
             self._agent_stopped(peer, message, now_s)
         elif isinstance(message, Hello):
-            self._welcome(peer, now_s)
+            self._welcome(peer, message, now_s)
         elif peer.phase is Phase.LOST:
             self._send_expelled(peer, now_s)
         elif isinstance(message, SimulationData):
             self._events.append(DataReceived(peer.name, message.payload))
         elif isinstance(message, Ping):
             peer.report = message.report
-            self._send(peer, Pong(message.t_agent_s, now_s, now_s), Service.BEST, now_s)
+            peer.pings.append((message.t_agent_s, now_s))
+            self._dirty.add(peer.index)
         elif isinstance(message, SimulationReady):
             self._agent_simulation_ready(peer, now_s)
         elif isinstance(message, SimulationComplete):
@@ -517,8 +416,14 @@ class HostSession:
         else:
             self.malformed_count += 1  # a message that only hosts send
 
-    def _welcome(self, peer: Peer, now_s: float) -> None:
+    def _welcome(self, peer: Peer, hello: Hello, now_s: float) -> None:
         state = self.state
+        peer.pid = hello.pid
+        if hello.runtime_version != __version__ or hello.agent != peer.name:
+            reason = f"{hello.agent} runs MADNS {hello.runtime_version}, the host {__version__}"
+            self._lose(peer, reason, now_s)
+            self._send_expelled(peer, now_s)
+            return
         if state in (HostState.HOST_STARTUP, HostState.SIMULATION_SETUP):
             self._set_phase(peer, Phase.READY)
             self._progress(now_s)
@@ -567,6 +472,9 @@ class HostSession:
         peer.loss_reason = reason
         peer.rejoining = False
         self._set_phase(peer, Phase.LOST, reason)
+        if peer.link is not None:
+            # What it has not acknowledged is lost, and counted so; a last word may still reach it.
+            peer.link.abandon(Service.RELIABLE)
         if self.state not in HOST_LIVE:
             self._progress(now_s)
             return
@@ -622,14 +530,22 @@ class HostSession:
         if self.state not in HOST_LIVE:
             return
         for peer in self.peers.values():
-            if peer.phase in (Phase.ABSENT, Phase.STOPPED, Phase.LOST):
-                continue
-            limit_s = self._timeouts.silence_s
-            if self.state is HostState.HOST_SIMULATION_READY or peer.phase is Phase.SETTING_UP:
-                # Its half is being set up, or that of an agent which shares its process.
-                limit_s += self._timeouts.agent_setup_s
+            limit_s = self._silence_limit_s(peer, now_s)
             if now_s - peer.heard_s > limit_s:
                 self._lose(peer, f"silent for {limit_s:g} s while {peer.phase.value}", now_s)
+
+    def _silence_limit_s(self, peer: Peer, now_s: float) -> float:
+        """Return how long *peer* may say nothing: longer where its plug-in or its disk keeps it busy."""
+        state, phase = self.state, peer.phase
+        if phase in (Phase.ABSENT, Phase.STOPPED, Phase.LOST) or state is HostState.BEGIN_SHUTDOWN:
+            return float("inf")  # nobody to hear, or a state whose own deadline waits for all
+        limit_s = self._timeouts.silence_s
+        if state is HostState.HOST_SIMULATION_READY or phase is Phase.SETTING_UP:
+            # Its half is being set up, or that of an agent which shares its process.
+            return limit_s + self._timeouts.agent_setup_s
+        if now_s > self._end_host_s:
+            return limit_s + self._timeouts.complete_s  # its half makes its summary
+        return limit_s
 
     def _check_state_deadline(self, now_s: float) -> None:
         if now_s < self._state_deadline_s:
@@ -637,14 +553,19 @@ class HostSession:
         state = self.state
         waited_s = round(now_s - self._entered_s, 1)
         if state is HostState.HOST_STARTUP:
-            self._lose_all("AGENT_READY", waited_s, Phase.ABSENT, now_s=now_s)
+            self._lose_all("AGENT_READY", waited_s, Phase.ABSENT, Phase.JOINING, now_s=now_s)
         elif state is HostState.SIMULATION_SETUP:
             self.emergency(
                 "host", f"setup of the simulation took longer than {waited_s:g} s", now_s
             )
         elif state is HostState.HOST_SIMULATION_READY:
             self._lose_all(
-                "AGENT_SIMULATION_READY", waited_s, Phase.READY, Phase.SETTING_UP, now_s=now_s
+                "AGENT_SIMULATION_READY",
+                waited_s,
+                Phase.JOINING,
+                Phase.READY,
+                Phase.SETTING_UP,
+                now_s=now_s,
             )
         elif state is HostState.SIMULATION_START:
             self._lose_all("SIMULATION_COMPLETE", waited_s, *_UNFINISHED, now_s=now_s)
@@ -675,4 +596,4 @@ class HostSession:
 
 
 _BEFORE_STOP = tuple(state for state in HOST_LIVE if state is not HostState.BEGIN_SHUTDOWN)
-_UNFINISHED = (Phase.READY, Phase.SETTING_UP, Phase.SIMULATION_READY, Phase.RUNNING)
+_UNFINISHED = (Phase.JOINING, Phase.READY, Phase.SETTING_UP, Phase.SIMULATION_READY, Phase.RUNNING)

@@ -240,6 +240,14 @@ class Link:
             self._watch.add(stream.counters.sent, deadline_s, now_s, (channel, body))
         stream.push(body, channel)
 
+    def send_urgent(self, body: bytes, service: Service, now_s: float) -> None:
+        """Queue one of the framework's own few words, also in a stream whose queue is full."""
+        self._now_s = now_s
+        if service == _BEST:
+            self._best_out.push(body, 0)
+        else:
+            self._out[service - 1].push(body, 0)
+
     def _check_queue(self, stream: SendStream, size: int) -> None:
         limit = self._limits.send_queue_bytes_max
         if size > MESSAGE_BYTES_MAX or size > limit:
@@ -533,10 +541,14 @@ class Link:
         """Return the next SYNC message that broke its deadline, each once."""
         return self._watch.next_broken()
 
-    def abandon(self) -> None:
-        """Give the peer up: what it has not acknowledged is counted as lost and forgotten."""
-        for stream in self._out:
-            stream.abandon()
+    def abandon(self, *services: Service) -> None:
+        """
+        Give streams up, all without an argument: what is not acknowledged is counted as lost and forgotten.
+
+        Nothing can be sent in such a stream again: its receiver waits for what is gone.
+        """
+        for service in services or (Service.RELIABLE, Service.SYNC):
+            self._out[service - 1].abandon()
 
 
 def _seal(run_key: bytes, session: bytes, agent_index: int, incarnation: int, role: Role) -> Seal:

@@ -5,11 +5,13 @@ import random
 
 import pytest
 
+from madns_runtime import __version__
 from madns_runtime.config import Timeouts
 from madns_runtime.protocol import agent_session as a
-from madns_runtime.protocol import host_session as h
+from madns_runtime.protocol import host_events as h
 from madns_runtime.protocol.agent_session import AgentIdentity, AgentSession
-from madns_runtime.protocol.host_session import HostSession, Phase
+from madns_runtime.protocol.host_events import Phase
+from madns_runtime.protocol.host_session import HostSession
 from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.states import AgentState, HostState
 from madns_runtime.protocol.wire import Wire
@@ -21,7 +23,7 @@ TIMEOUTS = Timeouts(
     agent_setup_s=5,
     start_lead_s=0.5,
     silence_s=2.5,
-    complete_s=2,
+    complete_s=4,
     shutdown_s=3,
 )
 DURATION_S = 5.0
@@ -58,7 +60,7 @@ class World:
                 name=name,
                 index=self.names.index(name) + 1,
                 incarnation=self.incarnation,
-                runtime_version="0",
+                runtime_version=__version__,
                 pid=1,
             ),
             WIRE,
@@ -364,7 +366,7 @@ def test_datagrams_of_strangers_change_nothing_but_counters():
     stranger = World(("agent-1",))
     stranger.join("agent-1")
     session = AgentSession(
-        AgentIdentity(name="agent-1", index=1, incarnation=77, runtime_version="0", pid=1),
+        AgentIdentity(name="agent-1", index=1, incarnation=77, runtime_version=__version__, pid=1),
         Wire(run_key=b"x" * 32, session=WIRE.session),
         timeouts=TIMEOUTS,
         report=dict,
@@ -387,3 +389,115 @@ def test_all_agents_lost_ends_even_a_run_that_may_lose_members():
 
     assert w.host.state is HostState.EXIT
     assert w.host_event(h.EmergencyDeclared) is not None
+
+
+def test_rejoin_survives_the_loss_of_its_first_datagram():
+    w = world(policy="continue")
+    w.run_for(1.5)
+    w.host.agent_exited("agent-2", "killed by SIGKILL", w.now_s)
+    del w.agents["agent-2"]
+    w.run_for(0.3)
+    w.join("agent-2")
+    w.agents["agent-2"].datagrams_to_send(w.now_s)  # the hello, lost
+
+    w.run_for(12)
+
+    assert w.agent_saw("agent-2", a.ExpelledFromRun) is None
+    assert w.host_event(h.AgentRejoined) == h.AgentRejoined("agent-2")
+    assert w.host.peers["agent-2"].summary == {"ok": "agent-2"}
+
+
+def test_late_word_of_an_earlier_process_does_not_lose_its_successor():
+    w = world(policy="continue")
+    w.run_for(1.5)
+
+    w.host.agent_exited("agent-2", "killed by SIGKILL", w.now_s, pid=999)
+
+    assert w.host.peers["agent-2"].phase is Phase.RUNNING
+    w.host.agent_exited("agent-2", "killed by SIGKILL", w.now_s, pid=1)
+    assert w.host.peers["agent-2"].phase is Phase.LOST
+
+
+def test_slow_summary_or_slow_disk_of_an_agent_costs_no_run():
+    w = world()
+    w.run_for(1.0 + DURATION_S - 0.5)
+    w.frozen.add("agent-2")  # deep in finish(), then in closing its records
+    w.run_for(3.5)
+    w.frozen.clear()
+
+    w.run_for(6)
+
+    assert w.host_event(h.EmergencyDeclared) is None
+    assert w.host.state is HostState.EXIT
+
+
+def test_stop_overtakes_no_reliable_data():
+    w = world(count=1, loss=0.2, seed=5)
+    w.run_for(1.5)
+    for number in range(40):
+        w.host.send("agent-1", number, Service.RELIABLE, w.now_s)
+        w.agents["agent-1"].send(number, Service.RELIABLE, w.now_s)
+    w.now_s = w.t0_s + DURATION_S  # the end comes while they are under way
+
+    w.run_for(8)
+
+    got = [e.payload for e in w.agent_events["agent-1"] if isinstance(e, a.DataReceived)]
+    back = [e.payload for e in w.host_events if isinstance(e, h.DataReceived)]
+    assert got == list(range(40))
+    assert back == list(range(40))
+
+
+def test_data_sent_before_set_up_waits_for_the_agents_half():
+    w = world(count=1)
+    w.host_sets_up = False
+    w.run_for(0.5)
+    w.host.send("agent-1", "early", Service.SYNC, w.now_s)
+    w.run_for(0.3)
+    assert w.agent_saw("agent-1", a.DataReceived) is None
+
+    w.host.setup_finished({"agent-1": {}}, w.now_s)
+    w.run_for(0.5)
+
+    kinds = [type(e) for e in w.agent_events["agent-1"]]
+    assert kinds.index(a.SetupReceived) < kinds.index(a.DataReceived)
+
+
+def test_messages_to_a_lost_agent_are_counted():
+    w = world(policy="continue")
+    w.run_for(1.5)
+    w.frozen.add("agent-2")
+    w.host.send("agent-2", "never read", Service.RELIABLE, w.now_s)
+    w.run_for(3)
+
+    assert w.host.send("agent-2", "nobody there", Service.RELIABLE, w.now_s) is False
+
+    peer = w.host.peers["agent-2"]
+    assert peer.not_sent == 1
+    assert peer.link.counters.reliable.lost == 1
+
+
+def test_agent_of_another_version_is_refused_with_both_versions():
+    w = World(("agent-1",))
+    w.agents["agent-1"] = AgentSession(
+        AgentIdentity(name="agent-1", index=1, incarnation=1, runtime_version="0.0.1", pid=1),
+        WIRE,
+        timeouts=TIMEOUTS,
+        report=dict,
+        now_s=w.now_s,
+    )
+
+    w.run_for(2)
+
+    emergency = w.host_event(h.EmergencyDeclared)
+    assert emergency.reason == f"agent-1 runs MADNS 0.0.1, the host {__version__}"
+
+
+def test_broken_sync_deadline_is_told_by_the_side_that_sent():
+    w = world(count=1)
+    w.run_for(1.5)
+
+    w.host.send("agent-1", "late", Service.SYNC, w.now_s, deadline_s=w.now_s - 0.1)
+    w.run_for(1)
+
+    assert w.host_event(h.SyncDeadlineBroken).agent == "agent-1"
+    assert w.host.peers["agent-1"].link.counters.deadlines_broken == 1
