@@ -31,7 +31,7 @@ class FaultParameters:
     agent: str = "agent-02"
     """The one agent that misbehaves, if agents do."""
     tick: int = 10
-    """The tick in whose step it happens."""
+    """From this tick on, the first of its calls does it."""
     waste_bytes: int = 0
     """Recorded by that agent every tick."""
     host_waste_bytes: int = 0
@@ -47,8 +47,10 @@ class Fault:
         self.parameters = parameters
 
     def strike(self, method: str) -> None:
+        """Do it, once, if this is the method that is meant."""
         if self.method != method:
             return
+        self.method = None
         action = self.parameters.action
         if action == "raise":
             raise ValueError(f"{method} is broken on purpose")  # the line that messages must name
@@ -89,7 +91,7 @@ class FaultyHost(HostSimulation):
     def receive(self, agent: str, message: Any) -> None:
         self.context.record("echoes", (agent, "x" * self.context.parameters.host_waste_bytes))
         self.context.send(agent, message)
-        if message == self.context.parameters.tick:
+        if message >= self.context.parameters.tick:
             self.fault.strike("receive")
 
     def timer(self, t_s: float) -> float:
@@ -121,11 +123,11 @@ class FaultyAgent(AgentSimulation):
     def step(self, tick: Tick) -> None:
         self.context.record("waves", (tick.index, self.waste))
         self.context.send(HOST, tick.index)
-        if tick.index == self.context.parameters.tick:
+        if tick.index >= self.context.parameters.tick:
             self.fault.strike("step")
 
     def receive(self, message: Any) -> None:
-        if message == self.context.parameters.tick:
+        if message >= self.context.parameters.tick:
             self.fault.strike("receive")
 
     def finish(self) -> Mapping[str, Any]:
