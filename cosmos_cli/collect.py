@@ -22,6 +22,7 @@ from cosmos_cli.errors import ExitCode, InputError, RunFailedError
 from cosmos_cli.expectation import Expected, find_missing
 from cosmos_cli.gather import Gathered, Progress, gather
 from cosmos_cli.manifest import build_manifest
+from cosmos_cli.problem import Problem, problems_of_run
 from cosmos_cli.report.html import write_report
 from cosmos_cli.rundir import RunDirectory, write_json
 from cosmos_cli.runjson import Evidence
@@ -69,7 +70,7 @@ def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; four a
     expected: Expected,
     *,
     interrupted: bool = False,
-    problems: Sequence[str] = (),
+    problems: Sequence[Problem] = (),
     has_report: bool = True,
     progress: Progress = say_nothing,
 ) -> RunSummary:
@@ -81,7 +82,7 @@ def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; four a
         result: What the host reported at its end; None if it could not.
         expected: Who should have recorded what.
         interrupted: Whether the operator ended it.
-        problems: What did not go as it should, each starting with who; a machine's ends with 3.
+        problems: What did not go as it should while it ran; a machine's ends with 3.
         has_report: Whether report.html is written; `cosmos report` can do it later.
         progress: Called with what is being done and how far it is, 0 to 1.
 
@@ -116,13 +117,12 @@ def collect_run(
     """
     _refuse_living(run, processes())
     before = run.read_json(run.run_json) or {}
-    problems = before.get("problems")
     return finish_run(
         run,
-        run.read_json(run.result_json) or run.read_json(run.left_result_json),
+        run.read_json(run.result_json) or run.read_left_result(),
         Expected.read(run),
         interrupted=before.get("status") == "interrupted",
-        problems=tuple(map(str, problems)) if isinstance(problems, list) else (),
+        problems=problems_of_run(before.get("problems")),
         progress=progress,
     )
 
@@ -147,7 +147,7 @@ def _refuse_living(run: RunDirectory, processes: Sequence[ProcessEntry]) -> None
 class _RunEnd:
     result: Mapping[str, Any] | None
     interrupted: bool
-    problems: tuple[str, ...]
+    problems: tuple[Problem, ...]
 
 
 def _evidence(run: RunDirectory, gathered: Gathered, end: _RunEnd, expected: Expected) -> Evidence:
@@ -199,9 +199,10 @@ def _with_report(run: RunDirectory, evidence: Evidence, document: Mapping[str, A
     try:
         return _attempt(evidence, run.report_html, lambda: write_report(run, document))
     except Exception as error:  # noqa: BLE001 - a defect of the report must not cost a run its verdict
-        problem = (
+        text = (
             f"report.html: not written: {type(error).__name__}: {error}; please report this defect"
         )
+        problem = Problem(text=text, step="collect")
         return dataclasses.replace(evidence, problems=(*evidence.problems, problem))
 
 

@@ -27,6 +27,8 @@ from madns_runtime.errors import ConfigurationError
 
 RESERVE_NAME = ".reserve"
 RESERVE_BYTES = 1024 * 1024
+RESULT_BYTES_MAX = 256 * 1024 * 1024
+"""A host's result is some kilobytes an agent; a file beyond this is none."""
 LOCK_NAME = ".lock"
 BUNDLE_SUFFIX = ".tar.zst"
 SCHEMA = 1
@@ -71,7 +73,7 @@ class RunDirectory:
 
     @property
     def left_result_json(self) -> Path:
-        """The same, left by a host whose operator was gone."""
+        """The same, as the host leaves it beside its records: its line to the operator may be cut."""
         return self.path / "host/result.json"
 
     @property
@@ -106,6 +108,17 @@ class RunDirectory:
         except (OSError, orjson.JSONDecodeError):
             return None
         return value if isinstance(value, dict) else None
+
+    def read_left_result(self) -> dict[str, Any] | None:
+        """Return the result that the host of this run left; None if there is none or it is cut."""
+        try:
+            if self.left_result_json.stat().st_size > RESULT_BYTES_MAX:
+                return None
+        except OSError:
+            return None
+        result = self.read_json(self.left_result_json)
+        is_result = result is not None and isinstance(result.get("status"), str)
+        return result if is_result else None
 
     def read_config(self) -> RunConfig | None:
         """Return the run's configuration from plan.json, None if it cannot be read."""

@@ -9,6 +9,7 @@ from typing import Any
 import orjson
 
 from cosmos_cli.expectation import Expected, mapping_at
+from cosmos_cli.problem import Problem
 from cosmos_cli.rundir import SCHEMA
 from cosmos_cli.statistics import TickStatistics, TickTotals, tick_totals
 from cosmos_cli.streams import StreamScan
@@ -34,7 +35,7 @@ class Evidence:
     round_trip_ms: Mapping[str, Any] = field(default_factory=dict)
     clock: Mapping[str, float] = field(default_factory=dict)
     interrupted: bool = False
-    problems: tuple[str, ...] = ()
+    problems: tuple[Problem, ...] = ()
     missing: tuple[str, ...] = ()
 
     def judged(self) -> tuple[Verdict, dict[str, Any]]:
@@ -63,15 +64,14 @@ class Evidence:
     def _facts(self, totals: TickTotals) -> Facts:
         result = self.result or {}
         messages = mapping_at(result, "messages")
-        of_machines = tuple(text for text in self.problems if self._is_of_machine(text))
         return Facts(
             host_status=_text(result.get("status")),
             who=_text(result.get("who")),
             reason=_text(result.get("reason")),
             interrupted=self.interrupted,
             lost_agents=self._lost(),
-            machine_problems=of_machines,
-            problems=tuple(text for text in self.problems if text not in of_machines),
+            machine_problems=tuple(f"{p.machine}: {p.text}" for p in self.problems if p.machine),
+            problems=tuple(p.text for p in self.problems if not p.machine),
             missing=self.missing,
             miss_ratio=totals.miss_ratio,
             overrun_ratio=totals.overrun_ratio,
@@ -92,9 +92,6 @@ class Evidence:
     def _lost(self) -> tuple[str, ...]:
         lost = (self.result or {}).get("lost")
         return tuple(map(str, lost)) if isinstance(lost, Sequence | Mapping) else ()
-
-    def _is_of_machine(self, problem: str) -> bool:
-        return any(problem.startswith((f"{name}:", f"{name} (")) for name in self.expected.machines)
 
     def _document(self, verdict: Verdict, totals: TickTotals) -> dict[str, Any]:
         result = self.result or {}
@@ -121,7 +118,7 @@ class Evidence:
             "clock": self.clock,
             "records": self._records(),
             "data": {"complete": not self.missing, "missing": list(self.missing)},
-            "problems": list(self.problems),
+            "problems": [problem.to_mapping() for problem in self.problems],
             "checks": [check.to_mapping() for check in verdict.checks],
             "scheduling": result.get("scheduling", {}),
             "simulation": self._simulation(),

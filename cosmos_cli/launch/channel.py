@@ -14,7 +14,7 @@ from typing import Any
 import orjson
 
 LINE_BYTES_MAX = 4 * 1024 * 1024
-"""A result with the summaries of thousands of agents fits; what is longer is cut."""
+"""What is longer is cut; a result that is, as of a thousand agents, is read from the file that the host leaves."""
 READ_BYTES = 65_536
 READS_MAX = 64
 """Reads of one descriptor before the others have their turn."""

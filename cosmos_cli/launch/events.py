@@ -71,7 +71,12 @@ class Logged:
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """The child is about to end; a host's result says how the run went, a supervisor has none."""
+    """
+    The child is about to end; a host's result says how the run went, a supervisor has none.
+
+    A host may also say where it lies instead: {"result": null, "file": "result.json"}, always the same
+    place, beside its records.
+    """
 
     result: Mapping[str, Any] | None
 

@@ -42,6 +42,8 @@ from cosmos_cli.launch.manual import ManualSeat
 from cosmos_cli.launch.outcome import LaunchOutcome, LaunchRequest, View
 from cosmos_cli.launch.reaper import Reaper
 from cosmos_cli.launch.signals import OperatorSignals
+from cosmos_cli.problem import Problem
+from cosmos_cli.rundir import RunDirectory
 
 STOP_GRACE_S = 2.0
 """From the host's end until supervisors are told to stop: agents that follow the host need less."""
@@ -54,6 +56,8 @@ NOISE_LINES_MAX = 20
 PROBLEMS_MAX = 200
 
 HOST = "host"
+HOST_EXIT_CODES = (0, 1)
+"""Of a host that came to its end: the run was complete, or was not."""
 RUNNING_STATE = "SIMULATION_START"
 
 
@@ -69,12 +73,13 @@ class Operator:
 
     def __init__(self, request: LaunchRequest, view: View, signals: OperatorSignals) -> None:
         self._request = request
+        self._run = RunDirectory(request.directory)
         self._timeouts = request.config.timeouts
         self._view = view
         self._signals = signals
         self._selector = selectors.DefaultSelector()
         self._deadlines = Deadlines()
-        self._reaper = Reaper(self._deadlines, self._problem)
+        self._reaper = Reaper(self._deadlines, self._problem_of)
         self._children: dict[str, Child] = {}
         self._machines: dict[str, str] = {}
         self._seats: dict[str, ManualSeat] = {}
@@ -85,7 +90,7 @@ class Operator:
         self._has_host_finished = False
         self._is_closing = False
         self._interruption: Literal["no", "clean", "at once"] = "no"
-        self._problems: list[str] = []
+        self._problems: list[Problem] = []
         self._noise: dict[str, int] = {}
 
     def run(self) -> LaunchOutcome:
@@ -98,7 +103,7 @@ class Operator:
         finally:
             leftovers = self._clear_up()
         return LaunchOutcome(
-            host_result=self._host_result,
+            host_result=self._host_result or self._run.read_left_result(),
             interruption=self._interruption,
             problems=tuple(self._problems),
             leftovers=leftovers,
@@ -137,10 +142,13 @@ class Operator:
                 self._view.say(f"{name}: {count} lines in all that are no events", "warning")
         return leftovers
 
-    def _problem(self, text: str) -> None:
+    def _problem(self, text: str, machine: str | None = None) -> None:
         if len(self._problems) < PROBLEMS_MAX:
-            self._problems.append(text)
+            self._problems.append(Problem(text=text, machine=machine))
         self._view.say(text, "error")
+
+    def _problem_of(self, child: Child, text: str) -> None:
+        self._problem(text, self._machines.get(child.name))
 
     # Starting -------------------------------------------------------------------------------------
 
@@ -178,7 +186,7 @@ class Operator:
             )
         except OSError as error:
             reason = f"{name} cannot be started: {error}"
-            self._problem(reason)
+            self._problem(reason, self._machines.get(name))
             self._ask_host_to_stop("failed", reason)
 
     def _open_seat(self, agent: str, launch: Mapping[str, Any]) -> None:
@@ -227,8 +235,11 @@ class Operator:
             if len(self._children) == 1 and self._interruption == "no":
                 self._start_agents(event)
         elif isinstance(event, Finished):
-            self._host_result, self._has_host_finished = event.result, True
-            self._close_down(grace_s=STOP_GRACE_S)
+            self._host_finished(event.result)
+
+    def _host_finished(self, result: Mapping[str, Any] | None) -> None:
+        self._host_result, self._has_host_finished = result or self._run.read_left_result(), True
+        self._close_down(grace_s=STOP_GRACE_S)
 
     def _supervisor_said(self, event: Event) -> None:
         if isinstance(event, AgentStarted):
@@ -300,6 +311,14 @@ class Operator:
         if child.name != HOST:
             self._supervisor_exited(child)
         elif not self._has_host_finished and not self._is_closing:
+            self._host_exited(child)
+
+    def _host_exited(self, child: Child) -> None:
+        """The host is gone and nothing was heard of its result: too long for a line, or cut off."""
+        result = self._run.read_left_result()
+        if result is not None and child.returncode() in HOST_EXIT_CODES:
+            self._host_finished(result)
+        else:
             self._problem(f"host (pid {child.pid}) {child.describe_exit()} before the run was over")
             self._show_last_words(child)
             self._close_down(grace_s=0.0)
@@ -311,7 +330,7 @@ class Operator:
         left = set(names) - self._agents_ended - set(self._request.manual)
         if left:
             how = f"{child.name} (pid {child.pid}) {child.describe_exit()}"
-            self._problem(f"{how} before its agents {', '.join(sorted(left))} were done")
+            self._problem_of(child, f"{how} before its agents {', '.join(sorted(left))} were done")
             self._show_last_words(child)
             for agent in sorted(left):
                 self._agents_ended.add(agent)

@@ -11,6 +11,7 @@ from typing import Any, Literal, Protocol
 
 from cosmos_cli.launch.deadlines import MANUAL_READY_S
 from cosmos_cli.launch.events import AgentChanged, Progress
+from cosmos_cli.problem import Problem
 from madns_runtime.config import AgentLaunch, HostLaunch, RunConfig, to_mapping
 
 RUN_KEY_BYTES = 32
@@ -67,7 +68,7 @@ class LaunchOutcome:
     host_result: Mapping[str, Any] | None
     """What the host said at its end; None if it could not."""
     interruption: Literal["no", "clean", "at once"] = "no"
-    problems: tuple[str, ...] = ()
+    problems: tuple[Problem, ...] = ()
     """What did not go as it should, each a sentence that names who and why."""
     leftovers: tuple[int, ...] = ()
     """Processes that even SIGKILL did not end."""

@@ -30,10 +30,10 @@ class Reaper:
 
     Args:
         deadlines: The loop's.
-        problem: Told whom it had to kill and why.
+        problem: Told which child it had to end or kill, and why in words.
     """
 
-    def __init__(self, deadlines: Deadlines, problem: Callable[[str], None]) -> None:
+    def __init__(self, deadlines: Deadlines, problem: Callable[[Child, str], None]) -> None:
         self._deadlines = deadlines
         self._problem = problem
         self._killed: set[str] = set()
@@ -56,7 +56,7 @@ class Reaper:
         """SIGTERM now, SIGKILL after a grace."""
         if self.has_ended(child):
             return
-        self._problem(f"{child.name} (pid {child.pid}) {why}: it is being ended")
+        self._problem(child, f"{child.name} (pid {child.pid}) {why}: it is being ended")
         child.channel.close_writing()
         child.signal(signal.SIGTERM)
         why = f"did not heed SIGTERM for {TERM_GRACE_S:g} s"
@@ -68,7 +68,9 @@ class Reaper:
         members = child.members()
         if members:
             pids = ", ".join(map(str, members))
-            self._problem(f"{child.name} (pid {child.pid}) {why}: killed with SIGKILL ({pids})")
+            self._problem(
+                child, f"{child.name} (pid {child.pid}) {why}: killed with SIGKILL ({pids})"
+            )
         self._killed.add(child.name)
         child.signal(signal.SIGKILL)
         at_s = time.monotonic() + KILL_WAIT_S

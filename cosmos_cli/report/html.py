@@ -229,9 +229,10 @@ def _measured(value: object) -> str:
 
 def _gaps(document: Mapping[str, Any]) -> str:
     parts = []
+    problem_texts = [problem.get("text") for problem in document.get("problems", ())]
     for title, lines in (
         ("Data that are missing", mapping_at(document, "data").get("missing")),
-        ("What did not go as it should", document.get("problems")),
+        ("What did not go as it should", problem_texts),
     ):
         if lines:
             items = "".join(f"<li>{html.escape(str(item))}</li>" for item in lines)

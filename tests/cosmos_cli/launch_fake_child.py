@@ -97,10 +97,26 @@ def host(line: Line) -> int:
             sys.stderr.write("last words of the host\n")
             sys.stderr.flush()
             os.kill(os.getpid(), signal.SIGKILL)
-    line.say("finished", result={"status": status, "reason": reason, "agents": {}, "lost": []})
+    finish(line, launch["directory"], {"status": status, "reason": reason})
     if FAKE.get("stays"):
         time.sleep(60)
     return 0 if status == "complete" else 1
+
+
+def finish(line: Line, directory: str, told: dict) -> None:
+    result = {**told, "agents": {}, "lost": []}
+    if FAKE.get("leaves_result"):
+        with open(os.path.join(directory, "result.json"), "w") as file:
+            json.dump({**result, "left": True}, file)
+    how = FAKE.get("finishes_with", "line")
+    if how == "line":
+        line.say("finished", result=result)
+    elif how == "file":
+        line.say("finished", result=None, file="result.json")
+    elif how == "cut":
+        os.write(line.write_fd, json.dumps({"event": "finished", "result": result}).encode()[:-9])
+    elif how == "SIGKILL":
+        os.kill(os.getpid(), signal.SIGKILL)
 
 
 def agents(line: Line) -> int:

@@ -8,6 +8,7 @@ from synthetic_run import SyntheticRun, make_config
 
 from cosmos_cli.collect import collect_run, finish_run
 from cosmos_cli.errors import InputError
+from cosmos_cli.problem import Problem
 from madns_runtime.processes import ProcessEntry
 
 
@@ -238,16 +239,71 @@ def test_collect_refuses_while_a_process_of_the_run_lives(tmp_path):
 
 def test_problem_of_a_machine_ends_with_3_and_names_it(tmp_path):
     made = SyntheticRun(tmp_path).write()
+    text = "agents@loopback (pid 7) was killed by SIGKILL"
 
     summary = finish_run(
         made.run,
         made.result(),
         made.expected,
-        problems=("loopback: supervisor was killed by signal 9",),
+        problems=[Problem(machine="loopback", text=text)],
     )
 
     assert summary.exit_code == 3
-    assert "loopback: supervisor" in summary.verdict.text
+    assert f"MACHINES FAILED: loopback: {text}" in summary.verdict.text
+    assert summary.document["problems"] == [{"machine": "loopback", "text": text, "step": "run"}]
+    assert f"<li>{text}</li>" in made.run.report_html.read_text()
+
+
+def test_problem_of_a_machine_is_kept_when_the_run_is_collected_again(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    found = [Problem(machine="loopback", text="it was cut off")]
+    first = finish_run(made.run, made.result(), made.expected, problems=found)
+
+    second = collect_run(made.run, processes=lambda: [])
+
+    assert (first.exit_code, second.exit_code) == (3, 3)
+    assert second.document == first.document
+
+
+def test_trouble_with_the_report_is_forgotten_once_it_is_mended(tmp_path, monkeypatch):
+    made = SyntheticRun(tmp_path).write()
+
+    def break_down(*_arguments):
+        raise ZeroDivisionError("no ticks")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("cosmos_cli.collect.write_report", break_down)
+        finish(made)
+        broken = collect_run(made.run, processes=lambda: [])
+    mended = collect_run(made.run, processes=lambda: [])
+
+    assert broken.exit_code == 3
+    assert len(broken.document["problems"]) == 1
+    assert "report.html: not written: ZeroDivisionError" in broken.verdict.text
+    assert mended.exit_code == 0
+    assert mended.document["problems"] == []
+
+
+def test_result_that_the_host_left_is_collected_and_in_the_manifest(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    left = made.run.left_result_json
+    left.write_bytes(orjson.dumps(made.result()))
+
+    summary = collect_run(made.run, processes=lambda: [])
+
+    assert summary.exit_code == 0, summary.verdict.text
+    assert "host/result.json" in read(made.run.manifest_json)["files"]
+
+
+@pytest.mark.parametrize("content", [b"", b'{"status": "comp', b"[]", b'{"agents": {}}'])
+def test_result_that_was_cut_off_is_none(tmp_path, content):
+    made = SyntheticRun(tmp_path).write()
+    made.run.left_result_json.write_bytes(content)
+
+    summary = collect_run(made.run, processes=lambda: [])
+
+    assert summary.exit_code == 1
+    assert summary.missing == ("host: no result",)
 
 
 def test_missed_ticks_break_the_deadline_check(tmp_path):

@@ -108,6 +108,10 @@ class Launched:
         self.wait_for(lambda: text in self.talk, f"talk {text!r}")
 
 
+def texts(outcome: dict[str, Any]) -> list[str]:
+    return [problem["text"] for problem in outcome["problems"]]
+
+
 def is_alive(pid: int) -> bool:
     try:
         return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
@@ -140,7 +144,7 @@ def test_run_that_completes_hands_back_the_hosts_result(launched: Launched) -> N
 
     assert outcome["host_result"]["status"] == "complete"
     assert outcome["interruption"] == "no"
-    assert outcome["problems"] == []
+    assert texts(outcome) == []
     assert outcome["leftovers"] == []
     assert 'launched ["agent-01", "agent-02"] loopback port 40001' in launched.notes
     assert "running\n" in launched.talk
@@ -152,8 +156,8 @@ def test_host_that_never_listens_is_ended_and_named(launched: Launched) -> None:
     outcome = launched.outcome()
 
     assert outcome["host_result"] is None
-    assert "has not listened within 1 s" in outcome["problems"][0]
-    assert outcome["problems"][0].startswith("host (pid ")
+    assert "has not listened within 1 s" in texts(outcome)[0]
+    assert texts(outcome)[0].startswith("host (pid ")
 
 
 def test_host_that_dies_before_it_listens_is_quoted(launched: Launched) -> None:
@@ -162,7 +166,7 @@ def test_host_that_dies_before_it_listens_is_quoted(launched: Launched) -> None:
     outcome = launched.outcome()
 
     assert outcome["host_result"] is None
-    assert "exited with code 3 before the run was over" in outcome["problems"][0]
+    assert "exited with code 3 before the run was over" in texts(outcome)[0]
     assert "  | OSError: address already in use" in launched.talk
 
 
@@ -174,7 +178,7 @@ def test_killed_host_is_reported_with_its_last_words_and_supervisors_are_stopped
     outcome = launched.outcome()
 
     assert outcome["host_result"] is None
-    assert "was killed by SIGKILL before the run was over" in outcome["problems"][0]
+    assert "was killed by SIGKILL before the run was over" in texts(outcome)[0]
     assert "  | last words of the host" in launched.talk
     assert "stopped" in launched.notes
 
@@ -186,7 +190,7 @@ def test_workers_that_a_killed_host_leaves_in_its_group_are_killed(launched: Lau
 
     outcome = launched.outcome()
 
-    assert any("left 1 running that should have ended" in line for line in outcome["problems"])
+    assert any("left 1 running that should have ended" in line for line in texts(outcome))
     assert len(launched.pids()) == 3
 
 
@@ -206,12 +210,44 @@ def test_killed_supervisor_is_reported_and_each_of_its_agents_told_to_the_host(
 
     outcome = launched.outcome()
 
-    assert "was killed by SIGKILL before its agents agent-01, agent-02" in outcome["problems"][0]
+    assert "was killed by SIGKILL before its agents agent-01, agent-02" in texts(outcome)[0]
+    assert outcome["problems"][0]["machine"] == "loopback"
     told = [line for line in launched.notes.splitlines() if "agent_exited" in line]
     assert [re.findall("agent-..|killed by SIGKILL", line) for line in told] == [
         ["agent-01", "killed by SIGKILL"],
         ["agent-02", "killed by SIGKILL"],
     ]
+
+
+@pytest.mark.parametrize("how", ["file", "nothing", "cut"])
+def test_result_that_did_not_come_through_the_line_is_read_from_its_file(
+    launched: Launched, how: str
+) -> None:
+    launched.start(host={"leaves_result": True, "finishes_with": how})
+
+    outcome = launched.outcome()
+
+    assert outcome["host_result"]["status"] == "complete"
+    assert outcome["host_result"]["left"] is True
+    assert texts(outcome) == []
+
+
+def test_host_that_was_killed_after_it_left_its_result_is_still_told(launched: Launched) -> None:
+    launched.start(host={"leaves_result": True, "finishes_with": "SIGKILL"})
+
+    outcome = launched.outcome()
+
+    assert outcome["host_result"]["status"] == "complete"
+    assert "was killed by SIGKILL before the run was over" in texts(outcome)[0]
+
+
+def test_host_that_ends_without_any_result_is_told(launched: Launched) -> None:
+    launched.start(host={"finishes_with": "nothing"})
+
+    outcome = launched.outcome()
+
+    assert outcome["host_result"] is None
+    assert "exited with code 0 before the run was over" in texts(outcome)[0]
 
 
 def test_children_that_heed_neither_stop_nor_sigterm_are_killed_and_named(
@@ -226,8 +262,11 @@ def test_children_that_heed_neither_stop_nor_sigterm_are_killed_and_named(
     outcome = launched.outcome()
 
     assert outcome["host_result"]["status"] == "complete"
-    killed = [line for line in outcome["problems"] if "killed with SIGKILL" in line]
+    killed = [line for line in texts(outcome) if "killed with SIGKILL" in line]
     assert [line.split(" ")[0] for line in killed] == ["host", "agents@loopback"]
+    machines = {p["machine"] for p in outcome["problems"] if p["text"].startswith("agents@")}
+    assert machines == {"loopback"}
+    assert {p["machine"] for p in outcome["problems"] if p["text"].startswith("host")} == {None}
     assert all("did not heed SIGTERM for 0.5 s" in line for line in killed)
 
 
@@ -250,7 +289,7 @@ def test_running_host_that_falls_silent_is_ended(launched: Launched) -> None:
 
     outcome = launched.outcome()
 
-    assert "has said nothing for 1 s" in outcome["problems"][0]
+    assert "has said nothing for 1 s" in texts(outcome)[0]
 
 
 def test_host_that_stays_in_a_state_for_too_long_is_ended(launched: Launched) -> None:
@@ -259,7 +298,7 @@ def test_host_that_stays_in_a_state_for_too_long_is_ended(launched: Launched) ->
     outcome = launched.outcome()
 
     # start_lead_s + duration_s + complete_s of the defaults are 70.5 s.
-    assert "has been in SIMULATION_START for 1.5 s" in outcome["problems"][0]
+    assert "has been in SIMULATION_START for 1.5 s" in texts(outcome)[0]
 
 
 @pytest.mark.parametrize(
@@ -282,7 +321,7 @@ def test_one_signal_stops_the_run_cleanly(
     assert outcome["interruption"] == "clean"
     assert outcome["host_result"]["status"] == "interrupted"
     assert outcome["host_result"]["reason"] == reason
-    assert outcome["problems"] == []
+    assert texts(outcome) == []
     assert "stopping; press Ctrl-C again to end at once" in launched.talk
     assert "stopped" in launched.notes
 
@@ -298,7 +337,7 @@ def test_second_ctrl_c_kills_at_once(launched: Launched) -> None:
 
     assert outcome["interruption"] == "at once"
     assert outcome["host_result"] is None
-    assert len([line for line in outcome["problems"] if "on the operator's word" in line]) == 2
+    assert len([line for line in texts(outcome) if "on the operator's word" in line]) == 2
 
 
 def test_second_hangup_of_a_closing_terminal_is_no_second_word(launched: Launched) -> None:
@@ -326,7 +365,7 @@ def test_host_that_ignores_the_stop_is_ended_after_its_deadline(launched: Launch
     outcome = launched.outcome()
 
     assert outcome["interruption"] == "clean"
-    assert "has not stopped within 1 s of being told to" in outcome["problems"][0]
+    assert "has not stopped within 1 s of being told to" in texts(outcome)[0]
 
 
 def test_interrupt_before_the_host_listens_starts_no_agents(launched: Launched) -> None:
@@ -362,7 +401,7 @@ def test_program_that_cannot_be_started_ends_the_run_and_is_named(launched: Laun
     outcome = launched.outcome()
 
     assert outcome["host_result"]["status"] == "failed"
-    assert "agents@loopback cannot be started" in outcome["problems"][0]
+    assert "agents@loopback cannot be started" in texts(outcome)[0]
     assert "/nonexistent/python" in outcome["host_result"]["reason"]
 
 
@@ -372,7 +411,7 @@ def test_host_that_cannot_be_started_is_named(launched: Launched) -> None:
     outcome = launched.outcome()
 
     assert outcome["host_result"] is None
-    assert "host cannot be started" in outcome["problems"][0]
+    assert "host cannot be started" in texts(outcome)[0]
 
 
 def test_host_that_goes_on_without_agents_is_told_to_stop(launched: Launched) -> None:
@@ -433,7 +472,7 @@ def test_manual_agent_gets_its_launch_from_a_private_socket(launched: Launched) 
 
     assert agent.wait(PATIENCE_S) == 0
     assert outcome["host_result"]["status"] == "interrupted"
-    assert outcome["problems"] == []
+    assert texts(outcome) == []
     assert not socket_path.parent.exists()
 
 
