@@ -9,14 +9,13 @@ from typing import Any
 import orjson
 
 from cosmos_cli.expectation import Expected, mapping_at
+from cosmos_cli.packets import SERVICES, duplicates_by_service, packet_counts
 from cosmos_cli.problem import Problem
 from cosmos_cli.rundir import SCHEMA
 from cosmos_cli.statistics import TickStatistics, TickTotals, tick_totals
 from cosmos_cli.streams import StreamScan
 from cosmos_cli.verdict import Facts, Limits, Verdict, is_number, judge, plugin_checks
 from madns_runtime.config import RunConfig
-
-SERVICES = ("best", "reliable", "sync")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +112,8 @@ class Evidence:
             "seed": config.seed if config else self.started.get("seed"),
             "versions": self.started.get("versions", {}),
             "timing": self._timing(totals),
-            "messages": {name: mapping_at(result, "messages", name) for name in SERVICES},
+            "messages": self._messages(),
+            "packets": packet_counts(mapping_at(result, "agents")),
             "round_trip_ms": self.round_trip_ms,
             "clock": self.clock,
             "records": self._records(),
@@ -134,6 +134,11 @@ class Evidence:
         }
         count = len(self.expected.agents) or len(self.ticks.agents)
         return {"count": count, "lost": list(self._lost()), "incarnations": restarted}
+
+    def _messages(self) -> dict[str, Any]:
+        twice = duplicates_by_service(mapping_at(self.result, "agents"))
+        totals = {name: mapping_at(self.result, "messages", name) for name in SERVICES}
+        return {name: {**totals[name], "duplicates": twice[name]} for name in SERVICES}
 
     def _timing(self, totals: TickTotals) -> dict[str, Any]:
         return {

@@ -29,6 +29,10 @@ class Source:
         """Return what the agent's half of the simulation summed up; empty for one that died."""
         return mapping_at(self.document, "simulation", "agents", name)
 
+    def packet_counts(self, name: str) -> Mapping[str, Any]:
+        """Return how many packets of an agent were lost, duplicated and out of order, if any were counted."""
+        return mapping_at(self.document, "packets", name)
+
     def time_of(self, table: TableReader, source: str) -> tuple[Floats, str]:
         """
         Return the abscissae of a source's records and what they are.

@@ -148,6 +148,7 @@ class SyntheticRun:
                 "messages": {},
                 "records": self.records.get(name, {}),
                 "simulation": {
+                    "service": "best",
                     "sent": self.ticks,
                     "lost": 0,
                     "duplicated": 0,

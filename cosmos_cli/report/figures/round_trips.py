@@ -123,9 +123,11 @@ def _table(source: Source, by_agent: Mapping[str, Summary]) -> TableBlock:
             *COUNTS.values(),
         ),
         rows=rows,
+        note="Duplicated and out of order are mostly what the link dropped before the simulation saw it;"
+        " a packet behind a newer one is lost to it, too.",
     )
 
 
 def _count(source: Source, agent: str, key: str) -> int | None:
-    value = source.agent_summary(agent).get(key)
+    value = source.packet_counts(agent).get(key)
     return value if isinstance(value, int) else None
