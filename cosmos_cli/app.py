@@ -152,7 +152,7 @@ def _report(description: dict[str, Any], text: str, wants_json: bool, *, bare: b
         if wants_json:
             print_json(description)
         print_error(text, bare=bare)
-    except BrokenPipeError:
+    except OSError:  # nobody is there to read it; the exit code still tells
         _leave_quietly()
     return int(description["exit_code"])
 
@@ -183,7 +183,9 @@ def _report_unexpected(error: Exception, wants_json: bool) -> int:
 
 def _leave_quietly() -> int:
     """Whoever read our output has gone, as `head` does; the interpreter must not complain at exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    from cosmos_cli.console import let_go_of_output
+
+    let_go_of_output()
     return int(ExitCode.RUN_FAILED)
 
 

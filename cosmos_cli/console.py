@@ -88,6 +88,22 @@ def print_error(text: str, *, bare: bool = False) -> None:
     _write(sys.stderr, text if bare else f"{paint('error', 'red', sys.stderr)}: {text}")
 
 
+def let_go_of_output() -> None:
+    """
+    Send the rest of both streams nowhere: whoever read them is gone, as `head` or a closed terminal.
+
+    What is still buffered would fail again whenever it is flushed, at the latest at the interpreter's end.
+    """
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            os.dup2(nowhere, stream.fileno())
+            stream.flush()
+    os.close(nowhere)
+
+
 def aligned(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> list[str]:
     """Return one aligned line a row, headings first; numbers to the right."""
     cells = [[column.heading for column in columns], *[list(row) for row in rows]]

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from cosmos_cli.console import Console, JsonOption, QuietOption, SetOption
+from cosmos_cli.console import Console, JsonOption, QuietOption, SetOption, let_go_of_output
 from cosmos_cli.launch.execute import RunOptions, execute
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.rundir import runs_root
@@ -48,6 +48,11 @@ def run(
     )
     checked = load_scenario(scenario, overrides)
     summary = execute(checked, options, partial(make_view, quiet=quiet))
-    console.print_json(dict(summary.document))
-    (console.say if json else console.data)(summary.last_line)
+    try:
+        console.print_json(dict(summary.document))
+        (console.say if json else console.data)(summary.last_line)
+    except (
+        OSError
+    ):  # a closed terminal or pipe: what the run came to stands in run.json, and in the code
+        let_go_of_output()
     raise typer.Exit(int(summary.exit_code))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+import pty
 import signal
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -147,6 +150,46 @@ def test_second_ctrl_c_still_collects_what_is_on_disk(
     assert run_json(environment)["status"] == "interrupted"
     assert not (directory / "report.html").exists()
     assert (directory / "manifest.json").exists()
+
+
+@pytest.mark.process
+def test_closed_terminal_ends_with_the_code_of_the_summary(
+    environment: dict[str, str], scenario: Path
+) -> None:
+    environment["COSMOS_FAKE"] = json.dumps({"host": {"runs_s": 60}})
+    ours, terminal = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, str(DRIVER), "cosmos", "run", str(scenario)],
+        stdin=terminal,
+        stdout=terminal,
+        stderr=terminal,
+        env=environment,
+        start_new_session=True,
+        # As a terminal's window does for its shell: whoever leads the session hears of its end.
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+    )
+    os.close(terminal)
+    wait_for_note(environment, "launched [")
+    os.close(ours)
+
+    assert process.wait(PATIENCE_S) == 130
+    assert run_json(environment)["exit_code"] == 130
+
+
+@pytest.mark.process
+def test_reader_that_has_left_does_not_change_the_exit_code(
+    environment: dict[str, str], scenario: Path
+) -> None:
+    environment["COSMOS_FAKE"] = json.dumps({"host": {"runs_s": 60}})
+    process = start(environment, str(scenario))
+    wait_for_note(environment, "launched [")
+    assert process.stdout is not None
+    process.stdout.close()
+    process.send_signal(signal.SIGTERM)
+
+    assert process.wait(PATIENCE_S) == 130
+    assert process.stderr is not None
+    process.stderr.close()
 
 
 @pytest.mark.process
