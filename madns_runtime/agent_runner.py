@@ -13,9 +13,16 @@ from typing import Any, TypeVar
 
 from madns_runtime import __version__
 from madns_runtime.config import AgentLaunch
-from madns_runtime.context import RunContext, describe_exception
-from madns_runtime.errors import MadnsError
+from madns_runtime.context import (
+    RunContext,
+    check_deadline,
+    check_service,
+    clean_text,
+    describe_exception,
+)
+from madns_runtime.errors import MadnsError, PluginError
 from madns_runtime.health.probe import process_usage
+from madns_runtime.plugin import returned
 from madns_runtime.plugin.api import HOST, AgentSimulation, Tick
 from madns_runtime.protocol import agent_session as told
 from madns_runtime.protocol.agent_session import AgentIdentity, AgentSession
@@ -25,6 +32,7 @@ from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.states import AgentState
 from madns_runtime.protocol.wire import Wire
 from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.udp import UdpSocket
 from madns_runtime.recording.records import CLOCK, EVENTS, LOG, PROCESS, TICKS
 from madns_runtime.recording.writer import Recorder
@@ -51,6 +59,17 @@ class Program:
     parameters: Any
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """How an agent ended."""
+
+    as_ordered: bool
+    """By the host's order at the end of a run."""
+    reason: str = ""
+    may_restart: bool = False
+    """It failed by itself while the run may go on: another try makes sense."""
+
+
 class AgentRunner:
     """
     Runs one agent in a loop that others may share.
@@ -60,7 +79,7 @@ class AgentRunner:
         launch: The run.
         program: What it runs.
         reactor: The loop.
-        on_ended: Called once, with whether it ended as the host ordered, and why not.
+        on_ended: Called once, with how it ended.
     """
 
     def __init__(
@@ -70,7 +89,7 @@ class AgentRunner:
         program: Program,
         *,
         reactor: Reactor,
-        on_ended: Callable[[str, bool, str], None],
+        on_ended: Callable[[str, Outcome], None],
     ) -> None:
         config = launch.config
         self.name = name
@@ -126,9 +145,10 @@ class AgentRunner:
         self._usage_timer = reactor.call_at(math.inf, self._record_usage)
         self._clock_recorded_s = 0.0
         self._scheduling: dict[str, Any] = {}
-        self._outcome: tuple[bool, str] = (False, "did not end")
+        self._outcome = Outcome(as_ordered=False, reason="did not end")
         self._is_closed = False
         self._is_recording = True
+        self._takes_data = True
 
     def start(self) -> None:
         """Begin: says hello at once."""
@@ -159,7 +179,7 @@ class AgentRunner:
         if data is None:
             return
         message = self._session.receive_data(data, monotonic())
-        if message is not NO_DATA:
+        if message is not NO_DATA and self._takes_data:
             try:
                 self._receive(message)
             except (Exception, SystemExit) as error:  # noqa: BLE001 - a plug-in may raise anything
@@ -196,7 +216,8 @@ class AgentRunner:
 
     def _handle(self, event: told.AgentSessionEvent) -> None:
         if isinstance(event, told.DataReceived):
-            self._call("receive", self._simulation.receive, event.payload)
+            if self._takes_data:
+                self._call("receive", self._simulation.receive, event.payload)
         elif isinstance(event, told.ClockEstimated):
             self._record_clock()
         elif isinstance(event, told.StateEntered):
@@ -206,12 +227,12 @@ class AgentRunner:
         elif isinstance(event, told.StartReceived):
             self._start_run(event.t0_host_s)
         elif isinstance(event, told.StopReceived):
-            self._outcome = (True, "")
+            self._outcome = Outcome(as_ordered=True)
             self._close_records()
         elif isinstance(event, told.EmergencyDeclared):
-            self._end_early(f"{event.who}: {event.reason}")
+            self._end_early(f"{event.who}: {event.reason}", is_own=event.who == self.name)
         elif isinstance(event, told.ExpelledFromRun):
-            self._end_early(f"expelled by the host: {event.reason}")
+            self._end_early(f"expelled by the host: {event.reason}", is_own=True)
         else:
             self._close()
 
@@ -247,9 +268,10 @@ class AgentRunner:
         self._event("phase", phase_s=phase_s)
         if now_s > 0:
             self._pacer.skip_to(now_s)
+        freeze_garbage()  # what set-up made stays: no collection walks it in mid-run
         self._arm_tick()
         process_usage()
-        self._record_usage()
+        self._usage_timer.reschedule(self._reactor.now_s() + self._config.health.period_s)
 
     def _arm_tick(self) -> None:
         pacer = self._pacer
@@ -272,7 +294,14 @@ class AgentRunner:
             if self._first is None:
                 self._first = (timing.t_s, began_s)
             self._newest = (timing.t_s, began_s)
-            tick = Tick(timing.index, timing.t_s, self._period_s, timing.lateness_s, timing.missed)
+            tick = Tick(
+                timing.index,
+                timing.t_s,
+                self._period_s,
+                timing.lateness_s,
+                timing.missed,
+                timing.deadline_s,
+            )
             try:
                 self._step(tick)
             except (Exception, SystemExit) as error:  # noqa: BLE001 - a plug-in may raise anything
@@ -298,7 +327,8 @@ class AgentRunner:
         if self._pacer is None or self._session.state is not AgentState.RUN_SIMULATION:
             return
         self._pacer.finish(self._simulated_s())
-        summary = self._call("finish", self._simulation.finish)
+        self._takes_data = False  # what comes from now on is too late for the summary
+        summary = self._call("finish", self._simulation.finish, check=returned.summary)
         if self._session.state is AgentState.RUN_SIMULATION:
             self._session.run_finished(self._summary(summary), self._reactor.now_s())
         self._pump()
@@ -316,7 +346,7 @@ class AgentRunner:
             if clock.is_valid
             else None,
             "scheduling": self._scheduling,
-            "simulation": dict(simulation) if isinstance(simulation, Mapping) else {},
+            "simulation": simulation or {},
         }
 
     def _real_time_factor(self) -> float | None:
@@ -325,8 +355,9 @@ class AgentRunner:
             return None
         return round((self._newest[0] - self._first[0]) / (self._newest[1] - self._first[1]), 9)
 
-    def _end_early(self, reason: str) -> None:
-        self._outcome = (False, reason)
+    def _end_early(self, reason: str, *, is_own: bool) -> None:
+        self._outcome = Outcome(as_ordered=False, reason=reason, may_restart=is_own)
+        self._takes_data = False
         for timer in (self._tick_timer, self._end_timer, self._usage_timer):
             timer.cancel()
         self._event("emergency", reason=reason)
@@ -338,9 +369,13 @@ class AgentRunner:
         self._is_recording = False
         messages = self._session.link.counters.to_mapping()
         counts = self._recorder.close(self._config.timeouts.shutdown_s)
-        self._session.records_closed(
-            {**counts.to_mapping(), "messages": messages}, self._reactor.now_s()
-        )
+        records = {
+            **counts.to_mapping(),
+            "messages": messages,
+            "network": self._socket.counters(),
+            "held_dropped": self._session.held_dropped_count,
+        }
+        self._session.records_closed(records, self._reactor.now_s())
 
     def _close(self) -> None:
         self._is_closed = True
@@ -349,7 +384,7 @@ class AgentRunner:
             timer.cancel()
         self._reactor.remove_reader(self._socket.fileno())
         self._socket.close()
-        self._on_ended(self.name, *self._outcome)
+        self._on_ended(self.name, self._outcome)
 
     # Records ---------------------------------------------------------------------------------------
 
@@ -430,25 +465,41 @@ class AgentRunner:
         deadline_s: float | None = None,
     ) -> None:
         if to != HOST:
-            raise MadnsError(f"an agent sends to {HOST!r}, not to {to!r}")
+            raise PluginError(f"an agent sends to {HOST!r}, not to {to!r}")
         now_s = monotonic()
+        if deadline_s is not None:
+            check_deadline(service, is_running=self._t0_host_s is not None)
         if service is BEST:
             datagram = self._session.seal_data(message, now_s)
             if datagram is not None:
                 self._socket.send(datagram)
                 return
         due_s = None if deadline_s is None else self._local_s(deadline_s)
+        check_service(service)
         self._session.send(message, service, now_s, deadline_s=due_s)
         self._must_pump = True
         if service is SYNC:
             self._send_datagrams()
 
-    def _call(self, name: str, method: Callable[..., T], *arguments: Any) -> T | None:
-        """Call the plug-in; whatever it raises ends this agent with its name on it."""
+    def _call(
+        self,
+        name: str,
+        method: Callable[..., Any],
+        *arguments: Any,
+        check: Callable[[Any], T] | None = None,
+    ) -> T | None:
+        """Call the plug-in; what it raises, or returns against its contract, ends this agent by name."""
         try:
-            return method(*arguments)
+            value = method(*arguments)
         except (Exception, SystemExit) as error:  # noqa: BLE001 - a plug-in may raise anything
             self._plugin_failed(name, error)
+            return None
+        try:
+            return None if check is None else check(value)
+        except PluginError as error:
+            reason = f"{self._simulation_name}.{name} returned {clean_text(str(error))}"
+            self._session.emergency(reason, self._reactor.now_s())
+            self._must_pump = True
             return None
 
     def _plugin_failed(self, name: str, error: BaseException) -> None:

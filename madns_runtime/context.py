@@ -16,6 +16,8 @@ from madns_runtime.protocol.messages import Service
 from madns_runtime.recording.records import Field, StreamSchema
 from madns_runtime.recording.writer import Recorder
 
+TEXT_CHARACTERS_MAX = 2000
+"""Of what a plug-in's exception says; the whole is in the log."""
 FRAMEWORK_STREAMS = frozenset({"ticks", "clock", "events", "log", "health", "process"})
 
 
@@ -86,6 +88,30 @@ class JobContext(RunContext):
     submit: Callable[..., int]
 
 
+def check_service(service: Service) -> None:
+    """
+    Refuse what is no class of service.
+
+    Raises:
+        PluginError: It is something else, such as its name.
+    """
+    if not isinstance(service, Service):
+        raise PluginError(f"expected a Service, such as Service.RELIABLE, got {service!r}")
+
+
+def check_deadline(service: Service, *, is_running: bool) -> None:
+    """
+    Refuse a deadline that nobody could keep account of.
+
+    Raises:
+        PluginError: The class of service has none, or simulated time has not begun.
+    """
+    if service is not Service.SYNC:
+        raise PluginError(f"deadline_s goes with Service.SYNC, not with {service!r}")
+    if not is_running:
+        raise PluginError("deadline_s is simulated time, which has not begun")
+
+
 def describe_exception(error: BaseException, doing: str) -> str:
     """
     Return one line: which call of a plug-in raised what, and in which file and line.
@@ -103,8 +129,14 @@ def describe_exception(error: BaseException, doing: str) -> str:
         own = [frame for frame in frames[1:] if _is_below(Path(frame.filename), home)]
         frame = own[-1] if own else frames[-1]
         place = f" ({Path(frame.filename).name}:{frame.lineno})"
-    text = f": {error}" if str(error) else ""
+    text = f": {clean_text(str(error))}" if str(error) else ""
     return f"{doing} raised {type(error).__name__}{text}{place}"
+
+
+def clean_text(text: str) -> str:
+    """Return *text* as a message and a record can carry it: no lone surrogates, and bounded."""
+    text = text.encode("utf-8", "backslashreplace").decode("utf-8")
+    return text if len(text) <= TEXT_CHARACTERS_MAX else f"{text[:TEXT_CHARACTERS_MAX]} [cut]"
 
 
 def _is_below(path: Path, home: Path) -> bool:

@@ -22,11 +22,18 @@ from typing import Any, TypeVar
 import orjson
 
 from madns_runtime.config import HostLaunch, from_mapping
-from madns_runtime.context import JobContext, describe_exception
-from madns_runtime.errors import MadnsError
+from madns_runtime.context import (
+    JobContext,
+    check_deadline,
+    check_service,
+    clean_text,
+    describe_exception,
+)
+from madns_runtime.errors import MadnsError, PluginError
 from madns_runtime.executor import JobFailed, JobRunner, make_executor
 from madns_runtime.health.sampler import SAMPLER_TIMEOUT_S, start_sampler, stop_sampler
 from madns_runtime.host_result import HostReport, progress_report
+from madns_runtime.plugin import returned
 from madns_runtime.plugin.api import HOST
 from madns_runtime.plugin.registry import load_half, parse_parameters, resolve
 from madns_runtime.processes import register
@@ -58,8 +65,14 @@ FLUSH_TIMEOUT_S = 5.0
 OPERATOR_GONE = "the operator's process is gone"
 HANG_GRACE_S = 2.0
 """Beyond the time for shutdown: a loop that hangs in a plug-in, without an operator, ends by force."""
+RESULT_BYTES_MAX = 1024 * 1024
+"""A longer result is not sent to the operator, only named."""
 RESULT_FILE = "result.json"
-"""Beside the host's records: the result of a run whose operator is gone, or may hang."""
+"""Beside the host's records: the result, also of a run whose operator is gone, stopped or slow."""
+
+
+def _as_it_is(value: Any) -> Any:
+    return value
 
 
 class HostRuntime:
@@ -139,6 +152,7 @@ class HostRuntime:
         self._progress_timer = self._reactor.call_at(math.inf, self._progress)
         self._awaits_jobs = False
         self._must_pump = False
+        self._takes_data = True
         self._is_terminated = False
 
     def run(self) -> int:
@@ -171,7 +185,7 @@ class HostRuntime:
         if received is None:
             return
         message = self._session.receive_data(*received, monotonic())
-        if message is not None:
+        if message is not None and self._takes_data:
             self._call("receive", self._simulation.receive, *message)
             if not self._must_pump:
                 return
@@ -203,7 +217,8 @@ class HostRuntime:
 
     def _handle(self, event: told.HostSessionEvent) -> None:
         if isinstance(event, told.DataReceived):
-            self._call("receive", self._simulation.receive, event.agent, event.payload)
+            if self._takes_data:
+                self._call("receive", self._simulation.receive, event.agent, event.payload)
         elif isinstance(event, told.StateEntered):
             self._event("state", state=event.state.value)
             self._operator.emit({"event": "state", "state": event.state.value})
@@ -244,15 +259,23 @@ class HostRuntime:
         if not self._awaits_jobs or self._jobs.pending_count:
             return
         self._awaits_jobs = False
-        initial = {
-            agent: self._call("initial_data", self._simulation.initial_data, agent)
-            for agent in self._session.agents_in(Phase.READY)
-        }
-        if self._session.state is HostState.SIMULATION_SETUP:  # unless one of the calls raised
+        initial = {}
+        for agent in self._session.agents_in(Phase.READY):
+            if not self._is_in(HostState.SIMULATION_SETUP):
+                return  # the call before raised
+            initial[agent] = self._initial_data(agent)
+        if self._is_in(HostState.SIMULATION_SETUP):
             self._session.setup_finished(initial, self._reactor.now_s())
 
+    def _is_in(self, state: HostState) -> bool:
+        return self._session.state is state
+
+    def _initial_data(self, agent: str) -> Any:
+        call = self._simulation.initial_data
+        return self._call("initial_data", call, agent, check=returned.initial_data)
+
     def _send_setup(self, agent: str) -> None:
-        initial = self._call("initial_data", self._simulation.initial_data, agent)
+        initial = self._initial_data(agent)
         if self._session.state in HOST_LIVE:
             self._session.send_setup(agent, initial, self._reactor.now_s())
 
@@ -272,7 +295,8 @@ class HostRuntime:
     def _plugin_due(self) -> None:
         if self._session.state is not HostState.SIMULATION_START:
             return
-        next_s = self._call("timer", self._simulation.timer, self._simulated_s())
+        timer = self._simulation.timer
+        next_s = self._call("timer", timer, self._simulated_s(), check=returned.next_time)
         if next_s is not None and self._t0_s is not None:
             self._plugin_timer.reschedule(self._t0_s + next_s)
         self._pump()
@@ -291,16 +315,15 @@ class HostRuntime:
 
     def _complete(self) -> None:
         self._report.completed(self._simulated_s())
-        self._report.simulation = self._finish_simulation()
+        self._takes_data = False  # what comes from now on is too late for the summary
+        finish = self._simulation.finish
+        self._report.simulation = self._call("finish", finish, check=returned.summary) or {}
         if self._session.state is HostState.SIMULATION_COMPLETE:
             self._session.order_stop(self._reactor.now_s())
 
-    def _finish_simulation(self) -> Mapping[str, Any]:
-        summary = self._call("finish", self._simulation.finish)
-        return dict(summary) if isinstance(summary, Mapping) else {}
-
     def _emergency(self, event: told.EmergencyDeclared) -> None:
         who, reason = event.who, event.reason
+        self._takes_data = False
         if event.who in self._names and self._operator.has_hung_up():
             # An agent that ended with its operator may be heard before the operator's own silence.
             who, reason, self._report.ending_status = "operator", OPERATOR_GONE, "aborted"
@@ -312,6 +335,7 @@ class HostRuntime:
         if missing:
             self._log("error", f"{', '.join(missing)}: no word that records are closed")
             self._event("not_stopped", agents=list(missing))
+            self._report.not_stopped = missing
         self._jobs.close()
         health = stop_sampler(self._sampler, timeout_s=SAMPLER_TIMEOUT_S)
         self._session.cleaned_up()
@@ -346,7 +370,10 @@ class HostRuntime:
             self._end("operator", reason, str(command.get("status", "interrupted")))
         elif command.get("command") == "agent_exited":
             agent, how = str(command.get("agent")), str(command.get("how"))
-            self._session.agent_exited(agent, how, self._reactor.now_s())
+            pid = command.get("pid")
+            self._session.agent_exited(
+                agent, how, self._reactor.now_s(), pid=None if pid is None else int(pid)
+            )
             self._pump()
 
     def _terminated(self) -> None:
@@ -408,24 +435,32 @@ class HostRuntime:
                 self._socket.send(*sealed)
                 return
         if to not in self._session.peers:
-            raise MadnsError(f"no agent is called {to!r}")
+            raise PluginError(f"no agent is called {to!r}")
         due_s = None
-        if deadline_s is not None and self._t0_s is not None:
-            due_s = self._t0_s + deadline_s
+        if deadline_s is not None:
+            check_deadline(service, is_running=self._t0_s is not None)
+            due_s = (self._t0_s or 0.0) + deadline_s
+        check_service(service)
         self._session.send(to, message, service, now_s, deadline_s=due_s)
         self._must_pump = True
         if service is SYNC:
             self._send_datagrams()
 
-    def _call(self, name: str, method: Callable[..., T], *arguments: Any) -> T | None:
-        """Call the plug-in; whatever it raises ends the run with its name on it."""
+    def _call(
+        self,
+        name: str,
+        method: Callable[..., Any],
+        *arguments: Any,
+        check: Callable[[Any], T] = _as_it_is,
+    ) -> T | None:
+        """Call the plug-in; what it raises, or returns against its contract, ends the run by name."""
         began_s = monotonic()
+        doing = f"{self._simulation_name}.{name}"
         try:
-            return method(*arguments)
+            value = method(*arguments)
         except (Exception, SystemExit) as error:  # noqa: BLE001 - a plug-in may raise anything
             self._must_pump = True
-            reason = describe_exception(error, f"{self._simulation_name}.{name}")
-            self._plugin_failed(reason, error)
+            self._plugin_failed(describe_exception(error, doing), error)
             return None
         finally:
             took_s = monotonic() - began_s
@@ -435,6 +470,12 @@ class HostRuntime:
                     f"{self._simulation_name}.{name} took {took_s:.1f} s, and the host stood still;"
                     " hand long work to context.submit",
                 )
+        try:
+            return check(value)
+        except PluginError as error:
+            self._must_pump = True
+            self._plugin_failed(f"{doing} returned {clean_text(str(error))}", error)
+            return None
 
     def _plugin_failed(self, reason: str, error: BaseException) -> None:
         text = "".join(traceback.format_exception(error))
@@ -442,21 +483,30 @@ class HostRuntime:
         self._session.emergency(HOST, reason, self._reactor.now_s())
 
     def _close(self) -> int:
-        result = self._report.result(self._session)
-        if self._operator.is_gone or self._is_terminated:
-            self._leave(result)
-        self._operator.emit({"event": "finished", "result": result})
+        network = self._socket.counters()
+        result = self._report.result(self._session, network=network)
+        text = orjson.dumps(result, option=orjson.OPT_SERIALIZE_NUMPY)
+        is_left = self._leave(text)
+        if is_left and len(text) > RESULT_BYTES_MAX:
+            self._operator.emit({"event": "finished", "result": None, "file": RESULT_FILE})
+        else:
+            self._operator.emit({"event": "finished", "result": result})
         self._operator.flush(FLUSH_TIMEOUT_S)
         self._operator.close()
         self._socket.close()
         self._reactor.close()
         return 0 if result["status"] == "complete" else 1
 
-    def _leave(self, result: Mapping[str, Any]) -> None:
-        """Write the result where `cosmos collect` finds it: nobody else can."""
-        with contextlib.suppress(OSError):  # a full disk, say: then the records are all there is
-            path = self._directory / RESULT_FILE
-            path.write_bytes(orjson.dumps(result, option=orjson.OPT_SERIALIZE_NUMPY))
+    def _leave(self, text: bytes) -> bool:
+        """Write the result beside the records: no operator who is gone, or slow, costs it."""
+        path = self._directory / RESULT_FILE
+        try:
+            path.with_suffix(".tmp").write_bytes(text)
+            path.with_suffix(".tmp").replace(path)
+        except OSError:  # a full disk, say: then the line to the operator is all there is
+            path.with_suffix(".tmp").unlink(missing_ok=True)
+            return False
+        return True
 
 
 def window_bytes(receive_buffer_bytes: int, peers: int) -> int:

@@ -19,6 +19,8 @@ class HostReport:
     duration_s: float
     t0_utc: str | None = None
     lost: dict[str, str] = field(default_factory=dict)
+    not_stopped: tuple[str, ...] = ()
+    """Agents that gave no word that their records are closed."""
     simulation: Mapping[str, Any] = field(default_factory=dict)
     records: Mapping[str, Any] = field(default_factory=dict)
     scheduling: Mapping[str, Any] = field(default_factory=dict)
@@ -39,8 +41,8 @@ class HostReport:
         """Every agent has run its simulated time, at simulated time *t_s* of the host."""
         self._completed_s = t_s
 
-    def result(self, session: HostSession) -> dict[str, Any]:
-        """Return the result as the operator's side expects it."""
+    def result(self, session: HostSession, *, network: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the result as the operator's side expects it; *network* counts the host's socket."""
         agents = {
             name: _agent_result(peer, self.lost.get(name)) for name, peer in session.peers.items()
         }
@@ -56,7 +58,9 @@ class HostReport:
             "rtf": _worst_rtf(agents.values()),
             "agents": agents,
             "lost": sorted(self.lost),
-            "messages": _totals(agent["messages"] for agent in agents.values()),
+            "not_stopped": list(self.not_stopped),
+            "network": network,
+            "messages": _totals(agents.values()),
             "refused": {**session.refused, "malformed": session.malformed_count},
             "records": self.records,
             "simulation": self.simulation,
@@ -83,33 +87,17 @@ def _messages(peer: Peer, agent_side: Mapping[str, Any] | None) -> dict[str, Any
     """
     Join both ends' counters of an agent's link.
 
-    What one end sent in a stream and the other never had is lost. Without the agent's own count only
-    what the host saw is told.
+    The agent counts before its last word, the host after it. Without the agent's own count nobody
+    knows what was lost: None, and a check on it does not hold.
     """
     host_side: Mapping[str, Any] = peer.link.counters.to_mapping() if peer.link else {}
-    joined: dict[str, Any] = {}
-    for service in SERVICES:
-        up: Mapping[str, Any] = (agent_side or {}).get(service, {})
-        down: Mapping[str, Any] = host_side.get(service, {})
-        sent = up.get("sent", 0) + down.get("sent", 0)
-        received = up.get("received", 0) + down.get("received", 0)
-        if service == "best":
-            # What the receivers missed between two that came, and what a full queue pushed out.
-            lost = sum(side.get(name, 0) for side in (up, down) for name in ("lost", "dropped"))
-        elif agent_side is None:
-            lost = down.get("lost", 0)
-        else:
-            lost = max(0, up.get("sent", 0) - down.get("received", 0)) + max(
-                0, down.get("sent", 0) - up.get("received", 0)
-            )
-        joined[service] = {
-            "sent": sent,
-            "received": received,
-            "lost": lost,
-            "resent": up.get("resent", 0) + down.get("resent", 0),
-            "late": up.get("late", 0) + down.get("late", 0),
-            "deadlines_broken": up.get("deadlines_broken", 0) + down.get("deadlines_broken", 0),
-        }
+    joined: dict[str, Any] = {
+        service: _joined(service, host_side, agent_side) for service in SERVICES
+    }
+    joined["sync"]["deadlines_broken"] = host_side.get("deadlines_broken", 0) + (
+        agent_side or {}
+    ).get("deadlines_broken", 0)
+    joined["not_sent"] = peer.not_sent
     joined["agent"] = dict(agent_side or {})
     joined["host"] = dict(host_side)
     if peer.retired_counters:
@@ -117,12 +105,51 @@ def _messages(peer: Peer, agent_side: Mapping[str, Any] | None) -> dict[str, Any
     return joined
 
 
-def _totals(messages: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
-    totals: dict[str, dict[str, int]] = {service: {} for service in SERVICES}
-    for one in messages:
+def _joined(
+    service: str, host_side: Mapping[str, Any], agent_side: Mapping[str, Any] | None
+) -> dict[str, int | None]:
+    up: Mapping[str, Any] = (agent_side or {}).get(service, {})
+    down: Mapping[str, Any] = host_side.get(service, {})
+    # AgentStopped, in SYNC, is sent after the agent has counted.
+    last_word = 1 if service == "sync" and agent_side is not None else 0
+    sent_up, sent_down = up.get("sent", 0) + last_word, down.get("sent", 0)
+    lost: int | None = None
+    if service == "best":
+        # Gaps between what came; one that is pushed out of the sender's queue leaves a gap as well.
+        lost = up.get("lost", 0) + down.get("lost", 0)
+    elif agent_side is not None:
+        lost = max(0, sent_up - down.get("received", 0)) + max(0, sent_down - up.get("received", 0))
+    return {
+        "sent": sent_up + sent_down,
+        "received": up.get("received", 0) + down.get("received", 0),
+        "lost": lost,
+        "resent": up.get("resent", 0) + down.get("resent", 0),
+        "late": up.get("late", 0) + down.get("late", 0),
+    }
+
+
+def _totals(agents: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, int | None]]:
+    """
+    Add up the messages of all agents.
+
+    What was sent to agents that were lost is not judged with the rest, but told: "to_lost_agents".
+    """
+    totals: dict[str, dict[str, int | None]] = {service: {} for service in SERVICES}
+    for agent in agents:
+        is_lost = agent["state"] == Phase.LOST.value
         for service in SERVICES:
-            for name, count in one[service].items():
-                totals[service][name] = totals[service].get(name, 0) + count
+            total = totals[service]
+            for name, count in agent["messages"][service].items():
+                if is_lost and name == "lost":
+                    total.setdefault("lost", 0)
+                    continue
+                before = total.get(name, 0)
+                total[name] = None if count is None or before is None else before + count
+            down = agent["messages"]["host"].get(service, {})
+            undelivered = down.get("lost", 0) if is_lost and service != "best" else 0
+            earlier = agent["messages"].get("host_earlier", ())
+            undelivered += sum(one[service]["lost"] for one in earlier if service != "best")
+            total["to_lost_agents"] = (total.get("to_lost_agents") or 0) + undelivered
     return totals
 
 

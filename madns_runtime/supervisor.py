@@ -17,8 +17,9 @@ from typing import Any
 
 import orjson
 
-from madns_runtime.agent_runner import AgentRunner, Program
+from madns_runtime.agent_runner import AgentRunner, Outcome, Program
 from madns_runtime.config import AgentLaunch
+from madns_runtime.context import clean_text
 from madns_runtime.errors import MadnsError
 from madns_runtime.health.sampler import SAMPLER_TIMEOUT_S, start_sampler, stop_sampler
 from madns_runtime.health.stress import start_stress, stop_stress
@@ -27,7 +28,7 @@ from madns_runtime.processes import register
 from madns_runtime.reactor.lines import OperatorLink
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import apply as apply_scheduling
-from madns_runtime.reactor.scheduling import freeze_garbage, outlive_parent
+from madns_runtime.reactor.scheduling import outlive_parent
 from madns_runtime.reactor.watchdog import end_after_hang_up
 
 RESTART_DELAY_S = 0.2
@@ -48,6 +49,9 @@ class Child:
     pid: int
     incarnation: int
     reason: str | None = None
+    may_restart: bool = True
+    """What was killed may; one that ended by the host's order, or with the run, may not."""
+    has_ended_well: bool = False
 
 
 class Supervisor:
@@ -105,7 +109,7 @@ class Supervisor:
         reactor.on_signal(signal.SIGCHLD, self._reap)
         reactor.on_signal(signal.SIGTERM, lambda: self._end("SIGTERM"))
         reactor.on_signal(signal.SIGINT, lambda: None)  # a terminal's Ctrl-C is the operator's
-        reactor.add_reader(self._reason_read_fd, self._read_reasons)
+        reactor.add_reader(self._reason_read_fd, self._read_outcomes)
         self._reap()
         reactor.run()
         return self._close()
@@ -136,32 +140,41 @@ class Supervisor:
             with register(
                 self._launch.config.run, "agent", ",".join(agents), self._launch.directory
             ):
-                reasons = process.run()
-            code = 1 if reasons else 0
-            self._write_reasons(reasons)
+                outcomes = process.run()
+            code = 0 if all(outcome.as_ordered for outcome in outcomes.values()) else 1
+            self._write_outcomes(outcomes)
         except MadnsError as error:
-            self._write_reasons({agent: str(error) for agent in agents})
+            self._write_outcomes(_failed(agents, str(error)))
         except BaseException as error:  # noqa: BLE001 - the last frame of a process; it is told below
-            self._write_reasons({agent: f"{type(error).__name__}: {error}" for agent in agents})
+            self._write_outcomes(_failed(agents, f"{type(error).__name__}: {error}"))
             sys.excepthook(type(error), error, error.__traceback__)
         finally:
             sys.stderr.flush()
             os._exit(code)
 
-    def _write_reasons(self, reasons: Mapping[str, str]) -> None:
-        for agent, reason in reasons.items():
-            text = reason[: REASON_BYTES_MAX // 4]
-            line = orjson.dumps({"pid": os.getpid(), "agent": agent, "reason": text}) + b"\n"
-            os.write(self._reason_write_fd, line)
+    def _write_outcomes(self, outcomes: Mapping[str, Outcome]) -> None:
+        for agent, outcome in outcomes.items():
+            told = {
+                "pid": os.getpid(),
+                "agent": agent,
+                "as_ordered": outcome.as_ordered,
+                "reason": clean_text(outcome.reason)[: REASON_BYTES_MAX // 4],
+                "may_restart": outcome.may_restart,
+            }
+            os.write(self._reason_write_fd, orjson.dumps(told) + b"\n")
 
-    def _read_reasons(self) -> None:
+    def _read_outcomes(self) -> None:
         for line in os.read(self._reason_read_fd, 65_536).splitlines():
             told = orjson.loads(line)
             child = self._children.get(told["pid"])
-            if child is not None:
-                child.reason = (
-                    f"{told['agent']}: {told['reason']}" if child.reason is None else child.reason
-                )
+            if child is None:
+                continue
+            if told["as_ordered"]:
+                child.has_ended_well = True
+                continue
+            child.may_restart = child.may_restart and bool(told["may_restart"])
+            if child.reason is None:
+                child.reason = f"{told['agent']}: {told['reason']}"
 
     def _reap(self) -> None:
         for child in list(self._children.values()):
@@ -173,19 +186,22 @@ class Supervisor:
 
     def _child_ended(self, child: Child, status: int) -> None:
         code = os.waitstatus_to_exitcode(status)
-        if code != 0:
-            _drain(self._reason_read_fd, self._read_reasons)
+        _drain(self._reason_read_fd, self._read_outcomes)
+        if code == 0 and not child.has_ended_well:
+            child.reason = f"{', '.join(child.agents)}: its process ended by itself, exit code 0"
         del self._children[child.pid]
         signal_name = signal.Signals(-code).name if code < 0 else None
         how = _how(code, signal_name, child.reason)
         restarts = self._restarts.get(child.agents, 0)
+        has_failed = code != 0 or not child.has_ended_well
         will_restart = (
-            code != 0
+            has_failed
+            and child.may_restart
             and not self._is_ending
             and self._launch.config.on_agent_loss == "continue"
             and restarts < self._launch.config.agents.restarts_max
         )
-        self._failed = self._failed or code != 0
+        self._failed = self._failed or has_failed
         if self._is_ending and code > 0 and child.reason is None:
             self._tell_killed(
                 child, f"; machines/{self._launch.machine}/stderr.txt shows where it hung"
@@ -196,7 +212,7 @@ class Supervisor:
                     "event": "exited",
                     "agent": agent,
                     "pid": child.pid,
-                    "code": code if code >= 0 else None,
+                    "code": code if code >= 0 and not (has_failed and code == 0) else None,
                     "signal": signal_name,
                     "how": how,
                     "will_restart": will_restart,
@@ -292,10 +308,10 @@ class AgentProcess:
         self._program = program
         self._life_fd = life_fd
         self._runners: dict[str, AgentRunner] = {}
-        self._reasons: dict[str, str] = {}
+        self._outcomes: dict[str, Outcome] = {}
 
-    def run(self) -> dict[str, str]:
-        """Run every agent to its end; returns why, for each that did not end as ordered."""
+    def run(self) -> dict[str, Outcome]:
+        """Run every agent to its end, and return how each ended."""
         reactor = self._reactor
         reactor.on_signal(signal.SIGTERM, lambda: self._end("SIGTERM"))
         reactor.on_signal(signal.SIGINT, lambda: None)
@@ -308,10 +324,9 @@ class AgentProcess:
         grant = apply_scheduling(self._launch.config.scheduling, is_host=False).to_mapping()
         for runner in runners:
             runner.set_scheduling(grant)
-        freeze_garbage()
         reactor.run()
         reactor.close()
-        return self._reasons
+        return self._outcomes
 
     def _make_runner(self, name: str) -> AgentRunner:
         runner = AgentRunner(
@@ -331,12 +346,15 @@ class AgentProcess:
         for runner in list(self._runners.values()):
             runner.emergency(reason)
 
-    def _ended(self, name: str, as_ordered: bool, reason: str) -> None:
+    def _ended(self, name: str, outcome: Outcome) -> None:
         del self._runners[name]
-        if not as_ordered:
-            self._reasons[name] = reason
+        self._outcomes[name] = outcome
         if not self._runners:
             self._reactor.stop()
+
+
+def _failed(agents: Sequence[str], reason: str) -> dict[str, Outcome]:
+    return {agent: Outcome(as_ordered=False, reason=reason, may_restart=True) for agent in agents}
 
 
 def _groups(agents: Sequence[str], per_process: int) -> list[tuple[str, ...]]:

@@ -247,11 +247,11 @@ class Operator:
         elif isinstance(event, AgentExited):
             self._agents_ended.add(event.agent)
             if event.is_abnormal:
-                self._tell_host_exited(event.agent, event.how)
+                self._tell_host_exited(event.agent, event.how, event.pid)
 
-    def _tell_host_exited(self, agent: str, how: str) -> None:
+    def _tell_host_exited(self, agent: str, how: str, pid: int | None = None) -> None:
         if not self._has_host_finished:
-            command = {"command": "agent_exited", "agent": agent, "how": how}
+            command = {"command": "agent_exited", "agent": agent, "how": how, "pid": pid}
             self._children[HOST].channel.send(command)
 
     def _seat_left(self, agent: str) -> None:

@@ -29,12 +29,14 @@ class Tick(NamedTuple):
     index: int  # type: ignore[assignment]  # hides tuple.index, which nobody asks of a tick
     """0 at simulated time zero; skipped ticks leave gaps."""
     t_s: float
-    """Simulated time of the tick's deadline: index / tick_hz."""
+    """Nominal simulated time, index / tick_hz: the same for every agent."""
     period_s: float
     lateness_s: float
     """Wake-up time minus deadline."""
     missed: int
     """Ticks skipped since the one before."""
+    deadline_s: float = 0.0
+    """Simulated time at which this agent's tick was due: t_s plus its phase."""
 
 
 class Context(Protocol):

@@ -189,6 +189,19 @@ class UdpSocket:
         self.sent += 1
         return True
 
+    def counters(self) -> dict[str, int | str | None]:
+        """Return what the kernel took, refused and dropped, as a plain mapping."""
+        return {
+            "sent": self.sent,
+            "received": self.received,
+            "receive_buffer_bytes": self.receive_buffer_bytes,
+            "dropped_by_kernel": self.dropped_by_kernel,
+            "send_refused": self.send_refused,
+            "peer_refused": self.peer_refused,
+            "failures": self.failures,
+            "last_failure": self.last_failure,
+        }
+
     def close(self) -> None:
         """Close the socket; take it out of the reactor first."""
         self._is_closed = True

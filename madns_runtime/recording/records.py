@@ -71,10 +71,10 @@ CLOCK = StreamSchema(
         Field("offset_us", "us"),
         Field("drift_ppm", "1e-6"),
         Field("uncertainty_us", "us"),
-        Field("round_trip_us", "us"),
+        Field("round_trip_us_min", "us"),
     ),
 )
-"""An agent's estimate of the host's clock minus its own."""
+"""An agent's estimate of the host's clock minus its own; the round trip is the window's least."""
 
 EVENTS = StreamSchema(
     "events",
