@@ -46,17 +46,25 @@ def check_schema(schema: StreamSchema) -> None:
         raise PluginError(f"stream {schema.name}: a single field may not be named {names[0]}")
 
 
-def create_file(directory: Path, name: str, suffix: str) -> tuple[Path, int]:
+def create_file(directory: Path, name: str, suffix: str) -> tuple[Path, int, int]:
     """
-    Create the stream's file under the first name that is still free, and return its path and descriptor.
+    Create the stream's file under the first name that is still free.
+
+    Args:
+        directory: Where to.
+        name: The stream's.
+        suffix: A number to begin with, or a word; empty for <name>.jsonl.
+
+    Returns:
+        The file's path, its descriptor, and the number that it got.
 
     Raises:
         MachineError: The directory takes no new file.
     """
-    for path in _candidates(directory, name, suffix):
+    for number, path in _candidates(directory, name, suffix):
         try:
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
-            return path, os.open(path, flags, 0o644)
+            return path, os.open(path, flags, 0o644), number
         except FileExistsError:
             continue
         except OSError as error:
@@ -64,12 +72,12 @@ def create_file(directory: Path, name: str, suffix: str) -> tuple[Path, int]:
     raise MachineError(f"{directory}: holds {SUFFIX_MAX} files of stream {name}; clear it out")
 
 
-def _candidates(directory: Path, name: str, suffix: str) -> Iterator[Path]:
+def _candidates(directory: Path, name: str, suffix: str) -> Iterator[tuple[int, Path]]:
     stem, first = (name, int(suffix)) if suffix.isdecimal() else (name, 1)
     if suffix and not suffix.isdecimal():
         stem = f"{name}.{suffix}"
     for number in range(first, first + SUFFIX_MAX):
-        yield directory / (f"{stem}.jsonl" if number == 1 else f"{stem}.{number}.jsonl")
+        yield number, directory / (f"{stem}.jsonl" if number == 1 else f"{stem}.{number}.jsonl")
 
 
 class StreamFile:

@@ -83,6 +83,7 @@ class Recorder:
         self._level = VERBOSITY_LEVELS[settings.verbosity]
         self._limit_bytes = settings.buffer_bytes
         self._files: dict[str, StreamFile] = {}
+        self._life = 1
         self._queued_bytes = 0
         self._freed_bytes = 0
         self._t0_utc: str | None = None
@@ -96,7 +97,9 @@ class Recorder:
         """
         Create the file of a stream: <name>.jsonl, or <name>.<suffix>.jsonl.
 
-        An existing file is left alone: the next free of .2, .3, ... is taken.
+        An existing file is left alone: the next free of .2, .3, ... is taken. The number that the
+        first stream got is where all others begin: it tells which life of the process they are of, also
+        when an earlier one ended before it had opened them all.
 
         Raises:
             PluginError: The schema is unfit, or a stream of that name is open.
@@ -105,7 +108,10 @@ class Recorder:
         check_schema(schema)
         if schema.name in self._files:
             raise PluginError(f"stream {schema.name}: declared twice")
-        path, descriptor = create_file(self._directory, schema.name, suffix)
+        begin = suffix or str(self._life)
+        path, descriptor, number = create_file(self._directory, schema.name, begin)
+        if not self._files and not suffix:
+            self._life = number
         # A new dictionary, so that the writer thread never walks one that changes.
         self._files = {**self._files, schema.name: StreamFile(schema, path, descriptor)}
 

@@ -10,6 +10,7 @@ from cosmos_cli.collect import collect_run, finish_run
 from cosmos_cli.errors import InputError
 from cosmos_cli.problem import Problem
 from madns_runtime.processes import ProcessEntry
+from madns_runtime.recording.records import EVENTS, TICKS
 
 
 def finish(made, **changes):
@@ -196,6 +197,24 @@ def test_later_incarnation_is_in_the_table_and_its_predecessor_is_named_as_cut(t
     assert set(rows["incarnation"]) == {1, 2}
     assert rows["incarnation"].count(2) == 50
     assert "agents/agent-01/ticks.2.jsonl" in read(made.run.manifest_json)["files"]
+
+
+def test_life_that_ended_before_set_up_does_not_shift_the_numbers_of_the_next(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    for path in (made.run.path / "agents/agent-01").iterdir():
+        path.unlink()
+    first = made.recorder("agents/agent-01", "agent-01", TICKS, EVENTS)
+    first.close()
+    made.write_agent("agent-01")
+
+    finish(made)
+
+    for table in ("ticks", "round_trips"):
+        columns = pq.read_table(
+            made.run.tables / f"{table}.parquet", columns=["agent", "incarnation"]
+        )
+        rows = columns.filter(pq.filters_to_expression([("agent", "==", "agent-01")])).to_pydict()
+        assert set(rows["incarnation"]) == {2}, table
 
 
 def test_interrupted_run_ends_with_130_also_when_it_is_collected_again(tmp_path):

@@ -115,6 +115,17 @@ def test_existing_file_is_left_alone(tmp_path, existing, suffix, expected):
     assert all((tmp_path / name).read_text() == "precious" for name in existing)
 
 
+def test_all_streams_of_one_recorder_begin_at_the_number_of_its_first(tmp_path):
+    other = StreamSchema("own", (Field("x"),))
+    for streams in ((TICKS,), (TICKS, other), (TICKS, other)):
+        recorder = make_recorder(tmp_path)
+        for schema in streams:
+            recorder.open_stream(schema)
+        recorder.close(30)
+
+    assert {path.name for path in tmp_path.glob("own*")} == {"own.2.jsonl", "own.3.jsonl"}
+
+
 @pytest.mark.parametrize("name", ["../ticks", "a/b", "", ".hidden", "a.b", "x" * 65])
 def test_stream_name_that_is_no_file_name_is_refused(tmp_path, name):
     recorder = make_recorder(tmp_path)
