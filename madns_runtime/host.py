@@ -49,7 +49,7 @@ from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import apply as apply_scheduling
 from madns_runtime.reactor.scheduling import die_with_parent, freeze_garbage, outlive_parent
 from madns_runtime.reactor.udp import UdpSocket
-from madns_runtime.reactor.watchdog import end_after_hang_up
+from madns_runtime.reactor.watchdog import end_after_hang_up, extend
 from madns_runtime.recording.records import EVENTS, LOG
 from madns_runtime.recording.writer import Recorder
 from madns_runtime.timing.clock import utc_at_iso, utc_now_iso
@@ -113,7 +113,7 @@ class HostRuntime:
             self._reactor,
             fds,
             on_command=self._command,
-            on_gone=lambda: self._end("operator", OPERATOR_GONE, "aborted"),
+            on_gone=self._operator_gone,
             pending=pending,
         )
         self._socket = UdpSocket.bind(
@@ -375,6 +375,11 @@ class HostRuntime:
                 agent, how, self._reactor.now_s(), pid=None if pid is None else int(pid)
             )
             self._pump()
+
+    def _operator_gone(self) -> None:
+        # Waiting for agents, the sampler's close, the records: each has its own deadline.
+        extend(2 * self._config.timeouts.shutdown_s + SAMPLER_TIMEOUT_S + HANG_GRACE_S)
+        self._end("operator", OPERATOR_GONE, "aborted")
 
     def _terminated(self) -> None:
         """End on SIGTERM, which does not come from the operator: it has a line of its own."""

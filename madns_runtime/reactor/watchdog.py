@@ -11,10 +11,21 @@ import select
 import sys
 import threading
 
+_lock = threading.Lock()
+_has_noticed = False
+
+
+def extend(grace_s: float) -> None:
+    """Give a loop that noticed the hang-up itself *grace_s* to end in good order, instead of what was set."""
+    global _has_noticed  # noqa: PLW0603 - one loop and one watchdog a process
+    with _lock:
+        _has_noticed = True
+        faulthandler.dump_traceback_later(grace_s, exit=True, file=sys.__stderr__ or 2)
+
 
 def end_after_hang_up(fd: int, grace_s: float) -> None:
     """
-    End this process by force *grace_s* after the other end of *fd* has closed.
+    End this process by force *grace_s* after the other end of *fd* has closed; see `extend`.
 
     The thread it starts sleeps in the kernel until then and reads nothing. Who was stuck, and where,
     goes to standard error. The count-down needs no interpreter, so a call into C that never returns
@@ -25,6 +36,9 @@ def end_after_hang_up(fd: int, grace_s: float) -> None:
         poll = select.poll()
         poll.register(fd, 0)  # a closed other end is told without being asked for
         poll.poll()
-        faulthandler.dump_traceback_later(grace_s, exit=True, file=sys.__stderr__ or 2)
+        with _lock:
+            if _has_noticed:
+                return
+            faulthandler.dump_traceback_later(grace_s, exit=True, file=sys.__stderr__ or 2)
 
     threading.Thread(target=watch, name="watchdog", daemon=True).start()
