@@ -15,8 +15,8 @@ from cosmos_cli.feasibility import BITS_PER_BYTE, Feasibility, Inequality, Resou
 from cosmos_cli.models.inventory import load_inventory
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
 from cosmos_cli.plan import LOOPBACK, LaunchPlan, make_plan
-from madns_runtime.plugin.api import Demand, Flow
-from madns_runtime.plugin.registry import load_function
+from madns_runtime.plugin.api import Flow
+from madns_runtime.plugin.questions import ask_demand
 
 LATENCY_MS_UNKNOWN = 0.5
 """One way over a switch: the thesis's 1 ms is a bound, its own network was quicker."""
@@ -109,10 +109,12 @@ def _feasibility(scenario_file: ScenarioFile, resources: Resources) -> Feasibili
     simulation, agents = scenario_file.simulation, scenario_file.scenario.agents
     if simulation.demand is None:
         return None
-    base_directory = scenario_file.base_directory
-    function = load_function(simulation.demand, base_directory)
-    demand: Demand = function(
-        scenario_file.parameters, agents.count, agents.tick_hz, base_directory
+    demand = ask_demand(
+        simulation.demand,
+        scenario_file.base_directory,
+        parameters=scenario_file.parameters,
+        agents=agents.count,
+        tick_hz=agents.tick_hz,
     )
     demand = dataclasses.replace(demand, flows=(*demand.flows, *FRAMEWORK_FLOWS))
     return judge(demand, resources, agents=agents.count, tick_hz=agents.tick_hz)

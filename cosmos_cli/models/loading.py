@@ -18,9 +18,11 @@ from cosmos_cli.models.scenario import Scenario, cross_faults
 from cosmos_cli.models.translate import faults_of
 from cosmos_cli.models.yaml_source import read_source
 from madns_runtime.config import RunConfig, to_mapping
-from madns_runtime.errors import MadnsError
+from madns_runtime.errors import MadnsError, PluginError
 from madns_runtime.plugin.api import Simulation
-from madns_runtime.plugin.registry import load_function, resolve
+from madns_runtime.plugin.guard import blame, said
+from madns_runtime.plugin.questions import ask_check
+from madns_runtime.plugin.registry import is_file, part_faults, resolve
 
 _PLACEHOLDERS = {"name": "x", "simulation": "x", "agents": {"count": 1}}
 """Stand in for sections with faults, while the others are checked against each other."""
@@ -148,9 +150,12 @@ def _simulation(document: Document, base_directory: Path) -> tuple[Simulation | 
     if not isinstance(spec, str) or not spec:
         return None, []  # the model has said so already
     try:
-        return resolve(spec, base_directory), []
+        simulation = resolve(spec, base_directory)
     except MadnsError as error:
         return None, [document.fault(("simulation",), str(error))]
+    # Whoever writes a file wants to hear of all its slips; an installed simulation's halves stay unloaded.
+    texts = part_faults(simulation, base_directory) if is_file(spec) else []
+    return simulation, [document.fault(("simulation",), text) for text in texts]
 
 
 def _parameters(document: Document, simulation: Simulation) -> tuple[Any, list[Fault]]:
@@ -165,6 +170,10 @@ def _parameters(document: Document, simulation: Simulation) -> tuple[Any, list[F
             document.value["parameters"] = {}
         errors = error.errors(include_url=False)
         return None, faults_of(document, errors, simulation.parameters, below=("parameters",))
+    except Exception as error:  # noqa: BLE001 - a plug-in's class may raise anything
+        kind = simulation.parameters
+        text = f"{blame(error, kind)}: {kind.__name__}: {said(error)}"
+        return None, [document.fault(("simulation",), text)]
 
 
 def _plugin_faults(
@@ -177,7 +186,10 @@ def _plugin_faults(
     """Ask the simulation itself: it knows of missing files and of what fits together."""
     if simulation.check is None:
         return []
-    texts = load_function(simulation.check, base_directory)(parameters, agents, base_directory)
+    try:
+        texts = ask_check(simulation.check, base_directory, parameters=parameters, agents=agents)
+    except PluginError as error:
+        return [document.fault(("simulation",), str(error))]
     return [_plugin_fault(document, text) for text in texts]
 
 

@@ -8,6 +8,7 @@ that resolves it, and its classes can be found again by name.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import hashlib
@@ -17,7 +18,7 @@ import inspect
 import re
 import sys
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
@@ -26,16 +27,10 @@ from typing import Any, Literal
 from madns_runtime.config import from_mapping
 from madns_runtime.errors import MissingExtraError, PluginError
 from madns_runtime.plugin.api import AgentSimulation, HostSimulation, Simulation
+from madns_runtime.plugin.guard import missing_extra, place_of, said, talk_on_stderr
 
 GROUP = "madns.simulations"
 MODULE_PREFIX = "madns_plugin_"
-EXTRA_OF_MODULE = {
-    "pyarrow": "host",
-    "scipy": "host",
-    "sgp4": "host",
-    "zstandard": "host",
-    "sense_hat": "sense-hat",
-}
 HOST_METHODS = (
     "setup",
     "initial_data",
@@ -100,7 +95,7 @@ def load_half(descriptor: Simulation, role: Role, base_directory: Path) -> Calla
     half = _attribute(module, attribute, where)
     faults = _contract_faults(half, role)
     if faults:
-        raise PluginError(f"{where}: {'; '.join(faults)}")
+        raise PluginError(f"{_told(where, half)}: {'; '.join(faults)}")
     return half  # type: ignore[no-any-return]
 
 
@@ -115,8 +110,30 @@ def load_function(where: str, base_directory: Path) -> Callable[..., Any]:
     module, attribute = _load_module_of(where, base_directory)
     function = _attribute(module, attribute, where)
     if not callable(function):
-        raise PluginError(f"{where}: expected a function, got {type(function).__name__}")
+        raise PluginError(f"{_told(where)}: expected a function, got {type(function).__name__}")
     return function  # type: ignore[no-any-return]
+
+
+def part_faults(descriptor: Simulation, base_directory: Path) -> list[str]:
+    """
+    Import every part that a descriptor names, and say what is wrong with each.
+
+    For a file that somebody is writing just now: a registered simulation's parts are loaded when
+    they are needed, as its host may import a large library.
+    """
+    faults = []
+    for role in ("agent", "host"):
+        faults += _fault_of(lambda role=role: load_half(descriptor, role, base_directory))  # type: ignore[misc]
+    for where in (descriptor.demand, descriptor.check):
+        if where is not None:
+            faults += _fault_of(lambda where=where: load_function(where, base_directory))  # type: ignore[misc]
+    return faults
+
+
+def is_file(spec: str) -> bool:
+    """Tell whether a spec names a file beside the scenario, and no installed module."""
+    place = spec.rpartition(":")[0]
+    return place.endswith(".py") or "/" in place
 
 
 def parse_parameters(descriptor: Simulation, mapping: Mapping[str, Any]) -> Any:
@@ -145,7 +162,7 @@ def _load_module_of(where: str, base_directory: Path) -> tuple[ModuleType, str]:
     place, _, attribute = where.rpartition(":")
     if not place or not attribute.isidentifier():
         raise PluginError(f"{where!r}: expected module:attribute or ./file.py:attribute")
-    if place.endswith(".py") or "/" in place:
+    if is_file(where):
         return _load_file(base_directory / place, where), attribute
     if place.startswith(MODULE_PREFIX) and place in sys.modules:
         return sys.modules[place], attribute
@@ -154,11 +171,12 @@ def _load_module_of(where: str, base_directory: Path) -> tuple[ModuleType, str]:
 
 def _load_module(name: str, where: str) -> ModuleType:
     try:
-        return importlib.import_module(name)
+        with talk_on_stderr():
+            return importlib.import_module(name)
     except ImportError as error:
         raise _translated(error, where) from error
-    except Exception as error:  # a plug-in may raise anything while it is imported
-        raise PluginError(f"{where}: {_last_place(error, name)}{_said(error)}") from error
+    except (Exception, SystemExit) as error:  # a plug-in may raise anything while it is imported
+        raise PluginError(f"{where}: {_last_place(error, name)}{said(error)}") from error
 
 
 def _load_file(path: Path, where: str) -> ModuleType:
@@ -174,15 +192,29 @@ def _load_file(path: Path, where: str) -> ModuleType:
     module = importlib.util.module_from_spec(specification)
     sys.modules[name] = module  # before it runs: its dataclasses look their module up by name
     try:
-        specification.loader.exec_module(module)
+        with talk_on_stderr(), _neighbours_importable(path.parent):
+            specification.loader.exec_module(module)
     except BaseException as error:
         del sys.modules[name]
         if isinstance(error, ImportError):
             raise _translated(error, f"{path}{_line_in(error, path)}") from error
-        if isinstance(error, Exception):
-            raise PluginError(f"{path}{_line_in(error, path)}: {_said(error)}") from error
+        if isinstance(error, Exception | SystemExit):
+            raise PluginError(f"{path}{_line_in(error, path)}: {said(error)}") from error
         raise
     return module
+
+
+@contextlib.contextmanager
+def _neighbours_importable(folder: Path) -> Iterator[None]:
+    """Let a file import its neighbours while it loads; last in the path, so that none hides an installed module."""
+    entry = str(folder)
+    sys.path.append(entry)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(ValueError):
+            # From the end: the same folder may have been there before.
+            del sys.path[len(sys.path) - 1 - sys.path[::-1].index(entry)]
 
 
 def module_name(path: Path) -> str:
@@ -192,10 +224,36 @@ def module_name(path: Path) -> str:
 
 
 def _translated(error: ImportError, where: str) -> PluginError | MissingExtraError:
-    missing = (error.name or "").partition(".")[0]
-    if isinstance(error, ModuleNotFoundError) and missing in EXTRA_OF_MODULE:
-        return MissingExtraError(missing, EXTRA_OF_MODULE[missing])
-    return PluginError(f"{where}: {error}")
+    return missing_extra(error) or PluginError(f"{where}: {error}")
+
+
+def _fault_of(load: Callable[[], object]) -> list[str]:
+    try:
+        load()
+    except (PluginError, MissingExtraError) as error:
+        return [str(error)]
+    return []
+
+
+def _told(where: str, thing: Any = None) -> str:
+    """Return *where* as its writer knows it: of a file's part, its file and line instead of the module's name."""
+    place, _, attribute = where.rpartition(":")
+    module = sys.modules.get(place)
+    if not place.startswith(MODULE_PREFIX) or module is None:
+        return where
+    file = str(module.__file__)
+    if getattr(thing, "__module__", None) == place:
+        return f"{place_of(thing)}: {attribute}"
+    return f"{file}{_line_naming(file, attribute)}: {attribute}"
+
+
+def _line_naming(file: str, attribute: str) -> str:
+    """Return :LINE of the line that names a part as the descriptor does."""
+    with contextlib.suppress(OSError, UnicodeDecodeError):
+        for number, line in enumerate(Path(file).read_text(encoding="utf-8").splitlines(), 1):
+            if f':{attribute}"' in line or f":{attribute}'" in line:
+                return f":{number}"
+    return ""
 
 
 def _line_in(error: BaseException, path: Path) -> str:
@@ -210,17 +268,12 @@ def _line_in(error: BaseException, path: Path) -> str:
     return f":{lines[-1]}" if lines else ""
 
 
-def _last_place(error: Exception, module: str) -> str:
+def _last_place(error: BaseException, module: str) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     if isinstance(error, SyntaxError):
         return f"{error.filename}:{error.lineno}: "
     outside = [f for f in frames if "importlib" not in f.filename and f.filename != __file__]
     return f"{outside[-1].filename}:{outside[-1].lineno}: " if outside else f"{module}: "
-
-
-def _said(error: BaseException) -> str:
-    text = error.msg if isinstance(error, SyntaxError) else str(error)
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 def _attribute(module: ModuleType, name: str, where: str) -> Any:
@@ -230,6 +283,8 @@ def _attribute(module: ModuleType, name: str, where: str) -> Any:
         public = [key for key in vars(module) if not key.startswith("_")]
         close = difflib.get_close_matches(name, public, n=1)
         hint = f", did you mean {close[0]}?" if close else ""
+        if where.startswith(MODULE_PREFIX):
+            raise PluginError(f"{_told(where)}: there is no {name!r}{hint}") from None
         file = getattr(module, "__file__", None) or module.__name__
         raise PluginError(f"{where}: {file} has no {name!r}{hint}") from None
 

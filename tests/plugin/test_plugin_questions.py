@@ -1,0 +1,182 @@
+"""Faults of what a plug-in does outside of a run: while it is imported, in check and in demand."""
+
+import sys
+import textwrap
+
+import pytest
+
+from madns_runtime.errors import PluginError
+from madns_runtime.plugin import registry
+from madns_runtime.plugin.questions import ask_check, ask_demand
+
+HEAD = """\
+from dataclasses import dataclass
+from madns_runtime.plugin.api import AgentSimulation, Demand, Flow, Simulation
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Parameters:
+    gain: float = 2.0
+class Agent(AgentSimulation):
+    pass
+simulation = Simulation(
+    name="p", parameters=Parameters, agent=":Agent", check=":check", demand=":demand"
+)
+def check(parameters, agents, base_directory):
+    return []
+def demand(parameters, agents, tick_hz, base_directory):
+    return None
+"""
+LAST_LINE = HEAD.count("\n")
+
+
+@pytest.fixture
+def plugin(tmp_path):
+    """Return a function that writes a plug-in of HEAD and more; it returns the file."""
+
+    def write(more="", *, head=HEAD, name="plugin.py"):
+        path = tmp_path / name
+        path.write_text(head + textwrap.dedent(more))
+        return path
+
+    yield write
+    for name in [
+        n for n, m in sys.modules.items() if str(tmp_path) in str(vars(m).get("__file__"))
+    ]:
+        del sys.modules[name]
+
+
+def ask(path, question):
+    where = f"{path}:{question}"
+    if question == "check":
+        return ask_check(where, path.parent, parameters=None, agents=3)
+    return ask_demand(where, path.parent, parameters=None, agents=3, tick_hz=10.0)
+
+
+def refusal(path, question):
+    with pytest.raises(PluginError) as caught:
+        ask(path, question)
+    return str(caught.value)
+
+
+def test_plugin_that_ends_the_process_while_it_is_imported_is_to_blame(plugin):
+    path = plugin("import sys\nsys.exit(0)\n", head="")
+
+    with pytest.raises(PluginError) as caught:
+        registry.resolve(f"{path}:simulation", path.parent)
+
+    assert str(caught.value) == f"{path}:2: it called sys.exit(0)"
+
+
+def test_installed_module_that_ends_the_process_is_to_blame(plugin, monkeypatch):
+    path = plugin("raise SystemExit\n", head="", name="ends_at_once.py")
+    monkeypatch.syspath_prepend(path.parent)
+
+    with pytest.raises(PluginError, match=r"ends_at_once.py:1: it called sys.exit\(\)"):
+        registry.resolve("ends_at_once:simulation", path.parent)
+
+
+def test_what_a_plugin_prints_while_it_is_loaded_or_asked_goes_to_stderr(plugin, capsys):
+    path = plugin("""
+        print("while importing")
+        def check(*_):
+            print("while checking")
+            yield "gain: odd"
+    """)
+
+    assert ask(path, "check") == ["gain: odd"]
+
+    assert capsys.readouterr() == ("", "while importing\nwhile checking\n")
+
+
+@pytest.mark.parametrize("question", ["check", "demand"])
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ("return 1 / 0", "ZeroDivisionError: division by zero"),
+        ("import sys; sys.exit(0)", "it called sys.exit(0)"),
+    ],
+)
+def test_question_that_raises_is_told_with_its_line(plugin, question, body, said):
+    path = plugin(f"def {question}(*_):\n    {body}\n")
+
+    assert refusal(path, question) == f"{path}:{LAST_LINE + 2}: {question}(): {said}"
+
+
+def test_check_that_raises_while_it_yields_is_told_with_its_line(plugin):
+    path = plugin("def check(*_):\n    yield 'a: b'\n    raise ValueError('late')\n")
+
+    assert refusal(path, "check") == f"{path}:{LAST_LINE + 3}: check(): ValueError: late"
+
+
+@pytest.mark.parametrize("value", ["None", "3", "'gain: odd'", "[3]"])
+def test_check_that_returns_no_list_of_texts_is_told_with_its_place(plugin, value):
+    path = plugin(f"def check(*_):\n    return {value}\n")
+
+    message = refusal(path, "check")
+
+    assert message.startswith(f"{path}:{LAST_LINE + 1}: check() must return a list of texts")
+    assert message.endswith(f"got {value}")
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("buffer_s", "'1'"), ("lead_s", "float('nan')"), ("batch_bytes", "-1"), ("flows", "3")],
+)
+def test_demand_with_a_bad_figure_is_told_with_its_place(plugin, field, value):
+    path = plugin(f"""
+        GOOD = dict(flows=(Flow(name="a", message_bytes=3, rate_hz=1.0),), buffer_s=1.0,
+            batch_bytes=0, batch_compute_s=0.0, sync_bytes=0, sync_compute_s=0.0,
+            sync_rate_hz=0.0, lead_s=0.0, measured=False)
+        def demand(*_):
+            return Demand(**GOOD | {{"{field}": {value}}})
+    """)
+
+    message = refusal(path, "demand")
+
+    assert message.startswith(f"{path}:{LAST_LINE + 5}: demand() must return")
+    assert field in message
+
+
+def test_demand_that_is_none_is_told_with_its_place(plugin):
+    path = plugin()
+
+    assert refusal(path, "demand") == (
+        f"{path}:{LAST_LINE - 1}: demand() must return a madns_runtime.plugin.api.Demand, got None"
+    )
+
+
+def test_neighbour_of_a_plugin_file_can_be_imported_by_it(plugin):
+    plugin("FACTOR = 3\n", head="", name="neighbour_of_plugin.py")
+    path = plugin("from neighbour_of_plugin import FACTOR\n")
+    before = list(sys.path)
+
+    registry.resolve(f"{path}:simulation", path.parent)
+
+    assert sys.path == before
+    assert sys.modules[registry.module_name(path)].FACTOR == 3
+
+
+def test_neighbour_of_a_plugin_file_hides_no_installed_module(plugin):
+    plugin("raise RuntimeError('hidden')\n", head="", name="colorsys.py")
+    path = plugin("import colorsys\n")
+
+    assert registry.resolve(f"{path}:simulation", path.parent).name == "p"
+
+
+def test_every_faulty_part_of_a_file_is_told_with_its_line_and_not_with_a_modules_name(plugin):
+    path = plugin("""
+        class Host:
+            def setup(self): pass
+        broken = Simulation(name="p", parameters=Parameters, agent=":Agnt", host=":Host", check=":chck")
+    """)
+    descriptor = registry.resolve(f"{path}:broken", path.parent)
+
+    faults = registry.part_faults(descriptor, path.parent)
+
+    assert [fault.split(": ")[0] for fault in faults] == [
+        f"{path}:{LAST_LINE + 4}",
+        f"{path}:{LAST_LINE + 2}",
+        f"{path}:{LAST_LINE + 4}",
+    ]
+    assert "there is no 'Agnt', did you mean Agent?" in faults[0]
+    assert "no method initial_data()" in faults[1]
+    assert registry.MODULE_PREFIX not in "".join(faults)
