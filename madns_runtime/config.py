@@ -22,6 +22,10 @@ from madns_runtime.errors import ConfigurationError
 T = TypeVar("T")
 
 AGENTS_MAX = 5000
+SEED_MAX = 2**63 - 1
+"""A seed travels in messages as a signed integer of 64 bits."""
+DURATION_S_MAX = 10 * 365.25 * 86_400.0
+"""Ten years: a tick's number and every clock of a run stay exact far beyond it."""
 FORBID_EXTRA = {"extra": "forbid", "use_attribute_docstrings": True}
 
 
@@ -60,7 +64,7 @@ class TimeSettings:
 
     mode: Literal["realtime"] = "realtime"
     """Simulated seconds pass as wall seconds do."""
-    duration_s: Annotated[float, Gt(0)] = 60.0
+    duration_s: Annotated[float, Gt(0), Le(DURATION_S_MAX)] = 60.0
     """Simulated time of the run, s."""
     rtf_tolerance: Annotated[float, Gt(0)] = 1e-3
     """Largest deviation of the real-time factor from 1."""
@@ -190,7 +194,7 @@ class RunConfig:
     health: Health = field(default_factory=Health)
     executor: ExecutorSettings = field(default_factory=ExecutorSettings)
     on_agent_loss: Literal["abort", "continue"] = "abort"
-    seed: int = 0
+    seed: Annotated[int, Ge(0), Le(SEED_MAX)] = 0
     parameters: Mapping[str, Any] = field(default_factory=dict)
     """The simulation's own, already validated, defaults filled in."""
 

@@ -12,21 +12,29 @@ from cosmos_cli.errors import InputError
 from cosmos_cli.models.schema import schema_text
 from madns_runtime.plugin.registry import registered_names, resolve
 
+KEPT = Path("scenarios/scenario.schema.json")
+"""Where this repository keeps it, for editors and for `--check`."""
+
 
 def schema(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="Write to FILE.")
     ] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Write nothing; fail if FILE is not current.")
+        bool,
+        typer.Option(
+            "--check", help=f"Write nothing; fail if FILE, by default {KEPT}, is not current."
+        ),
     ] = False,
 ) -> None:
     """Print the JSON Schema of scenarios, for completion in editors."""
     console = Console()
     text = schema_text({name: resolve(name, Path()).parameters for name in registered_names()})
+    if check and output is None:
+        output = KEPT
+        if not output.is_file():
+            raise InputError(f"{output}: no such file here; name the file to check with --output")
     if output is None:
-        if check:
-            raise typer.BadParameter("--check needs --output FILE: the file to check")
         console.data(text.rstrip("\n"))
         return
     try:

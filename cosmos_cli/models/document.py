@@ -43,6 +43,8 @@ class Document:
     key_places: dict[Path, Place] = field(default_factory=dict)
     texts: dict[Path, str] = field(default_factory=dict)
     """Scalars as they are written."""
+    faults: list[Fault] = field(default_factory=list)
+    """Of single scalars, which are None in `value`: everything else can be checked all the same."""
 
     def fault(self, path: Path, text: str, *, at_key: bool = False) -> Fault:
         """Return a fault at the place of *path*, or of the nearest parent that was written."""
@@ -99,6 +101,8 @@ def read_document(source: Source) -> Document:
 
     Raises:
         InputError: Every fault of syntax, and every duplicate or unsuitable key.
+
+    A scalar without a meaning, such as a number that is not finite, is in the document's `faults`.
     """
     root = compose(source)
     document = Document(source)
@@ -109,7 +113,9 @@ def read_document(source: Source) -> Document:
     builder = _Builder(document)
     value = builder.build(root, ())
     if builder.faults:
-        raise InputError(faults=builder.faults)
+        raise InputError(faults=builder.faults + document.faults)
+    if document.faults and not isinstance(value, dict):
+        raise InputError(faults=document.faults)
     if not isinstance(value, dict):
         text = f"expected a mapping (key: value), got {kind_of(value)}"
         raise InputError(faults=[source.fault(text, line=root.line, column=root.column)])
@@ -151,6 +157,10 @@ class _Builder:
         if isinstance(node.value, list):
             items: Any = node.value
             return [self.build(item, (*path, index)) for index, item in enumerate(items)]
+        if node.fault:
+            fault = self._at(node, node.fault, path)
+            if all((f.line, f.column) != (node.line, node.column) for f in self.document.faults):
+                self.document.faults.append(fault)  # an alias stands for what was told already
         if node.is_plain:
             self.document.texts[path] = node.text
         return node.value
@@ -243,8 +253,9 @@ def parse_override(override: str) -> tuple[str, Path, Any]:
         value = builder.build(root, ()) if root else None
     except InputError as error:
         raise _override_error(key, error.faults[0].text) from None
-    if builder.faults:
-        raise _override_error(key, builder.faults[0].text)
+    faults = builder.faults + builder.document.faults
+    if faults:
+        raise _override_error(key, faults[0].text)
     return key, path, value
 
 

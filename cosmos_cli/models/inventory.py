@@ -84,7 +84,7 @@ def load_inventory(path: Path) -> tuple[Machine, ...]:
         InputError: With every fault found, in the order of the file.
     """
     document = read_document(read_source(path))
-    reader = _Reader(document)
+    reader = _Reader(document, faults=list(document.faults))
     for name, value in document.value.items():
         reader.group(name, value, (name,), ())
     if not reader.faults and not reader.own:

@@ -79,6 +79,7 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> ScenarioFile:
     """
     document = read_document(read_source(path))
     faults = apply_overrides(document, overrides)
+    faults += document.faults
     return _check(document, path, tuple(overrides), faults)
 
 
@@ -99,7 +100,7 @@ def _check(
             )
         faults += parameter_faults
     if scenario is None or simulation is None or faults:
-        raise InputError(faults=sorted(faults, key=_order))
+        raise InputError(faults=sorted(_told_once(faults, document.faults), key=_order))
     return ScenarioFile(
         path=path,
         text=document.source.text,
@@ -108,6 +109,12 @@ def _check(
         simulation=simulation,
         parameters=parameters,
     )
+
+
+def _told_once(faults: Sequence[Fault], scalars: Sequence[Fault]) -> list[Fault]:
+    """Leave out what follows from a scalar without a value: that it is missing, or of the wrong type."""
+    places = {(fault.line, fault.column) for fault in scalars}
+    return [f for f in faults if f in scalars or f.override or (f.line, f.column) not in places]
 
 
 def _order(fault: Fault) -> tuple[bool, int, int]:

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from madns_runtime.config import (
+    SEED_MAX,
     Agents,
     Deadline,
     ExecutorSettings,
@@ -66,7 +67,7 @@ class Scenario(BaseModel):
     """Who does the host's long work."""
     on_agent_loss: Literal["abort", "continue"] = "abort"
     """Whether the run ends when an agent is lost, or goes on without it."""
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Annotated[int, Field(ge=0, le=SEED_MAX)] = 0
     """Seed of every random number in the run."""
     parameters: dict[str, Any] = {}
     """The simulation's own settings."""
@@ -157,6 +158,10 @@ def _restarts(scenario: Scenario) -> Iterator[SectionFault]:
     if scenario.agents.restarts_max and scenario.on_agent_loss == "abort":
         text = f"expected 0 with on_agent_loss: abort, got {scenario.agents.restarts_max}"
         yield ("agents", "restarts_max"), f"{text}; say on_agent_loss: continue"
+    if scenario.agents.restarts_max and scenario.agents.per_process > 1:
+        text = f"expected 0 with agents.per_process: {scenario.agents.per_process}"
+        why = "an agent that shares its process cannot be started again alone"
+        yield ("agents", "restarts_max"), f"{text}, got {scenario.agents.restarts_max}: {why}"
 
 
 def _executor(scenario: Scenario) -> Iterator[SectionFault]:

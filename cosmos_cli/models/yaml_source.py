@@ -58,6 +58,8 @@ class Node:
     is_mapping: bool = False
     text: str = ""
     """A scalar as it is written."""
+    fault: str = ""
+    """What is wrong with a scalar that has no value; the rest of the file can be read all the same."""
     is_plain: bool = False
 
 
@@ -207,7 +209,8 @@ class _Composer:
         try:
             node.value = resolve_scalar(event.value)
         except ValueError as error:
-            raise self.error(str(error), event) from None
+            node.value, node.fault = None, str(error)
+            return
         if event.tag is None:
             return
         names = {bool: "bool", int: "int", float: "float", type(None): "null"}

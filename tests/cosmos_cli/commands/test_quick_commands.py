@@ -97,6 +97,13 @@ def test_schema_is_printed_written_and_checked(cosmos):
     assert err == "error: s.json: is not current; write it with: cosmos schema --output s.json\n"
 
 
+def test_schema_that_is_kept_in_scenarios_is_checked_by_default(cosmos):
+    Path("scenarios").mkdir()
+    cosmos("schema", "-o", "scenarios/scenario.schema.json")
+
+    assert cosmos("schema", "--check") == (0, "", "scenarios/scenario.schema.json: current\n")
+
+
 def test_schema_that_cannot_be_written_says_why(cosmos):
     assert cosmos("schema", "-o", "no/s.json") == (
         2,
@@ -214,7 +221,10 @@ def test_init_refuses_names_that_no_scenario_can_have(cosmos, name):
         (["vlidate"], "error: no command 'vlidate'; did you mean validate?\nsee `cosmos --help`\n"),
         (["validate"], "error: Missing argument 'FILE...'.\nsee `cosmos validate --help`\n"),
         (["validate", "--jsn"], "see `cosmos validate --help`\n"),
-        (["schema", "--check"], "--check needs --output FILE: the file to check"),
+        (
+            ["schema", "--check"],
+            "error: scenarios/scenario.schema.json: no such file here; name the file to check",
+        ),
         (["plan", "a.yaml", "--workers", "0"], "see `cosmos plan --help`\n"),
     ],
 )

@@ -195,6 +195,23 @@ def test_missing_keys_are_placed_at_what_lacks_them(see):
             "say on_agent_loss: continue",
         ),
         (
+            "on_agent_loss: continue\nagents: {count: 3, restarts_max: 2, per_process: 3}",
+            "a.yaml:4:34: agents.restarts_max: expected 0 with agents.per_process: 3, got 2: "
+            "an agent that shares its process cannot be started again alone",
+        ),
+        (
+            "agents: {count: 3}\nseed: 9223372036854775808",
+            "a.yaml:4:7: seed: expected <= 9223372036854775807, got 9223372036854775808",
+        ),
+        (
+            "agents: {count: 3}\ntime: {duration_s: 4e8}",
+            "a.yaml:4:20: time.duration_s: expected <= 315576000, got 4e8",
+        ),
+        (
+            "agents: {count: 3, tick_hz: .nan}",
+            "a.yaml:3:29: agents.tick_hz: expected a finite number, got .nan",
+        ),
+        (
             "agents: {count: 3, tick_hz: 0.01}",
             "a.yaml:1:1: time.duration_s: expected at least one tick (100 s at 0.01 Hz), got 60",
         ),
@@ -205,6 +222,18 @@ def test_each_mistake_has_its_sentence(see, line, shown):
 
     assert see(text).split("\n")[0] == shown
     assert see(text).count("\n") == 2  # one fault: the sentence, the source, the caret
+
+
+def test_numbers_that_are_not_finite_are_told_among_all_other_faults(see):
+    shown = see(
+        "name: a\nsimulation: counter\nagents: {count: .inf}\ntime: {duration_s: .nan}\nsed: 3\n"
+    )
+
+    assert [line for line in shown.splitlines() if line.startswith("a.yaml")] == [
+        "a.yaml:3:17: agents.count: expected a finite number, got .inf",
+        "a.yaml:4:20: time.duration_s: expected a finite number, got .nan",
+        "a.yaml:5:1: sed: unknown key, did you mean seed?",
+    ]
 
 
 def test_sections_without_faults_are_checked_against_each_other_even_if_another_is_broken(see):

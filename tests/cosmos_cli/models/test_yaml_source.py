@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cosmos_cli.errors import InputError
+from cosmos_cli.models.document import read_document
 from cosmos_cli.models.yaml_source import DEPTH_MAX, Source, compose, read_source, resolve_scalar
 
 
@@ -93,7 +94,6 @@ def fault_of(text):
         ("a: !thing 3\n", (1, 4), "expected a plain value, got the tag !thing"),
         ("a: !!python/object:os.x 3\n", (1, 4), "expected a plain value, got the tag !!python"),
         ("a: 1\n---\nb: 1\n", (2, 1), "expected one document, a second one starts here"),
-        ("a: .inf\n", (1, 4), "expected a finite number, got .inf"),
         ("a: 1\nb: \x07\n", (2, 4), "got the control character U+0007"),
     ],
 )
@@ -191,3 +191,12 @@ def test_huge_file_is_refused(tmp_path):
     path.write_bytes(b"#" * (4 * 1024 * 1024 + 1))
 
     assert "expected at most 4194304 bytes" in whole_fault(path)
+
+
+def test_scalar_without_a_value_does_not_stop_the_reading_of_the_rest():
+    document = read_document(Source.of("x", "a: &n .inf\nb: *n\nc: 3\n"))
+
+    assert document.value == {"a": None, "b": None, "c": 3}
+    assert [(f.line, f.column, f.path, f.text) for f in document.faults] == [
+        (1, 4, "a", "expected a finite number, got .inf")
+    ]
