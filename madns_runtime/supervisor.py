@@ -174,7 +174,8 @@ class Supervisor:
                 continue
             child.may_restart = child.may_restart and bool(told["may_restart"])
             if child.reason is None:
-                child.reason = f"{told['agent']}: {told['reason']}"
+                is_alone = len(child.agents) == 1
+                child.reason = told["reason"] if is_alone else f"{told['agent']}: {told['reason']}"
 
     def _reap(self) -> None:
         for child in list(self._children.values()):
@@ -188,7 +189,7 @@ class Supervisor:
         code = os.waitstatus_to_exitcode(status)
         _drain(self._reason_read_fd, self._read_outcomes)
         if code == 0 and not child.has_ended_well:
-            child.reason = f"{', '.join(child.agents)}: its process ended by itself, exit code 0"
+            child.reason = "its process ended by itself, exit code 0"
         del self._children[child.pid]
         signal_name = signal.Signals(-code).name if code < 0 else None
         how = _how(code, signal_name, child.reason)
