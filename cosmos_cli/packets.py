@@ -17,14 +17,14 @@ OWN_NAMES = ("lost", "duplicated", "out_of_order")
 """As a simulation's summary calls them."""
 
 
-def packet_counts(agents: Mapping[str, Any]) -> dict[str, dict[str, int]]:
+def packet_counts(agents: Mapping[str, Any]) -> dict[str, dict[str, int | None]]:
     """
     Return lost, duplicated and out_of_order by agent; empty where no simulation counts packets.
 
     Args:
         agents: The host's result by agent: "messages" of its link, "simulation" as it summed up.
 
-    An agent that died summed nothing up: of it the link's counters are told alone. A packet that came
+    An agent that died summed nothing up: of it the link's counters are told alone, None if it has none. A packet that came
     behind a newer one counts as out of order, and as lost too, for it never reached the simulation.
     """
     own = {name: mapping_at(agents, name, "simulation") for name in agents}
@@ -50,8 +50,9 @@ def duplicates_by_service(agents: Mapping[str, Any]) -> dict[str, int]:
 
 def _of_agent(
     messages: Mapping[str, Any], own: Mapping[str, Any], services: tuple[str, ...]
-) -> dict[str, int]:
-    link_lost = sum(_whole(mapping_at(messages, service).get("lost")) for service in services)
+) -> dict[str, int | None]:
+    of_link = [mapping_at(messages, service).get("lost") for service in services]
+    link_lost = None if None in of_link else sum(map(_whole, of_link))
     return {
         "lost": _whole(own["lost"]) if "lost" in own else link_lost,
         "duplicated": _whole(own.get("duplicated")) + _sum(messages, services, "duplicates"),

@@ -47,6 +47,13 @@ def test_agent_that_summed_nothing_up_has_its_links_counts():
     assert counts["b"] == {"lost": 9, "duplicated": 2, "out_of_order": 3}
 
 
+def test_loss_that_nobody_counted_is_not_told_as_none_lost():
+    own = {"service": "reliable", "lost": 0, "duplicated": 0, "out_of_order": 0}
+    dead = agent({}, reliable={"lost": None}, host={})
+
+    assert packet_counts({"a": agent(own), "b": dead})["b"]["lost"] is None
+
+
 def test_simulation_that_counts_no_packets_has_none():
     assert packet_counts({"a": agent({"satellite": "x"}, host={"best": {"late": 3}})}) == {}
 
