@@ -115,6 +115,9 @@ def cosmos(
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and end the process with the exit code of DESIGN 9."""
+    from cosmos_cli.console import open_standard_streams
+
+    open_standard_streams()
     sys.exit(run(sys.argv[1:] if arguments is None else list(arguments)))
 
 
@@ -125,8 +128,7 @@ def run(arguments: list[str]) -> int:
         code = typer.main.get_command(make_app()).main(
             arguments, prog_name="cosmos", standalone_mode=False
         )
-        sys.stdout.flush()
-        return int(code) if isinstance(code, int) else int(ExitCode.OK)
+        return _flushed(int(code) if isinstance(code, int) else int(ExitCode.OK))
     except (CosmosError, MadnsError) as error:
         has_places = isinstance(error, InputError) and error.faults
         return _report(describe(error), str(error), wants_json, bare=bool(has_places))
@@ -136,6 +138,8 @@ def run(arguments: list[str]) -> int:
         return _report(_plain("interrupted", "interrupted", 130), "interrupted", wants_json)
     except BrokenPipeError:
         return _leave_quietly()
+    except OSError as error:
+        return _report_lost_output(error, wants_json)
     except Exception as error:  # noqa: BLE001 - the last seam: a defect of ours still ends in one line
         return _report_unexpected(error, wants_json)
 
@@ -179,6 +183,29 @@ def _report_unexpected(error: Exception, wants_json: bool) -> int:
         advice = f"this is a defect of COSMoS; please report it with the traceback in {path}"
     text = f"{head}\n{advice}"
     return _report(_plain("unexpected", text, ExitCode.RUN_FAILED), text, wants_json)
+
+
+def _flushed(code: int) -> int:
+    """Return the command's code when all it printed has left, else that of a failure if it had none."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        return code or _leave_quietly()
+    except OSError as error:
+        from cosmos_cli.console import tell_lost_output
+
+        tell_lost_output(error)
+        return code or int(ExitCode.RUN_FAILED)
+    return code
+
+
+def _report_lost_output(error: OSError, wants_json: bool) -> int:
+    from cosmos_cli.console import OutputLost, tell_lost_output
+
+    if not isinstance(error, OutputLost):
+        return _report_unexpected(error, wants_json)
+    tell_lost_output(error)
+    return int(ExitCode.RUN_FAILED)
 
 
 def _leave_quietly() -> int:

@@ -7,10 +7,13 @@ for a table on a terminal.
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import io
 import json
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, TextIO
 
@@ -88,6 +91,63 @@ def print_error(text: str, *, bare: bool = False) -> None:
     _write(sys.stderr, text if bare else f"{paint('error', 'red', sys.stderr)}: {text}")
 
 
+class OutputLost(OSError):
+    """What a command had to say cannot be written: the disk behind a redirection is full, or stdout is closed."""
+
+
+class ClosedOutput(io.TextIOBase):
+    """Stands for a standard output that was closed before the program started, as `>&-` does."""
+
+    def write(self, text: str) -> int:
+        """Refuse, as a write to the closed descriptor would."""
+        raise OSError(errno.EBADF, "it is closed")
+
+    def fileno(self) -> int:
+        """Return the descriptor of stdout."""
+        return 1
+
+
+def open_standard_streams() -> None:
+    """
+    Give descriptors 0 to 2 back to their purpose where they were closed.
+
+    The next file or socket would get their numbers, and what is meant for a person would go there.
+    """
+    streams: Any = sys  # typeshed does not know that they may be None
+    for descriptor in (0, 1, 2):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest free number: this one
+    if streams.stdout is None:
+        streams.stdout = ClosedOutput()
+    if streams.stderr is None:
+        streams.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
+
+
+@contextlib.contextmanager
+def losing_output(instead: str) -> Iterator[None]:
+    """
+    Go on when stdout takes no more: the verdict's exit code matters more than its line.
+
+    Args:
+        instead: Where what was to be printed can be found; told on stderr.
+    """
+    try:
+        yield
+    except OSError as error:
+        tell_lost_output(error, instead)
+
+
+def tell_lost_output(error: OSError, instead: str = "") -> None:
+    """Say on stderr, if anybody hears, that stdout takes no more."""
+    let_go_of_output()
+    why = error.strerror or str(error)
+    with contextlib.suppress(OSError):
+        print_error(f"stdout: {why}" + (f"; {instead}" if instead else ""))
+    let_go_of_output()
+
+
 def let_go_of_output() -> None:
     """
     Send the rest of both streams nowhere: whoever read them is gone, as `head` or a closed terminal.
@@ -132,8 +192,13 @@ def paint(text: str, colour: str, stream: TextIO) -> str:
 
 
 def _write(stream: TextIO, text: str) -> None:
-    stream.write(text + "\n")
-    stream.flush()
+    try:
+        stream.write(text + "\n")
+        stream.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OutputLost(error.errno, error.strerror) from error
 
 
 def _rich_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:

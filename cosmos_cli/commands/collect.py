@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from cosmos_cli.commands.runs import RunsOption
-from cosmos_cli.console import Console, JsonOption, QuietOption
+from cosmos_cli.console import Console, JsonOption, QuietOption, losing_output
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.rundir import find_run, runs_root
 
@@ -36,7 +36,9 @@ def collect(
         summary = collect_run(found, progress=progress)
     for line in summary.missing:
         console.warn(line)
-    console.print_json(summary.document)
-    console.data(str(found.bundle))
-    console.say(summary.last_line)
+    with losing_output(f"{summary.verdict.text}; it stands in {found.run_json}"):
+        console.print_json(summary.document)
+        # The verdict where `run` puts it: on stdout, or beside JSON as talk.
+        (console.say if as_json else console.data)(summary.last_line)
+        console.say(f"packed: {found.bundle}")
     return int(ExitCode.DATA_INCOMPLETE if summary.missing else ExitCode.OK)

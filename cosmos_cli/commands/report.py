@@ -10,7 +10,7 @@ import typer
 from cosmos_cli.commands.collect import RunArgument
 from cosmos_cli.commands.runs import RunsOption
 from cosmos_cli.console import Console, JsonOption, QuietOption
-from cosmos_cli.errors import CosmosError, InputError
+from cosmos_cli.errors import InputError
 from cosmos_cli.rundir import find_run, runs_root
 
 
@@ -39,7 +39,7 @@ def report(
         try:
             console.say(f"report written to {write_report(found, document, html)}")
         except OSError as error:
-            raise CosmosError(f"{html}: cannot be written: {error.strerror or error}") from error
+            raise InputError(f"{html}: cannot be written: {error.strerror or error}") from error
     elif not as_json:
         print_report(console, document, build_sections(open_source(found, document)))
         console.say(f"with figures: {found.report_html}")

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from cosmos_cli.console import Console, JsonOption, QuietOption, SetOption, let_go_of_output
+from cosmos_cli.console import Console, JsonOption, QuietOption, SetOption, losing_output
 from cosmos_cli.launch.execute import RunOptions, execute
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.rundir import runs_root
@@ -48,11 +48,7 @@ def run(
     )
     checked = load_scenario(scenario, overrides)
     summary = execute(checked, options, partial(make_view, quiet=quiet))
-    try:
+    with losing_output(f"{summary.verdict.text}; it stands in {summary.run.run_json}"):
         console.print_json(dict(summary.document))
         (console.say if json else console.data)(summary.last_line)
-    except (
-        OSError
-    ):  # a closed terminal or pipe: what the run came to stands in run.json, and in the code
-        let_go_of_output()
     raise typer.Exit(int(summary.exit_code))

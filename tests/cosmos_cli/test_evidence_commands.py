@@ -22,16 +22,15 @@ def finish(made):
     return finish_run(made.run, made.result(), made.expected)
 
 
-def test_collect_prints_the_package_and_ends_with_0(made, capsys):
+def test_collect_prints_the_verdict_as_run_does_and_tells_the_package(made, capsys):
     finish(made)
 
     code = app.run(["collect", "1"])
 
     out, err = capsys.readouterr()
     assert code == 0
-    assert out == f"{made.run.bundle}\n"
-    assert "PASSED" in err.splitlines()[-1]
-    assert str(made.run.path) in err.splitlines()[-1]
+    assert out == f"PASSED: 10 checks hold | {made.run.path}\n"
+    assert f"packed: {made.run.bundle}\n" in err
 
 
 def test_collect_of_a_cut_off_run_ends_with_5_and_names_what_is_missing(made, capsys):
@@ -101,6 +100,14 @@ def test_report_writes_html_where_it_is_told_to(made, tmp_path, capsys):
 
     assert "PASSED" in target.read_text()
     assert capsys.readouterr().out == ""
+
+
+def test_report_to_an_impossible_path_is_bad_input(made, tmp_path, capsys):
+    finish(made)
+
+    assert app.run(["report", "1", "--html", str(tmp_path / "no/such/here.html")]) == 2
+
+    assert "no/such/here.html: cannot be written" in capsys.readouterr().err
 
 
 def test_report_of_a_run_that_is_not_collected_says_what_to_do(made, capsys):
