@@ -1,0 +1,113 @@
+"""What a plug-in may not do: the verdict names the call, whatever it returns or however it ends."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+pytestmark = pytest.mark.process
+
+PLUGIN = """
+import os
+from dataclasses import dataclass
+from madns_runtime.plugin.api import HOST, AgentSimulation, HostSimulation, Simulation
+from madns_runtime.protocol.messages import Service
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Parameters:
+    evil: str = ""
+
+class H(HostSimulation):
+    def setup(self, context):
+        self.context, self.evil = context, context.parameters.evil
+
+    def initial_data(self, agent):
+        return {1, 2} if self.evil == "initial_data" else {}
+
+    def timer(self, t_s):
+        if self.evil == "timer":
+            return float("nan")
+        if self.evil == "deadline":
+            for agent in self.context.agents:
+                self.context.send(agent, "late", Service.SYNC, deadline_s=t_s - 1.0)
+            return t_s + 0.2
+        return None
+
+    def finish(self):
+        return None if self.evil == "host_finish" else {}
+
+class A(AgentSimulation):
+    def setup(self, context, initial):
+        self.context, self.evil = context, context.parameters.evil
+
+    def step(self, tick):
+        if self.evil == "exit" and self.context.name == "agent-01" and tick.index == 3:
+            os._exit(0)
+        if self.evil == "text" and tick.index == 3:
+            raise ValueError("\\udcff" + "x" * 100_000)
+        if self.evil == "service":
+            self.context.send(HOST, 1, "SYNC")
+
+    def finish(self):
+        return {"set": {1, 2}} if self.evil == "agent_finish" else {}
+
+simulation = Simulation(name="evil", parameters=Parameters, host=":H", agent=":A")
+"""
+SCENARIO = """
+name: evil
+simulation: ./evil.py:simulation
+agents: {count: 2, tick_hz: 20}
+time: {duration_s: 1, rtf_tolerance: 1}
+deadline: {max_miss_ratio: 1}
+"""
+
+
+@pytest.mark.parametrize(
+    ("evil", "code", "who", "expected"),
+    [
+        ("initial_data", 1, "host", "H.initial_data returned a set: expected a mapping"),
+        ("timer", 1, "host", "H.timer returned nan: expected a simulated time"),
+        ("host_finish", 1, "host", "H.finish returned None: expected a mapping; is a return"),
+        ("agent_finish", 1, "agent-0", "A.finish returned a summary without a JSON form"),
+        ("exit", 1, "agent-01", "its process ended by itself, exit code 0"),
+        ("text", 1, "agent-0", "A.step raised ValueError: \\udcffxxx"),
+        ("service", 1, "agent-0", "expected a Service, such as Service.RELIABLE, got 'SYNC'"),
+    ],
+)
+def test_the_verdict_names_the_call(tmp_path, evil, code, who, expected):
+    result = run(tmp_path, evil)
+
+    assert result["exit_code"] == code
+    assert result["who"].startswith(who)
+    assert expected in result["reason"]
+    assert len(result["reason"]) < 3000
+
+
+def test_broken_sync_deadline_breaks_its_check(tmp_path):
+    result = run(tmp_path, "deadline")
+
+    broken = [check["name"] for check in result["checks"] if not check["passed"]]
+    assert broken == ["messages.sync.deadlines_broken"]
+    assert result["messages"]["sync"]["deadlines_broken"] >= 8
+    assert result["exit_code"] == 4
+
+
+def run(tmp_path, evil):
+    (tmp_path / "evil.py").write_text(PLUGIN, "utf-8")
+    (tmp_path / "evil.yaml").write_text(SCENARIO, "utf-8")
+    command = [sys.executable, "-m", "cosmos_cli.app", "run", str(tmp_path / "evil.yaml")]
+    command += ["--json", "--quiet", "--no-report", "--runs", str(tmp_path / "runs")]
+    command += ["--set", f"parameters.evil={evil}"]
+    done = subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+        env={**os.environ, "COSMOS_STATE_DIR": str(tmp_path / "state")},
+    )
+    result = json.loads(done.stdout)
+    assert done.returncode == result["exit_code"], done.stderr
+    return result
