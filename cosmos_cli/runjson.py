@@ -17,6 +17,8 @@ from cosmos_cli.streams import StreamScan
 from cosmos_cli.verdict import Facts, Limits, Verdict, is_number, judge, plugin_checks
 from madns_runtime.config import RunConfig
 
+TICKS_OF_A_RATE = 2
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
@@ -58,6 +60,7 @@ class Evidence:
         return Limits(
             miss_ratio_max=self.config.deadline.max_miss_ratio,
             rtf_tolerance=self.config.time.rtf_tolerance,
+            duration_s=self.config.time.duration_s,
         )
 
     def _facts(self, totals: TickTotals) -> Facts:
@@ -75,6 +78,7 @@ class Evidence:
             miss_ratio=totals.miss_ratio,
             overrun_ratio=totals.overrun_ratio,
             rtf=_number(result.get("rtf")),
+            has_rate=self._has_rate(),
             reliable_lost=_count(messages, "reliable", "lost"),
             sync_lost=_count(messages, "sync", "lost"),
             sync_deadlines_broken=_count(messages, "sync", "deadlines_broken"),
@@ -85,8 +89,13 @@ class Evidence:
 
     def _plugin_checks(self) -> list[Any]:
         agents = mapping_at(self.result, "agents")
-        of_agents = [mapping_at(agents, name, "simulation") for name in agents]
-        return plugin_checks([mapping_at(self.result, "simulation")]) + plugin_checks(of_agents)
+        of_agents = {name: mapping_at(agents, name, "simulation") for name in agents}
+        of_host = {"host": mapping_at(self.result, "simulation")}
+        return plugin_checks(of_host) + plugin_checks(of_agents)
+
+    def _has_rate(self) -> bool:
+        time, agents = (self.config.time, self.config.agents) if self.config else (None, None)
+        return time is None or agents is None or time.duration_s * agents.tick_hz >= TICKS_OF_A_RATE
 
     def _lost(self) -> tuple[str, ...]:
         lost = (self.result or {}).get("lost")
@@ -120,6 +129,7 @@ class Evidence:
             "data": {"complete": not self.missing, "missing": list(self.missing)},
             "problems": [problem.to_mapping() for problem in self.problems],
             "checks": [check.to_mapping() for check in verdict.checks],
+            "remarks": list(verdict.remarks),
             "scheduling": result.get("scheduling", {}),
             "simulation": self._simulation(),
         }
@@ -156,6 +166,7 @@ class Evidence:
             "dropped": sum(scan.dropped for scan in self.scans),
             "truncated": sum(scan.truncated for scan in self.scans),
             "damaged": sum(scan.damaged for scan in self.scans),
+            "not_finite": sum(scan.not_finite for scan in self.scans),
             "bytes": sum(scan.size_bytes for scan in self.scans),
         }
 

@@ -14,6 +14,9 @@ from typing import Any, TypeGuard
 
 from cosmos_cli.errors import ExitCode
 
+WAKE_UP_LATE_S = 0.02
+"""A single wake-up may be late by this much on an idle machine; lateness has checks of its own."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CheckResult:
@@ -35,6 +38,15 @@ class Limits:
 
     miss_ratio_max: float = 1e-3
     rtf_tolerance: float = 1e-3
+    duration_s: float | None = None
+    """Simulated time of the run; None if it is not known."""
+
+    @property
+    def rtf_error_max(self) -> float:
+        """Largest deviation of the real-time factor: in a short run, one late wake-up must not decide it."""
+        if not self.duration_s:
+            return self.rtf_tolerance
+        return max(self.rtf_tolerance, WAKE_UP_LATE_S / self.duration_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,6 +68,8 @@ class Facts:
     miss_ratio: float | None = None
     overrun_ratio: float | None = None
     rtf: float | None = None
+    has_rate: bool = True
+    """Whether there were ticks enough to tell a real-time factor: two."""
     reliable_lost: int | None = None
     sync_lost: int | None = None
     sync_deadlines_broken: int | None = None
@@ -75,6 +89,8 @@ class Verdict:
     who: str | None
     reason: str | None
     checks: tuple[CheckResult, ...]
+    remarks: tuple[str, ...] = ()
+    """What was not judged, and why."""
 
     @property
     def broken(self) -> tuple[CheckResult, ...]:
@@ -94,8 +110,21 @@ def judge(facts: Facts, limits: Limits) -> Verdict:
             who, reason = who or "host", reason or _why_no_result(facts.problems)
     code, text = _conclude(facts, status, checks, _blame(who, reason))
     return Verdict(
-        status=status, exit_code=code, text=text, who=who, reason=reason, checks=tuple(checks)
+        status=status,
+        exit_code=code,
+        text=text,
+        who=who,
+        reason=reason,
+        checks=tuple(checks),
+        remarks=() if _is_rate_judged(facts) else (NO_RATE,),
     )
+
+
+NO_RATE = "time.rtf: not judged: a single tick has no rate"
+
+
+def _is_rate_judged(facts: Facts) -> bool:
+    return facts.has_rate or facts.rtf is not None
 
 
 def run_status(facts: Facts) -> str:
@@ -114,7 +143,7 @@ def run_checks(facts: Facts, limits: Limits) -> list[CheckResult]:
         at_most("agents.lost", 0, len(facts.lost_agents)),
         at_most("deadline.miss_ratio", limits.miss_ratio_max, facts.miss_ratio),
         at_most("deadline.overrun_ratio", limits.miss_ratio_max, facts.overrun_ratio),
-        at_most("time.rtf", limits.rtf_tolerance, rtf_error),
+        *([at_most("time.rtf", limits.rtf_error_max, rtf_error)] if _is_rate_judged(facts) else []),
         at_most("messages.reliable.lost", 0, facts.reliable_lost),
         at_most("messages.sync.lost", 0, facts.sync_lost),
         at_most("messages.sync.deadlines_broken", 0, facts.sync_deadlines_broken),
@@ -130,31 +159,36 @@ def at_most(name: str, limit: float, got: float | None) -> CheckResult:
     return CheckResult(name=name, limit=limit, got=got, passed=got is not None and got <= limit)
 
 
-def plugin_checks(summaries: Sequence[Mapping[str, Any]], *, prefix: str = "") -> list[CheckResult]:
+def plugin_checks(summaries: Mapping[str, Mapping[str, Any]]) -> list[CheckResult]:
     """
     Return the plug-in's own checks over the host's or all agents' summaries, the worst of each name.
 
-    Worst is a check that did not pass, then the one with the largest excess over its limit. A check
-    that is no proper `Check` mapping is a broken one: a verdict must not depend on a typing slip.
+    Worst is a check that did not pass, then the one with the largest excess over its limit. What is no
+    list, or in it no proper `Check` mapping, is a broken check named WHO.checks: a verdict must not
+    depend on a typing slip.
+
+    Args:
+        summaries: By who made them.
     """
     worst: dict[str, CheckResult] = {}
-    for summary in summaries:
-        listed = summary.get("checks")
-        for item in listed if isinstance(listed, Sequence) else ():
-            check = _parse_check(item, prefix)
+    for who, summary in summaries.items():
+        listed = summary.get("checks", ())
+        # What is no list is taken for one malformed check.
+        for item in listed if isinstance(listed, list | tuple) else (None,):
+            check = _parse_check(item, who)
             known = worst.get(check.name)
             if known is None or _badness(check) > _badness(known):
                 worst[check.name] = check
     return list(worst.values())
 
 
-def _parse_check(item: Any, prefix: str) -> CheckResult:
+def _parse_check(item: Any, who: str) -> CheckResult:
     mapping = item if isinstance(item, Mapping) else {}
-    name = prefix + str(mapping.get("name", "unnamed check"))
-    limit, got, passed = (mapping.get(key) for key in ("limit", "got", "passed"))
-    if is_number(limit) and is_number(got) and isinstance(passed, bool):
-        return CheckResult(name=name, limit=limit, got=got, passed=passed)
-    return CheckResult(name=name, limit=limit if is_number(limit) else 0, got=None, passed=False)
+    name, limit, got, passed = (mapping.get(key) for key in ("name", "limit", "got", "passed"))
+    is_named = isinstance(name, str) and name
+    if is_named and is_number(limit) and is_number(got) and isinstance(passed, bool):
+        return CheckResult(name=str(name), limit=limit, got=got, passed=passed)
+    return CheckResult(name=f"{who}.checks", limit=0, got=None, passed=False)
 
 
 def is_number(value: object) -> TypeGuard[float]:
@@ -169,8 +203,14 @@ def _badness(check: CheckResult) -> tuple[bool, float]:
 
 def _blame(who: str | None, reason: str | None) -> str:
     if who and reason:
-        return f"{who}: {reason}"
-    return who or reason or "no reason was given"
+        return f"{who}: {first_line(reason)}"
+    return who or first_line(reason or "") or "no reason was given"
+
+
+def first_line(text: str) -> str:
+    """Return the first line of a text that may have several: a verdict is one line, all of it is in the log."""
+    first, *rest = text.strip().splitlines() or [""]
+    return f"{first.rstrip()} ..." if rest else first
 
 
 def _why_no_result(problems: Sequence[str]) -> str:
@@ -211,4 +251,4 @@ def _told(check: CheckResult) -> str:
 def _listed(items: Sequence[str], shown_max: int = 3) -> str:
     rest = len(items) - shown_max
     more = f"; and {rest} more" if rest > 0 else ""
-    return "; ".join(items[:shown_max]) + more
+    return "; ".join(first_line(item) for item in items[:shown_max]) + more

@@ -216,10 +216,11 @@ def _checks(document: Mapping[str, Any]) -> str:
             f'<td class="n">{html.escape(_measured(check.get("got")))}</td>'
             f'<td class="n">{html.escape(format_cell(check.get("limit")))}</td>{mark}</tr>'
         )
+    remarks = "".join(f"<p>{html.escape(str(text))}</p>" for text in document.get("remarks", ()))
     return (
         '<section><h2>Checks</h2><div class="wide"><table class="checks"><thead><tr><th>check</th>'
         '<th class="n">measured</th><th class="n">limit</th><th></th></tr></thead>'
-        f"<tbody>{''.join(rows)}</tbody></table></div></section>"
+        f"<tbody>{''.join(rows)}</tbody></table></div>{remarks}</section>"
     )
 
 

@@ -28,6 +28,8 @@ def print_report(
         console.data(f"  {name:<18}{value:>14}   {remark}")
     console.data("")
     console.table(CHECK_COLUMNS, [_check_row(check) for check in document.get("checks", ())])
+    for line in document.get("remarks", ()):
+        console.data(line)
     for line in mapping_at(document, "data").get("missing", ()):
         console.data(f"missing: {line}")
     for section in sections:

@@ -413,3 +413,32 @@ def test_progress_tells_of_every_long_step(tmp_path):
 
     assert {"reading", "writing", "packing"} <= {what for what, _ in told}
     assert all(0 <= share <= 1 for _, share in told)
+
+
+def test_values_that_were_not_finite_are_counted_in_run_json(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    path = made.stream("agent-01", "ticks")
+    end = orjson.dumps({"end": {"records": made.ticks, "dropped": 0, "not_finite": 3}})
+    path.write_bytes(b"\n".join([*path.read_bytes().split(b"\n")[:-2], end, b""]))
+
+    summary = finish(made)
+
+    assert summary.document["records"]["not_finite"] == 3
+
+
+def test_round_trips_of_the_clock_are_labelled_as_minima_and_have_no_tail(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    for name in made.names:
+        made.stream(name, "round_trips").unlink()
+        del made.records[name]["streams"]["round_trips"]
+
+    summary = finish(made)
+
+    assert summary.exit_code == 0, summary.verdict.text
+    assert summary.document["round_trip_ms"] == {
+        "stream": "clock (minimum a window)",
+        "count": 40,
+        "min": 0.18,
+        "p50": 0.18,
+        "max": 0.18,
+    }

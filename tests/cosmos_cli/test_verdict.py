@@ -116,18 +116,19 @@ def test_many_faults_are_cut_short_in_the_text():
 
 
 def test_worst_of_all_agents_counts_for_each_name():
-    summaries = [
-        {"checks": [{"name": "x", "limit": 5, "got": got, "passed": got <= 5}]}
+    summaries = {
+        f"a{got}": {"checks": [{"name": "x", "limit": 5, "got": got, "passed": got <= 5}]}
         for got in (1, 9, 7, 4)
-    ]
+    }
 
     assert plugin_checks(summaries) == [CheckResult(name="x", limit=5, got=9, passed=False)]
 
 
 def test_worst_of_passing_checks_is_the_one_nearest_its_limit():
-    summaries = [
-        {"checks": [{"name": "x", "limit": 5, "got": got, "passed": True}]} for got in (1, 4, 2)
-    ]
+    summaries = {
+        f"a{got}": {"checks": [{"name": "x", "limit": 5, "got": got, "passed": True}]}
+        for got in (1, 4, 2)
+    }
 
     assert plugin_checks(summaries)[0].got == 4
 
@@ -144,12 +145,45 @@ def test_worst_of_passing_checks_is_the_one_nearest_its_limit():
         None,
     ],
 )
-def test_malformed_check_is_a_broken_one(item):
-    (check,) = plugin_checks([{"checks": [item]}])
+def test_malformed_check_is_a_broken_one_named_after_who_made_it(item):
+    good = {"name": "y", "limit": 1, "got": 0, "passed": True}
 
-    assert (check.passed, check.got) == (False, None)
+    broken, held = plugin_checks({"agent-07": {"checks": [item, good]}})
+
+    assert broken == CheckResult(name="agent-07.checks", limit=0, got=None, passed=False)
+    assert (held.name, held.passed) == ("y", True)
 
 
-@pytest.mark.parametrize("summary", [{}, {"checks": None}, {"checks": 3}])
+@pytest.mark.parametrize("listed", [None, 3, "x", {"name": "x"}])
+def test_checks_that_are_no_list_are_a_broken_check(listed):
+    (check,) = plugin_checks({"host": {"checks": listed}})
+
+    assert (check.name, check.passed, check.got) == ("host.checks", False, None)
+
+
+@pytest.mark.parametrize("summary", [{}, {"checks": []}, {"checks": ()}])
 def test_summary_without_checks_has_none(summary):
-    assert plugin_checks([summary]) == []
+    assert plugin_checks({"host": summary}) == []
+
+
+def test_one_late_wake_up_does_not_decide_the_real_time_factor_of_a_short_run():
+    facts = dataclasses.replace(GOOD, rtf=1.009)
+
+    assert judge(facts, Limits(duration_s=2.0)).exit_code == 0
+    assert judge(facts, Limits(duration_s=2.3)).exit_code == 4
+    assert Limits(duration_s=60.0).rtf_error_max == 1e-3
+
+
+def test_real_time_factor_of_a_single_tick_is_not_judged_and_that_is_said():
+    verdict = judged(rtf=None, has_rate=False)
+
+    assert verdict.exit_code == 0
+    assert "time.rtf" not in [check.name for check in verdict.checks]
+    assert verdict.remarks == ("time.rtf: not judged: a single tick has no rate",)
+
+
+def test_reason_of_several_lines_is_one_in_the_verdict():
+    verdict = judged(host_status="aborted", who="agent-03", reason="ValueError: a\n  b\nc")
+
+    assert verdict.text == "ABORTED: agent-03: ValueError: a ..."
+    assert verdict.reason == "ValueError: a\n  b\nc"
