@@ -302,16 +302,26 @@ def check_evidence(directory: Path, document: dict[str, Any]) -> None:
     assert packed == {*files, "manifest.json"}
 
 
-def replace_agent_half(laboratory: Laboratory, text: str) -> None:
-    """Let the agents' half be another file, beside the scenario, that says *text*."""
-    (laboratory.folder / "half.py").write_text(text)
+BOARD_HALF = """\
+import sys, time
+from madns_runtime.plugin.api import AgentSimulation
+if sys.argv[0].endswith("agent.py"):  # where agents run, not where the scenario is checked
+    {statement}
+class Agent(AgentSimulation):
+    def step(self, tick): ...
+"""
+
+
+def do_on_import(laboratory: Laboratory, statement: str) -> None:
+    """Let line 4 of half.py, the agents' half, be *statement*: done where agents are started."""
+    (laboratory.folder / "half.py").write_text(BOARD_HALF.format(statement=statement))
     plugin = laboratory.folder / PLUGIN.name
     plugin.write_text(PLUGIN.read_text().replace('agent=":FaultyAgent"', 'agent="./half.py:Agent"'))
 
 
 def hang_on_import(laboratory: Laboratory) -> None:
     """Let the import of the agents' half never end."""
-    replace_agent_half(laboratory, "import time\n\ntime.sleep(600)\n")
+    do_on_import(laboratory, "time.sleep(600)")
 
 
 def wait_until_ended(

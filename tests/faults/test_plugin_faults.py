@@ -8,8 +8,8 @@ from fault_harness import (
     SCENARIO,
     Laboratory,
     check_ending,
+    do_on_import,
     hang_on_import,
-    replace_agent_half,
 )
 
 pytestmark = pytest.mark.process
@@ -184,10 +184,10 @@ def test_agent_half_that_takes_for_ever_to_import_is_named(laboratory):
 
 
 def test_agent_half_that_cannot_be_imported_is_named_with_its_line(laboratory):
-    replace_agent_half(laboratory, "import json\n\nraise RuntimeError('no such board')\n")
+    do_on_import(laboratory, "raise RuntimeError('no such board')")
     run = laboratory.start(*SHORT)
 
-    check_ending(run, 1, "failed", "half.py:3: RuntimeError: no such board")
+    check_ending(run, 1, "failed", "half.py:4: RuntimeError: no such board")
     assert run.document["who"].startswith("agent-0")
 
 
