@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from cosmos_cli.bundle import pack_run
+from cosmos_cli.earlier import Earlier
 from cosmos_cli.errors import ExitCode, InputError, RunFailedError
-from cosmos_cli.expectation import Expected, find_missing
+from cosmos_cli.expectation import Expected, find_missing, mapping_at
 from cosmos_cli.gather import Gathered, Progress, gather
 from cosmos_cli.manifest import build_manifest
 from cosmos_cli.problem import Problem, problems_of_run
@@ -90,6 +91,8 @@ def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; four a
         MachineError: A record stream cannot be read.
         RunFailedError: Not even run.json can be written.
     """
+    earlier = Earlier.read(run)
+    changed = earlier.changed_files(run)
     end = _RunEnd(result, interrupted, tuple(problems))
     if result is not None:
         # On a full disk the summary below still tells what matters of it.
@@ -97,6 +100,14 @@ def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; four a
             write_json(run.result_json, result)
     config = run.read_config()
     gathered = gather(run, config.agents.tick_hz if config else None, progress)
+    changed |= earlier.changed_streams(run, gathered.by_path())
+    if not run.plan_json.is_file():
+        changed.setdefault(run.plan_json.name, "missing; what was planned is not known")
+    gathered = dataclasses.replace(
+        gathered,
+        faults=(*gathered.faults, *(f"{name}: {what}" for name, what in changed.items())),
+        was={name: earlier.entries[name] for name in changed if name in earlier.entries},
+    )
     evidence = _evidence(run, gathered, end, expected)
     return _conclude(run, gathered, evidence, has_report=has_report, progress=progress)
 
@@ -117,13 +128,31 @@ def collect_run(
     """
     _refuse_living(run, processes())
     before = run.read_json(run.run_json) or {}
+    result = run.read_json(run.result_json) or run.read_left_result()
     return finish_run(
         run,
-        run.read_json(run.result_json) or run.read_left_result(),
-        Expected.read(run),
+        result,
+        _expected(run, before, result),
         interrupted=before.get("status") == "interrupted",
         problems=problems_of_run(before.get("problems")),
         progress=progress,
+    )
+
+
+def _expected(
+    run: RunDirectory, before: Mapping[str, Any], result: Mapping[str, Any] | None
+) -> Expected:
+    """Join what the plan, the result and an earlier collection know: any of them may have been lost."""
+    planned, earlier = Expected.read(run), Earlier.read(run)
+    agents = (
+        *planned.agents,
+        *mapping_at(result, "agents"),
+        *mapping_at(before, "simulation", "agents"),
+        *earlier.sources("agents"),
+    )
+    machines = (*planned.machines, *earlier.sources("machines"))
+    return dataclasses.replace(
+        planned, agents=tuple(dict.fromkeys(agents)), machines=tuple(dict.fromkeys(machines))
     )
 
 
@@ -220,7 +249,7 @@ def _write_summary(run: RunDirectory, gathered: Gathered, evidence: Evidence) ->
     verdict, document = evidence.judged()
     try:
         write_json(run.run_json, document)
-        write_json(run.manifest_json, build_manifest(run, gathered.by_path()))
+        write_json(run.manifest_json, build_manifest(run, gathered.by_path(), gathered.was))
     except OSError as error:
         raise RunFailedError(
             f"{run.path}: the summary cannot be written: {error.strerror or error}; the verdict was: "

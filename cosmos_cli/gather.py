@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 
@@ -25,6 +26,9 @@ class Gathered:
     scans: tuple[StreamScan, ...]
     faults: tuple[str, ...] = ()
     """Tables that could not be written or hold less than was recorded, each starting with its name."""
+
+    was: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Earlier manifest entries of files that are no longer what they were."""
 
     def by_path(self) -> dict[Path, StreamScan]:
         """Return the scans by file."""

@@ -23,13 +23,18 @@ def run_files(run: RunDirectory) -> Iterator[Path]:
         yield path
 
 
-def build_manifest(run: RunDirectory, scans: Mapping[Path, StreamScan]) -> dict[str, Any]:
+def build_manifest(
+    run: RunDirectory,
+    scans: Mapping[Path, StreamScan],
+    was: Mapping[str, Mapping[str, Any]] | None = None,
+) -> dict[str, Any]:
     """
     Return the manifest of all files but itself.
 
     Args:
         run: The run.
         scans: What was found in each stream file; it holds the hash already.
+        was: First entries of files that are no longer what they were, or are gone.
     """
     files: dict[str, Any] = {}
     for path in run_files(run):
@@ -37,11 +42,14 @@ def build_manifest(run: RunDirectory, scans: Mapping[Path, StreamScan]) -> dict[
         if name == MANIFEST_NAME:
             continue
         scan = scans.get(path)
-        files[name] = _stream_entry(scan) if scan else _plain_entry(path)
+        files[name] = _stream_entry(scan) if scan else file_entry(path)
+    for name, entry in (was or {}).items():
+        files[name] = {**files.get(name, {"missing": True}), "was": entry}
     return {"schema": SCHEMA, "run": run.name, "files": files}
 
 
-def _plain_entry(path: Path) -> dict[str, Any]:
+def file_entry(path: Path) -> dict[str, Any]:
+    """Return the entry of a file that is no stream: size and hash."""
     with path.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
         return {"bytes": stream.tell(), "sha256": digest}

@@ -56,11 +56,22 @@ class Evidence:
 
     def _limits(self) -> Limits:
         if self.config is None:
-            return Limits()
+            return self._limits_before()
         return Limits(
             miss_ratio_max=self.config.deadline.max_miss_ratio,
             rtf_tolerance=self.config.time.rtf_tolerance,
             duration_s=self.config.time.duration_s,
+        )
+
+    def _limits_before(self) -> Limits:
+        """Return the limits of an earlier verdict: the plan is lost. Those it does not tell are the defaults."""
+        listed = self.started.get("checks")
+        checks = [c for c in listed if isinstance(c, Mapping)] if isinstance(listed, list) else []
+        told = {c.get("name"): c["limit"] for c in checks if is_number(c.get("limit"))}
+        default = Limits()
+        return Limits(
+            miss_ratio_max=told.get("deadline.miss_ratio", default.miss_ratio_max),
+            rtf_tolerance=told.get("time.rtf", default.rtf_tolerance),
         )
 
     def _facts(self, totals: TickTotals) -> Facts:

@@ -1,3 +1,4 @@
+import shutil
 import tarfile
 
 import orjson
@@ -9,6 +10,7 @@ from synthetic_run import SyntheticRun, make_config
 from cosmos_cli.collect import collect_run, finish_run
 from cosmos_cli.errors import InputError
 from cosmos_cli.problem import Problem
+from madns_runtime.config import Deadline
 from madns_runtime.processes import ProcessEntry
 from madns_runtime.recording.records import EVENTS, TICKS
 
@@ -442,3 +444,70 @@ def test_round_trips_of_the_clock_are_labelled_as_minima_and_have_no_tail(tmp_pa
         "p50": 0.18,
         "max": 0.18,
     }
+
+
+def again(made):
+    return collect_run(made.run, processes=lambda: [])
+
+
+def test_agent_and_plan_that_were_deleted_are_both_named(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    finish(made)
+    shutil.rmtree(made.run.path / "agents/agent-02")
+    made.run.plan_json.unlink()
+
+    summary = again(made)
+
+    assert summary.exit_code == 5
+    named = {line.split(":")[0] for line in summary.missing}
+    assert {"agent-02", "plan.json", "agents/agent-02/ticks.jsonl"} <= named
+
+
+def test_agent_and_plan_are_named_even_without_the_manifest(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    finish(made)
+    shutil.rmtree(made.run.path / "agents/agent-02")
+    made.run.plan_json.unlink()
+    made.run.manifest_json.unlink()
+
+    assert {line.split(":")[0] for line in again(made).missing} == {"agent-02", "plan.json"}
+
+
+@pytest.mark.parametrize("name", ["plan.json", "scenario.yaml"])
+def test_input_that_was_deleted_is_named_and_limits_stay(tmp_path, name):
+    made = SyntheticRun(tmp_path, make_config(deadline=Deadline(max_miss_ratio=0.25))).write()
+    (made.run.path / "scenario.yaml").write_text("name: synthetic\n")
+    limits = {c["name"]: c["limit"] for c in finish(made).document["checks"]}
+    (made.run.path / name).unlink()
+
+    for _ in range(2):
+        summary = again(made)
+
+        assert summary.exit_code == 5
+        assert [line.split(":")[0] for line in summary.missing] == [name]
+        assert {c["name"]: c["limit"] for c in summary.document["checks"]} == limits
+
+
+def test_stream_that_was_shortened_and_closed_again_is_named_every_time(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    finish(made)
+    first = read(made.run.manifest_json)["files"]["agents/agent-01/round_trips.jsonl"]
+    path = made.stream("agent-01", "round_trips")
+    whole = path.read_bytes()
+    lines = whole.split(b"\n")
+    end = orjson.dumps({"end": {"records": made.ticks - 1, "dropped": 0, "not_finite": 0}})
+    path.write_bytes(b"\n".join([*lines[:-3], end, b""]))
+
+    for _ in range(2):
+        summary = again(made)
+
+        assert summary.exit_code == 5
+        assert summary.missing == (
+            "agents/agent-01/round_trips.jsonl: changed since the run was collected"
+            " (199 records, were 200)",
+        )
+        entry = read(made.run.manifest_json)["files"]["agents/agent-01/round_trips.jsonl"]
+        assert (entry["records"], entry["was"]) == (199, first)
+
+    path.write_bytes(whole)
+    assert again(made).exit_code == 0
