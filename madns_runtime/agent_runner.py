@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from time import monotonic
 from typing import Any, TypeVar
 
 from madns_runtime import __version__
+from madns_runtime.agent_records import AgentRecords
 from madns_runtime.config import AgentLaunch
 from madns_runtime.context import (
     RunContext,
@@ -34,9 +34,7 @@ from madns_runtime.protocol.wire import Wire
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.udp import UdpSocket
-from madns_runtime.recording.records import CLOCK, EVENTS, LOG, PROCESS, TICKS
-from madns_runtime.recording.writer import Recorder
-from madns_runtime.timing.clock import utc_at_iso, utc_now_iso
+from madns_runtime.timing.clock import utc_at_iso
 from madns_runtime.timing.rate import Pacer, stagger
 
 T = TypeVar("T")
@@ -45,9 +43,6 @@ BEST, SYNC = Service.BEST, Service.SYNC
 
 DRAIN_S = 0.1
 """After the last tick's period an agent listens this much longer for what is still under way."""
-CLOCK_RECORD_INTERVAL_S = 1.0
-PROBLEM_CHARACTERS_MAX = 200
-"""Of a recorder's trouble in a report, which must fit a datagram."""
 AGENT_RECEIVE_BUFFER_BYTES = 1024 * 1024
 
 
@@ -98,14 +93,11 @@ class AgentRunner:
         self._reactor = reactor
         self._on_ended = on_ended
         self._index = config.agents.resolved_names().index(name)
-        self._recorder = Recorder(
-            Path(launch.directory) / "agents" / name,
-            run=config.run,
-            source=name,
-            settings=config.recording,
+        self._records = AgentRecords(
+            Path(launch.directory) / "agents" / name, config, source=name, t_s=self._t_s_or_none
         )
-        for schema in (TICKS, CLOCK, EVENTS, LOG, PROCESS):
-            self._recorder.open_stream(schema)
+        self._record = self._records.recorder.record
+        self._t0_host_s: float | None = None
         self._socket = UdpSocket.connect(
             launch.host_address,
             launch.host_port,
@@ -131,7 +123,6 @@ class AgentRunner:
         self._simulation = program.simulation()
         self._simulation_name = type(self._simulation).__name__
         self._pacer: Pacer | None = None
-        self._t0_host_s: float | None = None
         self._step = self._simulation.step
         self._receive = self._simulation.receive
         self._must_pump = False
@@ -143,28 +134,26 @@ class AgentRunner:
         self._tick_timer = reactor.call_at(math.inf, self._tick)
         self._end_timer = reactor.call_at(math.inf, self._finish_run)
         self._usage_timer = reactor.call_at(math.inf, self._record_usage)
-        self._clock_recorded_s = 0.0
         self._scheduling: dict[str, Any] = {}
         self._outcome = Outcome(as_ordered=False, reason="did not end")
         self._is_closed = False
-        self._is_recording = True
         self._takes_data = True
 
     def start(self) -> None:
         """Begin: says hello at once."""
-        self._recorder.start()
-        self._event("start", pid=os.getpid())
+        self._records.recorder.start()
+        self._records.event("start", pid=os.getpid())
         if self._socket.warning:
-            self._recorder.log("warning", self._socket.warning, None)
+            self._records.log("warning", self._socket.warning)
         self._reactor.add_reader(self._socket.fileno(), self._readable)
         self._pump()
 
     def set_scheduling(self, grant: Mapping[str, Any]) -> None:
         """Take note of what the kernel granted to the loop."""
         self._scheduling = dict(grant)
-        self._event("scheduling", **self._scheduling)
+        self._records.event("scheduling", **self._scheduling)
         if grant.get("warning"):
-            self._recorder.log("warning", str(grant["warning"]), None)
+            self._records.log("warning", str(grant["warning"]))
 
     def emergency(self, reason: str) -> None:
         """End at once, keep the records, tell the host."""
@@ -201,7 +190,7 @@ class AgentRunner:
         while (event := session.next_event()) is not None:
             self._handle(event)
         while (broken := session.next_broken_deadline()) is not None:
-            self._event("sync_deadline_broken", late_s=broken.late_s)
+            self._records.event("sync_deadline_broken", late_s=broken.late_s)
         if self._is_closed:
             return
         self._send_datagrams()
@@ -221,7 +210,7 @@ class AgentRunner:
         elif isinstance(event, told.ClockEstimated):
             self._record_clock()
         elif isinstance(event, told.StateEntered):
-            self._event("state", state=event.state.value)
+            self._records.event("state", state=event.state.value)
         elif isinstance(event, told.SetupReceived):
             self._set_up(event.initial)
         elif isinstance(event, told.StartReceived):
@@ -243,7 +232,7 @@ class AgentRunner:
             name=self.name,
             config=self._config,
             parameters=self._program.parameters,
-            recorder=self._recorder,
+            recorder=self._records.recorder,
             now_s=self._simulated_s,
             send=self._send,
         )
@@ -264,8 +253,8 @@ class AgentRunner:
             tolerance_s=self._config.deadline.tolerance_ms * 1e-3,
         )
         now_s = self._simulated_s()
-        self._recorder.set_t0(utc_at_iso(-now_s))
-        self._event("phase", phase_s=phase_s)
+        self._records.recorder.set_t0(utc_at_iso(-now_s))
+        self._records.event("phase", phase_s=phase_s)
         if now_s > 0:
             self._pacer.skip_to(now_s)
         freeze_garbage()  # what set-up made stays: no collection walks it in mid-run
@@ -312,7 +301,7 @@ class AgentRunner:
                 # What the step sent leaves before anything else is done.
                 self._send_datagrams()
             margin_s = pacer.end(self._simulated_s())
-            self._recorder.record(
+            self._record(
                 "ticks",
                 (
                     timing.index,
@@ -360,17 +349,15 @@ class AgentRunner:
         self._takes_data = False
         for timer in (self._tick_timer, self._end_timer, self._usage_timer):
             timer.cancel()
-        self._event("emergency", reason=reason)
-        self._recorder.log("critical", f"emergency shutdown: {reason}", self._t_s_or_none())
+        self._records.event("emergency", reason=reason)
+        self._records.log("critical", f"emergency shutdown: {reason}")
         self._close_records()
 
     def _close_records(self) -> None:
-        self._event("end")
-        self._is_recording = False
         messages = self._session.link.counters.to_mapping()
-        counts = self._recorder.close(self._config.timeouts.shutdown_s)
+        counts = self._records.close(self._config.timeouts.shutdown_s)
         records = {
-            **counts.to_mapping(),
+            **counts,
             "messages": messages,
             "network": self._socket.counters(),
             "held_dropped": self._session.held_dropped_count,
@@ -389,45 +376,17 @@ class AgentRunner:
     # Records ---------------------------------------------------------------------------------------
 
     def _record_clock(self) -> None:
-        t_s = self._t_s_or_none()
-        now_s = self._reactor.now_s()
-        if t_s is None or now_s - self._clock_recorded_s < CLOCK_RECORD_INTERVAL_S:
-            return
-        if self._session.state is not AgentState.RUN_SIMULATION:
-            return
-        self._clock_recorded_s = now_s
-        clock = self._session.clock
-        self._recorder.record(
-            "clock",
-            (
-                round(t_s, 3),
-                round(clock.offset_s(now_s) * 1e6, 1),
-                round(clock.drift_ppm, 3),
-                round(clock.uncertainty_s(now_s) * 1e6, 1),
-                round(clock.round_trip_s_min * 1e6, 1),
-            ),
-        )
+        if self._session.state is AgentState.RUN_SIMULATION:
+            self._records.clock(self._session.clock, self._reactor.now_s())
 
     def _record_usage(self) -> None:
-        if self._session.state is not AgentState.RUN_SIMULATION:
-            return
-        self._recorder.record("process", process_usage(round(self._simulated_s(), 3)))
-        due_s = self._reactor.now_s() + self._config.health.period_s
-        self._usage_timer.reschedule(due_s)
-
-    def _event(self, event: str, **values: Any) -> None:
-        if not self._is_recording:
-            return
-        t_s = self._t_s_or_none()
-        rounded = None if t_s is None else round(t_s, 6)
-        self._recorder.record(
-            "events", {"t_s": rounded, "utc": utc_now_iso(), "event": event, **values}
-        )
+        if self._session.state is AgentState.RUN_SIMULATION:
+            self._records.usage()
+            due_s = self._reactor.now_s() + self._config.health.period_s
+            self._usage_timer.reschedule(due_s)
 
     def _report(self) -> Mapping[str, Any]:
-        report: dict[str, Any] = {"dropped": self._recorder.counts().dropped}
-        if (problem := self._recorder.problem) is not None:
-            report["problem"] = problem[:PROBLEM_CHARACTERS_MAX]
+        report = self._records.report()
         if self._pacer is not None:
             summary = self._pacer.summary()
             report.update(
@@ -504,7 +463,6 @@ class AgentRunner:
 
     def _plugin_failed(self, name: str, error: BaseException) -> None:
         self._must_pump = True
-        text = "".join(traceback.format_exception(error))
-        self._recorder.log("critical", text, self._t_s_or_none())
+        self._records.failure(error)
         reason = describe_exception(error, f"{self._simulation_name}.{name}")
         self._session.emergency(reason, self._reactor.now_s())
