@@ -19,11 +19,12 @@ _BEST: Final = int(Service.BEST)
 class BestSender:
     """Frames that wait for the next datagram; when the queue is full the oldest gives way."""
 
-    __slots__ = ("_counters", "_next", "queue")
+    __slots__ = ("_counters", "numbers", "queue")
 
     def __init__(self, queue_max: int, counters: ClassCounters) -> None:
         self._counters = counters
-        self._next: dict[int, int] = {}  # by channel
+        self.numbers: dict[int, int] = {}
+        """Number of the next message by channel."""
         self.queue: deque[bytes] = deque(maxlen=queue_max)
 
     def push(self, body: bytes, channel: int) -> None:
@@ -40,14 +41,10 @@ class BestSender:
             )
         if len(self.queue) == self.queue.maxlen:
             self._counters.dropped += 1
-        self.queue.append(self.frame(body, channel))
-
-    def frame(self, body: bytes, channel: int) -> bytes:
-        """Return the next frame of a channel, which is not queued and must leave before all others."""
-        number = self._next.get(channel, 0)
-        self._next[channel] = number + 1
+        number = self.numbers.get(channel, 0)
+        self.numbers[channel] = number + 1
+        self.queue.append(FRAME.pack(_BEST, channel, len(body), number) + body)
         self._counters.sent += 1
-        return FRAME.pack(_BEST, channel, len(body), number) + body
 
 
 class BestReceiver:

@@ -14,6 +14,7 @@ Both sides use the same class. Nothing here gives a peer up: the owner decides t
 from __future__ import annotations
 
 from collections import deque
+from hmac import compare_digest
 from struct import Struct
 from typing import Final
 
@@ -41,6 +42,7 @@ from madns_runtime.protocol.recovery import (
     RoundTrip,
 )
 from madns_runtime.protocol.seal import (
+    DATAGRAM_BYTES_MAX,
     HEADER_BYTES,
     MAC_BYTES,
     PAYLOAD_BYTES_MAX,
@@ -70,11 +72,12 @@ _AT_ONCE: Final = 1 << Service.SYNC | _PROBE
 _SENT_TIMES: Final = 256
 _NEVER: Final = float("inf")
 _BEST_ALONE: Final = 1 << Service.BEST
-_STREAMS: Final = slice(PREFIX_BYTES + 24, PREFIX_BYTES + 44)
-"""Where a header says how far either stream is and what is granted."""
-_ALONE: Final = Struct("<QQ28xHBxBBHQ")
-"""Of a datagram with one frame, behind its prefix: packet number, largest packet received, delay, contents,
-and the frame's service, channel, size and number."""
+_STREAMS_AT: Final = 24
+_STREAMS_BYTES: Final = 20
+_STREAMS: Final = slice(PREFIX_BYTES + _STREAMS_AT, PREFIX_BYTES + _STREAMS_AT + _STREAMS_BYTES)
+"""Where a datagram says how far either stream is and what is granted."""
+_ALONE: Final = Struct(f"<{PREFIX_BYTES}sQQQ{_STREAMS_BYTES}sHBB" + FRAME.format[1:])
+"""A header, with what it says of the streams in one piece, and that of the one frame behind it."""
 _ALONE_AT: Final = HEADER_BYTES + FRAME_BYTES
 _ALONE_BYTES_MIN: Final = _ALONE_AT + MAC_BYTES
 
@@ -105,6 +108,7 @@ class Link:
         "_seal",
         "_sent_times",
         "_streams_heard",
+        "_streams_told",
         "_watch",
         "counters",
         "last_received_s",
@@ -138,6 +142,7 @@ class Link:
         self._packets = ReceivedPackets()
         # What `open_best` may rely on; the long way keeps it up to date.
         self._streams_heard = b""
+        self._streams_told = b""
         self._is_listening = False
         self._measure_due_s = -_NEVER
         # The datagram being filled.
@@ -329,22 +334,23 @@ class Link:
         """Return the next packet: *payload* behind a header with all acknowledgements, sealed."""
         packet_number = self._packet_number + 1
         self._packet_number = packet_number
-        packets = self._packets
         reliable, sync = self._in
         reliable.advertised = reliable.limit
         sync.advertised = sync.limit
+        largest, ack_bits, delay = self._packets.acknowledge(now_s)
         rest = REST.pack(
             packet_number,
-            packets.largest,
-            packets.ack_bits,
+            largest,
+            ack_bits,
             reliable.next_expected,
             sync.next_expected,
             reliable.limit - reliable.next_expected,
             sync.limit - sync.next_expected,
-            packets.settle_ack(now_s),
+            delay,
             contents,
             0,
         )
+        self._streams_told = rest[_STREAMS_AT : _STREAMS_AT + _STREAMS_BYTES]
         datagram = self._seal.close(rest, payload)
         self._sent_times[packet_number % _SENT_TIMES] = now_s
         counters = self.counters
@@ -360,9 +366,39 @@ class Link:
         is too long.
         """
         best = self._best_out
-        if best.queue or len(body) > BEST_BYTES_MAX:
+        streams = self._streams_told
+        if not streams or best.queue or len(body) > BEST_BYTES_MAX:
             return None
-        return self._seal_packet(best.frame(body, channel), _BEST_ALONE, now_s)
+        self._packet_number = packet_number = self._packet_number + 1
+        largest, ack_bits, delay = self._packets.acknowledge(now_s)
+        number = best.numbers.get(channel, 0)
+        best.numbers[channel] = number + 1
+        seal = self._seal
+        unsealed = (
+            _ALONE.pack(
+                seal.prefix,
+                packet_number,
+                largest,
+                ack_bits,
+                streams,
+                delay,
+                _BEST_ALONE,
+                0,
+                _BEST,
+                channel,
+                len(body),
+                number,
+            )
+            + body
+        )
+        self._sent_times[packet_number % _SENT_TIMES] = now_s
+        counters = self.counters
+        counters.best.sent += 1
+        counters.datagrams_sent += 1
+        counters.bytes_sent += len(unsealed) + MAC_BYTES
+        mac = seal.send_mac.copy()
+        mac.update(unsealed)
+        return unsealed + mac.digest()
 
     # Receiving.
 
@@ -375,25 +411,38 @@ class Link:
         other datagram None, with nothing done, and `receive_datagram` must have it.
         """
         packets, best = self._packets, self._best_in
-        if (
-            self._is_listening
-            or best.ready
-            or data[_STREAMS] != self._streams_heard
-            or len(data) < _ALONE_BYTES_MIN
-        ):
+        if self._is_listening or best.ready or len(data) < _ALONE_BYTES_MIN:
             return None
-        packet_number, ack, ack_delay, contents, kind, channel, size, number = _ALONE.unpack_from(
-            data, PREFIX_BYTES
-        )
+        (
+            prefix,
+            packet_number,
+            ack,
+            _,
+            streams,
+            ack_delay,
+            contents,
+            _,
+            kind,
+            channel,
+            size,
+            number,
+        ) = _ALONE.unpack_from(data)
+        seal = self._seal
         if (
-            packet_number != packets.largest + 1
+            prefix != seal.peer_prefix
+            or packet_number != packets.largest + 1
+            or streams != self._streams_heard
             or contents != _BEST_ALONE
             or kind != _BEST
             or size != len(data) - _ALONE_BYTES_MIN
             or number != best.newest.get(channel, -1) + 1
             or ack > self._packet_number
-            or self._seal.find_fault(data) is not None
+            or len(data) > DATAGRAM_BYTES_MAX
         ):
+            return None
+        mac = seal.receive_mac.copy()
+        mac.update(data[:-MAC_BYTES])
+        if not compare_digest(mac.digest(), data[-MAC_BYTES:]):
             return None
         packets.add(packet_number, now_s)
         self._now_s = self.last_received_s = now_s
@@ -469,6 +518,7 @@ class Link:
         for kind, channel, number, payload in frames:
             if kind:
                 self._in[kind - 1].accept(number, payload, self._ready)
+                self._streams_told = b""
             else:
                 self._best_in.accept(channel, number, payload)
         return None
@@ -504,6 +554,7 @@ class Link:
         """Return the next message received, the streams' in their order; None if there is none."""
         if self._ready:
             message = self._ready.popleft()
+            self._streams_told = b""
             if self._in[message.service - 1].deliver():
                 self._packets.ack_due_s = self._now_s
             return message

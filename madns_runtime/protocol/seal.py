@@ -121,7 +121,14 @@ peek = Header.peek
 class Seal:
     """One side's end of a conversation: seals what it sends, checks what it receives."""
 
-    __slots__ = ("_receive_mac", "_send_mac", "agent_index", "incarnation", "peer_prefix", "prefix")
+    __slots__ = (
+        "agent_index",
+        "incarnation",
+        "peer_prefix",
+        "prefix",
+        "receive_mac",
+        "send_mac",
+    )
 
     def __init__(
         self, keys: LinkKeys, role: Role, *, session: bytes, agent_index: int, incarnation: int
@@ -134,13 +141,13 @@ class Seal:
         self.peer_prefix = _pack_prefix(session, agent_index, incarnation, peer)
         send_key, receive_key = (keys.up, keys.down) if is_agent else (keys.down, keys.up)
         # Copying a hash that has taken its key already is faster than keying a new one.
-        self._send_mac = blake2b(digest_size=MAC_BYTES, key=send_key)
-        self._receive_mac = blake2b(digest_size=MAC_BYTES, key=receive_key)
+        self.send_mac = blake2b(digest_size=MAC_BYTES, key=send_key)
+        self.receive_mac = blake2b(digest_size=MAC_BYTES, key=receive_key)
 
     def close(self, rest: bytes, payload: bytes) -> bytes:
         """Return the datagram of a packed header rest (see REST) and the frames behind it."""
         body = self.prefix + rest + payload
-        mac = self._send_mac.copy()
+        mac = self.send_mac.copy()
         mac.update(body)
         return body + mac.digest()
 
@@ -153,7 +160,7 @@ class Seal:
             return "short"
         if datagram[:PREFIX_BYTES] != self.peer_prefix:
             return "version" if datagram[0] != VERSION else "sender"
-        mac = self._receive_mac.copy()
+        mac = self.receive_mac.copy()
         mac.update(datagram[:-MAC_BYTES])
         if not hmac.compare_digest(mac.digest(), datagram[-MAC_BYTES:]):
             return "mac"

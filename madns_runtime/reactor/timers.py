@@ -76,7 +76,7 @@ class TimerQueue:
         Raises:
             ValueError: The time is not a number; infinite is never.
         """
-        if math.isnan(when_s):
+        if when_s != when_s:  # not a number
             raise ValueError("a timer's time must be a number, got nan")
         timer.when_s = when_s
         queued_s = timer._queued_s
@@ -110,7 +110,9 @@ class TimerQueue:
 
     def pop_due(self, now_s: float) -> Timer | None:
         """Take out and return the first timer that is due; None if none is."""
-        if self.earliest_s() > now_s:
+        # An entry is never later than its timer, so a first entry to come needs no closer look.
+        heap = self._heap
+        if not heap or heap[0][0] > now_s or self.earliest_s() > now_s:
             return None
         timer = heapq.heappop(self._heap)[2]
         timer._queued_s = None
