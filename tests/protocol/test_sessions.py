@@ -80,9 +80,9 @@ class World:
             _, _, target, data, source = heapq.heappop(self.flight)
             if target == "host":
                 if not self.host_is_dead:
-                    self.host.receive_datagram(data, (source,), self.now_s)
+                    self.deliver_to_host(data, source)
             elif target in self.agents and target not in self.frozen:
-                self.agents[target].receive_datagram(data, self.now_s)
+                self.deliver_to_agent(target, data)
             elif target in self.frozen:
                 self.post(target, data, source)  # the socket buffer keeps it
         if not self.host_is_dead:
@@ -90,6 +90,12 @@ class World:
         for name, session in self.agents.items():
             if name not in self.frozen:
                 self.step_agent(name, session)
+
+    def deliver_to_host(self, data, source):
+        self.host.receive_datagram(data, (source,), self.now_s)
+
+    def deliver_to_agent(self, name, data):
+        self.agents[name].receive_datagram(data, self.now_s)
 
     def step_host(self):
         host = self.host
