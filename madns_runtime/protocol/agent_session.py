@@ -99,7 +99,7 @@ class EmergencyDeclared:
 
 @dataclass(frozen=True, slots=True)
 class ExpelledFromRun:
-    """The host had declared this agent lost; this session is over, a new incarnation may join."""
+    """The host had declared this agent lost; this conversation is over, a new incarnation may join."""
 
     reason: str
 
