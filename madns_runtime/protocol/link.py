@@ -47,7 +47,6 @@ from madns_runtime.protocol.seal import (
     MAC_BYTES,
     PAYLOAD_BYTES_MAX,
     PREFIX_BYTES,
-    REST,
     Role,
     Seal,
     derive_keys,
@@ -72,12 +71,12 @@ _AT_ONCE: Final = 1 << Service.SYNC | _PROBE
 _SENT_TIMES: Final = 256
 _NEVER: Final = float("inf")
 _BEST_ALONE: Final = 1 << Service.BEST
-_STREAMS_AT: Final = 24
-_STREAMS_BYTES: Final = 20
-_STREAMS: Final = slice(PREFIX_BYTES + _STREAMS_AT, PREFIX_BYTES + _STREAMS_AT + _STREAMS_BYTES)
-"""Where a datagram says how far either stream is and what is granted."""
-_ALONE: Final = Struct(f"<{PREFIX_BYTES}sQQQ{_STREAMS_BYTES}sHBB" + FRAME.format[1:])
-"""A header, with what it says of the streams in one piece, and that of the one frame behind it."""
+_STREAMS: Final = Struct("<QQHH")
+"""What a header says of the streams: how far they are, and what is granted."""
+_REST: Final = Struct(f"<QQQ{_STREAMS.size}sHBB")
+"""REST with _STREAMS in one piece: from one datagram to the next it is the same, unless a stream moves."""
+_ALONE: Final = Struct(f"<{PREFIX_BYTES}s{_REST.format[1:]}{FRAME.format[1:]}")
+"""A whole header and that of the one frame behind it."""
 _ALONE_AT: Final = HEADER_BYTES + FRAME_BYTES
 _ALONE_BYTES_MIN: Final = _ALONE_AT + MAC_BYTES
 
@@ -334,29 +333,28 @@ class Link:
         """Return the next packet: *payload* behind a header with all acknowledgements, sealed."""
         packet_number = self._packet_number + 1
         self._packet_number = packet_number
-        reliable, sync = self._in
-        reliable.advertised = reliable.limit
-        sync.advertised = sync.limit
         largest, ack_bits, delay = self._packets.acknowledge(now_s)
-        rest = REST.pack(
-            packet_number,
-            largest,
-            ack_bits,
-            reliable.next_expected,
-            sync.next_expected,
-            reliable.limit - reliable.next_expected,
-            sync.limit - sync.next_expected,
-            delay,
-            contents,
-            0,
-        )
-        self._streams_told = rest[_STREAMS_AT : _STREAMS_AT + _STREAMS_BYTES]
+        streams = self._streams_told or self._tell_streams()
+        rest = _REST.pack(packet_number, largest, ack_bits, streams, delay, contents, 0)
         datagram = self._seal.close(rest, payload)
         self._sent_times[packet_number % _SENT_TIMES] = now_s
         counters = self.counters
         counters.datagrams_sent += 1
         counters.bytes_sent += len(datagram)
         return datagram
+
+    def _tell_streams(self) -> bytes:
+        """Return how far each stream is and what is granted, for this header and those to come."""
+        reliable, sync = self._in
+        reliable.advertised = reliable.limit
+        sync.advertised = sync.limit
+        self._streams_told = _STREAMS.pack(
+            reliable.next_expected,
+            sync.next_expected,
+            reliable.limit - reliable.next_expected,
+            sync.limit - sync.next_expected,
+        )
+        return self._streams_told
 
     def seal_best(self, body: bytes, now_s: float, *, channel: int) -> bytes | None:
         """
@@ -366,8 +364,7 @@ class Link:
         is too long.
         """
         best = self._best_out
-        streams = self._streams_told
-        if not streams or best.queue or len(body) > BEST_BYTES_MAX:
+        if best.queue or len(body) > BEST_BYTES_MAX:
             return None
         self._packet_number = packet_number = self._packet_number + 1
         largest, ack_bits, delay = self._packets.acknowledge(now_s)
@@ -380,7 +377,7 @@ class Link:
                 packet_number,
                 largest,
                 ack_bits,
-                streams,
+                self._streams_told or self._tell_streams(),
                 delay,
                 _BEST_ALONE,
                 0,
@@ -475,14 +472,12 @@ class Link:
             packet_number,
             ack,
             ack_bits,
-            reliable_next,
-            sync_next,
-            reliable_granted,
-            sync_granted,
+            streams,
             ack_delay,
             contents,
             _,
-        ) = REST.unpack_from(data, PREFIX_BYTES)
+        ) = _REST.unpack_from(data, PREFIX_BYTES)
+        reliable_next, sync_next, reliable_granted, sync_granted = _STREAMS.unpack(streams)
         packets = self._packets
         if not packets.is_new(packet_number):
             return "replay"
@@ -513,7 +508,7 @@ class Link:
             stream.arm_probe(now_s)
         if contents & _ELICITING:
             packets.owe_ack(now_s, at_once=not is_in_order or bool(contents & _AT_ONCE))
-        self._streams_heard = data[_STREAMS]
+        self._streams_heard = streams
         self._is_listening = reliable.is_listening or sync.is_listening
         for kind, channel, number, payload in frames:
             if kind:
