@@ -62,6 +62,8 @@ PROGRESS_INTERVAL_S = 0.5
 SLOW_CALL_S = 0.5
 """A call of the plug-in that takes this long while the run is on is told: agents lose a silent host."""
 FLUSH_TIMEOUT_S = 5.0
+PACE_TOTAL_BYTES_PER_S = 100e6
+"""What all agents together are sent in RELIABLE fragments, beyond bursts: most of a gigabit network."""
 OPERATOR_GONE = "the operator's process is gone"
 HANG_GRACE_S = 2.0
 """Beyond the time for shutdown: a loop that hangs in a plug-in, without an operator, ends by force."""
@@ -122,7 +124,8 @@ class HostRuntime:
             receive_buffer_bytes=config.network.receive_buffer_bytes,
         )
         limits = LinkLimits(
-            receive_window_bytes=window_bytes(self._socket.receive_buffer_bytes, len(self._names))
+            receive_window_bytes=window_bytes(self._socket.receive_buffer_bytes, len(self._names)),
+            pace_bytes_per_s=PACE_TOTAL_BYTES_PER_S / len(self._names),
         )
         self._session = HostSession(
             self._names,
