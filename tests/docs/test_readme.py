@@ -80,7 +80,7 @@ def test_every_command_that_the_readme_names_exists(tmp_path):
 
 
 def test_every_file_that_the_readme_links_to_exists():
-    linked = re.findall(r"\]\(([^)#]+)\)", README)
+    linked = re.findall(r"\]\(([^)#]+)\)", README) + re.findall(r'src="([^"]+)"', README)
 
     missing = [link for link in linked if "://" not in link and not (ROOT / link).exists()]
     assert missing == []
