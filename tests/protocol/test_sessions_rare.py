@@ -1,0 +1,226 @@
+"""Sessions where things happen out of turn: each is counted or refused, and nothing moves wrongly."""
+
+import pytest
+from test_sessions import TIMEOUTS, WIRE, World, world
+
+from madns_runtime import __version__
+from madns_runtime.protocol import agent_session as a
+from madns_runtime.protocol import host_events as h
+from madns_runtime.protocol.agent_session import HELD_MAX, AgentIdentity, AgentSession
+from madns_runtime.protocol.codec import encode_message
+from madns_runtime.protocol.host_events import Phase
+from madns_runtime.protocol.messages import (
+    AgentStopped,
+    Hello,
+    Pong,
+    Service,
+    SimulationStart,
+    SystemStop,
+)
+from madns_runtime.protocol.states import AgentState, HostState
+
+
+def say(w, name, message):
+    """Let an agent's link say something out of turn."""
+    w.agents[name].link.send_urgent(encode_message(message), Service.SYNC, w.now_s)
+    w.run_for(0.3)
+
+
+def order(w, name, message):
+    """Let the host's link say something out of turn."""
+    w.host.peers[name].link.send_urgent(encode_message(message), Service.SYNC, w.now_s)
+    w.host._dirty.add(w.host.peers[name].index)
+    w.run_for(0.3)
+
+
+def test_messages_of_the_wrong_side_or_without_sense_are_counted():
+    w = world(count=1)
+    w.run_for(1.5)
+
+    say(w, "agent-1", Pong(1.0, 2.0, 3.0))
+    w.agents["agent-1"].link.send_urgent(b"\xff\x00", Service.SYNC, w.now_s)
+    order(w, "agent-1", Hello("agent-1", __version__, 1))
+    order(w, "agent-1", SimulationStart(1.0))  # it runs already
+    w.host.peers["agent-1"].link.send_urgent(b"\xff\x00", Service.SYNC, w.now_s)
+    w.host._dirty.add(1)
+    w.run_for(0.3)
+
+    assert w.host.malformed_count == 2
+    assert w.agents["agent-1"].malformed_count == 3
+    assert w.host.peers["agent-1"].phase is Phase.RUNNING
+
+
+def test_agent_that_stops_before_it_is_told_to_is_lost():
+    w = world(count=2, policy="continue")
+    w.run_for(1.5)
+
+    say(w, "agent-1", AgentStopped({}))
+
+    lost = w.host_event(h.AgentLost)
+    assert lost == h.AgentLost("agent-1", "it stopped before it was told to")
+
+
+def test_stop_out_of_turn_moves_no_agent():
+    w = world(count=1)
+    w.run_for(1.5)
+
+    order(w, "agent-1", SystemStop())
+
+    assert w.agents["agent-1"].state is AgentState.RUN_SIMULATION
+    assert w.agents["agent-1"].malformed_count == 1
+
+
+def test_what_waits_for_set_up_is_bounded_and_the_rest_counted():
+    w = world(count=1)
+    w.host_sets_up = False
+    w.run_for(0.5)
+    for number in range(HELD_MAX + 5):
+        w.host.send("agent-1", number, Service.RELIABLE, w.now_s)
+    w.run_for(2)
+
+    w.host.setup_finished({"agent-1": {}}, w.now_s)
+    w.run_for(2)
+
+    got = [e.payload for e in w.agent_events["agent-1"] if isinstance(e, a.DataReceived)]
+    assert got == list(range(HELD_MAX))
+    assert w.agents["agent-1"].held_dropped_count == 5
+
+
+def test_newcomer_at_the_end_of_a_run_is_sent_away():
+    w = world(count=2, policy="continue")
+    w.run_for(1.5)
+    w.host.agent_exited("agent-2", "killed by SIGKILL", w.now_s)
+    del w.agents["agent-2"]
+    w.run_for(0.2)
+    w.host.emergency("operator", "interrupted", w.now_s)
+    w.join("agent-2")
+
+    w.run_for(1.0)
+
+    told = w.agent_saw("agent-2", a.EmergencyDeclared)
+    assert told.who == "host"
+    assert "already ending" in told.reason or told.reason == "interrupted"
+
+
+def test_successor_of_a_completed_agent_is_refused():
+    w = world(count=2)
+    w.agents["agent-2"].run_finished = lambda summary, now_s: None  # agent-2 is slow to finish
+    while w.host.peers["agent-1"].phase is not Phase.COMPLETE:
+        w.run_for(0.05)
+    first = w.agents["agent-1"]
+    w.join("agent-1")
+    w.run_for(0.2)
+
+    assert w.host.refused["old_incarnation"] > 0
+    assert w.host.peers["agent-1"].phase is Phase.COMPLETE
+    assert first is not w.agents["agent-1"]
+
+
+def test_agents_that_are_ready_or_silent_at_a_deadline_are_told_apart_under_continue():
+    w = World(("agent-1", "agent-2"), policy="continue")
+    w.join("agent-1")
+
+    w.run_for(6)
+
+    assert w.host.peers["agent-2"].phase is Phase.LOST
+    assert w.host.peers["agent-2"].loss_reason.startswith("no AGENT_READY in 5")
+    assert w.host.peers["agent-1"].phase is Phase.RUNNING
+
+
+def test_host_ends_though_agents_never_say_that_they_stopped():
+    w = world(count=2)
+    w.run_for(1.5)
+    w.frozen.update(w.names)
+    w.host.emergency("operator", "interrupted", w.now_s)
+
+    w.run_for(5)
+
+    assert w.host_event(h.AgentsStopped).missing == w.names
+    assert w.host.state is HostState.EXIT
+    assert w.host.get_timer() is None
+
+
+def test_word_of_unknown_or_ended_agents_changes_nothing():
+    w = world(count=2, policy="continue")
+    w.run_for(1.5)
+    w.host.agent_exited("agent-1", "gone", w.now_s)
+    events = len(w.host_events)
+
+    w.host.agent_exited("agent-1", "gone again", w.now_s)
+    w.host.agent_exited("nobody", "gone", w.now_s)
+    w.host.send_setup("agent-2", {}, w.now_s)
+    w.run_for(0.01)
+
+    lost = [e for e in w.host_events if isinstance(e, h.AgentLost)]
+    assert lost == [h.AgentLost("agent-1", "gone")]
+    assert len(w.host_events) <= events + 4
+
+
+def test_second_emergency_has_no_effect_on_either_side():
+    w = world(count=1)
+    w.run_for(1.5)
+    w.host.emergency("operator", "first", w.now_s)
+    w.host.emergency("operator", "second", w.now_s)
+    w.run_for(0.3)
+    w.agents["agent-1"].emergency("third", w.now_s)
+    order(w, "agent-1", Hello("agent-1", __version__, 1))
+    w.run_for(3)
+
+    declared = [e for e in w.host_events if isinstance(e, h.EmergencyDeclared)]
+    assert declared == [h.EmergencyDeclared("operator", "first")]
+    seen = [e for e in w.agent_events["agent-1"] if isinstance(e, a.EmergencyDeclared)]
+    assert seen == [a.EmergencyDeclared("operator", "first")]
+
+
+def test_agent_without_a_host_says_what_to_look_at_and_ends():
+    w = World(("agent-1",))
+    w.host_is_dead = True
+    w.join("agent-1")
+
+    w.run_for(8)
+
+    told = w.agent_saw("agent-1", a.EmergencyDeclared)
+    assert "no answer to HELLO in 5 s" in told.reason
+    assert "UDP port" in told.reason
+    assert w.agents["agent-1"].state is AgentState.EXIT
+    assert w.agents["agent-1"].get_timer() is None
+    w.agents["agent-1"].handle_timer(w.now_s)  # over: nothing moves
+    w.agents["agent-1"].receive_datagram(b"late", w.now_s)
+    assert w.agents["agent-1"].state is AgentState.EXIT
+
+
+def test_agent_that_is_never_told_to_go_on_ends_by_its_deadline():
+    w = world(count=1)
+    w.host.start = lambda *arguments: None
+
+    w.run_for(12)
+
+    told = w.agent_saw("agent-1", a.EmergencyDeclared)
+    assert "no order to go on from AGENT_SIMULATION_READY" in told.reason
+
+
+def test_broken_deadline_of_an_agents_own_message_is_told_once():
+    w = world(count=1)
+    w.run_for(1.5)
+    session = w.agents["agent-1"]
+    session.send("late", Service.SYNC, w.now_s, deadline_s=w.now_s - 1.0)
+    w.run_for(0.3)
+
+    assert session.next_broken_deadline().deadline_s < w.now_s
+    assert session.next_broken_deadline() is None
+
+
+@pytest.mark.parametrize("name", ["agent-2", "somebody"])
+def test_agent_that_gives_another_name_than_its_place_is_refused(name):
+    w = World(("agent-1",))
+    w.agents["agent-1"] = AgentSession(
+        AgentIdentity(name=name, index=1, incarnation=9, runtime_version=__version__, pid=1),
+        WIRE,
+        timeouts=TIMEOUTS,
+        report=dict,
+        now_s=w.now_s,
+    )
+
+    w.run_for(1)
+
+    assert w.host.peers["agent-1"].phase is Phase.LOST
