@@ -1,0 +1,1 @@
+"""How machines are reached: connections, what runs over them, and what became of each machine."""

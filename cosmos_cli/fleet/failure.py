@@ -1,0 +1,61 @@
+"""Why a machine could not do what it was asked to, in words, and what to do about it."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Any
+
+
+class FailureKind(StrEnum):
+    """What went wrong; scripts may rely on these words."""
+
+    UNREACHABLE = "unreachable"
+    """No route, or nothing answers."""
+    REFUSED = "refused"
+    """The machine answers, but no SSH server listens on that port."""
+    FROZEN = "frozen"
+    """The connection opens, but nothing is said: a hung machine, or one that is just starting."""
+    HOST_KEY_CHANGED = "host_key_changed"
+    HOST_KEY_UNKNOWN = "host_key_unknown"
+    AUTHENTICATION = "authentication"
+    """Wrong key or wrong user; the server does not tell which."""
+    LOST = "lost"
+    """The connection broke, or the machine stopped answering, in the midst of it."""
+    TIMEOUT = "timeout"
+    """It answers, but did not finish in time."""
+    PYTHON = "python"
+    """No Python there, or one that is too old."""
+    NO_SUDO = "no_sudo"
+    DISK_FULL = "disk_full"
+    READ_ONLY = "read_only"
+    BUSY = "busy"
+    """Another command works there."""
+    STEP = "step"
+    """A step of provisioning failed; the text quotes its last words."""
+    UNSUPPORTED = "unsupported"
+    """What is asked cannot be done on such a machine."""
+    DATA = "data"
+    """What came is not what was announced."""
+    DEFECT = "defect"
+    """COSMoS itself is to blame."""
+
+
+class MachineFailure(Exception):
+    """
+    One machine's failure. Others' results are never hidden by it.
+
+    Args:
+        kind: What went wrong.
+        text: A sentence with what was expected and what came; without the machine's name.
+        advice: What to do, starting with a small letter; may be empty.
+    """
+
+    def __init__(self, kind: FailureKind, text: str, advice: str = "") -> None:
+        super().__init__(f"{text}; {advice}" if advice else text)
+        self.kind = kind
+        self.text = text
+        self.advice = advice
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values for --json."""
+        return {"kind": self.kind.value, "text": self.text, "advice": self.advice}

@@ -1,0 +1,144 @@
+"""This computer as a machine: the same as over SSH, through pipes."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import subprocess
+import tempfile
+import time
+
+from cosmos_cli.fleet.connection import Completed
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.target import Target
+
+LOOPBACK = "127.0.0.1"
+ERROR_BYTES_MAX = 4096
+END_TIMEOUT_S = 5.0
+
+
+class LocalConnection:
+    """
+    This computer.
+
+    Args:
+        target: Its entry in the inventory.
+    """
+
+    own_address = LOOPBACK
+    peer_address = LOOPBACK
+
+    def __init__(self, target: Target) -> None:
+        self.target = target
+
+    def open(self, command: str) -> LocalStream:
+        """Start a shell command."""
+        return LocalStream(command)
+
+    def run(self, command: str, *, stdin: bytes = b"", timeout_s: float) -> Completed:
+        """Run a shell command to its end."""
+        try:
+            done = subprocess.run(
+                ["/bin/sh", "-c", command],
+                input=stdin,
+                capture_output=True,
+                timeout=timeout_s,
+                check=False,
+                start_new_session=True,
+            )
+        except subprocess.TimeoutExpired:
+            raise MachineFailure(FailureKind.TIMEOUT, f"not done in {timeout_s:g} s") from None
+        return Completed(exit_status=done.returncode, stdout=done.stdout, stderr=done.stderr)
+
+    def is_alive(self, *, timeout_s: float = 2.0) -> bool:
+        """Return True: whoever asks is this computer."""
+        return True
+
+    def close(self) -> None:
+        """Do nothing: there is nothing to close."""
+
+
+class LocalStream:
+    """A program here; see `cosmos_cli.fleet.connection.Stream`."""
+
+    def __init__(self, command: str) -> None:
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
+        self._process = subprocess.Popen(
+            ["/bin/sh", "-c", command],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            start_new_session=True,
+            bufsize=0,
+        )
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._stdin, self._stdout = self._process.stdin, self._process.stdout
+        for pipe in (self._stdin, self._stdout):
+            os.set_blocking(pipe.fileno(), False)
+
+    def fileno(self) -> int:
+        """Return what to poll."""
+        return self._stdout.fileno()
+
+    def read(self, count: int) -> bytes:
+        """Return what has come."""
+        return os.read(self._stdout.fileno(), count)
+
+    def write(self, data: bytes) -> int:
+        """Hand over what fits."""
+        try:
+            return os.write(self._stdin.fileno(), data)
+        except (BrokenPipeError, ValueError):
+            raise MachineFailure(FailureKind.LOST, "the program has ended") from None
+
+    def read_some(self, count: int, *, timeout_s: float) -> bytes:
+        """Wait for bytes."""
+        if not select.select([self._stdout], [], [], timeout_s)[0]:
+            raise MachineFailure(FailureKind.TIMEOUT, f"no answer in {timeout_s:g} s")
+        return self.read(count)
+
+    def write_all(self, data: bytes, *, timeout_s: float) -> None:
+        """Hand over everything."""
+        view = memoryview(data)
+        while view:
+            try:
+                view = view[self.write(view) :]  # type: ignore[arg-type]
+            except BlockingIOError:
+                if not select.select([], [self._stdin], [], timeout_s)[1]:
+                    raise MachineFailure(
+                        FailureKind.TIMEOUT, f"took no more input for {timeout_s:g} s"
+                    ) from None
+
+    def close_writing(self) -> None:
+        """End its standard input."""
+        with contextlib.suppress(OSError):
+            self._stdin.close()
+
+    def exit_status(self) -> int | None:
+        """Return how it ended, waiting a moment when its output has ended already."""
+        until_s = time.monotonic() + 1.0
+        while (status := self._process.poll()) is None and self._stdout.closed:
+            if time.monotonic() > until_s:
+                break
+            time.sleep(0.01)
+        return status
+
+    def errors(self) -> str:
+        """Return the last of its standard error."""
+        if self._errors.closed:
+            return ""
+        size = self._errors.seek(0, os.SEEK_END)
+        self._errors.seek(max(0, size - ERROR_BYTES_MAX))
+        return self._errors.read(ERROR_BYTES_MAX).decode(errors="replace")
+
+    def close(self) -> None:
+        """Close the pipes and wait for its end; one that does not heed is killed."""
+        self.close_writing()
+        self._stdout.close()
+        try:
+            self._process.wait(END_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._errors.close()

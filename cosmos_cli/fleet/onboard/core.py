@@ -1,0 +1,277 @@
+"""
+The loop on a machine: requests come in as frames, answers go out as frames.
+
+A frame is one line of JSON, then as many raw bytes as its "body" says. A request names a verb; other
+modules of this package enter theirs in `VERBS`. What needs root goes on to a second such loop behind
+`sudo -n`. The loop ends when its standard input does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+HEADER_BYTES_MAX = 64 * 1024 * 1024
+BODY_BYTES_MAX = 1024 * 1024 * 1024
+LAST_WORDS_BYTES = 4000
+
+
+class Refusal(Exception):
+    """
+    A request that could not be carried out; the operator's side makes a MachineFailure of it.
+
+    Args:
+        kind: A word of `cosmos_cli.fleet.failure.FailureKind`.
+        text: What was expected and what came.
+        advice: What to do.
+    """
+
+    def __init__(self, kind: str, text: str, advice: str = "") -> None:
+        super().__init__(text)
+        self.kind = kind
+        self.text = text
+        self.advice = advice
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Request:
+    """What a verb is given."""
+
+    arguments: Mapping[str, Any]
+    body: bytes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Part:
+    """One of many pieces of an answer; a verb that returns an iterator of these streams them."""
+
+    value: Any = None
+    body: bytes = b""
+
+
+Handler = Callable[[Request], Any]
+VERBS: dict[str, Handler] = {}
+
+
+def verb(name: str) -> Callable[[Handler], Handler]:
+    """Enter a function as the handler of a verb: it returns plain values, a `Part`, or an iterator of parts."""
+
+    def enter(handler: Handler) -> Handler:
+        VERBS[name] = handler
+        return handler
+
+    return enter
+
+
+class FrameReader:
+    """Reads frames from a binary stream."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+
+    def read(self) -> tuple[dict[str, Any], bytes] | None:
+        """Return header and body of the next frame; None at the end, also one in the midst of a frame."""
+        line = self._stream.readline(HEADER_BYTES_MAX)
+        if not line.endswith(b"\n"):
+            return None
+        header = json.loads(line)
+        size = int(header.get("body", 0))
+        if not 0 <= size <= BODY_BYTES_MAX:
+            return None
+        body = self._stream.read(size) if size else b""
+        return (header, body) if len(body) == size else None
+
+
+class FrameWriter:
+    """Writes frames to a binary stream."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+
+    def write(self, header: Mapping[str, Any], body: bytes = b"") -> None:
+        """Write one frame and flush it."""
+        line = json.dumps({**header, "body": len(body)}, separators=(",", ":")).encode() + b"\n"
+        self._stream.write(line)
+        if body:
+            self._stream.write(body)
+        self._stream.flush()
+
+
+class Rooted:
+    """A second loop as root, started when first needed."""
+
+    def __init__(self, boot: list[str], package: bytes) -> None:
+        self._boot = boot
+        self._package = package
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def relay(self, header: dict[str, Any], body: bytes, out: FrameWriter) -> None:
+        """Have root do it, and pass its answer on."""
+        process = self._process or self._start()
+        assert process.stdin is not None and process.stdout is not None
+        FrameWriter(process.stdin).write(header, body)  # type: ignore[arg-type]
+        reader = FrameReader(process.stdout)  # type: ignore[arg-type]
+        while (frame := reader.read()) is not None:
+            out.write(*frame)
+            if not frame[0].get("part"):
+                return
+        raise Refusal("lost", "what runs there as root ended without an answer")
+
+    def close(self) -> None:
+        """Let it end."""
+        if self._process is not None and self._process.stdin is not None:
+            with contextlib.suppress(OSError):
+                self._process.stdin.close()
+            self._process.wait()
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        try:
+            asked = subprocess.run(
+                ["sudo", "-n", "true"], capture_output=True, timeout=20, check=False
+            )
+        except (FileNotFoundError, subprocess.TimeoutExpired) as error:
+            raise no_sudo(f"sudo: {error}") from None
+        if asked.returncode:
+            raise no_sudo(asked.stderr.decode(errors="replace").strip() or "sudo refused")
+        process = subprocess.Popen(
+            ["sudo", "-n", *self._boot],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
+        assert process.stdin is not None
+        process.stdin.write(self._package)
+        process.stdin.flush()
+        assert process.stdout is not None
+        if FrameReader(process.stdout).read() is None:  # type: ignore[arg-type]
+            raise Refusal("lost", "what runs there as root ended before it began")
+        self._process = process
+        return process
+
+
+def no_sudo(said: str) -> Refusal:
+    """Return the refusal of a machine that lets nobody become root."""
+    return Refusal(
+        "no_sudo",
+        f"cannot become root without a password: {said}",
+        "let the user run sudo without one (a file in /etc/sudoers.d), or take what needs root out"
+        " of the inventory",
+    )
+
+
+def greet() -> None:
+    """Say who works here, as the first frame."""
+    told = {
+        "python": ".".join(map(str, sys.version_info[:3])),
+        "executable": sys.executable,
+        "uid": os.geteuid(),
+        "home": os.path.expanduser("~"),
+        "node": os.uname().nodename,
+        "pid": os.getpid(),
+    }
+    FrameWriter(sys.stdout.buffer).write({"ok": True, "value": told})
+
+
+def serve(boot: list[str], package: bytes) -> None:
+    """
+    Answer requests until standard input ends.
+
+    Args:
+        boot: Command line that starts this loop again.
+        package: What that one must be given first.
+    """
+    out = FrameWriter(os.fdopen(os.dup(1), "wb"))
+    os.dup2(2, 1)  # what a command prints must not mix with the frames
+    reader = FrameReader(sys.stdin.buffer)
+    os.set_inheritable(0, False)
+    rooted = Rooted(boot, package)
+    try:
+        while (frame := reader.read()) is not None:
+            header, body = frame
+            if header.get("root") and os.geteuid() != 0:
+                _guarded(out, lambda: rooted.relay(header, body, out))  # noqa: B023 - called at once
+            else:
+                _guarded(out, lambda: _answer(header, body, out))  # noqa: B023 - called at once
+    except BrokenPipeError:
+        pass  # the operator is gone; what was done is done
+    finally:
+        rooted.close()
+
+
+def _answer(header: dict[str, Any], body: bytes, out: FrameWriter) -> None:
+    handler = VERBS.get(str(header.get("verb")))
+    if handler is None:
+        raise Refusal("defect", f"no verb {header.get('verb')!r}")
+    value = handler(Request(arguments=header.get("arguments") or {}, body=body))
+    if isinstance(value, Iterator):
+        for part in value:
+            out.write({"ok": True, "part": True, "value": part.value}, part.body)
+        value = None
+    if isinstance(value, Part):
+        out.write({"ok": True, "value": value.value}, value.body)
+    else:
+        out.write({"ok": True, "value": value})
+
+
+def _guarded(out: FrameWriter, act: Callable[[], None]) -> None:
+    try:
+        act()
+    except BrokenPipeError:
+        raise
+    except Refusal as refusal:
+        _refuse(out, refusal)
+    except OSError as error:
+        _refuse(out, refusal_of(error))
+    except Exception as error:  # noqa: BLE001 - the operator is told; the loop serves on
+        _refuse(out, Refusal("defect", f"unexpected {type(error).__name__}: {error}"))
+
+
+def _refuse(out: FrameWriter, refusal: Refusal) -> None:
+    told = {"kind": refusal.kind, "text": refusal.text, "advice": refusal.advice}
+    out.write({"ok": False, "error": told})
+
+
+def refusal_of(error: OSError) -> Refusal:
+    """Return an error of the file system in words."""
+    where = f"{error.filename}: " if error.filename else ""
+    text = f"{where}{error.strerror or error}"
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return Refusal("disk_full", text, "make room there, then repeat the command")
+    if error.errno == errno.EROFS:
+        return Refusal(
+            "read_only", text, "check the card or disk there (a worn SD card turns read-only)"
+        )
+    return Refusal("step", text)
+
+
+def last_words(output: bytes) -> str:
+    """Return the end of what a command said, at most ten lines."""
+    lines = output[-LAST_WORDS_BYTES:].decode(errors="replace").strip().splitlines()
+    return "\n".join(lines[-10:])
+
+
+@verb("lock")
+def lock(request: Request) -> None:
+    """Take the machine's lock until this loop ends, so that two commands do not work there at once."""
+    path = os.path.expanduser(request.arguments["path"])
+    os.makedirs(os.path.dirname(path), exist_ok=True)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        holder = os.read(descriptor, 200).decode(errors="replace").strip()
+        os.close(descriptor)
+        by = f" ({holder})" if holder else ""
+        raise Refusal(
+            "busy", f"another command works there{by}", "wait for its end, then repeat"
+        ) from None
+    os.ftruncate(descriptor, 0)
+    os.write(descriptor, str(request.arguments.get("holder", "")).encode()[:200])

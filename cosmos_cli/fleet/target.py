@@ -1,0 +1,64 @@
+"""Where a machine is and how to log in there: what a connection needs of an inventory. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from cosmos_cli.models.inventory import Machine
+
+ROOT_DEFAULT = "~/cosmos"
+"""Folder of COSMoS on a machine; ~ is the home of who logs in."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Target:
+    """One machine as a connection sees it; holds no secret and may be written to disk."""
+
+    name: str
+    address: str
+    """Host name, address, or an alias of the operator's ssh configuration."""
+    connection: Literal["local", "ssh"] = "ssh"
+    user: str | None = None
+    """Who logs in; None leaves it to the ssh configuration."""
+    port: int | None = None
+    key_file: str | None = None
+    """Path of a private key here; None leaves it to the ssh configuration and the ssh agent."""
+    python: str | None = None
+    """Interpreter there; None looks for one."""
+    may_become_root: bool = True
+    """False when the inventory says ansible_become: false."""
+    root: str = ROOT_DEFAULT
+    """Folder of COSMoS there."""
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values for plan.json."""
+        return asdict(self)
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any]) -> Target:
+        """Read back what `to_mapping` wrote."""
+        return cls(**mapping)
+
+    @property
+    def label(self) -> str:
+        """Return the name, and the address where it is another."""
+        return self.name if self.address == self.name else f"{self.name} ({self.address})"
+
+
+def target_of(machine: Machine) -> Target:
+    """Return how to reach a machine of the inventory."""
+    values = machine.variables
+    python = values.get("ansible_python_interpreter")
+    return Target(
+        name=machine.name,
+        address=machine.address,
+        connection=machine.connection,
+        user=values.get("ansible_user"),
+        port=values.get("ansible_port"),
+        key_file=values.get("ansible_ssh_private_key_file"),
+        python=None if python in (None, "auto", "auto_silent", "auto_legacy") else str(python),
+        may_become_root=values.get("ansible_become") is not False,
+        root=values.get("cosmos_root") or ROOT_DEFAULT,
+    )
