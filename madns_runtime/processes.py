@@ -2,13 +2,15 @@
 The machine's register of what runs on it: one small file a process, believed only as far as the kernel agrees.
 
 A pid alone says nothing, for the kernel gives it out again: an entry holds the start time and the boot
-as well, and a process is signalled through a descriptor that cannot come to mean another.
+as well, and a process is signalled through a descriptor that cannot come to mean another. Standard
+library only: the operator's side sends this source to machines that have nothing of COSMoS installed.
 """
 
 from __future__ import annotations
 
 import contextlib
 import itertools
+import json
 import os
 import platform
 import re
@@ -19,8 +21,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
-
-import orjson
 
 Role = Literal["operator", "host", "supervisor", "agent"]
 
@@ -115,7 +115,7 @@ def register(run: str, role: Role, name: str, run_directory: str | Path) -> Regi
     path = directory / f"{pid}-{entry.start_ticks}-{next(_serials)}.json"
     try:
         directory.mkdir(parents=True, exist_ok=True, mode=0o700)
-        _write_whole(path, orjson.dumps(asdict(entry)))
+        _write_whole(path, json.dumps(asdict(entry)).encode())
     except OSError as error:
         problem = (
             f"{directory}: cannot note process {pid} ({role} {entry.name}) there: {error.strerror}; "
@@ -249,8 +249,8 @@ def _read_entry(path: Path) -> ProcessEntry | None:
         if path.stat().st_uid != os.geteuid():
             return None  # What another user wrote must not tell us whom to signal.
         with path.open("rb") as file:
-            values = orjson.loads(file.read(FILE_BYTES_MAX))
-    except (OSError, orjson.JSONDecodeError):
+            values = json.loads(file.read(FILE_BYTES_MAX))
+    except (OSError, ValueError, RecursionError):
         return None
     if not isinstance(values, dict):
         return None

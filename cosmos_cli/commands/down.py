@@ -8,7 +8,8 @@ import typer
 
 from cosmos_cli.console import Console, JsonOption, QuietOption
 from cosmos_cli.errors import ExitCode, InputError
-from cosmos_cli.launch.living import Ending, LivingRun, end_run, living_runs
+from cosmos_cli.fleet.onboard.processes import Ending
+from cosmos_cli.launch.living import LivingRun, end_run, living_runs
 from madns_runtime.processes import ProcessEntry
 
 CLEAN_TIMEOUT_S = 30.0

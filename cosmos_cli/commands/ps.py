@@ -7,7 +7,8 @@ from typing import Annotated, Any
 import typer
 
 from cosmos_cli.console import Column, Console, JsonOption, QuietOption
-from cosmos_cli.launch.living import LivingRun, age_s, living_runs
+from cosmos_cli.fleet.onboard.processes import age_s
+from cosmos_cli.launch.living import LivingRun, living_runs
 from madns_runtime.processes import ProcessEntry
 
 COLUMNS = (

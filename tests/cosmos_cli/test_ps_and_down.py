@@ -252,7 +252,9 @@ def test_down_fails_when_something_is_left(
     start: Start, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     host = start("0001-a", "host", "host", "stubborn")
-    monkeypatch.setattr("cosmos_cli.launch.living.end_process", lambda entry, number: False)
+    monkeypatch.setattr(
+        "cosmos_cli.fleet.onboard.processes.end_process", lambda entry, number: False
+    )
     monkeypatch.setattr("cosmos_cli.commands.down.FORCED_TIMEOUT_S", 0.1)
 
     code = cosmos(["down", "0001-a", "--timeout", "0.1"])
