@@ -39,7 +39,8 @@ class Expected:
         """Return what plan.json promises; of an unreadable plan nothing but the host's own records."""
         config, plan = run.read_config(), run.read_json(run.plan_json) or {}
         machines = plan.get("machines")
-        names = tuple(machines) if isinstance(machines, Mapping) else ()
+        named = machines if isinstance(machines, Mapping) else {}
+        names = tuple(name for name, machine in named.items() if _has_agents(machine))
         return cls.of(config, names) if config else cls(machines=names)
 
 
@@ -67,6 +68,11 @@ def find_missing(
     return [_line(name, found, agents) for name, found in faults.items() if found]
 
 
+def _has_agents(machine: object) -> bool:
+    """Tell whether a machine of the plan records: the host's may run no agent."""
+    return not isinstance(machine, Mapping) or machine.get("agents") != []
+
+
 def mapping_at(mapping: Mapping[str, Any] | None, *keys: str) -> Mapping[str, Any]:
     """Return the mapping under nested keys; an empty one if any is missing or something else."""
     value: Any = mapping
@@ -90,6 +96,8 @@ def _check_source(
     if not scans:
         found.append("no records")
         return
+    lives = {scan.file.incarnation for scan in scans}
+    found.extend(f"no records of incarnation {n}" for n in range(1, max(lives)) if n not in lives)
     have = {scan.file.stream for scan in scans}
     paths = {scan.file.path.name for scan in scans}
     reported = mapping_at(summary, "records", "streams")

@@ -29,13 +29,20 @@ class AgentRecords:
         config: The run.
         source: The agent's name.
         t_s: Returns the simulated time, s; None before it runs.
+        incarnation: Which process of this agent this is, from 1.
     """
 
     def __init__(
-        self, directory: Path, config: RunConfig, *, source: str, t_s: Callable[[], float | None]
+        self,
+        directory: Path,
+        config: RunConfig,
+        *,
+        source: str,
+        t_s: Callable[[], float | None],
+        incarnation: int = 1,
     ) -> None:
         self.recorder = Recorder(
-            directory, run=config.run, source=source, settings=config.recording
+            directory, run=config.run, source=source, settings=config.recording, life=incarnation
         )
         for schema in (TICKS, CLOCK, EVENTS, LOG, PROCESS):
             self.recorder.open_stream(schema)

@@ -48,10 +48,12 @@ AGENT_RECEIVE_BUFFER_BYTES = 1024 * 1024
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Program:
-    """What every agent of a process runs, loaded once."""
+    """What every agent of a process runs, loaded once, and in which life."""
 
     simulation: Callable[[], AgentSimulation]
     parameters: Any
+    incarnation: int = 1
+    """Which process of these agents this is."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,7 +96,11 @@ class AgentRunner:
         self._on_ended = on_ended
         self._index = config.agents.resolved_names().index(name)
         self._records = AgentRecords(
-            Path(launch.directory) / "agents" / name, config, source=name, t_s=self._t_s_or_none
+            Path(launch.directory) / "agents" / name,
+            config,
+            source=name,
+            t_s=self._t_s_or_none,
+            incarnation=program.incarnation,
         )
         self._record = self._records.recorder.record
         self._t0_host_s: float | None = None

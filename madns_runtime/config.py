@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -208,6 +208,8 @@ class HostLaunch:
     session_hex: str
     directory: str
     """Where the host records (host/ of the run directory)."""
+    is_detached: bool = False
+    """The operator leaves while the run goes on: the end of standard input is no end."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -225,6 +227,16 @@ class AgentLaunch:
     host_port: int
     directory: str
     """The run directory here; agents record in agents/<name>/, the machine's health in machines/<machine>/."""
+    is_detached: bool = False
+    """The operator leaves while the run goes on: the end of standard input is no end."""
+    life: Annotated[int, Ge(1)] = 1
+    """Which supervisor of this machine this is: more than 1 when the machine was lost and has returned."""
+    first_incarnations: Mapping[str, int] = field(default_factory=dict)
+    """The number that an agent's first process here gets; 1 where none is named."""
+
+    def first_incarnation(self, agents: Iterable[str]) -> int:
+        """Return the number of the first process of *agents*: their others were of an earlier supervisor."""
+        return max(self.first_incarnations.get(agent, 1) for agent in agents)
 
 
 def to_mapping(value: Any) -> dict[str, Any]:

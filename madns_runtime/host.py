@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 import orjson
 
-from madns_runtime.config import HostLaunch, from_mapping
+from madns_runtime.config import HostLaunch, RunConfig, from_mapping
 from madns_runtime.context import (
     JobContext,
     check_deadline,
@@ -117,7 +117,9 @@ class HostRuntime:
             on_command=self._command,
             on_gone=self._operator_gone,
             pending=pending,
+            is_detached=launch.is_detached,
         )
+        self._is_detached = launch.is_detached
         self._socket = UdpSocket.bind(
             config.network.address,
             config.network.port,
@@ -161,7 +163,12 @@ class HostRuntime:
     def run(self) -> int:
         """Run to the end and return the process's exit code."""
         config = self._config
-        end_after_hang_up(self._line_fd, config.timeouts.shutdown_s + HANG_GRACE_S)
+        if self._is_detached:
+            # Nobody is left who would end a loop that hangs in a plug-in.
+            extend(_longest_s(config) + HANG_GRACE_S)
+            signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        else:
+            end_after_hang_up(self._line_fd, config.timeouts.shutdown_s + HANG_GRACE_S)
         outlive_parent()
         self._reactor.on_signal(signal.SIGTERM, self._terminated)
         self._reactor.on_signal(
@@ -493,6 +500,7 @@ class HostRuntime:
     def _close(self) -> int:
         network = self._socket.counters()
         result = self._report.result(self._session, network=network)
+        result["events_dropped"] = self._operator.dropped_count
         text = orjson.dumps(result, option=orjson.OPT_SERIALIZE_NUMPY)
         is_left = self._leave(text)
         if is_left and len(text) > RESULT_BYTES_MAX:
@@ -515,6 +523,13 @@ class HostRuntime:
             path.with_suffix(".tmp").unlink(missing_ok=True)
             return False
         return True
+
+
+def _longest_s(config: RunConfig) -> float:
+    """Return how long a run may take at most: all its waits, one behind the other, s."""
+    t = config.timeouts
+    setup_s = t.agents_ready_s + t.host_setup_s + t.agent_setup_s + t.start_lead_s
+    return setup_s + config.time.duration_s + t.complete_s + 4 * t.shutdown_s + SAMPLER_TIMEOUT_S
 
 
 def window_bytes(receive_buffer_bytes: int, peers: int) -> int:

@@ -79,18 +79,21 @@ class Supervisor:
             machine=launch.machine,
             settings=config.health,
             recording=config.recording,
+            life=launch.life,
         )
         self._stress = start_stress(config.health.stress_workers)
         self._life_read_fd, self._life_write_fd = os.pipe()
         self._reason_read_fd, self._reason_write_fd = os.pipe()
         self._children: dict[int, Child] = {}
-        self._restarts: dict[tuple[str, ...], int] = {}
         self._is_ending = False
         self._failed = False
         gc.collect()
         gc.freeze()
         self._to_fork = _groups(launch.agents, config.agents.per_process)
-        started = [self._fork(agents, incarnation=1) for agents in self._to_fork]
+        started = [
+            self._fork(agents, incarnation=launch.first_incarnation(agents))
+            for agents in self._to_fork
+        ]
         self._reactor = Reactor()
         self._operator = OperatorLink(
             self._reactor,
@@ -98,6 +101,7 @@ class Supervisor:
             on_command=self._command,
             on_gone=lambda: self._end("the operator's process is gone"),
             pending=pending,
+            is_detached=launch.is_detached,
         )
         for child in started:
             self._tell_started(child)
@@ -105,6 +109,8 @@ class Supervisor:
     def run(self) -> int:
         """Run to the end and return the process's exit code: 0 if every agent ended as ordered."""
         outlive_parent()
+        if self._launch.is_detached:
+            signal.signal(signal.SIGHUP, signal.SIG_IGN)
         reactor = self._reactor
         reactor.on_signal(signal.SIGCHLD, self._reap)
         reactor.on_signal(signal.SIGTERM, lambda: self._end("SIGTERM"))
@@ -121,12 +127,12 @@ class Supervisor:
         sys.stderr.flush()
         pid = os.fork()
         if pid == 0:
-            self._run_child(agents)
+            self._run_child(agents, incarnation)
         child = Child(agents, pid, incarnation)
         self._children[pid] = child
         return child
 
-    def _run_child(self, agents: tuple[str, ...]) -> None:
+    def _run_child(self, agents: tuple[str, ...], incarnation: int) -> None:
         """Run as a child, and never return."""
         code = 1
         try:
@@ -134,7 +140,11 @@ class Supervisor:
             process = AgentProcess(
                 self._launch,
                 agents,
-                Program(simulation=self._simulation, parameters=self._parameters),
+                Program(
+                    simulation=self._simulation,
+                    parameters=self._parameters,
+                    incarnation=incarnation,
+                ),
                 life_fd=self._life_read_fd,
             )
             with register(
@@ -193,14 +203,13 @@ class Supervisor:
         del self._children[child.pid]
         signal_name = signal.Signals(-code).name if code < 0 else None
         how = _how(code, signal_name, child.reason)
-        restarts = self._restarts.get(child.agents, 0)
         has_failed = code != 0 or not child.has_ended_well
         will_restart = (
             has_failed
             and child.may_restart
             and not self._is_ending
             and self._launch.config.on_agent_loss == "continue"
-            and restarts < self._launch.config.agents.restarts_max
+            and child.incarnation <= self._launch.config.agents.restarts_max
         )
         self._failed = self._failed or has_failed
         if self._is_ending and code > 0 and child.reason is None:
@@ -220,7 +229,6 @@ class Supervisor:
                 }
             )
         if will_restart:
-            self._restarts[child.agents] = restarts + 1
             self._to_fork.append(child.agents)
             due_s = self._reactor.now_s() + RESTART_DELAY_S
             self._reactor.call_at(due_s, lambda: self._restart(child))

@@ -25,13 +25,14 @@ SAMPLER_TIMEOUT_S = RECORDS_TIMEOUT_S + 1.0
 """How long whoever ends the sampler should wait for it: its records need their own time."""
 
 
-def start_sampler(
+def start_sampler(  # noqa: PLR0913 - who records, and how; all by name
     directory: Path,
     *,
     run: str,
     machine: str,
     settings: Health,
     recording: Recording,
+    life: int = 1,
 ) -> Child:
     """
     Start the process that records this machine's state of health. Call it before threads are started.
@@ -42,10 +43,11 @@ def start_sampler(
         machine: Name of this machine.
         settings: The period.
         recording: How its records reach the disk.
+        life: Which life of the process that starts it this is; the file is numbered by it.
     """
 
     def main(lifeline: Lifeline) -> Mapping[str, Any]:
-        recorder = Recorder(directory, run=run, source=machine, settings=recording)
+        recorder = Recorder(directory, run=run, source=machine, settings=recording, life=life)
         recorder.open_stream(HEALTH)
         recorder.start()
         _sample(lifeline, Probe(directory), recorder, period_s=settings.period_s)

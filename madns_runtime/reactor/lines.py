@@ -1,11 +1,14 @@
 """
 JSON lines to and from whoever started this process; when that side closes, it is gone.
 
-The first line that comes in is the launch document; it may hold a secret and is never echoed.
+An operator on another computer may go without a word, as by a power cut: it sends pings, and when they
+cease it is gone as well. The first line that comes in is the launch document; it may hold a secret and
+is never echoed.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import select
 import time
@@ -24,6 +27,8 @@ LAUNCH_TIMEOUT_S = 30.0
 OUT_BYTES_MAX = 4 * 1024 * 1024
 """What may wait for an operator who does not read; more is dropped, oldest first, and counted."""
 READ_BYTES = 65_536
+PING_SILENCE_S = 30.0
+"""An operator that has sent pings and sends none for this long is gone."""
 
 
 def read_launch(fd: int) -> tuple[dict[str, Any], bytes]:
@@ -67,13 +72,14 @@ class OperatorLink:
 
     Args:
         reactor: The loop.
-        read_fd: Where commands come from; its end means that the operator is gone.
-        write_fd: Where events go to.
-        on_command: Called with each command.
-        on_gone: Called once when the operator's end closes.
+        fds: Where commands come from, whose end means that the operator is gone, and where events go to.
+        on_command: Called with each command; pings are answered here.
+        on_gone: Called once when the operator's end closes, or its pings cease.
+        pending: What had already come behind the launch document.
+        is_detached: The operator will leave, and that is no end.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - three are optional or by name
         self,
         reactor: Reactor,
         fds: tuple[int, int],
@@ -81,16 +87,21 @@ class OperatorLink:
         on_command: Callable[[Mapping[str, Any]], None],
         on_gone: Callable[[], None],
         pending: bytes = b"",
+        is_detached: bool = False,
     ) -> None:
         self._reactor = reactor
         self._read_fd, self._write_fd = fds
         self._on_command = on_command
         self._on_gone = on_gone
+        self._is_detached = is_detached
         self._in = b""
         self._out: deque[bytes] = deque()
         self._out_bytes = 0
+        self._is_deaf = False
         self.dropped_count = 0
+        """Events that nobody took."""
         self.is_gone = False
+        self._silence_timer = reactor.call_at(math.inf, self._lost)
         os.set_blocking(self._read_fd, False)
         os.set_blocking(self._write_fd, False)
         reactor.add_reader(self._read_fd, self._readable)
@@ -100,6 +111,9 @@ class OperatorLink:
 
     def emit(self, event: Mapping[str, Any]) -> None:
         """Send one event; never blocks."""
+        if self._is_deaf:
+            self.dropped_count += 1
+            return
         line = orjson.dumps(event, option=orjson.OPT_SERIALIZE_NUMPY) + b"\n"
         self._out.append(line)
         self._out_bytes += len(line)
@@ -112,7 +126,9 @@ class OperatorLink:
             self.dropped_count += 1
 
     def has_hung_up(self) -> bool:
-        """Tell whether the operator's end is closed, before the loop has come to see it."""
+        """Tell whether the operator's end is closed though it should not be, before the loop has come to see it."""
+        if self._is_detached:
+            return False
         poll = select.poll()
         poll.register(self._read_fd, 0)
         return self.is_gone or bool(poll.poll(0))
@@ -129,6 +145,7 @@ class OperatorLink:
 
     def close(self) -> None:
         """Stop listening; the descriptors stay open."""
+        self._silence_timer.cancel()
         if not self.is_gone:
             self._reactor.remove_reader(self._read_fd)
 
@@ -140,6 +157,8 @@ class OperatorLink:
             except BlockingIOError:
                 return
             except OSError:
+                self._is_deaf = True
+                self.dropped_count += len(self._out)
                 self._out.clear()
                 self._out_bytes = 0
                 return
@@ -159,9 +178,15 @@ class OperatorLink:
         if data:
             self._take(data)
             return
+        self._lost()
+
+    def _lost(self) -> None:
+        """Take the operator for gone."""
+        self._silence_timer.cancel()
         self._reactor.remove_reader(self._read_fd)
         self.is_gone = True
-        self._on_gone()
+        if not self._is_detached:
+            self._on_gone()
 
     def _take(self, data: bytes) -> None:
         *lines, self._in = (self._in + data).split(b"\n")
@@ -172,4 +197,12 @@ class OperatorLink:
             except orjson.JSONDecodeError:
                 continue
             if isinstance(command, dict):
-                self._on_command(command)
+                self._obey(command)
+
+    def _obey(self, command: Mapping[str, Any]) -> None:
+        if command.get("command") != "ping":
+            self._on_command(command)
+            return
+        self.emit({"event": "pong", "n": command.get("n")})
+        if not self._is_detached:
+            self._silence_timer.reschedule(self._reactor.now_s() + PING_SILENCE_S)

@@ -57,12 +57,13 @@ class Recorder:
         source: Who records: host, an agent's or a machine's name.
         settings: Bounds, interval and verbosity.
         log_echo: Called with level and text of what is logged.
+        life: Which life of its process this is; files are numbered from it.
 
     Raises:
         MachineError: The directory cannot be made.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - who records, and how; two are optional
         self,
         directory: Path,
         *,
@@ -70,6 +71,7 @@ class Recorder:
         source: str,
         settings: Recording,
         log_echo: LogEcho | None = None,
+        life: int = 1,
     ) -> None:
         try:
             directory.mkdir(parents=True, exist_ok=True)
@@ -83,7 +85,7 @@ class Recorder:
         self._level = VERBOSITY_LEVELS[settings.verbosity]
         self._limit_bytes = settings.buffer_bytes
         self._files: dict[str, StreamFile] = {}
-        self._life = 1
+        self._life = life
         self._queued_bytes = 0
         self._freed_bytes = 0
         self._t0_utc: str | None = None

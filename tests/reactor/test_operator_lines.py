@@ -1,5 +1,6 @@
 """The line to the operator: commands in, events out, and the end of either side felt."""
 
+import json
 import os
 
 import pytest
@@ -117,3 +118,78 @@ def test_events_to_an_operator_who_is_gone_are_no_error(reactor, pipes):
     made.emit({"event": "log"})
 
     assert made.flush(1.0)
+
+
+def read_events(fd):
+    os.set_blocking(fd, False)
+    return [json.loads(line) for line in os.read(fd, 65_536).splitlines()]
+
+
+def test_pings_are_answered_and_are_no_commands(reactor, pipes):
+    commands, gone = [], []
+    link(reactor, pipes, commands, gone)
+    os.write(pipes[1], b'{"command": "ping", "n": 7}\n{"command": "stop"}\n')
+    reactor.call_at(reactor.now_s() + 0.05, reactor.stop)
+
+    reactor.run()
+
+    assert read_events(pipes[2]) == [{"event": "pong", "n": 7}]
+    assert commands == [{"command": "stop"}]
+    assert gone == []
+
+
+def test_operator_whose_pings_cease_is_gone(reactor, pipes, monkeypatch):
+    monkeypatch.setattr(lines, "PING_SILENCE_S", 0.1)
+    commands, gone = [], []
+    line = link(reactor, pipes, commands, gone)
+    os.write(pipes[1], b'{"command": "ping", "n": 1}\n')
+
+    reactor.run()
+
+    assert gone == [True]
+    assert line.is_gone
+
+
+def test_operator_that_never_pinged_is_not_gone_for_its_silence(reactor, pipes, monkeypatch):
+    monkeypatch.setattr(lines, "PING_SILENCE_S", 0.05)
+    commands, gone = [], []
+    link(reactor, pipes, commands, gone)
+    reactor.call_at(reactor.now_s() + 0.2, reactor.stop)
+
+    reactor.run()
+
+    assert gone == []
+
+
+@pytest.mark.parametrize("leaves", ["closes", "falls silent"])
+def test_detached_process_stays_when_its_operator(reactor, pipes, monkeypatch, leaves):
+    monkeypatch.setattr(lines, "PING_SILENCE_S", 0.05)
+    commands, gone = [], []
+    line = OperatorLink(
+        reactor,
+        (pipes[0], pipes[3]),
+        on_command=commands.append,
+        on_gone=lambda: gone.append(True),
+        is_detached=True,
+    )
+    os.write(pipes[1], b'{"command": "ping", "n": 1}\n')
+    if leaves == "closes":
+        os.close(pipes[1])
+        os.close(pipes[2])
+    reactor.call_at(reactor.now_s() + 0.2, reactor.stop)
+
+    reactor.run()
+
+    assert gone == []
+    assert not line.has_hung_up()
+
+
+def test_events_that_nobody_takes_are_counted(reactor, pipes):
+    line = link(reactor, pipes, [], [])
+    os.close(pipes[2])
+
+    for _ in range(3):
+        line.emit({"event": "log"})
+
+    assert line.dropped_count == 3
+    assert line.flush(0.1)
