@@ -1,0 +1,272 @@
+"""
+What a run left on this machine: listed with hashes, sent in pieces, deleted once its copy is verified.
+
+Nothing of a run is touched while something of it lives: neither what the register of processes names
+nor anything that holds one of its files open for writing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import stat
+import time
+import zlib
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from cosmos_cli.fleet.onboard.core import Part, Refusal, Request, verb
+from cosmos_cli.fleet.onboard.living import find_living, path_of, wait_for_end
+
+PIECE_BYTES = 262_144
+FILES_MAX = 100_000
+BATCH_FILES = 500
+BATCH_S = 1.0
+"""So often a long manifest gives a sign of life."""
+READ_BYTES = 1_048_576
+LEVEL = 1
+"""Of zlib: a board compresses as fast as its network card takes it, or nearly."""
+PACKED_SHARE_MAX = 0.9
+"""What shrinks less than to this is sent as it is."""
+LISTINGS_MAX = 8
+RELEASED_PREFIX = ".released-"
+"""Begins the name of a folder that may go: its copy is verified."""
+
+Entry = dict[str, Any]
+Stamp = tuple[int, ...]
+"""What changes when a file does: kind, inode, size, and both times to the nanosecond."""
+
+
+@dataclass(frozen=True, slots=True)
+class Listing:
+    """A directory as it was when its manifest was made."""
+
+    directory: str
+    stamps: dict[str, Stamp]
+
+
+_listings: dict[str, Listing] = {}
+"""Of this process, by the hash of the manifest."""
+
+
+@verb("manifest")
+def manifest(request: Request) -> Iterator[Part]:
+    """
+    List every file below a directory, hashed, in batches; at last the hash of the list itself.
+
+    Refuses with `busy` when something of the run still lives after `patience_s`.
+    """
+    directory, state = path_of(request, "directory"), path_of(request, "state")
+    wait_for_end(directory, state, float(request.arguments.get("patience_s", 0.0)))
+    if not is_folder(directory):
+        sweep(directory)
+        yield Part(value={"gone": True})
+        return
+    digest = hashlib.sha256()
+    stamps: dict[str, Stamp] = {}
+    batch: list[Entry] = []
+    sent_s = time.monotonic()
+    for path, stamp in walk(directory):
+        entry = yield from _described(directory, path, stamp)
+        stamps[path] = stamp
+        digest.update(entry_line(entry))
+        batch.append(entry)
+        if len(batch) >= BATCH_FILES or time.monotonic() - sent_s > BATCH_S:
+            yield Part(value={"files": batch})
+            batch, sent_s = [], time.monotonic()
+    name = digest.hexdigest()
+    while len(_listings) >= LISTINGS_MAX:
+        del _listings[next(iter(_listings))]
+    _listings[name] = Listing(directory, stamps)
+    yield Part(value={"files": batch, "sha256": name})
+
+
+def entry_line(entry: Entry) -> bytes:
+    """Return the bytes of an entry that go into the hash of a manifest."""
+    return json.dumps(entry, sort_keys=True, separators=(",", ":")).encode() + b"\n"
+
+
+@verb("fetch")
+def fetch(request: Request) -> Iterator[Part]:
+    """Send files, each as [path, first byte, end], in pieces; one that cannot be read does not stop the others."""
+    directory = path_of(request, "directory")
+    for index, (path, offset, end) in enumerate(request.arguments["files"]):
+        try:
+            yield from _pieces(index, os.path.join(directory, path), int(offset), int(end))
+        except OSError as error:
+            yield Part(value={"file": index, "error": error.strerror or str(error)})
+
+
+@verb("release")
+def release(request: Request) -> dict[str, bool]:
+    """Delete a directory, if it is still what the manifest of this hash says and nothing of the run lives."""
+    directory, state = path_of(request, "directory"), path_of(request, "state")
+    listing = _listings.get(str(request.arguments["manifest_sha256"]))
+    if listing is None or listing.directory != directory:
+        raise Refusal("data", f"{directory}: asked to release what was not listed")
+    wait_for_end(directory, state, 0.0)
+    if not is_folder(directory):
+        return {"released": False}
+    now = dict(walk(directory))
+    if now != listing.stamps:
+        differing = sorted(
+            path
+            for path in now.keys() | listing.stamps.keys()
+            if now.get(path) != listing.stamps.get(path)
+        )
+        raise Refusal(
+            "data",
+            f"{directory}: {len(differing)} files changed since they were listed, such as {differing[0]!r}",
+            "repeat the command",
+        )
+    remove(directory)
+    return {"released": True}
+
+
+@verb("inventory_runs")
+def inventory_runs(request: Request) -> list[Entry]:
+    """Return what lies in the folder of all runs: name, bytes, files, newest change, and what of it lives."""
+    folder, state = path_of(request, "runs"), path_of(request, "state")
+    if not is_folder(folder):
+        return []
+    found = []
+    for name in sorted(os.listdir(folder)):
+        directory = os.path.join(folder, name)
+        if stat.S_ISDIR(os.lstat(directory).st_mode):
+            living = find_living(directory, state)
+            found.append({"name": name, **measured(directory), "living": living})
+    return found
+
+
+def measured(directory: str) -> Entry:
+    """Return how much a directory holds, and when it was last changed, s since 1970."""
+    stamps = [stamp for _, stamp in walk(directory)]
+    newest_ns = max((stamp[3] for stamp in stamps), default=os.stat(directory).st_mtime_ns)
+    return {
+        "bytes": sum(stamp[2] for stamp in stamps),
+        "files": len(stamps),
+        "newest_s": newest_ns // 1_000_000_000,
+    }
+
+
+def is_folder(path: str) -> bool:
+    """
+    Tell whether *path* is a directory itself, and no link to one.
+
+    Raises:
+        Refusal: It is something else.
+    """
+    try:
+        mode = os.lstat(path).st_mode
+    except FileNotFoundError:
+        return False
+    if stat.S_ISDIR(mode):
+        return True
+    raise Refusal(
+        "data", f"{path}: expected a directory, found {kind_of(mode)}", "look at it there"
+    )
+
+
+def walk(directory: str) -> Iterator[tuple[str, Stamp]]:
+    """Yield whatever is no directory below one, in the order of names, and its stamp."""
+    count = 0
+    for folder, folders, names in os.walk(directory, onerror=_raise):
+        folders.sort()
+        links = [name for name in folders if os.path.islink(os.path.join(folder, name))]
+        for name in sorted([*names, *links]):
+            path = os.path.join(folder, name)
+            found = os.lstat(path)
+            count += 1
+            if count > FILES_MAX:
+                raise Refusal("data", f"{directory}: expected at most {FILES_MAX} files")
+            yield os.path.relpath(path, directory), _stamp(found)
+
+
+def remove(directory: str) -> None:
+    """Delete a directory so that it is there in full or not at all under its name, also after a power cut."""
+    parent, name = os.path.split(directory.rstrip("/"))
+    away = os.path.join(parent, f"{RELEASED_PREFIX}{name}-{os.getpid()}")
+    os.rename(directory, away)
+    descriptor = os.open(parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+    sweep(directory)
+
+
+def sweep(directory: str) -> None:
+    """Delete what was on its way out when an earlier deletion of this directory was cut."""
+    parent, name = os.path.split(directory.rstrip("/"))
+    for left in os.listdir(parent) if os.path.isdir(parent) else ():
+        if left.startswith(f"{RELEASED_PREFIX}{name}-"):
+            shutil.rmtree(os.path.join(parent, left))
+
+
+def kind_of(mode: int) -> str:
+    """Return what a file that is none is."""
+    kinds = {
+        stat.S_IFLNK: "a link",
+        stat.S_IFIFO: "a pipe",
+        stat.S_IFSOCK: "a socket",
+        stat.S_IFDIR: "a directory",
+    }
+    return kinds.get(stat.S_IFMT(mode), "a file" if stat.S_ISREG(mode) else "a device")
+
+
+def _described(directory: str, path: str, stamp: Stamp) -> Generator[Part, None, Entry]:
+    """Return the entry of a file; of a large one, signs of life on the way."""
+    mode, _, size_bytes, mtime_ns, _ = stamp
+    entry: Entry = {"path": path, "bytes": size_bytes, "mtime_s": mtime_ns // 1_000_000_000}
+    if not stat.S_ISREG(mode):
+        return {**entry, "bytes": 0, "kind": kind_of(mode)}
+    whole = os.path.join(directory, path)
+    digest, sent_s = hashlib.sha256(), time.monotonic()
+    try:
+        with open(whole, "rb", buffering=0, opener=_no_links) as file:
+            while data := file.read(READ_BYTES):
+                digest.update(data)
+                if time.monotonic() - sent_s > BATCH_S:
+                    yield Part(value={"reading": path})
+                    sent_s = time.monotonic()
+            after = _stamp(os.fstat(file.fileno()))
+    except OSError as error:
+        return {**entry, "error": error.strerror or str(error)}
+    if after != stamp:
+        raise Refusal(
+            "busy", f"{whole} changed while it was read", "something writes there; see what it is"
+        )
+    return {**entry, "sha256": digest.hexdigest()}
+
+
+def _pieces(index: int, path: str, offset: int, end: int) -> Iterator[Part]:
+    packs = True
+    with open(path, "rb", buffering=0, opener=_no_links) as file:
+        file.seek(offset)
+        while offset < end:
+            data = file.read(min(PIECE_BYTES, end - offset))
+            if not data:
+                text = f"it ends at byte {offset}, expected {end}"
+                yield Part(value={"file": index, "error": text})
+                return
+            body = zlib.compress(data, LEVEL) if packs else data
+            if packs and len(body) > PACKED_SHARE_MAX * len(data):
+                packs, body = False, data
+            value = {"file": index, "offset": offset, "bytes": len(data), "packed": packs}
+            yield Part(value=value, body=body)
+            offset += len(data)
+
+
+def _no_links(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+
+
+def _stamp(found: os.stat_result) -> Stamp:
+    return (found.st_mode, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
+
+
+def _raise(error: OSError) -> None:
+    raise error

@@ -1,0 +1,91 @@
+"""What plan.json says of the machines that recorded a part of a run: where they are, and what is theirs. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from cosmos_cli.fleet.layout import Layout
+from cosmos_cli.fleet.target import Target
+from cosmos_cli.rundir import RunDirectory
+
+AGENTS, MACHINES, HOST = "agents", "machines", "host"
+OPERATOR = "this computer"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """One machine that recorded a part of a run in a directory of its own."""
+
+    target: Target
+    directory: str
+    """The run's, there."""
+
+    @property
+    def machine(self) -> str:
+        """Name of the machine."""
+        return self.target.name
+
+    @property
+    def state(self) -> str:
+        """Its register of processes."""
+        return Layout(self.target.root).state
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sources:
+    """All of them, and who of all machines recorded for whom."""
+
+    remote: tuple[Source, ...] = ()
+    machine_of_agent: Mapping[str, str] = field(default_factory=dict)
+    host_machine: str | None = None
+    """Where the run's host was; None when it was this computer."""
+
+    @classmethod
+    def read(cls, run: RunDirectory) -> Sources:
+        """Return what the plan of a run says; of a plan that cannot be read, nothing."""
+        plan = run.read_json(run.plan_json) or {}
+        machines = _mappings(plan.get("machines"))
+        found = {name: source for name in machines if (source := _source(machines[name]))}
+        host = plan.get("host")
+        host_source = _source(host) if isinstance(host, Mapping) else None
+        if host_source is not None:
+            found.setdefault(host_source.machine, host_source)
+        return cls(
+            remote=tuple(found.values()),
+            machine_of_agent={
+                str(agent): name
+                for name in machines
+                for agent in machines[name].get("agents") or ()
+            },
+            host_machine=host_source.machine if host_source else None,
+        )
+
+    def owner_of(self, path: str) -> str | None:
+        """Return whose a path in the run directory is; None for one that nobody is known to write."""
+        top, *rest = path.split("/")
+        if top == HOST and rest:
+            return self.host_machine or OPERATOR
+        if len(rest) > 1 and top == MACHINES:
+            return rest[0]
+        if len(rest) > 1 and top == AGENTS:
+            return self.machine_of_agent.get(rest[0])
+        return None
+
+
+def _source(entry: Mapping[str, Any]) -> Source | None:
+    """Return what lies elsewhere; None for this computer, which records in the run directory itself."""
+    target, directory = entry.get("target"), entry.get("directory")
+    if not isinstance(target, Mapping) or not isinstance(directory, str):
+        return None
+    try:
+        known = Target.from_mapping(target)
+    except TypeError:
+        return None
+    return None if known.connection == "local" else Source(target=known, directory=directory)
+
+
+def _mappings(value: object) -> dict[str, Mapping[str, Any]]:
+    items = value.items() if isinstance(value, Mapping) else ()
+    return {str(name): entry for name, entry in items if isinstance(entry, Mapping)}

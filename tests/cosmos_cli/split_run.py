@@ -1,0 +1,137 @@
+"""A synthetic run whose records lie on "machines": folders below a temporary root, reached through pipes."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from synthetic_run import SyntheticRun, make_config
+
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.layout import Layout
+from cosmos_cli.fleet.local import LocalConnection, LocalStream
+from cosmos_cli.fleet.target import Target
+from cosmos_cli.retrieve import Retrieval, retrieve
+from cosmos_cli.rundir import write_json
+
+SESSION = "00112233445566ff"
+
+
+class SplitRun:
+    """A whole run of some agents a machine; what is not on a machine is in the run directory."""
+
+    def __init__(
+        self, root: Path, machines: int = 2, *, agents_each: int = 1, ticks: int = 200
+    ) -> None:
+        self.names = tuple(f"pi{index:02d}" for index in range(1, machines + 1))
+        config = make_config(machines * agents_each, ticks=ticks)
+        self.made = SyntheticRun(root / "runs", config).write()
+        self.run = self.made.run
+        shutil.rmtree(self.run.path / "machines/loopback")
+        self.targets = {
+            name: Target(
+                name=name,
+                address=f"192.0.2.{index}",
+                python=sys.executable,
+                root=str(root / "boards" / name),
+            )
+            for index, name in enumerate(self.names, 1)
+        }
+        self.agents = {
+            name: self.made.names[index * agents_each : (index + 1) * agents_each]
+            for index, name in enumerate(self.names)
+        }
+        self._write_plan()
+        for name in self.names:
+            self._move_out(name)
+
+    def directory(self, machine: str) -> Path:
+        """Where a machine keeps this run."""
+        return Path(Layout(self.targets[machine].root).run(self.run.name, SESSION))
+
+    def state(self, machine: str) -> Path:
+        return Path(Layout(self.targets[machine].root).state)
+
+    def connections(self, **others) -> dict:
+        return {name: LocalConnection(self.targets[name]) for name in self.names} | others
+
+    def retrieve(self, connections=None, **more) -> dict:
+        """Retrieve, and return the outcomes by machine."""
+        given = self.connections() if connections is None else connections
+        outcomes = retrieve(self.run, options=None, connections=given, **more)
+        return {outcome.machine: outcome for outcome in outcomes}
+
+    def visit(self, connections=None) -> Retrieval:
+        given = self.connections() if connections is None else connections
+        return Retrieval(self.run, options=None, connections=given)
+
+    def there(self, machine: str) -> dict[str, str]:
+        return hashes(self.directory(machine))
+
+    def leave_result(self) -> None:
+        write_json(self.run.left_result_json, self.made.result())
+
+    def _write_plan(self) -> None:
+        plan = self.run.read_json(self.run.plan_json)
+        machines = {
+            name: {
+                "address": target.address,
+                "connection": "ssh",
+                "agents": list(self.agents[name]),
+                "target": target.to_mapping(),
+                "directory": str(self.directory(name)),
+            }
+            for name, target in self.targets.items()
+        }
+        write_json(self.run.plan_json, {**plan, "machines": machines, "session": SESSION})
+
+    def _move_out(self, machine: str) -> None:
+        there = self.directory(machine)
+        self.made.write_health(5, folder=f"machines/{machine}", source=machine)
+        for path in (f"machines/{machine}", *(f"agents/{name}" for name in self.agents[machine])):
+            (there / path).parent.mkdir(parents=True, exist_ok=True)
+            (self.run.path / path).rename(there / path)
+
+
+class CutConnection(LocalConnection):
+    """A link that breaks after so many bytes have come; *change* may alter what comes."""
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        bytes_max: int | None = None,
+        change: Callable[[bytes], bytes] = bytes,
+    ) -> None:
+        super().__init__(target)
+        self._bytes_max = bytes_max
+        self._change = change
+        self.came = bytearray()
+
+    def open(self, command: str) -> LocalStream:
+        stream = super().open(command)
+        read = stream.read
+
+        def cut_read(count: int) -> bytes:
+            if self._bytes_max is not None:
+                count = min(count, self._bytes_max - len(self.came))
+                if count <= 0:
+                    raise MachineFailure(FailureKind.LOST, "the connection broke")
+            data = self._change(read(count))
+            self.came += data
+            return data
+
+        stream.read = cut_read
+        return stream
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    """Return every file below a folder, and the hash of its content."""
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
