@@ -69,7 +69,7 @@ class Board:
 
     Args:
         stream: To the process; it has greeted already.
-        greeting: What it said of itself: python, executable, uid, user, home, node, pid.
+        greeting: What it said of itself: python, executable, machine, bits, libc, uid, home, node, pid.
     """
 
     def __init__(self, stream: Stream) -> None:

@@ -11,8 +11,10 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import io
 import json
 import os
+import select
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -69,6 +71,34 @@ def verb(name: str) -> Callable[[Handler], Handler]:
         return handler
 
     return enter
+
+
+class PatientInput(io.RawIOBase):
+    """
+    Standard input that ends when its patience does.
+
+    A connection that was cut is not noticed here for many minutes; who holds the machine's lock must be
+    gone long before.
+
+    Args:
+        descriptor: To read from.
+    """
+
+    patience_s: float | None = None
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+
+    def readable(self) -> bool:
+        """Return True."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        """Wait for bytes; 0, the end, also when none came in time."""
+        wait_s = PatientInput.patience_s
+        if wait_s is not None and not select.select([self._descriptor], [], [], wait_s)[0]:
+            return 0
+        return os.readv(self._descriptor, [buffer])
 
 
 class FrameReader:
@@ -172,12 +202,22 @@ def greet() -> None:
     told = {
         "python": ".".join(map(str, sys.version_info[:3])),
         "executable": sys.executable,
+        "machine": os.uname().machine,
+        "bits": 64 if sys.maxsize > 2**32 else 32,
+        "libc": _libc(),
         "uid": os.geteuid(),
         "home": os.path.expanduser("~"),
         "node": os.uname().nodename,
         "pid": os.getpid(),
     }
     FrameWriter(sys.stdout.buffer).write({"ok": True, "value": told})
+
+
+def _libc() -> str:
+    try:
+        return os.confstr("CS_GNU_LIBC_VERSION") or ""
+    except (OSError, ValueError):
+        return ""
 
 
 def serve(boot: list[str], package: bytes) -> None:
@@ -190,7 +230,7 @@ def serve(boot: list[str], package: bytes) -> None:
     """
     out = FrameWriter(os.fdopen(os.dup(1), "wb"))
     os.dup2(2, 1)  # what a command prints must not mix with the frames
-    reader = FrameReader(sys.stdin.buffer)
+    reader = FrameReader(io.BufferedReader(PatientInput(0)))  # nobody asks before the greeting
     os.set_inheritable(0, False)
     rooted = Rooted(boot, package)
     try:
@@ -260,7 +300,11 @@ def last_words(output: bytes) -> str:
 
 @verb("lock")
 def lock(request: Request) -> None:
-    """Take the machine's lock until this loop ends, so that two commands do not work there at once."""
+    """
+    Take the machine's lock until this loop ends, so that two commands do not work there at once.
+
+    With "patience_s" the loop ends, and with it the lock, when nothing was asked for so long.
+    """
     path = os.path.expanduser(request.arguments["path"])
     os.makedirs(os.path.dirname(path), exist_ok=True)
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
@@ -275,3 +319,4 @@ def lock(request: Request) -> None:
         ) from None
     os.ftruncate(descriptor, 0)
     os.write(descriptor, str(request.arguments.get("holder", "")).encode()[:200])
+    PatientInput.patience_s = request.arguments.get("patience_s")
