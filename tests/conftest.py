@@ -6,6 +6,8 @@ import os
 
 import pytest
 
+pytest_plugins = ["tower.fixtures"]  # of tests/tower; costs nothing where no test asks for a tower
+
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_makereport(item, call):

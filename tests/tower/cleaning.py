@@ -1,0 +1,97 @@
+"""
+Removes what a tower's supervisor can leave behind when it is killed: control groups and files.
+
+Boards, mounts, network interfaces and loop devices end with their processes. A guardian process does
+this as soon as its supervisor ends; `down` does it when the guardian was killed as well.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+from . import kernel
+from .board import kill_group, remove_group
+from .network import remove_interface
+from .places import Places
+
+
+def mount_cgroups(target: Path, name: str) -> Path:
+    """Mount the control groups where only this mount namespace sees them; return the tower's own."""
+    target.mkdir(parents=True, exist_ok=True)
+    kernel.mount("cgroup2", target, "cgroup2")
+    return target / name
+
+
+def clean(places: Places) -> None:
+    """Remove every trace of a tower. The caller owns its index."""
+    _in_child(lambda: _clean_groups(places))
+    if Path(f"/sys/class/net/{places.uplink}").exists():
+        remove_interface(places.uplink)
+    with contextlib.suppress(OSError, json.JSONDecodeError, KeyError):
+        for number in places.read_state()["loops_added"]:
+            kernel.remove_loop_device(number)
+    places.remove()
+
+
+def start_guardian(places: Places, lock: int) -> int:
+    """
+    Fork the process that cleans up when this one has ended.
+
+    Args:
+        places: The tower's.
+        lock: The descriptor that owns its index; the guardian owns it, too, until it is done.
+
+    Returns:
+        A descriptor; the guardian wakes up when its last copy is closed.
+    """
+    read, write = os.pipe2(os.O_CLOEXEC)
+    child = os.fork()
+    if child:
+        os.close(read)
+        os.waitpid(child, 0)
+        return write
+    try:
+        if os.fork():  # nobody's child: its end concerns nobody
+            os._exit(0)
+        os.setsid()
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, signal.SIG_IGN)
+        os.chdir("/")
+        null = os.open("/dev/null", os.O_RDWR)
+        for descriptor in range(3):
+            os.dup2(null, descriptor)
+        os.close(write)
+        os.read(read, 1)
+        with contextlib.suppress(FileNotFoundError):  # cleaned by the supervisor itself
+            if os.path.samestat(os.fstat(lock), places.folder.stat()):
+                clean(places)
+    finally:
+        os._exit(0)
+
+
+def _clean_groups(places: Places) -> None:
+    """Kill what is left in the tower's control groups and remove them."""
+    kernel.unshare(kernel.CLONE_NEWNS)
+    kernel.make_mounts_private()
+    groups = mount_cgroups(places.folder / "groups", places.cgroup)
+    if groups.is_dir():
+        for group in [path for path in groups.iterdir() if path.is_dir()]:
+            kill_group(group)
+            remove_group(group)
+        remove_group(groups)
+
+
+def _in_child(function: Callable[[], None]) -> None:
+    """Call *function* in a process of its own: its mounts end with it."""
+    child = os.fork()
+    if child == 0:
+        try:
+            function()
+        finally:
+            os._exit(0)
+    os.waitpid(child, 0)  # each of its waits has a deadline

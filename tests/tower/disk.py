@@ -1,0 +1,135 @@
+"""
+A board's disk: an ext4 file system in a file, on a loop device.
+
+A real file system, so that a board can lose what it had not synced when its power is cut, fill up, and
+turn read-only under open files as a worn card does. The file lies in memory; what is not written and
+what was deleted takes none.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import subprocess
+import time
+from pathlib import Path
+
+from . import kernel
+
+PATIENCE_S = 10.0
+POLL_S = 0.01
+UPPER = "upper"
+WORK = "work"
+BALLAST = "ballast"
+"""Fills the disk; it lies beside what the board sees."""
+
+
+class DiskError(Exception):
+    """A disk cannot be made, mounted or released."""
+
+
+def make_template(path: Path, size_mib: int) -> None:
+    """Write an empty file system, to be copied for every board: it takes a few kB."""
+    path.touch(mode=0o600)
+    os.truncate(path, size_mib << 20)
+    options = ["-E", "lazy_itable_init=1,lazy_journal_init=1", "-J", "size=4", "-m", "0"]
+    _run(["mkfs.ext4", "-q", "-F", *options, str(path)])
+
+
+class Disk:
+    """
+    One board's disk.
+
+    Args:
+        image: The file.
+        mount_point: Where the supervisor sees it while the board has power.
+    """
+
+    def __init__(self, image: Path, mount_point: Path) -> None:
+        self.image = image
+        self.mount_point = mount_point
+        self.loop: str | None = None
+        self.has_failed = False
+
+    def create(self, template: Path) -> None:
+        """Make it from the empty *template*."""
+        _run(["cp", "--sparse=always", str(template), str(self.image)])
+        self.mount_point.mkdir(parents=True)
+
+    def mount(self) -> None:
+        """Put it into the board: what a board does to its card when power comes on."""
+        if self.has_failed:  # as the boot scripts of a Pi would; 1 = errors corrected
+            _run(["e2fsck", "-p", str(self.image)], accept=(0, 1))
+            self.has_failed = False
+        options = "loop,errors=remount-ro,noatime,discard"
+        _run(["mount", "-t", "ext4", "-o", options, str(self.image), str(self.mount_point)])
+        self.loop = f"loop{os.minor(self.mount_point.stat().st_dev)}"
+        for name in (UPPER, WORK):
+            (self.mount_point / name).mkdir(exist_ok=True)
+
+    def release(self) -> None:
+        """Take it out, and wait until the kernel has let it go."""
+        self.remove_ballast()
+        kernel.unmount(self.mount_point)
+        loop, self.loop = self.loop, None
+        until_s = time.monotonic() + PATIENCE_S
+        # A board that is just starting holds a copy of this mount for some milliseconds.
+        while os.path.exists(f"/sys/block/{loop}/loop/backing_file"):
+            if time.monotonic() > until_s:
+                raise DiskError(
+                    f"{self.image.name}: still in use {PATIENCE_S:g} s after its release"
+                )
+            time.sleep(POLL_S)
+
+    def lose_power(self) -> None:
+        """Forget what was not synced, and take no more."""
+        kernel.lose_power(self.mount_point)
+
+    def fail(self) -> None:
+        """Meet an error of the medium: the file system turns read-only, whoever has files open."""
+        Path(f"/sys/fs/ext4/{self.loop}/trigger_fs_error").write_text("tower")
+        self.has_failed = True
+
+    def fill(self, free_bytes: int = 0) -> None:
+        """Leave only *free_bytes* of room."""
+        self.remove_ballast()
+        os.sync()
+        for _ in range(3):  # block maps take room of their own
+            state = os.statvfs(self.mount_point)
+            size = state.f_bavail * state.f_frsize - free_bytes
+            if size <= 0:
+                break
+            self._grow_ballast(size)
+
+    def remove_ballast(self) -> None:
+        """Give the room back."""
+        with contextlib.suppress(OSError):  # a failed disk keeps it
+            (self.mount_point / BALLAST).unlink(missing_ok=True)
+
+    def destroy(self) -> None:
+        """Delete the medium."""
+        self.image.unlink(missing_ok=True)
+        shutil.rmtree(self.mount_point, ignore_errors=True)
+
+    def _grow_ballast(self, size: int) -> None:
+        """Reserve up to *size* more bytes, without writing them."""
+        descriptor = os.open(self.mount_point / BALLAST, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC)
+        try:
+            while size >= 4096:
+                end = os.fstat(descriptor).st_size
+                try:
+                    os.posix_fallocate(descriptor, end, size)
+                except OSError:
+                    size //= 2
+                else:
+                    break
+        finally:
+            os.close(descriptor)
+
+
+def _run(command: list[str], accept: tuple[int, ...] = (0,)) -> None:
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    if result.returncode not in accept:
+        talk = (result.stderr + result.stdout).strip()
+        raise DiskError(f"{' '.join(command)}: exit {result.returncode}: {talk}")

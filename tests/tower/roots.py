@@ -1,0 +1,145 @@
+"""
+Debian systems of foreign architectures, built once and kept.
+
+`mmdebstrap` builds them from this computer's own package sources; programs in them run by qemu-user. The
+emulators are registered with the kernel by whoever needs them, in a private mount of binfmt_misc: since
+Linux 6.7 a registration ends with its last mount.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from . import kernel
+from .console import say
+from .specification import debian_architecture
+
+SUITE = "bookworm"
+PACKAGES = ("python3", "python3-venv", "openssh-server", "sudo")
+PACKAGES_MORE = {"armhf": ("python3-numpy", "python3-msgpack", "python3-psutil")}
+"""There are no wheels of these for 32-bit ARM: its runtime lives on the distribution's."""
+EMULATORS = {"arm64": "aarch64", "armhf": "arm"}
+REGISTRY = Path("/proc/sys/fs/binfmt_misc")
+BUILD_PATIENCE_S = 1800
+TOOLS = ("mmdebstrap", "arch-test")
+
+
+class RootError(Exception):
+    """A foreign system cannot be had here."""
+
+
+def cache_folder() -> Path:
+    """Return where built systems are kept: COSMOS_TOWER_CACHE, or ~/.cache/cosmos-tower."""
+    chosen = os.environ.get("COSMOS_TOWER_CACHE")
+    return Path(chosen) if chosen else Path.home() / ".cache" / "cosmos-tower"
+
+
+def why_unavailable(arch: str) -> str | None:
+    """Return why boards of this architecture cannot be had here, or None."""
+    if (cache_folder() / arch).is_dir():
+        missing = []
+    else:
+        missing = [tool for tool in TOOLS if shutil.which(tool) is None]
+    if arch in EMULATORS and not _emulator_file(arch).is_file():
+        missing.append(f"qemu-user-static ({_emulator_file(arch)})")
+    return f"{arch} boards need {', '.join(missing)}: apt-get install" if missing else None
+
+
+def ensure_root(arch: str) -> Path:
+    """
+    Return the folder of a system, building it first if it is not there.
+
+    Two callers at once build it once: the second waits.
+
+    Raises:
+        RootError: Tools are missing, or the build failed.
+    """
+    cache = cache_folder()
+    if (cache / arch).is_dir():
+        return cache / arch
+    reason = why_unavailable(arch)
+    if reason:
+        raise RootError(reason)
+    cache.mkdir(parents=True, exist_ok=True)
+    with open(cache / f"{arch}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (cache / arch).is_dir():
+            _build(arch, cache)
+    return cache / arch
+
+
+def register_emulators(architectures: Iterator[str] | list[str]) -> None:
+    """
+    Let the kernel run these architectures' programs, as long as this mount namespace lives.
+
+    The caller has a private mount namespace. Flag C is added to Debian's own lines: without it
+    set-user-ID programs such as sudo stay powerless.
+    """
+    foreign = sorted(set(architectures) & set(EMULATORS) - {debian_architecture()})
+    if not foreign:
+        return
+    kernel.mount("binfmt_misc", REGISTRY, "binfmt_misc")
+    for arch in foreign:
+        name = f"cosmos-{EMULATORS[arch]}"
+        line = _emulator_file(arch).read_text().strip()
+        _, _, rest = line[1:].split(":", 2)
+        pattern, _, _ = rest.rpartition(":")
+        with contextlib.suppress(FileExistsError):  # another tower has done it
+            descriptor = os.open(REGISTRY / "register", os.O_WRONLY)
+            try:
+                os.write(descriptor, f":{name}:M:{pattern}:POCF".encode())
+            finally:
+                os.close(descriptor)
+
+
+def _emulator_file(arch: str) -> Path:
+    return Path(f"/usr/lib/binfmt.d/qemu-{EMULATORS[arch]}.conf")
+
+
+def _build(arch: str, cache: Path) -> None:
+    """Build a system under a temporary name; only a whole one gets its own."""
+    say(f"tower: building a Debian {SUITE} for {arch}, once; some minutes")
+    folder = Path(tempfile.mkdtemp(prefix=f"{arch}.part-", dir=cache))
+    log = cache / f"{arch}.log"
+    names = ",".join((*PACKAGES, *PACKAGES_MORE.get(arch, ())))
+    command = ["mmdebstrap", f"--arch={arch}", "--variant=minbase", f"--include={names}"]
+    command += [SUITE, str(folder / "root"), *_sources()]
+    child = os.fork()
+    if child == 0:
+        try:
+            kernel.unshare(kernel.CLONE_NEWNS)
+            kernel.make_mounts_private()
+            register_emulators([arch])
+            with open(log, "w") as out:
+                run = subprocess.run(
+                    command, stdout=out, stderr=out, timeout=BUILD_PATIENCE_S, check=False
+                )
+            os._exit(1 if run.returncode else 0)
+        except BaseException as error:  # noqa: BLE001 - a forked process tells its log
+            log.write_text(f"{error}\n")
+            os._exit(1)
+    _, status = os.waitpid(child, 0)
+    try:
+        if status:
+            tail = "\n".join(log.read_text().splitlines()[-10:])
+            raise RootError(f"mmdebstrap for {arch} failed; {log}:\n{tail}")
+        shutil.rmtree(folder / "root/var/cache/apt/archives", ignore_errors=True)
+        (folder / "root").rename(cache / arch)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _sources() -> list[str]:
+    """Return this computer's own sources of the suite, as sources.list lines."""
+    form = "deb $(REPO_URI) $(CODENAME) $(COMPONENT)"
+    command = ["apt-get", "indextargets", "--format", form, "Created-By: Packages"]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    lines = [line for line in run.stdout.splitlines() if line.split()[2:] == [SUITE, "main"]]
+    return sorted(set(lines))

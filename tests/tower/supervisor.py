@@ -1,0 +1,276 @@
+"""
+The supervisor: makes a tower, keeps its boards booting, obeys its control socket, and takes it down.
+
+One process, one loop: it waits for the control socket, for the end of a board, for its own end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import selectors
+import signal
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from . import cleaning, kernel, layout
+from .board import EXIT_OFF, Board, BoardError, Power, kill_group, remove_group
+from .console import say
+from .disk import DiskError
+from .faults import Scene, apply_fault
+from .network import NetworkError, Switch
+from .places import Places
+from .specification import TowerSpec
+
+POLL_S = 0.02
+"""How often booting boards are looked at; nothing is polled while all are up."""
+REQUEST_BYTES_MAX = 65_536
+REQUEST_PATIENCE_S = 5.0
+START_PATIENCE_S = 120.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """
+    How a supervisor runs.
+
+    Args:
+        spec: The tower.
+        ends_with_input: End when standard input does: a test's tower must not outlive the test.
+        tell: Gets lines for people.
+    """
+
+    spec: TowerSpec
+    ends_with_input: bool = False
+    tell: Callable[[str], None] = say
+
+
+class Supervisor:
+    """
+    Runs one tower. Create it in a process of its own: it changes that process's mount namespace.
+
+    Args:
+        options: See there.
+    """
+
+    def __init__(self, options: Options) -> None:
+        self._options = options
+        self._tell = options.tell
+        self._selector = selectors.DefaultSelector()
+        self._must_stop = False
+        self._boards: dict[str, Board] = {}
+        self._places: Places
+        self._switch: Switch
+        self._groups: Path
+
+    def run(self, on_up: Callable[[dict[str, Any]], None]) -> None:
+        """
+        Make the tower, call *on_up* with its state when every board is up, and keep it until told to end.
+
+        Raises:
+            BoardError: A board did not come up.
+            DiskError: No disks can be made here.
+            NetworkError: No network is free.
+        """
+        self._watch_signals()
+        self._places, network, lock = layout.claim(self._options.spec.network)
+        guardian = cleaning.start_guardian(self._places, lock)
+        try:
+            self._switch = Switch(network, self._places.uplink)
+            kernel.unshare(kernel.CLONE_NEWNS)
+            kernel.make_mounts_private()
+            self._groups = cleaning.mount_cgroups(
+                self._places.folder / "groups", self._places.cgroup
+            )
+            self._groups.mkdir()
+            self._boards = layout.make_boards(
+                self._options.spec, self._places, network, self._groups
+            )
+            self._listen()
+            self._start_all()
+            if not self._must_stop:
+                on_up(self.describe())
+            self._loop()
+        finally:
+            self._take_down()
+            cleaning.clean(self._places)
+            os.close(guardian)
+            os.close(lock)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the tower's state as plain data."""
+        return {
+            "tower": self._places.index,
+            "pid": os.getpid(),
+            "network": self._switch.network.cidr,
+            "operator_address": self._switch.network.operator,
+            "uplink": self._places.uplink,
+            "folder": str(self._places.folder),
+            "boards": {name: board.to_mapping() for name, board in self._boards.items()},
+        }
+
+    # Boots ----------------------------------------------------------------------------------------
+
+    def _start_all(self) -> None:
+        """Boot every board and wait until all are up."""
+        self._boot(list(self._boards.values()))
+        layout.write_state(self._places, self.describe(), self._boards)
+        until_s = time.monotonic() + START_PATIENCE_S
+        while not self._must_stop and any(
+            board.power is not Power.ON for board in self._boards.values()
+        ):
+            self._step()
+            ended = [name for name, board in self._boards.items() if board.power is Power.AWAY]
+            if ended or time.monotonic() > until_s:
+                names = ended or [n for n, b in self._boards.items() if b.power is not Power.ON]
+                raise BoardError(f"{', '.join(names)}: did not boot\n{self._read_logs(names)}")
+
+    def _boot(self, boards: list[Board]) -> None:
+        """Switch boards on, together: their cables are laid by one command."""
+        supplies = [(board.number, board.prepare_boot()) for board in boards]
+        self._switch.plug(supplies)
+        for board in boards:
+            if not board.is_link_up:
+                self._switch.set_link(board.number, is_up=False)
+            if board.loss_percent:
+                self._switch.set_loss(board.number, board.loss_percent)
+            assert board.supply is not None
+            self._selector.register(os.pidfd_open(board.supply), selectors.EVENT_READ, board)
+            board.finish_boot()
+
+    def _handle_end(self, board: Board, pidfd: int) -> None:
+        """A board has ended: release what it had, and decide whether it comes back."""
+        self._selector.unregister(pidfd)
+        os.close(pidfd)
+        assert board.supply is not None
+        _, status = os.waitpid(board.supply, 0)
+        code = os.waitstatus_to_exitcode(status)
+        self._release(board)
+        if code == EXIT_OFF or board.stays_off:
+            board.power = Power.OFF
+        else:
+            board.power = Power.AWAY
+            board.boot_due_s = time.monotonic() + self._options.spec.boot_delay_s
+        self._tell(f"{board.name}: {board.power.value} (exit {code})")
+
+    def _release(self, board: Board) -> None:
+        board.supply = None
+        kill_group(board.surroundings.cgroup)
+        remove_group(board.surroundings.cgroup)
+        self._switch.unplug(board.number)
+        board.disk.release()
+
+    # The loop -------------------------------------------------------------------------------------
+
+    def _loop(self) -> None:
+        while not self._must_stop:
+            self._step()
+
+    def _step(self) -> None:
+        """Wait for the next event and handle it."""
+        for key, _ in self._selector.select(self._timeout_s()):
+            if isinstance(key.data, Board):
+                self._handle_end(key.data, key.fd)
+            else:
+                key.data()
+        now_s = time.monotonic()
+        due = []
+        for board in self._boards.values():
+            if board.power is Power.BOOTING and board.is_listening:
+                board.power = Power.ON
+                self._tell(f"{board.name}: on ({board.address}, boot {board.boots})")
+            if board.power is Power.AWAY and now_s >= board.boot_due_s and not board.stays_off:
+                due.append(board)
+        if due and not self._must_stop:
+            self._boot(due)
+
+    def _timeout_s(self) -> float | None:
+        powers = {board.power for board in self._boards.values()}
+        if Power.BOOTING in powers:
+            return POLL_S
+        if Power.AWAY in powers:
+            due_s = min(b.boot_due_s for b in self._boards.values() if b.power is Power.AWAY)
+            return max(0.0, due_s - time.monotonic())
+        return None
+
+    def _watch_signals(self) -> None:
+        read, write = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+        signal.set_wakeup_fd(write)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, self._stop)
+        self._selector.register(read, selectors.EVENT_READ, lambda: os.read(read, 64))
+        if self._options.ends_with_input:
+            self._selector.register(0, selectors.EVENT_READ, self._read_input)
+
+    def _stop(self, *_: object) -> None:
+        self._must_stop = True
+
+    def _read_input(self) -> None:
+        if not os.read(0, 64):
+            self._must_stop = True
+            self._selector.unregister(0)
+
+    # Control --------------------------------------------------------------------------------------
+
+    def _listen(self) -> None:
+        server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        server.bind(str(self._places.control))
+        server.listen(16)
+        self._selector.register(server, selectors.EVENT_READ, lambda: self._accept(server))
+
+    def _accept(self, server: socket.socket) -> None:
+        """Answer one request; a caller that does not ask in time, or goes away, is forgotten."""
+        connection, _ = server.accept()
+        with connection, contextlib.suppress(OSError):
+            connection.settimeout(REQUEST_PATIENCE_S)
+            with connection.makefile("rb") as lines:
+                line = lines.readline(REQUEST_BYTES_MAX)
+            connection.sendall(json.dumps(self._answer(line)).encode() + b"\n")
+
+    def _answer(self, line: bytes) -> dict[str, Any]:
+        try:
+            request = json.loads(line)
+            verb = request["verb"]
+            if verb == "fault":
+                self._apply(request["board"], request["fault"], request.get("argument"))
+            elif verb == "stop":
+                self._must_stop = True
+            elif verb != "status":
+                raise ValueError(f"unknown verb {verb!r}")
+        except (BoardError, DiskError, NetworkError, ValueError, KeyError, OSError) as error:
+            return {"error": str(error)}
+        return self.describe()
+
+    def _apply(self, name: str, fault: str, argument: str | None) -> None:
+        board = self._boards.get(name)
+        if board is None:
+            raise BoardError(f"no board {name!r}; there are {', '.join(self._boards)}")
+        apply_fault(fault, Scene(board=board, switch=self._switch, argument=argument))
+        self._tell(f"{name}: {fault} {argument or ''}".rstrip())
+
+    # The end --------------------------------------------------------------------------------------
+
+    def _take_down(self) -> None:
+        """End every board. Files and control groups are removed by `cleaning.clean`."""
+        for board in self._boards.values():
+            board.kill()
+        for board in self._boards.values():
+            if board.supply is not None:
+                os.waitpid(board.supply, 0)
+                with contextlib.suppress(BoardError, DiskError, NetworkError, OSError):
+                    self._release(board)
+        if hasattr(self, "_switch"):
+            self._switch.close()
+
+    def _read_logs(self, names: list[str]) -> str:
+        texts = []
+        for name in names:
+            with contextlib.suppress(OSError):
+                log = (self._places.logs / f"{name}.log").read_text()
+                texts.append(f"--- log of {name}\n{log[-2000:]}")
+        return "\n".join(texts)
