@@ -14,6 +14,16 @@ from cosmos_cli.fleet.target import Target
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ConnectOptions:
+    """What an operator may decide about all connections of a command."""
+
+    timeout_s: float = 10.0
+    """Until a machine is logged in at; ConnectTimeout of the ssh configuration wins."""
+    accept_new_host_keys: bool = False
+    """Whether unknown host keys are recorded; changed ones are refused whatever stands here."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Completed:
     """A command that has ended."""
 
@@ -21,6 +31,8 @@ class Completed:
     """Negative for a signal."""
     stdout: bytes
     stderr: bytes
+    cut_bytes: int = 0
+    """How many bytes of both were too many to keep; a line in their midst says so."""
 
 
 class Stream(Protocol):

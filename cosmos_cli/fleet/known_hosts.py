@@ -1,0 +1,250 @@
+"""
+Which machine has which host key: OpenSSH's known_hosts files, read, asked and added to.
+
+A key is known, unknown, changed or revoked. Unknown ones may be recorded when the operator asks for it;
+a changed one never is.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import contextlib
+import fcntl
+import functools
+import hashlib
+import hmac
+import os
+import re
+import threading
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+SSH_PORT = 22
+HASHED = "|1|"
+REVOKED = "@revoked"
+CERTIFICATE_AUTHORITY = "@cert-authority"
+NOWHERE = ("/dev/null", "none")
+
+_RECORDING = threading.Lock()
+
+
+class Standing(Enum):
+    """What the files say about a key."""
+
+    KNOWN = "known"
+    UNKNOWN = "unknown"
+    CHANGED = "changed"
+    REVOKED = "revoked"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HostKey:
+    """A machine's public key."""
+
+    kind: str
+    """Such as ssh-ed25519."""
+    blob: bytes
+
+    @property
+    def fingerprint(self) -> str:
+        """Return what `ssh-keygen -l` shows."""
+        digest = base64.b64encode(hashlib.sha256(self.blob).digest()).decode()
+        return "SHA256:" + digest.rstrip("=")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Entry:
+    """One line of a known_hosts file."""
+
+    patterns: str
+    key: HostKey
+    file: str
+    line: int
+    is_revoked: bool = False
+
+    def matches(self, name: str) -> bool:
+        """Whether it speaks of *name*, a host name or [name]:port."""
+        if self.patterns.startswith(HASHED):
+            return _matches_hash(self.patterns, name)
+        is_match = False
+        for pattern in self.patterns.split(","):
+            if pattern.startswith("!"):
+                if _glob(pattern[1:].lower()).fullmatch(name):
+                    return False
+            elif not is_match:
+                is_match = _glob(pattern.lower()).fullmatch(name) is not None
+        return is_match
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """What is known of a key that a machine showed."""
+
+    standing: Standing
+    against: Entry | None = None
+    """The line that says otherwise."""
+
+
+class KnownHosts:
+    """
+    What the operator's known_hosts files say.
+
+    Args:
+        files: In the order in which they are asked.
+    """
+
+    def __init__(self, files: Sequence[Path]) -> None:
+        self._files = tuple(files)
+
+    def judge(self, names: Sequence[str], key: HostKey) -> Verdict:
+        """
+        Say what is known of *key* as a key of a machine.
+
+        Args:
+            names: See `names_of`.
+            key: What the machine showed.
+        """
+        found = [self._entries(name) for name in names]
+        for entry in (entry for entries in found for entry in entries):
+            if entry.is_revoked and entry.key == key:
+                return Verdict(standing=Standing.REVOKED, against=entry)
+        for entries in found:
+            keys = [entry for entry in entries if not entry.is_revoked]
+            if any(entry.key == key for entry in keys):
+                return Verdict(standing=Standing.KNOWN)
+            if keys and entries is found[0]:
+                alike = [entry for entry in keys if entry.key.kind == key.kind]
+                return Verdict(standing=Standing.CHANGED, against=(alike or keys)[0])
+        return Verdict(standing=Standing.UNKNOWN)
+
+    def kinds(self, names: Sequence[str]) -> list[str]:
+        """Return the kinds of keys that are known of a machine, so that it is asked for one of these."""
+        for name in names:
+            kinds = [entry.key.kind for entry in self._entries(name) if not entry.is_revoked]
+            if kinds:
+                return list(dict.fromkeys(kinds))
+        return []
+
+    def record(self, name: str, key: HostKey, *, is_hashed: bool = False) -> Verdict:
+        """
+        Add an unknown key to the first file, under a lock, unless somebody else has by now.
+
+        Returns:
+            KNOWN when it stands there now; CHANGED when another one does.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
+        file = self._files[0] if self._files else None
+        if file is None or str(file) in NOWHERE:
+            return Verdict(standing=Standing.KNOWN)
+        with _RECORDING:
+            file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            descriptor = os.open(file, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
+            with os.fdopen(descriptor, "r+b") as stream:
+                fcntl.flock(stream, fcntl.LOCK_EX)
+                verdict = self.judge((name,), key)
+                if verdict.standing is not Standing.UNKNOWN:
+                    return verdict
+                size = stream.seek(0, os.SEEK_END)
+                line = _line(_hashed(name) if is_hashed else name, key)
+                stream.write((b"" if size == 0 or _ends_a_line(stream, size) else b"\n") + line)
+        return Verdict(standing=Standing.KNOWN)
+
+    def _entries(self, name: str) -> list[Entry]:
+        return [entry for file in self._files for entry in _book(file).of(name)]
+
+
+def names_of(host: str, port: int, alias: str | None = None) -> tuple[str, ...]:
+    """Return under which names a machine's key is looked for; the first is the one that is recorded."""
+    if alias:
+        return (alias.lower(),)
+    plain = host.lower()
+    return (plain,) if port == SSH_PORT else (f"[{plain}]:{port}", plain)
+
+
+@dataclass(frozen=True, slots=True)
+class _Book:
+    """One file's lines: those that name a host plainly are found at once, all others are tried."""
+
+    plain: dict[str, list[Entry]]
+    others: list[Entry]
+
+    def of(self, name: str) -> list[Entry]:
+        found = [*self.plain.get(name, ()), *(e for e in self.others if e.matches(name))]
+        return sorted(found, key=lambda entry: entry.line) if len(found) > 1 else found
+
+
+def _book(file: Path) -> _Book:
+    try:
+        status = file.stat()
+    except OSError:
+        return _Book({}, [])
+    return _read_book(str(file), status.st_mtime_ns, status.st_size)
+
+
+@functools.lru_cache(maxsize=16)
+def _read_book(file: str, changed_ns: int, size_bytes: int) -> _Book:
+    """Read a file once for all machines; it is read again when it has changed."""
+    book = _Book({}, [])
+    with contextlib.suppress(OSError):
+        text = Path(file).read_text(encoding="utf-8", errors="replace")
+        for entry in parse(text, file):
+            if any(character in entry.patterns for character in "*?!|"):
+                book.others.append(entry)
+                continue
+            for name in entry.patterns.lower().split(","):
+                book.plain.setdefault(name, []).append(entry)
+    return book
+
+
+def parse(text: str, file: str = "") -> Iterable[Entry]:
+    """Read the lines of a known_hosts file; what is no such line is passed over, as ssh does."""
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        marker = words.pop(0) if words and words[0].startswith("@") else ""
+        if len(words) < 3 or words[0].startswith("#") or marker == CERTIFICATE_AUTHORITY:
+            continue
+        try:
+            blob = base64.b64decode(words[2], validate=True)
+        except (binascii.Error, ValueError):
+            continue
+        yield Entry(
+            patterns=words[0],
+            key=HostKey(kind=words[1], blob=blob),
+            file=file,
+            line=number,
+            is_revoked=marker == REVOKED,
+        )
+
+
+@functools.lru_cache(maxsize=4096)
+def _glob(pattern: str) -> re.Pattern[str]:
+    """Return OpenSSH's pattern, in which only * and ? are special; brackets belong to [host]:port."""
+    return re.compile(re.escape(pattern).replace(r"\*", ".*").replace(r"\?", "."))
+
+
+def _matches_hash(patterns: str, name: str) -> bool:
+    try:
+        salt, digest = (base64.b64decode(part) for part in patterns[len(HASHED) :].split("|"))
+    except (binascii.Error, ValueError):
+        return False
+    return hmac.compare_digest(hmac.digest(salt, name.encode(), "sha1"), digest)
+
+
+def _hashed(name: str) -> str:
+    salt = os.urandom(20)
+    digest = hmac.digest(salt, name.encode(), "sha1")
+    return HASHED + "|".join(base64.b64encode(part).decode() for part in (salt, digest))
+
+
+def _line(name: str, key: HostKey) -> bytes:
+    return f"{name} {key.kind} {base64.b64encode(key.blob).decode()}\n".encode()
+
+
+def _ends_a_line(stream: object, size: int) -> bool:
+    stream.seek(size - 1)  # type: ignore[attr-defined]
+    return bool(stream.read(1) == b"\n")  # type: ignore[attr-defined]

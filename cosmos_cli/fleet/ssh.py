@@ -1,0 +1,314 @@
+"""
+A machine over SSH: Fabric's connection with the operator's configuration, strict host keys and few login attempts.
+
+Opening is tried again, within its deadline, when the machine could not be reached or closed the connection
+before a word was said; a refused login never is.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable
+from typing import Any
+
+import fabric
+from paramiko.client import MissingHostKeyPolicy
+from paramiko.config import SSHConfig
+from paramiko.pkey import PKey
+from paramiko.ssh_exception import ChannelException, SSHException
+
+from cosmos_cli.fleet.connection import Completed, ConnectOptions
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.known_hosts import HostKey, KnownHosts, Standing
+from cosmos_cli.fleet.output import BoundedOutput
+from cosmos_cli.fleet.ssh_failures import (
+    host_key_failure,
+    is_banner_error,
+    lost,
+    opening_failure,
+)
+from cosmos_cli.fleet.ssh_keys import FewKeys
+from cosmos_cli.fleet.ssh_settings import JUMPS_MAX, SshSettings, settings_of
+from cosmos_cli.fleet.ssh_stream import READ_BYTES, SshStream, wait_for
+from cosmos_cli.fleet.ssh_transport import SshTransport, make_transport
+from cosmos_cli.fleet.target import Target
+from cosmos_cli.fleet.wire import Wire, connect_tcp, connect_through_command
+
+RETRY_PAUSES_S = (0.2, 0.5, 1.0, 2.0)
+OPEN_TIMEOUT_S = 20.0
+"""To start a command; a busy board takes seconds."""
+OUTPUT_BYTES_MAX = 16 * 1024 * 1024
+"""What `run` keeps of each output: one half of its begin, one of its end."""
+INPUT_POLL_S = 0.005
+
+
+class SshConnection:
+    """
+    A machine that is logged in at.
+
+    Args:
+        target: Its entry in the inventory.
+        connection: Fabric's, open.
+        wire: Below it.
+        hop: The jump host's connection, closed with this one.
+    """
+
+    def __init__(
+        self, target: Target, connection: fabric.Connection, wire: Wire, hop: SshConnection | None
+    ) -> None:
+        self.target = target
+        self._connection = connection
+        self._wire = wire
+        self._hop = hop
+
+    @property
+    def transport(self) -> SshTransport:
+        """Return paramiko's part."""
+        transport: SshTransport = self._connection.transport
+        return transport
+
+    @property
+    def own_address(self) -> str:
+        """Address of this computer as the machine reaches it; through a jump host, as that one does."""
+        return self._wire.own_address
+
+    @property
+    def peer_address(self) -> str:
+        """Address of the machine."""
+        return self._wire.peer_address or self.target.address
+
+    def open(self, command: str) -> SshStream:
+        """Start a shell command."""
+        return self._start(command)
+
+    def run(self, command: str, *, stdin: bytes = b"", timeout_s: float) -> Completed:
+        """Run a shell command to its end."""
+        half = OUTPUT_BYTES_MAX // 2
+        output, errors = BoundedOutput(half, half), BoundedOutput(half, half)
+        stream = self._start(command, errors)
+        try:
+            _converse(stream, memoryview(stdin), output, timeout_s)
+            status = stream.exit_status()
+        finally:
+            stream.close()
+        if status is None:
+            raise lost() if not self.transport.is_active() else _unknown_end()
+        return Completed(
+            exit_status=status,
+            stdout=output.data,
+            stderr=errors.data,
+            cut_bytes=output.cut_bytes + errors.cut_bytes,
+        )
+
+    def is_alive(self, *, timeout_s: float = 2.0) -> bool:
+        """Ask for a sign of life; paramiko's own keepalive notices neither a dead link nor a frozen machine."""
+        sign = self._wire.expect_sign()
+        try:
+            self.transport.ask_for_sign()
+        except (SSHException, OSError, EOFError):
+            return False
+        return sign.wait(timeout_s) and self.transport.is_active()
+
+    def close(self) -> None:
+        """Close it."""
+        self._connection.close()
+        self._wire.close()
+        if self._hop is not None:
+            self._hop.close()
+
+    def _start(self, command: str, errors: BoundedOutput | None = None) -> SshStream:
+        try:
+            channel = self.transport.start_command(command, timeout_s=OPEN_TIMEOUT_S)
+        except ChannelException as error:
+            raise MachineFailure(
+                FailureKind.BUSY,
+                f"the machine opens no further session ({error.text})",
+                "MaxSessions of its sshd_config may be too small",
+            ) from error
+        except (SSHException, OSError, EOFError) as error:
+            raise lost(error) from error
+        return SshStream(channel, self.transport, errors)
+
+
+def _unknown_end() -> MachineFailure:
+    return MachineFailure(
+        FailureKind.LOST,
+        "the command was refused, or ended without an exit status",
+        "may that user run commands there (ForceCommand, a login shell that ends at once)?",
+    )
+
+
+def _converse(
+    stream: SshStream, pending: memoryview, output: BoundedOutput, timeout_s: float
+) -> None:
+    """Feed a command and read what it says until it has ended."""
+    until_s = time.monotonic() + timeout_s
+    is_writing = True
+    while True:
+        pending = _feed(stream, pending)
+        if not pending and is_writing:
+            stream.close_writing()
+            is_writing = False
+        try:
+            data = stream.read(READ_BYTES)
+        except BlockingIOError:
+            remaining_s = until_s - time.monotonic()
+            if remaining_s <= 0:
+                text = f"the command did not end in {timeout_s:g} s"
+                raise MachineFailure(FailureKind.TIMEOUT, text) from None
+            wait_for(stream.fileno(), INPUT_POLL_S if pending else remaining_s)
+            continue
+        if not data:
+            return
+        output.add(data)
+
+
+def _feed(stream: SshStream, pending: memoryview) -> memoryview:
+    """Hand over what fits now and return the rest."""
+    try:
+        while pending:
+            pending = pending[stream.write(pending) :]  # type: ignore[arg-type]
+    except BlockingIOError:
+        pass
+    except MachineFailure:
+        return memoryview(b"")  # it ended before it had read all; its status tells
+    return pending
+
+
+def open_ssh(
+    target: Target, options: ConnectOptions, *, trail: tuple[str, ...] = ()
+) -> SshConnection:
+    """
+    Log in at a machine.
+
+    Args:
+        target: The machine.
+        options: How long, and whether unknown host keys are recorded.
+        trail: Addresses of the machines whose way leads through this one.
+
+    Raises:
+        MachineFailure: In words that say what to do.
+        InputError: The ssh configuration cannot be read.
+    """
+    settings = settings_of(target)
+    timeout_s = settings.connect_timeout_s or options.timeout_s
+    until_s = time.monotonic() + timeout_s
+    where = f"{settings.host} port {settings.port}"
+    pauses_s = iter(RETRY_PAUSES_S)
+    while True:
+        hop = _hop(settings, options, trail)
+        try:
+            wire = _wire(settings, hop, until_s - time.monotonic())
+            try:
+                connection = _log_in(settings, options, wire, until_s)
+                return SshConnection(target, connection, wire, hop)
+            except BaseException:
+                wire.close()
+                raise
+        except (OSError, SSHException, EOFError, MachineFailure) as error:
+            if hop is not None:
+                hop.close()
+            pause_s = next(pauses_s, timeout_s)
+            if time.monotonic() + pause_s >= until_s or not _is_worth_another_try(error):
+                raise opening_failure(error, where, timeout_s) from error
+        time.sleep(pause_s)
+
+
+def _is_worth_another_try(error: Exception) -> bool:
+    """Whether nobody has been heard yet: refused, unreachable, or closed before a word."""
+    if isinstance(error, MachineFailure):
+        return False
+    return is_banner_error(error) or isinstance(error, ConnectionRefusedError)
+
+
+def _hop(
+    settings: SshSettings, options: ConnectOptions, trail: tuple[str, ...]
+) -> SshConnection | None:
+    """Connect to the jump host nearest to the machine, through those before it."""
+    hop: SshConnection | None = None
+    if len(trail) >= JUMPS_MAX:
+        return None
+    for jump in settings.jumps:
+        if jump.address in (settings.host, *trail):
+            continue  # `Host *` with a ProxyJump means the jump host itself as well
+        through = hop
+        try:
+            hop = open_ssh(jump, options, trail=(*trail, settings.host, jump.address))
+        except MachineFailure as failure:
+            if through is not None:
+                through.close()
+            text = f"jump host {jump.address}: {failure.text}"
+            raise MachineFailure(failure.kind, text, failure.advice) from failure
+    return hop
+
+
+def _wire(settings: SshSettings, hop: SshConnection | None, timeout_s: float) -> Wire:
+    if hop is not None:
+        channel = hop.transport.open_channel(
+            "direct-tcpip", (settings.host, settings.port), ("127.0.0.1", 0), timeout=timeout_s
+        )
+        return Wire(channel, addresses=(hop.own_address, settings.host))
+    if settings.proxy_command:
+        return connect_through_command(settings.proxy_command)
+    return connect_tcp(settings.host, settings.port, timeout_s=timeout_s)
+
+
+def _log_in(
+    settings: SshSettings, options: ConnectOptions, wire: Wire, until_s: float
+) -> fabric.Connection:
+    known = KnownHosts(settings.known_hosts)
+    remaining_s = max(0.5, until_s - time.monotonic())
+    connection = fabric.Connection(
+        settings.host,
+        user=settings.user,
+        port=settings.port,
+        config=_config(),
+        forward_agent=False,
+        connect_kwargs={
+            "sock": wire,
+            "timeout": remaining_s,
+            "banner_timeout": remaining_s,
+            "auth_timeout": remaining_s,
+            "transport_factory": _factory(known.kinds(settings.names)),
+            "auth_strategy": FewKeys(settings),
+        },
+    )
+    connection.client.set_missing_host_key_policy(_StrictHostKeys(settings, options, known))
+    try:
+        connection.open()
+    except BaseException:
+        connection.client.close()
+        raise
+    return connection
+
+
+def _factory(known_kinds: list[str]) -> Callable[..., SshTransport]:
+    return lambda sock, disabled_algorithms: make_transport(sock, known_kinds)
+
+
+@functools.lru_cache(maxsize=1)
+def _config() -> fabric.Config:
+    """Return one empty configuration for all: Fabric's files and ssh's are none of its business here."""
+    return fabric.Config(ssh_config=SSHConfig(), lazy=True)
+
+
+class _StrictHostKeys(MissingHostKeyPolicy):
+    """Judges every host key: Fabric's own lists stay empty, so that it always asks here."""
+
+    def __init__(self, settings: SshSettings, options: ConnectOptions, known: KnownHosts) -> None:
+        self._settings = settings
+        self._accepts_new = options.accept_new_host_keys or settings.accepts_new_host_keys
+        self._known = known
+
+    def missing_host_key(self, client: Any, hostname: str, key: PKey) -> None:
+        """Accept a known key, record an unknown one if that is wanted, refuse every other."""
+        settings = self._settings
+        shown = HostKey(kind=key.get_name(), blob=key.asbytes())
+        verdict = self._known.judge(settings.names, shown)
+        if verdict.standing is Standing.UNKNOWN and self._accepts_new:
+            is_hashed = settings.hashes_known_hosts
+            verdict = self._known.record(settings.names[0], shown, is_hashed=is_hashed)
+        if verdict.standing is not Standing.KNOWN:
+            where = f"{settings.host} port {settings.port}"
+            raise host_key_failure(verdict, shown, settings.names, where)

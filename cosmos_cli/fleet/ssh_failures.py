@@ -1,0 +1,161 @@
+"""
+Why a connection failed, in words: what paramiko and the sockets raise becomes a MachineFailure. Pure.
+
+paramiko tells many cases apart by their texts only; this is the one place that reads them.
+"""
+
+from __future__ import annotations
+
+import errno
+import socket
+
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.known_hosts import HostKey, Standing, Verdict
+
+UNREACHABLE = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOWN)
+BANNER_ERROR = "Error reading SSH protocol banner"
+NO_SESSION = "No existing session"
+
+
+def opening_failure(error: Exception, where: str, timeout_s: float) -> MachineFailure:
+    """
+    Say why a connection could not be opened.
+
+    Args:
+        error: What was raised before anybody was logged in.
+        where: Address and port.
+        timeout_s: How long it was waited for.
+    """
+    if isinstance(error, MachineFailure):
+        return error
+    if isinstance(error, socket.gaierror):
+        return MachineFailure(
+            FailureKind.UNREACHABLE,
+            f"{where}: the name is not known ({error.strerror})",
+            "set ansible_host to its address, or enter the name in DNS, /etc/hosts or the ssh configuration",
+        )
+    if isinstance(error, ConnectionRefusedError):
+        return MachineFailure(
+            FailureKind.REFUSED,
+            f"{where}: connection refused",
+            "is its SSH server enabled and started, and ansible_port right?",
+        )
+    text = str(error)
+    if is_banner_error(error):
+        return _silent(text, where, timeout_s)
+    if isinstance(error, TimeoutError):
+        return MachineFailure(
+            FailureKind.UNREACHABLE,
+            f"{where}: no answer in {timeout_s:.0f} s",
+            "is it switched on, on this network, and its address right?",
+        )
+    if isinstance(error, OSError) and error.errno in UNREACHABLE:
+        return MachineFailure(
+            FailureKind.UNREACHABLE,
+            f"{where}: no route ({error.strerror})",
+            "is it switched on, on this network, and its address right?",
+        )
+    if text == NO_SESSION or "timeout" in text.lower():
+        return _frozen(where, timeout_s)
+    if "Incompatible ssh peer" in text or "Incompatible version" in text:
+        return MachineFailure(
+            FailureKind.UNSUPPORTED,
+            f"{where}: its SSH server shares no algorithm with this computer ({text})",
+            "update OpenSSH there",
+        )
+    return _broken(text or type(error).__name__, where)
+
+
+def is_banner_error(error: Exception) -> bool:
+    """Whether the machine was reached but said nothing of SSH; worth another try."""
+    return BANNER_ERROR in str(error)
+
+
+def _silent(text: str, where: str, timeout_s: float) -> MachineFailure:
+    if text == BANNER_ERROR or "timed out" not in text:
+        # paramiko appends what ended the reading: nothing for an end, "timed out" for silence.
+        return MachineFailure(
+            FailureKind.REFUSED,
+            f"{where}: the connection was closed before a word of SSH was said",
+            "is that an SSH server? it may also be starting, be full (MaxStartups), or punish earlier"
+            " failed logins: try again in a minute",
+        )
+    return _frozen(where, timeout_s)
+
+
+def _frozen(where: str, timeout_s: float) -> MachineFailure:
+    return MachineFailure(
+        FailureKind.FROZEN,
+        f"{where}: the connection opens, but nothing was said in {timeout_s:.0f} s",
+        "it hangs or is just starting: wait, or switch it off and on",
+    )
+
+
+def _broken(text: str, where: str) -> MachineFailure:
+    return MachineFailure(
+        FailureKind.LOST,
+        f"{where}: the connection broke while it was opened ({text})",
+        "look into the log of sshd there",
+    )
+
+
+def login_failure(error: Exception, user: str, where: str) -> MachineFailure:
+    """Say why nobody could be logged in, the host key being right."""
+    if isinstance(error, MachineFailure):
+        return error
+    text = str(error)
+    if "timeout" in text.lower():
+        return MachineFailure(
+            FailureKind.FROZEN,
+            f"{where}: no answer to the login of {user}",
+            "it hangs or is overloaded: wait, or switch it off and on",
+        )
+    return MachineFailure(
+        FailureKind.LOST,
+        f"{where}: the connection was closed while {user} logged in ({text or type(error).__name__})",
+        "it may be going down, or refuse that user (AllowUsers, /etc/nologin); look into the log of"
+        " sshd there",
+    )
+
+
+def lost(error: Exception | None = None) -> MachineFailure:
+    """Say that a connection broke in the midst of it."""
+    said = f" ({error})" if error is not None and str(error) else ""
+    return MachineFailure(
+        FailureKind.LOST,
+        f"the connection is lost{said}",
+        "has it lost power or network? repeat the command when it is back",
+    )
+
+
+def host_key_failure(
+    verdict: Verdict, key: HostKey, names: tuple[str, ...], where: str
+) -> MachineFailure:
+    """Say why a machine's host key is not accepted."""
+    shown = f"{key.kind} {key.fingerprint}"
+    if verdict.standing is Standing.UNKNOWN:
+        return MachineFailure(
+            FailureKind.HOST_KEY_UNKNOWN,
+            f"{where}: its host key is not known: {shown}",
+            "compare it with `ssh-keygen -lf /etc/ssh/ssh_host_*_key.pub` there, then record it with"
+            " --accept-new-host-keys, or log in once with ssh",
+        )
+    place = f" ({verdict.against.file}:{verdict.against.line})" if verdict.against else ""
+    if verdict.standing is Standing.REVOKED:
+        return MachineFailure(
+            FailureKind.HOST_KEY_CHANGED,
+            f"{where}: its host key is revoked{place}: {shown}",
+            "do not use that machine before you know who has its key",
+        )
+    expected = f", expected {_words(verdict)}" if verdict.against else ""
+    return MachineFailure(
+        FailureKind.HOST_KEY_CHANGED,
+        f"{where}: its host key has changed: got {shown}{expected}{place}",
+        "somebody else may answer there; if the machine was installed anew, forget the old key with"
+        f" `ssh-keygen -R '{names[0]}'` and accept the new one",
+    )
+
+
+def _words(verdict: Verdict) -> str:
+    assert verdict.against is not None
+    return f"{verdict.against.key.kind} {verdict.against.key.fingerprint}"
