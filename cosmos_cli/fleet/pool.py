@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from queue import Empty, SimpleQueue
 from typing import TypeVar
 
+from cosmos_cli.errors import CosmosError
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.outcome import Outcome
 from cosmos_cli.fleet.target import Target
@@ -16,7 +19,7 @@ T = TypeVar("T")
 FORKS_DEFAULT = 10
 """More threads than this gain little: the operator's processors are the limit (measured with 24 machines)."""
 WAIT_S = 0.5
-"""Between looks at the futures, so that Ctrl-C is heard."""
+"""Between looks at what is done, so that Ctrl-C is heard on every platform."""
 
 
 def for_each(
@@ -29,7 +32,8 @@ def for_each(
     """
     Do *task* for every machine and return all outcomes, in the order of *targets*.
 
-    Every wait of *task* must have a deadline of its own.
+    Every wait of *task* must have a deadline of its own. The threads are daemons: an interrupted command
+    ends without waiting for machines that do not answer.
 
     Args:
         targets: The machines.
@@ -39,25 +43,45 @@ def for_each(
 
     Raises:
         KeyboardInterrupt: Machines that had not begun are left alone.
+        CosmosError: One that *task* raised, such as a fault in the operator's own files.
     """
-    outcomes: dict[str, Outcome[T]] = {}
-    pool = ThreadPoolExecutor(
-        max_workers=max(1, min(forks, len(targets))), thread_name_prefix="fleet"
-    )
+    waiting = deque(enumerate(targets))
+    done: SimpleQueue[tuple[int, Outcome[T] | CosmosError]] = SimpleQueue()
+    for number in range(max(1, min(forks, len(targets)))):
+        work = threading.Thread(
+            target=_work, args=(waiting, task, done), name=f"fleet-{number}", daemon=True
+        )
+        work.start()
+    outcomes: dict[int, Outcome[T]] = {}
     try:
-        waiting: set[Future[Outcome[T]]] = {pool.submit(_attempt, t, task) for t in targets}
-        while waiting:
-            done, waiting = wait(waiting, timeout=WAIT_S, return_when=FIRST_COMPLETED)
-            for future in done:
-                outcome = future.result()
-                outcomes[outcome.machine] = outcome
-                on_done(outcome)
+        while len(outcomes) < len(targets):
+            try:
+                index, outcome = done.get(timeout=WAIT_S)
+            except Empty:
+                continue
+            if isinstance(outcome, CosmosError):
+                raise outcome
+            outcomes[index] = outcome
+            on_done(outcome)
     finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-    return [outcomes[target.name] for target in targets]
+        waiting.clear()
+    return [outcomes[index] for index in range(len(targets))]
 
 
-def _attempt(target: Target, task: Callable[[Target], T]) -> Outcome[T]:
+def _work(
+    waiting: deque[tuple[int, Target]],
+    task: Callable[[Target], T],
+    done: SimpleQueue[tuple[int, Outcome[T] | CosmosError]],
+) -> None:
+    while True:
+        try:
+            index, target = waiting.popleft()
+        except IndexError:
+            return
+        done.put((index, _attempt(target, task)))
+
+
+def _attempt(target: Target, task: Callable[[Target], T]) -> Outcome[T] | CosmosError:
     start_s = time.monotonic()
     value: T | None = None
     failure: MachineFailure | None = None
@@ -65,6 +89,8 @@ def _attempt(target: Target, task: Callable[[Target], T]) -> Outcome[T]:
         value = task(target)
     except MachineFailure as error:
         failure = error
+    except CosmosError as error:
+        return error
     except Exception as error:  # noqa: BLE001 - one machine's surprise must not hide the others' results
         failure = MachineFailure(
             FailureKind.DEFECT,
