@@ -15,14 +15,15 @@ import sys
 import time
 import traceback
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
 from . import kernel, setup
-from .disk import Disk
+from .disk import UPPER, Disk
+from .layer import Layer
 from .network import Network
 from .specification import BoardSpec
 
@@ -75,6 +76,19 @@ class Surroundings:
     log: Path
 
 
+@dataclass(slots=True)
+class Condition:
+    """What outlasts a board's boots, and what went wrong at the last."""
+
+    is_link_up: bool = True
+    loss_percent: float = 0.0
+    stays_off: bool = False
+    is_reflashed: bool = False
+    """A fresh card is put in before the next boot."""
+    boot_due_s: float = 0.0
+    trouble: str = ""
+
+
 class Board:
     """
     One board.
@@ -85,6 +99,7 @@ class Board:
         network: Gives its address.
         disk: Its medium.
         surroundings: What it is plugged into.
+        identity: Files that tell it from other boards: content and mode by path.
     """
 
     def __init__(
@@ -95,6 +110,7 @@ class Board:
         network: Network,
         disk: Disk,
         surroundings: Surroundings,
+        identity: Mapping[str, tuple[str, int]],
     ) -> None:
         self.number = number
         self.spec = spec
@@ -104,11 +120,9 @@ class Board:
         self.power = Power.OFF
         self.boots = 0
         self.boot_id = ""
-        self.is_link_up = True
-        self.loss_percent = 0.0
+        self.condition = Condition()
         self.supply: int | None = None
-        self.stays_off = False
-        self.boot_due_s = 0.0
+        self._identity = identity
         self._plugged: int | None = None
 
     @property
@@ -126,11 +140,27 @@ class Board:
         return None
 
     @property
+    def is_frozen(self) -> bool:
+        """Whether its programs are stopped."""
+        with contextlib.suppress(OSError):
+            return "frozen 1" in (self.surroundings.cgroup / "cgroup.events").read_text()
+        return False
+
+    @property
     def is_listening(self) -> bool:
         """Whether its sshd takes connections."""
         with contextlib.suppress(OSError):
             return SSH_LISTENS in Path(f"/proc/{self.supply}/net/tcp").read_text()
         return False
+
+    def flash(self, template: Path) -> None:
+        """Put a freshly written card in: the empty *template* with this board's identity."""
+        self.disk.create(template)
+        self.disk.mount()
+        upper = Layer(self.disk.mount_point / UPPER, self.surroundings.lowers[-1])
+        for path, (text, mode) in self._identity.items():
+            upper.add(path, text, mode)
+        self.disk.release()
 
     def prepare_boot(self) -> int:
         """
@@ -226,8 +256,11 @@ class Board:
             "boots": self.boots,
             "boot_id": self.boot_id,
             "init": self.init,
-            "is_link_up": self.is_link_up,
-            "loss_percent": self.loss_percent,
+            "is_link_up": self.condition.is_link_up,
+            "is_frozen": self.is_frozen,
+            "loss_percent": self.condition.loss_percent,
+            "has_disk_failed": self.disk.has_failed,
+            "trouble": self.condition.trouble,
         }
 
     def _need_init(self) -> int:

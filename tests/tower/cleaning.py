@@ -16,6 +16,7 @@ from pathlib import Path
 
 from . import kernel
 from .board import kill_group, remove_group
+from .disk import list_loop_devices, remove_loop_devices
 from .network import remove_interface
 from .places import Places
 
@@ -32,9 +33,9 @@ def clean(places: Places) -> None:
     _in_child(lambda: _clean_groups(places))
     if Path(f"/sys/class/net/{places.uplink}").exists():
         remove_interface(places.uplink)
-    with contextlib.suppress(OSError, json.JSONDecodeError, KeyError):
-        for number in places.read_state()["loops_added"]:
-            kernel.remove_loop_device(number)
+    with contextlib.suppress(FileNotFoundError, json.JSONDecodeError):
+        before = json.loads(places.loops.read_text())
+        remove_loop_devices(list_loop_devices() - set(before))
     places.remove()
 
 

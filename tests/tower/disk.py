@@ -13,12 +13,14 @@ import os
 import shutil
 import subprocess
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 from . import kernel
 
 PATIENCE_S = 10.0
 POLL_S = 0.01
+MOUNT_ATTEMPTS = 5
 UPPER = "upper"
 WORK = "work"
 BALLAST = "ballast"
@@ -54,8 +56,10 @@ class Disk:
 
     def create(self, template: Path) -> None:
         """Make it from the empty *template*."""
+        self.image.unlink(missing_ok=True)
+        self.has_failed = False
         _run(["cp", "--sparse=always", str(template), str(self.image)])
-        self.mount_point.mkdir(parents=True)
+        self.mount_point.mkdir(parents=True, exist_ok=True)
 
     def mount(self) -> None:
         """Put it into the board: what a board does to its card when power comes on."""
@@ -63,7 +67,7 @@ class Disk:
             _run(["e2fsck", "-p", str(self.image)], accept=(0, 1))
             self.has_failed = False
         options = "loop,errors=remount-ro,noatime,discard"
-        _run(["mount", "-t", "ext4", "-o", options, str(self.image), str(self.mount_point)])
+        _mount_image(options, self.image, self.mount_point)
         self.loop = f"loop{os.minor(self.mount_point.stat().st_dev)}"
         for name in (UPPER, WORK):
             (self.mount_point / name).mkdir(exist_ok=True)
@@ -126,6 +130,31 @@ class Disk:
                     break
         finally:
             os.close(descriptor)
+
+
+def list_loop_devices() -> set[int]:
+    """Return the numbers of the loop devices that the kernel has, used or not."""
+    names = (path.name.removeprefix("loop") for path in Path("/sys/block").glob("loop*"))
+    return {int(name) for name in names if name.isdecimal()}
+
+
+def remove_loop_devices(numbers: Iterable[int]) -> None:
+    """Take loop devices back out of the kernel, but for those in use."""
+    for number in numbers:
+        kernel.remove_loop_device(number)
+
+
+def _mount_image(options: str, image: Path, mount_point: Path) -> None:
+    """Mount a file; again if another tower's end has just taken away the loop device chosen for it."""
+    for attempt in range(MOUNT_ATTEMPTS):
+        try:
+            _run(["mount", "-t", "ext4", "-o", options, str(image), str(mount_point)])
+        except DiskError:
+            if attempt == MOUNT_ATTEMPTS - 1:
+                raise
+            time.sleep(POLL_S)
+        else:
+            return
 
 
 def _run(command: list[str], accept: tuple[int, ...] = (0,)) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from . import kernel
 from .base import NO_PASSWORD_NEEDED, REPOSITORY, USER, USER_ID
-from .board import Board, BoardError, Power
+from .board import Board, BoardError, Condition, Power
 from .keys import generate_key
 from .network import Switch
 from .packages import INDEX, NEWER_INDEX
@@ -58,7 +58,7 @@ class Fault:
 
 
 def _set_link(scene: Scene, is_up: bool) -> None:
-    scene.board.is_link_up = is_up
+    scene.board.condition.is_link_up = is_up
     if scene.board.supply is not None:  # else at its next boot
         scene.switch.set_link(scene.board.number, is_up=is_up)
 
@@ -66,9 +66,9 @@ def _set_link(scene: Scene, is_up: bool) -> None:
 def _set_loss(scene: Scene, loss_percent: float) -> None:
     if not 0 <= loss_percent <= 100:
         raise BoardError(f"loss: expected 0 to 100 percent, got {loss_percent:g}")
-    scene.board.loss_percent = loss_percent
+    scene.board.condition.loss_percent = loss_percent
     if scene.board.supply is not None:
-        scene.switch.set_loss(scene.board.number, loss_percent)
+        scene.switch.set_loss(scene.board.number, scene.board.supply, loss_percent)
 
 
 # Power ------------------------------------------------------------------------------------------
@@ -86,16 +86,25 @@ def _cut_power(scene: Scene) -> None:
 
 def _power_off(scene: Scene) -> None:
     _cut_power(scene)
-    scene.board.stays_off = True
+    scene.board.condition.stays_off = True
 
 
 def _power_on(scene: Scene) -> None:
     board = scene.board
     if board.power not in (Power.OFF, Power.AWAY):
         raise BoardError(f"{board.name} is {board.power.value} already")
-    board.stays_off = False
+    board.condition.stays_off = False
     board.power = Power.AWAY  # the supervisor boots what is away when its time has come
-    board.boot_due_s = 0.0
+    board.condition.boot_due_s = 0.0
+
+
+def _reflash(scene: Scene) -> None:
+    board = scene.board
+    board.condition = Condition(is_reflashed=True)
+    if board.supply is None:
+        _power_on(scene)
+    else:
+        _cut_power(scene)
 
 
 # The disk ---------------------------------------------------------------------------------------
@@ -228,6 +237,9 @@ FAULTS: dict[str, Fault] = {
     "reboot": Fault(
         act=lambda s: s.board.signal(signal.SIGTERM),
         text="reboot in good order, as `sudo reboot` does",
+    ),
+    "reflash": Fault(
+        act=_reflash, text="undo every fault: put a freshly written card in, and boot at once"
     ),
     "fill": Fault(
         act=lambda s: s.board.disk.fill(int(s.number(0)) * 1024),

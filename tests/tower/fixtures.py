@@ -52,7 +52,6 @@ def shared_tower8() -> Iterator[Tower]:
 
 @pytest.fixture
 def tower8(shared_tower8: Tower) -> Iterator[Tower]:
-    """Return eight boards, without the faults of the test before; their disks keep what it wrote."""
-    for name in shared_tower8.boards:
-        shared_tower8.reset(name)
+    """Return eight boards as freshly installed, whatever the tests before did to them."""
+    shared_tower8.reflash()
     yield shared_tower8

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from . import cleaning, kernel, pretend, roots
-from .base import write_base, write_python
+from .base import USER, write_base, write_python
 from .board import Board, Surroundings
-from .disk import Disk, make_template
-from .keys import generate_key
+from .disk import Disk, list_loop_devices, make_template
+from .keys import KeyPair, generate_key
 from .layer import Layer
 from .network import Network, NetworkError, check_network, find_network
 from .packages import write_repository
 from .places import TOWERS_MAX, Places, lock
 from .specification import NATIVE, BoardSpec, TowerSpec
+
+TEMPLATE = "template"
 
 
 def claim(network: str | None) -> tuple[Places, Network, int]:
@@ -46,6 +48,7 @@ def claim(network: str | None) -> tuple[Places, Network, int]:
                 continue
         free = wanted or find_network(index)
         if free is not None:
+            places.loops.write_text(json.dumps(sorted(list_loop_devices())))
             return places, free, owner
         places.remove()
         os.close(owner)
@@ -68,29 +71,31 @@ def make_boards(
     layers = _Layers(private, user_key.public)
     pretend.write_sys(private / "sys")
     pretend.write_settings(private / "settings")
-    make_template(private / "template", spec.disk_mib)
+    template = private / TEMPLATE
+    make_template(template, spec.disk_mib)
     boards = {}
+    keys = {board.name: generate_key(board.name) for board in spec.boards}
+    addresses = {
+        board.name: network.address(number) for number, board in enumerate(spec.boards, start=1)
+    }
     for number, board in enumerate(spec.boards, start=1):
-        disk = Disk(private / f"{board.name}.img", private / "disk" / board.name)
-        disk.create(private / "template")
-        surroundings = Surroundings(
-            lowers=layers.of(board),
-            sys_layer=private / "sys",
-            settings_layer=private / "settings",
-            cgroup=groups / board.name,
-            log=places.logs / f"{board.name}.log",
-        )
         boards[board.name] = Board(
-            number, board, network=network, disk=disk, surroundings=surroundings
+            number,
+            board,
+            network=network,
+            disk=Disk(private / f"{board.name}.img", private / "disk" / board.name),
+            surroundings=Surroundings(
+                lowers=layers.of(board),
+                sys_layer=private / "sys",
+                settings_layer=private / "settings",
+                cgroup=groups / board.name,
+                log=places.logs / f"{board.name}.log",
+            ),
+            identity=_describe(board.name, keys[board.name], addresses),
         )
-    _write_identities(boards, places)
+        boards[board.name].flash(template)
+    _write_operator_files(places, keys, addresses)
     return boards
-
-
-def write_state(places: Places, state: dict[str, Any], boards: dict[str, Board]) -> None:
-    """Write down what a cleaner needs after the supervisor was killed."""
-    del boards
-    places.state.write_text(json.dumps({**state, "loops_added": []}, indent=1))
 
 
 class _Layers:
@@ -122,26 +127,36 @@ class _Layers:
         return (layer.folder, *below)
 
 
-def _write_identities(boards: dict[str, Board], places: Places) -> None:
-    """Give every board a name and a host key, and the operator the means to reach and know them."""
+def _describe(name: str, key: KeyPair, addresses: Mapping[str, str]) -> dict[str, tuple[str, int]]:
+    """Return the files that tell a board from the others: content and mode by path."""
+    hosts = "".join(f"{address} {other}\n" for other, address in addresses.items())
+    return {
+        "etc/hostname": (f"{name}\n", 0o644),
+        "etc/hosts": (f"127.0.0.1 localhost\n127.0.1.1 {name}\n{hosts}", 0o644),
+        "etc/machine-id": (os.urandom(16).hex() + "\n", 0o644),
+        "etc/ssh/ssh_host_ed25519_key": (key.private, 0o600),
+        "etc/ssh/ssh_host_ed25519_key.pub": (f"{key.public}\n", 0o644),
+    }
+
+
+def _write_operator_files(
+    places: Places, keys: Mapping[str, KeyPair], addresses: Mapping[str, str]
+) -> None:
+    """Give the operator the means to know the boards and to reach them, with nothing of a user's own."""
     known, config = [], []
-    hosts = "".join(f"{board.address} {name}\n" for name, board in boards.items())
-    for name, board in boards.items():
-        key = generate_key(name)
-        board.disk.mount()
-        upper = Layer(board.disk.mount_point / "upper", board.surroundings.lowers[-1])
-        upper.add("etc/hostname", name + "\n")
-        upper.add("etc/hosts", f"127.0.0.1 localhost\n127.0.1.1 {name}\n{hosts}")
-        upper.add("etc/machine-id", os.urandom(16).hex() + "\n")
-        upper.add("etc/ssh/ssh_host_ed25519_key", key.private, 0o600)
-        upper.add("etc/ssh/ssh_host_ed25519_key.pub", key.public + "\n")
-        board.disk.release()
-        known.append(f"{board.address},{name} {' '.join(key.public.split()[:2])}\n")
-        config.append(f"Host {name}\n    HostName {board.address}\n")
+    for name, address in addresses.items():
+        known.append(f"{address},{name} {' '.join(keys[name].public.split()[:2])}\n")
+        config.append(f"Host {name}\n    HostName {address}\n")
     places.known_hosts.write_text("".join(known))
-    config.append(
-        f"Host *\n    User pi\n    IdentityFile {places.key}\n    IdentitiesOnly yes\n"
-        f"    IdentityAgent none\n    UserKnownHostsFile {places.known_hosts}\n"
-        "    GlobalKnownHostsFile /dev/null\n    StrictHostKeyChecking yes\n    PasswordAuthentication no\n"
-    )
+    settings = {
+        "User": USER,
+        "IdentityFile": places.key,
+        "IdentitiesOnly": "yes",
+        "IdentityAgent": "none",
+        "UserKnownHostsFile": places.known_hosts,
+        "GlobalKnownHostsFile": "/dev/null",
+        "StrictHostKeyChecking": "yes",
+        "PasswordAuthentication": "no",
+    }
+    config.append("Host *\n" + "".join(f"    {name} {value}\n" for name, value in settings.items()))
     places.ssh_config.write_text("".join(config))

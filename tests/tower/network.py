@@ -118,8 +118,8 @@ class Switch:
             f"link set {uplink} up",
         )
         _run(["ip", "-batch", "-"], text="\n".join(lines))
-        # Boards reach the operator and each other, and nothing behind the operator.
-        Path(f"/proc/sys/net/ipv4/conf/{uplink}/forwarding").write_text("0")
+        self._lossy: set[int] = set()
+        _forbid_forwarding(uplink)
 
     def plug(self, ports: Iterable[tuple[int, int]]) -> None:
         """
@@ -138,29 +138,40 @@ class Switch:
 
     def unplug(self, number: int) -> None:
         """Take a board's cable away; it may have gone with the board."""
+        self._lossy.discard(number)
         self._batch(f"link del port{number}", is_forced=True)
 
     def set_link(self, number: int, *, is_up: bool) -> None:
         """Pull a board's cable, or plug it in again."""
         self._batch(f"link set port{number} {'up' if is_up else 'down'}")
 
-    def set_loss(self, number: int, loss_percent: float) -> None:
+    def set_loss(self, number: int, process: int, loss_percent: float) -> None:
         """
         Lose this share of a board's packets, in each direction; 0 loses none.
 
         The rules sit on the switch's side of the cable: a drop in the board's own output would show as an
-        error of its send call. Segmentation is off there, or the share would be of 64 kB bundles.
+        error of its send call.
+
+        Args:
+            number: Of the board.
+            process: One in its network namespace.
+            loss_percent: 0 to 100.
         """
-        port, table = f"port{number}", f"port{number}"
-        drop = f"numgen random mod {LOSS_SCALE} < {round(loss_percent * LOSS_SCALE / 100)} drop"
-        rules = [f"add table netdev {table}", f"delete table netdev {table}"]
+        table = f"netdev port{number}"
+        share = round(loss_percent * LOSS_SCALE / 100)
+        drop = "drop" if share >= LOSS_SCALE else f"numgen random mod {LOSS_SCALE} < {share} drop"
+        rules = [f"add table {table}", f"delete table {table}"]
         if loss_percent > 0:
-            rules.append(f"add table netdev {table}")
+            rules.append(f"add table {table}")
             for hook in ("ingress", "egress"):
-                chain = f"type filter hook {hook} device {port} priority 0;"
-                rules.append(f"add chain netdev {table} {hook} {{ {chain} }}")
-                rules.append(f"add rule netdev {table} {hook} {drop}")
-        self._batch(f"link set {port} gso_max_segs {1 if loss_percent > 0 else 65535}")
+                chain = f"type filter hook {hook} device port{number} priority 0;"
+                rules.append(f"add chain {table} {hook} {{ {chain} }}")
+                rules.append(f"add rule {table} {hook} {drop}")
+        (self._lossy.add if loss_percent > 0 else self._lossy.discard)(number)
+        # One packet must be one packet: else bundles of 64 kB are lost or not. It costs speed.
+        board = ["nsenter", f"--net=/proc/{process}/ns/net"]
+        _run([*board, "ip", "link", "set", "eth0", "gso_max_segs", _bundle(loss_percent > 0)])
+        _run(["ip", "link", "set", self.uplink, "gso_max_segs", _bundle(bool(self._lossy))])
         _run(["nft", "-f", "-"], text="\n".join(rules), namespace=self._namespace)
 
     def close(self) -> None:
@@ -176,6 +187,20 @@ class Switch:
 def remove_interface(name: str) -> None:
     """Delete what is left of an uplink whose switch lives on."""
     _run(["ip", "link", "del", name], is_forced=True)
+
+
+def _bundle(is_lossy: bool) -> str:
+    return "1" if is_lossy else "65535"
+
+
+def _forbid_forwarding(uplink: str) -> None:
+    """Let boards reach the operator and each other, and nothing behind the operator."""
+    setting = Path(f"/proc/sys/net/ipv4/conf/{uplink}/forwarding")
+    try:
+        setting.write_text("0")
+    except OSError as error:  # as in a container whose /proc/sys cannot be written
+        if setting.read_text().strip() != "0":
+            raise NetworkError(f"{uplink} would forward packets of boards: {error}") from error
 
 
 def _make_namespace() -> int:

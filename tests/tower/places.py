@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import json
 import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 RUN = Path("/run/cosmos-tower")
 TOWERS_MAX = 64
@@ -30,8 +28,9 @@ class Places:
         return self.folder / "control"
 
     @property
-    def state(self) -> Path:
-        return self.folder / "state.json"
+    def loops(self) -> Path:
+        """The loop devices that were there before this tower."""
+        return self.folder / "loops_before.json"
 
     @property
     def key(self) -> Path:
@@ -62,10 +61,6 @@ class Places:
     @property
     def cgroup(self) -> str:
         return f"cosmos-tower-{self.index}"
-
-    def read_state(self) -> dict[str, Any]:
-        """Return what the supervisor wrote down when it started."""
-        return json.loads(self.state.read_text())  # type: ignore[no-any-return]
 
     def remove(self) -> None:
         """Delete the files, and the parent folder with the last tower."""

@@ -119,7 +119,6 @@ class Supervisor:
     def _start_all(self) -> None:
         """Boot every board and wait until all are up."""
         self._boot(list(self._boards.values()))
-        layout.write_state(self._places, self.describe(), self._boards)
         until_s = time.monotonic() + START_PATIENCE_S
         while not self._must_stop and any(
             board.power is not Power.ON for board in self._boards.values()
@@ -135,13 +134,18 @@ class Supervisor:
         supplies = [(board.number, board.prepare_boot()) for board in boards]
         self._switch.plug(supplies)
         for board in boards:
-            if not board.is_link_up:
-                self._switch.set_link(board.number, is_up=False)
-            if board.loss_percent:
-                self._switch.set_loss(board.number, board.loss_percent)
             assert board.supply is not None
+            condition = board.condition
+            if not condition.is_link_up:
+                self._switch.set_link(board.number, is_up=False)
+            if condition.loss_percent:
+                self._switch.set_loss(board.number, board.supply, condition.loss_percent)
             self._selector.register(os.pidfd_open(board.supply), selectors.EVENT_READ, board)
             board.finish_boot()
+
+    @property
+    def _template(self) -> Path:
+        return self._places.private / layout.TEMPLATE
 
     def _handle_end(self, board: Board, pidfd: int) -> None:
         """A board has ended: release what it had, and decide whether it comes back."""
@@ -151,11 +155,12 @@ class Supervisor:
         _, status = os.waitpid(board.supply, 0)
         code = os.waitstatus_to_exitcode(status)
         self._release(board)
-        if code == EXIT_OFF or board.stays_off:
+        if code == EXIT_OFF or board.condition.stays_off:
             board.power = Power.OFF
         else:
+            delay_s = 0.0 if board.condition.is_reflashed else self._options.spec.boot_delay_s
             board.power = Power.AWAY
-            board.boot_due_s = time.monotonic() + self._options.spec.boot_delay_s
+            board.condition.boot_due_s = time.monotonic() + delay_s
         self._tell(f"{board.name}: {board.power.value} (exit {code})")
 
     def _release(self, board: Board) -> None:
@@ -184,17 +189,32 @@ class Supervisor:
             if board.power is Power.BOOTING and board.is_listening:
                 board.power = Power.ON
                 self._tell(f"{board.name}: on ({board.address}, boot {board.boots})")
-            if board.power is Power.AWAY and now_s >= board.boot_due_s and not board.stays_off:
+            if board.power is Power.AWAY and now_s >= board.condition.boot_due_s:
                 due.append(board)
-        if due and not self._must_stop:
-            self._boot(due)
+        for board in due:
+            self._boot_again(board)
+
+    def _boot_again(self, board: Board) -> None:
+        """Boot one board of a running tower; if it fails, the others go on."""
+        try:
+            if board.condition.is_reflashed:
+                board.flash(self._template)
+                board.condition.is_reflashed = False
+            self._boot([board])
+            board.condition.trouble = ""
+        except (BoardError, DiskError, NetworkError, OSError) as error:
+            board.power = Power.OFF
+            board.condition.trouble = str(error)
+            self._tell(f"{board.name}: does not boot: {error}")
 
     def _timeout_s(self) -> float | None:
         powers = {board.power for board in self._boards.values()}
         if Power.BOOTING in powers:
             return POLL_S
         if Power.AWAY in powers:
-            due_s = min(b.boot_due_s for b in self._boards.values() if b.power is Power.AWAY)
+            due_s = min(
+                b.condition.boot_due_s for b in self._boards.values() if b.power is Power.AWAY
+            )
             return max(0.0, due_s - time.monotonic())
         return None
 

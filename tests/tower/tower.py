@@ -152,14 +152,13 @@ class Tower:
         text = None if argument is None else str(argument)
         ask(self.places, {"verb": "fault", "board": name, "fault": fault, "argument": text})
 
-    def reset(self, name: str) -> None:
-        """Undo every fault of a board whose undoing needs no boot, and boot it if it is off."""
-        if self.state()["boards"][name]["power"] == "off":
-            self.fault(name, "poweron")
-        self.wait_until_on(name)
-        for fault in ("up", "noloss", "thaw", "unfill", "sudo", "right-key", "own-host-key"):
-            self.fault(name, fault)
-        self.fault(name, "start-sshd")
+    def reflash(self, *names: str) -> None:
+        """Undo everything that happened to these boards, or to all: fresh disks, no fault; and wait."""
+        boards = self.state()["boards"]
+        for name in names or boards:
+            self.fault(name, "reflash")
+        for name in names or boards:
+            self.wait_until_on(name, boards[name]["boots"] + 1)
 
     def wait_until_on(self, name: str, boots: int = 0) -> dict[str, Any]:
         """Wait until a board takes connections, in its boot number *boots* at least; return its state."""
