@@ -135,12 +135,13 @@ class Incoming:
         return faults
 
     def _put(self, part: Path, path: Path) -> str | None:
+        between = [each for each in path.parents if each.is_relative_to(self._top)]
+        if any(each.is_symlink() for each in between if each != self._top):
+            return "a link here may lead out of the run directory"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except (FileExistsError, NotADirectoryError):
             return "a file is where its folder should be"
-        if not path.parent.resolve().is_relative_to(self._top.resolve()):
-            return "a link here leads out of the run directory"
         if path.is_symlink() or path.is_dir():
             return "a link or a folder is in its place"
         # One that has grown since it came the last time takes the place of its own beginning.

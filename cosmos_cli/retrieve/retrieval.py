@@ -9,11 +9,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING, Self, TypeVar
+from typing import Self, TypeVar
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.fleet.board import Board
-from cosmos_cli.fleet.connection import Connection
+from cosmos_cli.fleet.connection import Connection, ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.outcome import Outcome
 from cosmos_cli.fleet.pool import FORKS_DEFAULT, for_each
@@ -25,9 +25,6 @@ from cosmos_cli.retrieve.machine import MachineRetrieval
 from cosmos_cli.retrieve.notes import read_note
 from cosmos_cli.retrieve.sources import Source, Sources
 from cosmos_cli.rundir import RunDirectory
-
-if TYPE_CHECKING:
-    from cosmos_cli.fleet.connect import ConnectOptions
 
 PARTS = ("madns_runtime.processes", "living", "evidence")
 ATTEMPTS_MAX = 5
