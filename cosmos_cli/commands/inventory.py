@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cosmos_cli.console import Column, Console, JsonOption
-from cosmos_cli.models.inventory import load_inventory
+from cosmos_cli.models.inventory import Machine, load_machines
 
 COLUMNS = (
     Column("machine"),
@@ -16,6 +16,7 @@ COLUMNS = (
     Column("connection"),
     Column("user"),
     Column("groups"),
+    Column("devices"),
 )
 
 
@@ -23,24 +24,48 @@ def inventory(
     file: Annotated[
         Path,
         typer.Option(
-            "--inventory", "-i", metavar="FILE", envvar="COSMOS_INVENTORY", help="Inventory file."
+            "--inventory",
+            "-i",
+            metavar="FILE",
+            envvar="COSMOS_INVENTORY",
+            help="Inventory file, or a folder of them.",
         ),
     ],
+    limit: Annotated[
+        str | None,
+        typer.Option(
+            "--limit",
+            metavar="PATTERN",
+            envvar="COSMOS_LIMIT",
+            help="Only these machines: names, groups, globs, such as tower:!pi0*.",
+        ),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Show the machines of an inventory, their addresses and their groups."""
     console = Console(json=json)
-    machines = load_inventory(file)
-    rows = [
-        (
-            machine.name,
-            machine.address,
-            machine.connection,
-            str(machine.variables.get("ansible_user", "")),
-            ", ".join(machine.groups),
-        )
-        for machine in machines
-    ]
-    console.table(COLUMNS, rows)
+    machines = load_machines(file, limit)
+    console.table(COLUMNS, [_row(machine) for machine in machines])
     console.data(f"{len(machines)} machine{'s' if len(machines) > 1 else ''}")
-    console.print_json({"machines": [machine.to_mapping() for machine in machines]})
+    console.print_json({"machines": [_shown(machine) for machine in machines]})
+
+
+def _row(machine: Machine) -> tuple[str, ...]:
+    port = f":{machine.port}" if machine.port else ""
+    return (
+        machine.name,
+        f"[{machine.address}]{port}" if port and ":" in machine.address else machine.address + port,
+        machine.connection,
+        machine.user or "",
+        ", ".join(machine.groups),
+        ", ".join(machine.devices),
+    )
+
+
+def _shown(machine: Machine) -> dict[str, object]:
+    """Return what --json promises: the variables are those that Ansible sees."""
+    return {
+        "name": machine.name,
+        "groups": list(machine.groups),
+        "vars": dict(machine.variables),
+    }

@@ -174,9 +174,28 @@ def test_inventory_lists_machines(cosmos):
 
     lines = out.splitlines()
     assert code == 0
-    assert lines[0].split() == ["machine", "address", "connection", "user", "groups"]
-    assert lines[22].split() == ["pi22", "pi22", "ssh", "pi", "all,", "hwil,", "tower"]
-    assert lines[-1] == "24 machines"
+    assert lines[0].split() == ["machine", "address", "connection", "user", "groups", "devices"]
+    assert lines[22].split() == ["pi22", "pi22", "ssh", "pi", "all,", "hwil,", "tower", "sense_hat"]
+    assert lines[-1] == "25 machines"
+
+
+def test_inventory_is_limited(cosmos):
+    code, out, _ = cosmos(
+        "inventory", "-i", ROOT / "inventory/tower.yaml", "--limit", "tower:&hwil", "--json"
+    )
+
+    (machine,) = json.loads(out)["machines"]
+    assert code == 0
+    assert list(machine) == ["name", "groups", "vars"]
+    assert (machine["name"], machine["groups"]) == ("pi22", ["all", "hwil", "tower"])
+    assert machine["vars"]["cosmos_devices"] == ["sense_hat"]
+
+
+def test_limit_to_nothing_is_bad_input(cosmos):
+    code, out, err = cosmos("inventory", "-i", ROOT / "inventory/tower.yaml", "--limit", "twer")
+
+    assert (code, out) == (2, "")
+    assert err == "error: --limit twer: no machine or group is named twer, did you mean tower?\n"
 
 
 @pytest.mark.parametrize("template", TEMPLATES)

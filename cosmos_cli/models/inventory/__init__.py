@@ -1,0 +1,27 @@
+"""
+The inventory: on which machines. Ansible's YAML inventory, read as Ansible reads it.
+
+What is not understood (templates, secrets, other connections, an unknown cosmos_ variable, a scalar
+that YAML 1.1 reads otherwise) is a fault and never skipped; variables of others are kept.
+"""
+
+from cosmos_cli.models.inventory.load import (
+    Inventory,
+    load_inventory,
+    load_machines,
+    read_inventory,
+)
+from cosmos_cli.models.inventory.machine import Machine
+from cosmos_cli.models.inventory.names import MACHINES_MAX, expand
+from cosmos_cli.models.inventory.variables import Variables
+
+__all__ = [
+    "MACHINES_MAX",
+    "Inventory",
+    "Machine",
+    "Variables",
+    "expand",
+    "load_inventory",
+    "load_machines",
+    "read_inventory",
+]

@@ -1,0 +1,186 @@
+"""
+Which machines a --limit pattern means: Ansible's patterns, over the machines of an inventory. Pure.
+
+    pi07                  a machine              tower            a group
+    pi0*, ~pi[0-9]+       names and groups that a glob, or a regular expression from their start, fits
+    tower,lab  tower:lab  either                 all, *           every machine
+    tower:&hwil           both                   tower:!chiefs    the first without the second
+    tower[0] tower[-1]    by its place in what a pattern means; tower[1:3] both ends included, tower[5:]
+
+As in Ansible, whatever the order: first all that is added, then what must be shared, then what is left out.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import re
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+from cosmos_cli.errors import InputError
+from cosmos_cli.models.document import did_you_mean
+
+if TYPE_CHECKING:
+    from cosmos_cli.models.inventory.machine import Machine
+
+PATTERN_CHARACTERS_MAX = 4096
+ALL = "all"
+
+_PIECES = re.compile(r"(?:[^\s:\[\]]|\[[^\]]*\])+")
+_SUBSCRIPT = re.compile(r"(.+)\[(?:(-?[0-9]{1,9})|([0-9]{1,9}):([0-9]{0,9}))\]")
+_OLD_SUBSCRIPT = re.compile(r"(.+)\[([0-9]+)-([0-9]*)\]")
+
+
+class PatternError(ValueError):
+    """A pattern is malformed, names what there is not, or means no machine."""
+
+
+def select_machines(
+    machines: Sequence[Machine], pattern: str, *, groups: Sequence[str] = ()
+) -> tuple[Machine, ...]:
+    """
+    Return the machines that a --limit pattern means, in the order of *machines*.
+
+    Args:
+        machines: All there are.
+        pattern: As Ansible's --limit.
+        groups: Further groups that are known, although no machine is in them.
+
+    Raises:
+        InputError: The pattern is malformed, names what there is not, or means no machine.
+    """
+    try:
+        return matching_machines(machines, pattern, groups=groups)
+    except PatternError as error:
+        raise InputError(f"--limit {pattern}: {error}") from None
+
+
+def matching_machines(
+    machines: Sequence[Machine], pattern: str, *, groups: Sequence[str] = ()
+) -> tuple[Machine, ...]:
+    """
+    Return the machines that *pattern* means, for a caller who tells where it was written.
+
+    Raises:
+        PatternError: It is malformed, names what there is not, or means no machine.
+    """
+    pieces = _split(pattern)
+    matcher = _Matcher(machines, groups)
+    added: set[str] = set()
+    plain = [piece for piece in pieces if piece[0] not in "!&"]
+    for piece in plain or [ALL]:
+        added.update(matcher.names(piece))
+    for piece in pieces:
+        if piece[0] == "&":
+            added.intersection_update(matcher.names(piece[1:]))
+    for piece in pieces:
+        if piece[0] == "!":
+            added.difference_update(matcher.names(piece[1:]))
+    if matcher.faults:
+        raise PatternError("; ".join(dict.fromkeys(matcher.faults)))
+    if not added:
+        raise PatternError(f"means no machine; there are {_some(m.name for m in machines)}")
+    return tuple(machine for machine in machines if machine.name in added)
+
+
+def _split(pattern: str) -> list[str]:
+    """Return the pieces of a pattern, at commas, or at colons outside of brackets if there is no comma."""
+    if len(pattern) > PATTERN_CHARACTERS_MAX:
+        raise PatternError(f"expected at most {PATTERN_CHARACTERS_MAX} characters")
+    if "," in pattern:
+        pieces = [piece.strip() for piece in pattern.split(",")]
+    else:
+        pieces = _PIECES.findall(pattern)
+        if _PIECES.sub("", pattern).strip(": \t\r\n"):
+            raise PatternError("a bracket is never closed, or was never opened")
+    pieces = [piece for piece in pieces if piece]
+    if not pieces:
+        raise PatternError("expected a machine, a group or a pattern, got nothing")
+    for piece in pieces:
+        if piece in ("!", "&", "~"):
+            raise PatternError(f"expected a name after {piece!r}")
+        if piece[0] == "@":
+            raise PatternError("files of names (@FILE) are not understood: write the names")
+    return pieces
+
+
+class _Matcher:
+    """Finds the machines that one piece of a pattern means; what is unknown is collected in `faults`."""
+
+    def __init__(self, machines: Sequence[Machine], groups: Sequence[str]) -> None:
+        self.faults: list[str] = []
+        self.machines = dict.fromkeys(machine.name for machine in machines)
+        self.groups: dict[str, list[str]] = {ALL: [], **{name: [] for name in groups}}
+        places: dict[str, dict[str, int]] = {ALL: {}}
+        for index, machine in enumerate(machines):
+            for group in dict.fromkeys((ALL, *machine.groups)):
+                self.groups.setdefault(group, []).append(machine.name)
+                place = machine.positions.get(group, index)
+                places.setdefault(group, {})[machine.name] = place
+        for group, names in self.groups.items():
+            names.sort(key=places.get(group, {}).__getitem__)
+
+    def names(self, piece: str) -> list[str]:
+        """Return the machines; an empty list and a fault if there is no such thing."""
+        if piece in self.machines:
+            return [piece]
+        if piece[0] == "~":
+            return self._matches(piece)
+        old = _OLD_SUBSCRIPT.fullmatch(piece)
+        if old:
+            base, first, last = old.groups()
+            told = f"write {base}[{first}:{last}] for places, ~{base}[{first}-{last}] for names"
+            self.faults.append(f"{piece}: to Ansible, [{first}-{last}] counts places; {told}")
+            return []
+        match = _SUBSCRIPT.fullmatch(piece)
+        if match is None:
+            return self._matches(piece)
+        found = self._matches(match.group(1), piece)
+        return self._cut(found, match) if found else []
+
+    def _matches(self, text: str, piece: str = "") -> list[str]:
+        try:
+            if text[0] == "~":
+                fits = re.compile(text[1:]).match
+            else:
+                fits = re.compile(fnmatch.translate(text)).match
+        except re.error as error:
+            self.faults.append(f"{text}: not a regular expression: {error}")
+            return []
+        groups = [group for group in self.groups if fits(group)]
+        found = [name for group in groups for name in self.groups[group]]
+        if not groups or text[0] == "~" or _is_glob(text) or "." in text:
+            found += [name for name in self.machines if fits(name)]
+        if not found and not groups:
+            places = f" ({piece} counts places in a group; for names: ~REGEXP or a glob)"
+            self.faults.append(self._unknown(text) + (places if piece else ""))
+        return found
+
+    def _cut(self, found: list[str], match: re.Match[str]) -> list[str]:
+        if match.group(2) is None:
+            last = int(match.group(4)) if match.group(4) else len(found) - 1
+            return found[int(match.group(3)) : last + 1]
+        try:
+            return [found[int(match.group(2))]]
+        except IndexError:
+            self.faults.append(f"{match.group()}: {match.group(1)} has {len(found)} machines")
+            return []
+
+    def _unknown(self, text: str) -> str:
+        names = [*self.groups, *self.machines]
+        if text[0] == "~" or _is_glob(text):
+            return f"no machine or group is like {text}; there are {_some(names)}"
+        hint = did_you_mean(text, names)
+        if not hint.endswith("?"):
+            hint = f"; there are {_some(names)}"
+        return f"no machine or group is named {text}{hint}"
+
+
+def _is_glob(text: str) -> bool:
+    return any(character in text for character in "?*[")
+
+
+def _some(names: Iterator[str] | Sequence[str]) -> str:
+    """Return the names for a message, cut when there are many."""
+    listed = list(names)
+    return ", ".join(listed[:12]) + (f", ... ({len(listed)})" if len(listed) > 12 else "")

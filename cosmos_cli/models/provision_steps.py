@@ -1,0 +1,253 @@
+"""
+What a group of machines declares for itself in `cosmos_provision`: idempotent steps of few kinds.
+
+A step says what should be, never how to get there; the plan of `cosmos up` compares it with what is.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from cosmos_cli.models.texts import (
+    NOT_EMPTY,
+    FileMode,
+    MachinePath,
+    NonBlank,
+    SystemPackage,
+    SystemUser,
+    like,
+)
+
+FILE_BYTES_MAX = 64 * 1024 * 1024
+KINDS = ("packages", "file", "line", "service", "command")
+
+StepFault = tuple[tuple[str | int, ...], str]
+"""The path within `cosmos_provision`, and what is wrong there."""
+
+_CONFIG = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+class FileContent(BaseModel):
+    """A file with a given content."""
+
+    model_config = _CONFIG
+
+    dest: MachinePath
+    """Where it belongs on the machine."""
+    src: NonBlank | None = None
+    """The file here, relative to the inventory's folder; of a `Machine` it is absolute."""
+    content: str | None = None
+    """The content itself, instead of `src`."""
+    mode: FileMode | None = None
+    """Permissions, octal; as they are, or 0644 for a new file, if not given."""
+    owner: SystemUser | None = None
+    """Its owner; as it is, or who writes it, if not given."""
+    group: SystemUser | None = None
+    """Its group."""
+
+
+class LineInFile(BaseModel):
+    """One line that a file has, or has not."""
+
+    model_config = _CONFIG
+
+    path: MachinePath
+    """The file on the machine."""
+    line: Annotated[str, like(r"[^\r\n]*\S[^\r\n]*", "one line of text")] | None = None
+    """The whole line, without its end."""
+    regexp: NonBlank | None = None
+    """Python regular expression: the last line it is found in is replaced; with absent, every one is removed."""
+    state: Literal["present", "absent"] = "present"
+    """Whether the line is to be there."""
+    create: bool = False
+    """Whether a file that is missing is made; otherwise that is a failure."""
+
+
+class Service(BaseModel):
+    """A unit of systemd."""
+
+    model_config = _CONFIG
+
+    name: Annotated[str, like(r"[A-Za-z0-9_][A-Za-z0-9_.@:\\-]*", "the name of a systemd unit")]
+    """Name of the unit; `.service` may be left out."""
+    enabled: bool | None = None
+    """Whether it starts with the machine; as it is if not given."""
+    state: Literal["started", "stopped"] | None = None
+    """Whether it runs; as it is if not given."""
+
+
+class Command(BaseModel):
+    """A shell command for what no other kind can say, with a test that tells whether it was done."""
+
+    model_config = _CONFIG
+
+    run: NonBlank
+    """What /bin/sh runs."""
+    creates: MachinePath | None = None
+    """A path that exists once it is done."""
+    unless: NonBlank | None = None
+    """A shell command that succeeds once it is done; it must change nothing."""
+
+
+Action = tuple[str, ...] | FileContent | LineInFile | Service | Command
+"""What a step wants; a tuple holds the names of system packages."""
+
+
+class ProvisionStep(BaseModel):
+    """One step: exactly one kind of action."""
+
+    model_config = _CONFIG
+
+    name: NonBlank | None = None
+    """What people read about it."""
+    become: bool = True
+    """Whether it is done as root."""
+    packages: Annotated[tuple[SystemPackage, ...], NOT_EMPTY] | None = None
+    """System packages that are to be installed."""
+    file: FileContent | None = None
+    """A file with a given content."""
+    line: LineInFile | None = None
+    """One line that a file has, or has not."""
+    service: Service | None = None
+    """A unit of systemd."""
+    command: Command | None = None
+    """A shell command with a test that tells whether it was done."""
+
+    @property
+    def kind(self) -> str:
+        """Which of KINDS it is."""
+        return next(kind for kind in KINDS if getattr(self, kind) is not None)
+
+    @property
+    def action(self) -> Action:
+        """What it wants."""
+        action: Action = getattr(self, self.kind)
+        return action
+
+    @property
+    def label(self) -> str:
+        """The name, or what it does in a few words."""
+        if self.name:
+            return self.name
+        match self.action:
+            case FileContent(dest=dest):
+                return f"file {dest}"
+            case LineInFile(path=path):
+                return f"line in {path}"
+            case Service(name=name):
+                return f"service {name}"
+            case Command(run=run):
+                return f"command {run.splitlines()[0].strip()}"
+            case packages:
+                return f"packages {' '.join(packages)}"
+
+    def with_source_in(self, folder: Path) -> ProvisionStep:
+        """Return the step with the absolute path of its `src`, which is relative to *folder*."""
+        if self.file is None or self.file.src is None:
+            return self
+        source = str(source_path(self.file.src, folder))
+        return self.model_copy(update={"file": self.file.model_copy(update={"src": source})})
+
+
+def source_path(src: str, folder: Path) -> Path:
+    """Return the absolute path of a file here that a step names."""
+    return (folder / Path(src).expanduser()).absolute()
+
+
+def step_faults(steps: Any, folder: Path) -> list[StepFault]:
+    """
+    Return what no single field of a step can know to be wrong.
+
+    Args:
+        steps: The value of `cosmos_provision` as it was written; what the model refuses is left out.
+        folder: The inventory's, from which `src` is found.
+    """
+    return [
+        ((index, *path), text)
+        for index, step in enumerate(steps if isinstance(steps, list) else ())
+        if isinstance(step, Mapping)
+        for path, text in _faults_of_step(step, folder)
+    ]
+
+
+def _faults_of_step(step: Mapping[str, Any], folder: Path) -> Iterator[StepFault]:
+    kinds = [kind for kind in KINDS if step.get(kind) is not None]
+    is_misspelt = any(key not in ProvisionStep.model_fields for key in step)
+    if len(kinds) > 1 or not (kinds or is_misspelt):
+        got = " and ".join(kinds) or "none of them"
+        yield (), f"expected exactly one of {', '.join(KINDS)} in a step, got {got}"
+    for kind in kinds:
+        if isinstance(step[kind], Mapping):
+            for path, text in _CHECKS[kind](step[kind], folder):
+                yield (kind, *path), text
+
+
+def _file_faults(file: Mapping[str, Any], folder: Path) -> Iterator[StepFault]:
+    src = file.get("src")
+    given = [key for key in ("src", "content") if file.get(key) is not None]
+    if len(given) != 1:
+        yield (), f"expected exactly one of src and content, got {' and '.join(given) or 'neither'}"
+    if isinstance(src, str) and src.strip():
+        problem = _source_problem(source_path(src, folder))
+        if problem:
+            yield ("src",), problem
+
+
+def _source_problem(path: Path) -> str:
+    try:
+        if not path.exists():
+            return f"no such file: {path}; it is looked for from the inventory's folder"
+        if not path.is_file():
+            return f"expected a file, got the folder {path}"
+        size_bytes = path.stat().st_size
+    except OSError as error:
+        return f"{path} cannot be read: {error.strerror}"
+    if size_bytes > FILE_BYTES_MAX:
+        return f"expected at most {FILE_BYTES_MAX} bytes, got {size_bytes} in {path}"
+    return ""
+
+
+def _line_faults(line: Mapping[str, Any], folder: Path) -> Iterator[StepFault]:
+    text, regexp = line.get("line"), line.get("regexp")
+    if line.get("state", "present") == "present" and text is None:
+        yield (), "expected line: the line that is to be present"
+    if line.get("state") == "absent" and (text is None) == (regexp is None):
+        yield (), "expected exactly one of line and regexp with state: absent"
+    if not isinstance(regexp, str):
+        return
+    try:
+        found = re.compile(regexp)
+    except re.error as error:
+        yield ("regexp",), f"not a regular expression: {error}"
+        return
+    is_present = line.get("state", "present") == "present"
+    if is_present and isinstance(text, str) and not found.search(text):
+        why = "the next `cosmos up` would not find what this one wrote, and write it again"
+        yield ("regexp",), f"expected it to be found in the line {text!r}, too: {why}"
+
+
+def _service_faults(service: Mapping[str, Any], folder: Path) -> Iterator[StepFault]:
+    if service.get("enabled") is None and service.get("state") is None:
+        yield (), "expected enabled, state or both: nothing is asked of the service"
+
+
+def _command_faults(command: Mapping[str, Any], folder: Path) -> Iterator[StepFault]:
+    given = [key for key in ("creates", "unless") if command.get(key) is not None]
+    if len(given) != 1:
+        why = "it tells whether the command was done already"
+        got = " and ".join(given) or "neither"
+        yield (), f"expected exactly one of creates and unless, got {got}: {why}"
+
+
+_CHECKS: Mapping[str, Callable[[Mapping[str, Any], Path], Iterator[StepFault]]] = {
+    "packages": lambda packages, folder: iter(()),
+    "file": _file_faults,
+    "line": _line_faults,
+    "service": _service_faults,
+    "command": _command_faults,
+}
