@@ -1,32 +1,56 @@
 """
 From a scenario and machines to a launch plan. Pure: the same input gives the same plan.
 
-Agents are dealt in blocks of neighbours, so that the machines' loads differ by one agent at most.
+Agents are dealt in blocks of neighbours, so that the machines' loads differ by one agent at most, as
+far as the scenario's placement rules and the room on the machines allow.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import heapq
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from cosmos_cli.errors import InputError
+from cosmos_cli.errors import Fault, InputError
+from cosmos_cli.fleet.target import target_of
+from cosmos_cli.models.document import Path as ValuePath
+from cosmos_cli.models.document import did_you_mean, dotted
 from cosmos_cli.models.inventory import Machine
+from cosmos_cli.models.limit import PatternError, matching_machines
+from cosmos_cli.models.placement import PlacementRule, claim_agents
 from cosmos_cli.models.scenario import Scenario
 
 LOOPBACK = Machine(name="loopback", address="127.0.0.1", connection="local")
 """This computer, where a run without an inventory takes place."""
+NAMES_SHOWN_MAX = 8
+
+FaultAt = Callable[[ValuePath, str], Fault]
+"""Tells where a path of the scenario stands in its file."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MachinePlan:
     """What one machine runs."""
 
-    name: str
-    address: str
-    connection: Literal["local", "ssh"]
+    machine: Machine
     processes: tuple[tuple[str, ...], ...]
     """The names of the agents in each process."""
+
+    @property
+    def name(self) -> str:
+        """The machine's name."""
+        return self.machine.name
+
+    @property
+    def address(self) -> str:
+        """The machine's address."""
+        return self.machine.address
+
+    @property
+    def connection(self) -> Literal["local", "ssh"]:
+        """How the machine is reached."""
+        return self.machine.connection
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -35,9 +59,7 @@ class MachinePlan:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for plan.json."""
-        return {
-            "address": self.address,
-            "connection": self.connection,
+        return _machine_mapping(self.machine) | {
             "agents": list(self.agents),
             "processes": [list(process) for process in self.processes],
         }
@@ -51,7 +73,11 @@ class LaunchPlan:
     machines: tuple[MachinePlan, ...]
     """Machines that run at least one agent, in the inventory's order."""
     idle: tuple[str, ...] = ()
-    """Names of machines that are left without an agent."""
+    """Names of machines that are left without an agent, although they would take one."""
+    host: Machine | None = None
+    """The machine of the run's host; None for the operator's own."""
+    notes: tuple[str, ...] = ()
+    """What a person should know about the placement."""
 
     @property
     def agents_by_machine(self) -> Mapping[str, tuple[str, ...]]:
@@ -61,53 +87,224 @@ class LaunchPlan:
     @property
     def is_local(self) -> bool:
         """Whether every machine is this computer."""
-        return all(machine.connection == "local" for machine in self.machines)
+        host = [self.host] if self.host else []
+        machines = [*host, *(planned.machine for planned in self.machines)]
+        return all(machine.connection == "local" for machine in machines)
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return plain values for plan.json."""
+        """Return plain values for plan.json: enough to reach every machine again without the inventory."""
         return {
             "scenario": self.scenario,
+            "host": {"name": self.host.name} | _machine_mapping(self.host) if self.host else None,
             "machines": {machine.name: machine.to_mapping() for machine in self.machines},
             "idle": list(self.idle),
+            "notes": list(self.notes),
         }
 
 
-def make_plan(scenario: Scenario, machines: Sequence[Machine] = (LOOPBACK,)) -> LaunchPlan:
+def make_plan(
+    scenario: Scenario,
+    machines: Sequence[Machine] = (LOOPBACK,),
+    *,
+    host: str | None = None,
+    fault_at: FaultAt | None = None,
+) -> LaunchPlan:
     """
     Place the scenario's agents on machines.
+
+    Without an inventory, that is on LOOPBACK alone, the rules' machines and bounds are left out of
+    account, so that every scenario can be tried on one computer; a note says so.
 
     Args:
         scenario: The scenario.
         machines: At least one; by default this computer alone.
+        host: Name of the machine that runs the host, None for the operator's own. Agents are placed
+            there only by a rule that asks for machines or devices, or when there is no other.
+        fault_at: Tells where faults stand in the scenario's file, as `ScenarioFile.fault` does.
 
     Raises:
-        InputError: There is no machine.
+        InputError: There is no machine, no such host, or the rules cannot be kept: with every fault.
     """
     if not machines:
         raise InputError("expected at least one machine, got none; check the inventory")
+    dealer = _Dealer(machines, _host_of(machines, host), fault_at or _fault_without_place)
     names = scenario.agents.resolved_names()
-    placed, idle, start = [], [], 0
-    for index, machine in enumerate(machines):
-        share = _share(len(names), len(machines), index)
-        if share:
-            processes = _chunks(names[start : start + share], scenario.agents.per_process)
-            placed.append(
-                MachinePlan(
-                    name=machine.name,
-                    address=machine.address,
-                    connection=machine.connection,
-                    processes=processes,
-                )
+    claims = claim_agents(names, scenario.placement)
+    dealer.faults += [dealer.fault_at(("placement", *path), text) for path, text in claims.faults]
+    for index, (rule, agents) in enumerate(zip(scenario.placement, claims.taken, strict=True)):
+        dealer.follow(index, rule, agents)
+    dealer.deal_rest(claims.left)
+    if dealer.faults:
+        raise InputError(faults=dealer.faults)
+    order = {name: index for index, name in enumerate(names)}
+    return LaunchPlan(
+        scenario=scenario.name,
+        machines=tuple(
+            MachinePlan(
+                machine=place.machine,
+                processes=_chunks(
+                    sorted(place.agents, key=order.__getitem__), scenario.agents.per_process
+                ),
             )
+            for place in dealer.places
+            if place.agents
+        ),
+        idle=dealer.idle(),
+        host=dealer.host,
+        notes=tuple(dealer.notes),
+    )
+
+
+@dataclass(slots=True)
+class _Place:
+    """A machine while agents are dealt."""
+
+    machine: Machine
+    agents: list[str] = field(default_factory=list)
+
+    def room(self, per_machine: int | None) -> int | None:
+        """Return for how many more agents there is room; None for any number."""
+        limits = [] if per_machine is None else [per_machine]
+        if self.machine.agents_max is not None:
+            limits.append(max(0, self.machine.agents_max - len(self.agents)))
+        return min(limits, default=None)
+
+
+class _Dealer:
+    """Deals agents over machines, and collects what cannot be done."""
+
+    def __init__(
+        self, machines: Sequence[Machine], host: Machine | None, fault_at: FaultAt
+    ) -> None:
+        self.places = [_Place(machine) for machine in machines]
+        self.host = host
+        self.fault_at = fault_at
+        self.has_inventory = tuple(machines) != (LOOPBACK,)
+        self.faults: list[Fault] = []
+        self.notes: list[str] = []
+
+    def follow(self, index: int, rule: PlacementRule, agents: Sequence[str]) -> None:
+        """Deal the agents of one rule."""
+        path: ValuePath = ("placement", index)
+        if not self.has_inventory and (rule.machines or rule.per_machine):
+            words = [f"machines: {rule.machines}"] if rule.machines else []
+            words += [f"per_machine: {rule.per_machine}"] if rule.per_machine else []
+            told = "without an inventory all agents run on this computer"
+            self.notes.append(f"{dotted(path)}: {', '.join(words)} is left out of account: {told}")
+        places = self._places_for(path, rule)
+        if places:
+            per_machine = rule.per_machine if self.has_inventory else None
+            self._deal(path, agents, places, per_machine)
+
+    def deal_rest(self, agents: Sequence[str]) -> None:
+        """Deal the agents that no rule has taken over all machines."""
+        self._deal(("agents", "count"), agents, self._default_places(), None)
+
+    def idle(self) -> tuple[str, ...]:
+        """Return the machines that are left without an agent, but the host's and those that take none."""
+        return tuple(
+            place.machine.name
+            for place in self.places
+            if not place.agents and place.machine is not self.host and place.machine.agents_max != 0
+        )
+
+    def _default_places(self) -> list[_Place]:
+        return [place for place in self.places if place.machine is not self.host] or self.places
+
+    def _places_for(self, path: ValuePath, rule: PlacementRule) -> list[_Place]:
+        """Return where a rule's agents may run; an empty list and a fault if nowhere."""
+        places = self.places if rule.machines or rule.devices else self._default_places()
+        if rule.machines and self.has_inventory:
+            try:
+                chosen = matching_machines([p.machine for p in self.places], rule.machines)
+            except PatternError as error:
+                self.faults.append(self.fault_at((*path, "machines"), str(error)))
+                return []
+            names = {machine.name for machine in chosen}
+            places = [place for place in places if place.machine.name in names]
+        fitting = [place for place in places if set(rule.devices) <= set(place.machine.devices)]
+        if not fitting:
+            self.faults.append(self.fault_at((*path, "devices"), self._no_device(rule, places)))
+        return fitting
+
+    def _no_device(self, rule: PlacementRule, places: Sequence[_Place]) -> str:
+        wanted = " and ".join(rule.devices)
+        if not self.has_inventory:
+            return f"no inventory, so no machine with {wanted}: give one with -i"
+        there = sorted({device for place in places for device in place.machine.devices})
+        known = f"devices there: {', '.join(there)}" if there else "no machine there has a device"
+        hint = "name it in cosmos_devices of the machine that has it"
+        return f"none of {_some(places)} has {wanted} ({known}); {hint}"
+
+    def _deal(
+        self,
+        path: ValuePath,
+        agents: Sequence[str],
+        places: Sequence[_Place],
+        per_machine: int | None,
+    ) -> None:
+        """Deal *agents* in blocks, so that the loads become as even as they can."""
+        rooms = [place.room(per_machine) for place in places]
+        bounded = [room for room in rooms if room is not None]
+        if len(bounded) == len(rooms) and sum(bounded) < len(agents):
+            self.faults.append(self.fault_at(path, _no_room(len(agents), sum(bounded), places)))
+            return
+        shares = _shares(len(agents), [len(place.agents) for place in places], rooms)
+        start = 0
+        for place, share in zip(places, shares, strict=True):
+            place.agents += agents[start : start + share]
+            start += share
+
+
+def _no_room(count: int, room: int, places: Sequence[_Place]) -> str:
+    cure = "add machines, raise cosmos_agents in the inventory or per_machine in the scenario"
+    return f"room for {room} of {count} agents on {_some(places)}: {cure}, or lower agents.count"
+
+
+def _shares(count: int, loads: Sequence[int], rooms: Sequence[int | None]) -> list[int]:
+    """Return how many of *count* agents go to each machine: always one more to the least loaded, the first of them."""
+    shares = [0] * len(loads)
+    waiting = [(load, index) for index, load in enumerate(loads) if rooms[index] != 0]
+    heapq.heapify(waiting)
+    for _ in range(count):
+        load, index = waiting[0]
+        shares[index] += 1
+        if shares[index] == rooms[index]:
+            heapq.heappop(waiting)
         else:
-            idle.append(machine.name)
-        start += share
-    return LaunchPlan(scenario=scenario.name, machines=tuple(placed), idle=tuple(idle))
+            heapq.heapreplace(waiting, (load + 1, index))
+    return shares
 
 
-def _share(total: int, parts: int, index: int) -> int:
-    """Return the size of block *index* when *total* things are dealt in *parts* blocks, larger ones first."""
-    return total // parts + (index < total % parts)
+def _host_of(machines: Sequence[Machine], name: str | None) -> Machine | None:
+    if name is None:
+        return None
+    for machine in machines:
+        if machine.name == name:
+            return machine
+    hint = did_you_mean(name, [machine.name for machine in machines])
+    raise InputError(f"host: no machine is named {name}{hint}")
+
+
+def _fault_without_place(path: ValuePath, text: str) -> Fault:
+    return Fault(text=text, path=dotted(path))
+
+
+def _machine_mapping(machine: Machine) -> dict[str, Any]:
+    return {
+        "address": machine.address,
+        "connection": machine.connection,
+        "groups": list(machine.groups),
+        "devices": list(machine.devices),
+        "target": target_of(machine).to_mapping(),
+    }
+
+
+def _some(places: Sequence[_Place]) -> str:
+    names = [place.machine.name for place in places]
+    if len(names) <= NAMES_SHOWN_MAX:
+        return ", ".join(names)
+    return f"{', '.join(names[:NAMES_SHOWN_MAX])}, ... ({len(names)})"
 
 
 def _chunks(names: Sequence[str], size: int) -> tuple[tuple[str, ...], ...]:

@@ -81,7 +81,9 @@ def plan(
     console = Console(json=json)
     scenario_file = load_scenario(file, set_ or ())
     launch_plan = make_plan(
-        scenario_file.scenario, load_inventory(inventory) if inventory else (LOOPBACK,)
+        scenario_file.scenario,
+        load_inventory(inventory) if inventory else (LOOPBACK,),
+        fault_at=scenario_file.fault,
     )
     latency_s, latency_source = _latency(latency_ms, launch_plan)
     resources = Resources(

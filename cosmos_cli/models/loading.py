@@ -16,7 +16,7 @@ from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.parameters import adapter_of
 from cosmos_cli.models.scenario import Scenario, cross_faults
 from cosmos_cli.models.translate import faults_of
-from cosmos_cli.models.yaml_source import read_source
+from cosmos_cli.models.yaml_source import Source, read_source
 from madns_runtime.config import RunConfig, to_mapping
 from madns_runtime.errors import MadnsError, PluginError
 from madns_runtime.plugin.api import Simulation
@@ -52,6 +52,13 @@ class ScenarioFile:
     def parameters_mapping(self) -> dict[str, Any]:
         """The parameters as a plain mapping, defaults filled in."""
         return to_mapping(self.parameters)
+
+    def fault(self, path: ValuePath, text: str) -> Fault:
+        """Return a fault at its place in the file, for what only a later step can find wrong."""
+        document = read_document(Source.of(str(self.path), self.text))
+        apply_overrides(document, self.overrides)
+        written = _is_written(document, path)
+        return document.fault(path, text) if written else document.missing(path, text)
 
     def run_config(self, run: str) -> RunConfig:
         """Return what host and agents of the run named *run* are told."""

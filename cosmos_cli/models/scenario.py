@@ -13,6 +13,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from cosmos_cli.models.placement import PlacementRule, claim_agents
+from cosmos_cli.models.texts import Requirement
 from madns_runtime.config import (
     SEED_MAX,
     Agents,
@@ -37,7 +39,7 @@ SectionFault = tuple[tuple[str | int, ...], str]
 
 
 class Scenario(BaseModel):
-    """What to simulate. The scenario says nothing about machines: those are the inventory's."""
+    """What to simulate. On which machines is the inventory's; `placement` says what belongs where."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
@@ -69,6 +71,10 @@ class Scenario(BaseModel):
     """Whether the run ends when an agent is lost, or goes on without it."""
     seed: Annotated[int, Field(ge=0, le=SEED_MAX)] = 0
     """Seed of every random number in the run."""
+    requirements: tuple[Requirement, ...] = ()
+    """Python packages that the simulation needs on the agents' machines, as pip names them."""
+    placement: tuple[PlacementRule, ...] = ()
+    """Which agents run on which machines, rule by rule; the rest is spread evenly over all."""
     parameters: dict[str, Any] = {}
     """The simulation's own settings."""
 
@@ -172,10 +178,18 @@ def _executor(scenario: Scenario) -> Iterator[SectionFault]:
         yield ("executor", "kind"), f"expected process, thread or module:callable, got {kind!r}"
 
 
+def _placement(scenario: Scenario) -> Iterator[SectionFault]:
+    if scenario.agents.names and len(scenario.agents.names) != scenario.agents.count:
+        return  # told already, and what the names mean is open
+    for path, text in claim_agents(scenario.agents.resolved_names(), scenario.placement).faults:
+        yield ("placement", *path), text
+
+
 _CHECKS: tuple[tuple[frozenset[str], Callable[[Scenario], Iterator[SectionFault]]], ...] = (
     (frozenset({"agents"}), _names),
     (frozenset({"agents"}), _processes),
     (frozenset({"agents", "time"}), _duration),
     (frozenset({"agents", "on_agent_loss"}), _restarts),
     (frozenset({"executor"}), _executor),
+    (frozenset({"agents", "placement"}), _placement),
 )
