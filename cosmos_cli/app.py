@@ -32,6 +32,8 @@ COMMANDS = (
     "schema",
     "plan",
     "inventory",
+    "ping",
+    "exec",
     "run",
     "ps",
     "down",
@@ -74,7 +76,8 @@ def load_command(verb: str) -> Any:
     """Import `cosmos_cli.commands.<verb>` and return its function as a command."""
     module = importlib.import_module(f"cosmos_cli.commands.{verb}")
     single = typer.Typer(add_completion=False, rich_markup_mode=None)
-    single.command(name=verb)(getattr(module, verb))
+    settings = getattr(module, "CONTEXT_SETTINGS", None)
+    single.command(name=verb, context_settings=settings)(getattr(module, verb))
     return typer.main.get_command(single)
 
 

@@ -12,6 +12,9 @@ from typing import Protocol
 
 from cosmos_cli.fleet.target import Target
 
+OUTPUT_BYTES_MAX = 16 * 1024 * 1024
+"""What `Connection.run` keeps of each output: one half of its begin, one of its end."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConnectOptions:
@@ -111,9 +114,19 @@ class Connection(Protocol):
             MachineFailure: The connection is lost.
         """
 
-    def run(self, command: str, *, stdin: bytes = b"", timeout_s: float) -> Completed:
+    @property
+    def opening_s(self) -> float:
+        """How long it took to be logged in there."""
+
+    def run(self, command: str, *, stdin: bytes | None = b"", timeout_s: float) -> Completed:
         """
         Run a shell command to its end.
+
+        Args:
+            command: For the user's shell there.
+            stdin: What it reads; None for nothing, and no end either before the connection closes, for
+                which `cosmos_cli.fleet.watched` waits.
+            timeout_s: Until it has ended.
 
         Raises:
             MachineFailure: TIMEOUT, or the connection is lost.

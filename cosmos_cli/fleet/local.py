@@ -5,17 +5,21 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import selectors
+import signal
 import subprocess
 import tempfile
 import time
 
-from cosmos_cli.fleet.connection import Completed
+from cosmos_cli.fleet.connection import OUTPUT_BYTES_MAX, Completed
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.output import BoundedOutput
 from cosmos_cli.fleet.target import Target
 
 LOOPBACK = "127.0.0.1"
 ERROR_BYTES_MAX = 4096
 END_TIMEOUT_S = 5.0
+READ_BYTES = 262_144
 
 
 class LocalConnection:
@@ -26,6 +30,7 @@ class LocalConnection:
         target: Its entry in the inventory.
     """
 
+    opening_s = 0.0
     own_address = LOOPBACK
     peer_address = LOOPBACK
 
@@ -36,20 +41,29 @@ class LocalConnection:
         """Start a shell command."""
         return LocalStream(command)
 
-    def run(self, command: str, *, stdin: bytes = b"", timeout_s: float) -> Completed:
+    def run(self, command: str, *, stdin: bytes | None = b"", timeout_s: float) -> Completed:
         """Run a shell command to its end."""
+        half = OUTPUT_BYTES_MAX // 2
+        output, errors = BoundedOutput(half, half), BoundedOutput(half, half)
+        process = subprocess.Popen(
+            ["/bin/sh", "-c", command],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        )
         try:
-            done = subprocess.run(
-                ["/bin/sh", "-c", command],
-                input=stdin,
-                capture_output=True,
-                timeout=timeout_s,
-                check=False,
-                start_new_session=True,
+            _converse(
+                process, None if stdin is None else memoryview(stdin), (output, errors), timeout_s
             )
-        except subprocess.TimeoutExpired:
-            raise MachineFailure(FailureKind.TIMEOUT, f"not done in {timeout_s:g} s") from None
-        return Completed(exit_status=done.returncode, stdout=done.stdout, stderr=done.stderr)
+        finally:
+            _end(process)
+        return Completed(
+            exit_status=process.returncode,
+            stdout=output.data,
+            stderr=errors.data,
+            cut_bytes=output.cut_bytes + errors.cut_bytes,
+        )
 
     def is_alive(self, *, timeout_s: float = 2.0) -> bool:
         """Return True: whoever asks is this computer."""
@@ -142,3 +156,61 @@ class LocalStream:
             self._process.kill()
             self._process.wait()
         self._errors.close()
+
+
+def _converse(
+    process: subprocess.Popen[bytes],
+    pending: memoryview | None,
+    outputs: tuple[BoundedOutput, BoundedOutput],
+    timeout_s: float,
+) -> None:
+    """Feed a command, unless *pending* is None, and read what it says until both its outputs have ended."""
+    assert process.stdin is not None and process.stdout is not None and process.stderr is not None
+    until_s = time.monotonic() + timeout_s
+    with selectors.DefaultSelector() as selector:
+        for pipe, output in zip((process.stdout, process.stderr), outputs, strict=True):
+            selector.register(pipe, selectors.EVENT_READ, output)
+        if pending is not None:
+            os.set_blocking(process.stdin.fileno(), False)
+            selector.register(process.stdin, selectors.EVENT_WRITE)
+        while process.stdout in selector.get_map() or process.stderr in selector.get_map():
+            ready = selector.select(max(0.0, until_s - time.monotonic()))
+            if not ready:
+                text = f"the command did not end in {timeout_s:g} s"
+                raise MachineFailure(FailureKind.TIMEOUT, text)
+            for key, _ in ready:
+                if key.data is None:
+                    pending = _feed(key.fd, pending or memoryview(b""))
+                    if not pending:
+                        selector.unregister(process.stdin)
+                        process.stdin.close()
+                elif data := os.read(key.fd, READ_BYTES):
+                    key.data.add(data)
+                else:
+                    selector.unregister(key.fileobj)
+    try:
+        process.wait(max(0.0, until_s - time.monotonic()))
+    except subprocess.TimeoutExpired:
+        text = f"the command did not end in {timeout_s:g} s"
+        raise MachineFailure(FailureKind.TIMEOUT, text) from None
+
+
+def _feed(descriptor: int, pending: memoryview) -> memoryview:
+    """Hand over what fits now and return the rest; a program that has ended reads no more."""
+    try:
+        return pending[os.write(descriptor, pending) :] if pending else pending
+    except BlockingIOError:
+        return pending
+    except BrokenPipeError:
+        return memoryview(b"")
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Kill what has not ended, with its children, and let go of its pipes."""
+    if process.poll() is None:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    for pipe in (process.stdin, process.stdout, process.stderr):
+        if pipe is not None:
+            pipe.close()

@@ -18,7 +18,7 @@ from paramiko.config import SSHConfig
 from paramiko.pkey import PKey
 from paramiko.ssh_exception import ChannelException, SSHException
 
-from cosmos_cli.fleet.connection import Completed, ConnectOptions
+from cosmos_cli.fleet.connection import OUTPUT_BYTES_MAX, Completed, ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.known_hosts import HostKey, KnownHosts, Standing
 from cosmos_cli.fleet.output import BoundedOutput
@@ -38,8 +38,6 @@ from cosmos_cli.fleet.wire import Wire, connect_tcp, connect_through_command
 RETRY_PAUSES_S = (0.2, 0.5, 1.0, 2.0)
 OPEN_TIMEOUT_S = 20.0
 """To start a command; a busy board takes seconds."""
-OUTPUT_BYTES_MAX = 16 * 1024 * 1024
-"""What `run` keeps of each output: one half of its begin, one of its end."""
 INPUT_POLL_S = 0.005
 
 
@@ -58,6 +56,7 @@ class SshConnection:
         self, target: Target, connection: fabric.Connection, wire: Wire, hop: SshConnection | None
     ) -> None:
         self.target = target
+        self.opening_s = 0.0
         self._connection = connection
         self._wire = wire
         self._hop = hop
@@ -82,13 +81,13 @@ class SshConnection:
         """Start a shell command."""
         return self._start(command)
 
-    def run(self, command: str, *, stdin: bytes = b"", timeout_s: float) -> Completed:
+    def run(self, command: str, *, stdin: bytes | None = b"", timeout_s: float) -> Completed:
         """Run a shell command to its end."""
         half = OUTPUT_BYTES_MAX // 2
         output, errors = BoundedOutput(half, half), BoundedOutput(half, half)
         stream = self._start(command, errors)
         try:
-            _converse(stream, memoryview(stdin), output, timeout_s)
+            _converse(stream, None if stdin is None else memoryview(stdin), output, timeout_s)
             status = stream.exit_status()
         finally:
             stream.close()
@@ -140,16 +139,14 @@ def _unknown_end() -> MachineFailure:
 
 
 def _converse(
-    stream: SshStream, pending: memoryview, output: BoundedOutput, timeout_s: float
+    stream: SshStream, pending: memoryview | None, output: BoundedOutput, timeout_s: float
 ) -> None:
-    """Feed a command and read what it says until it has ended."""
+    """Feed a command, unless *pending* is None, and read what it says until it has ended."""
     until_s = time.monotonic() + timeout_s
-    is_writing = True
     while True:
-        pending = _feed(stream, pending)
-        if not pending and is_writing:
+        if pending is not None and not (pending := _feed(stream, pending)):
             stream.close_writing()
-            is_writing = False
+            pending = None
         try:
             data = stream.read(READ_BYTES)
         except BlockingIOError:
@@ -193,7 +190,8 @@ def open_ssh(
     """
     settings = settings_of(target)
     timeout_s = settings.connect_timeout_s or options.timeout_s
-    until_s = time.monotonic() + timeout_s
+    start_s = time.monotonic()
+    until_s = start_s + timeout_s
     where = f"{settings.host} port {settings.port}"
     pauses_s = iter(RETRY_PAUSES_S)
     while True:
@@ -201,8 +199,10 @@ def open_ssh(
         try:
             wire = _wire(settings, hop, until_s - time.monotonic())
             try:
-                connection = _log_in(settings, options, wire, until_s)
-                return SshConnection(target, connection, wire, hop)
+                fabric_connection = _log_in(settings, options, wire, until_s)
+                connection = SshConnection(target, fabric_connection, wire, hop)
+                connection.opening_s = time.monotonic() - start_s
+                return connection
             except BaseException:
                 wire.close()
                 raise

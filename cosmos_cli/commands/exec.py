@@ -1,0 +1,145 @@
+"""`cosmos exec`: one command on all machines at once."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any
+
+import typer
+
+from cosmos_cli.commands.fleet_options import (
+    FORKS_DEFAULT,
+    AcceptHostKeysOption,
+    ForksOption,
+    InventoryOption,
+    LimitOption,
+    fleet_of,
+)
+from cosmos_cli.console import Console, JsonOption, QuietOption
+from cosmos_cli.errors import ExitCode
+from cosmos_cli.fleet.connection import Completed, Connection
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.outcome import Outcome, failed
+from cosmos_cli.fleet.watched import NO_SUDO_MARK, as_root, watched
+from cosmos_cli.models.inventory import Machine
+
+CONTEXT_SETTINGS = {"allow_interspersed_args": False}
+"""What follows the command's first word belongs to it, with or without -- before."""
+TIMEOUT_S = 600.0
+
+
+def exec(  # noqa: A001 - the verb's name is the function's
+    inventory: InventoryOption,
+    command: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="COMMAND...",
+            help="One argument is a line for /bin/sh; several are a program and its arguments.",
+        ),
+    ],
+    limit: LimitOption = None,
+    sudo: Annotated[bool, typer.Option("--sudo", help="As root, through sudo -n.")] = False,
+    timeout_s: Annotated[
+        float, typer.Option("--timeout", metavar="S", min=0.1, help="Time for the command, s.")
+    ] = TIMEOUT_S,
+    forks: ForksOption = FORKS_DEFAULT,
+    accept_new_host_keys: AcceptHostKeysOption = False,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """
+    Run a command on every machine at once; it ends with this one, also on Ctrl-C.
+
+    Ends with 1 when it failed on any machine, with 3 when a machine itself failed.
+    """
+    console = Console(json=json, quiet=quiet)
+    fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
+    line = command[0] if len(command) == 1 else shlex.join(command)
+    width = max(len(machine.name) for machine in fleet.machines)
+    outcomes = fleet.each(
+        _task(line, is_root=sudo, timeout_s=timeout_s),
+        lambda outcome: _print(console, outcome, width),
+    )
+    exit_code = _exit_code(outcomes)
+    console.say(_verdict(outcomes))
+    console.print_json(
+        {
+            "command": line,
+            "machines": [outcome.to_mapping(_mapping(outcome.value)) for outcome in outcomes],
+            "exit_code": int(exit_code),
+        }
+    )
+    return int(exit_code)
+
+
+def _task(
+    line: str, *, is_root: bool, timeout_s: float
+) -> Callable[[Connection, Machine], Completed]:
+    shell_line = as_root(watched(line)) if is_root else watched(line)
+
+    def task(connection: Connection, machine: Machine) -> Completed:
+        if is_root and not connection.target.may_become_root:
+            raise MachineFailure(
+                FailureKind.NO_SUDO,
+                "the inventory forbids to become root there (ansible_become: false)",
+                "leave out --sudo, or that machine with --limit",
+            )
+        done = connection.run(shell_line, stdin=None, timeout_s=timeout_s)
+        if is_root and done.stderr.rstrip().endswith(NO_SUDO_MARK.encode()):
+            said = done.stderr.decode(errors="replace").replace(NO_SUDO_MARK, "").strip()
+            raise MachineFailure(
+                FailureKind.NO_SUDO,
+                f"cannot become root without a password: {said}",
+                "let the user run sudo without one (a file in /etc/sudoers.d)",
+            )
+        return done
+
+    return task
+
+
+def _print(console: Console, outcome: Outcome[Completed], width: int) -> None:
+    """Print what a machine said, each line under its name: output as data, errors as talk."""
+    head = f"{outcome.machine:<{width}}"
+    done = outcome.value
+    if done is None:
+        console.say(f"{head} ! {outcome.failure}")
+        return
+    for text, tell in ((done.stdout, console.data), (done.stderr, console.say)):
+        lines = text.decode(errors="replace").splitlines()
+        if lines:
+            tell("\n".join(f"{head} | {line}" for line in lines))
+    if done.exit_status:
+        console.say(f"{head} ! {_status_words(done.exit_status)}")
+
+
+def _status_words(status: int) -> str:
+    return f"ended by signal {-status}" if status < 0 else f"exit status {status}"
+
+
+def _mapping(done: Completed | None) -> dict[str, Any]:
+    if done is None:
+        return {"exit_status": None, "stdout": None, "stderr": None, "cut_bytes": 0}
+    return {
+        "exit_status": done.exit_status,
+        "stdout": done.stdout.decode(errors="replace"),
+        "stderr": done.stderr.decode(errors="replace"),
+        "cut_bytes": done.cut_bytes,
+    }
+
+
+def _exit_code(outcomes: Sequence[Outcome[Completed]]) -> ExitCode:
+    if failed(outcomes):
+        return ExitCode.MACHINES
+    is_bad = any(outcome.value and outcome.value.exit_status for outcome in outcomes)
+    return ExitCode.RUN_FAILED if is_bad else ExitCode.OK
+
+
+def _verdict(outcomes: Sequence[Outcome[Completed]]) -> str:
+    bad = len(failed(outcomes))
+    nonzero = sum(bool(outcome.value and outcome.value.exit_status) for outcome in outcomes)
+    count = len(outcomes)
+    parts = [f"{count - bad - nonzero} ok"]
+    parts += [f"{nonzero} exit status not 0"] if nonzero else []
+    parts += [f"{bad} machines failed"] if bad else []
+    return f"{count} machine{'' if count == 1 else 's'}: {', '.join(parts)}"

@@ -1,0 +1,36 @@
+"""
+A command that ends with whoever asked for it. Pure.
+
+Without a terminal, sshd lets a command run on when its connection closes. So a shell beside it waits for
+the end of standard input, on which nothing is ever sent, and then ends the whole process group.
+"""
+
+from __future__ import annotations
+
+import shlex
+
+NO_SUDO_MARK = "cosmos: no sudo"
+FORCED_AFTER_S = 2
+
+# $1 is the command. `read` returns at the end of standard input only; sshd and LocalConnection start each
+# command in a session, thus a process group, of its own. A subshell keeps an `exit` in the command from
+# leaving the watcher behind.
+_WATCH = (
+    "exec 3<&0 </dev/null; "
+    '{ read -r _ <&3; trap "" TERM; kill -TERM 0; '
+    f"sleep {FORCED_AFTER_S}; kill -KILL 0; }} >/dev/null 2>&1 & w=$!; "
+    'exec 3<&-; (eval "$1"); s=$?; kill $w; exit $s'
+)
+
+
+def watched(command: str) -> str:
+    """Return a shell command that does the same and is ended, with its children, when standard input ends."""
+    return f"exec /bin/sh -c {shlex.quote(_WATCH)} sh {shlex.quote(command)}"
+
+
+def as_root(command: str) -> str:
+    """Return a shell command that does the same as root; says NO_SUDO_MARK last when it may not."""
+    return (
+        f'if [ "$(id -u)" != 0 ]; then sudo -n true || {{ echo {shlex.quote(NO_SUDO_MARK)} >&2;'
+        f" exit 1; }}; exec sudo -n /bin/sh -c {shlex.quote(command)}; fi; {command}"
+    )
