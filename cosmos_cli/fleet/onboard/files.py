@@ -1,0 +1,277 @@
+"""
+Files on a machine, changed one at a time and each at once: before or after, never half.
+
+A new content is written beside, brought to the disk, and renamed. What a power failure leaves beside is
+overwritten by the next attempt.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import re
+import stat
+from collections.abc import Mapping
+from typing import Any
+
+from cosmos_cli.fleet.onboard.core import Refusal, Request, verb
+
+MODE_DEFAULT = 0o644
+FOLDER_MODE_DEFAULT = 0o755
+KINDS = {stat.S_IFREG: "file", stat.S_IFDIR: "directory"}
+
+
+def look_at(path: str) -> dict[str, Any]:
+    """Tell what a path is; a link is followed."""
+    try:
+        found = os.stat(os.path.expanduser(path))
+    except (FileNotFoundError, NotADirectoryError):
+        return {"kind": "missing"}
+    return {
+        "kind": KINDS.get(stat.S_IFMT(found.st_mode), "other"),
+        "mode": stat.S_IMODE(found.st_mode),
+        "owner": _name_of(found.st_uid, is_group=False),
+        "group": _name_of(found.st_gid, is_group=True),
+        "size_bytes": found.st_size,
+    }
+
+
+def content_hash(path: str) -> str:
+    """Return the SHA-256 of a file's content."""
+    import hashlib
+
+    with open(os.path.expanduser(path), "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def edited(content: str, *, line: str | None, regexp: str | None, is_present: bool) -> str:
+    """
+    Return a file's content with one line there or not; all else stays as it is. Pure.
+
+    Args:
+        content: Of the file.
+        line: The whole line, without its end.
+        regexp: Where it is found: the last such line is replaced, or every one is removed.
+        is_present: Whether the line is to be there.
+    """
+    lines = content.split("\n")  # what stands behind the last end of line is the last item
+    meant = [
+        index
+        for index, text in enumerate(lines)
+        if (index < len(lines) - 1 or text) and _is_meant(text.rstrip("\r"), line, regexp)
+    ]
+    if not is_present:
+        kept = [text for index, text in enumerate(lines) if index not in meant]
+        has_lost_end = bool(meant) and meant[-1] == len(lines) - 1 and len(lines) > 1
+        return "\n".join([*kept, ""] if has_lost_end and kept else kept)
+    if line is None:
+        raise ValueError("expected the line that is to be present")
+    end = "\r" if "\r\n" in content else ""
+    if meant:
+        last = meant[-1]
+        kept = "\r" if lines[last].endswith("\r") else ""
+        return "\n".join([*lines[:last], line + kept, *lines[last + 1 :]])
+    if lines[-1]:
+        lines[-1] += end
+        lines.append("")
+    return "\n".join([*lines[:-1], line + end, ""])
+
+
+def _is_meant(text: str, line: str | None, regexp: str | None) -> bool:
+    return text == line if regexp is None else re.search(regexp, text) is not None
+
+
+def replace_file(path: str, content: bytes, how: Mapping[str, Any]) -> bool:
+    """
+    Give a file a content, a mode and an owner at once; tell whether anything changed.
+
+    Args:
+        path: The file; a link stays one. Folders above that are missing are made.
+        content: All of it.
+        how: "mode", "owner", "group"; what is missing or null stays as it is.
+    """
+    path = os.path.realpath(os.path.expanduser(path))
+    folder, name = os.path.split(path)
+    os.makedirs(folder, mode=FOLDER_MODE_DEFAULT, exist_ok=True)
+    before = _stat_of_file(path)
+    mode, uid, gid = _wanted_of(how, before)
+    if before is not None and _read(path) == content and _state_of(before) == (mode, uid, gid):
+        return False
+    beside = os.path.join(folder, f".{name}.cosmos-new")
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(beside)
+    descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+            file.flush()
+            _give(file.fileno(), uid, gid)
+            os.fchmod(file.fileno(), mode)
+            os.fsync(file.fileno())
+        os.rename(beside, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(beside)
+        raise
+    sync_folder(folder)
+    return True
+
+
+def sync_folder(folder: str) -> None:
+    """Bring what a folder holds to the disk."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # a file system that cannot: nothing more can be done
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def _stat_of_file(path: str) -> os.stat_result | None:
+    try:
+        found = os.stat(path)
+    except FileNotFoundError:
+        return None
+    if not stat.S_ISREG(found.st_mode):
+        raise Refusal("step", f"{path}: expected a file, got something else", "remove it there")
+    return found
+
+
+def _read(path: str) -> bytes | None:
+    try:
+        with open(path, "rb") as file:
+            return file.read()
+    except PermissionError:
+        return None
+
+
+def _state_of(found: os.stat_result) -> tuple[int, int, int]:
+    return stat.S_IMODE(found.st_mode), found.st_uid, found.st_gid
+
+
+def _wanted_of(how: Mapping[str, Any], before: os.stat_result | None) -> tuple[int, int, int]:
+    mode = how.get("mode")
+    if mode is None:
+        mode = stat.S_IMODE(before.st_mode) if before else MODE_DEFAULT
+    uid = _number_of(how.get("owner"), is_group=False)
+    gid = _number_of(how.get("group"), is_group=True)
+    if uid is None:
+        uid = before.st_uid if before else os.geteuid()
+    if gid is None:
+        gid = before.st_gid if before else os.getegid()
+    return mode, uid, gid
+
+
+def _give(descriptor: int, uid: int, gid: int) -> None:
+    """Give an open file to its owner; a file system that knows no owners already says the right one or fails."""
+    found = os.fstat(descriptor)
+    if (found.st_uid, found.st_gid) != (uid, gid):
+        os.fchown(descriptor, uid, gid)
+
+
+def _number_of(name: str | None, *, is_group: bool) -> int | None:
+    import grp
+    import pwd
+
+    if name is None:
+        return None
+    try:
+        return grp.getgrnam(name).gr_gid if is_group else pwd.getpwnam(name).pw_uid
+    except KeyError:
+        if name.isdecimal():
+            return int(name)
+        what = "group" if is_group else "user"
+        raise Refusal("step", f"there is no {what} {name!r} on this machine") from None
+
+
+def _name_of(number: int, *, is_group: bool) -> str:
+    import grp
+    import pwd
+
+    with contextlib.suppress(KeyError):
+        return grp.getgrgid(number).gr_name if is_group else pwd.getpwuid(number).pw_name
+    return str(number)
+
+
+@verb("make_directories")
+def make_directories(request: Request) -> list[str]:
+    """Make folders that are missing, and return which those were."""
+    made = []
+    for path in request.arguments["paths"]:
+        full = os.path.expanduser(path)
+        if not os.path.isdir(full):
+            os.makedirs(full, mode=FOLDER_MODE_DEFAULT, exist_ok=True)
+            sync_folder(os.path.dirname(full))
+            made.append(path)
+    return made
+
+
+@verb("write_file")
+def write_file(request: Request) -> bool:
+    """Give a file the content that came as the body; tell whether anything changed."""
+    arguments = request.arguments
+    return replace_file(arguments["path"], request.body, arguments)
+
+
+@verb("remove_file")
+def remove_file(request: Request) -> bool:
+    """Remove a file; tell whether it was there."""
+    path = os.path.expanduser(request.arguments["path"])
+    try:
+        os.unlink(path)
+    except FileNotFoundError:
+        return False
+    sync_folder(os.path.dirname(path))
+    return True
+
+
+@verb("own_file")
+def own_file(request: Request) -> bool:
+    """Give a file or folder another mode or owner; tell whether anything changed."""
+    path = os.path.expanduser(request.arguments["path"])
+    before = os.stat(path)
+    mode, uid, gid = _wanted_of(request.arguments, before)
+    if _state_of(before) == (mode, uid, gid):
+        return False
+    if (before.st_uid, before.st_gid) != (uid, gid):
+        os.chown(path, uid, gid)  # takes set-id bits away, so the mode comes after it
+    os.chmod(path, mode)
+    return True
+
+
+@verb("edit_line")
+def edit_line(request: Request) -> bool:
+    """Have a line in a file or not; tell whether anything changed."""
+    arguments = request.arguments
+    path = os.path.expanduser(arguments["path"])
+    try:
+        with open(path, "rb") as file:
+            before = file.read().decode(errors="surrogateescape")
+    except FileNotFoundError:
+        if not arguments.get("create"):
+            raise
+        before = ""
+    after = edited(
+        before,
+        line=arguments.get("line"),
+        regexp=arguments.get("regexp"),
+        is_present=bool(arguments["is_present"]),
+    )
+    if after == before and os.path.exists(path):
+        return False
+    return replace_file(path, after.encode(errors="surrogateescape"), {})
+
+
+@verb("set_values")
+def set_values(request: Request) -> None:
+    """Write values where the kernel takes them: below /proc/sys or /sys."""
+    for path, value in request.arguments["values"]:
+        try:
+            with open(path, "w") as file:
+                file.write(value)
+        except OSError as error:
+            text = f"{path}: {error.strerror}, when {value!r} was written"
+            raise Refusal("step", text) from None

@@ -1,0 +1,249 @@
+"""
+The plan of what a group declares for itself in `cosmos_provision`, in the order of the inventory. Pure.
+
+A step may build on an earlier one of the same plan: two lines of one file, a line in a file that a step
+before makes. So what the plan will have done is kept in a sketch, beside what the facts say.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import Any
+
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.onboard.files import MODE_DEFAULT, edited
+from cosmos_cli.models.provision_steps import Command, FileContent, LineInFile, Service
+from cosmos_cli.provision.facts import Facts, FileFact, condition_key
+from cosmos_cli.provision.packages import package_step
+from cosmos_cli.provision.step import Change, Kind, Request, Step
+from cosmos_cli.provision.wanted import Declared, condition_of
+
+COMMAND_TIMEOUT_S = 1800.0
+SERVICE_TIMEOUT_S = 120.0
+SIGN_OF_LIFE_TIMEOUT_S = 20.0
+"""A command there says once a second that it still runs."""
+UNIT_FOLDERS = (
+    "/etc/systemd/system/",
+    "/usr/local/lib/systemd/system/",
+    "/usr/lib/systemd/system/",
+)
+
+ENABLED = frozenset({"enabled", "enabled-runtime", "static", "alias", "indirect", "generated"})
+"""What `is-enabled` says of a unit that starts by itself, or that no `enable` would change."""
+DISABLED = frozenset(
+    {"disabled", "static", "alias", "indirect", "generated", "masked", "not-found", "unknown"}
+)
+RUNNING = frozenset({"active", "reloading", "activating"})
+
+
+@dataclasses.dataclass(slots=True)
+class Sketch:
+    """The machine as it will be once the steps before are done."""
+
+    files: dict[str, FileFact]
+    packages: set[str]
+    """Those that will have been installed."""
+
+
+def declared_steps(
+    facts: Facts, declared: tuple[Declared, ...], packages: Collection[str] = ()
+) -> Iterator[Step]:
+    """
+    Yield the steps that are not done yet.
+
+    Args:
+        facts: Of the machine.
+        declared: All of them, in their order.
+        packages: What steps before these install.
+
+    Raises:
+        MachineFailure: One cannot be done, such as a line in a file that is not there.
+    """
+    sketch = Sketch(files=dict(facts.files), packages=set(packages))
+    for each in declared:
+        for step in _PLANNERS[each.step.kind](each, facts, sketch):
+            name = each.step.name
+            yield dataclasses.replace(step, title=f"{step.title} ({name})") if name else step
+
+
+def _packages(declared: Declared, facts: Facts, sketch: Sketch) -> Iterator[Step]:
+    yield from package_step(facts, declared.step.packages or (), sketch.packages)
+
+
+def _file(declared: Declared, facts: Facts, sketch: Sketch) -> Iterator[Step]:
+    action, path, content = declared.step.action, str(declared.path), declared.content
+    assert isinstance(action, FileContent) and content is not None
+    before = _known_file(sketch, path)
+    changes = _file_changes(before, action, content.sha256)
+    if not changes:
+        return
+    after = FileFact(
+        kind="file",
+        mode=_mode(action) if action.mode else before.mode or MODE_DEFAULT,
+        owner=action.owner or before.owner,
+        group=action.group or before.group,
+        size_bytes=len(content.data),
+        sha256=content.sha256,
+        text=_text_of(content.data),
+    )
+    sketch.files[path] = after
+    how = {"path": path, "mode": _mode(action), "owner": action.owner, "group": action.group}
+    yield Step(
+        kind=Kind.FILE,
+        title=f"file {path}: {', '.join(changes)}",
+        requests=(
+            Request(
+                verb="write_file",
+                arguments=how,
+                body=content.data,
+                as_root=declared.step.become,
+            ),
+        ),
+        change=Change(path=path, before=before.text, after=after.text),
+        size_bytes=len(content.data),
+    )
+    if path.startswith(UNIT_FOLDERS) and before.sha256 != content.sha256:
+        yield _service_step("systemd: read its units again", {"reload": True}, declared)
+
+
+def _file_changes(before: FileFact, action: FileContent, sha256: str) -> list[str]:
+    if before.kind == "missing":
+        return ["create"]
+    if before.kind == "denied":
+        return ["write"]  # root will see whether it has to
+    changes = ["change"] if before.sha256 != sha256 else []
+    mode = _mode(action)
+    if mode is not None and mode != before.mode:
+        changes.append(f"mode {before.mode or 0:04o} -> {mode:04o}")
+    for what, wanted, found in (
+        ("owner", action.owner, before.owner),
+        ("group", action.group, before.group),
+    ):
+        if wanted is not None and wanted != found:
+            changes.append(f"{what} {found} -> {wanted}")
+    return changes
+
+
+def _mode(action: FileContent) -> int | None:
+    return None if action.mode is None else int(action.mode, 8)
+
+
+def _text_of(data: bytes) -> str:
+    return data.decode(errors="surrogateescape")
+
+
+def _known_file(sketch: Sketch, path: str) -> FileFact:
+    found = sketch.files.get(path, FileFact())
+    if found.kind in ("directory", "other"):
+        what = "folder" if found.kind == "directory" else "special file"
+        text = f"{path}: expected a file, got a {what}"
+        raise MachineFailure(FailureKind.STEP, text, "correct the path in cosmos_provision")
+    return found
+
+
+def _line(declared: Declared, facts: Facts, sketch: Sketch) -> Iterator[Step]:
+    action, path = declared.step.action, str(declared.path)
+    assert isinstance(action, LineInFile)
+    before = _known_file(sketch, path)
+    is_present = action.state == "present"
+    if before.kind == "missing" and not is_present:
+        return
+    if before.kind == "missing" and not action.create:
+        text = f"line in {path}: there is no such file on this machine"
+        raise MachineFailure(
+            FailureKind.STEP, text, "correct the path, or say create: true in cosmos_provision"
+        )
+    if before.kind != "missing" and before.text is None:
+        text = f"line in {path}: the file cannot be read, or it is too long to be edited"
+        raise MachineFailure(FailureKind.STEP, text)
+    content = before.text or ""
+    after = edited(content, line=action.line, regexp=action.regexp, is_present=is_present)
+    if after == content and before.kind != "missing":
+        return
+    sketch.files[path] = dataclasses.replace(before, kind="file", text=after, sha256="")
+    arguments = {
+        "path": path,
+        "line": action.line,
+        "regexp": action.regexp,
+        "is_present": is_present,
+        "create": action.create,
+    }
+    yield Step(
+        kind=Kind.LINE,
+        title=f"line in {path}: {_line_words(action, content)}",
+        requests=(Request(verb="edit_line", arguments=arguments, as_root=declared.step.become),),
+        change=Change(path=path, before=before.text, after=after),
+        size_bytes=len(after),
+    )
+
+
+def _line_words(action: LineInFile, content: str) -> str:
+    if action.state == "absent":
+        return f"remove {action.line if action.line is not None else f'what {action.regexp} finds'}"
+    appended = edited(content, line=action.line, regexp=None, is_present=True)
+    replaced = edited(content, line=action.line, regexp=action.regexp, is_present=True)
+    return f"{'add' if appended == replaced else 'change to'} {action.line}"
+
+
+def _service(declared: Declared, facts: Facts, sketch: Sketch) -> Iterator[Step]:
+    action = declared.step.action
+    assert isinstance(action, Service)
+    found = facts.services.get(action.name)
+    enabled, active = (found.enabled, found.active) if found else ("unknown", "unknown")
+    do = []
+    if action.enabled is True and enabled not in ENABLED:
+        do.append("enable")
+    if action.enabled is False and enabled not in DISABLED:
+        do.append("disable")
+    if action.state == "started" and active not in RUNNING:
+        do.append("start")
+    if action.state == "stopped" and active in RUNNING:
+        do.append("stop")
+    if do:
+        asked = {"name": action.name, "do": do, "reload": True}
+        yield _service_step(f"service {action.name}: {', '.join(do)}", asked, declared)
+
+
+def _service_step(title: str, asked: Mapping[str, Any], declared: Declared) -> Step:
+    request = Request(
+        verb="service",
+        arguments={**asked, "timeout_s": SERVICE_TIMEOUT_S},
+        as_root=declared.step.become,
+        timeout_s=SIGN_OF_LIFE_TIMEOUT_S,
+        streams=True,
+    )
+    return Step(kind=Kind.SERVICE, title=title, requests=(request,))
+
+
+def _command(declared: Declared, facts: Facts, sketch: Sketch) -> Iterator[Step]:
+    action, as_root = declared.step.action, declared.step.become
+    assert isinstance(action, Command)
+    condition = condition_of(action, home=facts.home, as_root=as_root)
+    if facts.conditions.get(condition_key(condition)):
+        return
+    asked = {**condition, "run": action.run, "timeout_s": COMMAND_TIMEOUT_S}
+    first = action.run.strip().splitlines()[0]
+    more = " ..." if "\n" in action.run.strip() else ""
+    yield Step(
+        kind=Kind.COMMAND,
+        title=f"command {first}{more}",
+        requests=(
+            Request(
+                verb="command",
+                arguments=asked,
+                as_root=as_root,
+                timeout_s=SIGN_OF_LIFE_TIMEOUT_S,
+                streams=True,
+            ),
+        ),
+    )
+
+
+_PLANNERS: Mapping[str, Callable[[Declared, Facts, Sketch], Iterator[Step]]] = {
+    "packages": _packages,
+    "file": _file,
+    "line": _line,
+    "service": _service,
+    "command": _command,
+}

@@ -1,0 +1,61 @@
+"""Machines of made-up facts, for tests of the plan: a Raspberry Pi as it comes, and what differs from it."""
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+
+from cosmos_cli.models.inventory import Machine
+from cosmos_cli.models.provision_steps import ProvisionStep
+from cosmos_cli.provision.facts import Facts
+from cosmos_cli.provision.wanted import Content, wanted_of
+
+CASES = Path(__file__).parent / "cases"
+BOARD = json.loads((CASES / "board.json").read_text())
+HOME = "/home/pi"
+
+
+def told(**changes):
+    """Return the board's answer with changes: mappings are merged, null takes an entry away."""
+    answer = json.loads(json.dumps(BOARD))
+    for key, value in changes.items():
+        if isinstance(value, dict) and isinstance(answer.get(key), dict):
+            merged = answer[key] | value
+            for path, fact in value.items():
+                if isinstance(fact, dict) and "text" in fact:
+                    data = fact["text"].encode(errors="surrogateescape")
+                    merged[path] = {"sha256": hashlib.sha256(data).hexdigest(), **fact}
+            answer[key] = {k: v for k, v in merged.items() if v is not None or key == "network"}
+        else:
+            answer[key] = value
+    return answer
+
+
+def facts_of(**changes):
+    prunable = tuple(changes.pop("prunable", ()))
+    facts = Facts.from_mapping(told(**changes), asked_utc_s=1000.0, answered_utc_s=1001.0)
+    return dataclasses.replace(facts, prunable=prunable)
+
+
+def machine_of(*, variables=None, packages=(), provision=()):
+    return Machine(
+        name="pi01",
+        address="pi01",
+        variables=variables or {},
+        packages=tuple(packages),
+        provision=tuple(ProvisionStep.model_validate(step) for step in provision),
+    )
+
+
+def read_file(path):
+    return Content.of(Path(path).read_bytes())
+
+
+def wanted(home=HOME, environments=(), trees=(), **entries):
+    return wanted_of(
+        machine_of(**entries),
+        home=home,
+        read_file=read_file,
+        environments=environments,
+        trees=trees,
+    )

@@ -1,0 +1,167 @@
+"""The plan of `cosmos up`: from facts and wants, only what must change. Cases stand in cases/plans.json."""
+
+import dataclasses
+import json
+from dataclasses import dataclass
+
+import pytest
+
+from cosmos_cli.fleet.failure import MachineFailure
+from cosmos_cli.provision.notes import notes_of
+from cosmos_cli.provision.steps import RESERVE_BYTES, check_possible, plan_steps
+from provision_machines import CASES, HOME, facts_of, wanted
+
+PLANS = json.loads((CASES / "plans.json").read_text())
+
+
+@pytest.mark.parametrize("case", PLANS, ids=[case["name"] for case in PLANS])
+def test_plan(case):
+    facts = facts_of(**case.get("facts", {}))
+    wants = wanted(
+        variables=case.get("variables"),
+        packages=case.get("packages", ()),
+        provision=case.get("provision", ()),
+    )
+    if "failure" in case:
+        with pytest.raises(MachineFailure) as caught:
+            plan_steps(facts, wants)
+        assert [caught.value.kind.value, caught.value.text] == case["failure"]
+        assert caught.value.advice
+        return
+
+    steps = plan_steps(facts, wants)
+
+    assert [[s.kind.value, s.title, s.needs_root] for s in steps] == case["steps"]
+
+
+@dataclass(frozen=True)
+class FakeEnvironment:
+    key: str = "abc"
+    lock: tuple = ("numpy", "msgpack")
+    distribution_packages: tuple = ()
+    size_bytes: int = 100_000_000
+
+
+@dataclass(frozen=True)
+class FakeTree:
+    label: str = "runtime"
+    hash: str = "0123456789abcdef"
+    files: tuple = ("a", "b", "c")
+    size_bytes: int = 1_000_000
+
+
+def test_environment_and_trees_that_are_not_there_come_after_what_they_need():
+    wants = wanted(
+        packages=("htop",),
+        environments=(FakeEnvironment(distribution_packages=("python3-numpy",)),),
+        trees=(FakeTree(), FakeTree(label="scenario a", hash="ff")),
+        variables={"cosmos_realtime_priority": 1},
+        provision=({"packages": ["gpsd"]},),
+    )
+
+    steps = plan_steps(dataclasses.replace(facts_of(), trees=frozenset({"ff"})), wants)
+
+    assert [step.title for step in steps] == [
+        "packages htop, python3-numpy: install",
+        "setting cosmos_realtime_priority: not set -> 1",
+        "package gpsd: install",
+        "environment abc: build with 2 packages",
+        "tree runtime: send 3 files (0123456789ab)",
+    ]
+
+
+def test_pruning_keeps_what_is_wanted():
+    wants = wanted(environments=(FakeEnvironment(),), trees=(FakeTree(),))
+    facts = dataclasses.replace(
+        facts_of(prunable=("trees/00", "wheels/11")),
+        trees=frozenset({FakeTree().hash}),
+        environments=frozenset({"abc"}),
+    )
+
+    (step,) = plan_steps(facts, wants)
+
+    assert step.title == "prune what nobody uses: trees/00, wheels/11"
+    assert step.requests[0].arguments["trees"] == [FakeTree().hash]
+    assert step.requests[0].arguments["environments"] == ["abc"]
+
+
+def refused(steps, **changes):
+    with pytest.raises(MachineFailure) as caught:
+        check_possible(facts_of(**changes), steps)
+    assert caught.value.advice
+    return caught.value.kind.value, caught.value.text
+
+
+ROOTED = plan_steps(facts_of(), wanted(variables={"cosmos_wifi": False, "cosmos_bluetooth": False}))
+ROOTLESS = plan_steps(facts_of(files={f"{HOME}/cosmos": None}), wanted())
+
+
+def test_plan_without_steps_is_possible_on_any_machine():
+    check_possible(facts_of(disk={"is_read_only": True, "free_bytes": 0}, sudo=False), ())
+
+
+def test_plan_without_root_needs_none():
+    check_possible(facts_of(sudo=False), ROOTLESS)
+
+
+def test_plan_that_needs_root_is_refused_with_its_steps_where_nobody_becomes_root():
+    assert refused(ROOTED, sudo=False) == (
+        "no_sudo",
+        "pi cannot become root without a password, which is needed for:"
+        " setting cosmos_wifi: on -> off; setting cosmos_bluetooth: on -> off",
+    )
+    check_possible(facts_of(sudo=True), ROOTED)
+
+
+def test_full_disk_is_refused_before_anything_is_sent():
+    steps = plan_steps(facts_of(), wanted(environments=(FakeEnvironment(),)))
+    needed = FakeEnvironment.size_bytes + RESERVE_BYTES
+
+    check_possible(facts_of(disk={"free_bytes": needed}), steps)
+
+    assert refused(steps, disk={"free_bytes": needed - 1}) == (
+        "disk_full",
+        "about 116 MB are needed on /home/pi, 116 MB are free",
+    )
+
+
+def test_read_only_disk_and_foreign_folder_are_refused():
+    assert refused(ROOTLESS, disk={"is_read_only": True})[0] == "read_only"
+    assert refused(ROOTLESS, disk={"is_writable": False}) == (
+        "step",
+        "pi may not write in /home/pi",
+    )
+
+
+def test_facts_tell_the_clock_and_leave_out_what_only_the_plan_needed():
+    facts = facts_of(clock={"utc_s": 1010.5})
+
+    mapping = facts.to_mapping()
+
+    assert mapping["clock_offset_s"] == 10.0
+    assert mapping["model"] == "Raspberry Pi 4 Model B Rev 1.4"
+    assert mapping["radios"] == {"rfkill0": "bluetooth: on", "rfkill1": "wlan: on"}
+    assert "files" not in mapping
+    assert json.loads(json.dumps(mapping)) == mapping
+
+
+@pytest.mark.parametrize(
+    ("changes", "variables", "words"),
+    [
+        ({}, {}, ()),
+        ({"clock": {"utc_s": 1004.0}}, {}, ()),
+        ({"clock": {"utc_s": 1000.5 - 7200}}, {}, ("2 h behind this computer's",)),
+        ({"clock": {"utc_s": 1000.5 + 30}}, {}, ("30 s ahead of this computer's",)),
+        ({"throttled": 0x50005}, {}, ("its supply voltage is too low and it is throttled",)),
+        ({"throttled": 0x50000}, {}, ()),
+        ({}, {"cosmos_realtime_priority": 50}, ("is granted real-time priority 0, not 50",)),
+        ({"realtime_priority_max": 50}, {"cosmos_realtime_priority": 50}, ()),
+        ({"realtime_priority_max": None}, {"cosmos_realtime_priority": 50}, ()),
+        ({"user": {"id": 0}}, {"cosmos_realtime_priority": 50}, ()),
+    ],
+)
+def test_notes(changes, variables, words):
+    notes = notes_of(facts_of(**changes), wanted(variables=variables))
+
+    assert len(notes) == len(words)
+    assert all(word in note for word, note in zip(words, notes, strict=True))
