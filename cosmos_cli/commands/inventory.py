@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
-
-import typer
-
+from cosmos_cli.commands.fleet_options import InventoryOption, LimitOption
 from cosmos_cli.console import Column, Console, JsonOption
 from cosmos_cli.models.inventory import Machine, load_machines
 
@@ -21,30 +17,13 @@ COLUMNS = (
 
 
 def inventory(
-    file: Annotated[
-        Path,
-        typer.Option(
-            "--inventory",
-            "-i",
-            metavar="FILE",
-            envvar="COSMOS_INVENTORY",
-            help="Inventory file, or a folder of them.",
-        ),
-    ],
-    limit: Annotated[
-        str | None,
-        typer.Option(
-            "--limit",
-            metavar="PATTERN",
-            envvar="COSMOS_LIMIT",
-            help="Only these machines: names, groups, globs, such as tower:!pi0*.",
-        ),
-    ] = None,
+    inventory: InventoryOption,
+    limit: LimitOption = None,
     json: JsonOption = False,
 ) -> None:
     """Show the machines of an inventory, their addresses and their groups."""
     console = Console(json=json)
-    machines = load_machines(file, limit)
+    machines = load_machines(inventory, limit)
     console.table(COLUMNS, [_row(machine) for machine in machines])
     console.data(f"{len(machines)} machine{'s' if len(machines) > 1 else ''}")
     console.print_json({"machines": [_shown(machine) for machine in machines]})

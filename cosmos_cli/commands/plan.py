@@ -169,6 +169,8 @@ def _show_placement(console: Console, launch_plan: LaunchPlan) -> None:
     console.table(PLACEMENT, rows)
     if launch_plan.idle:
         console.data(f"without an agent: {', '.join(launch_plan.idle)}")
+    for note in launch_plan.notes:
+        console.say(f"note: {note}")
 
 
 def _ends(names: tuple[str, ...]) -> str:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from cosmos_cli.models.inventory import Machine
+if (
+    TYPE_CHECKING
+):  # what reads a target from a plan needs no inventory, whose models take long to import
+    from cosmos_cli.models.inventory import Machine
 
 ROOT_DEFAULT = "~/cosmos"
 """Folder of COSMoS on a machine; ~ is the home of who logs in."""
@@ -49,16 +52,14 @@ class Target:
 
 def target_of(machine: Machine) -> Target:
     """Return how to reach a machine of the inventory."""
-    values = machine.variables
-    python = values.get("ansible_python_interpreter")
     return Target(
         name=machine.name,
         address=machine.address,
         connection=machine.connection,
-        user=values.get("ansible_user"),
-        port=values.get("ansible_port"),
-        key_file=values.get("ansible_ssh_private_key_file"),
-        python=None if python in (None, "auto", "auto_silent", "auto_legacy") else str(python),
-        may_become_root=values.get("ansible_become") is not False,
-        root=values.get("cosmos_root") or ROOT_DEFAULT,
+        user=machine.user,
+        port=machine.port,
+        key_file=None if machine.key_file is None else str(machine.key_file),
+        python=machine.python,
+        may_become_root=machine.may_become_root,
+        root=machine.root,
     )

@@ -87,7 +87,7 @@ class _Claiming:
             self._take_next(index, rule.count)
         else:
             if self.rest_taken_by is not None:
-                text = f"[{self.rest_taken_by}] takes all agents that are left: none is left here"
+                text = f"placement[{self.rest_taken_by}] takes all agents that are left: none is left here"
                 self.faults.append(((index,), text))
             self.rest_taken_by = index
             self._own(index, self.left)
@@ -112,7 +112,7 @@ class _Claiming:
             self.faults.append((path, text))
         elif not free:
             first = self.owners[fitting[0]]
-            where = "above in this rule" if first == index else f"by [{first}]"
+            where = "above in this rule" if first == index else f"by placement[{first}]"
             self.faults.append((path, f"expected each agent once, {pattern} is taken {where}"))
         self._own(index, free)
 
