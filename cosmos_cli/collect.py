@@ -2,9 +2,10 @@
 The end of a run: what was recorded is gathered, judged, reported and packaged.
 
 `finish_run` does it for the run that just ended, `collect_run` again for any run, also one whose host
-or operator was killed. Both may be repeated: what is recorded is only read. Whatever cannot be
-written, as on a full disk, is named in the verdict; run.json and the manifest come last, in the space
-that the reserve kept free.
+or operator was killed. Both may be repeated: what is recorded is only read. What machines recorded is
+brought here before, by `cosmos_cli.retrieve`; where that failed is among the problems. Whatever cannot
+be written, as on a full disk, is named in the verdict; run.json and the manifest come last, in the
+space that the reserve kept free.
 """
 
 from __future__ import annotations
@@ -20,11 +21,12 @@ from typing import Any
 from cosmos_cli.bundle import pack_run
 from cosmos_cli.earlier import Earlier
 from cosmos_cli.errors import ExitCode, InputError, RunFailedError
-from cosmos_cli.expectation import Expected, find_missing, mapping_at
+from cosmos_cli.expectation import HOST, Expected, find_missing, mapping_at
 from cosmos_cli.gather import Gathered, Progress, gather
 from cosmos_cli.manifest import build_manifest
 from cosmos_cli.problem import Problem, problems_of_run
 from cosmos_cli.report.html import write_report
+from cosmos_cli.retrieve.sources import Sources
 from cosmos_cli.rundir import RunDirectory, write_json
 from cosmos_cli.runjson import Evidence
 from cosmos_cli.statistics import clock_statistics, round_trip_statistics, tick_statistics
@@ -83,7 +85,8 @@ def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; four a
         result: What the host reported at its end; None if it could not.
         expected: Who should have recorded what.
         interrupted: Whether the operator ended it.
-        problems: What did not go as it should while it ran; a machine's ends with 3.
+        problems: What did not go as it should while it ran; a machine's ends with 3. Of the step
+            collect: whose records have not all come.
         has_report: Whether report.html is written; `cosmos report` can do it later.
         progress: Called with what is being done and how far it is, 0 to 1.
 
@@ -115,18 +118,25 @@ def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; four a
 def collect_run(
     run: RunDirectory,
     *,
+    problems: Sequence[Problem] = (),
     progress: Progress = say_nothing,
     processes: LivingProcesses = list_processes,
 ) -> RunSummary:
     """
     Gather, judge, report and package a run again: finished, cut off, or its host killed.
 
+    Args:
+        run: The run.
+        problems: What was met while its records were brought here from machines.
+        progress: Called with what is being done and how far it is, 0 to 1.
+        processes: Tells what lives on this computer.
+
     Raises:
         InputError: Processes of the run still live; the message names them.
         MachineError: A record stream cannot be read.
         RunFailedError: Not even run.json can be written.
     """
-    _refuse_living(run, processes())
+    refuse_living(run, processes())
     before = run.read_json(run.run_json) or {}
     result = run.read_json(run.result_json) or run.read_left_result()
     return finish_run(
@@ -134,7 +144,7 @@ def collect_run(
         result,
         _expected(run, before, result),
         interrupted=before.get("status") == "interrupted",
-        problems=problems_of_run(before.get("problems")),
+        problems=(*problems_of_run(before.get("problems")), *problems),
         progress=progress,
     )
 
@@ -156,7 +166,13 @@ def _expected(
     )
 
 
-def _refuse_living(run: RunDirectory, processes: Sequence[ProcessEntry]) -> None:
+def refuse_living(run: RunDirectory, processes: Sequence[ProcessEntry]) -> None:
+    """
+    See that nothing of a run lives on this computer.
+
+    Raises:
+        InputError: It does; the message names who.
+    """
     living = [
         f"{entry.role} {entry.name} (pid {entry.pid})"
         for entry in processes
@@ -181,7 +197,8 @@ class _RunEnd:
 
 def _evidence(run: RunDirectory, gathered: Gathered, end: _RunEnd, expected: Expected) -> Evidence:
     tables = open_tables(run.tables)
-    missing = find_missing(expected, gathered.scans, end.result)
+    unretrieved = _unretrieved(run, end.problems)
+    missing = find_missing(expected, gathered.scans, end.result, unretrieved)
     return Evidence(
         run=run.name,
         started=run.read_json(run.run_json) or {},
@@ -196,6 +213,14 @@ def _evidence(run: RunDirectory, gathered: Gathered, end: _RunEnd, expected: Exp
         clock=clock_statistics(tables.get("clock")),
         missing=(*missing, *gathered.faults),
     )
+
+
+def _unretrieved(run: RunDirectory, problems: Sequence[Problem]) -> dict[str, str]:
+    """Return whose records may lie on a machine still, and why: by machine, agent, and the host."""
+    why = {p.machine: p.text for p in problems if p.machine and p.step == "collect"}
+    sources = Sources.read(run)
+    away = ((name, sources.machine_of(name)) for name in (HOST, *sources.machine_of_agent))
+    return {**why, **{name: f"not retrieved from {m}" for name, m in away if m in why}}
 
 
 def _conclude(

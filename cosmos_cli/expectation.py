@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
+from types import MappingProxyType
 from typing import Any
 
 from cosmos_cli.rundir import RunDirectory
@@ -17,6 +18,7 @@ HOST_STREAMS = tuple(schema.name for schema in (EVENTS, LOG, HEALTH))
 MACHINE_STREAMS = (HEALTH.name,)
 FAULTS_SHOWN_MAX = 3
 HOST = "host"
+NOTHING: Mapping[str, str] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +47,10 @@ class Expected:
 
 
 def find_missing(
-    expected: Expected, scans: Sequence[StreamScan], result: Mapping[str, Any] | None
+    expected: Expected,
+    scans: Sequence[StreamScan],
+    result: Mapping[str, Any] | None,
+    unretrieved: Mapping[str, str] = NOTHING,
 ) -> list[str]:
     """
     Return one line a source whose data are not all there, each starting with its name.
@@ -54,6 +59,8 @@ def find_missing(
         expected: Who should have recorded what.
         scans: What is there.
         result: What the host reported; None if it could not, which is itself a gap.
+        unretrieved: By machine whose records have not all come, and by agent that recorded on it, why.
+            Such a machine has a line in any case: nobody else knows what it recorded beside.
     """
     agents = mapping_at(result, "agents")
     faults: dict[str, list[str]] = {HOST: [] if result is not None else ["no result"]}
@@ -65,7 +72,11 @@ def find_missing(
         found = [scan for scan in scans if scan.file.role == "machine" and scan.file.source == name]
         _check_source(faults, name, found, expected.machine_streams, None)
     _check_uninvited(faults, scans, expected)
-    return [_line(name, found, agents) for name, found in faults.items() if found]
+    for name in unretrieved:
+        if name not in (HOST, *expected.agents) and not faults.get(name):
+            faults[name] = ["not all of its records are here"]
+    causes = {**unretrieved, **_reasons(agents)}
+    return [_line(name, found, causes.get(name)) for name, found in faults.items() if found]
 
 
 def _has_agents(machine: object) -> bool:
@@ -130,11 +141,15 @@ def _check_uninvited(
             faults.setdefault(scan.file.source, []).append(_told(scan))
 
 
-def _line(name: str, faults: Sequence[str], agents: Mapping[str, Any]) -> str:
+def _reasons(agents: Mapping[str, Any]) -> dict[str, str]:
+    """Return what became of agents, as far as the host knew."""
+    reasons = {name: mapping_at(agents, name).get("reason") for name in agents}
+    return {name: text for name, text in reasons.items() if isinstance(text, str) and text}
+
+
+def _line(name: str, faults: Sequence[str], cause: str | None) -> str:
     """Say what is missing of a source, and first what happened to it if that is known."""
-    reason = mapping_at(agents, name).get("reason")
-    cause = f"{reason}: " if isinstance(reason, str) and reason else ""
-    return f"{name}: {cause}{_listed(faults)}"
+    return f"{name}: {f'{cause}: ' if cause else ''}{_listed(faults)}"
 
 
 def _told(scan: StreamScan) -> str:

@@ -31,6 +31,7 @@ ATTEMPTS_MAX = 5
 """So often a broken link is made anew, as long as every attempt brings something."""
 PAUSE_S = 1.0
 TOLD_INTERVAL_S = 0.1
+LIVING_SHOWN_MAX = 5
 BROKEN = (FailureKind.LOST, FailureKind.TIMEOUT)
 
 Progress = Callable[[str, float], None]
@@ -137,6 +138,23 @@ class Retrieval:
                 found[outcome.machine] = outcome.value
         return found
 
+    def refuse_living(self) -> None:
+        """
+        See that nothing of the run lives on a machine that answers.
+
+        Raises:
+            InputError: It does; the message names who lives where.
+        """
+        living = self.find_living()
+        if living:
+            shown = list(living.items())[:LIVING_SHOWN_MAX]
+            told = "; ".join(f"on {name}: {', '.join(words)}" for name, words in shown)
+            more = len(living) - len(shown)
+            raise InputError(
+                f"{self._run.name} is still running {told}{f' and on {more} more' if more else ''};"
+                " wait for its end, or end it with: cosmos down"
+            )
+
     def fetch(self) -> list[Outcome[Retrieved]]:
         """Bring everything here that is not here yet; an outcome for every machine of the run."""
         fetched = {outcome.machine: outcome for outcome in self._each(self._fetch_from)}
@@ -152,19 +170,15 @@ class Retrieval:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        is_interrupted = kind is not None and not issubclass(kind, Exception)
+        self._tally.is_over = True
         for visit in list(self._visits.values()):
-            visit.close(at_once=is_interrupted)
+            visit.close(at_once=kind is not None)
         self._lock.close()
 
     def _each(self, task: Callable[[Source], T]) -> list[Outcome[T]]:
         by_name = {source.machine: source for source in self.due}
-        try:
-            targets = [source.target for source in by_name.values()]
-            return for_each(targets, lambda target: task(by_name[target.name]), forks=self._forks)
-        except KeyboardInterrupt:
-            self._tally.is_over = True
-            raise
+        targets = [source.target for source in by_name.values()]
+        return for_each(targets, lambda target: task(by_name[target.name]), forks=self._forks)
 
     def _kept(self, source: Source) -> Outcome[Retrieved]:
         note = read_note(self._run, source.machine)

@@ -47,20 +47,23 @@ class Sources:
         """Return what the plan of a run says; of a plan that cannot be read, nothing."""
         plan = run.read_json(run.plan_json) or {}
         machines = _mappings(plan.get("machines"))
-        found = {name: source for name in machines if (source := _source(machines[name]))}
-        host = plan.get("host")
-        host_source = _source(host) if isinstance(host, Mapping) else None
-        if host_source is not None:
-            found.setdefault(host_source.machine, host_source)
+        named = _mappings({HOST: plan.get("host")}).get(HOST, {})
+        session = str(plan.get("session") or "")
+        host = _source(named, run.name, session)
+        found = {name: _source(entry, run.name, session) for name, entry in machines.items()}
+        remote = {source.machine: source for source in (*found.values(), host) if source}
         return cls(
-            remote=tuple(found.values()),
+            remote=tuple(remote.values()),
             machine_of_agent={
-                str(agent): name
-                for name in machines
-                for agent in machines[name].get("agents") or ()
+                str(agent): name for name in machines for agent in _listed(machines[name])
             },
-            host_machine=host_source.machine if host_source else None,
+            host_machine=host.machine if host else None,
         )
+
+    def machine_of(self, source: str) -> str | None:
+        """Return which machine recorded for an agent, or for the host; None if it was this computer."""
+        machine = self.host_machine if source == HOST else self.machine_of_agent.get(source)
+        return machine if any(each.machine == machine for each in self.remote) else None
 
     def owner_of(self, path: str) -> str | None:
         """Return whose a path in the run directory is; None for one that nobody is known to write."""
@@ -74,18 +77,27 @@ class Sources:
         return None
 
 
-def _source(entry: Mapping[str, Any]) -> Source | None:
+def _source(entry: Mapping[str, Any], run: str, session_hex: str) -> Source | None:
     """Return what lies elsewhere; None for this computer, which records in the run directory itself."""
-    target, directory = entry.get("target"), entry.get("directory")
-    if not isinstance(target, Mapping) or not isinstance(directory, str):
+    mapping, directory = entry.get("target"), entry.get("directory")
+    if not isinstance(mapping, Mapping):
         return None
     try:
-        known = Target.from_mapping(target)
+        target = Target.from_mapping(mapping)
     except TypeError:
         return None
-    return None if known.connection == "local" else Source(target=known, directory=directory)
+    if target.connection == "local":
+        return None
+    if not isinstance(directory, str):
+        directory = Layout(target.root).run(run, session_hex)
+    return Source(target=target, directory=directory)
 
 
 def _mappings(value: object) -> dict[str, Mapping[str, Any]]:
     items = value.items() if isinstance(value, Mapping) else ()
     return {str(name): entry for name, entry in items if isinstance(entry, Mapping)}
+
+
+def _listed(entry: Mapping[str, Any]) -> list[Any]:
+    agents = entry.get("agents")
+    return agents if isinstance(agents, list) else []

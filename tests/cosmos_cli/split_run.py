@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from registered import registered
 from synthetic_run import SyntheticRun, make_config
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
@@ -67,6 +68,11 @@ class SplitRun:
     def visit(self, connections=None) -> Retrieval:
         given = self.connections() if connections is None else connections
         return Retrieval(self.run, options=None, connections=given)
+
+    def living(self, machine: str, role: str, name: str):
+        """Have a process of this run live on a machine."""
+        places = {"directory": self.directory(machine), "state": self.state(machine)}
+        return registered(self.run.name, role, name, **places)
 
     def there(self, machine: str) -> dict[str, str]:
         return hashes(self.directory(machine))

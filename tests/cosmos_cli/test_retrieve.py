@@ -3,8 +3,6 @@
 import contextlib
 import os
 import shutil
-import subprocess
-import sys
 import threading
 
 import orjson
@@ -155,7 +153,7 @@ def test_lines_are_packed_on_the_way_and_noise_is_not(tmp_path):
 def test_living_processes_of_the_run_are_named_and_nothing_is_touched(tmp_path):
     split = SplitRun(tmp_path)
     before = split.there("pi02")
-    with registered(split, "pi02", "agent", "agent-02") as pid:
+    with split.living("pi02", "agent", "agent-02") as pid:
         with split.visit() as visit:
             living = visit.find_living()
         outcomes = split.retrieve()
@@ -207,7 +205,7 @@ def test_release_is_refused_while_something_lives_and_of_what_was_not_listed(tmp
     with Board.start(LocalConnection(split.targets["pi01"]), PARTS) as board:
         digest = list(board.parts("manifest", where))[-1].value["sha256"]
         with (
-            registered(split, "pi01", "supervisor", "pi01"),
+            split.living("pi01", "supervisor", "pi01"),
             pytest.raises(MachineFailure, match="supervisor pi01") as busy,
         ):
             board.call("release", {**where, "manifest_sha256": digest})
@@ -296,24 +294,3 @@ def test_only_one_command_retrieves_a_run(tmp_path):
         split.retrieve()
 
     assert split.retrieve()["pi01"].is_ok
-
-
-@contextlib.contextmanager
-def registered(split, machine, role, name):
-    """Run a process that is in a machine's register for this run."""
-    program = (
-        "import sys, time\nfrom madns_runtime.processes import register\n"
-        "register(*sys.argv[1:])\nprint('ready', flush=True)\ntime.sleep(60)"
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-c", program, split.run.name, role, name, str(split.directory(machine))],
-        env={**os.environ, "COSMOS_STATE_DIR": str(split.state(machine))},
-        stdout=subprocess.PIPE,
-    )
-    try:
-        assert process.stdout.readline() == b"ready\n"
-        yield process.pid
-    finally:
-        process.kill()
-        process.wait()
-        process.stdout.close()

@@ -1,0 +1,245 @@
+"""`cosmos collect` of runs that recorded on machines: all there, partly there, cut off, still alive."""
+
+import json
+
+import pytest
+from split_run import SplitRun, hashes
+
+from cosmos_cli import app
+from cosmos_cli.collect import collect_run
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.local import LocalConnection
+from cosmos_cli.problem import Problem
+from cosmos_cli.retrieve import retrieval
+
+pytestmark = pytest.mark.process
+
+
+class Network:
+    """Which machines answer."""
+
+    def __init__(self):
+        self.off = set()
+        self.asked = []
+
+    def connect(self, target, _options):
+        self.asked.append(target.name)
+        if target.name in self.off:
+            raise MachineFailure(FailureKind.UNREACHABLE, "no route to host", "is it switched on?")
+        return LocalConnection(target)
+
+
+@pytest.fixture(autouse=True)
+def network(tmp_path, monkeypatch):
+    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
+    monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
+    network = Network()
+    monkeypatch.setattr(retrieval, "_connect", network.connect)
+    return network
+
+
+@pytest.fixture
+def split(tmp_path):
+    """A run that is over: the host here left its result, the records lie on two machines."""
+    split = SplitRun(tmp_path)
+    split.leave_result()
+    return split
+
+
+def document(split):
+    return json.loads(split.run.run_json.read_bytes())
+
+
+def named(split):
+    return {line.split(":")[0] for line in document(split)["data"]["missing"]}
+
+
+def test_records_of_all_machines_come_and_the_run_is_judged(split, capsys):
+    before = {path: digest for name in split.names for path, digest in split.there(name).items()}
+
+    code = app.run(["collect"])
+
+    out, err = capsys.readouterr()
+    assert code == 0, err
+    assert out == f"PASSED: 10 checks hold | {split.run.path}\n"
+    assert "pi01  7 of 7 files" in err
+    assert before.items() <= hashes(split.run.path).items()
+    files = json.loads(split.run.manifest_json.read_bytes())["files"]
+    assert {"machines/pi01/manifest.json", "machines/pi02/health.jsonl"} <= set(files)
+    assert split.run.bundle.exists()
+
+
+def test_second_time_is_the_same_and_asks_nobody(split, network):
+    app.run(["collect"])
+    first, files, package = document(split), hashes(split.run.path), split.run.bundle.read_bytes()
+    network.asked.clear()
+
+    assert app.run(["collect"]) == 0
+
+    assert network.asked == []
+    assert document(split) == first
+    assert hashes(split.run.path) == files
+    assert split.run.bundle.read_bytes() == package
+
+
+def test_machine_that_is_gone_is_named_and_collected_later(split, network, capsys):
+    network.off.add("pi02")
+
+    code = app.run(["collect"])
+
+    err = capsys.readouterr().err
+    assert code == 5
+    assert named(split) == {"pi02", "agent-02"}
+    assert "pi02  failed: no route to host; is it switched on?" in err
+    assert "warning: agent-02: not retrieved from pi02: no records" in err
+    assert document(split)["exit_code"] == 3
+    assert document(split)["verdict"].startswith("MACHINES FAILED: pi02: no route to host")
+    assert split.run.bundle.exists()
+
+    network.off.clear()
+
+    assert app.run(["collect"]) == 0
+    assert document(split)["exit_code"] == 0
+    assert document(split)["problems"] == []
+    assert document(split)["data"] == {"complete": True, "missing": []}
+
+
+def test_machine_whose_other_files_did_not_come_is_named_although_its_streams_are_here(
+    split, capsys
+):
+    (split.directory("pi02") / "run.json").write_text("{}")
+
+    assert app.run(["collect"]) == 5
+
+    assert named(split) == {"pi02"}
+    line = document(split)["data"]["missing"][0]
+    assert line.endswith("not all of its records are here")
+    assert "run.json: this name is the operator's" in line
+
+
+def test_run_that_still_lives_on_a_machine_is_refused_and_nothing_is_touched(split, capsys):
+    before = hashes(split.run.path)
+    with split.living("pi02", "agent", "agent-02") as pid:
+        code = app.run(["collect"])
+
+        err = capsys.readouterr().err
+        assert code == 2
+        assert (
+            f"{split.run.name} is still running on pi02: agent agent-02 (pid {pid}); wait for"
+            in err
+        )
+        assert hashes(split.run.path) == before
+        assert split.there("pi01")
+
+    assert app.run(["collect"]) == 0
+
+
+def test_machines_are_left_alone_when_asked_to(split, network, capsys):
+    code = app.run(["collect", "--no-retrieve"])
+
+    assert code == 5
+    assert network.asked == []
+    assert named(split) == {"pi01", "pi02", "agent-01", "agent-02"}
+    assert "as --no-retrieve says" in capsys.readouterr().err
+    assert app.run(["collect"]) == 0
+
+
+def test_run_that_a_power_failure_cut_off_is_packaged_with_every_cut_counted(split, capsys):
+    split.run.left_result_json.unlink()
+    cut = split.directory("pi01") / "agents/agent-01/ticks.jsonl"
+    split.made.cut(cut, cut.stat().st_size // 2)
+    lost = split.directory("pi02") / "agents/agent-02/clock.jsonl"
+    split.made.cut(lost, 0)
+    whole_lines = cut.read_bytes().count(b"\n") - 1
+
+    code = app.run(["collect"])
+
+    assert code == 5
+    lines = {line.split(":")[0]: line for line in document(split)["data"]["missing"]}
+    assert set(lines) == {"host", "agent-01", "agent-02"}
+    assert f"ticks cut after {whole_lines} records" in lines["agent-01"]
+    assert "clock empty file: nothing reached the disk" in lines["agent-02"]
+    files = json.loads(split.run.manifest_json.read_bytes())["files"]
+    entry = files["agents/agent-01/ticks.jsonl"]
+    assert (entry["records"], entry["truncated"]) == (whole_lines, True)
+    assert not split.directory("pi01").exists()
+    assert split.run.bundle.exists()
+    assert "agent-01: ticks cut" in capsys.readouterr().err
+    assert app.run(["collect"]) == 5
+
+
+def test_host_on_a_machine_brings_its_result(split, tmp_path):
+    plan = json.loads(split.run.plan_json.read_bytes())
+    machine = plan["machines"]["pi02"]
+    plan["host"] = {"name": "pi02", "target": machine["target"], "directory": machine["directory"]}
+    split.run.plan_json.write_text(json.dumps(plan))
+    (split.run.path / "host").rename(split.directory("pi02") / "host")
+
+    assert app.run(["collect"]) == 0
+
+    assert split.run.left_result_json.exists()
+
+
+def test_result_that_did_not_come_from_the_hosts_machine_is_explained(split, network):
+    plan = json.loads(split.run.plan_json.read_bytes())
+    plan["host"] = {"name": "pi02", "target": plan["machines"]["pi02"]["target"]}
+    split.run.plan_json.write_text(json.dumps(plan))
+    (split.run.path / "host").rename(split.directory("pi02") / "host")
+    network.off.add("pi02")
+
+    assert app.run(["collect"]) == 5
+
+    lines = document(split)["data"]["missing"]
+    assert lines[0].startswith("host: not retrieved from pi02: no result")
+
+
+def test_file_that_is_damaged_here_after_it_came_is_named_every_time(split):
+    split.retrieve()
+    path = split.run.path / "agents/agent-01/ticks.jsonl"
+    whole = path.read_bytes()
+    path.write_bytes(whole.replace(b"1", b"2", 1))
+
+    for _ in range(2):
+        assert app.run(["collect"]) == 5
+        assert document(split)["data"]["missing"] == [
+            "agents/agent-01/ticks.jsonl: changed since the run was collected"
+        ]
+    path.write_bytes(whole)
+    assert app.run(["collect"]) == 0
+
+
+def test_file_that_went_on_growing_on_the_machine_is_no_damage(split, network):
+    path = split.directory("pi01") / "agents/agent-01/log.jsonl"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-20])
+    held = split.directory("pi01") / "run.json"  # keeps the directory from being released
+    held.touch()
+    assert app.run(["collect"]) == 5
+    path.write_bytes(whole)
+    held.unlink()
+
+    assert app.run(["collect"]) == 0, document(split)["data"]["missing"]
+
+
+def test_streams_in_folders_of_a_plug_ins_own_are_not_taken_for_missing(split):
+    own = split.directory("pi01") / "agents/agent-01/own"
+    own.mkdir()
+    (own / "series.jsonl").write_text('{"a": 1}\n')
+
+    assert app.run(["collect"]) == 0
+    assert app.run(["collect"]) == 0
+
+    (split.run.path / "agents/agent-01/own/series.jsonl").unlink()
+    assert app.run(["collect"]) == 5
+
+
+def test_problem_of_the_run_outranks_data_that_are_missing(split):
+    """3 before 5: what is missing is the consequence, the machine is what has to be looked after."""
+    split.retrieve()
+    (split.run.path / "agents/agent-01/clock.jsonl").unlink()
+    lost = Problem(machine="pi01", text="machine pi01 is lost")
+
+    summary = collect_run(split.run, problems=[lost], processes=lambda: [])
+
+    assert summary.exit_code == 3
+    assert summary.missing
