@@ -1,0 +1,288 @@
+"""
+Gives machines their environments, and asks them what is installed, whether it runs, and what nobody needs.
+
+The operator's side of `cosmos_cli.fleet.onboard.environment` and `.installed`.
+"""
+
+from __future__ import annotations
+
+import mmap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from cosmos_cli.fleet.board import Board
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.layout import Layout
+from cosmos_cli.provision.lock import Locked, normal_name
+from cosmos_cli.provision.trees import Progress, no_progress
+from cosmos_cli.provision.wheelhouse import Environment
+
+PARTS = ("store", "trees", "wheels", "environment", "installed")
+"""What a `Board` must be started with for trees and environments, in this order."""
+PIECE_BYTES = 4 * 1024 * 1024
+BUILD_TIMEOUT_S = 900.0
+"""A slow card writes some megabytes a second, and an emulated board unpacks as slowly."""
+LOOK_TIMEOUT_S = 120.0
+START_TIMEOUT_S = 120.0
+"""Of an interpreter that compiles all that it imports for the first time, on a slow board."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Installed:
+    """What a machine says is installed there."""
+
+    trees: Mapping[str, bool]
+    """Of each tree asked for: whether it is there and really of that content."""
+    environments: Mapping[str, bool]
+    prunable: Mapping[str, Sequence[str]]
+    """By "trees", "environments" and "wheels": what nobody needs any more."""
+    folders: Mapping[str, str]
+    """The same folders as absolute paths there."""
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any]) -> Installed:
+        """Read the answer of the verb "installed"."""
+        return cls(
+            trees=mapping["trees"],
+            environments=mapping["environments"],
+            prunable=mapping["prunable"],
+            folders=mapping["folders"],
+        )
+
+    @property
+    def prunable_count(self) -> int:
+        """Return how many things nobody needs any more."""
+        return sum(len(names) for names in self.prunable.values())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RuntimeCheck:
+    """What is to be seen to run on a machine."""
+
+    key: str
+    """Of the environment."""
+    trees: Sequence[str]
+    """Hashes of the trees on the path, the runtime's first."""
+    is_full: bool
+    """After a change: import everything; else only look whether it is there."""
+    modules: Sequence[str] = ()
+    """Names of the modules that wheels and the distribution brought."""
+    simulation: str = ""
+    """Of the scenario, whose agents' half is imported as well when all is."""
+    base: str = ""
+    """Hash of the scenario's tree."""
+    udp: Mapping[str, Any] | None = None
+    """What `cosmos_cli.provision.echo.Echo.question` returned; None leaves the network out."""
+
+
+def installed_request(
+    layout: Layout,
+    *,
+    trees: Sequence[str],
+    environments: Sequence[str],
+    touch: bool = False,
+) -> dict[str, Any]:
+    """
+    Return the arguments of the verbs "installed" and "prune_installed".
+
+    Args:
+        layout: Of the machine.
+        trees: Hashes of the trees that are wanted; never pruned.
+        environments: Keys of the environments that are wanted; never pruned.
+        touch: Whether these are remembered as wanted just now, so that no other operator prunes them.
+    """
+    return {
+        "folders": {
+            "trees": layout.trees,
+            "environments": layout.environments,
+            "wheels": layout.wheels,
+        },
+        "trees": list(trees),
+        "environments": list(environments),
+        "touch": touch,
+    }
+
+
+def ask_installed(board: Board, request: Mapping[str, Any]) -> Installed:
+    """
+    Ask a machine what is installed there.
+
+    Args:
+        board: Started with `PARTS`.
+        request: Made by `installed_request`.
+
+    Raises:
+        MachineFailure: The connection is lost.
+    """
+    return Installed.from_mapping(board.call("installed", request, timeout_s=LOOK_TIMEOUT_S).value)
+
+
+def prune(board: Board, request: Mapping[str, Any]) -> Mapping[str, Sequence[str]]:
+    """
+    Remove what no living run uses, *request* does not name, and is not among the newest.
+
+    Returns:
+        What was removed, as `Installed.prunable`.
+    """
+    removed: Mapping[str, Sequence[str]] = board.call(
+        "prune_installed", request, timeout_s=BUILD_TIMEOUT_S
+    ).value
+    return removed
+
+
+def install_environment(
+    board: Board, layout: Layout, environment: Environment, progress: Progress = no_progress
+) -> bool:
+    """
+    See that an environment is on a machine; wheels that are there already are not sent.
+
+    Args:
+        board: Started with `PARTS`, holding the machine's lock.
+        layout: Of the machine.
+        environment: What is wanted.
+        progress: Told while wheels are sent and installed.
+
+    Returns:
+        Whether anything was changed there.
+
+    Raises:
+        MachineFailure: The distribution's packages are missing or too old, a run uses what is to be rebuilt,
+            the disk is full or read-only, or the connection is lost.
+    """
+    content = environment.content
+    asked = {
+        "folder": layout.environments,
+        "wheels_folder": layout.wheels,
+        "key": environment.key,
+        "python": list(environment.platform.python),
+        "sees_system": content.sees_system,
+        "wheels": [
+            {"sha256": wheel.sha256, "filename": wheel.filename, "size": wheel.size_bytes}
+            for wheel in environment.lock
+        ],
+    }
+    told: Mapping[str, Any] = board.call("environment", asked, timeout_s=BUILD_TIMEOUT_S).value
+    if told["changed"] or not told["missing"]:
+        return bool(told["changed"])
+    check_distribution(board, environment)
+    have = {each["sha256"]: each["have"] for each in told["missing"]}
+    wheels = [(wheel, have[wheel.sha256]) for wheel in environment.lock if wheel.sha256 in have]
+    _send_wheels(board, layout, environment, wheels, progress)
+    progress("installing", 1.0)
+    told = board.call("environment", asked, timeout_s=BUILD_TIMEOUT_S).value
+    if told["missing"]:
+        raise MachineFailure(
+            FailureKind.DATA, "wheels that were sent are not there", "repeat the command"
+        )
+    return bool(told["changed"])
+
+
+def check_distribution(board: Board, environment: Environment) -> None:
+    """
+    See that the machine's distribution has what no wheel brings, new enough.
+
+    Raises:
+        MachineFailure: UNSUPPORTED: it has not; every package is named.
+    """
+    from packaging.specifiers import SpecifierSet
+
+    wanted = environment.content.distributed
+    if not wanted:
+        return
+    names = {"names": [each.name for each in wanted]}
+    found: Mapping[str, str | None] = board.call("versions", names, timeout_s=LOOK_TIMEOUT_S).value
+    faults, packages = [], []
+    for each in wanted:
+        version = found[each.name]
+        needed = f"{each.name}{each.specifier}"
+        if version is None:
+            faults.append(f"{each.package} is not installed (needed: {needed})")
+            packages.append(each.package)
+        elif not SpecifierSet(each.specifier).contains(version, prereleases=True):
+            faults.append(f"{each.package} brings {each.name} {version}, needed: {needed}")
+    if faults:
+        missing = (
+            f"install them there: sudo apt-get install {' '.join(packages)}" if packages else ""
+        )
+        advice = missing or "use a newer release of the distribution there, or a 64-bit one"
+        raise MachineFailure(
+            FailureKind.UNSUPPORTED,
+            f"no wheels are made for {environment.platform.label}, and of its distribution "
+            + "; ".join(faults),
+            advice,
+        )
+
+
+def check_runtime(board: Board, layout: Layout, check: RuntimeCheck) -> dict[str, Any]:
+    """
+    See that the runtime starts on a machine, and that datagrams reach this computer and come back.
+
+    Returns:
+        {"runtime": its version, "start_ms": ..., "round_trip_ms": ... or None}.
+
+    Raises:
+        MachineFailure: It does not start, or no datagram came back; the text has the last words.
+    """
+    told: dict[str, Any] = board.call(
+        "check_runtime", check_request(layout, check), timeout_s=START_TIMEOUT_S + LOOK_TIMEOUT_S
+    ).value
+    return told
+
+
+def check_request(layout: Layout, check: RuntimeCheck) -> dict[str, Any]:
+    """Return the arguments of the verb "check_runtime"."""
+    return {
+        "python": layout.python(check.key),
+        "path": [layout.tree(each) for each in check.trees],
+        "is_full": check.is_full,
+        "modules": list(check.modules),
+        "simulation": check.simulation,
+        "base": layout.tree(check.base) if check.base else "",
+        "udp": check.udp,
+        "timeout_s": START_TIMEOUT_S,
+    }
+
+
+def modules_of(environment: Environment) -> tuple[str, ...]:
+    """Return the names under which the runtime's own requirements are imported."""
+    names = {wheel.name for wheel in environment.lock}
+    names |= {each.name for each in environment.content.distributed}
+    return tuple(
+        sorted(name.replace("-", "_") for name in map(normal_name, names) if name in RUNTIME_NAMES)
+    )
+
+
+RUNTIME_NAMES = ("annotated-types", "msgpack", "numpy", "orjson", "psutil")
+
+
+def _send_wheels(
+    board: Board,
+    layout: Layout,
+    environment: Environment,
+    wheels: Sequence[tuple[Locked, int]],
+    progress: Progress,
+) -> None:
+    whole_bytes = sum(wheel.size_bytes - have for wheel, have in wheels)
+    sent_bytes = 0
+    for wheel, have in wheels:
+        arguments = {
+            "folder": layout.wheels,
+            "sha256": wheel.sha256,
+            "filename": wheel.filename,
+            "size": wheel.size_bytes,
+        }
+        with (
+            environment.wheel(wheel).open("rb") as file,
+            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
+        ):
+            for offset in range(have, wheel.size_bytes, PIECE_BYTES):
+                piece = content[offset : offset + PIECE_BYTES]
+                board.call(
+                    "wheel",
+                    {**arguments, "offset": offset},
+                    body=piece,
+                    timeout_s=LOOK_TIMEOUT_S,
+                )
+                sent_bytes += len(piece)
+                progress(f"wheels {sent_bytes / 1e6:.1f} MB", sent_bytes / max(1, whole_bytes))

@@ -1,0 +1,295 @@
+"""
+Code and scenario files as trees: known by the hash of their content, sent once, never changed there.
+
+A tree on a machine is a folder named after the hash of what is in it. Of a tree that is not there yet
+only those files are sent whose content no tree there has: one edited file is one file sent.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.metadata
+import os
+import stat
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import madns_runtime
+from cosmos_cli.errors import InputError
+from cosmos_cli.fleet.board import Board
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.layout import Layout
+from cosmos_cli.models.loading import ScenarioFile
+from cosmos_cli.rundir import BUNDLE_SUFFIX, RUN_NAME
+
+DISTRIBUTION = "cosmos-madns"
+FILES_MAX = 5_000
+TREE_BYTES_MAX = 256 * 1024 * 1024
+BATCH_BYTES = 4 * 1024 * 1024
+"""Of content a frame; a batch is compressed as one."""
+COMPRESSION_LEVEL = 6
+ROUNDS_MAX = 3
+"""Another operator who assembles the same tree at the same time may take what was just sent."""
+ASSEMBLE_TIMEOUT_S = 120.0
+LARGEST_SHOWN = 3
+CACHE_FOLDERS = ("__pycache__", "node_modules")
+CACHE_SUFFIXES = (".pyc", ".egg-info")
+FILE_MODE, PROGRAM_MODE = 0o444, 0o555
+
+Progress = Callable[[str, float], None]
+"""Takes what is being done and how far it is, from 0 to 1."""
+
+
+def no_progress(_what: str, _share: float) -> None:
+    """Tell nobody."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TreeFile:
+    """One file of a tree."""
+
+    path: str
+    """Within the tree, with slashes."""
+    sha256: str
+    mode: int
+    """0o555 for a program, 0o444 for any other file: nobody changes a tree."""
+    size_bytes: int
+    source: Path | bytes = field(repr=False)
+    """Where its content is here, or the content itself."""
+
+    def read(self) -> bytes:
+        """
+        Return its content.
+
+        Raises:
+            MachineFailure: It is no longer what it was when the tree was made.
+        """
+        content = self.source if isinstance(self.source, bytes) else self.source.read_bytes()
+        if hashlib.sha256(content).hexdigest() != self.sha256:
+            raise MachineFailure(
+                FailureKind.DATA, f"{self.source!s} was changed while it was sent", "repeat"
+            )
+        return content
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tree:
+    """Files that belong together; made by `tree_of`."""
+
+    label: str
+    """What it is, in words; no part of the hash."""
+    hash: str
+    files: tuple[TreeFile, ...]
+
+    @property
+    def size_bytes(self) -> int:
+        """Return the size of all files."""
+        return sum(file.size_bytes for file in self.files)
+
+
+def tree_of(label: str, files: Sequence[TreeFile]) -> Tree:
+    """Return a tree of these files, in the order of their paths."""
+    ordered = tuple(sorted(files, key=lambda file: file.path))
+    digest = hashlib.sha256()
+    for file in ordered:
+        kind = "x" if file.mode & stat.S_IXUSR else "-"
+        digest.update(f"{kind} {file.sha256} {file.path}\n".encode())
+    return Tree(label=label, hash=digest.hexdigest(), files=ordered)
+
+
+@functools.lru_cache(maxsize=1)
+def runtime_tree() -> Tree:
+    """
+    Return the package `madns_runtime` as it is installed here.
+
+    With what the distribution says of itself, so that there too simulations are found by name.
+    """
+    package = Path(madns_runtime.__file__).parent
+    files = [
+        _read(path, f"{package.name}/{name}")
+        for path, name in _walk(package, package)
+        if name.endswith((".py", ".json", "py.typed")) or "/data/" in f"/{name}"
+    ]
+    return tree_of("runtime", [*files, *_distribution_files()])
+
+
+def scenario_tree(scenario_file: ScenarioFile) -> Tree:
+    """
+    Return the scenario's folder: what its files name, and its plug-ins with their neighbours.
+
+    Hidden files, caches, virtual environments, runs and empty folders are left out. A link to a file or
+    folder within is sent as what it leads to.
+
+    Raises:
+        InputError: The folder is larger than a scenario's should be, or has a link that leads outside.
+    """
+    folder = scenario_file.base_directory
+    found = []
+    total_bytes = 0
+    for path, name in _walk(folder, folder):
+        found.append((path, name))
+        total_bytes += path.stat().st_size
+        if len(found) > FILES_MAX or total_bytes > TREE_BYTES_MAX:
+            raise _too_large(folder, found)
+    return tree_of(f"scenario {scenario_file.scenario.name}", [_read(*each) for each in found])
+
+
+def send_tree(board: Board, layout: Layout, tree: Tree, progress: Progress = no_progress) -> bool:
+    """
+    See that a tree is on a machine; what is there already is verified, not sent.
+
+    Args:
+        board: Started with `cosmos_cli.provision.environment.PARTS`.
+        layout: Of the machine.
+        tree: What is wanted.
+        progress: Told while files are sent.
+
+    Returns:
+        Whether anything was changed there.
+
+    Raises:
+        MachineFailure: The connection is lost, its disk is full or read-only, or a file changed here.
+    """
+    asked = {
+        "folder": layout.trees,
+        "hash": tree.hash,
+        "label": tree.label,
+        "files": [[file.path, file.sha256, file.mode] for file in tree.files],
+    }
+    for _ in range(ROUNDS_MAX):
+        told: Mapping[str, Any] = board.call("tree", asked, timeout_s=ASSEMBLE_TIMEOUT_S).value
+        if not told["missing"]:
+            return bool(told["changed"])
+        _send_blobs(board, layout, _first_of_each(tree, told["missing"]), progress)
+    raise MachineFailure(
+        FailureKind.DATA,
+        f"{tree.label}: files that were sent are not there ({len(told['missing'])} missing)",
+        "repeat when no other command works there",
+    )
+
+
+def _first_of_each(tree: Tree, wanted: Sequence[str]) -> list[TreeFile]:
+    by_hash = {file.sha256: file for file in reversed(tree.files)}
+    return [by_hash[sha256] for sha256 in wanted]
+
+
+def _send_blobs(
+    board: Board, layout: Layout, files: Sequence[TreeFile], progress: Progress
+) -> None:
+    whole_bytes = sum(file.size_bytes for file in files)
+    sent_bytes = 0
+    for batch in _batches(files):
+        body = zlib.compress(b"".join(file.read() for file in batch), COMPRESSION_LEVEL)
+        arguments = {
+            "folder": layout.trees,
+            "blobs": [[file.sha256, file.size_bytes] for file in batch],
+        }
+        board.call("blobs", arguments, body=body, timeout_s=ASSEMBLE_TIMEOUT_S)
+        sent_bytes += sum(file.size_bytes for file in batch)
+        progress(f"files {sent_bytes / 1e6:.1f} MB", sent_bytes / max(1, whole_bytes))
+
+
+def _batches(files: Sequence[TreeFile]) -> Iterator[list[TreeFile]]:
+    batch: list[TreeFile] = []
+    size_bytes = 0
+    for file in files:
+        if batch and size_bytes + file.size_bytes > BATCH_BYTES:
+            yield batch
+            batch, size_bytes = [], 0
+        batch.append(file)
+        size_bytes += file.size_bytes
+    if batch:
+        yield batch
+
+
+def _distribution_files() -> Iterator[TreeFile]:
+    """Yield the little of a .dist-info folder that an installed simulation is found by, and the version."""
+    distribution = importlib.metadata.distribution(DISTRIBUTION)
+    version = distribution.version
+    groups: dict[str, list[str]] = {}
+    for entry in sorted(distribution.entry_points, key=lambda e: (e.group, e.name)):
+        if entry.value.startswith(f"{madns_runtime.__name__}."):
+            groups.setdefault(entry.group, []).append(f"{entry.name} = {entry.value}")
+    entries = "\n".join("\n".join([f"[{group}]", *lines, ""]) for group, lines in groups.items())
+    folder = f"{DISTRIBUTION.replace('-', '_')}-{version}.dist-info"
+    metadata = f"Metadata-Version: 2.1\nName: {DISTRIBUTION}\nVersion: {version}\n"
+    yield _file(f"{folder}/METADATA", metadata.encode(), FILE_MODE)
+    yield _file(f"{folder}/entry_points.txt", entries.encode(), FILE_MODE)
+
+
+def _read(path: Path, name: str) -> TreeFile:
+    try:
+        content = path.read_bytes()
+        is_program = bool(path.stat().st_mode & stat.S_IXUSR)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return _file(name, content, PROGRAM_MODE if is_program else FILE_MODE, path)
+
+
+def _file(name: str, content: bytes, mode: int, source: Path | None = None) -> TreeFile:
+    return TreeFile(
+        path=name,
+        sha256=hashlib.sha256(content).hexdigest(),
+        mode=mode,
+        size_bytes=len(content),
+        source=content if source is None else source,
+    )
+
+
+def _walk(folder: Path, top: Path, above: tuple[Path, ...] = ()) -> Iterator[tuple[Path, str]]:
+    """Yield the files of a folder that belong to a tree, each with its path within *top*."""
+    above = (*above, folder.resolve())
+    try:
+        entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read: {error.strerror or error}") from error
+    for entry in entries:
+        path = folder / entry.name
+        if entry.name.startswith(".") or entry.name.endswith(CACHE_SUFFIXES):
+            continue
+        if not entry.name.isprintable():
+            raise InputError(f"{str(path)!r}: expected a file name of printable characters")
+        if entry.is_symlink():
+            _refuse_outside(path, top)
+        if entry.is_dir():
+            is_loop = path.resolve() in above
+            if not is_loop and not _is_left_out(path):
+                yield from _walk(path, top, above)
+        elif entry.is_file():
+            if not _is_bundle(entry.name):
+                yield path, path.relative_to(top).as_posix()
+        elif entry.is_symlink():
+            raise InputError(f"{path}: a link that leads nowhere; remove it")
+
+
+def _is_left_out(path: Path) -> bool:
+    """Tell whether a folder is a cache, a virtual environment or a run."""
+    is_run = RUN_NAME.match(path.name) is not None and (path / "plan.json").exists()
+    return is_run or path.name in CACHE_FOLDERS or (path / "pyvenv.cfg").exists()
+
+
+def _is_bundle(name: str) -> bool:
+    return name.endswith(BUNDLE_SUFFIX) and RUN_NAME.match(name) is not None
+
+
+def _refuse_outside(path: Path, top: Path) -> None:
+    real = path.resolve()
+    if not real.is_relative_to(top.resolve()):
+        raise InputError(
+            f"{path}: a link that leads out of the scenario's folder, to {real}; machines are sent"
+            f" {top} and no more, so copy into it what the scenario needs"
+        )
+
+
+def _too_large(folder: Path, found: Sequence[tuple[Path, str]]) -> InputError:
+    sizes = sorted(((path.stat().st_size, name) for path, name in found), reverse=True)
+    largest = ", ".join(f"{name} ({size / 1e6:.1f} MB)" for size, name in sizes[:LARGEST_SHOWN])
+    return InputError(
+        f"{folder}: expected a scenario's folder of at most {FILES_MAX} files and"
+        f" {TREE_BYTES_MAX // (1024 * 1024)} MB, found more; the largest are {largest}; give the scenario"
+        " and what it needs a folder of their own"
+    )

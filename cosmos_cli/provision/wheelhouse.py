@@ -1,0 +1,353 @@
+"""
+Environments for machines without internet: resolved and downloaded here, remembered in a cache.
+
+    <cache>/locks/<hash of what was asked>.json    what an environment is made of
+    <cache>/wheels/<sha256>/<wheel>                 shared by all runs and all machines
+
+When nothing changed no process is started and no network is needed. Safe for threads and processes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import importlib.metadata
+import json
+import os
+import tempfile
+import time
+import zipfile
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from email.parser import HeaderParser
+from pathlib import Path
+
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.provision import resolver
+from cosmos_cli.provision.lock import (
+    DISTRIBUTION_PACKAGES,
+    Candidate,
+    Chosen,
+    Distributed,
+    Lock,
+    Locked,
+    choose,
+    normal_name,
+    with_specifiers,
+)
+from cosmos_cli.provision.platform import Platform
+from cosmos_cli.provision.trees import DISTRIBUTION, Progress, no_progress
+from cosmos_cli.rundir import write_atomically
+
+CACHE_VARIABLE = "COSMOS_CACHE"
+SCHEMA = 1
+"""Of what is remembered; what another one wrote is resolved anew."""
+TRUTH_EXTRA = "truth"
+SYSTEM_PREFIX = "python3-"
+FAILURE_KEPT_S = 30.0
+"""Other machines of a kind need not wait for the same answer; a later command asks anew."""
+LOCK_TIMEOUT_S = 3600.0
+LOCK_POLL_S = 0.05
+
+_failures: dict[str, tuple[float, MachineFailure]] = {}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Environment:
+    """A virtual environment that machines can be given; made by `prepare`."""
+
+    content: Lock
+    wheels: Path
+    """Folder of the wheels here, each in a folder named after its hash."""
+
+    @property
+    def key(self) -> str:
+        """Return its name on machines: the hash of what it is made of."""
+        return self.content.key
+
+    @property
+    def platform(self) -> Platform:
+        """Return what it is made for."""
+        return self.content.platform
+
+    @property
+    def lock(self) -> tuple[Locked, ...]:
+        """Return its wheels."""
+        return self.content.wheels
+
+    @property
+    def distribution_packages(self) -> tuple[str, ...]:
+        """Return the system packages that a machine must have before it can be installed."""
+        return tuple(each.package for each in self.content.distributed)
+
+    @property
+    def size_bytes(self) -> int:
+        """Return what it takes on a machine: its wheels, which are kept there, and its files."""
+        return sum(wheel.size_bytes + wheel.installed_bytes for wheel in self.lock)
+
+    def wheel(self, locked: Locked) -> Path:
+        """Return where one of its wheels is here."""
+        return _wheel(self.wheels, locked)
+
+
+def cache_folder() -> Path:
+    """Return the folder of what was downloaded: COSMOS_CACHE, else cosmos among the user's caches."""
+    given = os.environ.get(CACHE_VARIABLE)
+    if given:
+        return Path(given).absolute()
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cosmos"
+
+
+def sees_system_packages(packages: Iterable[str]) -> bool:
+    """Tell whether a machine's system packages (cosmos_packages) hold any that Python code imports."""
+    return any(package.startswith(SYSTEM_PREFIX) for package in packages)
+
+
+def prepare(
+    platform: Platform,
+    requirements: Sequence[str],
+    *,
+    is_host: bool = False,
+    sees_system: bool = False,
+    progress: Progress = no_progress,
+) -> Environment:
+    """
+    Return the environment for a machine, its wheels downloaded.
+
+    Args:
+        platform: Of the machine.
+        requirements: Of the scenario and of the machine, beyond what the runtime needs.
+        is_host: Whether the host's half runs there.
+        sees_system: Whether the distribution's Python packages can be imported; see `sees_system_packages`.
+        progress: Told what takes long.
+
+    Raises:
+        MachineFailure: A requirement has no wheel for such a machine, or the index cannot be reached.
+    """
+    need = _Need(
+        platform=platform,
+        requirements=tuple(sorted({text.strip() for text in requirements})),
+        is_host=is_host,
+        sees_system=sees_system,
+    )
+    cache = cache_folder()
+    path = cache / "locks" / f"{need.name()}.json"
+    content = _read_lock(path, cache)
+    if content is None:
+        with _locked(path.with_suffix(".lock")):
+            content = _read_lock(path, cache) or _make_lock(path, need, cache, progress)
+    return Environment(content=content, wheels=cache / "wheels")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Need:
+    """What is asked for."""
+
+    platform: Platform
+    requirements: tuple[str, ...]
+    is_host: bool
+    sees_system: bool
+
+    def name(self) -> str:
+        """Return the name of the answer in the cache."""
+        platform = self.platform
+        asked = {
+            "schema": SCHEMA,
+            "platform": [platform.python, platform.machine, platform.libc_version],
+            "runtime": sorted(importlib.metadata.requires(DISTRIBUTION) or ()),
+            "requirements": self.requirements,
+            "is_host": self.is_host,
+            "sees_system": self.sees_system,
+        }
+        return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+
+    def runtime_requirements(self) -> tuple[str, ...]:
+        """Return what the installed distribution says that the runtime needs on such a machine."""
+        from packaging.requirements import Requirement
+
+        environment = self.platform.marker_environment()
+        environment["extra"] = TRUTH_EXTRA if self.is_host else ""
+        needed = []
+        for text in importlib.metadata.requires(DISTRIBUTION) or ():
+            requirement = Requirement(text)
+            if requirement.marker is None or requirement.marker.evaluate(environment):
+                needed.append(f"{requirement.name}{requirement.specifier}")
+        return tuple(sorted(needed))
+
+
+def _make_lock(path: Path, need: _Need, cache: Path, progress: Progress) -> Lock:
+    failed_s, failure = _failures.get(str(path), (0.0, None))
+    if failure is not None and time.monotonic() - failed_s < FAILURE_KEPT_S:
+        raise failure
+    try:
+        content = _resolve(need, cache, progress)
+    except MachineFailure as error:
+        _failures[str(path)] = (time.monotonic(), error)
+        raise
+    write_atomically(path, json.dumps(content.to_mapping(), indent=1).encode())
+    return content
+
+
+def _resolve(need: _Need, cache: Path, progress: Progress) -> Lock:
+    platform = need.platform
+    _check(need.requirements)
+    everything = [*need.runtime_requirements(), *need.requirements]
+    progress(f"resolving {len(everything)} requirements for {platform.label}", 0.0)
+    chosen, missing = choose(resolver.resolve(everything, platform), platform)
+    distributed = _distributed(missing, platform)
+    _refuse_ancient(need, {candidate.name for candidate in missing})
+    wheels = _fetch(chosen, cache, platform, progress)
+    for wheel in wheels:
+        everything += _requirements_of(_wheel(cache / "wheels", wheel))
+    return Lock(
+        platform=platform,
+        wheels=wheels,
+        distributed=with_specifiers(distributed, everything, platform),
+        sees_system=need.sees_system or bool(distributed),
+    )
+
+
+def _check(requirements: Sequence[str]) -> None:
+    from packaging.requirements import InvalidRequirement, Requirement
+
+    for text in requirements:
+        try:
+            requirement = Requirement(text)
+        except InvalidRequirement as error:
+            reason = str(error).splitlines()[0]
+        else:
+            if requirement.url is None:
+                continue
+            reason = "an address; what no index has belongs into the scenario's folder"
+        raise MachineFailure(
+            FailureKind.UNSUPPORTED,
+            f"requirement {resolver.SECRET.sub('://***@', text)!r}: expected a name and versions such as"
+            f" pyproj>=3.6, got {reason}",
+            "correct `requirements` in the scenario or cosmos_requirements in the inventory",
+        )
+
+
+def _distributed(missing: Sequence[Candidate], platform: Platform) -> tuple[Distributed, ...]:
+    """Return what 32-bit ARM takes from its distribution, because nobody makes wheels of it."""
+    found = []
+    for candidate in missing:
+        package = DISTRIBUTION_PACKAGES.get(candidate.name)
+        if package is None or not platform.is_32_bit:
+            raise resolver.no_wheel(
+                candidate.name, f"{candidate.version} has no wheel for", platform
+            )
+        found.append(Distributed(name=candidate.name, package=package))
+    return tuple(found)
+
+
+def _refuse_ancient(need: _Need, missing: set[str]) -> None:
+    """
+    Refuse a version that is taken only because newer ones have no wheel for the machine.
+
+    Resolvers go back in time silently: for Python 3.13 they find lgpio of 2020. Who wants that says so.
+    """
+    from packaging.requirements import Requirement
+    from packaging.version import Version
+
+    platform = need.platform
+    for requirement in map(Requirement, need.requirements):
+        name, specifier = requirement.name, str(requirement.specifier)
+        marker = requirement.marker
+        is_pinned = any(each.operator in ("==", "===") for each in requirement.specifier)
+        is_elsewhere = marker is not None and not marker.evaluate(platform.marker_environment())
+        if is_pinned or is_elsewhere or normal_name(name) in missing:
+            continue
+        newest = resolver.newest_version(name, specifier, platform, with_wheel=False)
+        usable = resolver.newest_version(name, specifier, platform, with_wheel=True)
+        if newest and usable and Version(usable) < Version(newest):
+            text = f"{newest} has no wheel for"
+            raise resolver.no_wheel(name, text, platform, pin=usable)
+
+
+def _fetch(
+    chosen: Sequence[Chosen], cache: Path, platform: Platform, progress: Progress
+) -> tuple[Locked, ...]:
+    """Return the wheels with their sizes; those that the cache lacks are downloaded."""
+    folder = cache / "wheels"
+    lacking = [each for each in chosen if not _wheel(folder, each.locked).exists()]
+    if lacking:
+        progress(f"downloading {len(lacking)} wheels for {platform.label}", 0.5)
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".new-", dir=folder) as private:
+            resolver.download(lacking, Path(private), platform)
+            for each in lacking:
+                _keep(Path(private, each.locked.filename), each.locked, folder)
+    return tuple(_sized(each.locked, _wheel(folder, each.locked)) for each in chosen)
+
+
+def _keep(downloaded: Path, locked: Locked, folder: Path) -> None:
+    try:
+        with downloaded.open("rb") as file:
+            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+            os.fsync(file.fileno())
+    except FileNotFoundError:
+        sha256 = ""
+    if sha256 != locked.sha256:
+        raise MachineFailure(
+            FailureKind.DATA,
+            f"{locked.filename}: what the package index gave is not what it announced",
+            "repeat; if that does not help, the index or a proxy before it is broken",
+        )
+    path = _wheel(folder, locked)
+    path.parent.mkdir(exist_ok=True)
+    downloaded.replace(path)
+
+
+def _sized(locked: Locked, path: Path) -> Locked:
+    with zipfile.ZipFile(path) as wheel:
+        installed_bytes = sum(entry.file_size for entry in wheel.infolist())
+    size_bytes = path.stat().st_size
+    return replace(locked, size_bytes=size_bytes, installed_bytes=installed_bytes)
+
+
+def _requirements_of(path: Path) -> list[str]:
+    """Return what a wheel says that it needs."""
+    with zipfile.ZipFile(path) as wheel:
+        for name in wheel.namelist():
+            if name.endswith(".dist-info/METADATA"):
+                metadata = HeaderParser().parsestr(wheel.read(name).decode())
+                return [str(text) for text in metadata.get_all("Requires-Dist", [])]
+    return []
+
+
+def _wheel(folder: Path, locked: Locked) -> Path:
+    return folder / locked.sha256 / locked.filename
+
+
+def _read_lock(path: Path, cache: Path) -> Lock | None:
+    """Return what is remembered; None if nothing is, or if a wheel of it is gone."""
+    try:
+        content = Lock.from_mapping(json.loads(path.read_bytes()))
+        for wheel in content.wheels:
+            if _wheel(cache / "wheels", wheel).stat().st_size != wheel.size_bytes:
+                return None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return content
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Hold a lock between threads and processes; the kernel drops it when its holder dies."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    until_s = time.monotonic() + LOCK_TIMEOUT_S
+    with path.open("wb") as file:
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() > until_s:
+                    raise MachineFailure(
+                        FailureKind.BUSY,
+                        f"another command on this computer holds {path}",
+                        "wait for its end, then repeat",
+                    ) from None
+                time.sleep(LOCK_POLL_S)
+        yield
