@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from cosmos_cli.models.placement import PlacementRule, claim_agents
-from cosmos_cli.models.texts import Requirement
+from cosmos_cli.models.texts import NAME_PATTERN, Requirement
 from madns_runtime.config import (
     SEED_MAX,
     Agents,
@@ -29,7 +29,6 @@ from madns_runtime.config import (
     TimeSettings,
 )
 
-NAME_PATTERN = "^[a-z0-9][a-z0-9-]*$"
 AGENT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 RESERVED_NAMES = ("host",)
 EXECUTOR_KINDS = ("process", "thread")

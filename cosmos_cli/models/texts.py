@@ -8,6 +8,8 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field
 
 TEXT_CHARACTERS_MAX = 4096
+NAME_PATTERN = "^[a-z0-9][a-z0-9-]*$"
+"""Of scenarios. It stands here so that inventories are read without importing what scenarios are made of."""
 
 
 def like(pattern: str, expected: str) -> BeforeValidator:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Union
 
 from cosmos_cli.errors import Fault
 from cosmos_cli.models.document import Document, Path, did_you_mean, kind_of
-from cosmos_cli.models.scenario import NAME_PATTERN
+from cosmos_cli.models.texts import NAME_PATTERN
 
 _EXPECTED = {
     "bool_type": "true or false",
