@@ -6,12 +6,8 @@ from collections.abc import Callable
 
 from madns_runtime.config import RunConfig
 
-LISTEN_TIMEOUT_S = 15.0
-"""From the host's start until it listens: imports on a slow board take a few seconds."""
 MARGIN_S = 10.0
 """The host has its own deadlines and names who missed them; the operator's come this much later."""
-HOST_SILENCE_S = 20.0
-"""A running host reports twice a second; one that is silent for this long is taken for hung."""
 STALL_S = 5.0
 """A turn of the loop that took this long means that the operator was stopped (Ctrl-Z), not its children."""
 MANUAL_READY_S = 600.0

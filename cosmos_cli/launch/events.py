@@ -102,6 +102,20 @@ class AgentExited:
 
 
 @dataclass(frozen=True, slots=True)
+class ProcessKnown:
+    """A program on another machine has this number there, which is also its group's."""
+
+    pid: int
+
+
+@dataclass(frozen=True, slots=True)
+class Pong:
+    """The answer to ping number *n*."""
+
+    n: int
+
+
+@dataclass(frozen=True, slots=True)
 class Noise:
     """A line that is no event."""
 
@@ -117,6 +131,8 @@ Event = (
     | Finished
     | AgentStarted
     | AgentExited
+    | ProcessKnown
+    | Pong
     | Noise
 )
 
@@ -190,6 +206,14 @@ def _exited(d: Mapping[str, Any]) -> Event:
     )
 
 
+def _process(d: Mapping[str, Any]) -> Event:
+    return ProcessKnown(int(d["pid"]))
+
+
+def _pong(d: Mapping[str, Any]) -> Event:
+    return Pong(int(d["n"]))
+
+
 def _float(value: Any) -> float | None:
     return None if value is None else float(value)
 
@@ -203,4 +227,6 @@ _PARSERS: Mapping[str, Callable[[Mapping[str, Any]], Event]] = {
     "finished": _finished,
     "started": _started,
     "exited": _exited,
+    "process": _process,
+    "pong": _pong,
 }

@@ -1,12 +1,14 @@
 """
-The operator's side of a run: one loop over the children's pipes, hand-started agents, signals and deadlines.
+The operator's side of a run: one loop over the children's lines, hand-started agents, signals and deadlines.
 
 It starts the host, then one supervisor a machine, passes on who died, and leaves only when no process
-of the run lives: first they are asked to stop, then `Reaper` ends them.
+of the run lives: first they are asked to stop, then `Reaper` ends them. Of a detached run it leaves
+everything once it is under way.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import selectors
 import signal
@@ -15,16 +17,8 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any, Literal
 
-from cosmos_cli.launch import children
-from cosmos_cli.launch.children import Child, Program
-from cosmos_cli.launch.deadlines import (
-    HOST_SILENCE_S,
-    LISTEN_TIMEOUT_S,
-    MARGIN_S,
-    STALL_S,
-    Deadlines,
-    state_limit_s,
-)
+from cosmos_cli.launch.children import Child
+from cosmos_cli.launch.deadlines import STALL_S
 from cosmos_cli.launch.events import (
     AgentChanged,
     AgentExited,
@@ -34,15 +28,22 @@ from cosmos_cli.launch.events import (
     Listening,
     Logged,
     Noise,
+    Pong,
     Progress,
     StateChanged,
     parse_event,
 )
-from cosmos_cli.launch.manual import ManualSeat
-from cosmos_cli.launch.outcome import LaunchOutcome, LaunchRequest, View
+from cosmos_cli.launch.host_limits import RUNNING_STATE, HostLimits
+from cosmos_cli.launch.loop import Loop
+from cosmos_cli.launch.machines import RemoteMachine
+from cosmos_cli.launch.outcome import FIRST_LIFE, LaunchOutcome, LaunchRequest, Life, View
 from cosmos_cli.launch.reaper import Reaper
+from cosmos_cli.launch.roll import Roll
+from cosmos_cli.launch.seats import Seats
 from cosmos_cli.launch.signals import OperatorSignals
-from cosmos_cli.problem import Problem
+from cosmos_cli.launch.starter import HOST, Starter, Told
+from cosmos_cli.launch.talk import Talk
+from cosmos_cli.launch.watch import MachineWatch
 from cosmos_cli.rundir import RunDirectory
 
 STOP_GRACE_S = 2.0
@@ -51,156 +52,202 @@ END_MARGIN_S = 5.0
 """A supervisor kills its own late agents and names them; the operator's deadline comes after that."""
 SELECT_MAX_S = 1.0
 """A wake-up lost to a bug costs this long, not the run."""
-NOISE_LINES_MAX = 20
-"""Lines of a child that are no events are shown this often, then only counted."""
-PROBLEMS_MAX = 200
+PUSH_INTERVAL_S = 0.02
+"""While a line to another machine is full, it is tried again this often."""
+BACKGROUND_END_S = 10.0
+"""For what machines are still being asked when the run is over."""
+LIFE_LINE_S = 30.0
+"""A supervisor that hears no ping for this long ends by itself (`madns_runtime.reactor.lines`)."""
 
-HOST = "host"
 HOST_EXIT_CODES = (0, 1)
 """Of a host that came to its end: the run was complete, or was not."""
-RUNNING_STATE = "SIMULATION_START"
+NO_MACHINES: Mapping[str, RemoteMachine] = {}
 
 
 class Operator:
     """
-    Runs one launch to its end.
+    Runs one launch to its end, or until it can be left alone.
 
     Args:
         request: What to start.
         view: Where talk goes.
         signals: Entered by the caller, so that it also covers what comes after the loop.
+        remote: The machines that are other computers; the caller closes them.
     """
 
-    def __init__(self, request: LaunchRequest, view: View, signals: OperatorSignals) -> None:
+    def __init__(
+        self,
+        request: LaunchRequest,
+        view: View,
+        signals: OperatorSignals,
+        remote: Mapping[str, RemoteMachine] = NO_MACHINES,
+    ) -> None:
         self._request = request
         self._run = RunDirectory(request.directory)
         self._timeouts = request.config.timeouts
         self._view = view
+        self._talk = Talk(view)
         self._signals = signals
-        self._selector = selectors.DefaultSelector()
-        self._deadlines = Deadlines()
+        self._loop = Loop.make()
+        self._deadlines = self._loop.deadlines
         self._reaper = Reaper(self._deadlines, self._problem_of)
+        self._starter = Starter(request, remote, self._loop)
+        directories = {name: request.place_of(name).directory for name in remote}
+        self._watch = MachineWatch(remote, directories, self._loop, self)
+        self._roll = Roll(request)
+        self._limits = HostLimits(
+            self._deadlines,
+            request.config,
+            give_up=self._give_up_on_host,
+            stop=partial(self._ask_host_to_stop, "failed"),
+        )
+        self._seats = Seats(
+            self._loop,
+            on_line=self._said,
+            on_left=self._seat_left,
+            problem=self._talk.problem,
+        )
         self._children: dict[str, Child] = {}
         self._machines: dict[str, str] = {}
-        self._seats: dict[str, ManualSeat] = {}
-        self._agents_ended: set[str] = set()
         self._exited: set[str] = set()
-        self._host_state = "HOST_STARTUP"
+        self._listening: Listening | None = None
         self._host_result: Mapping[str, Any] | None = None
         self._has_host_finished = False
         self._is_closing = False
+        self._is_detached = False
         self._interruption: Literal["no", "clean", "at once"] = "no"
-        self._problems: list[Problem] = []
-        self._noise: dict[str, int] = {}
+        self._unreachable: set[str] = set()
 
     def run(self) -> LaunchOutcome:
         """Start everything, wait for the end of everything, and say how it went."""
-        self._selector.register(self._signals, selectors.EVENT_READ, self._signalled)
+        self._loop.selector.register(self._signals, selectors.EVENT_READ, self._signalled)
+        leftovers: tuple[int, ...] = ()
         try:
             self._start_host()
             while not self._is_over():
                 self._turn()
         finally:
-            leftovers = self._clear_up()
+            if self._is_detached:
+                self._let_go()
+            else:
+                leftovers = self._clear_up()
         return LaunchOutcome(
             host_result=self._host_result or self._run.read_left_result(),
             interruption=self._interruption,
-            problems=tuple(self._problems),
+            problems=self._talk.problems,
             leftovers=leftovers,
+            is_detached=self._is_detached,
         )
 
     # The loop -------------------------------------------------------------------------------------
 
     def _turn(self) -> None:
         turned_s = time.monotonic()
-        wait_s = self._deadlines.wait_s(turned_s)
-        timeout_s = SELECT_MAX_S if wait_s is None else min(wait_s, SELECT_MAX_S)
-        for key, mask in self._selector.select(timeout_s):
+        for key, mask in self._loop.selector.select(self._wait_s(turned_s)):
             # An earlier callback of this round may have closed this one's descriptor.
-            if self._selector.get_map().get(key.fd) is key:
+            if self._loop.selector.get_map().get(key.fd) is key:
                 key.data(mask)
         for name, child in list(self._children.items()):
-            if name not in self._exited and child.returncode() is not None:
+            if name not in self._exited and child.has_exited():
                 self._child_exited(child)
         now_s = time.monotonic()
         if now_s - turned_s > STALL_S:
             self._deadlines.postpone(now_s - turned_s)
         self._deadlines.fire(now_s)
 
+    def _wait_s(self, now_s: float) -> float:
+        wait_s = self._deadlines.wait_s(now_s)
+        is_full = [child.push() for child in self._children.values()]
+        limit_s = PUSH_INTERVAL_S if any(is_full) else SELECT_MAX_S
+        return limit_s if wait_s is None else min(wait_s, limit_s)
+
     def _is_over(self) -> bool:
-        return not self._seats and all(map(self._reaper.has_ended, self._children.values()))
+        if self._is_detached:
+            return True
+        is_ended = all(map(self._reaper.has_ended, self._children.values()))
+        return not self._seats and is_ended and not self._watch.is_trying
+
+    def _let_go(self) -> None:
+        """Leave a detached run to itself."""
+        for child in self._children.values():
+            child.release()
+        self._loop.background.close(BACKGROUND_END_S)
+        self._loop.selector.close()
 
     def _clear_up(self) -> tuple[int, ...]:
-        for seat in self._seats.values():
-            seat.close()
+        self._seats.close()
+        self._watch.stop_seeking()
         leftovers = self._reaper.kill_whatever_lives(list(self._children.values()))
         if leftovers:
-            self._problem(f"processes {', '.join(map(str, leftovers))} outlived SIGKILL")
-        self._selector.close()
-        for name, count in self._noise.items():
-            if count > NOISE_LINES_MAX:
-                self._view.say(f"{name}: {count} lines in all that are no events", "warning")
+            self._talk.problem(f"processes {', '.join(map(str, leftovers))} outlived SIGKILL")
+        self._loop.background.close(BACKGROUND_END_S)
+        self._loop.selector.close()
+        self._talk.noise_in_all()
         return leftovers
 
-    def _problem(self, text: str, machine: str | None = None) -> None:
-        if len(self._problems) < PROBLEMS_MAX:
-            self._problems.append(Problem(text=text, machine=machine))
-        self._view.say(text, "error")
-
     def _problem_of(self, child: Child, text: str) -> None:
-        self._problem(text, self._machines.get(child.name))
+        self._talk.problem(text, self._machines.get(child.name))
 
     # Starting -------------------------------------------------------------------------------------
 
     def _start_host(self) -> None:
-        self._start(HOST, children.HOST_PROGRAM, HOST, launch=self._request.host_launch())
-        self._limit_phase(LISTEN_TIMEOUT_S, "has not listened within {:g} s")
+        machine = self._request.host_machine
+        try:
+            child = self._starter.start_host(self._told(HOST, machine))
+        except OSError as error:
+            self._cannot_start(HOST, error)
+            return
+        self._children[HOST] = child
+        if machine is not None:
+            self._machines[HOST] = machine
+            self._watch.add(machine, child, is_host=True)
+        self._limits.started(is_here=machine is None)
 
     def _start_agents(self, listening: Listening) -> None:
-        launch_of = partial(
-            self._request.agent_launch, address=listening.address, port=listening.port
-        )
+        self._listening = listening
         for machine, names in self._request.machines.items():
             started = tuple(name for name in names if name not in self._request.manual)
             if started:
-                child = f"agents@{machine}"
-                self._machines[child] = machine
-                launch = launch_of(machine, started)
-                self._start(child, children.AGENT_PROGRAM, f"machines/{machine}", launch=launch)
+                self._start_supervisor(machine, started)
             for name in names:
                 if name in self._request.manual:
-                    self._open_seat(name, launch_of(machine, (name,)))
+                    launch = self._request.agent_launch(machine, (name,), listening)
+                    self._open_seat(name, launch)
         if self._request.nice:  # after the children, who would inherit it
             os.nice(self._request.nice)
 
-    def _start(
-        self, name: str, arguments: tuple[str, ...], folder: str, *, launch: Mapping[str, Any]
+    def _start_supervisor(
+        self, machine: str, agents: tuple[str, ...], life: Life = FIRST_LIFE
     ) -> None:
-        stderr = self._request.directory / folder / "stderr.txt"
+        assert self._listening is not None
+        name = f"agents@{machine}" + (f" ({life.number})" if life.number > 1 else "")
+        self._machines[name] = machine
+        launch = self._request.agent_launch(machine, agents, self._listening, life)
         try:
-            self._children[name] = Child(
-                Program(name=name, arguments=arguments, stderr=stderr),
-                self._selector,
-                launch=launch,
-                on_line=partial(self._said, name),
-            )
+            told = self._told(name, machine)
+            child = self._starter.start_agents(name, machine, launch, told)
         except OSError as error:
-            reason = f"{name} cannot be started: {error}"
-            self._problem(reason, self._machines.get(name))
-            self._ask_host_to_stop("failed", reason)
+            self._cannot_start(name, error)
+            return
+        self._children[name] = child
+        self._watch.add(machine, child, is_host=False)
+
+    def _told(self, name: str, machine: str | None) -> Told:
+        return Told(
+            on_line=partial(self._said, name),
+            on_unreachable=lambda why: self.machine_gone(machine or ""),
+        )
+
+    def _cannot_start(self, name: str, error: OSError) -> None:
+        reason = f"{name} cannot be started: {error}"
+        self._talk.problem(reason, self._machines.get(name))
+        self._ask_host_to_stop("failed", reason)
 
     def _open_seat(self, agent: str, launch: Mapping[str, Any]) -> None:
-        seat = ManualSeat(
-            agent,
-            self._selector,
-            launch=launch,
-            on_line=partial(self._said, agent),
-            on_left=partial(self._seat_left, agent),
-        )
-        self._seats[agent] = seat
+        command = self._seats.open(agent, launch)
         limit_s = self._timeouts.agents_ready_s
         self._view.say(
-            f"start {agent} by hand within {limit_s:g} s, in another terminal:\n  {seat.command()}",
+            f"start {agent} by hand within {limit_s:g} s, in another terminal:\n  {command}",
             "manual",
         )
 
@@ -209,11 +256,11 @@ class Operator:
     def _said(self, name: str, line: bytes) -> None:
         event = parse_event(line)
         if isinstance(event, Logged):
-            self._view.say(f"{event.source or name}: {event.text}", event.level)
+            self._talk.logged(name, event)
         elif isinstance(event, Noise):
-            self._noise[name] = self._noise.get(name, 0) + 1
-            if self._noise[name] <= NOISE_LINES_MAX:
-                self._view.say(f"{name}: {event.text}", "info")
+            self._talk.noise(name, event)
+        elif isinstance(event, Pong):
+            self._watch.pong(self._machines.get(name, ""), name, event.n)
         elif name == HOST:
             self._host_said(event)
         else:
@@ -222,17 +269,17 @@ class Operator:
     def _host_said(self, event: Event) -> None:
         if isinstance(event, Progress):
             self._view.progress(event)
-            self._expect_sign_of_life()
+            self._limits.heard()
         elif isinstance(event, AgentChanged):
             self._view.agent(event)
         elif isinstance(event, StateChanged):
-            self._host_state = event.state
             self._view.state(event.state)
-            self._expect_next_state()
-            self._expect_sign_of_life()
+            self._limits.entered(event.state)
+            if event.state == RUNNING_STATE and self._interruption == "no":
+                self._is_detached = self._request.is_detached
         elif isinstance(event, Listening):
-            self._expect_next_state()
-            if len(self._children) == 1 and self._interruption == "no":
+            self._limits.expect_next_state()
+            if self._listening is None and self._interruption == "no":
                 self._start_agents(event)
         elif isinstance(event, Finished):
             self._host_finished(event.result)
@@ -243,71 +290,45 @@ class Operator:
 
     def _supervisor_said(self, event: Event) -> None:
         if isinstance(event, AgentStarted):
-            self._agents_ended.discard(event.agent)
+            self._roll.started(event.agent, event.incarnation)
         elif isinstance(event, AgentExited):
-            self._agents_ended.add(event.agent)
+            self._roll.exited(event.agent, is_abnormal=event.is_abnormal)
             if event.is_abnormal:
                 self._tell_host_exited(event.agent, event.how, event.pid)
 
     def _tell_host_exited(self, agent: str, how: str, pid: int | None = None) -> None:
-        if not self._has_host_finished:
+        if not self._has_host_finished and HOST not in self._exited:
             command = {"command": "agent_exited", "agent": agent, "how": how, "pid": pid}
-            self._children[HOST].channel.send(command)
+            self._children[HOST].send(command)
 
     def _seat_left(self, agent: str) -> None:
-        if self._is_closing:
-            self._close_seat(agent)
-        elif agent not in self._agents_ended:
+        if agent not in self._roll.ended:
             self._tell_host_exited(agent, "its hand-started process is gone")
-
-    # Deadlines of the host ------------------------------------------------------------------------
-
-    def _limit_phase(self, limit_s: float, late: str) -> None:
-        """Give up on the host unless its state changes within *limit_s*; *late* says what it did not do."""
-        action = partial(self._give_up_on_host, late.format(limit_s))
-        self._deadlines.set("phase", time.monotonic() + limit_s, action)
-
-    def _expect_next_state(self) -> None:
-        if not self._is_closing:
-            limit_s = state_limit_s(self._host_state, self._request.config)
-            self._limit_phase(limit_s, f"has been in {self._host_state} for {{:g}} s")
-
-    def _expect_sign_of_life(self) -> None:
-        if self._host_state != RUNNING_STATE or self._is_closing:
-            self._deadlines.cancel("silence")
-            return
-        action = partial(self._give_up_on_host, f"has said nothing for {HOST_SILENCE_S:g} s")
-        self._deadlines.set("silence", time.monotonic() + HOST_SILENCE_S, action)
-
-    def _expect_end_of_host(self) -> None:
-        """Nobody is left whom the host could wait for."""
-        t = self._timeouts
-        limit_s = t.silence_s + t.complete_s + t.shutdown_s + MARGIN_S
-        reason = f"the host has gone on without agents for {limit_s:g} s"
-        action = partial(self._ask_host_to_stop, "failed", reason)
-        self._deadlines.set("alone", time.monotonic() + limit_s, action)
 
     def _ask_host_to_stop(self, status: str, reason: str) -> None:
         host = self._children.get(HOST)
-        if host is None or self._is_closing:
-            return
-        host.channel.send({"command": "stop", "reason": reason, "status": status})
-        limit_s = self._timeouts.shutdown_s + MARGIN_S
-        self._limit_phase(limit_s, "has not stopped within {:g} s of being told to")
+        if host is not None and not self._is_closing:
+            host.send({"command": "stop", "reason": reason, "status": status})
+            self._limits.told_to_stop()
 
     def _give_up_on_host(self, what: str) -> None:
         host = self._children[HOST]
         self._reaper.end(host, what)
-        self._show_last_words(host)
+        self._talk.last_words(host)
         self._close_down(grace_s=0.0)
 
     # The end of children --------------------------------------------------------------------------
 
     def _child_exited(self, child: Child) -> None:
+        machine = self._machines.get(child.name)
+        if machine is not None and child.loss() is not None:
+            self._watch.lose(machine, child.loss() or "")
+            return
         self._exited.add(child.name)
-        child.channel.drain()
-        child.channel.close()
+        child.drain()
         self._reaper.leader_ended(child)
+        if machine is not None:
+            self._watch.remove(machine, child)
         if child.name != HOST:
             self._supervisor_exited(child)
         elif not self._has_host_finished and not self._is_closing:
@@ -319,66 +340,101 @@ class Operator:
         if result is not None and child.returncode() in HOST_EXIT_CODES:
             self._host_finished(result)
         else:
-            self._problem(f"host (pid {child.pid}) {child.describe_exit()} before the run was over")
-            self._show_last_words(child)
+            how = child.describe_exit()
+            self._problem_of(child, f"host (pid {child.pid}) {how} before the run was over")
+            self._talk.last_words(child)
             self._close_down(grace_s=0.0)
 
     def _supervisor_exited(self, child: Child) -> None:
         if self._is_closing:
             return
-        names = self._request.machines[self._machines[child.name]]
-        left = set(names) - self._agents_ended - set(self._request.manual)
+        machine = self._machines[child.name]
+        left = self._roll.left_on(machine)
         if left:
             how = f"{child.name} (pid {child.pid}) {child.describe_exit()}"
-            self._problem_of(child, f"{how} before its agents {', '.join(sorted(left))} were done")
-            self._show_last_words(child)
-            for agent in sorted(left):
-                self._agents_ended.add(agent)
-                self._tell_host_exited(agent, f"its supervisor {how}")
-        if self._machines.keys() <= self._exited and not self._seats:
-            self._expect_end_of_host()
+            self._problem_of(child, f"{how} before its agents {', '.join(left)} were done")
+            self._talk.last_words(child)
+            self._agents_lost(left, f"its supervisor {how}")
+        if self.is_wanted(machine):
+            self._watch.revive(machine)
+        if self._machines.keys() - {HOST} <= self._exited and not self._seats:
+            self._limits.alone()
+
+    def _agents_lost(self, agents: tuple[str, ...], how: str) -> None:
+        for agent in agents:
+            self._roll.exited(agent, is_abnormal=True)
+            self._tell_host_exited(agent, how)
 
     def _close_down(self, *, grace_s: float) -> None:
         """The host is done or gone: the rest has to end too, in the time that shutdown is given."""
         if self._is_closing:
             return
         self._is_closing = True
-        self._deadlines.cancel("phase", "silence", "alone")
+        self._limits.over()
+        self._watch.stop_seeking()
         now_s = time.monotonic()
         self._deadlines.set("stop", now_s + grace_s, self._tell_stop)
         limit_s = grace_s + self._timeouts.shutdown_s + END_MARGIN_S
         late = f"has not ended within {limit_s:g} s of the end of the run"
         for name, child in self._children.items():
-            if name != HOST or self._has_host_finished:
+            if (name != HOST or self._has_host_finished) and not self._reaper.has_ended(child):
                 self._reaper.expect_end(child, now_s + limit_s, late)
-        for agent, seat in list(self._seats.items()):
-            seat.stop_listening()
-            if seat.is_taken:
-                action = partial(self._abandon_seat, agent)
-                self._deadlines.set(f"seat {agent}", now_s + limit_s, action)
-            else:
-                self._close_seat(agent)
+        self._seats.end(now_s + limit_s)
 
     def _tell_stop(self) -> None:
         command = {"command": "stop", "reason": "the run is over"}
-        for name in self._machines:
-            self._children[name].channel.send(command)
-        for seat in self._seats.values():
-            seat.send(command)
+        for name, child in self._children.items():
+            if name != HOST:
+                child.send(command)
+        self._seats.send(command)
 
-    def _abandon_seat(self, agent: str) -> None:
-        self._problem(f"{agent}, started by hand, is still connected: its line is being closed")
-        self._close_seat(agent)
+    # Machines ---------------------------------------------------------------------------------------
 
-    def _close_seat(self, agent: str) -> None:
-        self._deadlines.cancel(f"seat {agent}")
-        self._seats.pop(agent).close()
+    def machine_lost(self, machine: str, why: str) -> None:
+        """Give up what runs there, and tell the host whose agents they were."""
+        text = f"machine {machine} is lost: {why}"
+        self._talk.problem(text, machine)
+        for name, child in self._children.items():
+            if self._machines.get(name) == machine and not self._reaper.has_ended(child):
+                self._exited.add(name)
+                self._reaper.forget(child)
+                child.close()
+        if self._request.host_machine == machine and not self._has_host_finished:
+            self._close_down(grace_s=0.0)
+        if not self._is_closing:
+            self._agents_lost(self._roll.left_on(machine), text)
 
-    def _show_last_words(self, child: Child) -> None:
-        lines = child.last_words()
-        if lines:
-            shown = "\n".join(f"  | {line}" for line in lines)
-            self._view.say(f"the last lines of {child.stderr}:\n{shown}", "error")
+    def supervisor_silent(self, machine: str, child: Child) -> None:
+        """End a supervisor that hangs beside a host that does not."""
+        self._reaper.kill(child, "gives no sign of life")
+
+    def machine_slow(self, machine: str, took_s: float) -> None:
+        """Say that a machine was nearly lost."""
+        text = f"{machine} answered only after {took_s:.1f} s; is its link or its processor overloaded?"
+        self._view.say(text, "warning")
+
+    def is_wanted(self, machine: str) -> bool:
+        """Tell whether a lost machine that returns would be given its agents again."""
+        is_open = self._limits.is_open and not self._is_closing and self._interruption == "no"
+        return is_open and bool(self._roll.restartable_on(machine))
+
+    def machine_back(self, machine: str) -> None:
+        """Give a returned machine its agents again, if the run still goes on."""
+        agents = self._roll.restartable_on(machine)
+        if not self.is_wanted(machine):
+            return
+        self._view.say(f"{machine} has returned; its agents {', '.join(agents)} rejoin", "warning")
+        self._limits.not_alone()
+        self._start_supervisor(machine, agents, self._roll.next_life_on(machine))
+
+    def machine_gone(self, machine: str) -> None:
+        """Say of a machine that nothing can be done there, once."""
+        if machine not in self._unreachable:
+            self._unreachable.add(machine)
+            silence_s = max(LIFE_LINE_S, self._timeouts.silence_s)
+            limit_s = math.ceil(silence_s + 2 * self._timeouts.shutdown_s)
+            text = f"{machine} cannot be reached; its agents end by themselves within {limit_s} s"
+            self._view.say(text, "warning")
 
     # The person -----------------------------------------------------------------------------------
 
@@ -391,6 +447,7 @@ class Operator:
 
     def _interrupt(self, number: signal.Signals) -> None:
         self._interruption = "clean"
+        self._watch.stop_seeking()
         self._view.say("stopping; press Ctrl-C again to end at once", "warning")
         by = "the operator" if number is signal.SIGINT else number.name
         self._ask_host_to_stop("interrupted", f"interrupted by {by}")
@@ -399,9 +456,9 @@ class Operator:
         self._interruption = "at once"
         self._view.say("ending at once", "warning")
         self._is_closing = True
-        self._deadlines.cancel("phase", "silence", "alone", "stop")
-        for agent in list(self._seats):
-            self._close_seat(agent)
+        self._limits.over()
+        self._deadlines.cancel("stop")
+        self._seats.close()
         for child in self._children.values():
             if not self._reaper.has_ended(child):
                 self._reaper.kill(child, "was ended at once on the operator's word")

@@ -10,18 +10,16 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
-from cosmos_cli.launch.children import Child
+from cosmos_cli.launch.children import GROUP_CHECK_S, KILL_WAIT_S, Child
 from cosmos_cli.launch.deadlines import Deadlines
 
 TERM_GRACE_S = 3.0
 """From SIGTERM to SIGKILL."""
-KILL_WAIT_S = 5.0
-"""For the kernel to carry out a SIGKILL; a process that hangs in a device outlives it."""
 GROUP_GRACE_S = 5.0
 """For what a dead child has left in its group: agents and workers end by themselves in this time."""
-GROUP_CHECK_S = 0.1
 
 
 class Reaper:
@@ -57,7 +55,7 @@ class Reaper:
         if self.has_ended(child):
             return
         self._problem(child, f"{child.name} (pid {child.pid}) {why}: it is being ended")
-        child.channel.close_writing()
+        child.close_writing()
         child.signal(signal.SIGTERM)
         why = f"did not heed SIGTERM for {TERM_GRACE_S:g} s"
         at_s = time.monotonic() + TERM_GRACE_S
@@ -76,6 +74,11 @@ class Reaper:
         at_s = time.monotonic() + KILL_WAIT_S
         self._deadlines.set(_end_name(child), at_s, partial(self._gone.add, child.name))
 
+    def forget(self, child: Child) -> None:
+        """Take a child for ended: its machine is lost, and nothing can be done from here."""
+        self._gone.add(child.name)
+        self._deadlines.cancel(_end_name(child), f"group {child.name}")
+
     def kill_whatever_lives(self, children: Sequence[Child]) -> tuple[int, ...]:
         """
         Kill and wait, outside of the loop: the last resort, also when the loop itself has failed.
@@ -83,18 +86,11 @@ class Reaper:
         Returns:
             Processes that outlived it.
         """
-        alive = [child for child in children if child.members()]
-        for child in alive:
-            child.signal(signal.SIGKILL)
-        until_s = time.monotonic() + KILL_WAIT_S
-        while any(child.members() for child in alive) and time.monotonic() < until_s:
-            for child in alive:
-                child.returncode()  # reaps
-            time.sleep(GROUP_CHECK_S)
+        with ThreadPoolExecutor(max(1, len(children))) as pool:
+            left = [pid for pids in pool.map(_end_by_force, children) for pid in pids]
         for child in children:
-            child.returncode()
-            child.channel.close()
-        return tuple(pid for child in alive for pid in child.members())
+            child.close()
+        return tuple(left)
 
     def _check_group(self, child: Child, until_s: float) -> None:
         now_s = time.monotonic()
@@ -108,6 +104,10 @@ class Reaper:
         if not self.has_ended(child):
             again = partial(self._check_group, child, until_s)
             self._deadlines.set(f"group {child.name}", now_s + GROUP_CHECK_S, again)
+
+
+def _end_by_force(child: Child) -> list[int]:
+    return child.end_by_force()
 
 
 def _end_name(child: Child) -> str:

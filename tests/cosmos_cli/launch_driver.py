@@ -4,7 +4,7 @@ Runs the operator's loop, or the whole command line, over fake children, as a pr
     launch_driver.py operator DIRECTORY    prints the outcome as JSON
     launch_driver.py cosmos ARGUMENT...    as `cosmos ARGUMENT...`
 
-COSMOS_CONSTANTS shortens waits: {"operator.MARGIN_S": 1, ...} of modules in cosmos_cli.launch.
+COSMOS_CONSTANTS shortens waits: {"host_limits.MARGIN_S": 1, ...} of modules in cosmos_cli.launch.
 """
 
 from __future__ import annotations

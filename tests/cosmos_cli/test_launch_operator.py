@@ -151,7 +151,7 @@ def test_run_that_completes_hands_back_the_hosts_result(launched: Launched) -> N
 
 
 def test_host_that_never_listens_is_ended_and_named(launched: Launched) -> None:
-    launched.start(host={"silent_start": True}, constants={"operator.LISTEN_TIMEOUT_S": 1.0})
+    launched.start(host={"silent_start": True}, constants={"host_limits.LISTEN_TIMEOUT_S": 1.0})
 
     outcome = launched.outcome()
 
@@ -284,7 +284,7 @@ def test_output_that_is_no_event_is_shown_a_few_times_and_is_not_fatal(launched:
 def test_running_host_that_falls_silent_is_ended(launched: Launched) -> None:
     launched.start(
         host={"runs_s": 30, "is_silent": True},
-        constants={"operator.HOST_SILENCE_S": 1.0},
+        constants={"host_limits.HOST_SILENCE_S": 1.0},
     )
 
     outcome = launched.outcome()
@@ -357,7 +357,7 @@ def test_host_that_ignores_the_stop_is_ended_after_its_deadline(launched: Launch
     launched.start(
         host={"runs_s": 60, "ignores_stop": True},
         timeouts={"shutdown_s": 0.5},
-        constants={"operator.MARGIN_S": 0.5},
+        constants={"host_limits.MARGIN_S": 0.5},
     )
     launched.wait_for_note("launched [")
     launched.signal(signal.SIGINT)
@@ -372,7 +372,7 @@ def test_interrupt_before_the_host_listens_starts_no_agents(launched: Launched) 
     launched.start(
         host={"silent_start": True},
         timeouts={"shutdown_s": 0.5},
-        constants={"operator.MARGIN_S": 0.1},
+        constants={"host_limits.MARGIN_S": 0.1},
     )
     launched.wait_for_note("launched")
     launched.signal(signal.SIGINT)
@@ -419,7 +419,7 @@ def test_host_that_goes_on_without_agents_is_told_to_stop(launched: Launched) ->
         host={"runs_s": 60, "ignores_exits": True},
         agents={"killed_after_s": 0.1},
         timeouts={"silence_s": 0.25, "complete_s": 0.25, "shutdown_s": 1},
-        constants={"operator.MARGIN_S": 1},
+        constants={"host_limits.MARGIN_S": 1},
     )
 
     outcome = launched.outcome()

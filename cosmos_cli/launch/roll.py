@@ -1,0 +1,65 @@
+"""Who of a run's agents has started, ended, and may be started again. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from cosmos_cli.launch.outcome import LaunchRequest, Life
+
+
+class Roll:
+    """
+    The roll of the agents that supervisors run.
+
+    Args:
+        request: Who runs where.
+    """
+
+    def __init__(self, request: LaunchRequest) -> None:
+        self._machines: Mapping[str, tuple[str, ...]] = request.machines
+        self._manual = frozenset(request.manual)
+        config = request.config
+        may_continue = config.on_agent_loss == "continue"
+        self._restarts_max = config.agents.restarts_max if may_continue else 0
+        self._incarnations: dict[str, int] = {}
+        self._done: set[str] = set()
+        self._lives: dict[str, int] = {}
+        self.ended: set[str] = set()
+        """Agents whose process has ended, and that were not started again."""
+
+    def started(self, agent: str, incarnation: int) -> None:
+        """Note a new process of an agent."""
+        self.ended.discard(agent)
+        self._incarnations[agent] = max(incarnation, self._incarnations.get(agent, 0))
+
+    def exited(self, agent: str, *, is_abnormal: bool) -> None:
+        """Note the end of an agent's process."""
+        self.ended.add(agent)
+        if not is_abnormal:
+            self._done.add(agent)
+
+    def left_on(self, machine: str) -> tuple[str, ...]:
+        """Return a machine's agents of whose end nobody has heard."""
+        return tuple(sorted(set(self._own(machine)) - self.ended))
+
+    def restartable_on(self, machine: str) -> tuple[str, ...]:
+        """Return a machine's agents that were cut off and may be started once more."""
+        return tuple(
+            agent
+            for agent in self._own(machine)
+            if agent not in self._done and 0 < self._restarts_max >= self._count(agent)
+        )
+
+    def next_life_on(self, machine: str) -> Life:
+        """Return what a new supervisor of a machine is told of those before it."""
+        number = self._lives.get(machine, 1) + 1
+        self._lives[machine] = number
+        incarnations = {agent: self._count(agent) + 1 for agent in self._own(machine)}
+        return Life(number=number, incarnations=incarnations)
+
+    def _own(self, machine: str) -> tuple[str, ...]:
+        names = self._machines.get(machine, ())
+        return tuple(name for name in names if name not in self._manual)
+
+    def _count(self, agent: str) -> int:
+        return self._incarnations.get(agent, 0)
