@@ -20,12 +20,29 @@ from .disk import list_loop_devices, remove_loop_devices
 from .network import remove_interface
 from .places import Places
 
+GROUPS = "groups"
 
-def mount_cgroups(target: Path, name: str) -> Path:
-    """Mount the control groups where only this mount namespace sees them; return the tower's own."""
-    target.mkdir(parents=True, exist_ok=True)
+
+def mount_groups(places: Places) -> Path:
+    """
+    Make the tower's control group and mount it where only this mount namespace sees it.
+
+    Only the tower's own: nothing that goes wrong here may reach the machine's other groups.
+    """
+    target = places.folder / GROUPS
+    target.mkdir(exist_ok=True)
     kernel.mount("cgroup2", target, "cgroup2")
-    return target / name
+    own = target / places.cgroup
+    own.mkdir(exist_ok=True)
+    kernel.mount(own, target, flags=kernel.MS_BIND)
+    return target
+
+
+def unmount(places: Places) -> None:
+    """Take away the mounts of this mount namespace in the tower's folder."""
+    for path in (places.private, places.folder / GROUPS):
+        while os.path.ismount(path):
+            kernel.unmount(path, kernel.MNT_DETACH)
 
 
 def clean(places: Places) -> None:
@@ -79,12 +96,12 @@ def _clean_groups(places: Places) -> None:
     """Kill what is left in the tower's control groups and remove them."""
     kernel.unshare(kernel.CLONE_NEWNS)
     kernel.make_mounts_private()
-    groups = mount_cgroups(places.folder / "groups", places.cgroup)
-    if groups.is_dir():
-        for group in [path for path in groups.iterdir() if path.is_dir()]:
-            kill_group(group)
-            remove_group(group)
-        remove_group(groups)
+    groups = mount_groups(places)
+    for group in [path for path in groups.iterdir() if path.is_dir()]:
+        kill_group(group)
+        remove_group(group)
+    kernel.unmount(groups)
+    remove_group(groups / places.cgroup)
 
 
 def _in_child(function: Callable[[], None]) -> None:

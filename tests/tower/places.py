@@ -64,7 +64,13 @@ class Places:
 
     def remove(self) -> None:
         """Delete the files, and the parent folder with the last tower."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        for path in self.folder.iterdir() if self.folder.is_dir() else ():
+            if path.is_dir() and not os.path.ismount(path):  # never into what is mounted there
+                shutil.rmtree(path, ignore_errors=True)
+            elif not path.is_dir():
+                path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            self.folder.rmdir()
         with contextlib.suppress(OSError):
             RUN.rmdir()
 

@@ -57,6 +57,7 @@ LIMITS = {
     resource.RLIMIT_NICE: (0, 0),
 }
 """As on a freshly installed Debian; what `up` sets in /etc/security must show."""
+NANOSECONDS = 1_000_000_000
 TEMPORARY_BYTES = "size=256m"
 
 
@@ -79,7 +80,8 @@ def renew_clocks() -> None:
         kernel.unshare(kernel.CLONE_NEWTIME)
         offsets = []
         for name, clock in (("monotonic", time.CLOCK_MONOTONIC), ("boottime", time.CLOCK_BOOTTIME)):
-            offsets.append(f"{name} {-int(time.clock_gettime(clock))} 0\n")
+            seconds, nanoseconds = divmod(-time.clock_gettime_ns(clock), NANOSECONDS)
+            offsets.append(f"{name} {seconds} {nanoseconds}\n")
         Path("/proc/self/timens_offsets").write_text("".join(offsets))
 
 

@@ -66,7 +66,6 @@ class Supervisor:
         self._boards: dict[str, Board] = {}
         self._places: Places
         self._switch: Switch
-        self._groups: Path
 
     def run(self, on_up: Callable[[dict[str, Any]], None]) -> None:
         """
@@ -79,28 +78,24 @@ class Supervisor:
         """
         self._watch_signals()
         self._places, network, lock = layout.claim(self._options.spec.network)
-        guardian = cleaning.start_guardian(self._places, lock)
-        try:
+        with contextlib.ExitStack() as stack:
+            stack.callback(os.close, lock)
+            stack.callback(os.close, cleaning.start_guardian(self._places, lock))
+            stack.callback(cleaning.clean, self._places)
             self._switch = Switch(network, self._places.uplink)
+            stack.callback(self._switch.close)
             kernel.unshare(kernel.CLONE_NEWNS)
             kernel.make_mounts_private()
-            self._groups = cleaning.mount_cgroups(
-                self._places.folder / "groups", self._places.cgroup
-            )
-            self._groups.mkdir()
-            self._boards = layout.make_boards(
-                self._options.spec, self._places, network, self._groups
-            )
+            stack.callback(cleaning.unmount, self._places)
+            groups = cleaning.mount_groups(self._places)
+            self._boards = layout.make_boards(self._options.spec, self._places, network, groups)
+            stack.callback(self._end_boards)
             self._listen()
             self._start_all()
             if not self._must_stop:
                 on_up(self.describe())
-            self._loop()
-        finally:
-            self._take_down()
-            cleaning.clean(self._places)
-            os.close(guardian)
-            os.close(lock)
+            while not self._must_stop:
+                self._step()
 
     def describe(self) -> dict[str, Any]:
         """Return the tower's state as plain data."""
@@ -171,10 +166,6 @@ class Supervisor:
         board.disk.release()
 
     # The loop -------------------------------------------------------------------------------------
-
-    def _loop(self) -> None:
-        while not self._must_stop:
-            self._step()
 
     def _step(self) -> None:
         """Wait for the next event and handle it."""
@@ -275,8 +266,8 @@ class Supervisor:
 
     # The end --------------------------------------------------------------------------------------
 
-    def _take_down(self) -> None:
-        """End every board. Files and control groups are removed by `cleaning.clean`."""
+    def _end_boards(self) -> None:
+        """Kill every board; what they held is let go by `cleaning`, whatever fails here."""
         for board in self._boards.values():
             board.kill()
         for board in self._boards.values():
@@ -284,8 +275,6 @@ class Supervisor:
                 os.waitpid(board.supply, 0)
                 with contextlib.suppress(BoardError, DiskError, NetworkError, OSError):
                     self._release(board)
-        if hasattr(self, "_switch"):
-            self._switch.close()
 
     def _read_logs(self, names: list[str]) -> str:
         texts = []

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import signal
 import socket
 import subprocess
 import sys
@@ -26,7 +24,6 @@ from .inventory import format_inventory
 from .places import Places
 from .specification import BoardSpec, TowerSpec, name_boards
 
-START_PATIENCE_S = 180.0
 STOP_PATIENCE_S = 30.0
 ANSWER_PATIENCE_S = 60.0
 POLL_S = 0.02
@@ -108,13 +105,7 @@ class Tower:
             stderr=subprocess.PIPE,
             start_new_session=True,  # Ctrl-C is for the test runner, which then stops the tower
         )
-        assert self.process.stdout is not None and self.process.stderr is not None
-        line = self.process.stdout.readline()  # ends at the latest with START_PATIENCE_S over there
-        if not line:
-            talk = self.process.stderr.read().decode(errors="replace")
-            self.process.communicate()
-            raise TowerError(f"the tower did not start:\n{talk}")
-        state = json.loads(line)
+        state = self._read_state(self.process)
         self.places = Places(state["tower"])
         self.boards = {
             name: BoardInfo(
@@ -125,21 +116,25 @@ class Tower:
 
     def stop(self) -> None:
         """Take everything down and wait until nothing is left of it."""
-        process, self.process = self.process, None
-        if process is None:
-            return
-        assert process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):
-            process.stdin.close()
+        if self.process is not None:
+            _end(self.process)
+            self.process = None
+            wait_until_gone(self.places)
+
+    def _read_state(self, process: subprocess.Popen[bytes]) -> dict[str, Any]:
+        """Return what the supervisor says when it is up; if it does not come up, raise what it says then."""
+        assert process.stdout is not None and process.stderr is not None
         try:
-            process.wait(STOP_PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        for pipe in (process.stdout, process.stderr):
-            if pipe is not None:
-                pipe.close()
-        wait_until_gone(self.places)
+            line = process.stdout.readline()  # the supervisor's own deadlines end this wait
+            if line:
+                state: dict[str, Any] = json.loads(line)
+                return state
+            talk = process.stderr.read().decode(errors="replace")
+        except BaseException:  # an impatient user's Ctrl-C, too, must not leave a tower
+            _end(process)
+            raise
+        _end(process)
+        raise TowerError(f"the tower did not start:\n{talk}")
 
     # What it can do -------------------------------------------------------------------------------
 
@@ -265,7 +260,16 @@ def wait_until_gone(places: Places) -> None:
         time.sleep(POLL_S)
 
 
-def kill(process: subprocess.Popen[bytes]) -> None:
-    """Kill a supervisor as the kernel's memory killer would; for tests of what is left behind."""
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Let a supervisor end by closing its input, or end it."""
+    assert process.stdin is not None
+    with contextlib.suppress(BrokenPipeError):
+        process.stdin.close()
+    try:
+        process.wait(STOP_PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        process.kill()  # its guardian cleans up
+        process.wait()
+    for pipe in (process.stdout, process.stderr):
+        if pipe is not None:
+            pipe.close()

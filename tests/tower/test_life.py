@@ -1,0 +1,227 @@
+"""However a tower ends, nothing of it is left: no process, mount, namespace, link, group or file."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from . import kernel
+from .network import list_networks
+from .places import Places
+from .tower import Tower, TowerError, wait_until_gone
+
+pytestmark = pytest.mark.root
+
+PATIENCE_S = 20.0
+ROOT = Path(__file__).parents[2]
+CLI = (sys.executable, "-m", "tests.tower")
+OWNER = """
+import sys, time
+sys.path.insert(0, sys.argv[1])
+from tower import Tower
+with Tower(count=2) as tower:
+    print(tower.places.index, flush=True)
+    time.sleep(600)
+"""
+
+
+def list_processes(folder: str) -> set[tuple[int, str]]:
+    """Return the processes that live on a tower's mounts: number and start time."""
+    found = set()
+    for path in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            fields = (path / "stat").read_text().rpartition(")")[2].split()
+            mounts = (path / "mountinfo").read_text()
+            if f"lowerdir={folder}/" in mounts and fields[0] not in "ZX":
+                found.add((int(path.name), fields[19]))
+    return found
+
+
+def list_traces(places: Places) -> list[str]:
+    """Return what is left of a tower, in words."""
+    traces = [f"process {pid}" for pid, _ in list_processes(str(places.folder))]
+    if places.folder.exists():
+        traces.append(f"{places.folder}: {sorted(p.name for p in places.folder.rglob('*'))[:5]}")
+    if Path(f"/sys/class/net/{places.uplink}").exists():
+        traces.append(places.uplink)
+    if str(places.folder) in Path("/proc/self/mountinfo").read_text():
+        traces.append("mounts")
+    for backing in Path("/sys/block").glob("loop*/loop/backing_file"):
+        with contextlib.suppress(OSError):
+            if str(places.folder) in backing.read_text():
+                traces.append(str(backing))
+    return traces + list_groups(places)
+
+
+def list_groups(places: Places) -> list[str]:
+    """Return the tower's control groups, seen from a mount of our own."""
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            kernel.unshare(kernel.CLONE_NEWNS)
+            kernel.make_mounts_private()
+            kernel.mount("cgroup2", "/mnt", "cgroup2")
+            found = [str(path) for path in Path("/mnt").rglob(places.cgroup)]
+            os.write(write, json.dumps(found).encode())
+        finally:
+            os._exit(0)
+    os.close(write)
+    os.waitpid(child, 0)
+    with os.fdopen(read) as pipe:
+        return json.loads(pipe.read())  # type: ignore[no-any-return]
+
+
+def wait_until(condition: Callable[[], object], what: str) -> None:
+    until_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < until_s, what
+        time.sleep(0.02)
+
+
+def stress(tower: Tower) -> None:
+    """Do to a tower what makes it hard to clean up."""
+    tower.fault("pi01", "freeze")
+    tower.run("pi02", "setsid sleep 1000 >/dev/null 2>&1 & echo; head -c 5M /dev/zero > big")
+    tower.fault("pi02", "loss", 10)
+
+
+def find_guardian(supervisor: int) -> int:
+    """Return the supervisor's guardian: the other process that holds the tower's folder open."""
+    folder = os.readlink(next(iter(find_locks(supervisor))))
+    for path in Path("/proc").glob("[0-9]*"):
+        if int(path.name) != supervisor:
+            with contextlib.suppress(OSError):
+                if any(os.readlink(link) == folder for link in (path / "fd").iterdir()):
+                    return int(path.name)
+    raise AssertionError("no guardian")
+
+
+def find_locks(process: int) -> list[Path]:
+    links = Path(f"/proc/{process}/fd").iterdir()
+    return [link for link in links if os.readlink(link).startswith("/run/cosmos-tower/")]
+
+
+def test_traces_are_seen_while_a_tower_runs(make_tower):
+    tower = make_tower(count=1)
+    traces = " ".join(list_traces(tower.places))
+    for word in ("process", str(tower.places.folder), tower.places.uplink, "loop", "cgroup"):
+        assert word in traces or word == "cgroup"
+    assert list_groups(tower.places)
+
+
+def test_stopped_tower_leaves_nothing(make_tower):
+    tower = make_tower(count=2)
+    stress(tower)
+    tower.stop()
+    assert list_traces(tower.places) == []
+
+
+def test_tower_ends_with_a_failing_test(make_tower):
+    class Failure(Exception):
+        pass
+
+    with pytest.raises(Failure), Tower(count=1) as tower:
+        raise Failure
+    assert list_traces(tower.places) == []
+
+
+def test_killed_supervisor_leaves_nothing(make_tower):
+    tower = make_tower(count=2)
+    stress(tower)
+    assert len(list_processes(str(tower.places.folder))) >= 4
+
+    os.kill(tower.process.pid, signal.SIGKILL)
+    wait_until_gone(tower.places)
+
+    wait_until(lambda: not list_traces(tower.places), f"{list_traces(tower.places)}")
+
+
+def test_down_cleans_up_after_supervisor_and_guardian_were_killed(make_tower):
+    tower = make_tower(count=2)
+    stress(tower)
+    guardian = find_guardian(tower.process.pid)
+
+    os.kill(guardian, signal.SIGKILL)
+    os.kill(tower.process.pid, signal.SIGKILL)
+    tower.process.wait()
+    assert tower.places.folder.exists()
+    run_cli("--tower", str(tower.places.index), "down")
+
+    wait_until(lambda: not list_traces(tower.places), f"{list_traces(tower.places)}")
+
+
+def test_killed_owner_takes_its_tower_with_it():
+    command = [sys.executable, "-c", OWNER, str(ROOT / "tests")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as owner:
+        assert owner.stdout is not None
+        places = Places(int(owner.stdout.readline()))
+        assert list_traces(places)
+        owner.kill()
+    wait_until_gone(places)
+    assert list_traces(places) == []
+
+
+def test_killed_boot_leaves_nothing():
+    """A supervisor killed at any moment of its start leaves nothing either."""
+    for delay_s in (0.1, 0.3, 0.5, 0.7):
+        with subprocess.Popen(
+            [*CLI, "up", "4"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        ) as process:
+            time.sleep(delay_s)
+            folders = {os.readlink(link) for link in find_locks(process.pid)}
+            process.kill()
+        for folder in folders:
+            places = Places(int(Path(folder).name))
+            wait_until_gone(places)
+            wait_until(lambda: not list_traces(places), f"{delay_s} s: {list_traces(places)}")  # noqa: B023 - called at once
+
+
+def test_towers_at_once_share_nothing(make_tower):
+    first, second = make_tower(count=1), make_tower(count=1)
+
+    assert first.places != second.places
+    assert first.boards["pi01"].address != second.boards["pi01"].address
+    first.run("pi01", "touch first")
+    assert second.run("pi01", "ls").stdout == ""
+    first.stop()
+    second.run("pi01", "true")
+
+
+def test_network_in_use_is_refused(make_tower):
+    tower = make_tower(count=1)
+    prefix = ".".join(tower.boards["pi01"].address.split(".")[:2])
+    with pytest.raises(TowerError, match=r"is in use here .*choose another"):
+        make_tower(count=1, network=prefix)
+    with pytest.raises(TowerError, match="is not private"):
+        make_tower(count=1, network="8.8")
+
+
+def test_networks_of_this_computer_are_known():
+    assert any(network.is_loopback for network in list_networks())
+
+
+def test_ctrl_c_ends_a_tower_in_the_foreground():
+    with subprocess.Popen(
+        [*CLI, "up", "2", "--json"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        places = Places(json.loads(process.stdout.readline())["tower"])
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE_S) == 0
+    assert list_traces(places) == []
+
+
+def run_cli(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*CLI, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True
+    )
