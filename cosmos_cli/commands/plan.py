@@ -92,7 +92,7 @@ def plan(
         latency_s=latency_s,
         maneuvers_at_once=maneuvers_at_once,
     )
-    feasibility = _feasibility(scenario_file, resources)
+    feasibility = feasibility_of(scenario_file, resources)
     _show_placement(console, launch_plan)
     _show_feasibility(console, feasibility, resources, latency_source)
     console.print_json(
@@ -106,7 +106,7 @@ def plan(
         raise typer.Exit(ExitCode.BUDGET_BROKEN)
 
 
-def _feasibility(scenario_file: ScenarioFile, resources: Resources) -> Feasibility | None:
+def feasibility_of(scenario_file: ScenarioFile, resources: Resources) -> Feasibility | None:
     """Return None for a simulation that does not tell what it asks for."""
     simulation, agents = scenario_file.simulation, scenario_file.scenario.agents
     if simulation.demand is None:

@@ -1,0 +1,240 @@
+"""Checks of what decides when a loop wakes up: scheduling, clocks, and who else wants the processors. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from cosmos_cli.doctor.case import Case
+from cosmos_cli.doctor.finding import Level, Remark
+
+CAP_IPC_LOCK = 14
+REALTIME_SHARE_WARNING = 0.9
+TIMER_RESOLUTION_S_MAX = 1e-6
+SLOW_CLOCK_SOURCES = frozenset(("hpet", "acpi_pm", "jiffies", "pit"))
+BUSY_PROCESSORS_WARNING = 0.5
+BUSY_PROCESSORS_NOTE = 0.1
+STEAL_SHARE_WARNING = 0.01
+TICKS_A_PROCESSOR_HZ_MAX = 4500.0
+"""Empty steps, one process an agent, on a processor of a server (measured: 93 agents at 100 Hz on two)."""
+LIMITS = "/etc/security/limits.d/90-cosmos.conf"
+
+
+def governor(case: Case) -> Iterator[Remark]:
+    """A processor that sleeps deeply or runs slowly wakes up late."""
+    governors = sorted(set(case.facts.governors.values()))
+    if not governors:
+        return
+    if governors == ["performance"]:
+        yield Remark(found="processors run at full speed")
+        return
+    path = "/sys/devices/system/cpu/cpu*/cpufreq/scaling_governor"
+    yield Remark(
+        level=Level.WARNING,
+        found=f"CPU governor is {', '.join(governors)}: expected performance",
+        cure=case.cure("cosmos_cpu_governor: performance", f"echo performance | sudo tee {path}"),
+    )
+
+
+def realtime(case: Case) -> Iterator[Remark]:
+    """SCHED_FIFO: with it the tail of the lateness is shorter by far (15 / 171 us against 16 / 6200)."""
+    measured = case.part("wake_ups")
+    if case.wants.policy == "normal":
+        yield Remark(found="normal scheduling, as the scenario asks for")
+    elif measured.get("policy") == "fifo":
+        yield Remark(found=f"SCHED_FIFO with priority {priority_of(case)} is permitted")
+    elif measured.get("refusal"):
+        line = f"'{case.facts.user} - rtprio {priority_of(case)}'"
+        cure = f"echo {line} | sudo tee -a {LIMITS}, then log in anew"
+        yield Remark(
+            level=Level.WARNING,
+            found=f"SCHED_FIFO with priority {priority_of(case)} is refused: {measured['refusal']}",
+            cure=case.cure(f"cosmos_realtime_priority: {priority_of(case)}", cure),
+        )
+
+
+def priority_of(case: Case) -> int:
+    """Return the priority that is asked for there; the host runs here, and one above the agents."""
+    return case.wants.priority + (1 if case.is_here else 0)
+
+
+def realtime_throttling(case: Case) -> Iterator[Remark]:
+    """The kernel takes the processor from real-time loops that use more than their share."""
+    runtime_us = case.part("kernel").get("realtime_runtime_us")
+    period_us = case.part("kernel").get("realtime_period_us")
+    if runtime_us is None or not period_us:
+        return
+    cure = case.cure_by("sysctl -w kernel.sched_rt_runtime_us=950000")
+    if runtime_us == 0:
+        yield Remark(
+            level=Level.ERROR,
+            found="real-time loops get no time at all (kernel.sched_rt_runtime_us = 0)",
+            cure=cure,
+        )
+    elif 0 < runtime_us < REALTIME_SHARE_WARNING * period_us:
+        yield Remark(
+            level=Level.WARNING,
+            found="real-time loops are stopped beyond a share of",
+            cure=cure,
+            figure=100 * runtime_us / period_us,
+            unit="%",
+        )
+    else:
+        share = "no limit" if runtime_us < 0 else f"{100 * runtime_us / period_us:.0f} %"
+        yield Remark(found=f"share of real-time loops: {share}")
+
+
+def memory_lock(case: Case) -> Iterator[Remark]:
+    """The host asks for resident memory, agents never do."""
+    limit_bytes = case.facts.memory_lock_bytes_max
+    if not case.is_here:
+        return
+    if limit_bytes is None or case.has_capability(CAP_IPC_LOCK):
+        yield Remark(found="the host may keep its memory resident")
+        return
+    line = f"'{case.facts.user} - memlock unlimited'"
+    yield Remark(
+        level=Level.NOTE,
+        found="the host's memory may be paged out: at most so much may be locked",
+        cure=f"echo {line} | sudo tee -a {LIMITS}, then log in anew",
+        figure=limit_bytes / 1024**2,
+        unit="MiB",
+    )
+
+
+def timer(case: Case) -> Iterator[Remark]:
+    """Without fine timers every wake-up waits for the next tick of the kernel."""
+    resolution_s = case.part("kernel").get("timer_resolution_s")
+    if resolution_s is None:
+        return
+    is_fine = resolution_s <= TIMER_RESOLUTION_S_MAX
+    yield Remark(
+        level=Level.OK if is_fine else Level.WARNING,
+        found="timer resolution",
+        cure="" if is_fine else "a kernel with high-resolution timers (CONFIG_HIGH_RES_TIMERS)",
+        figure=resolution_s * 1e9,
+        unit="ns",
+    )
+
+
+def clock_source(case: Case) -> Iterator[Remark]:
+    """A clock that is read through a slow device costs microseconds each time."""
+    source = case.part("kernel").get("clock_source")
+    if not source:
+        return
+    if source in SLOW_CLOCK_SOURCES:
+        yield Remark(
+            level=Level.WARNING,
+            found=f"its clock is read from {source}, which is slow",
+            cure="choose tsc in /sys/devices/system/clocksource/clocksource0/current_clocksource;"
+            " `dmesg` says why the kernel did not",
+        )
+    else:
+        yield Remark(found=f"its clock is read from {source}")
+
+
+def wake_up(case: Case) -> Iterator[Remark]:
+    """Lateness of a loop that does nothing, against the tolerance of the run."""
+    told = case.part("wake_ups")
+    if told.get("p99_ms") is None:
+        return
+    tolerance_ms = case.wants.tolerance_ms
+    level = Level.OK
+    if told["max_ms"] > tolerance_ms:
+        level = Level.NOTE
+    if told["p99_ms"] > tolerance_ms:
+        level = Level.WARNING
+    if told["p50_ms"] > tolerance_ms:
+        level = Level.ERROR
+    by = "SCHED_FIFO" if told["policy"] == "fifo" else "normal scheduling"
+    how = f"{told['count']} wake-ups at {told['rate_hz']:g} Hz, {by}"
+    over = "" if level == Level.OK else f", and {tolerance_ms:g} ms are tolerated"
+    yield Remark(
+        level=level,
+        found=f"lateness of {how}{over}; 99 % within",
+        cure="" if level == Level.OK else _lateness_cure(told["policy"]),
+        figure=told["p99_ms"],
+        unit="ms",
+        detail=f"median {told['p50_ms']:.3g} ms, longest {told['max_ms']:.3g} ms",
+    )
+
+
+def _lateness_cure(policy: str) -> str:
+    others = "end what else is busy there (`busy`, `governor`, `steal` tell)"
+    return others if policy == "fifo" else f"permit SCHED_FIFO (`realtime` tells how); {others}"
+
+
+def busy(case: Case) -> Iterator[Remark]:
+    """Other people's processes."""
+    told = case.part("busy")
+    used = told.get("processors")
+    if used is None:
+        return
+    level = Level.OK
+    if used >= BUSY_PROCESSORS_NOTE:
+        level = Level.WARNING if used >= BUSY_PROCESSORS_WARNING else Level.NOTE
+    top = ", ".join(
+        f"{item['name']} (pid {item['pid']}, {item['user'] or '?'}) {100 * item['processors']:.0f} %"
+        for item in told.get("top") or ()
+    )
+    yield Remark(
+        level=level,
+        found="other processes use, of one processor",
+        cure=""
+        if level == Level.OK
+        else "end them for the run, or keep agents off their processors (cosmos_cpu_affinity)",
+        figure=100 * used,
+        unit="%",
+        detail="" if level == Level.OK else top,
+    )
+
+
+def steal(case: Case) -> Iterator[Remark]:
+    """A virtual machine whose processors are given to others stands still meanwhile."""
+    share = case.part("busy").get("steal_share")
+    if not share:
+        return
+    yield Remark(
+        level=Level.WARNING if share >= STEAL_SHARE_WARNING else Level.OK,
+        found="its hypervisor gave its processors to others for",
+        cure="processors of its own for this virtual machine, or a real one"
+        if share >= STEAL_SHARE_WARNING
+        else "",
+        figure=100 * share,
+        unit="%",
+    )
+
+
+def cpu_quota(case: Case) -> Iterator[Remark]:
+    """A quota stops everything in the container for tens of milliseconds when it is used up."""
+    quota = case.part("limits").get("cpu_quota")
+    if quota is None:
+        return
+    yield Remark(
+        level=Level.WARNING,
+        found="its control group is stopped when it used, of the processors",
+        cure="run it without a quota (no --cpus or --cpu-quota; processors of its own: --cpuset-cpus)",
+        figure=quota,
+    )
+
+
+def processors(case: Case) -> Iterator[Remark]:
+    """Agents that the scenario places there, against its processors."""
+    agents = case.wants.agents.get(case.machine, 0)
+    usable = case.part("limits").get("usable_processors")
+    if not agents or not usable:
+        return
+    load_hz = agents * case.wants.tick_hz / usable
+    is_much = load_hz > TICKS_A_PROCESSOR_HZ_MAX
+    yield Remark(
+        level=Level.WARNING if is_much else Level.OK,
+        found=f"{agents} agents at {case.wants.tick_hz:g} Hz on {usable} processors"
+        + (
+            f": a fast one does {TICKS_A_PROCESSOR_HZ_MAX:g} empty steps a second"
+            if is_much
+            else ""
+        ),
+        cure="fewer agents there (cosmos_agents, placement), a lower tick_hz, or several agents in a"
+        " process (agents.per_process)"
+        if is_much
+        else "",
+    )
