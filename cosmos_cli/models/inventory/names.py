@@ -77,6 +77,8 @@ def _check_name(name: str, pattern: str) -> None:
         text = f"expected letters, digits, '.', '_' or '-', got {name!r}"
         if ":" in name:
             text += ": give the machine a name, and its address in ansible_host"
+        elif " " in name:
+            text += ": write a colon after each machine, and each on its own line"
         raise ValueError(text)
 
 

@@ -14,9 +14,7 @@ from cosmos_cli.models.document import Document, did_you_mean, kind_of
 from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.inventory.groups import GroupTree
 from cosmos_cli.models.inventory.names import GROUP_NAME, MACHINES_MAX, expand, split_port
-from cosmos_cli.models.inventory.variables import PRIORITY, variable_faults
-
-GROUP_KEYS = ("hosts", "children", "vars")
+from cosmos_cli.models.inventory.variables import GROUP_KEYS, PRIORITY, variable_faults
 
 
 @dataclass(slots=True)
@@ -180,7 +178,10 @@ class Reader:
         self, value: Any, document: Document, path: ValuePath
     ) -> TypeGuard[dict[str, Any]]:
         if value is not None and not isinstance(value, dict):
-            self._fault(document, path, f"expected a mapping, got {kind_of(value)}")
+            text = f"expected a mapping, got {kind_of(value)}"
+            if isinstance(value, list):
+                text += ": write `name:` instead of `- name`"
+            self._fault(document, path, text)
         return isinstance(value, dict)
 
     def _fault(self, document: Document, path: ValuePath, text: str) -> None:

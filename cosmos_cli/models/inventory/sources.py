@@ -95,7 +95,25 @@ def _with_readings(document: Document) -> Document:
     root = compose(document.source)
     if root is not None:
         document.faults += _reading_faults(document.source, root)
+    if not document.faults:
+        document.faults += _loading_faults(document.source)
     return document
+
+
+def _loading_faults(source: Source) -> list[Fault]:
+    """Return what PyYAML, with which Ansible reads, refuses: an anchor that is defined twice, and the like."""
+    try:
+        yaml.load(source.text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
+        text = f"Ansible cannot read this: {error.problem or error.context}"
+        if "duplicate anchor" in f"{error.context} {error.problem}":
+            text = "expected each anchor once, which is all that Ansible reads; rename this one"
+        return [source.fault(text, line=line, column=column)]
+    except (ValueError, yaml.YAMLError) as error:
+        return [source.fault(f"Ansible cannot read this file: {error}", line=1, column=1)]
+    return []
 
 
 def _reading_faults(source: Source, root: Node) -> Iterator[Fault]:

@@ -27,6 +27,13 @@ ROOT_DEFAULT = "~/cosmos"
 PRIORITY = "ansible_group_priority"
 """Of a group, not of its machines: the strongest of groups at the same depth has the highest."""
 PROVISION = "cosmos_provision"
+GROUP_KEYS = ("hosts", "children", "vars")
+SECRET_REFUSED = (
+    "expected no secret in an inventory, which is copied to every run's folder: log in with a"
+    " key (ssh-copy-id USER@MACHINE; ansible_ssh_private_key_file names it) or the ssh agent,"
+    " and let sudo ask for none"
+)
+SECRET_HIDDEN = "not understood, and not shown here: its name says that it is a secret"
 
 Address = Annotated[str, like(r"[^\s/@\[\],]+", "a host name or an address, and nothing more")]
 RootFolder = Annotated[
@@ -168,21 +175,21 @@ def variable_faults(
 
 
 def without_secrets(faults: list[Fault]) -> list[Fault]:
-    """Return the faults without the lines of the file that could show a secret on a terminal or in a log."""
-    return [
-        dataclasses.replace(fault, source="") if _SECRET_LINE.search(fault.source) else fault
-        for fault in faults
-    ]
+    """Return the faults without what could show a secret on a terminal or in a log: its value, and the line it is on."""
+    return [_without_secret(fault) for fault in faults]
+
+
+def _without_secret(fault: Fault) -> Fault:
+    names = re.split(r"[.\[]", fault.path)
+    if any(_SECRET.fullmatch(name) for name in names) and fault.text != SECRET_REFUSED:
+        return dataclasses.replace(fault, text=SECRET_HIDDEN, source="")
+    return dataclasses.replace(fault, source="") if _SECRET_LINE.search(fault.source) else fault
 
 
 def _name_faults(key: str, value: Any) -> Iterator[str]:
     if _SECRET.fullmatch(key):
         if value is not None:
-            yield (
-                "expected no secret in an inventory, which is copied to every run's folder: log in with a"
-                " key (ssh-copy-id USER@MACHINE; ansible_ssh_private_key_file names it) or the ssh agent,"
-                " and let sudo ask for none"
-            )
+            yield SECRET_REFUSED
     elif _SSH_OPTIONS.fullmatch(key):
         yield "not understood: write it in your ssh configuration (~/.ssh/config), which is honoured"
     elif _HOST_KEY_CHECKING.fullmatch(key):
@@ -194,6 +201,11 @@ def _name_faults(key: str, value: Any) -> Iterator[str]:
         yield "expected sh: machines are reached through a POSIX shell"
     elif key == PRIORITY:
         yield "expected in the vars of a group in the inventory itself: elsewhere it has no effect"
+    elif key in GROUP_KEYS:
+        yield (
+            f"expected a variable, got {key}, a part of a group: put the group under children, or look"
+            " at the indentation"
+        )
     elif _MAGIC_NAME.fullmatch(key):
         yield "Ansible sets this variable itself and ignores what is written here"
     elif key.startswith("cosmos_") and key not in Variables.model_fields:

@@ -129,6 +129,11 @@ def test_ranges_are_expanded_with_both_ends(pattern, names):
         ("host", "'host' is reserved; give the machine another name"),
         ("hos[s:u]", "'host' is reserved; give the machine another name"),
         (
+            "pi01 pi02",
+            "expected letters, digits, '.', '_' or '-', got 'pi01 pi02': write a colon after each machine,"
+            " and each on its own line",
+        ),
+        (
             "fe80::1",
             "expected letters, digits, '.', '_' or '-', got 'fe80::1': give the machine a name, and its"
             " address in ansible_host",
@@ -185,7 +190,12 @@ def test_every_fault_is_named_with_its_place(read):
         ),
         (7, 9, "all.hosts.m2", "expected a mapping, got 5"),
         (8, 5, "all.hosts.a", "a is a group, too; give one of them another name"),
-        (9, 13, "all.children", "expected a mapping, got a list"),
+        (
+            9,
+            13,
+            "all.children",
+            "expected a mapping, got a list: write `name:` instead of `- name`",
+        ),
         (10, 1, "a b", "expected letters, digits, '_', '-' or '.' in a group's name, got 'a b'"),
         (11, 36, "a.vars.ansible_group_priority", "expected a whole number, got 'x'"),
         (
@@ -228,6 +238,25 @@ def test_scalars_that_mean_the_same_in_both_readings_or_are_quoted_are_taken(rea
     assert machine.variables["x"] == ["no", "0644", "0644", 1.5, True, 16, "off-line"]
 
 
+def test_what_pyyaml_refuses_is_refused(read):
+    text = "all:\n  hosts: {a: {x: &l [1]}, b: {x: &l [2]}}\n"
+
+    assert faults_of(read, text)[0][:2] == (2, 34)
+    assert faults_of(read, text)[0][3].startswith("expected each anchor once")
+
+
+def test_group_among_the_machines_is_told_from_its_keys(read):
+    text = "all:\n  hosts:\n    m1:\n    tower:\n      hosts: {m2: }\n      vars: {x: 1}\n"
+
+    faults = faults_of(read, text)
+
+    assert [fault[:3] for fault in faults] == [
+        (5, 7, "all.hosts.tower.hosts"),
+        (6, 7, "all.hosts.tower.vars"),
+    ]
+    assert "put the group under children" in faults[0][3]
+
+
 def test_key_that_ansible_reads_otherwise_is_refused(read):
     faults = faults_of(read, "all: {hosts: {m: {on: 1}}}\n")
 
@@ -256,6 +285,22 @@ def test_secret_is_refused_and_never_shown(read, name):
     assert "ssh agent" in str(caught.value)
     assert "swordfish" not in str(caught.value)
     assert "swordfish" not in json.dumps(caught.value.details())
+
+
+@pytest.mark.parametrize("value", ["0644", "'{{ 0644 }}'", "\n      0644", "[0644]"])
+@pytest.mark.parametrize(
+    "place", ["ansible_password", "ansible_password_file: x\n    deep:\n      ansible_become_pass"]
+)
+def test_secret_is_not_shown_by_a_fault_of_its_own_value(read, place, value):
+    with pytest.raises(InputError) as caught:
+        read(
+            f"all:\n  hosts: {{m: }}\n  vars:\n    {place}: {value}\n".replace(
+                "\n      0644", "\n        0644"
+            )
+        )
+
+    assert "0644" not in str(caught.value)
+    assert "0644" not in json.dumps(caught.value.details())
 
 
 def test_secret_is_not_shown_by_a_fault_of_syntax_either(read):
