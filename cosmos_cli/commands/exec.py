@@ -22,7 +22,6 @@ from cosmos_cli.fleet.connection import Completed, Connection
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.outcome import Outcome, failed
 from cosmos_cli.fleet.watched import NO_SUDO_MARK, as_root, watched
-from cosmos_cli.models.inventory import Machine
 
 CONTEXT_SETTINGS = {"allow_interspersed_args": False}
 """What follows the command's first word belongs to it, with or without -- before."""
@@ -56,8 +55,8 @@ def exec(  # noqa: A001 - the verb's name is the function's
     console = Console(json=json, quiet=quiet)
     fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
     line = command[0] if len(command) == 1 else shlex.join(command)
-    width = max(len(machine.name) for machine in fleet.machines)
-    outcomes = fleet.each(
+    width = max(len(target.name) for target in fleet.targets)
+    outcomes = fleet.each_target(
         _task(line, is_root=sudo, timeout_s=timeout_s),
         lambda outcome: _print(console, outcome, width),
     )
@@ -73,12 +72,10 @@ def exec(  # noqa: A001 - the verb's name is the function's
     return int(exit_code)
 
 
-def _task(
-    line: str, *, is_root: bool, timeout_s: float
-) -> Callable[[Connection, Machine], Completed]:
+def _task(line: str, *, is_root: bool, timeout_s: float) -> Callable[[Connection], Completed]:
     shell_line = as_root(watched(line)) if is_root else watched(line)
 
-    def task(connection: Connection, machine: Machine) -> Completed:
+    def task(connection: Connection) -> Completed:
         if is_root and not connection.target.may_become_root:
             raise MachineFailure(
                 FailureKind.NO_SUDO,

@@ -18,7 +18,6 @@ from cosmos_cli.console import Console, JsonOption, QuietOption
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.fleet.connection import Connection
 from cosmos_cli.fleet.outcome import Outcome, failed
-from cosmos_cli.models.inventory import Machine
 
 COMMAND_TIMEOUT_S = 10.0
 
@@ -42,7 +41,7 @@ def ping(
     console = Console(json=json, quiet=quiet)
     fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
     lines = _Lines(console, fleet)
-    outcomes = fleet.each(_ask, lines.take)
+    outcomes = fleet.each_target(_ask, lines.take)
     bad = failed(outcomes)
     exit_code = ExitCode.MACHINES if bad else ExitCode.OK
     console.data(_verdict(len(outcomes), len(bad)))
@@ -58,7 +57,7 @@ def ping(
     return int(exit_code)
 
 
-def _ask(connection: Connection, machine: Machine) -> Times:
+def _ask(connection: Connection) -> Times:
     start_s = time.monotonic()
     connection.run("true", timeout_s=COMMAND_TIMEOUT_S)
     return connection.opening_s * 1e3, (time.monotonic() - start_s) * 1e3
@@ -69,7 +68,7 @@ class _Lines:
 
     def __init__(self, console: Console, fleet: Fleet) -> None:
         self._console = console
-        self._names = [machine.name for machine in fleet.machines]
+        self._names = [target.name for target in fleet.targets]
         self._width = max(map(len, self._names))
         self._address_width = max(len(target.address) for target in fleet.targets)
         self._addresses = {target.name: target.address for target in fleet.targets}

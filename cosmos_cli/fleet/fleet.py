@@ -3,31 +3,41 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from cosmos_cli.fleet.connect import connect
 from cosmos_cli.fleet.connection import Connection, ConnectOptions
 from cosmos_cli.fleet.outcome import Outcome
 from cosmos_cli.fleet.pool import FORKS_DEFAULT, for_each
+from cosmos_cli.fleet.remembered import key_of, recall, remember
 from cosmos_cli.fleet.target import Target, target_of
-from cosmos_cli.models.inventory import Machine, load_machines
+
+if TYPE_CHECKING:
+    from cosmos_cli.models.inventory import Machine
 
 T = TypeVar("T")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Fleet:
     """What -i and --limit mean."""
 
-    machines: tuple[Machine, ...]
     targets: tuple[Target, ...]
-    """Of the machines, in the same order."""
+    """How to reach the machines, in the order of the inventory."""
     forks: int = FORKS_DEFAULT
     options: ConnectOptions = ConnectOptions()
+    load: Callable[[], tuple[Machine, ...]] = tuple
+    """Reads the inventory; who needs the targets alone is spared it."""
+
+    @functools.cached_property
+    def machines(self) -> tuple[Machine, ...]:
+        """All that the inventory says of the targets, in the same order."""
+        return self.load()
 
     def each(
         self,
@@ -38,7 +48,7 @@ class Fleet:
         Connect to every machine, do *task* there, and close the connection.
 
         Args:
-            task: Called in a thread, with an open connection.
+            task: Called in a thread, with an open connection and what the inventory says of the machine.
             on_done: Called in this thread as each machine is done.
 
         Returns:
@@ -49,12 +59,22 @@ class Fleet:
             InputError: The operator's ssh configuration cannot be read.
         """
         machines = {machine.name: machine for machine in self.machines}
+        return self.each_target(
+            lambda connection: task(connection, machines[connection.target.name]), on_done
+        )
+
+    def each_target(
+        self,
+        task: Callable[[Connection], T],
+        on_done: Callable[[Outcome[T]], None] = lambda outcome: None,
+    ) -> list[Outcome[T]]:
+        """Do the same without asking what the inventory says beyond how to reach the machines."""
         living = _Living()
 
         def work(target: Target) -> T:
             connection = connect(target, self.options)
             with living.holding(connection):
-                return task(connection, machines[target.name])
+                return task(connection)
 
         try:
             return for_each(self.targets, work, forks=self.forks, on_done=on_done)
@@ -99,10 +119,23 @@ def fleet_of(
     Raises:
         InputError: With every fault found.
     """
-    machines = load_machines(inventory, limit)
+    key = key_of(inventory, limit)
+    targets = recall(key)
+    load = functools.partial(_machines, inventory, limit)
+    if targets is None:
+        machines = load()
+        load = functools.partial(tuple, machines)
+        targets = tuple(target_of(machine) for machine in machines)
+        remember(key, targets)
     return Fleet(
-        machines=machines,
-        targets=tuple(target_of(machine) for machine in machines),
+        targets=targets,
         forks=forks,
         options=ConnectOptions(accept_new_host_keys=accept_new_host_keys),
+        load=load,
     )
+
+
+def _machines(inventory: Path, limit: str | None) -> tuple[Machine, ...]:
+    from cosmos_cli.models.inventory import load_machines  # takes 0.2 s to import
+
+    return load_machines(inventory, limit)
