@@ -14,7 +14,9 @@ from typing import Any, Protocol
 from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.layout import Layout
+from cosmos_cli.provision.environment import install_environment
 from cosmos_cli.provision.step import Kind, Request, Step
+from cosmos_cli.provision.trees import send_tree
 
 OWN_KINDS = (
     FailureKind.STEP,
@@ -105,13 +107,9 @@ class Applier:
         self.teller.detail(f"{what} ({share:.0%})")
 
     def _environment(self, step: Step) -> bool:
-        from cosmos_cli.provision.environment import install_environment
-
         return install_environment(self.board, self.layout, step.subject, self._tell_share)
 
     def _tree(self, step: Step) -> bool:
-        from cosmos_cli.provision.trees import send_tree
-
         return send_tree(self.board, self.layout, step.subject, self._tell_share)
 
 
@@ -128,6 +126,8 @@ def _has_changed(verb: str, value: Any) -> bool:
             return bool(value.get("changes"))
         case "command":
             return bool(value.get("ran"))
+        case "prune_installed":
+            return any(value.values())
         case "service" | "set_values":
             return True
     return bool(value)

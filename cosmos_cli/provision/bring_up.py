@@ -10,17 +10,18 @@ from __future__ import annotations
 import dataclasses
 import os
 import socket
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.connection import Connection
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.models.inventory import Machine
 from cosmos_cli.provision.apply import Applier, Done, Teller
+from cosmos_cli.provision.environment import PARTS
 from cosmos_cli.provision.facts import Facts, files_of
 from cosmos_cli.provision.notes import notes_of, priority_notes
 from cosmos_cli.provision.settings import setting_files
@@ -28,7 +29,7 @@ from cosmos_cli.provision.step import Kind, Step
 from cosmos_cli.provision.steps import check_possible, installed_question, plan_steps
 from cosmos_cli.provision.wanted import Content, Paths, Wanted, questions, wanted_of
 
-LOOK_PARTS = ("files", "facts", "store", "trees", "environment")
+LOOK_PARTS = ("files", "facts", *PARTS)
 WORK_PARTS = (*LOOK_PARTS, "system", "apt_words", "apt")
 LOCK_PATIENCE_S = 60.0
 """Without a question for so long the machine's lock is given up: the operator is gone."""
@@ -38,19 +39,38 @@ LOGIN_TIMEOUT_S = 10.0
 CHECK_TITLE = "runtime starts, and UDP comes and goes"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Kit:
-    """What machines are made ready with; one for all of them."""
+class Kit(Protocol):
+    """What machines are made ready with; one for all of them, used by many threads."""
 
-    environments: Callable[[Machine, Mapping[str, Any], Teller], tuple[Any, ...]]
-    """Builds what a machine needs, from its entry and what the helper there greeted with."""
-    trees: tuple[Any, ...]
-    """The runtime's first."""
-    read_file: Callable[[Path], Content]
-    echo: Callable[[Connection, Machine], Mapping[str, Any] | None]
-    """How a machine asks this computer for a UDP answer; None to leave that out."""
-    connect_again: Callable[[Connection], Connection]
-    paths: Paths = Paths()
+    @property
+    def trees(self) -> tuple[Any, ...]:
+        """Return the trees that every machine gets, the runtime's first."""
+
+    @property
+    def paths(self) -> Paths:
+        """Return where a machine's system keeps its settings."""
+
+    def environments(
+        self, machine: Machine, greeting: Mapping[str, Any], teller: Teller
+    ) -> tuple[Any, ...]:
+        """Return what a machine needs, built for what its helper greeted with."""
+
+    def read_file(self, path: Path) -> Content:
+        """Return a file of this computer."""
+
+    def udp_question(self, connection: Connection, machine: Machine) -> dict[str, Any]:
+        """Return where a machine is to send a datagram that comes back."""
+
+    def udp_heard(self, question: dict[str, Any]) -> int:
+        """Return how many datagrams of a question came here."""
+
+    def checks(
+        self, wanted: Wanted, udp: Mapping[str, Any], *, is_full: bool
+    ) -> list[dict[str, Any]]:
+        """Return the arguments of the questions whether the runtime starts there."""
+
+    def connect_again(self, connection: Connection) -> Connection:
+        """Return a second connection to the same machine: a new login."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,11 +147,11 @@ class _Work:
                 ),
                 paths=self.kit.paths,
             )
-            check = self._check_calls(wanted)
-            refused = self._look(board, wanted, also=check)
+            udp = self.kit.udp_question(self.connection, self.machine)
+            checks = self._look(board, wanted, also=self._checks(wanted, udp, is_full=False))
             steps = self._plan(wanted)
             if not steps:
-                _raise_first(refused)
+                self._raise_first(checks, udp)
                 self._note(wanted)
                 self._checked()
                 return
@@ -142,24 +162,37 @@ class _Work:
                 self._note(wanted)
                 self.brought.done = [Done(step=step, changed=True) for step in steps]
                 return
-        self._change(wanted, check)
+        self._change(wanted)
 
-    def _change(self, wanted: Wanted, check: Sequence[Mapping[str, Any]]) -> None:
+    def _change(self, wanted: Wanted) -> None:
         with Board.start(self.connection, WORK_PARTS) as board:
-            self._lock(board, wanted)
-            self._look(board, wanted, is_sudo_asked=True)
-            steps = self._plan(wanted)
-            check_possible(self._facts, steps)
             applier = Applier(board=board, layout=wanted.layout, teller=self.teller)
             self.brought.done = applier.done
             try:
-                applier.apply(steps)
+                self._apply(board, wanted, applier)
             finally:
                 self.brought.notes += applier.notes
             self.teller.detail("checking")
-            _raise_first(_several(board, check))
+            udp = self.kit.udp_question(self.connection, self.machine)
+            self._raise_first(_several(board, self._checks(wanted, udp, is_full=True)), udp)
         self._note(wanted)
         self._checked()
+
+    def _apply(self, board: Board, wanted: Wanted, applier: Applier) -> None:
+        """Make the folders, for the lock is in one of them; lock; look again; do the rest."""
+        self._look(board, wanted, is_sudo_asked=True)
+        steps = self._plan(wanted)
+        check_possible(self._facts, steps)
+        folders = tuple(step for step in steps if step.kind is Kind.DIRECTORY)
+        applier.apply(folders)
+        self._lock(board, wanted)
+        can_become_root = self._facts.can_become_root
+        self._look(board, wanted, touch=True)
+        self.brought.facts = dataclasses.replace(self._facts, can_become_root=can_become_root)
+        steps = self._plan(wanted)
+        check_possible(self._facts, steps)
+        self.brought.planned = (*folders, *steps)
+        applier.apply(steps)
 
     @property
     def _facts(self) -> Facts:
@@ -185,6 +218,7 @@ class _Work:
         wanted: Wanted,
         *,
         is_sudo_asked: bool = False,
+        touch: bool = False,
         also: Sequence[Mapping[str, Any]] = (),
     ) -> list[Mapping[str, Any]]:
         """Ask for all facts at once, and for *also*, whose answers are returned."""
@@ -198,7 +232,7 @@ class _Work:
         is_sudo_asked = is_sudo_asked and wanted.may_become_root
         calls = [
             {"verb": "facts", "arguments": {**asked, "sudo": is_sudo_asked}},
-            {"verb": "installed", "arguments": installed_question(wanted)},
+            {"verb": "installed", "arguments": installed_question(wanted, touch=touch)},
             *also,
         ]
         asked_utc_s = _utc_s()
@@ -213,22 +247,22 @@ class _Work:
         self.brought.facts = facts
         return others
 
-    def _check_calls(self, wanted: Wanted) -> list[Mapping[str, Any]]:
-        """Return the questions that tell whether the runtime starts there and UDP comes and goes."""
-        if not wanted.trees:
-            return []
-        layout, udp = wanted.layout, self.kit.echo(self.connection, self.machine)
-        return [
-            {
-                "verb": "check_runtime",
-                "arguments": {
-                    "python": layout.python(environment.key),
-                    "path": layout.tree(wanted.trees[0].hash),
-                    "udp": udp if index == 0 else None,
-                },
-            }
-            for index, environment in enumerate(wanted.environments)
-        ]
+    def _checks(
+        self, wanted: Wanted, udp: dict[str, Any], *, is_full: bool
+    ) -> list[Mapping[str, Any]]:
+        asked = self.kit.checks(wanted, udp, is_full=is_full)
+        return [{"verb": "check_runtime", "arguments": arguments} for arguments in asked]
+
+    def _raise_first(self, answers: Sequence[Mapping[str, Any]], udp: dict[str, Any]) -> None:
+        """Raise for a check that failed; say of datagrams that came but were not answered there, that it is so."""
+        try:
+            _raise_first(answers)
+        except MachineFailure as failure:
+            if "no UDP" not in failure.text or not self.kit.udp_heard(udp):
+                raise
+            text = "UDP from there comes here, but the answers do not come back"
+            advice = "is a firewall closing it, on the machine or on the way?"
+            raise MachineFailure(failure.kind, text, advice) from None
 
     def _checked(self) -> None:
         if self.kit.trees:

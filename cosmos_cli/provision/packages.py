@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from cosmos_cli.provision.facts import Facts
 from cosmos_cli.provision.step import Kind, Request, Step
 
-SIGN_OF_LIFE_TIMEOUT_S = 20.0
+SIGN_OF_LIFE_TIMEOUT_S = 30.0
 """The package manager's helper says once a second that it still runs."""
 ROOM_BYTES = 20_000_000
 """A guess for one package; what it really takes only apt knows, and it looks itself."""

@@ -11,6 +11,7 @@ from typing import Any
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.provision.declared import declared_steps
+from cosmos_cli.provision.environment import installed_request
 from cosmos_cli.provision.facts import Facts
 from cosmos_cli.provision.packages import package_step
 from cosmos_cli.provision.settings import setting_steps
@@ -136,18 +137,14 @@ def _prune(facts: Facts, wanted: Wanted) -> Iterator[Step]:
     )
 
 
-def installed_question(wanted: Wanted) -> dict[str, Any]:
-    """Return the arguments of the verbs "installed" and "prune_installed"."""
-    layout = wanted.layout
-    return {
-        "folders": {
-            "trees": layout.trees,
-            "environments": layout.environments,
-            "wheels": layout.wheels,
-        },
-        "trees": [tree.hash for tree in wanted.trees],
-        "environments": [environment.key for environment in wanted.environments],
-    }
+def installed_question(wanted: Wanted, *, touch: bool = False) -> dict[str, Any]:
+    """Return the arguments of the verbs "installed" and "prune_installed"; *touch* as `installed_request`."""
+    return installed_request(
+        wanted.layout,
+        trees=[tree.hash for tree in wanted.trees],
+        environments=[environment.key for environment in wanted.environments],
+        touch=touch,
+    )
 
 
 PLANNERS: tuple[Planner, ...] = (

@@ -8,11 +8,11 @@ from typing import Any, Literal
 
 from cosmos_cli.console import Column
 from cosmos_cli.fleet.failure import MachineFailure
+from cosmos_cli.fleet.names import compact
 from cosmos_cli.provision.bring_up import Brought
 from cosmos_cli.provision.step import Change, Step
 
 COLUMNS = (Column("machine"), Column("board"), Column("result"))
-NAMES_SHOWN_MAX = 8
 FAILURE_CHARACTERS_MAX = 600
 """Of a failure in the table; --json has all of it."""
 
@@ -107,7 +107,7 @@ def plan_lines(results: Sequence[MachineResult], *, has_diffs: bool) -> Iterator
             lines = tuple(_step_lines(result.brought.planned, has_diffs=has_diffs))
             groups.setdefault(lines, []).append(result)
     for lines, members in groups.items():
-        yield f"{', '.join(member.machine for member in members)}:"
+        yield f"{compact(member.machine for member in members)}:"
         yield from lines
 
 
@@ -146,11 +146,4 @@ def note_lines(results: Sequence[MachineResult]) -> Iterator[str]:
         for note in result.brought.notes:
             about.setdefault(note, []).append(result.machine)
     for note, machines in about.items():
-        yield f"{names_words(machines)}: {note}"
-
-
-def names_words(machines: Sequence[str]) -> str:
-    """Return names such as "pi01, pi02 and 3 more"."""
-    shown = ", ".join(machines[:NAMES_SHOWN_MAX])
-    more = len(machines) - NAMES_SHOWN_MAX
-    return f"{shown} and {more} more" if more > 0 else shown
+        yield f"{compact(machines)}: {note}"

@@ -62,9 +62,7 @@ def edited(content: str, *, line: str | None, regexp: str | None, is_present: bo
         if (index < len(lines) - 1 or text) and _is_meant(text.rstrip("\r"), line, regexp)
     ]
     if not is_present:
-        kept = [text for index, text in enumerate(lines) if index not in meant]
-        has_lost_end = bool(meant) and meant[-1] == len(lines) - 1 and len(lines) > 1
-        return "\n".join([*kept, ""] if has_lost_end and kept else kept)
+        return _without(lines, meant)
     if line is None:
         raise ValueError("expected the line that is to be present")
     end = "\r" if "\r\n" in content else ""
@@ -76,6 +74,13 @@ def edited(content: str, *, line: str | None, regexp: str | None, is_present: bo
         lines[-1] += end
         lines.append("")
     return "\n".join([*lines[:-1], line + end, ""])
+
+
+def _without(lines: list[str], meant: list[int]) -> str:
+    kept = [text for index, text in enumerate(lines) if index not in meant]
+    if kept and meant and meant[-1] == len(lines) - 1:
+        kept.append("")  # the line above keeps its end
+    return "\n".join(kept)
 
 
 def _is_meant(text: str, line: str | None, regexp: str | None) -> bool:

@@ -5,11 +5,11 @@ import json
 from dataclasses import dataclass
 
 import pytest
+from provision_machines import CASES, HOME, facts_of, wanted
 
 from cosmos_cli.fleet.failure import MachineFailure
 from cosmos_cli.provision.notes import notes_of
 from cosmos_cli.provision.steps import RESERVE_BYTES, check_possible, plan_steps
-from provision_machines import CASES, HOME, facts_of, wanted
 
 PLANS = json.loads((CASES / "plans.json").read_text())
 
