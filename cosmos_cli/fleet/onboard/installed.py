@@ -167,7 +167,9 @@ def _prunable(folders: dict[str, str], wanted: dict[str, Any]) -> dict[str, list
     for kind in wanted:
         paths = [os.path.join(folders[kind], name) for name in store.names_in(folders[kind])]
         kept = {os.path.join(folders[kind], name) for name in wanted[kind]}
-        rest = [path for path in paths if path not in kept | _newest(paths)]
+        others = [path for path in paths if path not in kept]
+        newest = _newest(others)  # of those only: what `up` sends now must not make its next plan prune
+        rest = [path for path in others if path not in newest]
         in_use = store.used(rest)
         found[kind] = [os.path.basename(path) for path in rest if path not in in_use]
     gone = {os.path.join(folders["environments"], key) for key in found["environments"]}
