@@ -22,6 +22,7 @@ from typing import Any
 import orjson
 
 from cosmos_cli.errors import InputError
+from cosmos_cli.runindex import remember_run, remembered_runs
 from madns_runtime.config import RunConfig, from_mapping, to_mapping
 from madns_runtime.errors import ConfigurationError
 
@@ -34,6 +35,7 @@ BUNDLE_SUFFIX = ".tar.zst"
 SCHEMA = 1
 """Version of run.json and manifest.json; a change that breaks a reader raises it."""
 RUNS_VARIABLE = "COSMOS_RUNS"
+RUNS_FOLDER = "runs"
 RUN_NAME = re.compile(r"^(\d{4,})-(.+)$")
 VERSIONED_PACKAGES = ("cosmos-madns", "numpy", "scipy", "sgp4", "msgpack", "orjson", "pyarrow")
 UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
@@ -139,7 +141,7 @@ class RunDirectory:
 
 def runs_root(option: str | os.PathLike[str] | None = None) -> Path:
     """Return the folder of all runs: the option, else COSMOS_RUNS, else ./runs."""
-    return Path(option or os.environ.get(RUNS_VARIABLE) or "runs")
+    return Path(option or os.environ.get(RUNS_VARIABLE) or RUNS_FOLDER)
 
 
 def create_run(root: Path, scenario_name: str) -> RunDirectory:
@@ -160,6 +162,7 @@ def create_run(root: Path, scenario_name: str) -> RunDirectory:
             number = max((run.number or 0 for run in list_runs(root)), default=0) + 1
             run = RunDirectory((root / f"{number:04d}-{slug}").resolve())
             run.path.mkdir()
+        remember_run(run.name, run.path)
         for folder in (run.path / "host", run.path / "agents", run.path / "machines"):
             folder.mkdir()
         _allocate(run.reserve, RESERVE_BYTES)
@@ -185,6 +188,9 @@ def find_run(root: Path, which: str) -> RunDirectory:
     """
     Find a run by path, full name, number (with or without zeros) or "last".
 
+    A run that is not in ./runs is looked for among all that were started by this user; a folder that
+    was named by --runs or COSMOS_RUNS is meant alone.
+
     Raises:
         InputError: There is none, or several; the message lists what there is.
     """
@@ -206,8 +212,25 @@ def find_run(root: Path, which: str) -> RunDirectory:
         raise InputError(
             f"{which}: {', '.join(run.name for run in found)} match; give the full name"
         )
+    if root == Path(RUNS_FOLDER):
+        elsewhere = find_elsewhere(which)
+        if len(elsewhere) == 1:
+            return elsewhere[0]
+        if elsewhere:
+            paths = ", ".join(str(run.path) for run in elsewhere)
+            raise InputError(
+                f"{which}: not in {root}, and several elsewhere; give the path: {paths}"
+            )
     known = ", ".join(run.name for run in runs[-5:]) or "none yet"
     raise InputError(f"{which}: no such run in {root}; the last ones are: {known}")
+
+
+def find_elsewhere(which: str) -> list[RunDirectory]:
+    """Return the runs that this user started anywhere and that a full name or a number means."""
+    runs = [RunDirectory(entry.path) for entry in remembered_runs()]
+    if which.isdecimal():
+        return [run for run in runs if run.number == int(which)]
+    return [run for run in runs if run.name == which]
 
 
 def write_atomically(path: Path, data: bytes) -> None:

@@ -2,21 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
 from cosmos_cli.errors import CosmosError, ExitCode, InputError
+from cosmos_cli.fleet.connection import ConnectOptions
+from cosmos_cli.fleet.pool import FORKS_DEFAULT
+from cosmos_cli.launch.fleet_run import (
+    host_config,
+    inventory_text,
+    places_of,
+    plan_mapping,
+    reach,
+)
+from cosmos_cli.launch.machines import RemoteMachine, close_machines
 from cosmos_cli.launch.operator import Operator
-from cosmos_cli.launch.outcome import LaunchOutcome, LaunchRequest, View, with_manual_agents
+from cosmos_cli.launch.outcome import (
+    LaunchOutcome,
+    LaunchRequest,
+    View,
+    make_session,
+    with_manual_agents,
+)
 from cosmos_cli.launch.signals import OperatorSignals
+from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.loading import ScenarioFile
-from cosmos_cli.plan import LaunchPlan, make_plan
+from cosmos_cli.plan import LOOPBACK, LaunchPlan, make_plan
+from cosmos_cli.problem import Problem
 from cosmos_cli.rundir import RunDirectory, begin_run, create_run
-from madns_runtime.config import RunConfig
 from madns_runtime.processes import register
 
 if TYPE_CHECKING:
@@ -42,42 +59,131 @@ class RunOptions:
     manual: tuple[str, ...] = ()
     """Agents that a person starts by hand."""
     has_report: bool = True
+    machines: tuple[Machine, ...] = (LOOPBACK,)
+    """Where its agents may run."""
+    host: str | None = None
+    """The machine that runs the host; None for this computer."""
+    is_detached: bool = False
+    """Once it runs, it goes on without its operator."""
+    forks: int = FORKS_DEFAULT
+    connecting: ConnectOptions = ConnectOptions()
+
+
+@dataclass(frozen=True, slots=True)
+class Detached:
+    """A run that goes on without its operator."""
+
+    run: RunDirectory
+
+    @property
+    def words(self) -> str:
+        """What a person is told."""
+        number = self.run.number or self.run.name
+        return (
+            f"detached: run {self.run.name} goes on;"
+            f" see cosmos ps, cosmos down {number}, cosmos collect {number}"
+        )
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return what --json prints."""
+        return {
+            "run": self.run.name,
+            "status": "running",
+            "is_detached": True,
+            "directory": str(self.run.path),
+            "exit_code": int(ExitCode.OK),
+        }
 
 
 def execute(
-    scenario: ScenarioFile, options: RunOptions, make_view: Callable[[str, float], View]
-) -> RunSummary:
+    scenario: ScenarioFile,
+    options: RunOptions,
+    make_view: Callable[[str, float], View],
+    say: Callable[[str], None] = lambda text: None,
+) -> RunSummary | Detached:
     """
-    Run a scenario on this computer and judge it.
+    Run a scenario and judge it, or leave it to itself once it runs.
 
     Args:
         scenario: What to run.
-        options: How.
+        options: How, and where.
         make_view: Called with the run's name and simulated time, s; returns where talk goes.
+        say: Where talk goes before there is a run.
 
     Raises:
         InputError: An option does not fit the scenario, or no run directory can be made.
+        MachinesError: Not all machines could be reached; nothing was started.
         CollectionInterrupted: What is on disk can be collected again.
     """
-    prepared = _prepare(scenario, options)
-    request = LaunchRequest(
-        config=prepared.config,
-        directory=prepared.run.path,
-        machines=prepared.plan.agents_by_machine,
-        manual=options.manual,
-        nice=OPERATOR_NICE,
+    plan = make_plan(
+        scenario.scenario, options.machines, host=options.host, fault_at=scenario.fault
     )
-    run = prepared.run
+    _check_manual(options, plan)
+    remote = reach(plan, scenario, options=options.connecting, forks=options.forks, say=say)
+    try:
+        prepared = _prepare(scenario, options, plan, remote)
+        return _execute(prepared, options, make_view)
+    finally:
+        close_machines(tuple(remote.values()))
+
+
+@dataclass(frozen=True, slots=True)
+class _Prepared:
+    run: RunDirectory
+    plan: LaunchPlan
+    request: LaunchRequest
+    remote: Mapping[str, RemoteMachine]
+
+
+def _prepare(
+    scenario: ScenarioFile,
+    options: RunOptions,
+    plan: LaunchPlan,
+    remote: Mapping[str, RemoteMachine],
+) -> _Prepared:
+    run = create_run(options.runs, scenario.scenario.name)
+    session_hex = make_session()
+    config = with_manual_agents(scenario.run_config(run.name), options.manual)
+    places = places_of(plan, remote, config, run=run, session_hex=session_hex)
+    config = host_config(config, places)
+    mapping = plan_mapping(plan, places, session_hex, is_detached=options.is_detached)
+    try:
+        begin_run(run, config, mapping)
+        (run.path / "scenario.yaml").write_text(scenario_text(scenario), encoding="utf-8")
+        if options.machines != (LOOPBACK,):
+            (run.path / "inventory.yaml").write_text(inventory_text(plan), encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{run.path}: cannot write there: {error.strerror or error}") from error
+    request = LaunchRequest(
+        config=config,
+        directory=run.path,
+        machines=plan.agents_by_machine,
+        places=places,
+        host_machine=plan.host.name if plan.host and plan.host.name in remote else None,
+        manual=options.manual,
+        is_detached=options.is_detached,
+        nice=OPERATOR_NICE,
+        session_hex=session_hex,
+    )
+    return _Prepared(run, plan, request, remote)
+
+
+def _execute(
+    prepared: _Prepared, options: RunOptions, make_view: Callable[[str, float], View]
+) -> RunSummary | Detached:
+    run, request = prepared.run, prepared.request
     with OperatorSignals() as signals, register(run.name, "operator", "operator", run.path) as own:
-        view = make_view(run.name, prepared.config.time.duration_s)
+        view = make_view(run.name, request.config.time.duration_s)
         try:
             view.say(_greeting(prepared))
-            if own.problem is not None:
-                view.say(own.problem, "warning")
-            outcome = Operator(request, view, signals).run()
+            for text in (*prepared.plan.notes, own.problem):
+                if text is not None:
+                    view.say(text, "warning")
+            outcome = Operator(request, view, signals, prepared.remote).run()
+            if outcome.is_detached:
+                return Detached(run)
             signals.raise_from_now()
-            has_report = options.has_report and outcome.interruption != "at once"
-            return _finish(prepared, outcome, has_report=has_report, view=view)
+            return _finish(prepared, outcome, options, view=view)
         except KeyboardInterrupt:
             raise CollectionInterrupted(
                 f"interrupted while collecting; the records are on disk, judge and package them with:"
@@ -85,26 +191,6 @@ def execute(
             ) from None
         finally:
             view.close()
-
-
-@dataclass(frozen=True, slots=True)
-class _Prepared:
-    run: RunDirectory
-    config: RunConfig
-    plan: LaunchPlan
-
-
-def _prepare(scenario: ScenarioFile, options: RunOptions) -> _Prepared:
-    plan = make_plan(scenario.scenario)
-    _check_manual(options.manual, plan)
-    run = create_run(options.runs, scenario.scenario.name)
-    config = with_manual_agents(scenario.run_config(run.name), options.manual)
-    try:
-        begin_run(run, config, plan.to_mapping())
-        (run.path / "scenario.yaml").write_text(scenario_text(scenario), encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{run.path}: cannot write there: {error.strerror or error}") from error
-    return _Prepared(run, config, plan)
 
 
 def scenario_text(scenario: ScenarioFile) -> str:
@@ -117,35 +203,72 @@ def scenario_text(scenario: ScenarioFile) -> str:
 
 
 def _finish(
-    prepared: _Prepared, outcome: LaunchOutcome, *, has_report: bool, view: View
+    prepared: _Prepared, outcome: LaunchOutcome, options: RunOptions, *, view: View
 ) -> RunSummary:
     # Imported late: the tables' library is large, and the run need not wait for it.
     from cosmos_cli.collect import finish_run
     from cosmos_cli.expectation import Expected
 
     view.state("COLLECTING")
+    is_patient = outcome.interruption != "at once"
+    missing = _retrieve(prepared, options, view, is_wanted=is_patient)
     return finish_run(
         prepared.run,
-        outcome.host_result,
-        Expected.of(prepared.config, prepared.plan.agents_by_machine),
+        outcome.host_result or prepared.run.read_left_result(),
+        Expected.of(prepared.request.config, prepared.plan.agents_by_machine),
         interrupted=outcome.interruption != "no",
-        problems=outcome.problems,
-        has_report=has_report,
+        problems=(*outcome.problems, *missing),
+        has_report=options.has_report and is_patient,
         progress=view.work,
     )
 
 
-def _check_manual(manual: tuple[str, ...], plan: LaunchPlan) -> None:
+def _retrieve(
+    prepared: _Prepared, options: RunOptions, view: View, *, is_wanted: bool
+) -> tuple[Problem, ...]:
+    """Bring what machines recorded here, and return whose records have not come."""
+    if not prepared.remote:
+        return ()
+    if not is_wanted:
+        text = f"its records were not fetched; fetch them with: cosmos collect {prepared.run.path}"
+        return tuple(Problem(text=text, machine=name, step="collect") for name in prepared.remote)
+    from cosmos_cli.retrieve import problems_of, retrieve
+
+    outcomes = retrieve(
+        prepared.run,
+        options=options.connecting,
+        forks=options.forks,
+        progress=view.work,
+        connections={name: machine.connection for name, machine in prepared.remote.items()},
+    )
+    problems = problems_of(outcomes)
+    for problem in problems:
+        view.say(f"{problem.machine}: {problem.text}", "error")
+    return problems
+
+
+def _check_manual(options: RunOptions, plan: LaunchPlan) -> None:
+    manual = options.manual
+    if manual and options.is_detached:
+        raise InputError("--manual and --detach: a hand-started agent needs its operator")
     names = [name for agents in plan.agents_by_machine.values() for name in agents]
     unknown = [name for name in manual if name not in names]
     if unknown:
         shown = ", ".join(names[:10]) + (", ..." if len(names) > 10 else "")
         raise InputError(f"--manual {', '.join(unknown)}: no such agent; there are {shown}")
+    for planned in plan.machines:
+        there = [name for name in manual if name in planned.agents]
+        if there and planned.connection != "local":
+            raise InputError(
+                f"--manual {', '.join(there)}: placed on {planned.name}, and only an agent on this"
+                " computer can be started by hand; place it there, or leave out the inventory"
+            )
 
 
 def _greeting(prepared: _Prepared) -> str:
-    agents, time = prepared.config.agents, prepared.config.time
+    config, run = prepared.request.config, prepared.run
+    where = f" on {len(prepared.plan.machines)} machines" if prepared.remote else ""
     return (
-        f"{prepared.run.name}: {agents.count} agents at {agents.tick_hz:g} Hz for"
-        f" {time.duration_s:g} s; records go to {prepared.run.path}"
+        f"{run.name}: {config.agents.count} agents{where} at {config.agents.tick_hz:g} Hz for"
+        f" {config.time.duration_s:g} s; records go to {run.path}"
     )

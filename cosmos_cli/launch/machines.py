@@ -41,12 +41,11 @@ class Prepared(Protocol):
         """The environment's interpreter."""
 
     @property
-    def python_path(self) -> str:
-        """PYTHONPATH: the runtime and what the scenario brings."""
-
-    @property
     def base_directory(self) -> str:
         """The scenario's folder there."""
+
+    def variables(self) -> Mapping[str, str]:
+        """Return the environment that programs of a run need, PYTHONPATH among it."""
 
 
 Prepare = Callable[[Connection, Board], Prepared]
@@ -59,7 +58,7 @@ class Paths:
     root: str
     state: str
     python: str
-    python_path: str
+    variables: Mapping[str, str]
     base_directory: str
 
 
@@ -92,7 +91,7 @@ class RemoteMachine:
             root=root,
             state=Layout(root).state,
             python=expanded(prepared.python, home),
-            python_path=prepared.python_path,
+            variables=prepared.variables(),
             base_directory=expanded(prepared.base_directory, home),
         )
         self._options = dataclasses.replace(options, timeout_s=RETURN_TIMEOUT_S)

@@ -19,6 +19,11 @@ RUN_KEY_BYTES = 32
 SESSION_BYTES = 8
 
 
+def make_session() -> str:
+    """Return what tells this run from all others on the wire and on machines; it is no secret."""
+    return secrets.token_hex(SESSION_BYTES)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Life:
     """Which of a machine's supervisors one is: a machine that was lost may return and get another."""
@@ -51,7 +56,7 @@ class LaunchRequest:
     nice: int = 0
     """How much the operator steps back behind its children once they are started."""
     run_key_hex: str = field(default_factory=lambda: secrets.token_hex(RUN_KEY_BYTES), repr=False)
-    session_hex: str = field(default_factory=lambda: secrets.token_hex(SESSION_BYTES))
+    session_hex: str = field(default_factory=make_session)
 
     def place_of(self, machine: str | None) -> Place:
         """Return where a machine's part of the run lives."""

@@ -48,9 +48,9 @@ def start_command(program: RemoteProgram, paths: Paths) -> str:
     stderr = str(PurePosixPath(program.run_directory, program.stderr))
     environment = {
         **ENVIRONMENT,
+        **paths.variables,
         MARK: program.run_directory,
         "COSMOS_STATE_DIR": paths.state,
-        "PYTHONPATH": paths.python_path,
         # Trees never change: what Python compiles goes elsewhere.
         "PYTHONPYCACHEPREFIX": str(PurePosixPath(paths.root, "state/pycache")),
     }
