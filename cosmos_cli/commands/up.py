@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,13 +23,15 @@ from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.fleet.connection import Connection
 from cosmos_cli.fleet.outcome import Outcome
 from cosmos_cli.models.inventory import Machine
-from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.provision import up_table
 from cosmos_cli.provision.bring_up import Brought, UpOptions, bring_up
 from cosmos_cli.provision.echo import Echo
 from cosmos_cli.provision.kit import Workshop
 from cosmos_cli.provision.up_table import MachineResult
 from cosmos_cli.provision.up_view import UpView
+
+if TYPE_CHECKING:
+    from cosmos_cli.models.loading import ScenarioFile
 
 
 def up(
@@ -65,7 +68,7 @@ def up(
     fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
     if host is not None and host not in {machine.name for machine in fleet.machines}:
         raise InputError(f"--host {host}: there is no such machine among those to be made ready")
-    files = [load_scenario(path) for path in scenarios or ()]
+    files = _load(scenarios or ())
     options = UpOptions(is_check=check, has_texts=diff)
     with Echo() as echo, UpView(console, [m.name for m in fleet.machines]) as view:
         kit = Workshop(files, host=host, echo=echo, options=fleet.options)
@@ -77,6 +80,14 @@ def up(
     exit_code = ExitCode.MACHINES if is_failed else ExitCode.OK
     console.print_json({**up_table.document(results, is_check=check), "exit_code": int(exit_code)})
     return int(exit_code)
+
+
+def _load(paths: Sequence[Path]) -> list[ScenarioFile]:
+    if not paths:
+        return []
+    from cosmos_cli.models.loading import load_scenario  # not needed for the runtime alone
+
+    return [load_scenario(path) for path in paths]
 
 
 def _bring_all(

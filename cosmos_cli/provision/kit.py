@@ -5,13 +5,12 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cosmos_cli.fleet.connect import connect
 from cosmos_cli.fleet.connection import Connection, ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.models.inventory import Machine
-from cosmos_cli.models.loading import ScenarioFile
 from cosmos_cli.provision.apply import Teller
 from cosmos_cli.provision.echo import Echo
 from cosmos_cli.provision.environment import RuntimeCheck, check_request, modules_of
@@ -19,6 +18,9 @@ from cosmos_cli.provision.platform import greeted_platform
 from cosmos_cli.provision.trees import Tree, runtime_tree, scenario_tree
 from cosmos_cli.provision.wanted import Content, Paths, Wanted
 from cosmos_cli.provision.wheelhouse import Environment, prepare, sees_system_packages
+
+if TYPE_CHECKING:  # importing the scenario's model takes longer than all that is done with it here
+    from cosmos_cli.models.loading import ScenarioFile
 
 
 class Workshop:

@@ -16,15 +16,17 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import madns_runtime
 from cosmos_cli.errors import InputError
 from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.layout import Layout
-from cosmos_cli.models.loading import ScenarioFile
 from cosmos_cli.rundir import BUNDLE_SUFFIX, RUN_NAME
+
+if TYPE_CHECKING:  # importing the scenario's model takes longer than all that is done with it here
+    from cosmos_cli.models.loading import ScenarioFile
 
 DISTRIBUTION = "cosmos-madns"
 FILES_MAX = 5_000
