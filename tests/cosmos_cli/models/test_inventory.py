@@ -524,3 +524,12 @@ def test_folder_without_an_inventory_is_refused(tmp_path):
 
     with pytest.raises(InputError, match="expected an inventory file in this folder"):
         load_inventory(tmp_path)
+
+
+def test_machines_are_bounded_over_all_groups_and_counted_once(read):
+    text = "a: {hosts: {'m[1:4999]': , n: }}\nb: {hosts: {'m[1:4999]': }}\n"
+
+    assert len(read(text)) == 5000
+    assert faults_of(read, text + "c: {hosts: {o: }}\n") == [
+        (3, 13, "c.hosts.o", "expected at most 5000 machines")
+    ]
