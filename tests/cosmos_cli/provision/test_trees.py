@@ -1,0 +1,416 @@
+"""Trees: what belongs to one, and that a machine has all of it or nothing, whatever is cut."""
+
+import hashlib
+import os
+import subprocess
+import sys
+import threading
+import zlib
+from pathlib import Path
+
+import pytest
+from onboard_machine import OwnMachine, snapshot
+
+from cosmos_cli.errors import InputError
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.models.loading import load_scenario
+from cosmos_cli.provision import trees
+from cosmos_cli.provision.environment import ask_installed, installed_request
+from cosmos_cli.provision.trees import (
+    TreeFile,
+    runtime_tree,
+    scenario_tree,
+    send_tree,
+    tree_of,
+)
+from madns_runtime import __version__
+
+SCENARIO = """
+name: small
+simulation: counter
+agents: {count: 2, tick_hz: 10}
+time: {mode: realtime, duration_s: 1}
+"""
+
+
+@pytest.fixture
+def machine(tmp_path):
+    return OwnMachine(tmp_path / "root")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A scenario's folder with a plug-in beside it."""
+    folder = tmp_path / "scenario"
+    (folder / "data").mkdir(parents=True)
+    (folder / "small.yaml").write_text(SCENARIO)
+    (folder / "flight.py").write_text("gain = 1\n")
+    (folder / "data/orbits.csv").write_text("1,2\n")
+    return folder
+
+
+def the_tree(folder):
+    return scenario_tree(load_scenario(folder / "small.yaml"))
+
+
+def paths(tree):
+    return [file.path for file in tree.files]
+
+
+def made_tree(**contents):
+    return tree_of(
+        "made",
+        [
+            TreeFile(
+                path=path,
+                sha256=hashlib.sha256(content).hexdigest(),
+                mode=0o444,
+                size_bytes=len(content),
+                source=content,
+            )
+            for path, content in contents.items()
+        ],
+    )
+
+
+def on_machine(machine, tree):
+    """Return the files of a tree as they are there."""
+    top = Path(machine.layout.tree(tree.hash))
+    return {
+        path.relative_to(top).as_posix(): path.read_bytes()
+        for path in top.rglob("*")
+        if path.is_file() and path.name != ".complete"
+    }
+
+
+def is_whole(machine, tree):
+    with machine.board() as board:
+        request = installed_request(machine.layout, trees=[tree.hash], environments=[])
+        return ask_installed(board, request).trees[tree.hash]
+
+
+def sent_blobs(machine):
+    return [blob for verb, given, _ in machine.calls if verb == "blobs" for blob in given["blobs"]]
+
+
+def test_tree_holds_the_scenarios_files_and_no_more(folder):
+    for path in (
+        ".git/config",
+        "__pycache__/flight.cpython-311.pyc",
+        "venv/pyvenv.cfg",
+        "venv/bin/python",
+        "0007-small/plan.json",
+        "0007-small/run.json",
+        "0007-small.tar.zst",
+        "flight.egg-info/PKG-INFO",
+    ):
+        (folder / path).parent.mkdir(exist_ok=True, parents=True)
+        (folder / path).write_text("x")
+    (folder / "empty").mkdir()
+
+    assert paths(the_tree(folder)) == ["data/orbits.csv", "flight.py", "small.yaml"]
+
+
+def test_hash_is_of_names_contents_and_execute_bits_alone(folder, tmp_path):
+    first = the_tree(folder)
+    copy = tmp_path / "elsewhere"
+    subprocess.run(["cp", "-r", folder, copy], check=True)
+    os.utime(copy / "flight.py", (1, 1))
+    (copy / "flight.py").chmod(0o600)
+
+    assert first.hash == the_tree(copy).hash
+    (copy / "flight.py").chmod(0o700)
+    executable = the_tree(copy).hash
+    (copy / "flight.py").write_text("gain = 2\n")
+    assert len({first.hash, executable, the_tree(copy).hash}) == 3
+
+
+def test_links_within_are_sent_as_what_they_lead_to(folder, machine):
+    (folder / "alias.csv").symlink_to("data/orbits.csv")
+    (folder / "more").symlink_to("data")
+    (folder / "data/loop").symlink_to("..")
+
+    tree = the_tree(folder)
+    with machine.board() as board:
+        send_tree(board, machine.layout, tree)
+
+    assert "alias.csv" in paths(tree) and "more/orbits.csv" in paths(tree)
+    assert on_machine(machine, tree)["alias.csv"] == b"1,2\n"
+
+
+@pytest.mark.parametrize("target", ["/etc/hostname", "../outside.txt", "gone.txt"])
+def test_links_that_lead_outside_or_nowhere_are_refused_by_name(folder, target):
+    (folder.parent / "outside.txt").write_text("x")
+    (folder / "link").symlink_to(target)
+
+    with pytest.raises(InputError, match=r"link: a link that leads"):
+        the_tree(folder)
+
+
+def test_too_large_a_folder_is_refused_with_what_makes_it_large(folder, monkeypatch):
+    monkeypatch.setattr(trees, "TREE_BYTES_MAX", 1000)
+    (folder / "huge.bin").write_bytes(bytes(1001))
+
+    with pytest.raises(InputError, match=r"huge.bin \(0.0 MB\)"):
+        the_tree(folder)
+
+
+def test_too_many_files_are_refused(folder, monkeypatch):
+    monkeypatch.setattr(trees, "FILES_MAX", 2)
+
+    with pytest.raises(InputError, match="at most 2 files"):
+        the_tree(folder)
+
+
+def test_runtime_alone_finds_its_simulations_by_name(machine):
+    tree = runtime_tree()
+    with machine.board() as board:
+        assert send_tree(board, machine.layout, tree)
+    program = (
+        "import importlib.metadata as m, madns_runtime\n"
+        "print(m.version('cosmos-madns'), madns_runtime.__file__)\n"
+        "print(sorted(e.value for e in m.entry_points(group='madns.simulations')))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-I", "-S", "-c", f"import sys\nsys.path[:0] = sys.argv[1:]\n{program}"]
+        + [machine.layout.tree(tree.hash)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+
+    version, entries = done.stdout.splitlines()
+    assert f"{__version__} {machine.layout.tree(tree.hash)}/madns_runtime/__init__.py" == version
+    assert "madns_runtime.simulations.counter:simulation" in entries
+    assert not any("cosmos_cli" in path or "__pycache__" in path for path in paths(tree))
+
+
+def test_tree_arrives_as_it_is_and_read_only(folder, machine):
+    (folder / "tool.sh").write_text("#!/bin/sh\n")
+    (folder / "tool.sh").chmod(0o755)
+    (folder / "empty.txt").touch()
+    tree = the_tree(folder)
+
+    with machine.board() as board:
+        assert send_tree(board, machine.layout, tree)
+
+    assert on_machine(machine, tree) == {
+        file.path: (folder / file.path).read_bytes() for file in tree.files
+    }
+    top = Path(machine.layout.tree(tree.hash))
+    assert (top / "tool.sh").stat().st_mode & 0o777 == 0o555
+    assert (top / "flight.py").stat().st_mode & 0o777 == 0o444
+
+
+def test_second_time_nothing_is_sent_and_nothing_touched(folder, machine):
+    tree = the_tree(folder)
+    with machine.board() as board:
+        send_tree(board, machine.layout, tree)
+        before = snapshot(machine.root)
+        machine.calls.clear()
+
+        assert not send_tree(board, machine.layout, tree)
+
+    assert [verb for verb, _, _ in machine.calls] == ["tree"]
+    assert before == snapshot(machine.root)
+
+
+def test_one_edited_file_is_one_file_sent(folder, machine):
+    with machine.board() as board:
+        send_tree(board, machine.layout, the_tree(folder))
+        (folder / "flight.py").write_text("gain = 2\n")
+        machine.calls.clear()
+        edited = the_tree(folder)
+        assert send_tree(board, machine.layout, edited)
+
+    assert [[hashlib.sha256(b"gain = 2\n").hexdigest(), 9]] == sent_blobs(machine)
+    assert on_machine(machine, edited)["flight.py"] == b"gain = 2\n"
+
+
+def test_what_is_there_twice_is_sent_once(machine):
+    tree = made_tree(a=b"same", b=b"same", c=b"")
+    with machine.board() as board:
+        send_tree(board, machine.layout, tree)
+
+    assert len(sent_blobs(machine)) == 2
+    assert on_machine(machine, tree) == {"a": b"same", "b": b"same", "c": b""}
+
+
+def test_large_trees_come_in_batches(machine, monkeypatch):
+    monkeypatch.setattr(trees, "BATCH_BYTES", 1000)
+    tree = made_tree(**{f"f{index}": os.urandom(400) for index in range(7)})
+    told = []
+    with machine.board() as board:
+        send_tree(board, machine.layout, tree, lambda what, share: told.append(share))
+
+    assert [len(g["blobs"]) for verb, g, _ in machine.calls if verb == "blobs"] == [2, 2, 2, 1]
+    assert told == sorted(told) and told[-1] == 1.0
+    assert is_whole(machine, tree)
+
+
+def test_connection_cut_at_every_frame_is_repaired_by_the_next_call(machine, monkeypatch):
+    monkeypatch.setattr(trees, "BATCH_BYTES", 1000)
+    cuts = 0
+    for steps in range(100):
+        tree = made_tree(**{f"d/f{index}": os.urandom(400) for index in range(5)})
+        try:
+            with machine.board(cut_after=steps) as board:
+                send_tree(board, machine.layout, tree)
+            break
+        except MachineFailure as failure:
+            assert FailureKind.LOST is failure.kind
+        cuts += 1
+        if Path(machine.layout.tree(tree.hash)).exists():
+            assert is_whole(machine, tree)
+        with machine.board() as board:
+            send_tree(board, machine.layout, tree)
+        assert tree_files(tree) == on_machine(machine, tree)
+
+    assert cuts >= 10  # two questions and three batches, and the answer to each
+
+
+def tree_files(tree):
+    return {file.path: file.source for file in tree.files}
+
+
+def test_resumed_transfer_sends_only_what_had_not_come(machine, monkeypatch):
+    monkeypatch.setattr(trees, "BATCH_BYTES", 1000)
+    tree = made_tree(**{f"f{index}": os.urandom(600) for index in range(6)})
+    with pytest.raises(MachineFailure), machine.board(cut_after=7) as board:
+        send_tree(board, machine.layout, tree)
+    machine.calls.clear()
+
+    with machine.board() as board:
+        send_tree(board, machine.layout, tree)
+
+    assert 0 < len(sent_blobs(machine)) < 6
+    assert is_whole(machine, tree)
+
+
+@pytest.mark.parametrize("harm", ["byte", "gone", "added", "mode", "mark"])
+def test_any_change_on_the_machine_is_noticed_and_repaired(folder, machine, harm):
+    tree = the_tree(folder)
+    with machine.board() as board:
+        send_tree(board, machine.layout, tree)
+    assert is_whole(machine, tree)
+    file = Path(machine.layout.tree(tree.hash)) / "flight.py"
+    times = file.stat()
+    file.chmod(0o644)
+    match harm:
+        case "byte":
+            file.write_text("gain = 9\n")
+            os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))
+        case "gone":
+            file.unlink()
+        case "added":
+            (file.parent / "random.py").write_text("")
+        case "mode":
+            file.chmod(0o755)
+        case "mark":
+            (file.parent / ".complete").unlink()
+
+    assert not is_whole(machine, tree)
+    with machine.board() as board:
+        assert send_tree(board, machine.layout, tree)
+    assert is_whole(machine, tree)
+    assert {file.path for file in tree.files} == set(on_machine(machine, tree))
+
+
+def test_caches_of_imported_modules_are_no_change(folder, machine):
+    tree = the_tree(folder)
+    with machine.board() as board:
+        send_tree(board, machine.layout, tree)
+    top = machine.layout.tree(tree.hash)
+    subprocess.run([sys.executable, "-c", "import flight"], env={"PYTHONPATH": top}, check=True)
+
+    assert (Path(top) / "__pycache__").is_dir()
+    assert is_whole(machine, tree)
+
+
+def test_files_that_a_living_run_adds_do_not_break_its_tree(folder, machine):
+    tree = the_tree(folder)
+    with machine.board() as board:
+        send_tree(board, machine.layout, tree)
+    top = machine.layout.tree(tree.hash)
+    with subprocess.Popen(
+        [sys.executable, "-c", "input()"],
+        env={"COSMOS_BASE_DIRECTORY": top},
+        stdin=subprocess.PIPE,
+    ) as process:
+        (Path(top) / "notes.txt").write_text("x")
+        assert is_whole(machine, tree)
+        (Path(top) / "flight.py").unlink()
+        assert not is_whole(machine, tree)
+        process.communicate(b"\n", timeout=20)
+
+
+def test_many_operators_at_once_end_with_one_whole_tree(machine):
+    tree = made_tree(**{f"f{index}": os.urandom(2000) for index in range(30)})
+    failures = []
+
+    def send():
+        try:
+            with OwnMachine(machine.root).board() as board:
+                send_tree(board, machine.layout, tree)
+        except MachineFailure as failure:
+            failures.append(failure)
+
+    threads = [threading.Thread(target=send) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(120)
+
+    assert all(failure.kind in (FailureKind.DATA, FailureKind.BUSY) for failure in failures)
+    assert len(failures) < 6
+    assert is_whole(machine, tree)
+    with machine.board() as board:
+        send_tree(board, machine.layout, tree)
+    assert tree_files(tree) == on_machine(machine, tree)
+
+
+def test_file_that_changes_while_it_is_sent_is_told(folder, machine):
+    tree = the_tree(folder)
+    (folder / "flight.py").write_text("gain = 3\n")
+
+    with machine.board() as board, pytest.raises(MachineFailure, match="flight.py was changed"):
+        send_tree(board, machine.layout, tree)
+    assert not Path(machine.layout.tree(tree.hash)).exists()
+
+
+@pytest.mark.parametrize("path", ["../evil", "/evil", "a/../../evil", "", "a//b", "."])
+def test_no_path_leads_out_of_a_tree(machine, path):
+    with machine.board() as board, pytest.raises(MachineFailure, match="path within the tree"):
+        send_tree(board, machine.layout, made_tree(**{path: b"x"}))
+
+
+@pytest.mark.parametrize(
+    ("sizes", "body"),
+    [
+        ([["0" * 64, 4]], zlib.compress(b"text")),
+        ([[hashlib.sha256(b"text").hexdigest(), 3]], zlib.compress(b"text")),
+        ([[hashlib.sha256(b"text").hexdigest(), 4]], b"no zlib"),
+        ([[hashlib.sha256(b"text").hexdigest(), 4]], zlib.compress(b"text")[:-6]),
+    ],
+)
+def test_blobs_that_are_not_what_they_claim_are_refused(machine, sizes, body):
+    with machine.board() as board, pytest.raises(MachineFailure) as caught:
+        board.call("blobs", {"folder": machine.layout.trees, "blobs": sizes}, body=body)
+
+    assert FailureKind.DATA is caught.value.kind
+    assert [p for p in Path(machine.layout.trees).rglob("*") if p.is_file()] == []
+
+
+def test_leftovers_of_makers_that_are_gone_are_removed(machine):
+    half_made = Path(machine.layout.trees, ".abc.1-2")
+    half_made.mkdir(parents=True)
+    (half_made / "file").write_text("x")
+    os.utime(half_made, (1, 1))
+    fresh = Path(machine.layout.trees, ".def.1-2")
+    fresh.mkdir()
+
+    with machine.board() as board:
+        send_tree(board, machine.layout, made_tree(a=b"x"))
+
+    assert not half_made.exists()
+    assert fresh.exists()
