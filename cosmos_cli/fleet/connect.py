@@ -1,9 +1,10 @@
-"""The one way to a machine: over SSH, or this computer."""
+"""The one way to a machine: over SSH, or to this computer."""
 
 from __future__ import annotations
 
 from cosmos_cli.fleet.connection import Connection, ConnectOptions
 from cosmos_cli.fleet.local import LocalConnection
+from cosmos_cli.fleet.opening import open_ssh
 from cosmos_cli.fleet.target import Target
 
 __all__ = ["ConnectOptions", "connect"]
@@ -21,6 +22,4 @@ def connect(target: Target, options: ConnectOptions = DEFAULT) -> Connection:
     """
     if target.connection == "local":
         return LocalConnection(target)
-    from cosmos_cli.fleet.ssh import open_ssh  # importing it takes longer than connecting
-
     return open_ssh(target, options)

@@ -15,12 +15,13 @@ import functools
 import hashlib
 import hmac
 import os
-import re
 import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
+
+from cosmos_cli.fleet.ssh_config import matches
 
 SSH_PORT = 22
 HASHED = "|1|"
@@ -69,14 +70,7 @@ class Entry:
         """Whether it speaks of *name*, a host name or [name]:port."""
         if self.patterns.startswith(HASHED):
             return _matches_hash(self.patterns, name)
-        is_match = False
-        for pattern in self.patterns.split(","):
-            if pattern.startswith("!"):
-                if _glob(pattern[1:].lower()).fullmatch(name):
-                    return False
-            elif not is_match:
-                is_match = _glob(pattern.lower()).fullmatch(name) is not None
-        return is_match
+        return matches(self.patterns.split(","), name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -219,12 +213,6 @@ def parse(text: str, file: str = "") -> Iterable[Entry]:
             line=number,
             is_revoked=marker == REVOKED,
         )
-
-
-@functools.lru_cache(maxsize=4096)
-def _glob(pattern: str) -> re.Pattern[str]:
-    """Return OpenSSH's pattern, in which only * and ? are special; brackets belong to [host]:port."""
-    return re.compile(re.escape(pattern).replace(r"\*", ".*").replace(r"\?", "."))
 
 
 def _matches_hash(patterns: str, name: str) -> bool:

@@ -1,15 +1,15 @@
 """
-A machine over SSH: Fabric's connection with the operator's configuration, strict host keys and few login attempts.
+A machine over SSH: Fabric's connection with strict host keys and few login attempts.
 
-Opening is tried again, within its deadline, when the machine could not be reached or closed the connection
-before a word was said; a refused login never is.
+Imported after a wire is open: importing paramiko and Fabric takes longer than the servers need to start.
 """
 
 from __future__ import annotations
 
 import functools
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import fabric
@@ -21,21 +21,23 @@ from paramiko.ssh_exception import ChannelException, SSHException
 from cosmos_cli.fleet.connection import OUTPUT_BYTES_MAX, Completed, ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.known_hosts import HostKey, KnownHosts, Standing
+from cosmos_cli.fleet.local import LOOPBACK
 from cosmos_cli.fleet.output import BoundedOutput
 from cosmos_cli.fleet.ssh_failures import (
     host_key_failure,
-    is_banner_error,
+    jump_failure,
     lost,
     opening_failure,
 )
 from cosmos_cli.fleet.ssh_keys import FewKeys
-from cosmos_cli.fleet.ssh_settings import JUMPS_MAX, SshSettings, settings_of
+from cosmos_cli.fleet.ssh_settings import SshSettings
 from cosmos_cli.fleet.ssh_stream import READ_BYTES, SshStream, wait_for
 from cosmos_cli.fleet.ssh_transport import SshTransport, make_transport
 from cosmos_cli.fleet.target import Target
-from cosmos_cli.fleet.wire import Wire, connect_tcp, connect_through_command
+from cosmos_cli.fleet.wire import Wire
 
-RETRY_PAUSES_S = (0.2, 0.5, 1.0, 2.0)
+TIMEOUT_S_MIN = 0.5
+"""What is left of a deadline for logging in, at least."""
 OPEN_TIMEOUT_S = 20.0
 """To start a command; a busy board takes seconds."""
 INPUT_POLL_S = 0.005
@@ -49,17 +51,22 @@ class SshConnection:
         target: Its entry in the inventory.
         connection: Fabric's, open.
         wire: Below it.
-        hop: The jump host's connection, closed with this one.
+        hops: The jump hosts' connections, closed with this one.
     """
 
     def __init__(
-        self, target: Target, connection: fabric.Connection, wire: Wire, hop: SshConnection | None
+        self,
+        target: Target,
+        connection: fabric.Connection,
+        wire: Wire,
+        hops: Sequence[SshConnection] = (),
     ) -> None:
         self.target = target
         self.opening_s = 0.0
         self._connection = connection
         self._wire = wire
-        self._hop = hop
+        self._hops = tuple(hops)
+        self._asking = threading.Lock()
 
     @property
     def transport(self) -> SshTransport:
@@ -103,18 +110,43 @@ class SshConnection:
     def is_alive(self, *, timeout_s: float = 2.0) -> bool:
         """Ask for a sign of life; paramiko's own keepalive notices neither a dead link nor a frozen machine."""
         sign = self._wire.expect_sign()
-        try:
-            self.transport.ask_for_sign()
-        except (SSHException, OSError, EOFError):
-            return False
-        return sign.wait(timeout_s) and self.transport.is_active()
+        # Asking may wait behind an upload that has come to a standstill; the answer is not waited for there.
+        threading.Thread(target=self._ask_for_sign, name="sign-of-life", daemon=True).start()
+        was_heard = sign.wait(timeout_s)
+        return was_heard and not self._wire.is_ended and self.transport.is_active()
+
+    def _ask_for_sign(self) -> None:
+        if self._asking.acquire(blocking=False):
+            try:
+                self.transport.ask_for_sign()
+            except (SSHException, OSError, EOFError):
+                self._wire.close()
+            finally:
+                self._asking.release()
 
     def close(self) -> None:
         """Close it."""
         self._connection.close()
         self._wire.close()
-        if self._hop is not None:
-            self._hop.close()
+        for hop in reversed(self._hops):
+            hop.close()
+
+    def wire_to(self, host: str, port: int, *, timeout_s: float) -> Wire:
+        """
+        Open a wire from the machine to another one, as a jump host does.
+
+        Raises:
+            MachineFailure: The machine does not reach it, or may not.
+        """
+        try:
+            channel = self.transport.open_channel(
+                "direct-tcpip", (host, port), (LOOPBACK, 0), timeout=timeout_s
+            )
+        except ChannelException as error:
+            raise jump_failure(error.code, error.text, f"{host} port {port}") from error
+        except (SSHException, OSError, EOFError) as error:
+            raise opening_failure(error, f"{host} port {port}", timeout_s) from error
+        return Wire(channel, addresses=(self.own_address, host))
 
     def _start(self, command: str, errors: BoundedOutput | None = None) -> SshStream:
         try:
@@ -173,92 +205,23 @@ def _feed(stream: SshStream, pending: memoryview) -> memoryview:
     return pending
 
 
-def open_ssh(
-    target: Target, options: ConnectOptions, *, trail: tuple[str, ...] = ()
-) -> SshConnection:
+def log_in(
+    settings: SshSettings, options: ConnectOptions, wire: Wire, until_s: float
+) -> fabric.Connection:
     """
-    Log in at a machine.
+    Log in at a machine whose wire is open.
 
     Args:
-        target: The machine.
-        options: How long, and whether unknown host keys are recorded.
-        trail: Addresses of the machines whose way leads through this one.
+        settings: Of the machine.
+        options: Whether unknown host keys are recorded.
+        wire: To its SSH server; closed when this fails.
+        until_s: Deadline, monotonic.
 
     Raises:
         MachineFailure: In words that say what to do.
-        InputError: The ssh configuration cannot be read.
     """
-    settings = settings_of(target)
-    timeout_s = settings.connect_timeout_s or options.timeout_s
-    start_s = time.monotonic()
-    until_s = start_s + timeout_s
-    where = f"{settings.host} port {settings.port}"
-    pauses_s = iter(RETRY_PAUSES_S)
-    while True:
-        hop = _hop(settings, options, trail)
-        try:
-            wire = _wire(settings, hop, until_s - time.monotonic())
-            try:
-                fabric_connection = _log_in(settings, options, wire, until_s)
-                connection = SshConnection(target, fabric_connection, wire, hop)
-                connection.opening_s = time.monotonic() - start_s
-                return connection
-            except BaseException:
-                wire.close()
-                raise
-        except (OSError, SSHException, EOFError, MachineFailure) as error:
-            if hop is not None:
-                hop.close()
-            pause_s = next(pauses_s, timeout_s)
-            if time.monotonic() + pause_s >= until_s or not _is_worth_another_try(error):
-                raise opening_failure(error, where, timeout_s) from error
-        time.sleep(pause_s)
-
-
-def _is_worth_another_try(error: Exception) -> bool:
-    """Whether nobody has been heard yet: refused, unreachable, or closed before a word."""
-    if isinstance(error, MachineFailure):
-        return False
-    return is_banner_error(error) or isinstance(error, ConnectionRefusedError)
-
-
-def _hop(
-    settings: SshSettings, options: ConnectOptions, trail: tuple[str, ...]
-) -> SshConnection | None:
-    """Connect to the jump host nearest to the machine, through those before it."""
-    hop: SshConnection | None = None
-    if len(trail) >= JUMPS_MAX:
-        return None
-    for jump in settings.jumps:
-        if jump.address in (settings.host, *trail):
-            continue  # `Host *` with a ProxyJump means the jump host itself as well
-        through = hop
-        try:
-            hop = open_ssh(jump, options, trail=(*trail, settings.host, jump.address))
-        except MachineFailure as failure:
-            if through is not None:
-                through.close()
-            text = f"jump host {jump.address}: {failure.text}"
-            raise MachineFailure(failure.kind, text, failure.advice) from failure
-    return hop
-
-
-def _wire(settings: SshSettings, hop: SshConnection | None, timeout_s: float) -> Wire:
-    if hop is not None:
-        channel = hop.transport.open_channel(
-            "direct-tcpip", (settings.host, settings.port), ("127.0.0.1", 0), timeout=timeout_s
-        )
-        return Wire(channel, addresses=(hop.own_address, settings.host))
-    if settings.proxy_command:
-        return connect_through_command(settings.proxy_command)
-    return connect_tcp(settings.host, settings.port, timeout_s=timeout_s)
-
-
-def _log_in(
-    settings: SshSettings, options: ConnectOptions, wire: Wire, until_s: float
-) -> fabric.Connection:
     known = KnownHosts(settings.known_hosts)
-    remaining_s = max(0.5, until_s - time.monotonic())
+    timeout_s = max(TIMEOUT_S_MIN, until_s - time.monotonic())
     connection = fabric.Connection(
         settings.host,
         user=settings.user,
@@ -267,9 +230,9 @@ def _log_in(
         forward_agent=False,
         connect_kwargs={
             "sock": wire,
-            "timeout": remaining_s,
-            "banner_timeout": remaining_s,
-            "auth_timeout": remaining_s,
+            "timeout": timeout_s,
+            "banner_timeout": timeout_s,
+            "auth_timeout": timeout_s,
             "transport_factory": _factory(known.kinds(settings.names)),
             "auth_strategy": FewKeys(settings),
         },
@@ -277,9 +240,12 @@ def _log_in(
     connection.client.set_missing_host_key_policy(_StrictHostKeys(settings, options, known))
     try:
         connection.open()
-    except BaseException:
-        connection.client.close()
-        raise
+    except (SSHException, OSError, EOFError) as error:
+        raise opening_failure(error, settings.where, timeout_s) from error
+    finally:
+        if connection.transport is None:
+            connection.client.close()
+            wire.close()
     return connection
 
 
@@ -310,5 +276,4 @@ class _StrictHostKeys(MissingHostKeyPolicy):
             is_hashed = settings.hashes_known_hosts
             verdict = self._known.record(settings.names[0], shown, is_hashed=is_hashed)
         if verdict.standing is not Standing.KNOWN:
-            where = f"{settings.host} port {settings.port}"
-            raise host_key_failure(verdict, shown, settings.names, where)
+            raise host_key_failure(verdict, shown, settings.names, settings.where)

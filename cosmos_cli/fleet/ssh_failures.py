@@ -15,6 +15,8 @@ from cosmos_cli.fleet.known_hosts import HostKey, Standing, Verdict
 UNREACHABLE = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOWN)
 BANNER_ERROR = "Error reading SSH protocol banner"
 NO_SESSION = "No existing session"
+NOT_ALLOWED = 1
+"""SSH_OPEN_ADMINISTRATIVELY_PROHIBITED."""
 
 
 def opening_failure(error: Exception, where: str, timeout_s: float) -> MachineFailure:
@@ -41,7 +43,7 @@ def opening_failure(error: Exception, where: str, timeout_s: float) -> MachineFa
             "is its SSH server enabled and started, and ansible_port right?",
         )
     text = str(error)
-    if is_banner_error(error):
+    if BANNER_ERROR in text:
         return _silent(text, where, timeout_s)
     if isinstance(error, TimeoutError):
         return MachineFailure(
@@ -66,9 +68,19 @@ def opening_failure(error: Exception, where: str, timeout_s: float) -> MachineFa
     return _broken(text or type(error).__name__, where)
 
 
-def is_banner_error(error: Exception) -> bool:
-    """Whether the machine was reached but said nothing of SSH; worth another try."""
-    return BANNER_ERROR in str(error)
+def jump_failure(code: int, said: str, where: str) -> MachineFailure:
+    """Say why a jump host did not connect further."""
+    if code == NOT_ALLOWED:
+        return MachineFailure(
+            FailureKind.UNSUPPORTED,
+            f"{where}: the jump host does not let connections through ({said})",
+            "allow it there with AllowTcpForwarding",
+        )
+    return MachineFailure(
+        FailureKind.UNREACHABLE,
+        f"{where}: the jump host does not reach it ({said})",
+        "is it switched on, on that network, and its address right?",
+    )
 
 
 def _silent(text: str, where: str, timeout_s: float) -> MachineFailure:

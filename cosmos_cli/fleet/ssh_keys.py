@@ -24,6 +24,7 @@ from paramiko.message import Message
 from paramiko.pkey import PKey, UnknownKeyType
 from paramiko.ssh_exception import (
     AuthenticationException,
+    BadAuthenticationType,
     PasswordRequiredException,
     SSHException,
 )
@@ -61,8 +62,7 @@ class FewKeys:
         try:
             self._try_keys(transport)
         except (SSHException, OSError, EOFError) as error:
-            where = f"{self._settings.host} port {self._settings.port}"
-            raise login_failure(error, self._settings.user, where) from error
+            raise login_failure(error, self._settings.user, self._settings.where) from error
 
     def _try_keys(self, transport: Transport) -> None:
         user = self._settings.user
@@ -75,8 +75,12 @@ class FewKeys:
             tried.append(label)
             try:
                 further = transport.auth_publickey(user, key)
-            except AuthenticationException:
-                if not transport.is_active():
+            except BadAuthenticationType as error:
+                methods = ", ".join(error.allowed_types)
+                notes.append(f"the machine takes no key now, only {methods}")
+                break
+            except AuthenticationException as error:
+                if not transport.is_active() or "timeout" in str(error):
                     raise
                 continue
             if further:

@@ -1,8 +1,8 @@
 """
 The bytes below SSH: a TCP socket, a proxy command's pipe or a channel through a jump host, with two things added.
 
-It knows when the machine was last heard, and it gives up on a machine that takes no more bytes; paramiko alone
-would try for ever.
+It tells when the machine is heard again, and it gives up on a machine that takes no more bytes; paramiko
+alone would try for ever.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Protocol
 SEND_STALL_S_MAX = 15.0
 """A machine that took no byte for so long is taken for lost; a busy card delays sshd by less."""
 PROXY_END_TIMEOUT_S = 1.0
+TIMEOUT_S_MIN = 0.01
 
 
 class Pipe(Protocol):
@@ -63,8 +64,8 @@ class Wire:
         self._sign = threading.Event()
         self._closed = False  # paramiko asks for a socket's own
         self.own_address, self.peer_address = addresses
-        self.heard_s = time.monotonic()
-        """When the last bytes came, monotonic."""
+        self.is_ended = False
+        """Whether the other side has closed it."""
 
     def send(self, data: bytes) -> int:
         """Send what fits; raise when nothing has fitted for SEND_STALL_S_MAX."""
@@ -83,14 +84,14 @@ class Wire:
     def recv(self, count: int) -> bytes:
         """Wait for bytes."""
         data = self._pipe.recv(count)
-        if self._quick is not None:
+        if data and self._quick is not None:
             self._quick.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
-        self.heard_s = time.monotonic()
+        self.is_ended = not data
         self._sign.set()
         return data
 
     def expect_sign(self) -> threading.Event:
-        """Return an event that is set when the next bytes come."""
+        """Return an event that is set when the next bytes come, or their end."""
         self._sign.clear()
         return self._sign
 
@@ -117,13 +118,17 @@ def connect_tcp(host: str, port: int, *, timeout_s: float) -> Wire:
         OSError: Of the last address that the name stands for.
     """
     until_s = time.monotonic() + timeout_s
-    error: OSError = OSError(f"{host} stands for no address")
-    for family, kind, protocol, _, address in socket.getaddrinfo(
-        host, port, type=socket.SOCK_STREAM
-    ):
+    error = OSError(f"{host} stands for no address")
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    except UnicodeError:
+        raise socket.gaierror(socket.EAI_NONAME, "not a host name") from None
+    for index, (family, kind, protocol, _, address) in enumerate(found):
         sock = socket.socket(family, kind, protocol)
         try:
-            sock.settimeout(max(0.001, until_s - time.monotonic()))
+            # An address that does not answer must leave time for the others.
+            share_s = (until_s - time.monotonic()) / (len(found) - index)
+            sock.settimeout(max(TIMEOUT_S_MIN, share_s))
             sock.connect(address)
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             addresses = (sock.getsockname()[0], sock.getpeername()[0])
