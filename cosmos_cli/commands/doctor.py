@@ -104,12 +104,11 @@ class _Examination:
         overrides: Sequence[str],
     ) -> None:
         self._console = console
-        machines = [] if fleet is None else list(fleet.machines)
         self._fleet = fleet and _remote_part(fleet)
         self._scenario_file: Any = None
-        self.wants = Wants(machines=len(self._fleet.machines) if self._fleet else 0)
+        self.wants = Wants(machines=len(self._fleet.targets) if self._fleet else 0)
         if scenario is not None:
-            self._read_scenario(scenario, overrides, machines)
+            self._read_scenario(scenario, overrides, fleet.machines if fleet else ())
 
     def _read_scenario(
         self, path: Path, overrides: Sequence[str], machines: Sequence[Machine]
@@ -129,7 +128,7 @@ class _Examination:
         """Return what every machine told, this computer first."""
         outcomes: list[Outcome[Told]] = []
         own_addresses: set[str] = set()
-        if self._fleet and self._fleet.machines:
+        if self._fleet and self._fleet.targets:
             with Responder(self.wants.port) as responder:
                 if responder.is_port_taken:
                     self._console.warn(
@@ -196,12 +195,8 @@ class _Examination:
 
 def _remote_part(fleet: Fleet) -> Fleet:
     """Return the fleet without this computer, which is looked at anyway."""
-    kept = [index for index, target in enumerate(fleet.targets) if target.connection != "local"]
-    return dataclasses.replace(
-        fleet,
-        machines=tuple(fleet.machines[index] for index in kept),
-        targets=tuple(fleet.targets[index] for index in kept),
-    )
+    targets = tuple(target for target in fleet.targets if target.connection != "local")
+    return dataclasses.replace(fleet, targets=targets)
 
 
 def _show(
@@ -212,16 +207,15 @@ def _show(
     is_all: bool,
 ) -> None:
     rows = [
+        ("failed", failure.kind.value, outcome.machine, failure.text, failure.advice)
+        for outcome in outcomes
+        if (failure := outcome.failure)
+    ]
+    rows += [
         (group.level.value, group.check, group.names, group.found, group.cure)
         for group in grouped(findings)
         if is_all or group.level != Level.OK
     ]
-    for outcome in failed(outcomes):
-        assert outcome.failure is not None
-        failure = outcome.failure
-        rows.insert(
-            0, ("failed", failure.kind.value, outcome.machine, failure.text, failure.advice)
-        )
     if rows:
         console.table(COLUMNS, rows)
 

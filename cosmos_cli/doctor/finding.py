@@ -135,5 +135,7 @@ def _details(findings: Sequence[Finding]) -> str:
     told = [(f.machine, f.remark.detail) for f in findings if f.remark.detail]
     if len({detail for _, detail in told}) <= 1:
         return told[0][1] if told else ""
+    if findings[0].level == Level.OK:
+        return ""
     shown = "; ".join(f"{machine}: {detail}" for machine, detail in told[:DETAILS_SHOWN_MAX])
     return shown + ("; ..." if len(told) > DETAILS_SHOWN_MAX else "")

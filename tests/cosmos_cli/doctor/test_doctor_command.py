@@ -1,0 +1,176 @@
+"""`cosmos doctor` as a person meets it; machines are this computer under other names."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cosmos_cli.app import run as cosmos
+from cosmos_cli.doctor.finding import HERE
+from cosmos_cli.fleet.connection import Connection, ConnectOptions
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.local import LocalConnection
+from cosmos_cli.fleet.target import Target
+
+pytestmark = pytest.mark.process
+
+SCENARIO = """\
+name: two
+simulation: counter
+agents: {count: 2, tick_hz: 20}
+network: {receive_buffer_bytes: 2000000000}
+"""
+INVENTORY = """\
+all:
+  vars: {cosmos_root: ROOT}
+  hosts:
+    "pi[01:03]": {}
+    here: {ansible_connection: local}
+"""
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("cosmos_cli.doctor.probe.WAKE_UP_COUNT", 3)
+    monkeypatch.setattr("cosmos_cli.doctor.probe.ROUND_TRIP_COUNT", 5)
+    monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
+
+
+@pytest.fixture
+def inventory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    def connect(target: Target, options: ConnectOptions) -> Connection:
+        if target.name == "pi03":
+            raise MachineFailure(FailureKind.UNREACHABLE, "no route to pi03", "switch it on")
+        return LocalConnection(target)
+
+    monkeypatch.setattr("cosmos_cli.fleet.fleet.connect", connect)
+    path = tmp_path / "inventory.yaml"
+    path.write_text(INVENTORY.replace("ROOT", str(tmp_path / "cosmos")))
+    return path
+
+
+@pytest.fixture
+def told(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Let machines tell something else, so that nothing depends on this computer's state."""
+    import cosmos_cli.commands.doctor as command
+
+    ask, ask_here = command.ask, command.ask_here
+    other: dict[str, dict[str, Any]] = {}
+
+    def change(machine: str, **facts: Any) -> None:
+        other[machine] = facts
+
+    def changed(machine: str, values: dict[str, Any]) -> dict[str, Any]:
+        # Nothing of this computer that would be found wanting elsewhere.
+        values["wake_ups"] |= {"p50_ms": 0.1, "p99_ms": 0.1, "max_ms": 0.1, "policy": "fifo"}
+        values["busy"] |= {"processors": 0.0, "steal_share": 0.0, "swapped_pages": 0}
+        values["limits"] |= {"cpu_quota": None}
+        values["interfaces"] = []
+        values["facts"]["network"]["receive_buffer_bytes_max"] = 2_000_000_000
+        values["facts"]["disk"] |= {"free_bytes": 10**12, "free_files": 10**6}
+        values["facts"]["memory"]["available_bytes"] = 10**10
+        values["facts"] |= {"throttled": 0, "temperature_c": 40.0, "governors": {}}
+        values["facts"] |= other.get(machine, {})
+        return values
+
+    monkeypatch.setattr(command, "ask", lambda c, *a, **k: changed(c.target.name, ask(c, *a, **k)))
+    monkeypatch.setattr(command, "ask_here", lambda *a, **k: changed(HERE, ask_here(*a, **k)))
+    return change
+
+
+def test_this_computer_alone(told: Callable[..., None], capsys: pytest.CaptureFixture[str]) -> None:
+    code = cosmos(["doctor", "--all"])
+
+    out = capsys.readouterr().out
+    assert code == 0
+    assert out.splitlines()[0].split() == ["LEVEL", "CHECK", "MACHINES", "FOUND", "CURE"]
+    assert "SCHED_FIFO with priority 11 is permitted" in out
+    assert out.splitlines()[-1].startswith(f"{HERE}: ")
+
+
+def test_machines_are_grouped_by_what_was_found(
+    told: Callable[..., None], inventory: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for machine in ("pi01", "pi02"):
+        told(machine, governors={"cpu0": "ondemand"})
+
+    code = cosmos(["doctor", "-i", str(inventory), "--limit", "!pi03"])
+
+    lines = capsys.readouterr().out.splitlines()
+    (line,) = [line for line in lines if " governor " in line]
+    assert code == 0
+    assert "pi01, pi02" in line
+    assert "`cosmos_cpu_governor: performance` in the inventory, then `cosmos up`" in line
+    assert lines[-1].startswith("2 machines and this computer: 1 warning, ")
+
+
+def test_strict_fails_on_warnings(told: Callable[..., None], inventory: Path) -> None:
+    told("pi01", governors={"cpu0": "ondemand"})
+
+    assert cosmos(["doctor", "-i", str(inventory), "--limit", "pi01", "--strict"]) == 1
+
+
+def test_error_fails(
+    told: Callable[..., None], inventory: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told("pi02", throttled=1)
+
+    code = cosmos(["doctor", "-i", str(inventory), "--limit", "pi01:pi02", "--json"])
+
+    answer = json.loads(capsys.readouterr().out)
+    machines = {machine["machine"]: machine for machine in answer["machines"]}
+    assert code == answer["exit_code"] == 1
+    assert answer["levels"]["error"] == 1
+    assert list(machines) == [HERE, "pi01", "pi02"]
+    assert {
+        "check": "throttled",
+        "level": "error",
+        "found": "now: under-voltage",
+    }.items() <= next(f for f in machines["pi02"]["findings"] if f["level"] == "error").items()
+    assert machines["pi01"]["probed"]["round_trips"]["answered"] == 5
+
+
+def test_unreachable_machine_hides_nobody_and_ends_with_3(
+    told: Callable[..., None], inventory: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told("pi01", throttled=1)
+
+    code = cosmos(["doctor", "-i", str(inventory)])
+
+    lines = capsys.readouterr().out.splitlines()
+    assert code == 3
+    assert lines[1].split()[:3] == ["failed", "unreachable", "pi03"]
+    assert "switch it on" in lines[1]
+    assert any(line.startswith("error") and "pi01" in line for line in lines)
+    assert lines[-1].startswith("3 machines and this computer: 1 error")
+    assert "1 failed" in lines[-1]
+
+
+def test_wants_are_the_scenarios(
+    told: Callable[..., None],
+    inventory: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "two.yaml").write_text(SCENARIO)
+    told("pi01", network={"receive_buffer_bytes_max": 8_388_608})
+
+    cosmos(
+        ["doctor", str(tmp_path / "two.yaml"), "-i", str(inventory), "--limit", "pi01", "--json"]
+    )
+
+    answer = json.loads(capsys.readouterr().out)
+    here, machine = answer["machines"]
+    assert answer["scenario"] == "two"
+    assert any(f["check"] == "feasibility" and f["level"] == "ok" for f in here["findings"])
+    assert any("2 agents at 20 Hz" in f["found"] for f in machine["findings"])
+
+
+def test_nothing_is_left_in_the_runs_folder(told: Callable[..., None], tmp_path: Path) -> None:
+    cosmos(["doctor"])
+
+    assert not (tmp_path / "runs").exists()
