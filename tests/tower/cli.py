@@ -13,6 +13,7 @@ from .console import say, show
 from .faults import FAULTS
 from .inventory import format_inventory
 from .places import Places, is_owned, list_towers, lock
+from .roots import ensure_root
 from .serve import STARTUP_ERRORS
 from .specification import ARCHITECTURES, NATIVE, BoardSpec, TowerSpec, name_boards
 from .supervisor import Options, Supervisor
@@ -32,8 +33,12 @@ def main() -> None:
 
 def _make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="tower", description=__doc__)
+    chosen = os.environ.get("COSMOS_TOWER")
     parser.add_argument(
-        "--tower", type=int, help="index, where several run (default: the only one)"
+        "--tower",
+        type=int,
+        default=int(chosen) if chosen else None,
+        help="index, where several run (default: COSMOS_TOWER, or the only one)",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     up = commands.add_parser("up", help="make a tower; Ctrl-C takes it down")
@@ -68,7 +73,13 @@ def _make_parser() -> argparse.ArgumentParser:
     inventory.set_defaults(run=_inventory)
     environment = commands.add_parser("environment", help="print what `cosmos` needs: eval it")
     environment.set_defaults(run=_environment)
-    down = commands.add_parser("down", help="take towers down, and clean up after killed ones")
+    build = commands.add_parser("roots", help="build the systems of foreign boards, once")
+    build.add_argument(
+        "arch", nargs="+", choices=[arch for arch in ARCHITECTURES if arch != NATIVE]
+    )
+    build.set_defaults(run=_build_roots)
+    down = commands.add_parser("down", help="take a tower down, and clean up after killed ones")
+    down.add_argument("--all", action="store_true", help="where several run")
     down.set_defaults(run=_down)
     return parser
 
@@ -105,6 +116,8 @@ def _status(arguments: argparse.Namespace) -> None:
         show(json.dumps(ask(_find(arguments), {"verb": "status"}), indent=1))
         return
     for places in list_towers():
+        if arguments.tower not in (None, places.index):
+            continue
         if not is_owned(places):
             say(f"tower {places.index}: killed; `down` removes what is left")
             continue
@@ -146,17 +159,27 @@ def _environment(arguments: argparse.Namespace) -> None:
     show(f"export COSMOS_SSH_CONFIG={_find(arguments).ssh_config}")
 
 
+def _build_roots(arguments: argparse.Namespace) -> None:
+    for arch in arguments.arch:
+        show(str(ensure_root(arch)))
+
+
 def _down(arguments: argparse.Namespace) -> None:
-    chosen = list_towers() if arguments.tower is None else [Places(arguments.tower)]
-    for places in chosen:
-        if is_owned(places):
-            ask(places, {"verb": "stop"})
-            wait_until_gone(places)
-        else:
+    """End a running tower; remove what killed ones left, which needs no choice."""
+    towers = list_towers() if arguments.tower is None else [Places(arguments.tower)]
+    running = [places for places in towers if is_owned(places)]
+    for places in towers:
+        if places not in running:
             owner = lock(places)
             if owner is not None:
                 cleaning.clean(places)
                 os.close(owner)
+                say(f"tower {places.index}: cleaned up")
+    if running and not arguments.all:
+        running = [_find(arguments)]
+    for places in running:
+        ask(places, {"verb": "stop"})
+        wait_until_gone(places)
         say(f"tower {places.index}: down")
 
 

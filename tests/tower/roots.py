@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
 import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 from . import kernel
@@ -25,6 +26,13 @@ SUITE = "bookworm"
 PACKAGES = ("python3", "python3-venv", "openssh-server", "sudo")
 PACKAGES_MORE = {"armhf": ("python3-numpy", "python3-msgpack", "python3-psutil")}
 """There are no wheels of these for 32-bit ARM: its runtime lives on the distribution's."""
+DPKG_OPTIONS = (
+    "force-unsafe-io",
+    "path-exclude=/usr/share/man/*",
+    "path-exclude=/usr/share/locale/*",
+)
+ALONE = ("unshare", "--pid", "--fork", "--kill-child", "--mount-proc", "--")
+"""What it starts ends with it."""
 EMULATORS = {"arm64": "aarch64", "armhf": "arm"}
 REGISTRY = Path("/proc/sys/fs/binfmt_misc")
 BUILD_PATIENCE_S = 1800
@@ -75,7 +83,7 @@ def ensure_root(arch: str) -> Path:
     return cache / arch
 
 
-def register_emulators(architectures: Iterator[str] | list[str]) -> None:
+def register_emulators(architectures: Iterable[str]) -> None:
     """
     Let the kernel run these architectures' programs, as long as this mount namespace lives.
 
@@ -104,36 +112,46 @@ def _emulator_file(arch: str) -> Path:
 
 
 def _build(arch: str, cache: Path) -> None:
-    """Build a system under a temporary name; only a whole one gets its own."""
+    """Build a system under a temporary name; only a whole one gets its own. The caller holds the lock."""
+    for path in cache.glob(f"{arch}.part-*"):  # of a builder that was killed
+        shutil.rmtree(path, ignore_errors=True)
     say(f"tower: building a Debian {SUITE} for {arch}, once; some minutes")
     folder = Path(tempfile.mkdtemp(prefix=f"{arch}.part-", dir=cache))
     log = cache / f"{arch}.log"
     names = ",".join((*PACKAGES, *PACKAGES_MORE.get(arch, ())))
-    command = ["mmdebstrap", f"--arch={arch}", "--variant=minbase", f"--include={names}"]
+    command = [*ALONE, "mmdebstrap", f"--arch={arch}", "--variant=minbase", f"--include={names}"]
+    command += [f"--dpkgopt={option}" for option in DPKG_OPTIONS]
     command += [SUITE, str(folder / "root"), *_sources()]
-    child = os.fork()
-    if child == 0:
-        try:
-            kernel.unshare(kernel.CLONE_NEWNS)
-            kernel.make_mounts_private()
-            register_emulators([arch])
-            with open(log, "w") as out:
-                run = subprocess.run(
-                    command, stdout=out, stderr=out, timeout=BUILD_PATIENCE_S, check=False
-                )
-            os._exit(1 if run.returncode else 0)
-        except BaseException as error:  # noqa: BLE001 - a forked process tells its log
-            log.write_text(f"{error}\n")
-            os._exit(1)
-    _, status = os.waitpid(child, 0)
     try:
-        if status:
+        with open(log, "w") as out:
+            run = subprocess.run(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=out,
+                timeout=BUILD_PATIENCE_S,
+                check=False,
+                preexec_fn=functools.partial(_enter_workshop, os.getpid(), arch),
+            )
+        if run.returncode:
             tail = "\n".join(log.read_text().splitlines()[-10:])
             raise RootError(f"mmdebstrap for {arch} failed; {log}:\n{tail}")
         shutil.rmtree(folder / "root/var/cache/apt/archives", ignore_errors=True)
         (folder / "root").rename(cache / arch)
+    except subprocess.TimeoutExpired as error:
+        raise RootError(
+            f"mmdebstrap for {arch}: not done in {BUILD_PATIENCE_S} s; {log}"
+        ) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _enter_workshop(builder: int, arch: str) -> None:
+    """Let the process that becomes mmdebstrap run foreign programs, and end with its builder."""
+    kernel.die_with_parent(builder)
+    kernel.unshare(kernel.CLONE_NEWNS)
+    kernel.make_mounts_private()
+    register_emulators([arch])
 
 
 def _sources() -> list[str]:

@@ -107,8 +107,13 @@ def find_guardian(supervisor: int) -> int:
 
 
 def find_locks(process: int) -> list[Path]:
-    links = Path(f"/proc/{process}/fd").iterdir()
-    return [link for link in links if os.readlink(link).startswith("/run/cosmos-tower/")]
+    """Return the descriptors by which a process owns a tower's index."""
+    found = []
+    for link in Path(f"/proc/{process}/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # closed meanwhile
+            if os.readlink(link).startswith("/run/cosmos-tower/"):
+                found.append(link)
+    return found
 
 
 def test_traces_are_seen_while_a_tower_runs(make_tower):
@@ -178,6 +183,7 @@ def test_killed_boot_leaves_nothing():
             [*CLI, "up", "4"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
         ) as process:
             time.sleep(delay_s)
+            process.send_signal(signal.SIGSTOP)
             folders = {os.readlink(link) for link in find_locks(process.pid)}
             process.kill()
         for folder in folders:
