@@ -36,6 +36,7 @@ COMMANDS = (
     "ping",
     "doctor",
     "exec",
+    "wipe",
     "run",
     "ps",
     "down",

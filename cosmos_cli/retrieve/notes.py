@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from cosmos_cli.retrieve.disk import local_disk
+from cosmos_cli.retrieve.disk import hash_of, local_disk
 from cosmos_cli.retrieve.offer import MANIFEST_NAME, RETRIEVED_NAME
 from cosmos_cli.retrieve.sources import MACHINES
 from cosmos_cli.rundir import SCHEMA, RunDirectory, utc_now, write_json
@@ -107,6 +107,15 @@ def retrieved_files(run: RunDirectory) -> Iterator[tuple[str, Mapping[str, Any]]
     """Yield path and entry of every file that came from a machine and was verified then."""
     for _, files in _manifests(run):
         yield from files
+
+
+def is_all_here(run: RunDirectory, machine: str) -> bool:
+    """Tell whether every file that a machine's kept manifest lists is here, with that content."""
+    manifests = dict(_manifests(run))
+    return machine in manifests and all(
+        hash_of(run.path / path, int(entry.get("bytes", -1))) == entry["sha256"]
+        for path, entry in manifests[machine]
+    )
 
 
 def retrieved_paths(run: RunDirectory) -> Iterator[tuple[str, str]]:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 
 from cosmos_cli.fleet.onboard.core import Refusal, Request, verb
-from madns_runtime.processes import list_processes
+from madns_runtime.processes import ProcessEntry, list_processes
 
 LIVING_SHOWN_MAX = 5
 POLL_S = 0.05
@@ -51,14 +51,24 @@ def wait_for_end(directory: str, state: str, patience_s: float) -> None:
 
 def find_living(directory: str, state: str) -> list[str]:
     """Return in words what lives of the run in a directory: by the register, or because it writes there."""
-    os.environ["COSMOS_STATE_DIR"] = state
     inside = os.path.realpath(directory)
     entries = {
-        entry.pid: f"{entry.role} {entry.name} (pid {entry.pid})"
-        for entry in list_processes()
+        entry.pid: words_of(entry)
+        for entry in read_register(state)
         if is_within(os.path.realpath(entry.run_directory), inside)
     }
     return [*entries.values(), *(text for pid, text in _writers(inside) if pid not in entries)]
+
+
+def read_register(state: str) -> list[ProcessEntry]:
+    """Return the living processes of all runs on this machine."""
+    os.environ["COSMOS_STATE_DIR"] = state
+    return list_processes()
+
+
+def words_of(entry: ProcessEntry) -> str:
+    """Return a process as a person is told of it."""
+    return f"{entry.role} {entry.name} (pid {entry.pid})"
 
 
 def is_within(path: str, directory: str) -> bool:

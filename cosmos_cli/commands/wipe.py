@@ -1,0 +1,173 @@
+"""`cosmos wipe`: deletes old runs on machines, those that were collected; or all of COSMoS there."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import Annotated, Any
+
+import typer
+
+from cosmos_cli.commands.fleet_options import (
+    FORKS_DEFAULT,
+    AcceptHostKeysOption,
+    Fleet,
+    ForksOption,
+    InventoryOption,
+    LimitOption,
+    fleet_of,
+)
+from cosmos_cli.commands.runs import RunsOption
+from cosmos_cli.confirm import confirm
+from cosmos_cli.console import Column, Console, JsonOption, QuietOption
+from cosmos_cli.errors import ExitCode
+from cosmos_cli.fleet.connection import Connection
+from cosmos_cli.fleet.failure import MachineFailure
+from cosmos_cli.fleet.outcome import Outcome
+from cosmos_cli.retrieve.disk import megabytes
+from cosmos_cli.rundir import runs_root
+from cosmos_cli.wipe import Order, RunThere, Wiped, carry_out, look, make_order, runs_here
+
+COLUMNS = (
+    Column("machine"),
+    Column("run"),
+    Column("files", is_number=True),
+    Column("size", is_number=True),
+    Column("changed (UTC)"),
+    Column("state"),
+    Column("will be"),
+)
+INSTALLED = "environments, trees, wheels"
+HOLDER = "cosmos wipe"
+
+
+def wipe(
+    inventory: InventoryOption,
+    limit: LimitOption = None,
+    uncollected: Annotated[
+        bool, typer.Option("--uncollected", help="Delete also runs that were never collected.")
+    ] = False,
+    all_: Annotated[
+        bool,
+        typer.Option(
+            "--all", help="Delete environments and code as well: all that `up` put there."
+        ),
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
+    folder: RunsOption = None,
+    forks: ForksOption = FORKS_DEFAULT,
+    accept_new_host_keys: AcceptHostKeysOption = False,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """
+    Delete what runs left on machines. What was not collected stays, and so does what lives.
+
+    Shows what would go and asks. A run counts as collected when all that lies there is here, verified
+    once more. Ends with 3 when any machine failed.
+    """
+    console = Console(json=json, quiet=quiet)
+    fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
+    known = runs_here(runs_root(folder))
+
+    def find(connection: Connection) -> Order:
+        if connection.target.connection == "local":
+            return Order()  # runs on this computer record where they are collected
+        findings = look(connection, known, is_all=all_)
+        return make_order(findings, is_all=all_, with_uncollected=uncollected)
+
+    found = fleet.each_target(find)
+    rows = [row for outcome in found for row in _rows(outcome)]
+    if rows:
+        console.table(COLUMNS, rows)
+    orders = {o.machine: o.value for o in found if o.value and not o.value.is_empty}
+    if orders and not confirm(_question(list(orders.values())), is_sure=yes):
+        console.say("nothing was deleted")
+        orders = {}
+    wiped = _carry_out(fleet, orders)
+    return _tell(console, found, wiped)
+
+
+def _carry_out(fleet: Fleet, orders: dict[str, Order]) -> dict[str, Outcome[Wiped]]:
+    targets = tuple(target for target in fleet.targets if target.name in orders)
+    chosen = dataclasses.replace(fleet, targets=targets)
+    outcomes = chosen.each_target(
+        lambda connection: carry_out(connection, orders[connection.target.name], HOLDER)
+    )
+    return {outcome.machine: outcome for outcome in outcomes}
+
+
+def _rows(outcome: Outcome[Order]) -> list[list[str]]:
+    order = outcome.value
+    if order is None:
+        return []
+    rows = [_row(outcome.machine, run, "deleted") for run in order.runs]
+    rows += [_row(outcome.machine, run, "kept") for run in order.kept]
+    if order.is_root:
+        size = megabytes(order.installed_bytes)
+        rows.append([outcome.machine, INSTALLED, "", size, "", "", "deleted"])
+    return rows
+
+
+def _row(machine: str, run: RunThere, fate: str) -> list[str]:
+    changed = datetime.fromtimestamp(run.newest_s, UTC).strftime("%Y-%m-%d %H:%M")
+    state = f"running: {', '.join(run.living)}" if run.living else run.state
+    return [machine, run.name, str(run.files), megabytes(run.bytes), changed, state, fate]
+
+
+def _question(orders: Sequence[Order]) -> str:
+    runs = [run for order in orders for run in order.runs]
+    lost = sum(run.state == "not collected" for run in runs)
+    parts = [f"{len(runs)} runs"] if runs else []
+    if any(order.is_root for order in orders):
+        parts.append(INSTALLED)
+    never = f", {lost} of them NEVER COLLECTED" if lost else ""
+    size = megabytes(sum(order.bytes for order in orders))
+    return f"delete {' and '.join(parts)} ({size}{never}) on {len(orders)} machines?"
+
+
+def _tell(
+    console: Console, found: Sequence[Outcome[Order]], wiped: dict[str, Outcome[Wiped]]
+) -> int:
+    """Say what became of each machine, and return the exit code."""
+    failures = {o.machine: o.failure for o in found if o.failure is not None}
+    failures |= {o.machine: o.failure for o in wiped.values() if o.failure is not None}
+    for machine, failure in failures.items():
+        console.warn(f"{machine}: {failure}")
+    done = {name: outcome.value for name, outcome in wiped.items() if outcome.value is not None}
+    for machine, value in done.items():
+        for path in value.left:
+            console.say(f"{machine}: kept {path}{_why(path)}")
+    runs = sum(len(value.runs) for value in done.values())
+    size = megabytes(sum(value.bytes for value in done.values()))
+    kept = sum(len(o.value.kept) for o in found if o.value is not None)
+    console.data(
+        f"{len(found)} machines: {runs} runs deleted ({size}), {kept} kept, {len(failures)} failed"
+    )
+    exit_code = ExitCode.MACHINES if failures else ExitCode.OK
+    machines = [_mapping(o, done.get(o.machine), failures.get(o.machine)) for o in found]
+    console.print_json({"machines": machines, "exit_code": int(exit_code)})
+    return int(exit_code)
+
+
+def _why(path: str) -> str:
+    if path.endswith(".json"):
+        return ", which remembers what settings were before; `cosmos up` puts them back"
+    return ", which was not collected"
+
+
+def _mapping(
+    found: Outcome[Order], wiped: Wiped | None, failure: MachineFailure | None
+) -> dict[str, Any]:
+    order = found.value or Order()
+    return {
+        "machine": found.machine,
+        "ok": failure is None,
+        "failure": failure.to_mapping() if failure else None,
+        "found": [run.to_mapping() for run in (*order.runs, *order.kept)],
+        "deleted": list(wiped.runs) if wiped else [],
+        "deleted_bytes": wiped.bytes if wiped else 0,
+        "is_root_gone": wiped.is_root_gone if wiped else False,
+        "left": list(wiped.left) if wiped else [],
+    }
