@@ -28,6 +28,7 @@ LOCAL_HEADER = struct.Struct("<4s22xHH")
 LOCAL_SIGNATURE = b"PK\x03\x04"
 IS_ENCRYPTED = 1
 PROGRAM_MODE, FILE_MODE = 0o755, 0o644
+DATA_FOLDERS = ("purelib", "platlib", "scripts", "headers", "data")
 MODULE = re.compile(r"[A-Za-z_][\w.]*")
 SCRIPT = """#!{python}
 import sys
@@ -55,7 +56,7 @@ class Place:
         return os.path.join(self.top, f"lib/python{self.python_version}/site-packages")
 
     def folder(self, scheme: str, name: str) -> str:
-        """Return where a part of a wheel's data folder goes."""
+        """Return where a part of a wheel's data folder goes, one of `DATA_FOLDERS`."""
         folders = {
             "purelib": self.site,
             "platlib": self.site,
@@ -63,8 +64,6 @@ class Place:
             "headers": os.path.join(self.top, f"include/site/python{self.python_version}", name),
             "data": self.top,
         }
-        if scheme not in folders:
-            raise Refusal("data", f"{name}: unknown data folder {scheme!r}")
         return folders[scheme]
 
 
@@ -180,6 +179,8 @@ class Wheel:
             return os.path.join(place.site, name), False
         if len(parts) < 3:
             raise Refusal("data", f"{self._name}: {name!r} belongs nowhere")
+        if parts[1] not in DATA_FOLDERS:
+            raise Refusal("data", f"{self._name}: unknown data folder {parts[1]!r}")
         folder = place.folder(parts[1], self._name.split("-")[0])
         return os.path.join(folder, *parts[2:]), parts[1] == "scripts"
 

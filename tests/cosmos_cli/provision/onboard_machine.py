@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from contextlib import contextmanager
+from pathlib import Path
 
 from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
@@ -94,6 +95,7 @@ def snapshot(folder):
         for name in names:
             path = os.path.join(top, name)
             status = os.lstat(path)
-            content = os.readlink(path) if os.path.islink(path) else open(path, "rb").read()
+            is_link = os.path.islink(path)
+            content = os.readlink(path) if is_link else Path(path).read_bytes()
             found[os.path.relpath(path, folder)] = (content, status.st_mode, status.st_mtime_ns)
     return found

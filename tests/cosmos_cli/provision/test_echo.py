@@ -1,0 +1,148 @@
+"""UDP between a machine and the operator is tried both ways, and a silence is put into words."""
+
+import socket
+import threading
+
+import pytest
+
+from cosmos_cli.fleet.onboard import installed
+from cosmos_cli.fleet.onboard.core import Refusal
+from cosmos_cli.provision import echo as module
+from cosmos_cli.provision.echo import Echo
+
+
+@pytest.fixture
+def echo():
+    with Echo("127.0.0.1") as echo:
+        yield echo
+
+
+@pytest.fixture
+def link():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        link.settimeout(0.2)
+        yield link
+
+
+def test_round_trip_is_measured_and_counted(echo):
+    question = echo.question("127.0.0.1")
+
+    assert 0 < installed._round_trip_ms(question) < 300
+    assert echo.heard(question) == 1
+
+
+def test_many_machines_share_one_echo(echo):
+    questions = [echo.question("127.0.0.1") for _ in range(20)]
+    found = []
+    threads = [
+        threading.Thread(target=lambda q=q: found.append(installed._round_trip_ms(q)))
+        for q in questions
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(10)
+
+    assert len(found) == 20
+    assert all(echo.heard(question) for question in questions)
+
+
+def test_strangers_get_no_answer(echo, link):
+    question = echo.question("127.0.0.1")
+    for packet in (b"", b"x" * 16, b"y" * 1000, bytes.fromhex(question["nonce_hex"])[:15]):
+        link.sendto(packet, ("127.0.0.1", echo.port))
+
+    with pytest.raises(TimeoutError):
+        link.recv(100)
+    assert echo.heard(question) == 0
+
+
+def test_answer_has_no_more_bytes_than_the_question(echo, link):
+    nonce = bytes.fromhex(echo.question("127.0.0.1")["nonce_hex"])
+    link.sendto(nonce + b"\x02", ("127.0.0.1", echo.port))
+
+    assert link.recv(1000) == nonce + b"\x02"
+
+
+def test_lost_datagrams_are_sent_again(monkeypatch, echo):
+    """The first two go nowhere, as on a lossy link."""
+    monkeypatch.setattr(installed, "ECHO_WAIT_S", 0.05)
+    question = echo.question("127.0.0.1")
+    sent = []
+
+    class Lossy(socket.socket):
+        def sendto(self, packet, where):
+            sent.append(packet)
+            return super().sendto(packet, where) if len(sent) > 2 else len(packet)
+
+    monkeypatch.setattr(installed.socket, "socket", Lossy)
+
+    assert installed._round_trip_ms(question) > 0
+    assert len(sent) == 3
+    assert echo.heard(question) == 1
+
+
+def test_silence_names_the_address_and_what_to_do(monkeypatch, link):
+    monkeypatch.setattr(installed, "ECHO_WAIT_S", 0.02)
+    link.bind(("127.0.0.1", 0))
+    port = link.getsockname()[1]
+
+    with pytest.raises(Refusal) as caught:
+        installed._round_trip_ms({"address": "127.0.0.1", "port": port, "nonce_hex": "00" * 16})
+
+    assert caught.value.text == f"no UDP from here to 127.0.0.1:{port}"
+    assert "is a firewall closing it?" in caught.value.advice
+
+
+def test_address_that_is_none_is_told(monkeypatch):
+    monkeypatch.setattr(installed, "ECHO_WAIT_S", 0.02)
+
+    with pytest.raises(Refusal, match=r"no UDP from here to no\.such\.host\.invalid:9 \("):
+        installed._round_trip_ms(
+            {"address": "no.such.host.invalid", "port": 9, "nonce_hex": "00" * 16}
+        )
+
+
+def test_foreign_answers_are_not_taken_for_ours(monkeypatch):
+    """Somebody else answers on that port."""
+    monkeypatch.setattr(installed, "ECHO_WAIT_S", 0.05)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        other.settimeout(5)
+
+        def answer():
+            for _ in range(3):
+                _, sender = other.recvfrom(100)
+                other.sendto(b"z" * 17, sender)
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        question = {"address": "127.0.0.1", "port": other.getsockname()[1], "nonce_hex": "00" * 16}
+        with pytest.raises(Refusal, match="no UDP"):
+            installed._round_trip_ms(question)
+        thread.join(5)
+
+
+def test_questions_are_bounded(monkeypatch, echo):
+    monkeypatch.setattr(module, "NONCES_MAX", 3)
+    questions = [echo.question("127.0.0.1") for _ in range(5)]
+
+    assert len(echo._nonces) == 3
+    assert installed._round_trip_ms(questions[-1]) > 0
+
+
+def test_closing_twice_is_harmless():
+    echo = Echo("127.0.0.1")
+    echo.close()
+    echo.close()
+
+    assert not echo._thread.is_alive()
+
+
+def test_ipv6_is_echoed_too():
+    try:
+        echo = Echo("::1")
+    except OSError as error:
+        pytest.skip(f"no IPv6 here: {error}")
+    with echo:
+        assert installed._round_trip_ms(echo.question("::1")) > 0

@@ -1,0 +1,522 @@
+"""Virtual environments on a machine: whole or not there, built from wheels with nothing but Python."""
+
+import contextlib
+import dataclasses
+import hashlib
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from made_wheels import make_runtime_wheels, make_wheel, only_index
+from onboard_machine import OwnMachine, snapshot
+
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.provision import environment as module
+from cosmos_cli.provision.environment import (
+    RuntimeCheck,
+    ask_installed,
+    check_distribution,
+    check_runtime,
+    install_environment,
+    installed_request,
+    modules_of,
+    prune,
+)
+from cosmos_cli.provision.lock import Distributed, Lock, Locked
+from cosmos_cli.provision.platform import greeted_platform
+from cosmos_cli.provision.trees import runtime_tree, send_tree
+from cosmos_cli.provision.wheelhouse import Environment, prepare
+
+REAL_PACKAGES = ("msgpack", "numpy", "orjson", "psutil")
+
+
+@pytest.fixture
+def machine(tmp_path):
+    return OwnMachine(tmp_path / "root")
+
+
+class House:
+    """A wheelhouse whose wheels are made as they are asked for."""
+
+    def __init__(self, folder, machine):
+        self.folder = folder
+        with machine.board() as board:
+            self.platform = greeted_platform(board.greeting)
+
+    def environment(self, *wheels, **changes):
+        locked = []
+        for path in wheels:
+            content = path.read_bytes()
+            name, version = path.name.split("-")[:2]
+            sha256 = hashlib.sha256(content).hexdigest()
+            (self.folder / sha256).mkdir(parents=True, exist_ok=True)
+            (self.folder / sha256 / path.name).write_bytes(content)
+            locked.append(
+                Locked(
+                    name=name,
+                    version=version,
+                    sha256=sha256,
+                    filename=path.name,
+                    size_bytes=len(content),
+                )
+            )
+        content = Lock(platform=self.platform, wheels=tuple(locked))
+        return Environment(content=dataclasses.replace(content, **changes), wheels=self.folder)
+
+
+@pytest.fixture
+def house(tmp_path, machine):
+    return House(tmp_path / "house", machine)
+
+
+@pytest.fixture
+def navlib(tmp_path):
+    """A wheel with all that a wheel may bring."""
+    return make_wheel(
+        tmp_path / "made",
+        "nav-lib",
+        "1.2",
+        files={
+            "nav_lib/data/table.bin": os.urandom(5000),
+            "nav_lib-1.2.data/scripts/nav-tool": b"#!python\nimport nav_lib\nprint(nav_lib.version)\n",
+            "nav_lib-1.2.data/data/share/nav/readme": b"hello",
+            "nav_lib-1.2.data/headers/nav.h": b"//",
+            "nav_lib-1.2.data/purelib/nav_extra.py": b"x = 1\n",
+        },
+        entry_points="[console_scripts]\nnav = nav_lib.main:Tool.run [extra]\n[other]\na = b:c\n",
+    )
+
+
+def install(machine, environment, **how):
+    with machine.board(**how) as board:
+        return install_environment(board, machine.layout, environment)
+
+
+def python(machine, environment, program):
+    """Run a program in an environment, with nothing else on its path."""
+    done = subprocess.run(
+        [machine.layout.python(environment.key), "-c", program],
+        capture_output=True,
+        text=True,
+        env={},
+        cwd="/",
+        check=True,
+    )
+    return done.stdout.strip()
+
+
+def is_whole(machine, environment):
+    with machine.board() as board:
+        request = installed_request(machine.layout, trees=[], environments=[environment.key])
+        return ask_installed(board, request).environments[environment.key]
+
+
+def top_of(machine, environment):
+    return Path(machine.layout.environment(environment.key))
+
+
+def test_wheels_are_installed_as_the_specification_says(machine, house, navlib):
+    environment = house.environment(navlib)
+
+    assert install(machine, environment)
+
+    top = top_of(machine, environment)
+    assert (
+        python(machine, environment, "import nav_lib, nav_extra; print(nav_lib.version)") == "1.2"
+    )
+    told = python(machine, environment, "import sys; print(sys.prefix)")
+    assert told == str(top)
+    version = "import importlib.metadata as m; print(m.version('nav-lib'), m.files('nav-lib')[0])"
+    assert python(machine, environment, version).startswith("1.2 ")
+    tool = subprocess.run([top / "bin/nav-tool"], capture_output=True, text=True, check=True)
+    assert tool.stdout == "1.2\n"
+    starter = (top / "bin/nav").read_text()
+    assert f"#!{top}/bin/python\n" in starter and "from nav_lib.main import Tool\n" in starter
+    assert (top / "share/nav/readme").read_text() == "hello"
+    assert list(top.glob("include/site/*/nav_lib/nav.h"))
+
+
+def test_record_lists_what_is_there(machine, house, navlib):
+    environment = house.environment(navlib)
+    install(machine, environment)
+
+    program = (
+        "import importlib.metadata as m\n"
+        "print([str(f) for f in m.files('nav-lib') if not f.locate().exists()])\n"
+        "print(m.distribution('nav-lib').read_text('INSTALLER').strip())"
+    )
+
+    assert python(machine, environment, program) == "[]\ncosmos"
+
+
+def test_second_time_nothing_is_sent_and_nothing_touched(machine, house, navlib):
+    environment = house.environment(navlib)
+    install(machine, environment)
+    before = snapshot(machine.root)
+    machine.calls.clear()
+
+    assert not install(machine, environment)
+
+    assert [verb for verb, _, _ in machine.calls] == ["environment"]
+    assert before == snapshot(machine.root)
+
+
+def test_wheel_that_another_environment_brought_is_not_sent_again(machine, house, navlib, tmp_path):
+    install(machine, house.environment(navlib))
+    machine.calls.clear()
+    other = make_wheel(tmp_path / "made", "other")
+
+    install(machine, house.environment(navlib, other))
+
+    sent = {given["filename"] for verb, given, _ in machine.calls if verb == "wheel"}
+    assert sent == {other.name}
+
+
+def test_connection_cut_at_every_frame_is_repaired_by_the_next_call(
+    machine, house, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(module, "PIECE_BYTES", 4000)
+    cuts = 0
+    for steps in range(100):
+        wheel = make_wheel(tmp_path / f"m{steps}", "bulk", files={"bulk/x": os.urandom(9000)})
+        environment = house.environment(wheel)
+        try:
+            install(machine, environment, cut_after=steps)
+            break
+        except MachineFailure as failure:
+            assert failure.kind is FailureKind.LOST
+        cuts += 1
+        install(machine, environment)
+        assert is_whole(machine, environment)
+        assert python(machine, environment, "import bulk; print(bulk.version)") == "99.0"
+
+    assert cuts >= 10  # two questions and three pieces, and the answer to each
+
+
+def test_cut_transfer_of_a_wheel_is_resumed(machine, house, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "PIECE_BYTES", 4000)
+    wheel = make_wheel(tmp_path / "made", "bulk", files={"bulk/x": os.urandom(20_000)})
+    environment = house.environment(wheel)
+    with pytest.raises(MachineFailure):
+        install(machine, environment, cut_after=8)
+    machine.calls.clear()
+
+    install(machine, environment)
+
+    sent_bytes = sum(size for verb, _, size in machine.calls if verb == "wheel")
+    assert 0 < sent_bytes < wheel.stat().st_size - 4000
+
+
+def test_helper_killed_at_any_moment_leaves_nothing_half(machine, house, tmp_path):
+    files = {f"bulk/m{index}.py": os.urandom(2000) for index in range(150)}
+    killed = 0
+    for delay_ms in (0, 10, 20, 35, 60, 100):
+        wheel = make_wheel(tmp_path / f"m{delay_ms}", "bulk", f"{delay_ms}.0", files=files)
+        environment = house.environment(wheel)
+        with contextlib.suppress(MachineFailure), machine.board() as board:
+            threading.Timer(delay_ms / 1000, machine.kill, [board]).start()
+            install_environment(board, machine.layout, environment)
+            time.sleep(0.2)
+        killed += not is_whole(machine, environment)
+        install(machine, environment)
+        assert is_whole(machine, environment)
+        assert python(machine, environment, "import bulk; print(bulk.version)") == f"{delay_ms}.0"
+
+    assert killed
+
+
+@pytest.mark.parametrize("harm", ["byte", "gone", "mark", "python", "half-built"])
+def test_damage_is_noticed_and_the_environment_built_anew(machine, house, navlib, harm):
+    environment = house.environment(navlib)
+    install(machine, environment)
+    assert is_whole(machine, environment)
+    top = top_of(machine, environment)
+    file = next(top.rglob("nav_lib/__init__.py"))
+    match harm:
+        case "byte":
+            file.write_text(file.read_text().replace("1.2", "1.3"))
+        case "gone":
+            file.unlink()
+        case "mark" | "half-built":
+            (top / ".complete").unlink()
+        case "python":
+            (top / "bin/python").unlink()
+            (top / "bin/python").symlink_to("/usr/bin/python2.7")
+
+    assert not is_whole(machine, environment)
+    assert install(machine, environment)
+    assert is_whole(machine, environment)
+    assert python(machine, environment, "import nav_lib; print(nav_lib.version)") == "1.2"
+    assert not any(verb == "wheel" for verb, _, _ in machine.calls[-3:])
+
+
+def test_what_a_package_adds_for_itself_is_no_damage(machine, house, navlib):
+    environment = house.environment(navlib)
+    install(machine, environment)
+    python(machine, environment, "import nav_lib")
+    site = next(top_of(machine, environment).rglob("nav_lib"))
+    (site / "cache.bin").write_bytes(b"x")
+
+    assert is_whole(machine, environment)
+
+
+def test_damaged_environment_of_a_living_run_is_left_alone(machine, house, navlib):
+    environment = house.environment(navlib)
+    install(machine, environment)
+    command = [machine.layout.python(environment.key), "-c", "input()"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+        file = next(top_of(machine, environment).rglob("nav_lib/__init__.py"))
+        file.write_text("")
+        before = snapshot(top_of(machine, environment))
+        with pytest.raises(MachineFailure, match="a run uses it") as caught:
+            install(machine, environment)
+        process.communicate(b"\n", timeout=20)
+
+    assert caught.value.kind is FailureKind.BUSY
+    assert "cosmos down" in caught.value.advice
+    assert before == snapshot(top_of(machine, environment))
+    assert install(machine, environment)
+
+
+def test_wheel_changed_on_the_machine_is_sent_again(machine, house, navlib, tmp_path):
+    install(machine, house.environment(navlib))
+    (kept,) = Path(machine.layout.wheels).rglob("*.whl")
+    kept.write_bytes(kept.read_bytes()[:-1] + b"!")
+    other = house.environment(navlib, make_wheel(tmp_path / "made", "other"))
+
+    assert install(machine, other)
+    assert python(machine, other, "import nav_lib; print(nav_lib.version)") == "1.2"
+
+
+def test_wheel_that_rots_in_the_operators_cache_is_refused(machine, house, navlib):
+    environment = house.environment(navlib)
+    path = environment.wheel(environment.lock[0])
+    path.write_bytes(path.read_bytes()[:-1] + b"!")
+
+    with pytest.raises(MachineFailure, match="not what was announced"):
+        install(machine, environment)
+    assert not top_of(machine, environment).exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"record": {"bad/__init__.py": "sha256=AAAA"}}, "is not what RECORD says"),
+        ({"record": {"bad/__init__.py": ""}}, "has no hash in RECORD"),
+        ({"record": {"bad/__init__.py": "md5=AAAA"}}, "has no hash in RECORD"),
+        ({"files": {"../../evil.py": b"x"}}, "leads out of the environment"),
+        ({"files": {"/tmp/evil.py": b"x"}}, "leads out of the environment"),
+        ({"files": {"bad-1.0.data/nowhere/x": b"x"}}, "unknown data folder"),
+        ({"files": {"other-1.0.dist-info/METADATA": b"x"}}, "expected one folder"),
+        ({"wheel_version": "2.0"}, "expected Wheel-Version 1"),
+        ({"entry_points": "[console_scripts]\nx = os;rm:run\n"}, "no entry point"),
+        ({"entry_points": "[console_scripts]\n../x = os:run\n"}, "no entry point"),
+    ],
+)
+def test_wheel_that_breaks_the_specification_is_refused(machine, house, tmp_path, changes, said):
+    environment = house.environment(make_wheel(tmp_path / "made", "bad", "1.0", **changes))
+
+    with pytest.raises(MachineFailure, match=said) as caught:
+        install(machine, environment)
+
+    assert caught.value.kind is FailureKind.DATA
+    assert "bad-1.0-py3-none-any.whl" in caught.value.text
+    assert not is_whole(machine, environment)
+
+
+def test_other_python_than_the_environment_is_for_is_refused(machine, house, navlib):
+    platform = dataclasses.replace(house.platform, python=(3, 99))
+    environment = house.environment(navlib, platform=platform)
+
+    with pytest.raises(MachineFailure, match="expected Python"):
+        install(machine, environment)
+
+
+def test_systems_packages_are_seen_only_when_wanted(machine, house, navlib):
+    own, open_ = house.environment(navlib), house.environment(navlib, sees_system=True)
+    install(machine, own)
+    install(machine, open_)
+
+    for environment, word in ((own, "false"), (open_, "true")):
+        settings = (top_of(machine, environment) / "pyvenv.cfg").read_text()
+        assert f"include-system-site-packages = {word}\n" in settings
+
+
+@pytest.fixture
+def distribution(tmp_path, monkeypatch):
+    """What the machine's distribution has: numpy 1.19, and no msgpack."""
+    folder = tmp_path / "system"
+    info = folder / "numpy-1.19.5.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: numpy\nVersion: 1.19.5\n")
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+
+
+def test_distribution_that_lacks_or_is_too_old_is_told_by_name(
+    machine, house, navlib, distribution
+):
+    environment = house.environment(
+        navlib,
+        sees_system=True,
+        distributed=(
+            Distributed(name="numpy", package="python3-numpy", specifier=">=1.24"),
+            Distributed(name="nosuchthing", package="python3-nosuchthing", specifier=">=1.0"),
+        ),
+    )
+
+    with pytest.raises(MachineFailure) as caught:
+        install(machine, environment)
+
+    assert "python3-numpy brings numpy 1.19.5, needed: numpy>=1.24" in caught.value.text
+    assert "python3-nosuchthing is not installed (needed: nosuchthing>=1.0)" in caught.value.text
+    assert "apt-get install python3-nosuchthing" in caught.value.advice
+    assert not top_of(machine, environment).exists()
+
+
+def test_distribution_that_is_new_enough_is_taken(machine, house, navlib, distribution):
+    numpy = Distributed(name="numpy", package="python3-numpy", specifier=">=1.19,<2")
+    environment = house.environment(navlib, sees_system=True, distributed=(numpy,))
+
+    with machine.board() as board:
+        check_distribution(board, environment)
+    assert install(machine, environment)
+
+
+def test_prune_spares_the_wanted_the_newest_and_the_used(machine, house, tmp_path):
+    environments = []
+    for index in range(6):
+        wheel = make_wheel(tmp_path / "made", "each", f"{index}.0")
+        environments.append(house.environment(wheel))
+        install(machine, environments[-1])
+        mark = top_of(machine, environments[-1]) / ".complete"
+        os.utime(mark, (1000 + index, 1000 + index))
+    wanted, used = environments[0], environments[1]
+    request = installed_request(machine.layout, trees=[], environments=[wanted.key])
+    command = [machine.layout.python(used.key), "-c", "input()"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+        with machine.board() as board:
+            foretold = ask_installed(board, request).prunable
+            removed = prune(board, request)
+            left = ask_installed(board, request)
+        process.communicate(b"\n", timeout=20)
+
+    gone = {environments[2].key, environments[3].key}
+    assert set(removed["environments"]) == set(foretold["environments"]) == gone
+    assert left.prunable_count == 0
+    assert {path.name for path in Path(machine.layout.environments).iterdir()} == {
+        environment.key for environment in environments
+    } - gone
+    kept = {path.name for path in Path(machine.layout.wheels).iterdir()}
+    assert {e.lock[0].sha256 for e in environments if e.key not in gone} == kept
+
+
+def test_what_a_run_asked_for_is_among_the_newest(machine, house, tmp_path):
+    environments = []
+    for index in range(3):
+        environments.append(house.environment(make_wheel(tmp_path / "made", "each", f"{index}.0")))
+        install(machine, environments[-1])
+        os.utime(top_of(machine, environments[-1]) / ".complete", (1000 + index, 1000 + index))
+    first = environments[0].key
+    with machine.board() as board:
+        asked = installed_request(machine.layout, trees=[], environments=[first], touch=True)
+        ask_installed(board, asked)
+        nothing = installed_request(machine.layout, trees=[], environments=[])
+
+        assert first not in prune(board, nothing)["environments"]
+
+
+def test_full_disk_leaves_no_half_built_environment(machine, house, navlib, tmp_path, monkeypatch):
+    """A limit on the size of files stands for the disk; the real thing is tried on virtual boards."""
+    wheel = make_wheel(tmp_path / "made", "bulk", files={"bulk/x": bytes(3_000_000)})
+    environment = house.environment(wheel)
+
+    class Limited(OwnMachine):
+        def open(self, command):
+            return super().open(f"ulimit -f 1000; trap '' XFSZ; {command}")
+
+    with pytest.raises(MachineFailure):
+        install(Limited(machine.root), environment)
+    assert not top_of(machine, environment).exists()
+    assert install(machine, environment)
+
+
+@pytest.mark.process
+def test_runtime_runs_from_its_environment_and_tree_alone(machine, tmp_path, monkeypatch):
+    """What an agent imports is imported from what was sent, and from nowhere else."""
+    monkeypatch.setenv("COSMOS_CACHE", str(tmp_path / "cache"))
+    runtime = runtime_tree()
+    with machine.board() as board:
+        environment = prepare(greeted_platform(board.greeting), [])
+        install_environment(board, machine.layout, environment)
+        send_tree(board, machine.layout, runtime)
+        check = RuntimeCheck(
+            key=environment.key,
+            trees=[runtime.hash],
+            is_full=True,
+            modules=modules_of(environment),
+            simulation="constellation",
+        )
+        told = check_runtime(board, machine.layout, check)
+        light = check_runtime(board, machine.layout, dataclasses.replace(check, is_full=False))
+    program = (
+        "import madns_runtime.agent, numpy, sys\n"
+        "print(sorted({m.__file__.split('/lib/')[0] for m in sys.modules.values()\n"
+        "    if getattr(m, '__file__', None) and ('numpy' in m.__name__ or 'madns' in m.__name__)}))\n"
+        "print([p for p in sys.path if 'site-packages' in p or 'dist-packages' in p])\n"
+    )
+    done = subprocess.run(
+        [machine.layout.python(environment.key), "-c", program],
+        env={"PYTHONPATH": machine.layout.tree(runtime.hash)},
+        cwd="/",
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+
+    assert told["runtime"] == light["runtime"] != ""
+    top = machine.layout.environment(environment.key)
+    folder = f"lib/python{environment.platform.python_text}/site-packages"
+    assert f"{[f'{top}/{folder}']}" == done.stdout.splitlines()[1]
+    assert sys.prefix not in done.stdout
+    assert set(REAL_PACKAGES) < set(modules_of(environment))
+
+
+def test_runtime_that_does_not_start_is_told_with_its_last_words(machine, house, navlib):
+    environment = house.environment(navlib)
+    install(machine, environment)
+    check = RuntimeCheck(key=environment.key, trees=["0" * 64], is_full=False)
+
+    with machine.board() as board, pytest.raises(MachineFailure) as caught:
+        check_runtime(board, machine.layout, check)
+
+    assert "the runtime does not start there" in caught.value.text
+    assert "No module named 'madns_runtime'" in caught.value.text
+
+
+def test_missing_module_is_named_by_the_light_check(machine, house, navlib):
+    environment, runtime = house.environment(navlib), runtime_tree()
+    install(machine, environment)
+    check = RuntimeCheck(
+        key=environment.key, trees=[runtime.hash], is_full=False, modules=("nav_lib", "numpy")
+    )
+
+    with machine.board() as board, pytest.raises(MachineFailure, match="no module named numpy$"):
+        send_tree(board, machine.layout, runtime)
+        check_runtime(board, machine.layout, check)
+
+
+def test_prepared_environment_installs(machine, tmp_path, monkeypatch):
+    with machine.board() as board:
+        platform = greeted_platform(board.greeting)
+    python_digits = "".join(map(str, platform.python))
+    make_runtime_wheels(tmp_path / "index", python_digits, machines=[platform.machine])
+    only_index(monkeypatch, tmp_path, tmp_path / "index")
+
+    environment = prepare(platform, [])
+
+    assert install(machine, environment)
+    assert python(machine, environment, "import numpy; print(numpy.version)") == "99.0"
