@@ -9,7 +9,9 @@ from __future__ import annotations
 import functools
 import importlib.util
 import json
+import re
 import shlex
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,27 +29,34 @@ CALL_TIMEOUT_S = 30.0
 READ_BYTES = 262_144
 FRAME_BYTES_MAX = 1024 * 1024 * 1024
 
-_BOOT = "import sys;PACKAGE=sys.stdin.buffer.read(int(sys.argv[1]));exec(PACKAGE)"
+_BOOT = (
+    "import sys,zlib;PACKAGE=sys.stdin.buffer.read(int(sys.argv[1]));exec(zlib.decompress(PACKAGE))"
+)
+_VERB = re.compile(r'^@verb\("([^"]+)"\)', re.MULTILINE)
 
-# Must be understood by any Python 3, to say so when it is too old.
+# Must be understood by any Python 3, to say so when it is too old. A module is loaded when one of its verbs
+# is first asked for: most commands need a few of those that are sent.
 _OPENING = """
-import json, sys, types
+import json, sys
 if sys.version_info < NEEDED:
     found = ".".join(map(str, sys.version_info[:3]))
     told = {"kind": "python", "text": "%s is Python %s" % (sys.executable, found), "advice": ""}
     print(json.dumps({"ok": False, "error": told, "body": 0}), flush=True)
     sys.exit(3)
-for name, source in json.loads(MODULES):
-    parent, _, own = name.rpartition(".")
-    module = types.ModuleType(name)
-    if source is None:
-        module.__path__ = []
-    sys.modules[name] = module
-    if parent:
-        setattr(sys.modules[parent], own, module)
-    if source is not None:
-        exec(compile(source, name, "exec"), module.__dict__)
-core = sys.modules[CORE]
+class Finder:
+    modules = json.loads(MODULES)
+    def find_spec(self, name, path=None, target=None):
+        if name in self.modules:
+            return type(sys.__spec__)(name, self, is_package=self.modules[name] is None)
+    def create_module(self, spec):
+        return None
+    def exec_module(self, module):
+        source = self.modules[module.__name__]
+        if source is not None:
+            exec(compile(source, module.__name__, "exec"), module.__dict__)
+sys.meta_path.insert(0, Finder())
+core = __import__(CORE, fromlist=["serve"])
+core.WHERE.update(json.loads(VERBS))
 core.greet()
 core.serve([sys.executable, "-I", "-S", "-c", BOOT, str(len(PACKAGE))], PACKAGE)
 """
@@ -239,19 +248,21 @@ def start_command(python: str | None, package_bytes: int) -> str:
 
 @functools.lru_cache
 def _package(parts: tuple[str, ...]) -> bytes:
-    """Return the program that is sent: the wanted modules' sources and what starts them."""
+    """Return the program that is sent, packed: the wanted modules' sources and what starts them."""
     names = [f"{PARTS}.core", *(p if "." in p else f"{PARTS}.{p}" for p in parts)]
     modules: dict[str, str | None] = {}
+    verbs: dict[str, str] = {}
     for name in names:
         steps = name.split(".")
         for depth in range(1, len(steps)):
             modules.setdefault(".".join(steps[:depth]), None)
-        modules[name] = _source(name)
+        modules[name] = source = _source(name)
+        verbs |= dict.fromkeys(_VERB.findall(source), name)
     head = (
         f"NEEDED = {PYTHON_NEEDED!r}\nCORE = {f'{PARTS}.core'!r}\nBOOT = {_BOOT!r}\n"
-        f"MODULES = {json.dumps(list(modules.items()))!r}\n"
+        f"MODULES = {json.dumps(modules)!r}\nVERBS = {json.dumps(verbs)!r}\n"
     )
-    return (head + _OPENING).encode()
+    return zlib.compress((head + _OPENING).encode())
 
 
 def _source(name: str) -> str:

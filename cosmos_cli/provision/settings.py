@@ -118,9 +118,12 @@ class _Plan:
         if different:
             requests.append(_set(different))
         before = _shown(setting, live.values()) or ("set otherwise" if found.text else "not set")
+        is_kept = bool(live) and not different
+        how = "keep" if is_kept else f"{before} ->"
+        after = " after a restart, too" if is_kept else ""
         yield Step(
             kind=Kind.SETTING,
-            title=f"setting {setting.variable}: {before} -> {_value_words(value)}",
+            title=f"setting {setting.variable}: {how} {_value_words(value)}{after}",
             requests=tuple(requests),
             subject=setting.field,
             change=Change(path=path, before=found.text, after=text),

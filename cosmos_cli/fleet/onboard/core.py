@@ -15,15 +15,20 @@ import io
 import json
 import os
 import select
-import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any, BinaryIO
+
+TYPE_CHECKING = False  # to import typing and dataclasses takes longer than most that is done here
+if TYPE_CHECKING:
+    import subprocess
+    from typing import Any, BinaryIO
+
+    Handler = Callable[["Request"], Any]
 
 HEADER_BYTES_MAX = 64 * 1024 * 1024
 BODY_BYTES_MAX = 1024 * 1024 * 1024
 LAST_WORDS_BYTES = 4000
+SUDO_TIMEOUT_S = 20.0
 
 
 class Refusal(Exception):
@@ -43,24 +48,29 @@ class Refusal(Exception):
         self.advice = advice
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Request:
     """What a verb is given."""
 
-    arguments: Mapping[str, Any]
-    body: bytes
+    __slots__ = ("arguments", "body")
+
+    def __init__(self, *, arguments: Mapping[str, Any], body: bytes) -> None:
+        self.arguments = arguments
+        self.body = body
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Part:
     """One of many pieces of an answer; a verb that returns an iterator of these streams them."""
 
-    value: Any = None
-    body: bytes = b""
+    __slots__ = ("body", "value")
+
+    def __init__(self, *, value: Any = None, body: bytes = b"") -> None:
+        self.value = value
+        self.body = body
 
 
-Handler = Callable[[Request], Any]
 VERBS: dict[str, Handler] = {}
+WHERE: dict[str, str] = {}
+"""In which module a verb is that may not be loaded yet; filled by who starts the loop."""
 
 
 def verb(name: str) -> Callable[[Handler], Handler]:
@@ -71,6 +81,20 @@ def verb(name: str) -> Callable[[Handler], Handler]:
         return handler
 
     return enter
+
+
+def handler_of(name: str) -> Handler:
+    """
+    Return the handler of a verb; its module is loaded now, if it is not yet.
+
+    Raises:
+        Refusal: There is none.
+    """
+    if name not in VERBS and name in WHERE:
+        __import__(WHERE[name])
+    if name not in VERBS:
+        raise Refusal("defect", f"no verb {name!r}")
+    return VERBS[name]
 
 
 class PatientInput(io.RawIOBase):
@@ -163,14 +187,19 @@ class Rooted:
             self._process.wait()
 
     def _start(self) -> subprocess.Popen[bytes]:
+        import subprocess
+
         try:
-            asked = subprocess.run(
-                ["sudo", "-n", "true"], capture_output=True, timeout=20, check=False
+            asked = subprocess.Popen(
+                ["sudo", "-n", "true"], stdin=subprocess.DEVNULL, stderr=subprocess.PIPE
             )
+            _, said = asked.communicate(timeout=SUDO_TIMEOUT_S)
         except (FileNotFoundError, subprocess.TimeoutExpired) as error:
-            raise no_sudo(f"sudo: {error}") from None
+            raise no_sudo(
+                f"sudo: {error}"
+            ) from None  # what runs as root cannot be killed from here
         if asked.returncode:
-            raise no_sudo(asked.stderr.decode(errors="replace").strip() or "sudo refused")
+            raise no_sudo(said.decode(errors="replace").strip() or "sudo refused")
         process = subprocess.Popen(
             ["sudo", "-n", *self._boot],
             stdin=subprocess.PIPE,
@@ -247,9 +276,7 @@ def serve(boot: list[str], package: bytes) -> None:
 
 
 def _answer(header: dict[str, Any], body: bytes, out: FrameWriter) -> None:
-    handler = VERBS.get(str(header.get("verb")))
-    if handler is None:
-        raise Refusal("defect", f"no verb {header.get('verb')!r}")
+    handler = handler_of(str(header.get("verb")))
     value = handler(Request(arguments=header.get("arguments") or {}, body=body))
     if isinstance(value, Iterator):
         for part in value:

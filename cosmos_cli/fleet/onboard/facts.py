@@ -9,17 +9,19 @@ Every path begins with one of the folders that the request gives for /etc, /sys 
 from __future__ import annotations
 
 import contextlib
-import glob
 import os
 import resource
 import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
 
-from cosmos_cli.fleet.onboard.core import VERBS, Refusal, Request, refusal_of, verb
+from cosmos_cli.fleet.onboard.core import Refusal, Request, handler_of, refusal_of, verb
 from cosmos_cli.fleet.onboard.files import content_hash, look_at
+
+TYPE_CHECKING = False  # to import typing takes longer than most that is done here
+if TYPE_CHECKING:
+    from typing import Any
 
 TEXT_BYTES_MAX = 262_144
 CONDITION_TIMEOUT_S = 60.0
@@ -37,10 +39,9 @@ def several(request: Request) -> list[dict[str, Any]]:
     answers: list[dict[str, Any]] = []
     for call in request.arguments["calls"]:
         try:
-            handler = VERBS.get(call["verb"])
-            if handler is None:
-                raise Refusal("defect", f"no verb {call['verb']!r}")
-            value = handler(Request(arguments=call.get("arguments") or {}, body=b""))
+            value = handler_of(call["verb"])(
+                Request(arguments=call.get("arguments") or {}, body=b"")
+            )
             answers.append({"ok": True, "value": value})
         except (Refusal, OSError) as error:
             refusal = refusal_of(error) if isinstance(error, OSError) else error
@@ -292,8 +293,10 @@ def _limit(which: int) -> int | None:
 
 def _governors(sys_: str) -> dict[str, str]:
     found = {}
-    for path in sorted(glob.glob(f"{sys_}/devices/system/cpu/cpu[0-9]*/cpufreq/scaling_governor")):
-        found[path.split("/")[-3]] = _text(path) or ""
+    for name in sorted(_names(f"{sys_}/devices/system/cpu")):
+        governor = _text(f"{sys_}/devices/system/cpu/{name}/cpufreq/scaling_governor")
+        if governor is not None and name[3:].isdecimal():  # the others are not processors
+            found[name] = governor
     return found
 
 

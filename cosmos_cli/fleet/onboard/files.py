@@ -13,9 +13,12 @@ import os
 import re
 import stat
 from collections.abc import Mapping
-from typing import Any
 
 from cosmos_cli.fleet.onboard.core import Refusal, Request, verb
+
+TYPE_CHECKING = False  # to import typing takes longer than most that is done here
+if TYPE_CHECKING:
+    from typing import Any
 
 MODE_DEFAULT = 0o644
 FOLDER_MODE_DEFAULT = 0o755

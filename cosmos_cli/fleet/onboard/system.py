@@ -13,10 +13,13 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 from cosmos_cli.fleet.onboard.core import Part, Refusal, Request, last_words, verb
 from cosmos_cli.fleet.onboard.facts import is_done
+
+TYPE_CHECKING = False  # to import typing takes longer than most that is done here
+if TYPE_CHECKING:
+    from typing import Any
 
 SIGN_OF_LIFE_S = 1.0
 END_TIMEOUT_S = 5.0

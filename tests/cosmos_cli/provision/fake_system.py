@@ -1,0 +1,135 @@
+"""A folder that looks like the system of a Raspberry Pi, and a kit that makes machines ready from nothing."""
+
+import hashlib
+from pathlib import Path
+
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.local import LocalConnection
+from cosmos_cli.fleet.target import Target
+from cosmos_cli.provision.bring_up import UpOptions, bring_up
+from cosmos_cli.provision.wanted import Content, Paths
+
+FILES = {
+    "etc/os-release": 'PRETTY_NAME="Debian GNU/Linux 12 (bookworm)"\nID=debian\nVERSION_ID="12"\n',
+    "sys/firmware/devicetree/base/model": "Raspberry Pi 4 Model B Rev 1.4\0",
+    "sys/class/thermal/thermal_zone0/temp": "48312\n",
+    "sys/devices/platform/soc/soc:firmware/get_throttled": "50005\n",
+    "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor": "ondemand\n",
+    "sys/devices/system/cpu/cpu0/cpufreq/scaling_available_governors": "ondemand performance\n",
+    "sys/devices/system/cpu/cpu1/cpufreq/scaling_governor": "ondemand\n",
+    "sys/class/rfkill/rfkill0/type": "wlan\n",
+    "sys/class/rfkill/rfkill0/soft": "0\n",
+    "sys/class/rfkill/rfkill0/hard": "0\n",
+    "sys/class/rfkill/rfkill1/type": "bluetooth\n",
+    "sys/class/rfkill/rfkill1/soft": "1\n",
+    "sys/class/rfkill/rfkill1/hard": "0\n",
+    "sys/class/net/wlan0/operstate": "up\n",
+    "sys/class/net/wlan0/wireless/x": "",
+    "sys/class/net/eth0/operstate": "up\n",
+    "proc/meminfo": "MemTotal:  3884152 kB\nMemAvailable:  3500000 kB\n",
+    "proc/uptime": "4321.10 12000.00\n",
+    "proc/sys/net/core/rmem_max": "212992\n",
+    "proc/sys/net/core/rmem_default": "212992\n",
+    "proc/sys/kernel/random/boot_id": "7e9c8f0a-0000-4000-8000-000000000001\n",
+}
+
+
+def make_system(folder):
+    """Write the system, and return where it is."""
+    for name, text in FILES.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return Paths(etc=str(folder / "etc"), sys=str(folder / "sys"), proc=str(folder / "proc"))
+
+
+def connection_to(folder):
+    target = Target(name="pi01", address="127.0.0.1", connection="local", root=str(folder))
+    return LocalConnection(target)
+
+
+class FakeKit:
+    """Neither wheels nor an echo: what is tested is the way between."""
+
+    def __init__(self, paths=None, trees=()):
+        self.paths = paths or Paths()
+        self.trees = tuple(trees)
+
+    def environments(self, machine, greeting, teller):
+        return ()
+
+    def read_file(self, path):
+        return Content.of(Path(path).read_bytes())
+
+    def udp_question(self, connection, machine):
+        return {}
+
+    def udp_heard(self, question):
+        return 0
+
+    def checks(self, wanted, udp, *, is_full):
+        return []
+
+    def connect_again(self, connection):
+        return LocalConnection(connection.target)
+
+
+class Listener:
+    """A teller that remembers."""
+
+    def __init__(self):
+        self.steps = []
+
+    def step(self, title):
+        self.steps.append(title)
+
+    def detail(self, text):
+        pass
+
+
+def up(connection, machine, kit=None, listener=None, **options):
+    return bring_up(
+        connection, machine, kit or FakeKit(), UpOptions(**options), listener or Listener()
+    )
+
+
+def contents(folder):
+    """Return every path below a folder with what it is: mode, time of its content, hash."""
+    found = {}
+    for path in sorted(Path(folder).rglob("*")):
+        state = path.lstat()
+        is_file = path.is_file() and not path.is_symlink()
+        digest = hashlib.sha256(path.read_bytes()).hexdigest() if is_file else ""
+        found[str(path.relative_to(folder))] = (state.st_mode, digest)
+    return found
+
+
+class CutStream:
+    """A stream that is lost before a certain request."""
+
+    def __init__(self, stream, counter):
+        self._stream = stream
+        self._counter = counter
+
+    def __getattr__(self, name):
+        return getattr(self._stream, name)
+
+    def write_all(self, data, *, timeout_s):
+        self._counter["left"] -= 1
+        if self._counter["left"] < 0:
+            raise MachineFailure(FailureKind.LOST, "the connection broke")
+        self._stream.write_all(data, timeout_s=timeout_s)
+
+
+class CutConnection:
+    """A connection that is lost before the request with a certain number, the helper's own program included."""
+
+    def __init__(self, connection, requests):
+        self._connection = connection
+        self._counter = {"left": requests}
+
+    def __getattr__(self, name):
+        return getattr(self._connection, name)
+
+    def open(self, command):
+        return CutStream(self._connection.open(command), self._counter)

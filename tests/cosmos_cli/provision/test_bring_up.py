@@ -1,0 +1,365 @@
+"""`cosmos up` on one machine: this computer, with a folder for its system, through the real helper."""
+
+import hashlib
+import time
+
+import pytest
+from fake_system import (
+    CutConnection,
+    FakeKit,
+    Listener,
+    connection_to,
+    contents,
+    make_system,
+    up,
+)
+from provision_machines import machine_of
+
+from cosmos_cli.fleet.board import Board
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.provision.bring_up import LOOK_PARTS
+from cosmos_cli.provision.trees import TreeFile, tree_of
+
+pytestmark = pytest.mark.process
+needs_root = pytest.mark.root
+
+SETTINGS = {
+    "cosmos_receive_buffer_bytes": 8388608,
+    "cosmos_realtime_priority": 50,
+    "cosmos_cpu_governor": "performance",
+    "cosmos_wifi": False,
+    "cosmos_bluetooth": False,
+}
+
+
+@pytest.fixture
+def place(tmp_path):
+    """Return the folders: of COSMoS there, and one for files that steps make."""
+    (tmp_path / "made").mkdir()
+    return tmp_path
+
+
+def steps_below(folder):
+    return (
+        {"become": False, "file": {"content": "a=1\n", "dest": f"{folder}/a.conf", "mode": "0600"}},
+        {"become": False, "line": {"path": f"{folder}/a.conf", "line": "b=2"}},
+        {
+            "become": False,
+            "command": {"run": f"echo done > {folder}/b", "creates": f"{folder}/b"},
+        },
+        {
+            "become": False,
+            "command": {"run": f"echo more >> {folder}/c", "unless": f"test -s {folder}/c"},
+        },
+    )
+
+
+def machine_at(place, **entries):
+    variables = {"cosmos_root": f"{place}/cosmos", **entries.pop("variables", {})}
+    return machine_of(variables=variables, **entries)
+
+
+def kinds(brought):
+    return [(done.step.kind.value, done.changed) for done in brought.done]
+
+
+def test_first_up_makes_what_is_missing_and_the_second_changes_nothing(place):
+    machine = machine_at(place, provision=steps_below(place / "made")[2:])
+    connection = connection_to(place / "cosmos")
+
+    first = up(connection, machine)
+    before = contents(place)
+    second = up(connection, machine)
+
+    assert first.failure is None
+    assert kinds(first) == [("directory", True)] * 6 + [("command", True)] * 2
+    assert (place / "made/c").read_text() == "more\n"
+    assert (second.failure, second.changed_count) == (None, 0)
+    assert contents(place) == before
+
+
+def test_check_shows_the_plan_and_changes_nothing(place):
+    machine = machine_at(place, provision=steps_below(place / "made"))
+    connection = connection_to(place / "cosmos")
+    listener = Listener()
+
+    planned = up(connection, machine, listener=listener, is_check=True, has_texts=True)
+
+    assert contents(place) == {"made": contents(place)["made"]}
+    assert listener.steps == []
+    done = up(connection, machine, listener=listener)
+    assert [d.step.title for d in planned.done] == [d.step.title for d in done.done]
+    assert listener.steps == [d.step.title for d in done.done]
+    assert planned.planned[6].change.after == "a=1\n"
+
+
+def test_contradicting_steps_are_at_least_carried_out_in_order(place):
+    up(connection_to(place / "cosmos"), machine_at(place, provision=steps_below(place / "made")))
+
+    assert (place / "made/a.conf").read_text() == "a=1\nb=2\n"
+    assert (place / "made/a.conf").stat().st_mode & 0o777 == 0o600
+
+
+def test_failing_command_ends_the_plan_and_keeps_what_was_done(place):
+    made = place / "made"
+    provision = (
+        {"become": False, "command": {"run": f"touch {made}/a", "creates": f"{made}/a"}},
+        {
+            "become": False,
+            "command": {"run": "echo first; echo the reason >&2; exit 7", "creates": f"{made}/b"},
+        },
+        {"become": False, "command": {"run": f"touch {made}/c", "creates": f"{made}/c"}},
+    )
+
+    brought = up(connection_to(place / "cosmos"), machine_at(place, provision=provision))
+
+    assert brought.failure.kind is FailureKind.STEP
+    assert brought.failure.text == (
+        "command echo first; echo the reason >&2; exit 7: exit status 7:\nfirst\nthe reason"
+    )
+    assert kinds(brought)[6:] == [("command", True)]
+    assert sorted(path.name for path in made.iterdir()) == ["a"]
+
+
+def test_command_whose_condition_still_fails_is_noted(place):
+    provision = ({"become": False, "command": {"run": "true", "unless": "false"}},)
+
+    brought = up(connection_to(place / "cosmos"), machine_at(place, provision=provision))
+
+    assert brought.failure is None
+    assert brought.notes == [
+        "command true: it ran, but its `unless` does not hold yet: the next `cosmos up` runs it again"
+    ]
+
+
+def test_condition_that_an_earlier_step_met_is_seen(place):
+    target = place / "made/a"
+    provision = (
+        {"become": False, "file": {"content": "", "dest": str(target)}},
+        {"become": False, "command": {"run": "exit 1", "creates": str(target)}},
+    )
+
+    brought = up(connection_to(place / "cosmos"), machine_at(place, provision=provision))
+
+    assert (brought.failure, kinds(brought)[6:]) == (None, [("file", True), ("command", False)])
+
+
+def test_other_command_that_works_there_is_named(place):
+    machine = machine_at(place)
+    connection = connection_to(place / "cosmos")
+
+    with Board.start(connection) as board:
+        board.call("lock", {"path": f"{place}/cosmos/state/lock", "holder": "cosmos wipe"})
+        machine = machine_at(place, provision=steps_below(place / "made")[2:])
+        brought = up(connection, machine)
+
+    assert brought.failure.kind is FailureKind.BUSY
+    assert "cosmos wipe" in brought.failure.text
+    assert list((place / "made").iterdir()) == []
+
+
+def test_machine_that_is_ready_needs_no_lock(place):
+    connection = connection_to(place / "cosmos")
+    up(connection, machine_at(place))
+
+    with Board.start(connection) as board:
+        board.call("lock", {"path": f"{place}/cosmos/state/lock"})
+        brought = up(connection, machine_at(place))
+
+    assert (brought.failure, brought.changed_count) == (None, 0)
+
+
+def test_helper_gives_up_the_lock_when_nobody_asks(place):
+    connection = connection_to(place / "cosmos")
+    lock = {"path": f"{place}/lock", "patience_s": 0.05}
+    with Board.start(connection) as silent, Board.start(connection) as other:
+        silent.call("lock", lock)
+        until_s = time.monotonic() + 30.0
+        while True:
+            try:
+                other.call("lock", {"path": f"{place}/lock"})
+                break
+            except MachineFailure as failure:
+                assert failure.kind is FailureKind.BUSY
+                assert time.monotonic() < until_s
+                time.sleep(0.02)
+
+
+def small_tree(text="print(1)\n"):
+    data = text.encode()
+    file = TreeFile(
+        path="a.py",
+        sha256=hashlib.sha256(data).hexdigest(),
+        mode=0o444,
+        size_bytes=len(data),
+        source=data,
+    )
+    return tree_of("runtime", [file])
+
+
+@pytest.fixture(scope="module")
+def uncut(tmp_path_factory):
+    """Return the paths below COSMoS's folder after an `up` that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("uncut")
+    machine = machine_at(folder, provision=steps_below(folder)[2:])
+    brought = up(connection_to(folder / "cosmos"), machine, FakeKit(trees=[small_tree()]))
+    assert brought.failure is None
+    return set(contents(folder / "cosmos"))
+
+
+@pytest.mark.parametrize("requests", range(18))
+def test_cut_before_any_request_is_repaired_by_the_next_up(place, uncut, requests):
+    made = place / "made"
+    machine = machine_at(place, provision=steps_below(made)[2:])
+    kit = FakeKit(trees=[small_tree()])
+    connection = connection_to(place / "cosmos")
+    brought = up(CutConnection(connection, requests), machine, kit)
+    assert brought.failure is None or brought.failure.kind is FailureKind.LOST
+    repaired = up(connection, machine, kit)
+    again = up(connection, machine, kit)
+
+    assert repaired.failure is None
+    assert again.changed_count == 0
+    assert set(contents(place / "cosmos")) == uncut
+    assert (made / "c").read_text() == "more\n"
+
+
+def test_half_written_file_of_a_power_cut_is_no_obstacle(place):
+    folder = place / "made"
+    (folder / ".a.conf.cosmos-new").write_text("half")
+    provision = ({"become": False, "file": {"content": "a=1\n", "dest": f"{folder}/a.conf"}},)
+
+    brought = up(connection_to(place / "cosmos"), machine_at(place, provision=provision))
+
+    assert brought.failure is None
+    assert [path.name for path in folder.iterdir()] == ["a.conf"]
+
+
+def test_link_stays_a_link_and_its_file_is_changed(place):
+    folder = place / "made"
+    (folder / "real").write_text("x\n")
+    (folder / "link").symlink_to("real")
+    provision = ({"become": False, "line": {"path": f"{folder}/link", "line": "y"}},)
+
+    up(connection_to(place / "cosmos"), machine_at(place, provision=provision))
+
+    assert (folder / "link").is_symlink()
+    assert (folder / "real").read_text() == "x\ny\n"
+
+
+def test_line_keeps_bytes_that_are_no_text_and_the_mode(place):
+    path = place / "made/a"
+    path.write_bytes(b"caf\xe9\r\nb\r\n")
+    path.chmod(0o640)
+    provision = ({"become": False, "line": {"path": str(path), "line": "c"}},)
+
+    up(connection_to(place / "cosmos"), machine_at(place, provision=provision))
+
+    assert path.read_bytes() == b"caf\xe9\r\nb\r\nc\r\n"
+    assert path.stat().st_mode & 0o777 == 0o640
+
+
+def test_facts_of_a_board(place):
+    kit = FakeKit(make_system(place / "system"))
+
+    facts = up(connection_to(place / "cosmos"), machine_at(place), kit, is_check=True).facts
+
+    assert facts.board.model == "Raspberry Pi 4 Model B Rev 1.4"
+    assert facts.board.os_name == "Debian GNU/Linux 12 (bookworm)"
+    assert facts.temperature_c == 48.312
+    assert facts.throttled == 0x50005
+    assert facts.memory_total_bytes == 3884152 * 1024
+    assert facts.network.receive_buffer_bytes_max == 212992
+    assert facts.network.wireless_up == ("wlan0",)
+    assert facts.governors == {"cpu0": "ondemand", "cpu1": "ondemand"}
+    assert [(radio.type, radio.is_soft_blocked) for radio in facts.radios] == [
+        ("wlan", False),
+        ("bluetooth", True),
+    ]
+    assert facts.uptime_s == 4321.1
+    assert abs(facts.clock_offset_s) < 60.0
+    assert facts.disk.free_bytes > 0
+
+
+def test_facts_of_this_computer_need_nothing_of_a_board(place):
+    with Board.start(connection_to(place), LOOK_PARTS) as board:
+        told = board.call("facts", {"root": f"{place}/not/there/yet", "sudo": True}).value
+
+    assert told["disk"]["path"] == str(place)
+    assert told["python"]["version"][0] == 3
+    assert told["clock"]["utc_s"] > 1e9
+    assert isinstance(told["sudo"], bool)
+
+
+def test_several_requests_in_one_frame_fail_alone(place):
+    with Board.start(connection_to(place), LOOK_PARTS) as board:
+        calls = [
+            {"verb": "make_directories", "arguments": {"paths": ["/proc/nothing/here"]}},
+            {"verb": "no such verb"},
+            {"verb": "make_directories", "arguments": {"paths": [f"{place}/a"]}},
+        ]
+        answers = board.call("several", {"calls": calls}).value
+
+    assert [answer["ok"] for answer in answers] == [False, False, True]
+    assert "no verb" in answers[1]["error"]["text"]
+    assert answers[2]["value"] == [f"{place}/a"]
+
+
+def values(path):
+    """Return what a file of the kernel says; how it ends its lines is its own affair."""
+    return path.read_text().strip() if path.is_file() else None
+
+
+@needs_root
+def test_settings_are_made_on_a_system_and_put_back(place):
+    kit = FakeKit(make_system(place / "system"))
+    (place / "system/sys/class/net/wlan0/operstate").write_text("down\n")
+    before = contents(place / "system")
+    values_before = {path: values(place / "system" / path) for path in before}
+    machine = machine_at(place, variables=SETTINGS)
+    connection = connection_to(place / "cosmos")
+
+    made = up(connection, machine, kit)
+    again = up(connection, machine, kit)
+
+    assert made.failure is None
+    assert [done.step.title for done in made.done[6:]] == [
+        "setting cosmos_receive_buffer_bytes: 212992 -> 8388608",
+        "setting cosmos_realtime_priority: not set -> 50",
+        "setting cosmos_cpu_governor: ondemand -> performance",
+        "setting cosmos_wifi: on -> off",
+        "setting cosmos_bluetooth: keep off after a restart, too",
+    ]
+    assert again.changed_count == 0
+    assert (place / "system/proc/sys/net/core/rmem_max").read_text() == "8388608"
+    assert (place / "system/sys/class/rfkill/rfkill0/soft").read_text() == "1"
+    limits = (place / "system/etc/security/limits.d/90-cosmos.conf").read_text()
+    assert limits.splitlines()[1] == f"{made.facts.user} - rtprio 50"
+
+    put_back = up(connection, machine_at(place), kit)
+
+    assert put_back.failure is None
+    after = contents(place / "system")
+    assert not [path for path in after if "90-cosmos" in path]
+    assert {path: values(place / "system" / path) for path in before} == values_before
+
+
+@needs_root
+def test_wifi_that_may_carry_the_connection_stays(place):
+    kit = FakeKit(make_system(place / "system"))
+    machine = machine_at(place, variables={"cosmos_wifi": False})
+
+    brought = up(connection_to(place / "cosmos"), machine, kit)
+
+    assert brought.failure.kind is FailureKind.UNSUPPORTED
+    assert "cut this very connection" in brought.failure.text
+    assert not (place / "cosmos").exists()
+
+
+def test_machine_that_may_not_become_root_is_refused_before_anything_is_done(place):
+    variables = {"ansible_become": False, "cosmos_realtime_priority": 50}
+
+    brought = up(connection_to(place / "cosmos"), machine_at(place, variables=variables))
+
+    assert brought.failure.kind is FailureKind.NO_SUDO
+    assert not (place / "cosmos").exists()
