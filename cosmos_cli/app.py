@@ -36,6 +36,8 @@ COMMANDS = (
     "ping",
     "doctor",
     "exec",
+    "packages",
+    "reboot",
     "wipe",
     "run",
     "ps",

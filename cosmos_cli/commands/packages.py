@@ -1,0 +1,216 @@
+"""`cosmos packages`: system packages of all machines at once."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import time
+from collections.abc import Sequence
+from enum import StrEnum
+from typing import Annotated, Any
+
+import typer
+
+from cosmos_cli.commands.fleet_options import (
+    FORKS_DEFAULT,
+    AcceptHostKeysOption,
+    ForksOption,
+    InventoryOption,
+    LimitOption,
+    fleet_of,
+)
+from cosmos_cli.console import Console, JsonOption, QuietOption
+from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.fleet.board import Board
+from cosmos_cli.fleet.connection import Connection
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.fleet import Fleet
+from cosmos_cli.fleet.layout import Layout
+from cosmos_cli.fleet.onboard.apt_words import PYTHON_HINT
+from cosmos_cli.fleet.ordered import InOrder
+from cosmos_cli.fleet.outcome import Outcome, failed
+
+PARTS = ("apt_words", "apt")
+PIECE_TIMEOUT_S = 60.0
+"""A sign of life comes each second; a slow card may hold one up."""
+TIMEOUT_S = 1800.0
+NAMES_SHOWN_MAX = 5
+NAME = re.compile(r"[a-z0-9][a-z0-9+.-]*[a-z0-9+.](?::[a-z0-9-]+)?(?:=[A-Za-z0-9.+:~-]+)?")
+"""A package's name, perhaps with its architecture and a version; one that ends in - would be removed."""
+
+Changed = dict[str, Any]
+"""What the verb "packages" tells at its end: "changes" and "notes"."""
+
+
+class Action(StrEnum):
+    """What is done."""
+
+    INSTALL = "install"
+    REMOVE = "remove"
+    UPGRADE = "upgrade"
+
+
+def packages(
+    inventory: InventoryOption,
+    action: Annotated[Action, typer.Argument(help="What to do.")],
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME...]", help="Packages; upgrade without one means all."),
+    ] = None,
+    limit: LimitOption = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Show what would change, and change nothing.")
+    ] = False,
+    timeout_s: Annotated[
+        float, typer.Option("--timeout", metavar="S", min=1.0, help="Time for each machine, s.")
+    ] = TIMEOUT_S,
+    forks: ForksOption = FORKS_DEFAULT,
+    accept_new_host_keys: AcceptHostKeysOption = False,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """
+    Install, remove or upgrade system packages (apt) on every machine.
+
+    Ends with 3 when any machine failed. What a machine always needs belongs into cosmos_packages of the
+    inventory; `cosmos up` installs it.
+    """
+    console = Console(json=json, quiet=quiet)
+    wanted = check_names(action, names or [])
+    fleet = _without_this_computer(console, fleet_of(inventory, limit, forks, accept_new_host_keys))
+    start_s = time.monotonic()
+    outcomes = _change(console, fleet, action, wanted, timeout_s=timeout_s, is_check=check)
+    exit_code = ExitCode.MACHINES if failed(outcomes) else ExitCode.OK
+    console.data(_verdict(outcomes, time.monotonic() - start_s, is_check=check))
+    console.print_json(
+        {
+            "action": action.value,
+            "names": wanted,
+            "is_check": check,
+            "machines": [outcome.to_mapping(_mapping(outcome)) for outcome in outcomes],
+            "changed": sum(_is_changed(outcome) for outcome in outcomes),
+            "failed": len(failed(outcomes)),
+            "exit_code": int(exit_code),
+        }
+    )
+    return int(exit_code)
+
+
+def check_names(action: Action, names: Sequence[str]) -> list[str]:
+    """
+    Return the names, each once.
+
+    Raises:
+        InputError: There is none where one is needed, or some are no names of packages: all of them are named.
+    """
+    if not names and action != Action.UPGRADE:
+        raise InputError(f"name the packages to {action.value}")
+    wrong = [name for name in names if not NAME.fullmatch(name)]
+    if wrong:
+        shown = ", ".join(map(repr, wrong))
+        raise InputError(
+            f"expected names of Debian packages such as i2c-tools, got {shown}; {PYTHON_HINT}"
+        )
+    return list(dict.fromkeys(names))
+
+
+def _without_this_computer(console: Console, fleet: Fleet) -> Fleet:
+    """Leave out what is reached without a connection: its packages are its owner's affair."""
+    for target in fleet.targets:
+        if target.connection == "local":
+            console.say(f"{target.name}: left alone, it is this computer")
+    targets = tuple(target for target in fleet.targets if target.connection != "local")
+    return dataclasses.replace(fleet, targets=targets)
+
+
+def _change(
+    console: Console,
+    fleet: Fleet,
+    action: Action,
+    names: Sequence[str],
+    *,
+    timeout_s: float,
+    is_check: bool,
+) -> list[Outcome[Changed]]:
+    arguments = {
+        "action": action.value,
+        "names": list(names),
+        "is_check": is_check,
+        "timeout_s": timeout_s,
+    }
+    width = max((len(target.name) for target in fleet.targets), default=0)
+
+    def task(connection: Connection) -> Changed:
+        return _change_one(connection, arguments)
+
+    def tell(outcome: Outcome[Changed]) -> None:
+        console.data(f"{outcome.machine:<{width}}  {_words(outcome)}")
+
+    return fleet.each_target(task, InOrder(fleet.targets, tell))
+
+
+def _change_one(connection: Connection, arguments: dict[str, Any]) -> Changed:
+    """Work on one machine; what is said meanwhile is a sign of life."""
+    target, is_check = connection.target, bool(arguments["is_check"])
+    if not target.may_become_root and not is_check:
+        raise MachineFailure(
+            FailureKind.NO_SUDO,
+            "the inventory forbids to become root there (ansible_become: false)",
+            "leave that machine out with --limit",
+        )
+    last: Changed = {}
+    with Board.start(connection, PARTS) as board:
+        if not is_check:
+            lock = {"path": Layout(target.root).lock, "holder": "cosmos packages"}
+            board.call("lock", lock)
+        for part in board.parts(
+            "packages", arguments, as_root=not is_check, timeout_s=PIECE_TIMEOUT_S
+        ):
+            last = dict(part.value)
+    if "changes" not in last:
+        raise MachineFailure(FailureKind.DATA, "ended without saying what it changed")
+    return last
+
+
+def _is_changed(outcome: Outcome[Changed]) -> bool:
+    return bool(outcome.value and outcome.value["changes"])
+
+
+def _words(outcome: Outcome[Changed]) -> str:
+    done = outcome.value
+    if done is None:
+        return f"failed   {outcome.failure}"
+    told = [_change_words(change) for change in done["changes"][:NAMES_SHOWN_MAX]]
+    more = len(done["changes"]) - len(told)
+    changes = ", ".join(told) + (f" and {more} more" if more > 0 else "")
+    status = f"changed  {changes}" if told else "ok"
+    notes = "; ".join(done["notes"])
+    return f"{status}  ({notes})" if notes else status
+
+
+def _change_words(change: dict[str, Any]) -> str:
+    name, old, new = change["name"], change["old"], change["new"]
+    if old is None:
+        return f"{name} {new} (new)"
+    return f"{name} {old} (removed)" if new is None else f"{name} {old} -> {new}"
+
+
+def _verdict(outcomes: Sequence[Outcome[Changed]], duration_s: float, *, is_check: bool) -> str:
+    count, bad = len(outcomes), len(failed(outcomes))
+    changed = sum(map(_is_changed, outcomes))
+    machines = f"{count} machine{'' if count == 1 else 's'}"
+    would = "would be " if is_check else ""
+    return (
+        f"{machines}: {changed} {would}changed, {count - changed - bad} ok, {bad} failed"
+        f" in {duration_s:.1f} s"
+    )
+
+
+def _mapping(outcome: Outcome[Changed]) -> dict[str, Any]:
+    done = outcome.value
+    status = "failed" if done is None else "changed" if done["changes"] else "ok"
+    return {
+        "status": status,
+        "changes": done["changes"] if done else [],
+        "notes": done["notes"] if done else [],
+    }

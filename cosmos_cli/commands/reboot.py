@@ -1,0 +1,145 @@
+"""`cosmos reboot`: reboot machines, and say of each when it is back."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import time
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import typer
+
+from cosmos_cli.commands.fleet_options import (
+    AcceptHostKeysOption,
+    ForksOption,
+    InventoryOption,
+    LimitOption,
+    fleet_of,
+)
+from cosmos_cli.console import Console, JsonOption, QuietOption
+from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.fleet.connect import connect
+from cosmos_cli.fleet.fleet import Fleet
+from cosmos_cli.fleet.names import compact
+from cosmos_cli.fleet.outcome import Outcome, failed
+from cosmos_cli.reboot import Rebooted, Rebooting
+from madns_runtime.processes import read_boot_id
+
+FORKS_DEFAULT = 100
+"""All at once: there is nothing to do here but wait."""
+TIMEOUT_S = 180.0
+
+
+def reboot(
+    inventory: InventoryOption,
+    limit: LimitOption = None,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Also machines where a run lives, or a command works.")
+    ] = False,
+    timeout_s: Annotated[
+        float,
+        typer.Option("--timeout", metavar="S", min=1.0, help="Until a machine must be back, s."),
+    ] = TIMEOUT_S,
+    forks: ForksOption = FORKS_DEFAULT,
+    accept_new_host_keys: AcceptHostKeysOption = False,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """
+    Reboot machines and wait until each is really back: another boot that answers.
+
+    This computer is never rebooted. Ends with 3 when any machine failed or was not back in time.
+    """
+    console = Console(json=json, quiet=quiet)
+    fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
+    own = [target.name for target in fleet.targets if target.connection == "local"]
+    for name in own:
+        console.say(f"{name}: left alone, it is this computer")
+    fleet = dataclasses.replace(
+        fleet, targets=tuple(t for t in fleet.targets if t.connection != "local")
+    )
+    if fleet.targets and not yes:
+        _ask(fleet)
+    start_s = time.monotonic()
+    outcomes = _reboot(console, fleet, timeout_s, is_forced=force)
+    exit_code = ExitCode.MACHINES if failed(outcomes) else ExitCode.OK
+    console.data(_verdict(outcomes, time.monotonic() - start_s))
+    console.print_json(
+        {
+            "machines": [_mapping(outcome) for outcome in outcomes],
+            "left_alone": own,
+            "exit_code": int(exit_code),
+        }
+    )
+    return int(exit_code)
+
+
+def _ask(fleet: Fleet) -> None:
+    """
+    Have a person agree.
+
+    Raises:
+        InputError: There is none to ask.
+        typer.Abort: The answer is no.
+    """
+    names = compact(target.name for target in fleet.targets)
+    count = len(fleet.targets)
+    what = f"reboot {count} machine{'' if count == 1 else 's'} ({names})"
+    if not sys.stdin.isatty():
+        raise InputError(f"{what}: nobody is there to ask; give --yes")
+    typer.confirm(f"{what}?", abort=True, err=True)
+
+
+def _reboot(
+    console: Console, fleet: Fleet, timeout_s: float, *, is_forced: bool
+) -> list[Outcome[Rebooted]]:
+    if not fleet.targets:
+        return []
+    rebooting = Rebooting(
+        timeout_s=timeout_s,
+        own_boot_id=read_boot_id(),
+        is_forced=is_forced,
+        options=fleet.options,
+        connect=connect,
+    )
+    width = max(len(target.name) for target in fleet.targets)
+
+    def tell(outcome: Outcome[Rebooted]) -> None:
+        console.data(f"{outcome.machine:<{width}}  {_words(outcome)}")
+
+    return fleet.each_target(rebooting.reboot, tell)
+
+
+def _words(outcome: Outcome[Rebooted]) -> str:
+    done = outcome.value
+    if done is None:
+        return f"failed  {outcome.failure}"
+    if done.back_s is None:
+        return f"left alone: {done.why_not}"
+    return f"back after {done.back_s:.1f} s"
+
+
+def _verdict(outcomes: Sequence[Outcome[Rebooted]], duration_s: float) -> str:
+    back = sum(bool(o.value and o.value.back_s is not None) for o in outcomes)
+    bad = len(failed(outcomes))
+    count = len(outcomes)
+    parts = [f"{back} back"]
+    parts += [f"{count - back - bad} left alone"] if count > back + bad else []
+    parts += [f"{bad} failed"] if bad else []
+    machines = f"{count} machine{'' if count == 1 else 's'}"
+    return f"{machines}: {', '.join(parts)} in {duration_s:.1f} s"
+
+
+def _mapping(outcome: Outcome[Rebooted]) -> dict[str, Any]:
+    done = outcome.value
+    back_s = done.back_s if done else None
+    status = "failed" if done is None else "left_alone" if back_s is None else "back"
+    return outcome.to_mapping(
+        {
+            "status": status,
+            "back_s": None if back_s is None else round(back_s, 2),
+            "boot_id": done.boot_id if done else None,
+        }
+    )
