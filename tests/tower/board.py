@@ -230,6 +230,7 @@ class Board:
             os.close(read)
             try:
                 kernel.enter(f"/proc/{init}/ns/mnt")
+                assert Path(setup.INIT).exists(), "not on the board"
                 answer = {"value": function()}
             except Exception as error:  # noqa: BLE001 - it is told to the caller, whatever it is
                 answer = {"error": f"{type(error).__name__}: {error}"}
@@ -264,8 +265,9 @@ class Board:
         }
 
     def _need_init(self) -> int:
+        """Return PID 1 of a board that is up: before that it still has the operator's root directory."""
         init = self.init
-        if init is None:
+        if init is None or self.power is not Power.ON:
             raise BoardError(f"{self.name} is {self.power.value}, expected it to be on")
         return init
 

@@ -21,6 +21,8 @@ from .network import remove_interface
 from .places import Places
 
 GROUPS = "groups"
+LOOP_PATIENCE_S = 2.0
+"""A killed board lets its disk go a moment after its end; another tower's disk stays in use."""
 
 
 def mount_groups(places: Places) -> Path:
@@ -52,7 +54,7 @@ def clean(places: Places) -> None:
         remove_interface(places.uplink)
     with contextlib.suppress(FileNotFoundError, json.JSONDecodeError):
         before = json.loads(places.loops.read_text())
-        remove_loop_devices(list_loop_devices() - set(before))
+        remove_loop_devices(list_loop_devices() - set(before), LOOP_PATIENCE_S)
     places.remove()
 
 

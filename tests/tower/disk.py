@@ -76,15 +76,23 @@ class Disk:
         """Take it out, and wait until the kernel has let it go."""
         self.remove_ballast()
         kernel.unmount(self.mount_point)
-        loop, self.loop = self.loop, None
         until_s = time.monotonic() + PATIENCE_S
         # A board that is just starting holds a copy of this mount for some milliseconds.
-        while os.path.exists(f"/sys/block/{loop}/loop/backing_file"):
+        while self._is_held():
             if time.monotonic() > until_s:
                 raise DiskError(
                     f"{self.image.name}: still in use {PATIENCE_S:g} s after its release"
                 )
             time.sleep(POLL_S)
+        self.loop = None
+
+    def _is_held(self) -> bool:
+        """Whether the loop device still has this image, and not already another tower's."""
+        try:
+            backing = Path(f"/sys/block/{self.loop}/loop/backing_file").read_text()
+        except OSError:
+            return False
+        return backing.strip() == str(self.image)
 
     def lose_power(self) -> None:
         """Forget what was not synced, and take no more."""
@@ -138,10 +146,15 @@ def list_loop_devices() -> set[int]:
     return {int(name) for name in names if name.isdecimal()}
 
 
-def remove_loop_devices(numbers: Iterable[int]) -> None:
-    """Take loop devices back out of the kernel, but for those in use."""
-    for number in numbers:
-        kernel.remove_loop_device(number)
+def remove_loop_devices(numbers: Iterable[int], patience_s: float) -> None:
+    """Take loop devices back out of the kernel, but for those that are still in use after a while."""
+    left = set(numbers)
+    until_s = time.monotonic() + patience_s
+    while True:
+        left = {number for number in left if not kernel.remove_loop_device(number)}
+        if not left or time.monotonic() > until_s:
+            return
+        time.sleep(POLL_S)
 
 
 def _mount_image(options: str, image: Path, mount_point: Path) -> None:

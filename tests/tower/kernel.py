@@ -8,6 +8,7 @@ name of the call, because "[Errno 1] Operation not permitted" alone tells nobody
 from __future__ import annotations
 
 import ctypes
+import errno
 import fcntl
 import os
 import signal
@@ -126,12 +127,12 @@ def lose_power(disk: Path) -> None:
 
 
 def remove_loop_device(number: int) -> bool:
-    """Take an unused loop device back out of the kernel; False if it is in use or gone."""
+    """Take an unused loop device back out of the kernel; False if it is in use."""
     try:
         with open("/dev/loop-control", "rb") as control:
             fcntl.ioctl(control, LOOP_CTL_REMOVE, number)
-    except OSError:
-        return False
+    except OSError as error:
+        return error.errno == errno.ENODEV  # it is gone already
     return True
 
 

@@ -32,6 +32,7 @@ POLL_S = 0.02
 REQUEST_BYTES_MAX = 65_536
 REQUEST_PATIENCE_S = 5.0
 START_PATIENCE_S = 120.0
+EXPECTED_ERRORS = (BoardError, DiskError, NetworkError, OSError)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,16 +150,37 @@ class Supervisor:
         assert board.supply is not None
         _, status = os.waitpid(board.supply, 0)
         code = os.waitstatus_to_exitcode(status)
-        self._release(board)
-        if code == EXIT_OFF or board.condition.stays_off:
-            board.power = Power.OFF
-        else:
-            delay_s = 0.0 if board.condition.is_reflashed else self._options.spec.boot_delay_s
+        condition = board.condition
+        board.power = Power.OFF
+        try:
+            self._release(board)
+        except EXPECTED_ERRORS as error:
+            self._give_up(board, error)
+            return
+        if code != EXIT_OFF and not condition.stays_off:
+            delay_s = 0.0 if condition.is_reflashed else self._options.spec.boot_delay_s
             board.power = Power.AWAY
-            board.condition.boot_due_s = time.monotonic() + delay_s
+            condition.boot_due_s = time.monotonic() + delay_s
         self._tell(f"{board.name}: {board.power.value} (exit {code})")
 
+    def _boot_again(self, board: Board) -> None:
+        """Boot one board of a running tower; if it fails, the others go on."""
+        try:
+            if board.condition.is_reflashed:
+                board.flash(self._template)
+                board.condition.is_reflashed = False
+            self._boot([board])
+            board.condition.trouble = ""
+        except EXPECTED_ERRORS as error:
+            board.power = Power.OFF
+            self._give_up(board, error)
+
+    def _give_up(self, board: Board, error: Exception) -> None:
+        board.condition.trouble = str(error)
+        self._tell(f"{board.name}: stays off: {error}")
+
     def _release(self, board: Board) -> None:
+        """Take away what belonged to a boot. Whatever remains is known to belong to none."""
         board.supply = None
         kill_group(board.surroundings.cgroup)
         remove_group(board.surroundings.cgroup)
@@ -184,19 +206,6 @@ class Supervisor:
                 due.append(board)
         for board in due:
             self._boot_again(board)
-
-    def _boot_again(self, board: Board) -> None:
-        """Boot one board of a running tower; if it fails, the others go on."""
-        try:
-            if board.condition.is_reflashed:
-                board.flash(self._template)
-                board.condition.is_reflashed = False
-            self._boot([board])
-            board.condition.trouble = ""
-        except (BoardError, DiskError, NetworkError, OSError) as error:
-            board.power = Power.OFF
-            board.condition.trouble = str(error)
-            self._tell(f"{board.name}: does not boot: {error}")
 
     def _timeout_s(self) -> float | None:
         powers = {board.power for board in self._boards.values()}
@@ -253,7 +262,7 @@ class Supervisor:
                 self._must_stop = True
             elif verb != "status":
                 raise ValueError(f"unknown verb {verb!r}")
-        except (BoardError, DiskError, NetworkError, ValueError, KeyError, OSError) as error:
+        except (*EXPECTED_ERRORS, ValueError, KeyError) as error:
             return {"error": str(error)}
         return self.describe()
 
@@ -273,7 +282,7 @@ class Supervisor:
         for board in self._boards.values():
             if board.supply is not None:
                 os.waitpid(board.supply, 0)
-                with contextlib.suppress(BoardError, DiskError, NetworkError, OSError):
+                with contextlib.suppress(*EXPECTED_ERRORS):
                     self._release(board)
 
     def _read_logs(self, names: list[str]) -> str:

@@ -275,3 +275,15 @@ def test_unknown_board_is_told(tower8):
 
 def test_every_fault_is_explained():
     assert all(fault.text and fault.text[0].islower() for fault in FAULTS.values())
+
+
+def test_board_that_is_not_up_yet_is_left_alone(tower8):
+    """Until its boot has changed its root directory, a board's file system is the operator's."""
+    tower8.fault("pi01", "poweroff")
+    tower8.wait_until(lambda board: board["power"] == "off", "pi01", "off")
+    tower8.fault("pi01", "poweron")
+    with pytest.raises(TowerError, match="pi01 is (away|booting), expected it to be on"):
+        for _ in range(1000):  # it is up within some hundred of these
+            tower8.fault("pi01", "no-sudo")
+            tower8.fault("pi01", "crash")
+            time.sleep(0.001)

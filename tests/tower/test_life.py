@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import secrets
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ import pytest
 from . import kernel
 from .network import list_networks
 from .places import Places
+from .specification import BoardSpec
 from .tower import Tower, TowerError, wait_until_gone
 
 pytestmark = pytest.mark.root
@@ -55,11 +57,17 @@ def list_traces(places: Places) -> list[str]:
         traces.append(places.uplink)
     if str(places.folder) in Path("/proc/self/mountinfo").read_text():
         traces.append("mounts")
+    return traces + list_groups(places)
+
+
+def list_disks(name: str) -> list[str]:
+    """Return the loop devices that hold a disk of a board with this name, which no other tower has."""
+    found = []
     for backing in Path("/sys/block").glob("loop*/loop/backing_file"):
         with contextlib.suppress(OSError):
-            if str(places.folder) in backing.read_text():
-                traces.append(str(backing))
-    return traces + list_groups(places)
+            if f"/{name}.img" in backing.read_text():  # the folder does not show in our namespace
+                found.append(backing.parents[1].name)
+    return found
 
 
 def list_groups(places: Places) -> list[str]:
@@ -117,11 +125,26 @@ def find_locks(process: int) -> list[Path]:
 
 
 def test_traces_are_seen_while_a_tower_runs(make_tower):
-    tower = make_tower(count=1)
+    name = f"disk{secrets.token_hex(4)}"
+    tower = make_tower(boards=[BoardSpec(name=name)])
     traces = " ".join(list_traces(tower.places))
-    for word in ("process", str(tower.places.folder), tower.places.uplink, "loop", "cgroup"):
-        assert word in traces or word == "cgroup"
-    assert list_groups(tower.places)
+    for word in ("process", str(tower.places.folder), tower.places.uplink, "/mnt/"):
+        assert word in traces
+    assert list_disks(name)
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_ended_tower_lets_its_disks_go(make_tower, how):
+    before = set(Path("/sys/block").glob("loop*"))
+    names = [f"disk{secrets.token_hex(4)}-{number}" for number in range(12)]
+    tower = make_tower(boards=[BoardSpec(name=name) for name in names])
+
+    os.kill(tower.process.pid, how)
+    wait_until_gone(tower.places)
+
+    wait_until(lambda: not any(list_disks(name) for name in names), "disks in use")
+    added = set(Path("/sys/block").glob("loop*")) - before
+    assert not [path for path in added if not (path / "loop/backing_file").exists()]
 
 
 def test_stopped_tower_leaves_nothing(make_tower):
