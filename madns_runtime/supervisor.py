@@ -208,6 +208,7 @@ class Supervisor:
             has_failed
             and child.may_restart
             and not self._is_ending
+            and not self._operator.is_late  # the link is cut: the operator will start them again
             and self._launch.config.on_agent_loss == "continue"
             and child.incarnation <= self._launch.config.agents.restarts_max
         )

@@ -1,19 +1,72 @@
-"""`cosmos down`: end runs from outside, and only what they started."""
+"""`cosmos down`: end runs from outside, here and on their machines, and only what they started."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from cosmos_cli.commands.fleet_options import (
+    FORKS_DEFAULT,
+    AcceptHostKeysOption,
+    ForksOption,
+    LimitOption,
+)
+from cosmos_cli.commands.run import SomeInventoryOption
 from cosmos_cli.console import Console, JsonOption, QuietOption
 from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.onboard.processes import Ending
-from cosmos_cli.launch.living import LivingRun, end_run, living_runs
+from cosmos_cli.fleet.outcome import Outcome, failed
+from cosmos_cli.fleet.target import Target, target_of
+from cosmos_cli.launch.elsewhere import Fleetwide, Seen, unfinished_runs
+from cosmos_cli.launch.living import LivingRun, end_run, is_called, living_runs
+from cosmos_cli.models.inventory import load_machines
+from cosmos_cli.retrieve.sources import Source, Sources
+from cosmos_cli.rundir import RunDirectory, find_run, runs_root
 from madns_runtime.processes import ProcessEntry
 
 CLEAN_TIMEOUT_S = 30.0
 FORCED_TIMEOUT_S = 5.0
+
+
+@dataclass(slots=True, kw_only=True)
+class Doomed:
+    """A run that is to end."""
+
+    run: str
+    directory: str
+    here: LivingRun | None = None
+    there: dict[str, Source] = field(default_factory=dict)
+    """By machine."""
+    host: str | None = None
+    """The machine of its host; None for this computer."""
+
+    def is_called(self, which: str) -> bool:
+        """Tell whether *which* is this run's name, number or directory."""
+        return is_called(self.run, self.directory, which)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ended:
+    """What came of it."""
+
+    run: str
+    here: Ending
+    there: list[Outcome[Ending]]
+
+    @property
+    def endings(self) -> list[Ending]:
+        """Of all machines that answered, this computer's first."""
+        return [self.here, *(each.value for each in self.there if each.value is not None)]
+
+    @property
+    def left(self) -> list[ProcessEntry]:
+        """Who lives still."""
+        return [entry for ending in self.endings for entry in ending.left]
 
 
 def down(
@@ -22,45 +75,99 @@ def down(
         typer.Argument(metavar="RUN...", help="Names, numbers or directories of runs."),
     ] = None,
     all_: Annotated[bool, typer.Option("--all", help="End every living run.")] = False,
+    inventory: SomeInventoryOption = None,
+    limit: LimitOption = None,
     timeout_s: Annotated[
         float, typer.Option("--timeout", metavar="S", min=0.0, help="Time for a clean shutdown, s.")
     ] = CLEAN_TIMEOUT_S,
+    forks: ForksOption = FORKS_DEFAULT,
+    accept_new_host_keys: AcceptHostKeysOption = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
-) -> None:
-    """End runs on this machine: cleanly if they can, by force if they must."""
+) -> int:
+    """
+    End runs, here and on their machines: cleanly if they can, by force if they must.
+
+    With an inventory also runs that are only found on its machines. Ends with 3 when a machine does
+    not answer, with 1 when something lives still.
+    """
     console = Console(json=json, quiet=quiet)
-    chosen = choose(living_runs(), runs or [], is_all=all_)
-    endings = [
-        end_run(run, clean_s=timeout_s, forced_s=FORCED_TIMEOUT_S, say=console.say)
-        for run in chosen
-    ]
-    for ending in endings:
-        console.data(_words(ending))
+    fleet = Fleetwide(
+        options=ConnectOptions(accept_new_host_keys=accept_new_host_keys), forks=forks
+    )
+    machines = load_machines(inventory, limit) if inventory is not None else ()
+    targets = [target_of(machine) for machine in machines if machine.connection != "local"]
+    outcomes = fleet.look(targets)
+    known = known_runs(living_runs(), unfinished_runs())
+    known += found_runs(known, targets, outcomes)
+    chosen = choose(known, runs or [], is_all=all_)
+    ended = [_end(run, fleet, timeout_s, console.say) for run in chosen]
+    bad = [each for one in ended for each in failed(one.there)] + failed(outcomes)
+    for one in ended:
+        for line in _lines(one):
+            console.data(line)
+    for outcome in failed(outcomes):
+        console.say(f"{outcome.machine}: {outcome.failure}")
     if not chosen:
         console.say("no run lives on this machine")
-    console.print_json({"runs": [_mapping(ending) for ending in endings]})
-    if any(ending.left for ending in endings):
-        raise typer.Exit(ExitCode.RUN_FAILED)
+    is_left = any(one.left for one in ended)
+    exit_code = ExitCode.RUN_FAILED if is_left else ExitCode.MACHINES if bad else ExitCode.OK
+    console.print_json({"runs": [_mapping(one) for one in ended], "exit_code": int(exit_code)})
+    return int(exit_code)
 
 
-def choose(living: list[LivingRun], wanted: list[str], *, is_all: bool) -> list[LivingRun]:
+def known_runs(here: Sequence[LivingRun], unfinished: Sequence[RunDirectory]) -> list[Doomed]:
+    """Return every run that lives here, or may live on the machines of its plan, by name."""
+    found = {run.directory: Doomed(run=run.run, directory=run.directory, here=run) for run in here}
+    for run in unfinished:
+        found.setdefault(str(run.path), Doomed(run=run.name, directory=str(run.path)))
+    for doomed in found.values():
+        _add_machines(doomed, RunDirectory(Path(doomed.directory)))
+    return sorted(found.values(), key=lambda each: (each.run, each.directory))
+
+
+def found_runs(
+    known: Sequence[Doomed], targets: Sequence[Target], outcomes: Sequence[Outcome[list[Seen]]]
+) -> list[Doomed]:
+    """Return the runs that were seen on machines and that nothing here knows of."""
+    planned = {(s.machine, s.directory) for each in known for s in each.there.values()}
+    by_name = {target.name: target for target in targets}
+    found: dict[str, Doomed] = {}
+    for seen in (seen for outcome in outcomes for seen in outcome.value or ()):
+        if (seen.machine, seen.directory) in planned:
+            continue
+        # One run has a folder of one name on all of its machines.
+        folder = Path(seen.directory).name
+        doomed = found.setdefault(folder, Doomed(run=seen.entry.run, directory=folder))
+        source = Source(target=by_name[seen.machine], directory=seen.directory)
+        doomed.there[seen.machine] = source
+        doomed.host = seen.machine if seen.entry.role == "host" else doomed.host
+    return sorted(found.values(), key=lambda each: (each.run, each.directory))
+
+
+def _add_machines(doomed: Doomed, run: RunDirectory) -> None:
+    sources = Sources.read(run)
+    doomed.there = {source.machine: source for source in sources.remote}
+    doomed.host = sources.host_machine
+
+
+def choose(known: Sequence[Doomed], wanted: Sequence[str], *, is_all: bool) -> list[Doomed]:
     """
-    Return the living runs that are meant.
+    Return the runs that are meant.
 
     Raises:
         InputError: Nothing or something unknown was named, or a name that fits several.
     """
     if is_all:
-        return living
-    known = ", ".join(run.run for run in living) or "none"
+        return list(known)
+    names = ", ".join(run.run for run in known) or "none"
     if not wanted:
-        raise InputError(f"name the runs to end, or give --all; living runs: {known}")
-    chosen: list[LivingRun] = []
+        raise InputError(f"name the runs to end, or give --all; living runs: {names}")
+    chosen: list[Doomed] = []
     for which in wanted:
-        found = [run for run in living if run.is_called(which)]
+        found = [run for run in known if run.is_called(which)] or _ended_before(which)
         if not found:
-            raise InputError(f"{which}: no such run lives on this machine; living runs: {known}")
+            raise InputError(f"{which}: no such run lives on this machine; living runs: {names}")
         if len(found) > 1:
             directories = ", ".join(run.directory for run in found)
             raise InputError(f"{which}: several living runs; give the directory: {directories}")
@@ -68,17 +175,65 @@ def choose(living: list[LivingRun], wanted: list[str], *, is_all: bool) -> list[
     return chosen
 
 
+def _ended_before(which: str) -> list[Doomed]:
+    """Return a run that is known, though nothing says that it lives: its machines are asked all the same."""
+    try:
+        run = find_run(runs_root(), which)
+    except InputError:
+        return []
+    doomed = Doomed(run=run.name, directory=str(run.path))
+    _add_machines(doomed, run)
+    return [doomed]
+
+
+def _end(run: Doomed, fleet: Fleetwide, clean_s: float, say: Callable[[str], None]) -> Ended:
+    """End it where the host is first: who follows the host needs no force."""
+    here = Ending(run=run.run)
+    if run.here is not None:
+        here = end_run(run.here, clean_s=clean_s, forced_s=FORCED_TIMEOUT_S, say=say)
+    there: list[Outcome[Ending]] = []
+    if run.there:
+        say(f"{run.run}: asking {len(run.there)} machines to end it")
+    first = [source for name, source in run.there.items() if name == run.host]
+    rest = [source for name, source in run.there.items() if name != run.host]
+    for sources in (first, rest):
+        there += fleet.end(sources, clean_s=clean_s, forced_s=FORCED_TIMEOUT_S)
+    return Ended(run=run.run, here=here, there=there)
+
+
+def _lines(ended: Ended) -> list[str]:
+    lines = []
+    if ended.here.ended or ended.here.left:
+        lines.append(f"{ended.run}: {_words(ended.here)}")
+    for outcome in ended.there:
+        words = f"failed: {outcome.failure}" if outcome.value is None else _words(outcome.value)
+        lines.append(f"{ended.run}: {outcome.machine}: {words}")
+    return lines or [f"{ended.run}: nothing of it lives"]
+
+
 def _words(ending: Ending) -> str:
     if ending.left:
         pids = ", ".join(str(entry.pid) for entry in ending.left)
-        return f"{ending.run}: still living: {pids}"
+        return f"still living: {pids}"
+    if not ending.ended:
+        return "nothing of it lives"
     by_force = f", {len(ending.killed)} of them by force" if ending.killed else ""
-    return f"{ending.run}: ended {len(ending.ended)} processes{by_force}"
+    return f"ended {len(ending.ended)} processes{by_force}"
 
 
-def _mapping(ending: Ending) -> dict[str, Any]:
+def _mapping(ended: Ended) -> dict[str, Any]:
     return {
-        "run": ending.run,
+        "run": ended.run,
+        **_ending(ended.here),
+        "machines": [
+            outcome.to_mapping(_ending(outcome.value) if outcome.value else None)
+            for outcome in ended.there
+        ],
+    }
+
+
+def _ending(ending: Ending) -> Mapping[str, Any]:
+    return {
         "ended": [_process(entry) for entry in ending.ended],
         "killed": [_process(entry) for entry in ending.killed],
         "left": [_process(entry) for entry in ending.left],

@@ -1,18 +1,38 @@
-"""`cosmos ps`: what runs on this machine."""
+"""`cosmos ps`: what runs, here and on the machines of runs."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from cosmos_cli.commands.fleet_options import (
+    FORKS_DEFAULT,
+    AcceptHostKeysOption,
+    ForksOption,
+    LimitOption,
+)
+from cosmos_cli.commands.run import SomeInventoryOption
 from cosmos_cli.console import Column, Console, JsonOption, QuietOption
+from cosmos_cli.errors import ExitCode
+from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.onboard.processes import age_s
-from cosmos_cli.launch.living import LivingRun, living_runs
+from cosmos_cli.fleet.outcome import Outcome, failed
+from cosmos_cli.fleet.target import Target, target_of
+from cosmos_cli.launch.elsewhere import Fleetwide, Seen, distinct, unfinished_runs
+from cosmos_cli.launch.living import LivingRun, in_order, is_called, living_runs
+from cosmos_cli.models.inventory import load_machines
+from cosmos_cli.retrieve.sources import Sources
+from cosmos_cli.rundir import RunDirectory
 from madns_runtime.processes import ProcessEntry
 
+HERE = "(here)"
 COLUMNS = (
     Column("RUN"),
+    Column("MACHINE"),
     Column("ROLE"),
     Column("NAME"),
     Column("PID", is_number=True),
@@ -21,50 +41,158 @@ COLUMNS = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What lives of one run on one machine."""
+
+    run: str
+    machine: str | None
+    """None for this computer."""
+    directory: str
+    ages_s: dict[int, float]
+    """By process."""
+    processes: tuple[ProcessEntry, ...]
+
+
 def ps(
+    run: Annotated[
+        str | None, typer.Argument(metavar="RUN", help="Number, name or directory of a run; all.")
+    ] = None,
+    inventory: SomeInventoryOption = None,
+    limit: LimitOption = None,
     all_: Annotated[bool, typer.Option("--all", help="A line an agent, not only their number.")] = (
         False
     ),
+    forks: ForksOption = FORKS_DEFAULT,
+    accept_new_host_keys: AcceptHostKeysOption = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
-) -> None:
-    """List the processes of living runs on this machine."""
+) -> int:
+    """
+    List the processes of living runs: here, and on the machines that those runs were started on.
+
+    With an inventory, whatever lives on its machines. Ends with 3 when a machine does not answer.
+    """
     console = Console(json=json, quiet=quiet)
-    runs = living_runs()
-    rows = [row for run in runs for row in _rows(run, is_every_agent=all_)]
+    here = living_runs()
+    directories = _directories(here, run)
+    targets = [source.target for each in directories for source in Sources.read(each).remote]
+    if inventory is not None:
+        targets += [target_of(machine) for machine in load_machines(inventory, limit)]
+    fleet = Fleetwide(
+        options=ConnectOptions(accept_new_host_keys=accept_new_host_keys), forks=forks
+    )
+    outcomes = fleet.look(_others(targets))
+    parts = [part for part in (*_here(here), *_there(outcomes)) if _is_meant(part, run)]
+    parts.sort(key=lambda part: (part.run, part.machine or ""))
+    rows = [row for part in parts for row in _rows(part, is_every_agent=all_)]
     if rows:
         console.table(COLUMNS, rows)
     else:
-        console.say("no run lives on this machine")
-    console.print_json({"runs": [_mapping(run) for run in runs]})
+        console.say("no run lives on this machine" if not outcomes else "no run lives")
+    bad = failed(outcomes)
+    for outcome in bad:
+        console.say(f"{outcome.machine}: {outcome.failure}")
+    exit_code = ExitCode.MACHINES if bad else ExitCode.OK
+    console.print_json(
+        {
+            "runs": _mappings(parts, directories),
+            "machines": [outcome.to_mapping() for outcome in outcomes],
+            "exit_code": int(exit_code),
+        }
+    )
+    return int(exit_code)
 
 
-def _rows(run: LivingRun, *, is_every_agent: bool) -> list[list[str]]:
-    agents = run.of_role("agent")
-    shown = run.processes if is_every_agent else run.of_role("operator", "host", "supervisor")
+def _others(targets: Sequence[Target]) -> list[Target]:
+    return [target for target in distinct(targets) if target.connection != "local"]
+
+
+def _directories(here: Sequence[LivingRun], which: str | None) -> list[RunDirectory]:
+    """Return the runs whose machines are asked: those that live here, and those that may live elsewhere."""
+    runs = {Path(run.directory): RunDirectory(Path(run.directory)) for run in here}
+    runs |= {run.path: run for run in unfinished_runs()}
+    return [
+        run for run in runs.values() if which is None or is_called(run.name, str(run.path), which)
+    ]
+
+
+def _is_meant(part: Part, which: str | None) -> bool:
+    return which is None or is_called(part.run, part.directory, which)
+
+
+def _here(runs: Sequence[LivingRun]) -> list[Part]:
+    return [
+        Part(run.run, None, run.directory, {e.pid: age_s(e) for e in run.processes}, run.processes)
+        for run in runs
+    ]
+
+
+def _there(outcomes: Sequence[Outcome[list[Seen]]]) -> list[Part]:
+    found: dict[tuple[str, str, str], list[Seen]] = {}
+    for outcome in outcomes:
+        for seen in outcome.value or ():
+            found.setdefault((seen.entry.run, seen.machine, seen.directory), []).append(seen)
+    return [
+        Part(
+            run,
+            machine,
+            directory,
+            {each.entry.pid: each.age_s for each in seen},
+            in_order([each.entry for each in seen]),
+        )
+        for (run, machine, directory), seen in found.items()
+    ]
+
+
+def _rows(part: Part, *, is_every_agent: bool) -> list[list[str]]:
+    machine = part.machine or HERE
+    agents = [entry for entry in part.processes if entry.role == "agent"]
+    shown = [entry for entry in part.processes if is_every_agent or entry.role != "agent"]
     rows = [
-        [run.run, e.role, e.name, str(e.pid), age_words(age_s(e)), run.directory] for e in shown
+        [part.run, machine, e.role, e.name, str(e.pid), _age(part, e), part.directory]
+        for e in shown
     ]
     if agents and not is_every_agent:
         # One process may hold several agents; its name lists them.
         count = sum(len(entry.name.split(",")) for entry in agents)
-        oldest_s = max(map(age_s, agents))
-        rows.append([run.run, "agents", f"{count} agents", "", age_words(oldest_s), run.directory])
+        oldest = age_words(max(part.ages_s[entry.pid] for entry in agents))
+        rows.append([part.run, machine, "agents", f"{count} agents", "", oldest, part.directory])
     return rows
 
 
-def _mapping(run: LivingRun) -> dict[str, Any]:
-    processes = [process_mapping(entry) for entry in run.processes]
-    return {"run": run.run, "directory": run.directory, "processes": processes}
+def _age(part: Part, entry: ProcessEntry) -> str:
+    return age_words(part.ages_s[entry.pid])
 
 
-def process_mapping(entry: ProcessEntry) -> dict[str, Any]:
+def _mappings(parts: Sequence[Part], directories: Sequence[RunDirectory]) -> list[dict[str, Any]]:
+    """Return a mapping a run; its directory is the one here, where it has one."""
+    here = {
+        source.directory: str(run.path)
+        for run in directories
+        for source in Sources.read(run).remote
+    }
+    runs: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for part in parts:
+        directory = part.directory if part.machine is None else here.get(part.directory)
+        key = (part.run, directory or part.directory)
+        runs.setdefault(key, []).extend(
+            process_mapping(entry, part.ages_s[entry.pid], part.machine) for entry in part.processes
+        )
+    return [
+        {"run": run, "directory": directory, "processes": processes}
+        for (run, directory), processes in runs.items()
+    ]
+
+
+def process_mapping(entry: ProcessEntry, age: float, machine: str | None) -> dict[str, Any]:
     """Return a process as --json shows it."""
     return {
+        "machine": machine,
         "role": entry.role,
         "name": entry.name,
         "pid": entry.pid,
-        "age_s": round(age_s(entry), 1),
+        "age_s": round(age, 1),
         "started_utc": entry.utc,
     }
 

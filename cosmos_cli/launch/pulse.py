@@ -44,12 +44,13 @@ class Pulse:
 
     def pong(self, number: int, now_s: float) -> float:
         """Note the answer to question *number*, and to all before it; return how long the oldest took, s."""
+        if self._heard_s is None:
+            self._unanswered.clear()  # they waited for the process to start
+        self._heard_s = now_s
         took_s = 0.0
         while self._unanswered and self._unanswered[0][0] <= number:
             took_s = max(took_s, now_s - self._unanswered.popleft()[1])
-        first = self._heard_s is None
-        self._heard_s = now_s
-        return 0.0 if first else took_s
+        return took_s
 
     def silent_s(self, now_s: float) -> float:
         """Return for how long it has said nothing although it was asked; 0 while it starts."""

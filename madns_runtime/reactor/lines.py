@@ -29,6 +29,8 @@ OUT_BYTES_MAX = 4 * 1024 * 1024
 READ_BYTES = 65_536
 PING_SILENCE_S = 30.0
 """An operator that has sent pings and sends none for this long is gone."""
+PING_LATE_S = 2.0
+"""Pings come once a second; after this long without one something is wrong between here and there."""
 
 
 def read_launch(fd: int) -> tuple[dict[str, Any], bytes]:
@@ -98,6 +100,7 @@ class OperatorLink:
         self._out: deque[bytes] = deque()
         self._out_bytes = 0
         self._is_deaf = False
+        self._pinged_s = math.inf
         self.dropped_count = 0
         """Events that nobody took."""
         self.is_gone = False
@@ -132,6 +135,11 @@ class OperatorLink:
         poll = select.poll()
         poll.register(self._read_fd, 0)
         return self.is_gone or bool(poll.poll(0))
+
+    @property
+    def is_late(self) -> bool:
+        """Whether an operator that sends pings has not done so for a while."""
+        return not self._is_detached and self._reactor.now_s() - self._pinged_s > PING_LATE_S
 
     def flush(self, timeout_s: float) -> bool:
         """Write what waits; False if the operator did not take it in time."""
@@ -204,5 +212,6 @@ class OperatorLink:
             self._on_command(command)
             return
         self.emit({"event": "pong", "n": command.get("n")})
+        self._pinged_s = self._reactor.now_s()
         if not self._is_detached:
-            self._silence_timer.reschedule(self._reactor.now_s() + PING_SILENCE_S)
+            self._silence_timer.reschedule(self._pinged_s + PING_SILENCE_S)

@@ -104,13 +104,13 @@ def test_ps_groups_by_run_and_counts_agents(
 
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert code == 0
-    assert lines[0] == ["RUN", "ROLE", "NAME", "PID", "AGE", "DIRECTORY"]
-    assert [line[:3] for line in lines[1:]] == [
-        ["0001-a", "operator", "operator"],
-        ["0002-b", "host", "host"],
-        ["0002-b", "agents", "3"],
+    assert lines[0] == ["RUN", "MACHINE", "ROLE", "NAME", "PID", "AGE", "DIRECTORY"]
+    assert [line[:4] for line in lines[1:]] == [
+        ["0001-a", "(here)", "operator", "operator"],
+        ["0002-b", "(here)", "host", "host"],
+        ["0002-b", "(here)", "agents", "3"],
     ]
-    assert lines[2][3] == str(host.pid)
+    assert lines[2][4] == str(host.pid)
     assert {line[-1] for line in lines[2:]} == {str(tmp_path / "runs" / "0002-b")}
 
 
@@ -120,7 +120,7 @@ def test_ps_lists_every_agent_on_request(start: Start, capsys: pytest.CaptureFix
     cosmos(["ps", "--all"])
 
     lines = [line.split() for line in capsys.readouterr().out.splitlines()[1:]]
-    assert [line[2:4] for line in lines] == [
+    assert [line[3:5] for line in lines] == [
         ["agent-01", str(pids[0])],
         ["agent-02", str(pids[1])],
     ]

@@ -193,3 +193,17 @@ def test_events_that_nobody_takes_are_counted(reactor, pipes):
 
     assert line.dropped_count == 3
     assert line.flush(0.1)
+
+
+def test_operator_is_late_when_its_pings_are(reactor, pipes, monkeypatch):
+    monkeypatch.setattr(lines, "PING_LATE_S", 0.1)
+    line = link(reactor, pipes, [], [])
+    seen = [line.is_late]
+    os.write(pipes[1], b'{"command": "ping", "n": 1}\n')
+    reactor.call_at(reactor.now_s() + 0.05, lambda: seen.append(line.is_late))
+    reactor.call_at(reactor.now_s() + 0.5, lambda: (seen.append(line.is_late), reactor.stop()))
+
+    reactor.run()
+
+    assert seen[0] is False
+    assert seen[2] is True
