@@ -14,11 +14,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping
-from typing import Any
 
 from cosmos_cli.fleet.onboard import store
 from cosmos_cli.fleet.onboard.core import Refusal, Request, last_words, verb
-from cosmos_cli.fleet.onboard.wheels import Place, Wheel
+
+TYPE_CHECKING = False  # to import typing takes longer than most that is done here
+if TYPE_CHECKING:
+    from typing import Any
 
 MARK_SCHEMA = 1
 PART = ".part"
@@ -157,6 +159,8 @@ def _missing(folder: str, wheels: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _build(path: str, wheels: str, asked: Mapping[str, Any]) -> None:
+    from cosmos_cli.fleet.onboard.wheels import Place, Wheel
+
     version = ".".join(map(str, asked["python"]))
     place = Place(top=path, python=os.path.join(path, "bin/python"), python_version=version)
     for folder in (path, os.path.join(path, "bin")):

@@ -261,23 +261,27 @@ def _interface_of_connection(proc: str) -> str | None:
 
 
 def _interface_v4(own: str) -> str | None:
+    import _socket  # what `socket` adds to it takes longer to import than the rest of this module
     import fcntl
-    import socket
 
     get_address = 0x8915  # SIOCGIFADDR
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
-        for _, name in socket.if_nameindex():
+    asked = _socket.socket(_socket.AF_INET, _socket.SOCK_DGRAM)
+    try:
+        for _, name in _socket.if_nameindex():
             with contextlib.suppress(OSError):
-                found = fcntl.ioctl(asked, get_address, name.encode()[:15].ljust(256, b"\0"))
-                if socket.inet_ntoa(found[20:24]) == own:
+                wanted = name.encode()[:15].ljust(256, b"\0")
+                found = fcntl.ioctl(asked.fileno(), get_address, wanted)
+                if _socket.inet_ntoa(found[20:24]) == own:
                     return name
+    finally:
+        asked.close()
     return None
 
 
 def _interface_v6(own: str, proc: str) -> str | None:
-    import socket
+    import _socket
 
-    wanted = socket.inet_pton(socket.AF_INET6, own).hex()
+    wanted = _socket.inet_pton(_socket.AF_INET6, own).hex()
     for line in (_text(f"{proc}/net/if_inet6") or "").splitlines():
         words = line.split()
         if words[0] == wanted:

@@ -1,20 +1,27 @@
-"""What is installed on a machine: is it whole, does it run, does anybody still need it?"""
+"""
+What is installed on a machine: is it there and what it should be, does it run, does anybody still need it?
+
+Asked at every `up` and every run, so it imports little and changes nothing.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
-import socket
+import stat
 import subprocess
 import time
+from collections.abc import Mapping
 from typing import Any
 
 from cosmos_cli.fleet.onboard import store
 from cosmos_cli.fleet.onboard.core import Refusal, Request, last_words, verb
-from cosmos_cli.fleet.onboard.environment import is_whole as is_environment_whole
-from cosmos_cli.fleet.onboard.trees import is_whole as is_tree_whole
 
+CACHE = "__pycache__"
 NEWEST_KEPT = 2
 """Of the trees of one label, and of the environments, that nobody asks for."""
+ORPHAN_S = 3600.0
+"""A wheel that belongs to no environment after so long belongs to nobody."""
 ECHO_TRIES = 3
 ECHO_WAIT_S = 0.3
 ECHO_BYTES_MAX = 256
@@ -31,7 +38,7 @@ if missing:
 print(madns_runtime.__version__)
 """
 FULL = """
-import importlib, sys
+import importlib
 import madns_runtime
 import madns_runtime.agent
 for name in {modules!r}:
@@ -40,7 +47,7 @@ if {simulation!r}:
     from pathlib import Path
     from madns_runtime.plugin.registry import load_half, resolve
     base = Path({base!r})
-    load_half(resolve({simulation!r}, base), {role!r}, base)
+    load_half(resolve({simulation!r}, base), "agent", base)
 print(madns_runtime.__version__)
 """
 
@@ -53,36 +60,125 @@ def installed(request: Request) -> dict[str, Any]:
     With "touch", those are also remembered as wanted now.
     """
     asked = request.arguments
-    folders = {kind: store.expand(asked["folders"][kind]) for kind in asked["folders"]}
+    folders = {kind: store.expand(path) for kind, path in asked["folders"].items()}
     wanted = {"trees": asked["trees"], "environments": asked["environments"]}
-    whole = {
-        "trees": {name: is_tree_whole(folders["trees"], name) for name in wanted["trees"]},
-        "environments": {
-            key: is_environment_whole(os.path.join(folders["environments"], key))
-            for key in wanted["environments"]
-        },
+    checks = {"trees": is_tree_whole, "environments": is_environment_whole}
+    told: dict[str, Any] = {"folders": folders}
+    for kind, names in wanted.items():
+        told[kind] = {name: checks[kind](os.path.join(folders[kind], name)) for name in names}
+        for name in names if asked.get("touch") else ():
+            if told[kind][name]:
+                os.utime(os.path.join(folders[kind], name, store.MARK))
+    return {**told, "prunable": prunable(folders, wanted)}
+
+
+def is_tree_whole(path: str) -> bool:
+    """Read every file of a tree again, and tell whether it is what its name says."""
+    mark = store.read_mark(path)
+    if mark is None:
+        return False
+    tree_hash = os.path.basename(path)
+    found = files_of_tree(path)
+    if hash_of_tree(path, found) == tree_hash:
+        return True
+    # Flight software that writes beside its code must not make its own run's tree look broken.
+    known = [file for file in found if file[0] in mark.get("files", {})]
+    return (
+        len(known) < len(found)
+        and hash_of_tree(path, known) == tree_hash
+        and bool(store.used([path]))
+    )
+
+
+def files_of_tree(path: str) -> list[tuple[str, bool]]:
+    """Return the path of every file of a tree, and whether it is a program, in the order of the paths."""
+    found: list[tuple[str, bool]] = []
+    waiting = [""]
+    while waiting:
+        inner = waiting.pop()
+        for entry in os.scandir(os.path.join(path, inner)):
+            name = f"{inner}{entry.name}"
+            if entry.is_dir(follow_symlinks=False):
+                if entry.name != CACHE:
+                    waiting.append(f"{name}/")
+            elif name != store.MARK:
+                mode = entry.stat(follow_symlinks=False).st_mode
+                found.append((name, bool(mode & stat.S_IXUSR)))
+    return sorted(found)
+
+
+def hash_of_tree(path: str, files: list[tuple[str, bool]]) -> str:
+    """Return the hash of these files as `cosmos_cli.provision.trees.tree_of` makes it."""
+    digest = hashlib.sha256()
+    try:
+        for name, is_program in files:
+            content = store.hash_of(f"{path}/{name}")
+            digest.update(f"{'x' if is_program else '-'} {content} {name}\n".encode())
+    except OSError:
+        return ""
+    return digest.hexdigest()
+
+
+def is_environment_whole(path: str) -> bool:
+    """
+    Tell whether an environment is whole and nobody touched it since it was built.
+
+    Its thousands of files are looked at, not read again: a byte that somebody changes leaves a trace in the
+    time of its file. What was added, such as a package's own caches, does no harm.
+    """
+    mark = store.read_mark(path)
+    if mark is None or not os.access(os.path.join(path, "bin/python"), os.X_OK):
+        return False
+    return store.is_untouched(path, mark.get("files", {"": []}))
+
+
+def prunable(folders: Mapping[str, str], wanted: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Return what no living run uses, nobody asks for, and is not among the newest."""
+    found: dict[str, list[str]] = {}
+    for kind, names in wanted.items():
+        paths = [os.path.join(folders[kind], name) for name in store.names_in(folders[kind])]
+        kept = {os.path.join(folders[kind], name) for name in names}
+        rest = [path for path in paths if path not in kept]
+        spared = _newest(paths) if rest else set()
+        rest = [path for path in rest if path not in spared]
+        in_use = store.used(rest)
+        found[kind] = [os.path.basename(path) for path in rest if path not in in_use]
+    found["wheels"] = _orphans(folders, found["environments"])
+    return found
+
+
+def _newest(paths: list[str]) -> set[str]:
+    """Return the newest of each label; half-made ones are nobody's."""
+    by_label: dict[str, list[tuple[float, str]]] = {}
+    for path in paths:
+        mark = store.read_mark(path)
+        if mark is not None:
+            when_s = os.stat(os.path.join(path, store.MARK)).st_mtime
+            by_label.setdefault(str(mark.get("label", "")), []).append((when_s, path))
+    return {
+        path
+        for found in by_label.values()
+        for _, path in sorted(found, reverse=True)[:NEWEST_KEPT]
     }
-    if asked.get("touch"):
-        for kind, names in wanted.items():
-            for name in names:
-                store.touch_mark(os.path.join(folders[kind], name))
-    return {**whole, "folders": folders, "prunable": _prunable(folders, wanted)}
 
 
-@verb("prune_installed")
-def prune_installed(request: Request) -> dict[str, Any]:
-    """Remove the trees, environments and wheels that nobody needs."""
-    asked = request.arguments
-    folders = {kind: store.expand(asked["folders"][kind]) for kind in asked["folders"]}
-    wanted = {"trees": asked["trees"], "environments": asked["environments"]}
-    removed = _prunable(folders, wanted)
-    for kind, names in removed.items():
-        for name in names:
-            store.remove(os.path.join(folders[kind], name))
+def _orphans(folders: Mapping[str, str], gone: list[str]) -> list[str]:
+    """Return the wheels that no environment has, or that only those have that will be *gone*."""
+    needed: set[str] = set()
+    going: set[str] = set()
+    for key in store.names_in(folders["environments"]):
+        mark = store.read_mark(os.path.join(folders["environments"], key)) or {}
+        (going if key in gone else needed).update(mark.get("wheels", ()))
     now_s = time.clock_gettime(time.CLOCK_REALTIME)
-    for folder in folders.values():
-        store.remove_left_overs(folder, now_s)
-    return removed
+    return [
+        name
+        for name in store.names_in(folders["wheels"])
+        if name not in needed
+        and (
+            name in going
+            or now_s - os.stat(os.path.join(folders["wheels"], name)).st_mtime > ORPHAN_S
+        )
+    ]
 
 
 @verb("check_runtime")
@@ -93,19 +189,17 @@ def check_runtime(request: Request) -> dict[str, Any]:
     code = program.format(
         modules=asked["modules"],
         simulation=asked.get("simulation", ""),
-        base=asked.get("base", ""),
-        role=asked.get("role", "agent"),
+        base=store.expand(asked["base"]) if asked.get("base") else "/",
     )
     python = store.expand(asked["python"])
     path = os.pathsep.join(store.expand(folder) for folder in asked["path"])
     started_s = time.monotonic()
     try:
         done = subprocess.run(
-            [python, "-c", code],
+            [python, "-P", "-c", code],
             capture_output=True,
             timeout=asked["timeout_s"],
             env={**os.environ, **VARIABLES, "PYTHONPATH": path},
-            cwd="/",
             check=False,
         )
     except FileNotFoundError:
@@ -121,12 +215,14 @@ def check_runtime(request: Request) -> dict[str, Any]:
     return {
         "runtime": version[0] if version else "",
         "start_ms": round(start_s * 1000, 1),
-        "round_trip_ms": _round_trip_ms(udp) if udp else None,
+        "round_trip_ms": round_trip_ms(udp) if udp else None,
     }
 
 
-def _round_trip_ms(udp: dict[str, Any]) -> float:
+def round_trip_ms(udp: Mapping[str, Any]) -> float:
     """Send a nonce to the operator until it comes back."""
+    import socket
+
     nonce = bytes.fromhex(udp["nonce_hex"])
     address, port = str(udp["address"]), int(udp["port"])
     said = ""
@@ -134,9 +230,8 @@ def _round_trip_ms(udp: dict[str, Any]) -> float:
         family, _, _, _, where = socket.getaddrinfo(address, port, type=socket.SOCK_DGRAM)[0]
         with socket.socket(family, socket.SOCK_DGRAM) as link:
             for attempt in range(ECHO_TRIES):
-                packet = nonce + bytes([attempt])
                 sent_s = time.monotonic()
-                link.sendto(packet, where)
+                link.sendto(nonce + bytes([attempt]), where)
                 if _comes_back(link, nonce, sent_s + ECHO_WAIT_S):
                     return round((time.monotonic() - sent_s) * 1000, 3)
     except OSError as error:
@@ -149,7 +244,7 @@ def _round_trip_ms(udp: dict[str, Any]) -> float:
     )
 
 
-def _comes_back(link: socket.socket, nonce: bytes, until_s: float) -> bool:
+def _comes_back(link: Any, nonce: bytes, until_s: float) -> bool:
     while (left_s := until_s - time.monotonic()) > 0:
         link.settimeout(left_s)
         try:
@@ -159,38 +254,3 @@ def _comes_back(link: socket.socket, nonce: bytes, until_s: float) -> bool:
         if answer[: len(nonce)] == nonce:
             return True
     return False
-
-
-def _prunable(folders: dict[str, str], wanted: dict[str, Any]) -> dict[str, list[str]]:
-    """Return what no living run uses, nobody asks for, and is not among the newest."""
-    found: dict[str, list[str]] = {"trees": [], "environments": [], "wheels": []}
-    for kind in wanted:
-        paths = [os.path.join(folders[kind], name) for name in store.names_in(folders[kind])]
-        kept = {os.path.join(folders[kind], name) for name in wanted[kind]}
-        others = [path for path in paths if path not in kept]
-        newest = _newest(others)  # of those only: what `up` sends now must not make its next plan prune
-        rest = [path for path in others if path not in newest]
-        in_use = store.used(rest)
-        found[kind] = [os.path.basename(path) for path in rest if path not in in_use]
-    gone = {os.path.join(folders["environments"], key) for key in found["environments"]}
-    needed = set()
-    for key in store.names_in(folders["environments"]):
-        path = os.path.join(folders["environments"], key)
-        if path not in gone:
-            needed |= set((store.read_mark(path) or {}).get("wheels", ()))
-    if found["environments"]:
-        found["wheels"] = [w for w in store.names_in(folders["wheels"]) if w not in needed]
-    return found
-
-
-def _newest(paths: list[str]) -> set[str]:
-    """Return the newest of each label; half-made ones are nobody's."""
-    by_label: dict[str, list[tuple[float, str]]] = {}
-    for path in paths:
-        mark = store.read_mark(path)
-        if mark is not None:
-            when_s = os.stat(os.path.join(path, store.MARK)).st_mtime
-            by_label.setdefault(str(mark.get("label", "")), []).append((when_s, path))
-    return {
-        path for found in by_label.values() for _, path in sorted(found, reverse=True)[:NEWEST_KEPT]
-    }

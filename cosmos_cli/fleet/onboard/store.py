@@ -1,29 +1,23 @@
 """
-What trees, wheels and environments on a machine have in common: marks, durability, who uses them.
+What is known by the hash of its content on a machine: trees, wheels, environments. Only looks, for speed.
 
 Whatever has a name of its own there is whole: it was made beside or under its name, reached the disk, and
-got its name or its mark last. So a power failure at any point leaves what was, or what was wanted.
+got its name or its mark last (`cosmos_cli.fleet.onboard.keep`).
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import glob
 import hashlib
 import json
 import os
-import secrets
-import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 MARK = ".complete"
 HIDDEN = "."
 """What begins so is half made, or on its way out; nothing else may be."""
 READ_BYTES = 1024 * 1024
-LEFT_OVER_S = 3600.0
-"""A half-made thing that nobody has touched for so long has no maker any more."""
 
 
 def expand(path: str) -> str:
@@ -40,56 +34,6 @@ def hash_of(path: str) -> str:
     return digest.hexdigest()
 
 
-def beside(folder: str, name: str) -> str:
-    """Return the path of something half made that will be *name*."""
-    return os.path.join(folder, f"{HIDDEN}{name}.{os.getpid()}-{secrets.token_hex(4)}")
-
-
-def sync(folder: str) -> None:
-    """Wait until everything below a folder is on the disk: one call for thousands of files."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        libc = ctypes.CDLL(None, use_errno=True)
-        if libc.syncfs(descriptor):
-            number = ctypes.get_errno()
-            raise OSError(number, os.strerror(number), folder)
-    finally:
-        os.close(descriptor)
-
-
-def sync_names(folder: str) -> None:
-    """Wait until the names in a folder are on the disk."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def write_whole(path: str, content: bytes, *, is_durable: bool = True) -> None:
-    """Write a file under its name all at once."""
-    folder, name = os.path.split(path)
-    partial = beside(folder, name)
-    try:
-        with open(partial, "xb") as file:
-            file.write(content)
-            if is_durable:
-                file.flush()
-                os.fsync(file.fileno())
-        os.replace(partial, path)
-    except OSError:
-        with contextlib.suppress(OSError):
-            os.unlink(partial)
-        raise
-    if is_durable:
-        sync_names(folder)
-
-
-def mark_complete(folder: str, document: dict[str, Any]) -> None:
-    """Write the mark that says that a folder is whole; what is in it must be on the disk already."""
-    write_whole(os.path.join(folder, MARK), json.dumps(document).encode())
-
-
 def read_mark(folder: str) -> dict[str, Any] | None:
     """Return what a folder's mark says; None when it is not whole."""
     try:
@@ -100,21 +44,25 @@ def read_mark(folder: str) -> dict[str, Any] | None:
     return document if isinstance(document, dict) else None
 
 
-def touch_mark(folder: str) -> None:
-    """Remember that a folder is wanted now."""
-    with contextlib.suppress(OSError):
-        os.utime(os.path.join(folder, MARK))
+def trace(folder: str, names: Iterable[str]) -> dict[str, list[int]]:
+    """Return size and time of files: what changes when somebody writes to one."""
+    found = {}
+    for name in names:
+        status = os.lstat(os.path.join(folder, name))
+        found[name] = [status.st_size, status.st_mtime_ns]
+    return found
 
 
-def remove(path: str) -> None:
-    """Remove a folder; it loses its name at once, and what it holds by and by."""
-    folder, name = os.path.split(path)
-    gone = beside(folder, name)
+def is_untouched(folder: str, files: Mapping[str, list[int]]) -> bool:
+    """Tell whether files still have the size and the time that `trace` found; others do not matter."""
     try:
-        os.rename(path, gone)
-    except FileNotFoundError:
-        return
-    shutil.rmtree(gone)
+        for name, (size, mtime_ns) in files.items():
+            status = os.lstat(f"{folder}/{name}")
+            if status.st_mtime_ns != mtime_ns or status.st_size != size:
+                return False
+    except (OSError, ValueError, TypeError):
+        return False
+    return True
 
 
 def names_in(folder: str) -> list[str]:
@@ -123,14 +71,6 @@ def names_in(folder: str) -> list[str]:
         return sorted(name for name in os.listdir(folder) if not name.startswith(HIDDEN))
     except FileNotFoundError:
         return []
-
-
-def remove_left_overs(folder: str, now_s: float) -> None:
-    """Remove what was left half made, or half removed, by makers that are gone."""
-    for path in glob.glob(os.path.join(glob.escape(folder), f"{HIDDEN}*")):
-        with contextlib.suppress(OSError):
-            if now_s - os.lstat(path).st_mtime > LEFT_OVER_S:
-                shutil.rmtree(path) if os.path.isdir(path) else os.unlink(path)
 
 
 def used(paths: Iterable[str]) -> set[str]:

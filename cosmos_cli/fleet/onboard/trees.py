@@ -14,10 +14,13 @@ import stat
 import time
 import zlib
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 from cosmos_cli.fleet.onboard import store
 from cosmos_cli.fleet.onboard.core import Refusal, Request, verb
+
+TYPE_CHECKING = False  # to import typing takes longer than most that is done here
+if TYPE_CHECKING:
+    from typing import Any
 
 BLOBS = ".blobs"
 """Files that were sent and belong to no tree yet, by their hash."""

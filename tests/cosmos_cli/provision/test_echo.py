@@ -70,12 +70,12 @@ def test_lost_datagrams_are_sent_again(monkeypatch, echo):
     question = echo.question("127.0.0.1")
     sent = []
 
-    class Lossy(socket.socket):
+    class Lossy(installed._socket.socket):
         def sendto(self, packet, where):
             sent.append(packet)
             return super().sendto(packet, where) if len(sent) > 2 else len(packet)
 
-    monkeypatch.setattr(installed.socket, "socket", Lossy)
+    monkeypatch.setattr(installed._socket, "socket", Lossy)
 
     assert installed._round_trip_ms(question) > 0
     assert len(sent) == 3
