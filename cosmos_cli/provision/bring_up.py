@@ -29,8 +29,8 @@ from cosmos_cli.provision.step import Kind, Step
 from cosmos_cli.provision.steps import check_possible, installed_question, plan_steps
 from cosmos_cli.provision.wanted import Content, Paths, Wanted, questions, wanted_of
 
-LOOK_PARTS = ("files", "facts", *PARTS)
-WORK_PARTS = (*LOOK_PARTS, "system", "apt_words", "apt")
+HELPER_PARTS = ("files", "facts", *PARTS, "system", "apt_words", "apt")
+"""Each is loaded there when it is first needed."""
 LOCK_PATIENCE_S = 60.0
 """Without a question for so long the machine's lock is given up: the operator is gone."""
 LOOK_TIMEOUT_S = 150.0
@@ -135,48 +135,50 @@ class _Work:
 
     def do(self) -> None:
         self.teller.detail("looking")
-        with Board.start(self.connection, LOOK_PARTS) as board:
-            environments = self.kit.environments(self.machine, board.greeting, self.teller)
-            wanted = dataclasses.replace(
-                wanted_of(
-                    self.machine,
-                    home=str(board.greeting["home"]),
-                    read_file=self.kit.read_file,
-                    environments=environments,
-                    trees=self.kit.trees,
-                ),
-                paths=self.kit.paths,
-            )
+        with Board.start(self.connection, HELPER_PARTS) as board:
+            wanted = self._wanted(board.greeting)
             udp = self.kit.udp_question(self.connection, self.machine)
             checks = self._look(board, wanted, also=self._checks(wanted, udp, is_full=False))
             steps = self._plan(wanted)
             if not steps:
                 self._raise_first(checks, udp)
-                self._note(wanted)
-                self._checked()
-                return
-            if self.options.is_check:
-                if any(step.needs_root for step in steps):
-                    self._look(board, wanted, is_sudo_asked=True)
-                check_possible(self._facts, steps)
-                self._note(wanted)
-                self.brought.done = [Done(step=step, changed=True) for step in steps]
-                return
-        self._change(wanted)
-
-    def _change(self, wanted: Wanted) -> None:
-        with Board.start(self.connection, WORK_PARTS) as board:
-            applier = Applier(board=board, layout=wanted.layout, teller=self.teller)
-            self.brought.done = applier.done
-            try:
-                self._apply(board, wanted, applier)
-            finally:
-                self.brought.notes += applier.notes
-            self.teller.detail("checking")
-            udp = self.kit.udp_question(self.connection, self.machine)
-            self._raise_first(_several(board, self._checks(wanted, udp, is_full=True)), udp)
+            elif self.options.is_check:
+                self._foresee(board, wanted, steps)
+            else:
+                self._change(board, wanted)
         self._note(wanted)
-        self._checked()
+        if not (steps and self.options.is_check) and self.kit.trees:
+            step = Step(kind=Kind.CHECK, title=CHECK_TITLE)
+            self.brought.done = [*self.brought.done, Done(step=step, changed=False)]
+
+    def _wanted(self, greeting: Mapping[str, Any]) -> Wanted:
+        environments = self.kit.environments(self.machine, greeting, self.teller)
+        wanted = wanted_of(
+            self.machine,
+            home=str(greeting["home"]),
+            read_file=self.kit.read_file,
+            environments=environments,
+            trees=self.kit.trees,
+        )
+        return dataclasses.replace(wanted, paths=self.kit.paths)
+
+    def _foresee(self, board: Board, wanted: Wanted, steps: tuple[Step, ...]) -> None:
+        """Say what would be done, or that it cannot be done."""
+        if any(step.needs_root for step in steps):
+            self._look(board, wanted, is_sudo_asked=True)
+        check_possible(self._facts, steps)
+        self.brought.done = [Done(step=step, changed=True) for step in steps]
+
+    def _change(self, board: Board, wanted: Wanted) -> None:
+        applier = Applier(board=board, layout=wanted.layout, teller=self.teller)
+        self.brought.done = applier.done
+        try:
+            self._apply(board, wanted, applier)
+        finally:
+            self.brought.notes += applier.notes
+        self.teller.detail("checking")
+        udp = self.kit.udp_question(self.connection, self.machine)
+        self._raise_first(_several(board, self._checks(wanted, udp, is_full=True)), udp)
 
     def _apply(self, board: Board, wanted: Wanted, applier: Applier) -> None:
         """Make the folders, for the lock is in one of them; lock; look again; do the rest."""
@@ -263,11 +265,6 @@ class _Work:
             text = "UDP from there comes here, but the answers do not come back"
             advice = "is a firewall closing it, on the machine or on the way?"
             raise MachineFailure(failure.kind, text, advice) from None
-
-    def _checked(self) -> None:
-        if self.kit.trees:
-            step = Step(kind=Kind.CHECK, title=CHECK_TITLE)
-            self.brought.done = [*self.brought.done, Done(step=step, changed=False)]
 
     def _note(self, wanted: Wanted) -> None:
         facts, priority = self._facts, wanted.settings.realtime_priority

@@ -17,7 +17,7 @@ from provision_machines import machine_of
 
 from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
-from cosmos_cli.provision.bring_up import LOOK_PARTS
+from cosmos_cli.provision.bring_up import HELPER_PARTS
 from cosmos_cli.provision.trees import TreeFile, tree_of
 
 pytestmark = pytest.mark.process
@@ -207,7 +207,7 @@ def uncut(tmp_path_factory):
     return set(contents(folder / "cosmos"))
 
 
-@pytest.mark.parametrize("requests", range(18))
+@pytest.mark.parametrize("requests", range(17))
 def test_cut_before_any_request_is_repaired_by_the_next_up(place, uncut, requests):
     made = place / "made"
     machine = machine_at(place, provision=steps_below(made)[2:])
@@ -282,7 +282,7 @@ def test_facts_of_a_board(place):
 
 
 def test_facts_of_this_computer_need_nothing_of_a_board(place):
-    with Board.start(connection_to(place), LOOK_PARTS) as board:
+    with Board.start(connection_to(place), HELPER_PARTS) as board:
         told = board.call("facts", {"root": f"{place}/not/there/yet", "sudo": True}).value
 
     assert told["disk"]["path"] == str(place)
@@ -292,7 +292,7 @@ def test_facts_of_this_computer_need_nothing_of_a_board(place):
 
 
 def test_several_requests_in_one_frame_fail_alone(place):
-    with Board.start(connection_to(place), LOOK_PARTS) as board:
+    with Board.start(connection_to(place), HELPER_PARTS) as board:
         calls = [
             {"verb": "make_directories", "arguments": {"paths": ["/proc/nothing/here"]}},
             {"verb": "no such verb"},
