@@ -117,10 +117,11 @@ def make_ready(  # noqa: PLR0913 - which machine, and what of; all but the first
         ),
     )
     if not found.environments[environment.key]:
+        as_host = f" --host {target.name}" if is_host else ""
         raise MachineFailure(
             FailureKind.STEP,
             "the Python packages that the run needs are not installed there, or no longer whole",
-            f"run `cosmos up -i INVENTORY {cargo.scenario_path}` first",
+            f"run `cosmos up -i INVENTORY{as_host} {cargo.scenario_path}` first",
         )
     for tree in trees:
         if not found.trees[tree.hash]:
