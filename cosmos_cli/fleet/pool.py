@@ -47,13 +47,13 @@ def for_each(
     """
     waiting = deque(enumerate(targets))
     done: SimpleQueue[tuple[int, Outcome[T] | CosmosError]] = SimpleQueue()
-    for number in range(max(1, min(forks, len(targets)))):
-        work = threading.Thread(
-            target=_work, args=(waiting, task, done), name=f"fleet-{number}", daemon=True
-        )
-        work.start()
     outcomes: dict[int, Outcome[T]] = {}
     try:
+        for number in range(max(1, min(forks, len(targets)))):
+            worker = threading.Thread(
+                target=_work, args=(waiting, task, done), name=f"fleet-{number}", daemon=True
+            )
+            worker.start()
         while len(outcomes) < len(targets):
             try:
                 index, outcome = done.get(timeout=WAIT_S)

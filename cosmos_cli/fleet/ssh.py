@@ -241,7 +241,9 @@ def log_in(
     try:
         connection.open()
     except (SSHException, OSError, EOFError) as error:
-        raise opening_failure(error, settings.where, timeout_s) from error
+        transport = connection.client.get_transport()
+        has_spoken = transport is not None and bool(transport.remote_version)
+        raise opening_failure(error, settings.where, timeout_s, has_spoken=has_spoken) from error
     finally:
         if connection.transport is None:
             connection.client.close()

@@ -19,7 +19,9 @@ NOT_ALLOWED = 1
 """SSH_OPEN_ADMINISTRATIVELY_PROHIBITED."""
 
 
-def opening_failure(error: Exception, where: str, timeout_s: float) -> MachineFailure:
+def opening_failure(
+    error: Exception, where: str, timeout_s: float, *, has_spoken: bool = True
+) -> MachineFailure:
     """
     Say why a connection could not be opened.
 
@@ -27,9 +29,12 @@ def opening_failure(error: Exception, where: str, timeout_s: float) -> MachineFa
         error: What was raised before anybody was logged in.
         where: Address and port.
         timeout_s: How long it was waited for.
+        has_spoken: Whether a word of SSH was heard.
     """
     if isinstance(error, MachineFailure):
         return error
+    if not has_spoken and isinstance(error, EOFError):  # while paramiko greeted
+        return _silent(where)
     if isinstance(error, socket.gaierror):
         return MachineFailure(
             FailureKind.UNREACHABLE,
@@ -44,7 +49,9 @@ def opening_failure(error: Exception, where: str, timeout_s: float) -> MachineFa
         )
     text = str(error)
     if BANNER_ERROR in text:
-        return _silent(text, where, timeout_s)
+        # The text is the same for silence and for an end; what paramiko was handling tells.
+        is_silence = isinstance(error.__context__, TimeoutError)
+        return _frozen(where, timeout_s) if is_silence else _silent(where)
     if isinstance(error, TimeoutError):
         return MachineFailure(
             FailureKind.UNREACHABLE,
@@ -83,16 +90,13 @@ def jump_failure(code: int, said: str, where: str) -> MachineFailure:
     )
 
 
-def _silent(text: str, where: str, timeout_s: float) -> MachineFailure:
-    if text == BANNER_ERROR or "timed out" not in text:
-        # paramiko appends what ended the reading: nothing for an end, "timed out" for silence.
-        return MachineFailure(
-            FailureKind.REFUSED,
-            f"{where}: the connection was closed before a word of SSH was said",
-            "is that an SSH server? it may also be starting, be full (MaxStartups), or punish earlier"
-            " failed logins: try again in a minute",
-        )
-    return _frozen(where, timeout_s)
+def _silent(where: str) -> MachineFailure:
+    return MachineFailure(
+        FailureKind.REFUSED,
+        f"{where}: the connection was closed before a word of SSH was said",
+        "is that an SSH server? it may also be starting, be full (MaxStartups), or punish earlier"
+        " failed logins: try again in a minute",
+    )
 
 
 def _frozen(where: str, timeout_s: float) -> MachineFailure:

@@ -16,10 +16,10 @@ FORCED_AFTER_S = 2
 # command in a session, thus a process group, of its own. A subshell keeps an `exit` in the command from
 # leaving the watcher behind.
 _WATCH = (
-    "exec 3<&0 </dev/null; "
+    "c=$1; shift; exec 3<&0 </dev/null; "
     '{ read -r _ <&3; trap "" TERM; kill -TERM 0; '
     f"sleep {FORCED_AFTER_S}; kill -KILL 0; }} >/dev/null 2>&1 & w=$!; "
-    'exec 3<&-; (eval "$1"); s=$?; kill $w; exit $s'
+    'exec 3<&-; (eval "$c"); s=$?; kill $w; exit $s'
 )
 
 

@@ -19,6 +19,7 @@ START_TIMEOUT_S = 10.0
 KINDS = ("ed25519", "ecdsa", "rsa")
 
 CONFIGURATION = """
+{extra}
 Port {port}
 ListenAddress {address}
 {host_keys}
@@ -26,13 +27,12 @@ PidFile none
 AuthorizedKeysFile {authorized_keys}
 StrictModes no
 UsePAM no
-PasswordAuthentication no
+PasswordAuthentication {password}
 KbdInteractiveAuthentication no
 PrintMotd no
 LogLevel VERBOSE
 MaxStartups 100
 SetEnv HOME={home}
-{extra}
 """
 
 
@@ -46,6 +46,7 @@ class Sshd:
         address: str = "127.0.0.1",
         kinds: Sequence[str] = ("ed25519",),
         extra: str = "",
+        has_passwords: bool = False,
         port: int | None = None,
     ) -> None:
         self.directory = directory
@@ -65,6 +66,7 @@ class Sshd:
                 host_keys="\n".join(f"HostKey {file}" for file in self.host_keys.values()),
                 authorized_keys=self.authorized_keys,
                 extra=extra,
+                password="yes" if has_passwords else "no",
                 home=directory,
             ),
             encoding="utf-8",
@@ -89,13 +91,14 @@ class Sshd:
         assert SSHD is not None
         if os.geteuid() == 0:  # root's sshd insists on its empty directory
             Path("/run/sshd").mkdir(mode=0o755, exist_ok=True)
-        self.process = subprocess.Popen(
-            [SSHD, "-D", "-e", "-f", str(self._configuration)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=self.log.open("wb"),
-            start_new_session=True,
-        )
+        with self.log.open("wb") as log:
+            self.process = subprocess.Popen(
+                [SSHD, "-D", "-e", "-f", str(self._configuration)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=log,
+                start_new_session=True,
+            )
         until_s = time.monotonic() + START_TIMEOUT_S
         while not self._listens():
             if self.process.poll() is not None or time.monotonic() > until_s:

@@ -1,0 +1,568 @@
+"""Connecting to a real sshd: keys, host keys, configuration, and every way in which it can fail."""
+
+import contextlib
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from conftest import target_of, write_configuration
+from sshd import Sshd, free_port, make_key, public, silent_server
+
+from cosmos_cli.fleet.connect import ConnectOptions, connect
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.target import Target
+
+pytestmark = pytest.mark.process
+
+ACCEPT = ConnectOptions(accept_new_host_keys=True)
+DEFAULT = ConnectOptions()
+BRIEF = ConnectOptions(timeout_s=1.0)
+
+
+@contextlib.contextmanager
+def failing(kind):
+    """Expect a failure of a kind."""
+    with pytest.raises(MachineFailure) as caught:
+        yield caught
+    assert kind is caught.value.kind, caught.value
+    assert caught.value.advice
+
+
+def says(target, command="echo hello", options=DEFAULT):
+    connection = connect(target, options)
+    try:
+        return connection.run(command, timeout_s=10.0).stdout
+    finally:
+        connection.close()
+
+
+# Host keys.
+
+
+def test_unknown_host_key_is_refused_and_its_fingerprint_shown(sshd, known_hosts):
+    with failing(FailureKind.HOST_KEY_UNKNOWN) as caught:
+        connect(target_of(sshd))
+
+    fingerprint = subprocess.run(
+        ["ssh-keygen", "-lf", str(sshd.host_keys["ed25519"])], capture_output=True, text=True
+    ).stdout.split()[1]
+    assert fingerprint in caught.value.text
+    assert not known_hosts.exists()
+
+
+def test_unknown_host_key_is_recorded_when_that_is_wanted_and_known_from_then_on(sshd, known_hosts):
+    assert says(target_of(sshd), options=ACCEPT) == b"hello\n"
+    assert sshd.known_hosts_line() == known_hosts.read_text()
+
+    assert says(target_of(sshd)) == b"hello\n"
+    assert sshd.known_hosts_line() == known_hosts.read_text()
+
+
+def test_accept_new_of_the_ssh_configuration_counts_as_wanted(sshd, home, known_hosts):
+    write_configuration(home / ".ssh" / "config", "StrictHostKeyChecking accept-new")
+
+    assert says(target_of(sshd)) == b"hello\n"
+    assert sshd.known_hosts_line() == known_hosts.read_text()
+
+
+@pytest.mark.parametrize("options", [ConnectOptions(), ACCEPT])
+def test_changed_host_key_is_refused_whatever_is_wanted(sshd, known_hosts, tmp_path, options):
+    other = make_key(tmp_path / "other", "ed25519")
+    wrong = f"{sshd.name} {public(other)}"
+    known_hosts.write_text(wrong)
+
+    with failing(FailureKind.HOST_KEY_CHANGED) as caught:
+        connect(target_of(sshd), options)
+
+    assert f"{known_hosts}:1" in caught.value.text
+    assert wrong == known_hosts.read_text()
+
+
+@pytest.mark.parametrize("kind", ["ed25519", "ecdsa", "rsa"])
+def test_server_is_asked_for_a_key_of_the_kind_that_is_known(sshd, known_hosts, kind):
+    known_hosts.write_text(sshd.known_hosts_line(kind))
+
+    assert says(target_of(sshd)) == b"hello\n"
+
+
+def test_key_that_the_server_has_no_more_is_a_change_though_it_has_others(own_sshd, known_hosts):
+    known_hosts.write_text(f"{own_sshd.name} ssh-rsa QUJD\n")
+
+    with failing(FailureKind.HOST_KEY_CHANGED):
+        connect(target_of(own_sshd), ACCEPT)
+
+
+def test_revoked_host_key_is_refused(sshd, known_hosts):
+    line = sshd.known_hosts_line()
+    known_hosts.write_text(f"{line}@revoked * {line.split(' ', 1)[1]}")
+
+    with failing(FailureKind.HOST_KEY_CHANGED) as caught:
+        connect(target_of(sshd), ACCEPT)
+
+    assert "revoked" in caught.value.text
+
+
+def test_hashed_known_hosts_are_understood(known, known_hosts):
+    subprocess.run(["ssh-keygen", "-H", "-f", str(known_hosts)], check=True, capture_output=True)
+
+    assert says(target_of(known)) == b"hello\n"
+
+
+def test_many_threads_record_many_machines_and_lose_none(sshd, home, known_hosts):
+    """One server under many aliases: ten connections at once, each a machine of its own to known_hosts."""
+    hosts = [f"Host pi{n}\n  HostName {sshd.address}\n  HostKeyAlias pi{n}" for n in range(10)]
+    write_configuration(home / ".ssh" / "config", *hosts)
+    targets = [target_of(sshd, address=f"pi{n}") for n in range(10)]
+
+    with ThreadPoolExecutor(10) as pool:
+        said = list(pool.map(lambda target: says(target, options=ACCEPT), targets))
+
+    assert said == [b"hello\n"] * 10
+    names = [line.split()[0] for line in known_hosts.read_text().splitlines()]
+    assert sorted(f"pi{n}" for n in range(10)) == sorted(names)
+
+
+# Logging in.
+
+
+def test_wrong_key_is_told_with_user_and_key(known, tmp_path):
+    wrong = make_key(tmp_path / "wrong", "ed25519")
+
+    with failing(FailureKind.AUTHENTICATION) as caught:
+        connect(target_of(known, key_file=str(wrong)))
+
+    assert f"no login as {known.user} with {wrong}" in caught.value.text
+    assert "ssh-copy-id" in caught.value.advice
+
+
+def test_wrong_user_is_told_the_same_way(known):
+    with failing(FailureKind.AUTHENTICATION) as caught:
+        connect(target_of(known, user="nobody-of-this-name"))
+
+    assert "nobody-of-this-name" in caught.value.text
+    assert "ansible_user" in caught.value.advice
+
+
+def test_missing_key_is_named(known, tmp_path):
+    with failing(FailureKind.AUTHENTICATION) as caught:
+        connect(target_of(known, key_file=str(tmp_path / "none")))
+
+    assert f"{tmp_path}/none: no such key" in caught.value.text
+
+
+def test_file_that_is_no_key_is_named(known, known_hosts):
+    with failing(FailureKind.AUTHENTICATION) as caught:
+        connect(target_of(known, key_file=str(known_hosts)))
+
+    assert "not a private key that is understood" in caught.value.text
+
+
+def test_without_any_key_it_is_said_how_to_get_one(known):
+    with failing(FailureKind.AUTHENTICATION) as caught:
+        connect(target_of(known, key_file=None))
+
+    assert "no key to log in with" in caught.value.text
+    assert "ssh-keygen" in caught.value.advice
+
+
+def test_usual_key_files_are_tried(known, home):
+    shutil.copy(known.user_key, home / ".ssh" / "id_ed25519")
+
+    assert says(target_of(known, key_file=None)) == b"hello\n"
+
+
+def test_no_more_than_three_keys_are_tried(own_sshd, home, known_hosts, tmp_path):
+    known_hosts.write_text(own_sshd.known_hosts_line())
+    keys = [make_key(tmp_path / f"key{n}", "ed25519") for n in range(5)]
+    write_configuration(home / ".ssh" / "config", *(f"IdentityFile {key}" for key in keys))
+
+    with failing(FailureKind.AUTHENTICATION) as caught:
+        connect(target_of(own_sshd, key_file=None))
+
+    assert "no more than 3 keys are tried" in caught.value.text
+    assert own_sshd.log.read_text().count("Failed publickey") == 3
+
+
+def test_password_is_never_tried(tmp_path, known_hosts):
+    with Sshd(tmp_path / "s", extra="PubkeyAuthentication no", has_passwords=True) as server:
+        known_hosts.write_text(server.known_hosts_line())
+
+        with failing(FailureKind.AUTHENTICATION) as caught:
+            connect(target_of(server))
+
+        assert "takes no key" in caught.value.text
+        assert "password" not in server.log.read_text().replace("PasswordAuthentication", "")
+
+
+def test_key_alone_that_is_not_enough_is_told(tmp_path, known_hosts):
+    extra = "AuthenticationMethods publickey,password"
+    with Sshd(tmp_path / "s", extra=extra, has_passwords=True) as server:
+        known_hosts.write_text(server.known_hosts_line())
+
+        with failing(FailureKind.AUTHENTICATION) as caught:
+            connect(target_of(server))
+
+        assert "asked for more than a key (password)" in caught.value.text
+
+
+@pytest.fixture
+def agent(monkeypatch, tmp_path):
+    """A real ssh-agent of the test's own."""
+    socket_file = f"{tmp_path}/agent"
+    process = subprocess.Popen(
+        ["ssh-agent", "-D", "-a", socket_file], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    until_s = time.monotonic() + 10.0
+    while not os.path.exists(socket_file) and time.monotonic() < until_s:
+        time.sleep(0.01)
+    monkeypatch.setenv("SSH_AUTH_SOCK", socket_file)
+    yield lambda key, **more: subprocess.run(
+        ["ssh-add", "-q", str(key)], check=True, stdin=subprocess.DEVNULL, **more
+    )
+    process.terminate()
+    process.wait()
+
+
+def test_key_in_the_ssh_agent_is_used_by_many_threads(known, agent):
+    agent(known.user_key)
+
+    with ThreadPoolExecutor(6) as pool:
+        said = list(pool.map(lambda _: says(target_of(known, key_file=None)), range(6)))
+
+    assert said == [b"hello\n"] * 6
+
+
+def test_key_with_a_passphrase_is_used_through_the_agent(known, agent, tmp_path, monkeypatch):
+    key = tmp_path / "locked"
+    shutil.copy(known.user_key, key)
+    subprocess.run(["ssh-keygen", "-q", "-p", "-N", "secret", "-f", str(key)], check=True)
+
+    with failing(FailureKind.AUTHENTICATION) as caught:
+        connect(target_of(known, key_file=str(key)))
+    assert f"{key} needs its passphrase: ssh-add it" in caught.value.text
+
+    asks = tmp_path / "askpass"
+    asks.write_text("#!/bin/sh\necho secret\n")
+    asks.chmod(0o755)
+    environment = {**os.environ, "SSH_ASKPASS": str(asks), "SSH_ASKPASS_REQUIRE": "force"}
+    agent(key, env=environment)
+    from cosmos_cli.fleet import ssh_keys
+
+    ssh_keys._agent_keys.cache_clear()  # a process asks its agent once; here the agent has learnt since
+
+    assert says(target_of(known, key_file=str(key))) == b"hello\n"
+
+
+# Not reached.
+
+
+def test_port_without_a_server_is_refused(known):
+    with failing(FailureKind.REFUSED) as caught:
+        connect(target_of(known, port=free_port("127.0.0.1")), BRIEF)
+
+    assert "connection refused" in caught.value.text
+
+
+def test_server_that_starts_meanwhile_is_reached_in_a_further_attempt(tmp_path, known_hosts):
+    server = Sshd(tmp_path / "late")
+    known_hosts.write_text(server.known_hosts_line())
+    starter = threading.Timer(0.4, server.__enter__)
+    starter.start()
+    try:
+        assert says(target_of(server)) == b"hello\n"
+    finally:
+        starter.join()
+        server.__exit__()
+
+
+def test_silent_server_is_frozen_and_costs_no_more_than_the_deadline():
+    with silent_server() as port:
+        start_s = time.monotonic()
+
+        with failing(FailureKind.FROZEN):
+            connect(Target(name="pi", address="127.0.0.1", port=port), BRIEF)
+
+        assert time.monotonic() - start_s < 5.0
+
+
+def test_stopped_server_is_frozen(own_sshd, known_hosts):
+    known_hosts.write_text(own_sshd.known_hosts_line())
+    own_sshd.freeze()
+    try:
+        with failing(FailureKind.FROZEN):
+            connect(target_of(own_sshd), BRIEF)
+    finally:
+        own_sshd.thaw()
+
+
+def test_name_that_nobody_knows_is_told(known):
+    with failing(FailureKind.UNREACHABLE) as caught:
+        connect(target_of(known, address="no-such-machine.invalid"), BRIEF)
+
+    assert "the name is not known" in caught.value.text
+
+
+def test_what_is_no_name_is_told(known):
+    with failing(FailureKind.UNREACHABLE):
+        connect(target_of(known, address="a..b"), BRIEF)
+
+
+@contextlib.contextmanager
+def speaking_server(answer: bytes):
+    """A server that says something and closes."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve():
+            with contextlib.suppress(OSError):
+                while True:
+                    connection, _ = listener.accept()
+                    with connection:
+                        connection.sendall(answer)
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield listener.getsockname()[1]
+        listener.shutdown(socket.SHUT_RDWR)
+        thread.join()
+
+
+def test_server_that_closes_at_once_is_told(known):
+    with speaking_server(b"") as port, failing(FailureKind.REFUSED) as caught:
+        connect(target_of(known, port=port), BRIEF)
+
+    assert "before a word of SSH was said" in caught.value.text
+
+
+def test_server_that_closes_in_the_midst_of_it_is_told(known):
+    with speaking_server(b"SSH-2.0-test\r\n") as port, failing(FailureKind.LOST):
+        connect(target_of(known, port=port), BRIEF)
+
+
+# The operator's configuration.
+
+
+def test_alias_of_the_ssh_configuration_is_understood(sshd, home, known_hosts):
+    write_configuration(
+        home / ".ssh" / "config",
+        "Host board",
+        f"  HostName {sshd.address}",
+        f"  Port {sshd.port}",
+        f"  User {sshd.user}",
+        f"  IdentityFile {sshd.user_key}",
+        "  IdentitiesOnly yes",
+    )
+    known_hosts.write_text(sshd.known_hosts_line())
+    target = target_of(sshd, address="board", port=None, user=None, key_file=None)
+
+    assert says(target) == b"hello\n"
+
+
+def test_inventory_wins_over_the_ssh_configuration(known, home):
+    write_configuration(
+        home / ".ssh" / "config", "Host *", "  Port 1", "  User wrong", "  IdentityFile /none"
+    )
+
+    assert says(target_of(known)) == b"hello\n"
+
+
+def test_proxy_jump_leads_through_other_machines(sshd, own_sshd, home, known_hosts):
+    write_configuration(
+        home / ".ssh" / "config",
+        "Host first second",
+        f"  User {sshd.user}",
+        "Host first",
+        f"  HostName {sshd.address}",
+        f"  Port {sshd.port}",
+        f"  IdentityFile {sshd.user_key}",
+        "Host second",
+        f"  HostName {own_sshd.address}",
+        f"  Port {own_sshd.port}",
+        f"  IdentityFile {own_sshd.user_key}",
+        "Host last",
+        f"  HostName {sshd.address}",
+        "  ProxyJump first,second",
+    )
+    known_hosts.write_text(sshd.known_hosts_line() + own_sshd.known_hosts_line())
+    connection = connect(target_of(sshd, address="last"))
+    try:
+        said = connection.run("echo $SSH_CONNECTION", timeout_s=10.0).stdout.split()
+    finally:
+        connection.close()
+
+    assert str(sshd.port).encode() == said[3]
+    assert len(own_sshd.log.read_text().split("Accepted publickey")) == 2
+    assert not own_sshd.log.read_text().count("error")
+
+
+def test_failure_of_a_jump_host_names_it(known, home):
+    write_configuration(
+        home / ".ssh" / "config", "Host pi", f"  ProxyJump 127.0.0.1:{free_port('127.0.0.1')}"
+    )
+
+    with failing(FailureKind.REFUSED) as caught:
+        connect(target_of(known, address="pi"), BRIEF)
+
+    assert caught.value.text.startswith("jump host 127.0.0.1: ")
+
+
+def test_machine_behind_a_jump_host_that_is_not_reached_is_told(known, home):
+    write_configuration(
+        home / ".ssh" / "config",
+        "Host gate",
+        f"  HostName {known.address}",
+        f"  Port {known.port}",
+        f"  User {known.user}",
+        f"  IdentityFile {known.user_key}",
+        "Host 127.0.0.9",
+        "  ProxyJump gate",
+    )
+
+    with failing(FailureKind.UNREACHABLE) as caught:
+        connect(target_of(known, address="127.0.0.9", port=free_port("127.0.0.9")), BRIEF)
+
+    assert "the jump host does not reach it" in caught.value.text
+
+
+def test_jump_host_for_all_hosts_is_not_its_own(known, home):
+    write_configuration(
+        home / ".ssh" / "config",
+        "Host *",
+        f"  ProxyJump {known.user}@127.0.0.1:{known.port}",
+        f"  IdentityFile {known.user_key}",
+    )
+
+    assert says(target_of(known, address="localhost", key_file=None), options=ACCEPT) == b"hello\n"
+
+
+PIPE = (
+    "python3 -c 'import socket, sys, threading, os\n"
+    "s = socket.create_connection((sys.argv[1], int(sys.argv[2])))\n"
+    "def up():\n"
+    "  while d := os.read(0, 65536): s.sendall(d)\n"
+    "threading.Thread(target=up, daemon=True).start()\n"
+    "while d := s.recv(65536): os.write(1, d)' "
+)
+
+
+def test_proxy_command_carries_the_connection_and_ends_with_it(known, home, tmp_path):
+    script = tmp_path / "proxy"
+    script.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/pid\nexec {PIPE} $1 $2\n")
+    script.chmod(0o755)
+    write_configuration(home / ".ssh" / "config", "Host *", f"  ProxyCommand {script} %h %p")
+
+    assert says(target_of(known)) == b"hello\n"
+
+    pid = int((tmp_path / "pid").read_text())
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+
+
+def test_proxy_command_that_ends_at_once_is_told(known, home):
+    write_configuration(home / ".ssh" / "config", "Host *", "  ProxyCommand false")
+
+    with failing(FailureKind.REFUSED):
+        connect(target_of(known), BRIEF)
+
+
+# What a connection knows.
+
+
+def test_nagles_delay_is_off(known):
+    connection = connect(target_of(known))
+    try:
+        sock = connection._wire._pipe
+        assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == 1
+    finally:
+        connection.close()
+
+
+def test_addresses_are_those_of_both_ends(known):
+    connection = connect(target_of(known))
+    try:
+        assert (connection.own_address, connection.peer_address) == ("127.0.0.1", "127.0.0.1")
+        assert connection.opening_s > 0.0
+    finally:
+        connection.close()
+
+
+def test_nothing_is_left_behind_by_a_connection(known):
+    threads = threading.active_count()
+    files = len(os.listdir("/proc/self/fd"))
+
+    for _ in range(3):
+        says(target_of(known))
+    until_s = time.monotonic() + 5.0
+    while threading.active_count() > threads and time.monotonic() < until_s:
+        time.sleep(0.01)
+
+    assert threads == threading.active_count()
+    assert files == len(os.listdir("/proc/self/fd"))
+
+
+def test_living_machine_gives_a_sign(known):
+    connection = connect(target_of(known))
+    try:
+        assert connection.is_alive()
+        assert connection.is_alive()
+    finally:
+        connection.close()
+
+
+def test_frozen_machine_gives_none_within_the_deadline(own_sshd, known_hosts):
+    known_hosts.write_text(own_sshd.known_hosts_line())
+    connection = connect(target_of(own_sshd))
+    own_sshd.freeze()
+    try:
+        start_s = time.monotonic()
+        assert not connection.is_alive(timeout_s=0.5)
+        assert time.monotonic() - start_s < 5.0
+        own_sshd.thaw()
+        assert connection.is_alive(timeout_s=10.0)
+    finally:
+        own_sshd.thaw()
+        connection.close()
+
+
+def test_machine_that_is_gone_gives_no_sign(own_sshd, known_hosts):
+    known_hosts.write_text(own_sshd.known_hosts_line())
+    connection = connect(target_of(own_sshd))
+    try:
+        own_sshd.cut()
+        assert not connection.is_alive(timeout_s=10.0)
+        with failing(FailureKind.LOST):
+            connection.run("true", timeout_s=5.0)
+    finally:
+        connection.close()
+
+
+def test_secret_stands_in_no_process_list(known):
+    """The key's path may be seen; what is in it may not."""
+    key = known.user_key.read_text().splitlines()[1]
+    connection = connect(target_of(known))
+    try:
+        assert (
+            key.encode()
+            not in connection.run(
+                "cat /proc/[0-9]*/cmdline /proc/[0-9]*/environ 2>/dev/null", timeout_s=20.0
+            ).stdout
+        )
+    finally:
+        connection.close()
+
+
+def test_interrupt_in_the_main_thread_is_not_swallowed(known):
+    connection = connect(target_of(known))
+    timer = threading.Timer(0.3, lambda: os.kill(os.getpid(), signal.SIGINT))
+    timer.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            connection.run("sleep 30", timeout_s=20.0)
+    finally:
+        timer.join()
+        connection.close()

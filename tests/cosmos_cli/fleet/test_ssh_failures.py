@@ -1,0 +1,161 @@
+"""Every way in which a connection fails, in words that say what to do."""
+
+import errno
+import socket
+
+import pytest
+from paramiko.ssh_exception import (
+    AuthenticationException,
+    IncompatiblePeer,
+    SSHException,
+)
+
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.known_hosts import Entry, HostKey, Standing, Verdict
+from cosmos_cli.fleet.ssh_failures import (
+    host_key_failure,
+    jump_failure,
+    login_failure,
+    lost,
+    opening_failure,
+)
+
+WHERE = "10.0.0.3 port 22"
+KEY = HostKey(kind="ssh-ed25519", blob=b"key")
+LINE = Entry(patterns="pi", key=HostKey(kind="ssh-rsa", blob=b"old"), file="known_hosts", line=7)
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "words"),
+    [
+        (OSError(errno.EHOSTUNREACH, "No route to host"), FailureKind.UNREACHABLE, "no route"),
+        (OSError(errno.ENETUNREACH, "Network is unreachable"), FailureKind.UNREACHABLE, "no route"),
+        (TimeoutError("timed out"), FailureKind.UNREACHABLE, "no answer in 10 s"),
+        (ConnectionRefusedError(111, "refused"), FailureKind.REFUSED, "connection refused"),
+        (
+            socket.gaierror(-2, "Name or service not known"),
+            FailureKind.UNREACHABLE,
+            "the name is not known",
+        ),
+        (
+            SSHException("Error reading SSH protocol banner"),
+            FailureKind.REFUSED,
+            "closed before a word",
+        ),
+        (
+            SSHException("Error reading SSH protocol banner[Errno 104] Connection reset by peer"),
+            FailureKind.REFUSED,
+            "closed before a word",
+        ),
+        (SSHException("No existing session"), FailureKind.FROZEN, "nothing was said in 10 s"),
+        (SSHException("Negotiation failed."), FailureKind.LOST, "broke while it was opened"),
+        (EOFError(), FailureKind.LOST, "broke while it was opened"),
+        (ConnectionResetError(104, "reset"), FailureKind.LOST, "broke while it was opened"),
+        (
+            IncompatiblePeer("Incompatible ssh peer (no acceptable kex algorithm)"),
+            FailureKind.UNSUPPORTED,
+            "no algorithm",
+        ),
+        (
+            SSHException('Indecipherable protocol version "HTTP/1.1 400 Bad Request"'),
+            FailureKind.LOST,
+            "HTTP/1.1",
+        ),
+    ],
+)
+def test_opening_that_fails_says_why_and_what_to_do(error, kind, words):
+    failure = opening_failure(error, WHERE, 10.0)
+
+    assert kind is failure.kind
+    assert words in failure.text
+    assert WHERE in failure.text
+    assert failure.advice
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "words"),
+    [
+        (
+            AuthenticationException("Authentication failed: transport shut down or saw EOF"),
+            FailureKind.LOST,
+            "closed while pi logged in",
+        ),
+        (EOFError(), FailureKind.LOST, "closed while pi logged in"),
+        (AuthenticationException("Authentication timeout."), FailureKind.FROZEN, "no answer"),
+    ],
+)
+def test_login_that_breaks_is_told_from_one_that_is_refused(error, kind, words):
+    failure = login_failure(error, "pi", WHERE)
+
+    assert kind is failure.kind
+    assert words in failure.text
+    assert failure.advice
+
+
+def test_silence_before_a_word_was_heard_is_a_frozen_machine():
+    error = SSHException("Error reading SSH protocol banner")
+    error.__context__ = TimeoutError()  # the text alone does not tell
+
+    failure = opening_failure(error, WHERE, 10.0)
+
+    assert FailureKind.FROZEN is failure.kind
+    assert "nothing was said in 10 s" in failure.text
+
+
+def test_end_before_a_word_was_heard_is_no_broken_connection():
+    failure = opening_failure(EOFError(), WHERE, 10.0, has_spoken=False)
+
+    assert FailureKind.REFUSED is failure.kind
+
+
+def test_failure_in_words_already_stays_as_it_is():
+    failure = MachineFailure(FailureKind.NO_SUDO, "text")
+
+    assert failure is opening_failure(failure, WHERE, 1.0)
+    assert failure is login_failure(failure, "pi", WHERE)
+
+
+def test_unknown_host_key_is_shown_with_both_ways_to_accept_it():
+    failure = host_key_failure(Verdict(standing=Standing.UNKNOWN), KEY, ("pi",), WHERE)
+
+    assert FailureKind.HOST_KEY_UNKNOWN is failure.kind
+    assert f"ssh-ed25519 {KEY.fingerprint}" in failure.text
+    assert "--accept-new-host-keys" in failure.advice
+    assert "once with ssh" in failure.advice
+
+
+def test_changed_host_key_names_both_keys_the_line_and_the_danger():
+    verdict = Verdict(standing=Standing.CHANGED, against=LINE)
+
+    failure = host_key_failure(verdict, KEY, ("[pi]:2222", "pi"), WHERE)
+
+    assert FailureKind.HOST_KEY_CHANGED is failure.kind
+    assert KEY.fingerprint in failure.text
+    assert LINE.key.fingerprint in failure.text
+    assert "known_hosts:7" in failure.text
+    assert "ssh-keygen -R '[pi]:2222'" in failure.advice
+    assert "--accept-new-host-keys" not in failure.advice
+
+
+def test_revoked_host_key_is_no_matter_of_accepting():
+    verdict = Verdict(standing=Standing.REVOKED, against=LINE)
+
+    failure = host_key_failure(verdict, KEY, ("pi",), WHERE)
+
+    assert FailureKind.HOST_KEY_CHANGED is failure.kind
+    assert "revoked" in failure.text
+    assert "accept" not in failure.advice
+
+
+def test_jump_host_that_may_not_is_told_from_one_that_does_not_reach_it():
+    refused = jump_failure(1, "Administratively prohibited", WHERE)
+    unreached = jump_failure(2, "Connect failed", WHERE)
+
+    assert FailureKind.UNSUPPORTED is refused.kind
+    assert "AllowTcpForwarding" in refused.advice
+    assert FailureKind.UNREACHABLE is unreached.kind
+
+
+def test_lost_connection_is_told_with_its_cause():
+    assert lost(OSError("reset")).text == "the connection is lost (reset)"
+    assert FailureKind.LOST is lost().kind

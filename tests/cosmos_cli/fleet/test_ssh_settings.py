@@ -1,0 +1,143 @@
+"""How to log in at a machine: the inventory first, then the ssh configuration, then ssh's defaults."""
+
+import getpass
+from pathlib import Path
+
+import pytest
+from conftest import write_configuration
+
+from cosmos_cli.errors import InputError
+from cosmos_cli.fleet.ssh_settings import settings_of
+from cosmos_cli.fleet.target import Target
+
+
+@pytest.fixture
+def configure(home):
+    return lambda *lines: write_configuration(home / ".ssh" / "config", *lines)
+
+
+def settings(**values):
+    return settings_of(Target(**({"name": "pi", "address": "10.0.0.7"} | values)))
+
+
+def test_defaults_are_those_of_ssh(home, monkeypatch):
+    monkeypatch.delenv("COSMOS_SSH_CONFIG")
+    (home / ".ssh" / "config").unlink()
+
+    found = settings()
+
+    assert (found.host, found.port, found.user) == ("10.0.0.7", 22, getpass.getuser())
+    assert found.names == ("10.0.0.7",)
+    assert found.key_files[0] == home / ".ssh" / "id_ed25519"
+    assert not found.are_keys_named
+    assert found.known_hosts[0] == home / ".ssh" / "known_hosts"
+    assert Path("/etc/ssh/ssh_known_hosts") in found.known_hosts
+    assert not found.accepts_new_host_keys
+    assert (found.jumps, found.proxy_command, found.agent_socket) == ((), None, None)
+
+
+def test_configuration_beside_the_keys_is_read_when_none_is_named(home, monkeypatch):
+    monkeypatch.delenv("COSMOS_SSH_CONFIG")
+    (home / ".ssh" / "config").write_text("User pi\n")
+
+    assert settings().user == "pi"
+
+
+def test_inventory_wins(configure):
+    configure("Host *", "  User other", "  Port 1", "  IdentityFile /other")
+
+    found = settings(user="pi", port=2222, key_file="/key")
+
+    assert (found.user, found.port, found.key_files) == ("pi", 2222, (Path("/key"),))
+    assert found.identities_only
+
+
+def test_named_configuration_that_is_missing_is_told(monkeypatch, tmp_path):
+    monkeypatch.setenv("COSMOS_SSH_CONFIG", str(tmp_path / "none"))
+
+    with pytest.raises(InputError, match="COSMOS_SSH_CONFIG: .*none: no such file"):
+        settings()
+
+
+def test_alias_becomes_a_name_and_its_port_part_of_the_known_name(configure):
+    configure("Host pi", "  HostName pi.lab", "  Port 2222")
+
+    found = settings(address="pi")
+
+    assert (found.host, found.port) == ("pi.lab", 2222)
+    assert found.names == ("[pi.lab]:2222", "pi.lab")
+
+
+def test_host_key_alias_is_the_known_name(configure):
+    configure("HostKeyAlias board")
+
+    assert settings(port=2222).names == ("board",)
+
+
+@pytest.mark.parametrize(
+    ("word", "accepts"),
+    [("accept-new", True), ("no", True), ("off", True), ("ask", False), ("yes", False)],
+)
+def test_what_strict_host_key_checking_means(configure, word, accepts):
+    configure(f"StrictHostKeyChecking {word}")
+
+    assert settings().accepts_new_host_keys is accepts
+
+
+def test_jumps_are_read_with_user_and_port(configure):
+    configure("ProxyJump gate,pi@inner:2222,ssh://[fd00::1]:23")
+
+    assert [(j.address, j.user, j.port) for j in settings().jumps] == [
+        ("gate", None, None),
+        ("inner", "pi", 2222),
+        ("fd00::1", None, 23),
+    ]
+
+
+def test_jump_that_is_none_and_command_that_is_none_are_no_proxies(configure):
+    configure("ProxyJump none", "ProxyCommand none")
+
+    assert (settings().jumps, settings().proxy_command) == ((), None)
+
+
+def test_jump_that_is_not_understood_is_told(configure):
+    configure("ProxyJump pi@")
+
+    with pytest.raises(InputError, match="ProxyJump of pi: expected"):
+        settings()
+
+
+def test_agent_may_be_another_or_none(configure, monkeypatch):
+    monkeypatch.setenv("SSH_AUTH_SOCK", "/own")
+    monkeypatch.setenv("OTHER", "/other")
+
+    assert settings().agent_socket == "/own"
+    configure("IdentityAgent none")
+    assert settings_again().agent_socket is None
+    configure("IdentityAgent $OTHER")
+    assert settings_again().agent_socket == "/other"
+
+
+def settings_again():
+    """Read the configuration once more, which a process does not: it runs one command."""
+    from cosmos_cli.fleet import ssh_settings
+
+    ssh_settings._read.cache_clear()
+    return settings()
+
+
+def test_several_known_hosts_files_are_read_in_their_order(home):
+    (home / ".ssh" / "config").write_text(
+        'UserKnownHostsFile ~/a "/with space/b"\nGlobalKnownHostsFile none\n'
+    )
+
+    assert settings().known_hosts == (home / "a", Path("/with space/b"))
+
+
+def test_connect_timeout_is_a_number(configure):
+    configure("ConnectTimeout 3")
+    assert settings().connect_timeout_s == 3
+
+    configure("ConnectTimeout soon")
+    with pytest.raises(InputError, match="ConnectTimeout: expected a number, got 'soon'"):
+        settings_again()
