@@ -76,6 +76,7 @@ def doctor(
     start_s = time.monotonic()
     fleet = fleet_of(inventory, limit, forks, accept_new_host_keys) if inventory else None
     examination = _Examination(console, fleet, scenario, set_ or ())
+    console.say(f"measuring {_who(examination.wants.machines)}, some seconds each")
     outcomes = examination.outcomes()
     findings = {o.machine: examination.judge(o.machine, o.value) for o in outcomes if o.value}
     told = [finding for machine in findings.values() for finding in machine]
@@ -232,8 +233,6 @@ def _exit_code(
 def _verdict(
     findings: Sequence[Finding], outcomes: Sequence[Outcome[Told]], duration_s: float
 ) -> str:
-    count = len(outcomes) - 1
-    who = HERE if not count else f"{count} machine{'' if count == 1 else 's'} and {HERE}"
     parts = [
         f"{number} {level.value}{'' if number == 1 else 's'}"
         for level in (Level.ERROR, Level.WARNING, Level.NOTE)
@@ -241,7 +240,12 @@ def _verdict(
     ]
     bad = len(failed(outcomes))
     parts += [f"{bad} failed"] if bad else []
+    who = _who(len(outcomes) - 1)
     return f"{who}: {', '.join(parts) or 'nothing to cure'} in {duration_s:.1f} s"
+
+
+def _who(machines: int) -> str:
+    return f"{machines} machine{'' if machines == 1 else 's'} and {HERE}" if machines else HERE
 
 
 def _count(findings: Sequence[Finding], level: Level) -> int:

@@ -227,7 +227,7 @@ def processors(case: Case) -> Iterator[Remark]:
     is_much = load_hz > TICKS_A_PROCESSOR_HZ_MAX
     yield Remark(
         level=Level.WARNING if is_much else Level.OK,
-        found=f"{agents} agents at {case.wants.tick_hz:g} Hz on {usable} processors"
+        found=f"{agents} agent{'' if agents == 1 else 's'} at {case.wants.tick_hz:g} Hz on {usable} processors"
         + (
             f": a fast one does {TICKS_A_PROCESSOR_HZ_MAX:g} empty steps a second"
             if is_much
