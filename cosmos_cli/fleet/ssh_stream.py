@@ -92,7 +92,10 @@ class SshStream:
         while channel.recv_stderr_ready():
             self._errors.add(channel.recv_stderr(READ_BYTES))
         if channel.recv_ready():
-            data: bytes = channel.recv(count)
+            try:
+                data: bytes = channel.recv(count)
+            except (OSError, EOFError) as error:  # it tells the other side that there is room again
+                raise lost(error) from error
             self._bell.set()  # there may be more, and the end is news as well
             return data
         if channel.eof_received or channel.closed:

@@ -24,6 +24,7 @@ from cosmos_cli.retrieve.claims import Claims
 from cosmos_cli.retrieve.machine import MachineRetrieval
 from cosmos_cli.retrieve.notes import read_note
 from cosmos_cli.retrieve.sources import Source, Sources
+from cosmos_cli.retrieve.watched import WatchedConnection
 from cosmos_cli.rundir import RunDirectory
 
 PARTS = ("madns_runtime.processes", "living", "evidence")
@@ -219,7 +220,7 @@ class Retrieval:
             is_given = given is not None and given.is_alive()
             connection = given if is_given and given else _connect(source.target, self._options)
             try:
-                board = Board.start(connection, PARTS)
+                board = Board.start(WatchedConnection(connection), PARTS)
             except MachineFailure:
                 if not is_given:
                     connection.close()
