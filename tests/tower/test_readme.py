@@ -58,8 +58,11 @@ def test_commands_work(tmp_path):
                 timeout=PATIENCE_S,
                 check=False,
             )
+            if run.returncode == 0:
+                tower.wait(PATIENCE_S)  # the last command was `down`
         finally:
-            tower.terminate()
+            if tower.poll() is None:
+                tower.terminate()
     wait_until_gone(places)
 
     assert run.returncode == 0, run.stderr

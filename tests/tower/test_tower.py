@@ -99,7 +99,7 @@ def test_root_of_a_board_has_no_power_over_the_machine_below(tower, command):
 
 def test_nothing_private_of_this_computer_shows(tower):
     hidden = [Path.home(), Path(__file__), Path.cwd(), Path("/etc/ssh/ssh_host_rsa_key")]
-    listing = read(tower, "pi01", "sudo ls /home /opt /root /mnt /srv /usr/local/bin /var/log")
+    listing = read(tower, "bare", "sudo ls /home /opt /root /mnt /srv /usr/local/bin /var/log")
 
     for path in hidden:
         if path != Path("/root"):
