@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import stat
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from cosmos_cli.fleet.onboard.apt_words import (
 )
 from cosmos_cli.fleet.target import Target
 
+PATIENCE_S = 30.0
 PARTS = ("apt_words", "apt")
 
 SAID = {
@@ -127,6 +129,7 @@ action=$1; shift
 if [ -f "$PACKAGES/../say-$action" ]; then
     cat "$PACKAGES/../say-$action"; rm "$PACKAGES/../say-$action"; exit 100
 fi
+if [ -f "$PACKAGES/../slow" ]; then sleep "$(cat "$PACKAGES/../slow")"; fi
 case $action in
     install) for name; do echo 1.0 > "$PACKAGES/$name"; done ;;
     remove) for name; do rm "$PACKAGES/$name"; done ;;
@@ -154,6 +157,15 @@ class PlayedApt:
 
     def says_once(self, action: str, word: str) -> None:
         (self.folder / f"say-{action}").write_text(SAID[word])
+
+    def takes(self, duration_s: float) -> None:
+        (self.folder / "slow").write_text(str(duration_s))
+
+    def wait_for(self, name: str) -> None:
+        until_s = time.monotonic() + PATIENCE_S
+        while not (self.folder / "packages" / name).exists():
+            assert time.monotonic() < until_s, f"{name} was not installed"
+            time.sleep(0.05)
 
     def asked(self) -> list[str]:
         path = self.folder / "asked"
@@ -273,6 +285,30 @@ def test_lock_is_waited_for_a_bounded_time(apt: PlayedApt, packages: Packages) -
 
     assert failure.value.kind is FailureKind.BUSY
     assert len(apt.asked()) == 3
+
+
+@pytest.mark.process
+def test_apt_goes_on_to_its_end_when_its_time_is_over(apt: PlayedApt, packages: Packages) -> None:
+    apt.takes(3)
+
+    with pytest.raises(MachineFailure, match="apt-get still works there") as failure:
+        packages("install", "foo", timeout_s=0.5)
+
+    assert failure.value.kind is FailureKind.TIMEOUT
+    apt.wait_for("foo")
+
+
+@pytest.mark.process
+def test_apt_goes_on_to_its_end_when_nobody_listens_any_more(apt: PlayedApt) -> None:
+    apt.takes(3)
+    target = Target(name="pi01", address="127.0.0.1", connection="local")
+    board = Board.start(LocalConnection(target), PARTS)
+    parts = board.parts("packages", {"action": "install", "names": ["foo"]})
+
+    assert "doing" in next(parts).value
+    board.close()
+
+    apt.wait_for("foo")
 
 
 @pytest.mark.process
