@@ -28,6 +28,7 @@ OWN_KINDS = (
     FailureKind.BUSY,
 )
 """Failures of a step itself, told with its title; others are the machine's or the connection's."""
+REPEAT = "repeat `cosmos up` when it answers again: it goes on from there"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,8 +136,7 @@ def _has_changed(verb: str, value: Any) -> bool:
 
 def _of_step(step: Step, failure: MachineFailure) -> MachineFailure:
     if failure.kind is FailureKind.LOST:
-        advice = failure.advice or "repeat `cosmos up` when it answers again: it goes on from here"
-        return MachineFailure(failure.kind, f"{failure.text}, at {step.title}", advice)
+        return MachineFailure(failure.kind, f"{failure.text}, at {step.title}", REPEAT)
     if failure.kind not in OWN_KINDS:
         return failure
     return MachineFailure(failure.kind, f"{step.title}: {failure.text}", failure.advice)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import socket
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -19,8 +20,9 @@ from typing import Any, Protocol
 from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.connection import Connection
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.silence import WatchedConnection
 from cosmos_cli.models.inventory import Machine
-from cosmos_cli.provision.apply import Applier, Done, Teller
+from cosmos_cli.provision.apply import REPEAT, Applier, Done, Teller
 from cosmos_cli.provision.environment import PARTS
 from cosmos_cli.provision.facts import Facts, files_of
 from cosmos_cli.provision.notes import notes_of, priority_notes
@@ -33,6 +35,9 @@ HELPER_PARTS = ("files", "facts", *PARTS, "system", "apt_words", "apt")
 """Each is loaded there when it is first needed."""
 LOCK_PATIENCE_S = 60.0
 """Without a question for so long the machine's lock is given up: the operator is gone."""
+LOCK_WAIT_S = 10.0
+"""For another command to end there: one that was cut off gives the lock up within moments."""
+LOCK_RETRY_S = 0.5
 LOOK_TIMEOUT_S = 150.0
 """For all facts, conditions of commands included."""
 LOGIN_TIMEOUT_S = 10.0
@@ -120,8 +125,15 @@ def bring_up(
     try:
         _Work(connection, machine, kit, options, teller, brought).do()
     except MachineFailure as failure:
-        brought.failure = failure
+        brought.failure = _explained(connection, failure)
     return brought
+
+
+def _explained(connection: Connection, failure: MachineFailure) -> MachineFailure:
+    """Tell a machine that is gone from one that is slow."""
+    if failure.kind is not FailureKind.TIMEOUT or connection.is_alive():
+        return failure
+    return MachineFailure(FailureKind.LOST, f"it stopped answering: {failure.text}", REPEAT)
 
 
 @dataclass(slots=True)
@@ -135,7 +147,7 @@ class _Work:
 
     def do(self) -> None:
         self.teller.detail("looking")
-        with Board.start(self.connection, HELPER_PARTS) as board:
+        with Board.start(WatchedConnection(self.connection), HELPER_PARTS) as board:
             wanted = self._wanted(board.greeting)
             udp = self.kit.udp_question(self.connection, self.machine)
             checks = self._look(board, wanted, also=self._checks(wanted, udp, is_full=False))
@@ -212,7 +224,16 @@ class _Work:
             "holder": holder,
             "patience_s": LOCK_PATIENCE_S,
         }
-        board.call("lock", arguments)
+        until_s = time.monotonic() + LOCK_WAIT_S
+        while True:
+            try:
+                board.call("lock", arguments)
+                return
+            except MachineFailure as failure:
+                if failure.kind is not FailureKind.BUSY or time.monotonic() > until_s:
+                    raise
+                self.teller.detail(f"waiting: {failure.text}")
+                time.sleep(LOCK_RETRY_S)
 
     def _look(
         self,

@@ -17,6 +17,7 @@ from cosmos_cli.fleet.connection import Connection, ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.outcome import Outcome
 from cosmos_cli.fleet.pool import FORKS_DEFAULT, for_each
+from cosmos_cli.fleet.silence import WatchedConnection
 from cosmos_cli.fleet.target import Target
 from cosmos_cli.problem import Problem
 from cosmos_cli.retrieve.account import Account, Retrieved
@@ -24,7 +25,6 @@ from cosmos_cli.retrieve.claims import Claims
 from cosmos_cli.retrieve.machine import MachineRetrieval
 from cosmos_cli.retrieve.notes import read_note
 from cosmos_cli.retrieve.sources import Source, Sources
-from cosmos_cli.retrieve.watched import WatchedConnection
 from cosmos_cli.rundir import RunDirectory
 
 PARTS = ("madns_runtime.processes", "living", "evidence")

@@ -17,6 +17,7 @@ from provision_machines import machine_of
 
 from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.provision import bring_up
 from cosmos_cli.provision.bring_up import HELPER_PARTS
 from cosmos_cli.provision.trees import TreeFile, tree_of
 
@@ -144,7 +145,8 @@ def test_condition_that_an_earlier_step_met_is_seen(place):
     assert (brought.failure, kinds(brought)[6:]) == (None, [("file", True), ("command", False)])
 
 
-def test_other_command_that_works_there_is_named(place):
+def test_other_command_that_works_there_is_waited_for_and_named(place, monkeypatch):
+    monkeypatch.setattr(bring_up, "LOCK_WAIT_S", 0.0)
     machine = machine_at(place)
     connection = connection_to(place / "cosmos")
 

@@ -12,13 +12,15 @@ import time
 from cosmos_cli.fleet.connection import Connection, Stream
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 
+FULL_S = 0.005
+"""Between looks whether there is room again for what is sent."""
 SILENCE_S = 4.0
 """After so long without a byte the machine is asked for a sign of life."""
 
 
 class WatchedStream:
     """
-    A stream for a thread that waits with `read_some`; all else is the stream's own.
+    A stream for a thread that waits with `read_some` and `write_all`; all else is the stream's own.
 
     Args:
         stream: To a program.
@@ -30,7 +32,6 @@ class WatchedStream:
         self.fileno = stream.fileno
         self.read = stream.read
         self.write = stream.write
-        self.write_all = stream.write_all
         self.close_writing = stream.close_writing
         self.exit_status = stream.exit_status
         self.errors = stream.errors
@@ -52,10 +53,36 @@ class WatchedStream:
             except MachineFailure as failure:
                 if failure.kind is not FailureKind.TIMEOUT:
                     raise
-            if not self._connection.is_alive():
-                raise MachineFailure(FailureKind.LOST, "the machine stopped answering")
+            self._see_that_it_lives()
             if time.monotonic() >= until_s:
                 raise MachineFailure(FailureKind.TIMEOUT, f"no answer in {timeout_s:g} s")
+
+    def write_all(self, data: bytes, *, timeout_s: float) -> None:
+        """
+        Hand over everything, waiting for room; *timeout_s* is for each piece that is taken.
+
+        Raises:
+            MachineFailure: TIMEOUT, or the machine gives no sign of life.
+        """
+        view = memoryview(data)
+        taken_s = asked_s = time.monotonic()
+        while view:
+            try:
+                view = view[self.write(view) :]  # type: ignore[arg-type]
+                taken_s = asked_s = time.monotonic()
+                continue
+            except BlockingIOError:
+                now_s = time.monotonic()
+            if now_s - taken_s > timeout_s:
+                raise MachineFailure(FailureKind.TIMEOUT, f"took no more input for {timeout_s:g} s")
+            if now_s - asked_s > SILENCE_S:
+                self._see_that_it_lives()
+                asked_s = now_s
+            time.sleep(FULL_S)
+
+    def _see_that_it_lives(self) -> None:
+        if not self._connection.is_alive():
+            raise MachineFailure(FailureKind.LOST, "the machine stopped answering")
 
 
 class WatchedConnection:

@@ -1,13 +1,12 @@
 """A machine that is silent is waited for while it gives signs of life, and given up when it does not."""
 
 import pytest
-from split_run import SplitRun
 
+from cosmos_cli.fleet import silence
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.local import LocalConnection
+from cosmos_cli.fleet.silence import WatchedConnection
 from cosmos_cli.fleet.target import Target
-from cosmos_cli.retrieve import watched
-from cosmos_cli.retrieve.watched import WatchedConnection
 
 pytestmark = pytest.mark.process
 TARGET = Target(name="pi01", address="192.0.2.1")
@@ -24,7 +23,7 @@ class Watchable(LocalConnection):
 
 @pytest.fixture(autouse=True)
 def short_silence(monkeypatch):
-    monkeypatch.setattr(watched, "SILENCE_S", 0.05)
+    monkeypatch.setattr(silence, "SILENCE_S", 0.05)
 
 
 def read(connection, command, timeout_s):
@@ -64,7 +63,20 @@ def test_end_of_a_program_is_its_end():
     assert read(Watchable(alive=[True] * 1000), "true", 60.0) == b""
 
 
-def test_retrieval_works_over_a_watched_connection(tmp_path):
-    split = SplitRun(tmp_path, machines=1)
+def test_machine_that_takes_no_more_input_is_asked_for_a_sign_of_life():
+    stream = WatchedConnection(Watchable(alive=[True, False])).open("sleep 60")
+    try:
+        with pytest.raises(MachineFailure, match="stopped answering"):
+            stream.write_all(bytes(10_000_000), timeout_s=60.0)
+    finally:
+        stream.close()
 
-    assert split.retrieve()["pi01"].is_ok
+
+def test_all_of_a_large_input_is_taken():
+    stream = WatchedConnection(Watchable(alive=[True] * 1000)).open("wc -c")
+    try:
+        stream.write_all(bytes(10_000_000), timeout_s=60.0)
+        stream.close_writing()
+        assert stream.read_some(100, timeout_s=60.0).strip() == b"10000000"
+    finally:
+        stream.close()
