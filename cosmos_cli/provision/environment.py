@@ -18,8 +18,8 @@ from cosmos_cli.provision.lock import Locked, normal_name
 from cosmos_cli.provision.trees import Progress, no_progress
 from cosmos_cli.provision.wheelhouse import Environment
 
-PARTS = ("store", "trees", "wheels", "environment", "installed")
-"""What a `Board` must be started with for trees and environments, in this order."""
+PARTS = ("store", "installed", "keep", "trees", "wheels", "environment")
+"""What a `Board` must be started with for trees and environments."""
 PIECE_BYTES = 4 * 1024 * 1024
 BUILD_TIMEOUT_S = 900.0
 """A slow card writes some megabytes a second, and an emulated board unpacks as slowly."""
@@ -276,13 +276,16 @@ def _send_wheels(
             environment.wheel(wheel).open("rb") as file,
             mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
         ):
-            for offset in range(have, wheel.size_bytes, PIECE_BYTES):
+            offsets = range(have, wheel.size_bytes, PIECE_BYTES)
+            for offset in offsets or [
+                have
+            ]:  # all of it may have come, before the connection was cut
                 piece = content[offset : offset + PIECE_BYTES]
                 board.call(
                     "wheel",
                     {**arguments, "offset": offset},
                     body=piece,
-                    timeout_s=LOOK_TIMEOUT_S,
+                    timeout_s=BUILD_TIMEOUT_S,
                 )
                 sent_bytes += len(piece)
                 progress(f"wheels {sent_bytes / 1e6:.1f} MB", sent_bytes / max(1, whole_bytes))

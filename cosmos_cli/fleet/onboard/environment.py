@@ -1,29 +1,42 @@
 """
-Virtual environments on a machine: built from wheels that were sent, under their final names, marked when whole.
+Virtual environments on a machine: built from unpacked wheels under their final names, marked when whole.
 
 An environment is a folder with a link to the interpreter and `pyvenv.cfg` (PEP 405): neither venv, ensurepip,
-pip nor uv is needed there.
+pip nor uv is needed there. Its packages are hard links to the wheels' files: nothing is written twice.
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
+import errno
 import os
-import subprocess
+import re
+import shutil
 import sys
-import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
-from cosmos_cli.fleet.onboard import store
+from cosmos_cli.fleet.onboard import keep, store
 from cosmos_cli.fleet.onboard.core import Refusal, Request, last_words, verb
+from cosmos_cli.fleet.onboard.installed import is_environment_whole, prunable
+from cosmos_cli.fleet.onboard.wheels import is_wheel_whole, partial_path
 
 TYPE_CHECKING = False  # to import typing takes longer than most that is done here
 if TYPE_CHECKING:
     from typing import Any
 
 MARK_SCHEMA = 1
-PART = ".part"
+INSTALLER = b"cosmos\n"
+PROGRAM_MODE = 0o755
+NAME = re.compile(r"[A-Za-z_][\w.]*")
+NO_LINKS = (errno.EPERM, errno.EXDEV, errno.EMLINK, errno.EOPNOTSUPP, errno.ENOSYS)
+"""Of file systems that know no hard links, such as a USB stick's: files are copied there."""
+SCRIPT = """#!{python}
+import sys
+from {module} import {start}
+
+if __name__ == "__main__":
+    sys.exit({call}())
+"""
 VERSIONS_TIMEOUT_S = 60.0
 VERSIONS = """
 import importlib.metadata, json, sys
@@ -37,50 +50,6 @@ print(json.dumps(found))
 """
 
 
-@verb("versions")
-def versions(request: Request) -> dict[str, str | None]:
-    """Tell which versions of Python packages the distribution's interpreter finds; None for what it does not."""
-    names = [str(name) for name in request.arguments["names"]]
-    done = subprocess.run(
-        [_interpreter(), "-s", "-c", VERSIONS, *names],
-        capture_output=True,
-        timeout=VERSIONS_TIMEOUT_S,
-        cwd="/",
-        check=False,
-    )
-    if done.returncode:
-        raise Refusal("step", f"{_interpreter()}: {last_words(done.stderr)}")
-    found: dict[str, str | None] = json.loads(done.stdout)
-    return found
-
-
-@verb("wheel")
-def wheel(request: Request) -> None:
-    """Keep a piece of a wheel; with the last piece the whole is verified and gets its name."""
-    asked = request.arguments
-    folder = os.path.join(store.expand(asked["folder"]), asked["sha256"])
-    os.makedirs(folder, exist_ok=True)
-    path = os.path.join(folder, os.path.basename(asked["filename"]))
-    partial = path + PART
-    with open(partial, "ab") as file:
-        if file.tell() != asked["offset"]:
-            raise Refusal("data", f"{path}: expected {asked['offset']} bytes, has {file.tell()}")
-        try:
-            file.write(request.body)
-            file.flush()
-        except OSError:
-            os.unlink(partial)  # a full disk needs the room more than the next try needs the piece
-            raise
-        if file.tell() < asked["size"]:
-            return
-        os.fsync(file.fileno())
-    if store.hash_of(partial) != asked["sha256"]:
-        os.unlink(partial)
-        raise Refusal("data", f"{asked['filename']}: what came is not what was announced", "repeat")
-    os.replace(partial, path)
-    store.sync_names(folder)
-
-
 @verb("environment")
 def environment(request: Request) -> dict[str, Any]:
     """
@@ -89,15 +58,18 @@ def environment(request: Request) -> dict[str, Any]:
     Returns whether anything changed, and which wheels must be sent first, each with how much is there of it.
     """
     asked = request.arguments
-    folder = store.expand(asked["folder"])
+    folder, wheels = store.expand(asked["folder"]), store.expand(asked["wheels_folder"])
     path = os.path.join(folder, asked["key"])
-    if is_whole(path):
+    if is_environment_whole(path):
         return {"changed": False, "missing": []}
     if list(sys.version_info[:2]) != asked["python"]:
         found = ".".join(map(str, sys.version_info[:2]))
         raise Refusal("data", f"expected Python {asked['python']}, found {found}", "repeat")
-    wheels = store.expand(asked["wheels_folder"])
-    missing = _missing(wheels, asked["wheels"])
+    missing = [
+        {"sha256": wanted["sha256"], "have": _size_of_part(wheels, wanted)}
+        for wanted in asked["wheels"]
+        if not is_wheel_whole(os.path.join(wheels, wanted["sha256"]))
+    ]
     if missing:
         return {"changed": False, "missing": missing}
     if os.path.isdir(path) and store.used([path]):
@@ -106,105 +78,184 @@ def environment(request: Request) -> dict[str, Any]:
             f"the environment {path} is damaged, and a run uses it",
             "end that run (`cosmos ps`, `cosmos down`), then repeat",
         )
-    store.remove(path)
-    store.remove_left_overs(folder, time.clock_gettime(time.CLOCK_REALTIME))
+    keep.remove(path)
+    keep.remove_left_overs(folder)
+    keep.remove_left_overs(wheels)
     try:
-        _build(path, wheels, asked)
-    except OSError:
+        Builder(path, wheels, asked).build()
+    except (OSError, Refusal):
         with contextlib.suppress(OSError):
-            store.remove(path)  # most of all when the disk is full
+            keep.remove(path)  # most of all when the disk is full
         raise
     return {"changed": True, "missing": []}
 
 
-def is_whole(path: str) -> bool:
+def _size_of_part(wheels: str, wanted: Mapping[str, Any]) -> int:
+    """Return how much of a wheel has come."""
+    path = partial_path(wheels, wanted["sha256"])
+    with contextlib.suppress(FileNotFoundError):
+        size = os.stat(path).st_size
+        if size <= wanted["size"]:
+            return size
+        os.unlink(path)
+    return 0
+
+
+class Builder:
     """
-    Tell whether an environment is whole and nobody touched it since it was built.
+    Builds one environment.
 
-    Its thousands of files are looked at, not read again: a byte that somebody changes leaves a trace in the
-    times of its file. What was added, such as a package's own caches, does no harm.
+    Args:
+        path: Its folder, under its final name.
+        wheels: Folder of the unpacked wheels.
+        asked: What is wanted, as the verb is told.
     """
-    mark = store.read_mark(path)
-    if mark is None or not os.access(os.path.join(path, "bin/python"), os.X_OK):
-        return False
-    try:
-        for name, (size, mtime_ns) in mark["files"].items():
-            found = os.lstat(os.path.join(path, name))
-            if (found.st_size, found.st_mtime_ns) != (size, mtime_ns):
-                return False
-    except (OSError, KeyError, ValueError):
-        return False
-    return True
 
+    def __init__(self, path: str, wheels: str, asked: Mapping[str, Any]) -> None:
+        self._path = path
+        self._wheels = wheels
+        self._asked = asked
+        self._python = os.path.join(path, "bin/python")
+        self._version = ".".join(map(str, asked["python"]))
+        self._site = f"lib/python{self._version}/site-packages"
+        self._made: set[str] = set()
 
-def _missing(folder: str, wheels: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the wheels that are not there, or not what they were, and how much has come of each."""
-    missing = []
-    for wanted in wheels:
-        path = os.path.join(folder, wanted["sha256"], wanted["filename"])
-        try:
-            if store.hash_of(path) == wanted["sha256"]:
+    def build(self) -> None:
+        """
+        Build it, wait until it is on the disk, and mark it.
+
+        Raises:
+            Refusal: A wheel has parts that belong nowhere.
+        """
+        written = self._skeleton()
+        for wanted in self._asked["wheels"]:
+            written += self._install(os.path.join(self._wheels, wanted["sha256"]))
+        keep.sync(self._path)
+        document = {
+            "schema": MARK_SCHEMA,
+            "wheels": [wanted["sha256"] for wanted in self._asked["wheels"]],
+            "files": store.trace(self._path, written),
+        }
+        keep.mark_complete(self._path, document)
+        keep.sync_names(os.path.dirname(self._path))
+
+    def _skeleton(self) -> list[str]:
+        interpreter = interpreter_path()
+        for folder in ("bin", self._site):
+            os.makedirs(os.path.join(self._path, folder))
+        for name in ("python", "python3", f"python{self._version}"):
+            target = interpreter if name == "python" else "python"
+            os.symlink(target, os.path.join(self._path, "bin", name))
+        lines = {
+            "home": os.path.dirname(interpreter),
+            "include-system-site-packages": "true" if self._asked["sees_system"] else "false",
+            "version": ".".join(map(str, sys.version_info[:3])),
+        }
+        text = "".join(f"{key} = {value}\n" for key, value in lines.items())
+        return [self._write("pyvenv.cfg", text.encode())]
+
+    def _install(self, wheel: str) -> list[str]:
+        mark = store.read_mark(wheel) or {}
+        info = mark["info"]
+        written = []
+        for name in mark["files"]:
+            if name == f"{info}/RECORD":
                 continue
-            os.unlink(path)
-        except FileNotFoundError:
-            pass
-        have = 0
-        with contextlib.suppress(FileNotFoundError):
-            have = os.stat(path + PART).st_size
-        if have >= wanted["size"]:
-            os.unlink(path + PART)
-            have = 0
-        missing.append({"sha256": wanted["sha256"], "have": have})
-    return missing
+            source, target = os.path.join(wheel, name), self._target(name, info)
+            if "/scripts/" in name and (script := self._script(source)) is not None:
+                written.append(self._write(target, script, PROGRAM_MODE))
+            else:
+                written.append(self._link(source, target))
+        for name, program in self._starters(os.path.join(wheel, info, "entry_points.txt")):
+            written.append(self._write(f"bin/{name}", program, PROGRAM_MODE))
+        written.append(self._write(f"{self._site}/{info}/INSTALLER", INSTALLER))
+        written.append(self._record(info, written))
+        return written
 
+    def _target(self, name: str, info: str) -> str:
+        """Return where a file of a wheel belongs within the environment."""
+        top, _, rest = name.partition("/")
+        if top != f"{info.removesuffix('.dist-info')}.data":
+            return f"{self._site}/{name}"
+        scheme, _, inner = rest.partition("/")
+        folders = {
+            "purelib": self._site,
+            "platlib": self._site,
+            "scripts": "bin",
+            "headers": f"include/site/python{self._version}/{info.split('-')[0]}",
+            "data": ".",
+        }
+        if scheme not in folders or not inner:
+            raise Refusal("data", f"{info}: {name} belongs into no known folder")
+        return os.path.normpath(f"{folders[scheme]}/{inner}")
 
-def _build(path: str, wheels: str, asked: Mapping[str, Any]) -> None:
-    from cosmos_cli.fleet.onboard.wheels import Place, Wheel
+    def _script(self, source: str) -> bytes | None:
+        """Return a script whose first line asks for the environment's interpreter; None for other files."""
+        with open(source, "rb") as file:
+            content = file.read()
+        if not content.startswith(b"#!python"):
+            return None
+        return f"#!{self._python}\n".encode() + content.partition(b"\n")[2]
 
-    version = ".".join(map(str, asked["python"]))
-    place = Place(top=path, python=os.path.join(path, "bin/python"), python_version=version)
-    for folder in (path, os.path.join(path, "bin")):
-        os.makedirs(folder, exist_ok=True)
-    os.makedirs(place.site)
-    interpreter = _interpreter()
-    for name in ("python", "python3", f"python{version}"):
-        os.symlink(interpreter if name == "python" else "python", os.path.join(path, "bin", name))
-    lines = {
-        "home": os.path.dirname(interpreter),
-        "include-system-site-packages": "true" if asked["sees_system"] else "false",
-        "version": ".".join(map(str, sys.version_info[:3])),
-    }
-    text = "".join(f"{key} = {value}\n" for key, value in lines.items())
-    with open(os.path.join(path, "pyvenv.cfg"), "x", encoding="utf-8") as file:
-        file.write(text)
-    written = ["pyvenv.cfg"]
-    for wanted in asked["wheels"]:
-        wheel_ = Wheel(os.path.join(wheels, wanted["sha256"], wanted["filename"]))
+    def _starters(self, entry_points: str) -> Iterator[tuple[str, bytes]]:
+        """Yield the programs that a wheel's entry points ask for."""
+        if not os.path.exists(entry_points):
+            return
+        import configparser
+
+        entries = configparser.ConfigParser(delimiters=("=",), interpolation=None)
+        entries.optionxform = str  # type: ignore[method-assign,assignment]
+        entries.read(entry_points, encoding="utf-8")
+        for section in ("console_scripts", "gui_scripts"):
+            for name, value in entries.items(section) if entries.has_section(section) else ():
+                module, _, call = value.split("[")[0].replace(" ", "").partition(":")
+                if "/" in name or not NAME.fullmatch(module) or not NAME.fullmatch(call):
+                    raise Refusal("data", f"{entry_points}: no entry point: {name} = {value}")
+                start = call.split(".")[0]
+                text = SCRIPT.format(python=self._python, module=module, start=start, call=call)
+                yield name, text.encode()
+
+    def _record(self, info: str, written: list[str]) -> str:
+        """Leave RECORD, as tools that look at an environment expect it; the wheel's own has the hashes."""
+        path = f"{self._site}/{info}/RECORD"
+        rows = []
+        for name in [*written, path]:
+            inner = os.path.relpath(name, self._site)
+            rows.append(f'"{inner}",,\n' if "," in inner or '"' in inner else f"{inner},,\n")
+        return self._write(path, "".join(rows).encode())
+
+    def _link(self, source: str, target: str) -> str:
+        path = self._room(target)
         try:
-            written += wheel_.install(place)
-        finally:
-            wheel_.close()
-    _finish(path, written, asked)
+            os.link(source, path)
+        except FileExistsError:  # two wheels bring one file: the later one has it, as with pip
+            os.unlink(path)
+            os.link(source, path)
+        except OSError as error:
+            if error.errno not in NO_LINKS:
+                raise
+            shutil.copy2(source, path)
+        return target
+
+    def _write(self, target: str, content: bytes, mode: int = 0o644) -> str:
+        path = self._room(target)
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(path)  # it may be a link to a wheel's file
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+        with open(descriptor, "wb") as file:
+            file.write(content)
+        return target
+
+    def _room(self, target: str) -> str:
+        path = os.path.join(self._path, target)
+        folder = os.path.dirname(path)
+        if folder not in self._made:
+            os.makedirs(folder, exist_ok=True)
+            self._made.add(folder)
+        return path
 
 
-def _finish(path: str, written: list[str], asked: Mapping[str, Any]) -> None:
-    """Wait until all of it is on the disk, then say that it is whole."""
-    store.sync(path)
-    files = {}
-    for name in written:
-        found = os.lstat(os.path.join(path, name))
-        files[name] = [found.st_size, found.st_mtime_ns]
-    document = {
-        "schema": MARK_SCHEMA,
-        "key": asked["key"],
-        "wheels": [wanted["sha256"] for wanted in asked["wheels"]],
-        "files": files,
-    }
-    store.mark_complete(path, document)
-    store.sync_names(os.path.dirname(path))
-
-
-def _interpreter() -> str:
+def interpreter_path() -> str:
     """
     Return the interpreter that an environment links to: this one, or what stands behind it.
 
@@ -212,3 +263,37 @@ def _interpreter() -> str:
     packages that were made for this one.
     """
     return os.path.realpath(getattr(sys, "_base_executable", None) or sys.executable)
+
+
+@verb("versions")
+def versions(request: Request) -> dict[str, str | None]:
+    """Tell which versions of Python packages the distribution's interpreter finds; None for what it does not."""
+    import json
+    import subprocess
+
+    names = [str(name) for name in request.arguments["names"]]
+    done = subprocess.run(
+        [interpreter_path(), "-s", "-P", "-c", VERSIONS, *names],
+        capture_output=True,
+        timeout=VERSIONS_TIMEOUT_S,
+        check=False,
+    )
+    if done.returncode:
+        raise Refusal("step", f"{interpreter_path()}: {last_words(done.stderr)}")
+    found: dict[str, str | None] = json.loads(done.stdout)
+    return found
+
+
+@verb("prune_installed")
+def prune_installed(request: Request) -> dict[str, Any]:
+    """Remove the trees, environments and wheels that nobody needs."""
+    asked = request.arguments
+    folders = {kind: store.expand(path) for kind, path in asked["folders"].items()}
+    wanted = {"trees": asked["trees"], "environments": asked["environments"]}
+    removed = prunable(folders, wanted)
+    for kind, names in removed.items():
+        for name in names:
+            keep.remove(os.path.join(folders[kind], name))
+    for folder in folders.values():
+        keep.remove_left_overs(folder)
+    return removed

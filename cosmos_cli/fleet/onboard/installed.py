@@ -9,13 +9,15 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
-import subprocess
 import time
 from collections.abc import Mapping
-from typing import Any
 
 from cosmos_cli.fleet.onboard import store
 from cosmos_cli.fleet.onboard.core import Refusal, Request, last_words, verb
+
+TYPE_CHECKING = False  # to import typing takes longer than most that is done here
+if TYPE_CHECKING:
+    from typing import Any
 
 CACHE = "__pycache__"
 NEWEST_KEPT = 2
@@ -156,9 +158,7 @@ def _newest(paths: list[str]) -> set[str]:
             when_s = os.stat(os.path.join(path, store.MARK)).st_mtime
             by_label.setdefault(str(mark.get("label", "")), []).append((when_s, path))
     return {
-        path
-        for found in by_label.values()
-        for _, path in sorted(found, reverse=True)[:NEWEST_KEPT]
+        path for found in by_label.values() for _, path in sorted(found, reverse=True)[:NEWEST_KEPT]
     }
 
 
@@ -184,6 +184,8 @@ def _orphans(folders: Mapping[str, str], gone: list[str]) -> list[str]:
 @verb("check_runtime")
 def check_runtime(request: Request) -> dict[str, Any]:
     """See that the runtime starts here as an agent will, and that datagrams come and go."""
+    import subprocess
+
     asked = request.arguments
     program = FULL if asked["is_full"] else LIGHT
     code = program.format(
@@ -221,19 +223,22 @@ def check_runtime(request: Request) -> dict[str, Any]:
 
 def round_trip_ms(udp: Mapping[str, Any]) -> float:
     """Send a nonce to the operator until it comes back."""
-    import socket
+    import _socket  # what `socket` is made of: enough here, and a look is short of milliseconds
 
     nonce = bytes.fromhex(udp["nonce_hex"])
     address, port = str(udp["address"]), int(udp["port"])
     said = ""
     try:
-        family, _, _, _, where = socket.getaddrinfo(address, port, type=socket.SOCK_DGRAM)[0]
-        with socket.socket(family, socket.SOCK_DGRAM) as link:
+        family, _, _, _, where = _socket.getaddrinfo(address, port, 0, _socket.SOCK_DGRAM)[0]
+        link = _socket.socket(family, _socket.SOCK_DGRAM)
+        try:
             for attempt in range(ECHO_TRIES):
                 sent_s = time.monotonic()
                 link.sendto(nonce + bytes([attempt]), where)
                 if _comes_back(link, nonce, sent_s + ECHO_WAIT_S):
                     return round((time.monotonic() - sent_s) * 1000, 3)
+        finally:
+            link.close()
     except OSError as error:
         said = f" ({error.strerror or error})"
     raise Refusal(

@@ -12,7 +12,10 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+
+TYPE_CHECKING = False  # to import typing takes longer than most that is done here
+if TYPE_CHECKING:
+    from typing import Any
 
 MARK = ".complete"
 HIDDEN = "."

@@ -10,13 +10,12 @@ import contextlib
 import errno
 import hashlib
 import os
-import stat
-import time
 import zlib
 from collections.abc import Iterable, Mapping
 
-from cosmos_cli.fleet.onboard import store
+from cosmos_cli.fleet.onboard import keep, store
 from cosmos_cli.fleet.onboard.core import Refusal, Request, verb
+from cosmos_cli.fleet.onboard.installed import files_of_tree, hash_of_tree, is_tree_whole
 
 TYPE_CHECKING = False  # to import typing takes longer than most that is done here
 if TYPE_CHECKING:
@@ -24,8 +23,7 @@ if TYPE_CHECKING:
 
 BLOBS = ".blobs"
 """Files that were sent and belong to no tree yet, by their hash."""
-CACHE = "__pycache__"
-MANIFEST_SCHEMA = 1
+MARK_SCHEMA = 1
 
 
 @verb("blobs")
@@ -38,7 +36,7 @@ def blobs(request: Request) -> None:
         blob, content = content[:size], content[size:]
         if hashlib.sha256(blob).hexdigest() != sha256:
             raise Refusal("data", "a file that was sent is not what was announced", "repeat")
-        store.write_whole(os.path.join(folder, sha256), bytes(blob), is_durable=False)
+        keep.write_whole(os.path.join(folder, sha256), bytes(blob), is_durable=False)
 
 
 @verb("tree")
@@ -50,11 +48,11 @@ def tree(request: Request) -> dict[str, Any]:
     """
     asked = request.arguments
     folder = store.expand(asked["folder"])
-    if is_whole(folder, asked["hash"]):
+    if is_tree_whole(os.path.join(folder, asked["hash"])):
         return {"changed": False, "missing": []}
     os.makedirs(folder, exist_ok=True)
-    store.remove_left_overs(folder, time.clock_gettime(time.CLOCK_REALTIME))
-    new = store.beside(folder, asked["hash"])
+    keep.remove_left_overs(folder)
+    new = keep.beside(folder, asked["hash"])
     try:
         missing = _assemble(new, folder, asked["files"])
         if missing:
@@ -62,62 +60,8 @@ def tree(request: Request) -> dict[str, Any]:
         _settle(new, folder, asked)
     finally:
         with contextlib.suppress(FileNotFoundError):
-            store.remove(new)
+            keep.remove(new)
     return {"changed": True, "missing": []}
-
-
-def is_whole(folder: str, tree_hash: str) -> bool:
-    """Read every file of a tree again, and tell whether it is what its name says."""
-    path = os.path.join(folder, tree_hash)
-    if store.read_mark(path) is None:
-        return False
-    found = list(_files(path))
-    if _hash_of_tree(path, found) == tree_hash:
-        return True
-    # Flight software that writes beside its code must not make its own run's tree look broken.
-    manifest = _manifest(path)
-    known = [file for file in found if file[0] in manifest]
-    return (
-        len(known) < len(found)
-        and _hash_of_tree(path, known) == tree_hash
-        and bool(store.used([path]))
-    )
-
-
-def _hash_of_tree(path: str, files: list[tuple[str, bool]]) -> str:
-    """Return the hash of these files as `cosmos_cli.provision.trees.tree_of` makes it."""
-    digest = hashlib.sha256()
-    try:
-        for name, is_program in files:
-            content = store.hash_of(os.path.join(path, name))
-            digest.update(f"{'x' if is_program else '-'} {content} {name}\n".encode())
-    except OSError:
-        return ""
-    return digest.hexdigest()
-
-
-def _files(top: str) -> list[tuple[str, bool]]:
-    """Return the path of every file of a tree, and whether it is a program, in the order of the paths."""
-    found: list[tuple[str, bool]] = []
-    waiting = [""]
-    while waiting:
-        inner = waiting.pop()
-        for entry in os.scandir(os.path.join(top, inner)):
-            name = f"{inner}{entry.name}"
-            if entry.is_dir(follow_symlinks=False):
-                if entry.name != CACHE:
-                    waiting.append(f"{name}/")
-            elif name != store.MARK:
-                mode = entry.stat(follow_symlinks=False).st_mode
-                found.append((name, bool(mode & stat.S_IXUSR)))
-    return sorted(found)
-
-
-def _manifest(path: str) -> dict[str, str]:
-    """Return the hash of each file of a tree, as its mark tells."""
-    mark = store.read_mark(path) or {}
-    files = mark.get("files")
-    return files if isinstance(files, dict) else {}
 
 
 def _assemble(new: str, folder: str, files: list[list[Any]]) -> list[str]:
@@ -144,7 +88,8 @@ def _sources(folder: str) -> dict[str, list[str]]:
         sources.setdefault(sha256, []).append(os.path.join(sent, sha256))
     for tree_hash in store.names_in(folder):
         path = os.path.join(folder, tree_hash)
-        for name, sha256 in _manifest(path).items():
+        mark = store.read_mark(path) or {}
+        for name, sha256 in mark.get("files", {}).items():
             sources.setdefault(sha256, []).append(os.path.join(path, name))
     return sources
 
@@ -160,7 +105,7 @@ def _content(sha256: str, paths: Iterable[str]) -> bytes | None:
 
 def _put(top: str, name: str, mode: int, content: bytes) -> None:
     parts = name.split("/")
-    if os.path.isabs(name) or not all(parts) or {".", ".."} & set(parts):
+    if not all(parts) or {".", ".."} & set(parts):
         raise Refusal("data", f"{name!r}: expected a path within the tree")
     path = os.path.join(top, name)
     os.makedirs(os.path.dirname(path), exist_ok=True)
@@ -172,26 +117,26 @@ def _put(top: str, name: str, mode: int, content: bytes) -> None:
 
 def _settle(new: str, folder: str, asked: Mapping[str, Any]) -> None:
     """Give an assembled tree its name; what stands there and is broken makes room."""
-    files = {name: sha256 for name, sha256, _ in asked["files"]}
-    if _hash_of_tree(new, _files(new)) != asked["hash"]:
+    if hash_of_tree(new, files_of_tree(new)) != asked["hash"]:
         raise Refusal(
             "data",
             f"{asked['label']}: what was written is not what is read back",
             "check the disk there",
         )
-    store.sync(new)
-    store.mark_complete(new, {"schema": MANIFEST_SCHEMA, "label": asked["label"], "files": files})
+    keep.sync(new)
+    files = {name: sha256 for name, sha256, _ in asked["files"]}
+    keep.mark_complete(new, {"schema": MARK_SCHEMA, "label": asked["label"], "files": files})
     path = os.path.join(folder, asked["hash"])
-    store.remove(path)
+    keep.remove(path)
     try:
         os.rename(new, path)
     except OSError as error:
         if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
             raise
-        if not is_whole(folder, asked["hash"]):  # else another operator was quicker
+        if not is_tree_whole(path):  # else another operator was quicker
             text = f"{asked['label']}: another command works on it"
             raise Refusal("busy", text, "repeat") from None
-    store.sync_names(folder)
+    keep.sync_names(folder)
     for sha256 in set(files.values()):
         with contextlib.suppress(FileNotFoundError):
             os.unlink(os.path.join(folder, BLOBS, sha256))
