@@ -56,10 +56,14 @@ def exec(  # noqa: A001 - the verb's name is the function's
     fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
     line = command[0] if len(command) == 1 else shlex.join(command)
     width = max(len(target.name) for target in fleet.targets)
-    outcomes = fleet.each_target(
-        _task(line, is_root=sudo, timeout_s=timeout_s),
-        lambda outcome: _print(console, outcome, width),
-    )
+    try:
+        outcomes = fleet.each_target(
+            _task(line, is_root=sudo, timeout_s=timeout_s),
+            lambda outcome: _print(console, outcome, width),
+        )
+    except KeyboardInterrupt:
+        console.say("interrupted: what still ran there is ended")
+        raise
     exit_code = _exit_code(outcomes)
     console.say(_verdict(outcomes))
     console.print_json(

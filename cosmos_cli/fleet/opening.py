@@ -22,7 +22,7 @@ from cosmos_cli.fleet.wire import Wire, connect_tcp, connect_through_command
 if TYPE_CHECKING:
     from cosmos_cli.fleet.ssh import SshConnection
 
-PAUSES_S = (0.2, 0.5, 1.0, 2.0)
+PAUSES_S = (0.2, 0.5, 1.0)
 """Before the second and each further attempt."""
 TIMEOUT_S_MIN = 0.1
 

@@ -83,12 +83,23 @@ class Wire:
 
     def recv(self, count: int) -> bytes:
         """Wait for bytes."""
-        data = self._pipe.recv(count)
+        try:
+            data = self._pipe.recv(count)
+        except TimeoutError:
+            raise
+        except OSError:
+            self._end()
+            raise
         if data and self._quick is not None:
             self._quick.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
-        self.is_ended = not data
+        if not data:
+            self._end()
         self._sign.set()
         return data
+
+    def _end(self) -> None:
+        self.is_ended = True
+        self._sign.set()
 
     def expect_sign(self) -> threading.Event:
         """Return an event that is set when the next bytes come, or their end."""

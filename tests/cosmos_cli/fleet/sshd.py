@@ -32,7 +32,7 @@ KbdInteractiveAuthentication no
 PrintMotd no
 LogLevel VERBOSE
 MaxStartups 100
-SetEnv HOME={home}
+SetEnv HOME={home} {environment}
 """
 
 
@@ -47,6 +47,7 @@ class Sshd:
         kinds: Sequence[str] = ("ed25519",),
         extra: str = "",
         has_passwords: bool = False,
+        environment: str = "",
         port: int | None = None,
     ) -> None:
         self.directory = directory
@@ -68,6 +69,7 @@ class Sshd:
                 extra=extra,
                 password="yes" if has_passwords else "no",
                 home=directory,
+                environment=environment,
             ),
             encoding="utf-8",
         )
