@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from cosmos_cli.fleet.connection import ConnectOptions
-from cosmos_cli.fleet.outcome import Outcome
 from cosmos_cli.fleet.target import Target, target_of
 from cosmos_cli.launch.machines import Prepare, RemoteMachine, reach_machines
 from cosmos_cli.launch.places import LOOPBACK, Place, listening_config, says_address
@@ -71,10 +70,6 @@ def reach(
             is_host=target.name == host,
         )
 
-    def done(outcome: Outcome[RemoteMachine]) -> None:
-        if outcome.failure is not None:
-            say(f"{outcome.machine}: {outcome.failure}")
-
     say(f"reaching {len(machines)} machine{'s' * (len(machines) > 1)}")
     return reach_machines(
         [target_of(machine) for machine in machines],
@@ -83,7 +78,6 @@ def reach(
         options=options,
         connect=connect,
         forks=forks,
-        on_done=done,
     )
 
 

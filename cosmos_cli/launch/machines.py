@@ -191,7 +191,6 @@ def reach_machines(  # noqa: PLR0913 - how machines are reached and prepared; al
     options: ConnectOptions,
     connect: Connect,
     forks: int,
-    on_done: Callable[[Outcome[RemoteMachine]], None] = lambda outcome: None,
 ) -> dict[str, RemoteMachine]:
     """
     Connect to all machines and prepare each; whoever calls closes them.
@@ -219,7 +218,6 @@ def reach_machines(  # noqa: PLR0913 - how machines are reached and prepared; al
     def done(outcome: Outcome[RemoteMachine]) -> None:
         if outcome.value is not None:
             reached[outcome.machine] = outcome.value
-        on_done(outcome)
 
     try:
         outcomes = for_each(targets, reach, forks=forks, on_done=done)

@@ -8,7 +8,6 @@ everything once it is under way.
 
 from __future__ import annotations
 
-import math
 import os
 import selectors
 import signal
@@ -17,24 +16,13 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any, Literal
 
+from cosmos_cli.launch import events
 from cosmos_cli.launch.children import Child
+from cosmos_cli.launch.crew import Crew
 from cosmos_cli.launch.deadlines import STALL_S
-from cosmos_cli.launch.events import (
-    AgentChanged,
-    AgentExited,
-    AgentStarted,
-    Event,
-    Finished,
-    Listening,
-    Logged,
-    Noise,
-    Pong,
-    Progress,
-    StateChanged,
-    parse_event,
-)
 from cosmos_cli.launch.host_limits import RUNNING_STATE, HostLimits
 from cosmos_cli.launch.loop import Loop
+from cosmos_cli.launch.machine_care import Company, Decisions, MachineCare
 from cosmos_cli.launch.machines import RemoteMachine
 from cosmos_cli.launch.outcome import FIRST_LIFE, LaunchOutcome, LaunchRequest, Life, View
 from cosmos_cli.launch.reaper import Reaper
@@ -43,7 +31,6 @@ from cosmos_cli.launch.seats import Seats
 from cosmos_cli.launch.signals import OperatorSignals
 from cosmos_cli.launch.starter import HOST, Starter, Told
 from cosmos_cli.launch.talk import Talk
-from cosmos_cli.launch.watch import MachineWatch
 from cosmos_cli.rundir import RunDirectory
 
 STOP_GRACE_S = 2.0
@@ -56,8 +43,6 @@ PUSH_INTERVAL_S = 0.02
 """While a line to another machine is full, it is tried again this often."""
 BACKGROUND_END_S = 10.0
 """For what machines are still being asked when the run is over."""
-LIFE_LINE_S = 30.0
-"""A supervisor that hears no ping for this long ends by itself (`madns_runtime.reactor.lines`)."""
 
 HOST_EXIT_CODES = (0, 1)
 """Of a host that came to its end: the run was complete, or was not."""
@@ -92,9 +77,10 @@ class Operator:
         self._deadlines = self._loop.deadlines
         self._reaper = Reaper(self._deadlines, self._problem_of)
         self._starter = Starter(request, remote, self._loop)
-        directories = {name: request.place_of(name).directory for name in remote}
-        self._watch = MachineWatch(remote, directories, self._loop, self)
+        self._crew = Crew()
         self._roll = Roll(request)
+        self._care = self._make_care(remote)
+        self._watch = self._care.watch
         self._limits = HostLimits(
             self._deadlines,
             request.config,
@@ -105,32 +91,35 @@ class Operator:
             self._loop,
             on_line=self._said,
             on_left=self._seat_left,
-            problem=self._talk.problem,
+            talk=self._talk,
+            within_s=self._timeouts.agents_ready_s,
         )
-        self._children: dict[str, Child] = {}
-        self._machines: dict[str, str] = {}
-        self._exited: set[str] = set()
-        self._listening: Listening | None = None
+        self._listening: events.Listening | None = None
         self._host_result: Mapping[str, Any] | None = None
         self._has_host_finished = False
         self._is_closing = False
         self._is_detached = False
         self._interruption: Literal["no", "clean", "at once"] = "no"
-        self._unreachable: set[str] = set()
+
+    def _make_care(self, remote: Mapping[str, RemoteMachine]) -> MachineCare:
+        company = Company(self._loop, self._crew, self._roll, self._reaper, self._talk)
+        decisions = Decisions(
+            is_open=self._is_open,
+            agents_lost=self._agents_lost,
+            host_lost=partial(self._close_down, grace_s=0.0),
+            start_supervisor=self._start_supervisor,
+        )
+        return MachineCare(self._request, remote, company, decisions)
 
     def run(self) -> LaunchOutcome:
         """Start everything, wait for the end of everything, and say how it went."""
         self._loop.selector.register(self._signals, selectors.EVENT_READ, self._signalled)
-        leftovers: tuple[int, ...] = ()
         try:
             self._start_host()
             while not self._is_over():
                 self._turn()
         finally:
-            if self._is_detached:
-                self._let_go()
-            else:
-                leftovers = self._clear_up()
+            leftovers = self._let_go() if self._is_detached else self._clear_up()
         return LaunchOutcome(
             host_result=self._host_result or self._run.read_left_result(),
             interruption=self._interruption,
@@ -147,9 +136,8 @@ class Operator:
             # An earlier callback of this round may have closed this one's descriptor.
             if self._loop.selector.get_map().get(key.fd) is key:
                 key.data(mask)
-        for name, child in list(self._children.items()):
-            if name not in self._exited and child.has_exited():
-                self._child_exited(child)
+        for child in self._crew.newly_exited():
+            self._child_exited(child)
         now_s = time.monotonic()
         if now_s - turned_s > STALL_S:
             self._deadlines.postpone(now_s - turned_s)
@@ -157,27 +145,30 @@ class Operator:
 
     def _wait_s(self, now_s: float) -> float:
         wait_s = self._deadlines.wait_s(now_s)
-        is_full = [child.push() for child in self._children.values()]
-        limit_s = PUSH_INTERVAL_S if any(is_full) else SELECT_MAX_S
+        limit_s = PUSH_INTERVAL_S if self._crew.push() else SELECT_MAX_S
         return limit_s if wait_s is None else min(wait_s, limit_s)
 
     def _is_over(self) -> bool:
-        if self._is_detached:
-            return True
-        is_ended = all(map(self._reaper.has_ended, self._children.values()))
-        return not self._seats and is_ended and not self._watch.is_trying
+        is_ended = all(map(self._reaper.has_ended, self._crew.everybody()))
+        is_quiet = not self._seats and not self._watch.is_trying
+        return self._is_detached or (is_ended and is_quiet)
 
-    def _let_go(self) -> None:
-        """Leave a detached run to itself."""
-        for child in self._children.values():
+    def _is_open(self) -> bool:
+        """Tell whether agents may still join the run."""
+        return self._limits.is_open and not self._is_closing and self._interruption == "no"
+
+    def _let_go(self) -> tuple[int, ...]:
+        """Leave a detached run to itself; nobody is left over from it."""
+        for child in self._crew.everybody():
             child.release()
         self._loop.background.close(BACKGROUND_END_S)
         self._loop.selector.close()
+        return ()
 
     def _clear_up(self) -> tuple[int, ...]:
         self._seats.close()
         self._watch.stop_seeking()
-        leftovers = self._reaper.kill_whatever_lives(list(self._children.values()))
+        leftovers = self._reaper.kill_whatever_lives(self._crew.everybody())
         if leftovers:
             self._talk.problem(f"processes {', '.join(map(str, leftovers))} outlived SIGKILL")
         self._loop.background.close(BACKGROUND_END_S)
@@ -186,24 +177,25 @@ class Operator:
         return leftovers
 
     def _problem_of(self, child: Child, text: str) -> None:
-        self._talk.problem(text, self._machines.get(child.name))
+        self._talk.problem(text, self._crew.machine_of(child.name))
 
     # Starting -------------------------------------------------------------------------------------
 
     def _start_host(self) -> None:
         machine = self._request.host_machine
+        if machine is not None:
+            self._crew.place(HOST, machine)
         try:
             child = self._starter.start_host(self._told(HOST, machine))
         except OSError as error:
             self._cannot_start(HOST, error)
             return
-        self._children[HOST] = child
+        self._crew.add(child)
         if machine is not None:
-            self._machines[HOST] = machine
             self._watch.add(machine, child, is_host=True)
         self._limits.started(is_here=machine is None)
 
-    def _start_agents(self, listening: Listening) -> None:
+    def _start_agents(self, listening: events.Listening) -> None:
         self._listening = listening
         for machine, names in self._request.machines.items():
             started = tuple(name for name in names if name not in self._request.manual)
@@ -212,7 +204,7 @@ class Operator:
             for name in names:
                 if name in self._request.manual:
                     launch = self._request.agent_launch(machine, (name,), listening)
-                    self._open_seat(name, launch)
+                    self._seats.open(name, launch)
         if self._request.nice:  # after the children, who would inherit it
             os.nice(self._request.nice)
 
@@ -221,7 +213,7 @@ class Operator:
     ) -> None:
         assert self._listening is not None
         name = f"agents@{machine}" + (f" ({life.number})" if life.number > 1 else "")
-        self._machines[name] = machine
+        self._crew.place(name, machine)
         launch = self._request.agent_launch(machine, agents, self._listening, life)
         try:
             told = self._told(name, machine)
@@ -229,90 +221,84 @@ class Operator:
         except OSError as error:
             self._cannot_start(name, error)
             return
-        self._children[name] = child
+        self._crew.add(child)
+        self._limits.not_alone()
         self._watch.add(machine, child, is_host=False)
 
     def _told(self, name: str, machine: str | None) -> Told:
         return Told(
             on_line=partial(self._said, name),
-            on_unreachable=lambda why: self.machine_gone(machine or ""),
+            on_unreachable=lambda why: self._care.machine_gone(machine or ""),
         )
 
     def _cannot_start(self, name: str, error: OSError) -> None:
         reason = f"{name} cannot be started: {error}"
-        self._talk.problem(reason, self._machines.get(name))
+        self._talk.problem(reason, self._crew.machine_of(name))
         self._ask_host_to_stop("failed", reason)
-
-    def _open_seat(self, agent: str, launch: Mapping[str, Any]) -> None:
-        command = self._seats.open(agent, launch)
-        limit_s = self._timeouts.agents_ready_s
-        self._view.say(
-            f"start {agent} by hand within {limit_s:g} s, in another terminal:\n  {command}",
-            "manual",
-        )
 
     # What children say ----------------------------------------------------------------------------
 
     def _said(self, name: str, line: bytes) -> None:
-        event = parse_event(line)
-        if isinstance(event, Logged):
+        event = events.parse_event(line)
+        if isinstance(event, events.Logged):
             self._talk.logged(name, event)
-        elif isinstance(event, Noise):
+        elif isinstance(event, events.Noise):
             self._talk.noise(name, event)
-        elif isinstance(event, Pong):
-            self._watch.pong(self._machines.get(name, ""), name, event.n)
+        elif isinstance(event, events.Pong):
+            self._watch.pong(self._crew.machine_of(name) or "", name, event.n)
         elif name == HOST:
             self._host_said(event)
         else:
             self._supervisor_said(event)
 
-    def _host_said(self, event: Event) -> None:
-        if isinstance(event, Progress):
+    def _host_said(self, event: events.Event) -> None:
+        if isinstance(event, events.Progress):
             self._view.progress(event)
             self._limits.heard()
-        elif isinstance(event, AgentChanged):
+        elif isinstance(event, events.AgentChanged):
             self._view.agent(event)
-        elif isinstance(event, StateChanged):
+        elif isinstance(event, events.StateChanged):
             self._view.state(event.state)
             self._limits.entered(event.state)
             if event.state == RUNNING_STATE and self._interruption == "no":
                 self._is_detached = self._request.is_detached
-        elif isinstance(event, Listening):
+        elif isinstance(event, events.Listening):
             self._limits.expect_next_state()
             if self._listening is None and self._interruption == "no":
                 self._start_agents(event)
-        elif isinstance(event, Finished):
+        elif isinstance(event, events.Finished):
             self._host_finished(event.result)
 
     def _host_finished(self, result: Mapping[str, Any] | None) -> None:
-        self._host_result, self._has_host_finished = result or self._run.read_left_result(), True
+        self._host_result = result or self._run.read_left_result()
+        self._has_host_finished = True
         self._close_down(grace_s=STOP_GRACE_S)
 
-    def _supervisor_said(self, event: Event) -> None:
-        if isinstance(event, AgentStarted):
+    def _supervisor_said(self, event: events.Event) -> None:
+        if isinstance(event, events.AgentStarted):
             self._roll.started(event.agent, event.incarnation)
-        elif isinstance(event, AgentExited):
+        elif isinstance(event, events.AgentExited):
             self._roll.exited(event.agent, is_abnormal=event.is_abnormal)
             if event.is_abnormal:
                 self._tell_host_exited(event.agent, event.how, event.pid)
 
     def _tell_host_exited(self, agent: str, how: str, pid: int | None = None) -> None:
-        if not self._has_host_finished and HOST not in self._exited:
+        if not self._has_host_finished:
             command = {"command": "agent_exited", "agent": agent, "how": how, "pid": pid}
-            self._children[HOST].send(command)
+            self._crew.tell_host(command)
 
     def _seat_left(self, agent: str) -> None:
         if agent not in self._roll.ended:
             self._tell_host_exited(agent, "its hand-started process is gone")
 
     def _ask_host_to_stop(self, status: str, reason: str) -> None:
-        host = self._children.get(HOST)
-        if host is not None and not self._is_closing:
-            host.send({"command": "stop", "reason": reason, "status": status})
+        if self._crew.host is not None and not self._is_closing:
+            self._crew.tell_host({"command": "stop", "reason": reason, "status": status})
             self._limits.told_to_stop()
 
     def _give_up_on_host(self, what: str) -> None:
-        host = self._children[HOST]
+        host = self._crew.host
+        assert host is not None, "a host that was not started has no deadline"
         self._reaper.end(host, what)
         self._talk.last_words(host)
         self._close_down(grace_s=0.0)
@@ -320,11 +306,11 @@ class Operator:
     # The end of children --------------------------------------------------------------------------
 
     def _child_exited(self, child: Child) -> None:
-        machine = self._machines.get(child.name)
+        machine = self._crew.machine_of(child.name)
         if machine is not None and child.loss() is not None:
             self._watch.lose(machine, child.loss() or "")
             return
-        self._exited.add(child.name)
+        self._crew.mark_exited(child)
         child.drain()
         self._reaper.leader_ended(child)
         if machine is not None:
@@ -348,20 +334,19 @@ class Operator:
     def _supervisor_exited(self, child: Child) -> None:
         if self._is_closing:
             return
-        machine = self._machines[child.name]
+        machine = self._crew.machine_of(child.name) or ""
         left = self._roll.left_on(machine)
         if left:
             how = f"{child.name} (pid {child.pid}) {child.describe_exit()}"
             self._problem_of(child, f"{how} before its agents {', '.join(left)} were done")
             self._talk.last_words(child)
             self._agents_lost(left, f"its supervisor {how}")
-        if self.is_wanted(machine):
-            self._watch.revive(machine)
-        if self._machines.keys() - {HOST} <= self._exited and not self._seats:
+        self._care.supervisor_ended(machine)
+        if self._crew.are_supervisors_over() and not self._seats:
             self._limits.alone()
 
     def _agents_lost(self, agents: tuple[str, ...], how: str) -> None:
-        for agent in agents:
+        for agent in () if self._is_closing else agents:
             self._roll.exited(agent, is_abnormal=True)
             self._tell_host_exited(agent, how)
 
@@ -376,65 +361,16 @@ class Operator:
         self._deadlines.set("stop", now_s + grace_s, self._tell_stop)
         limit_s = grace_s + self._timeouts.shutdown_s + END_MARGIN_S
         late = f"has not ended within {limit_s:g} s of the end of the run"
-        for name, child in self._children.items():
-            if (name != HOST or self._has_host_finished) and not self._reaper.has_ended(child):
+        for child in self._crew.everybody():
+            is_due = child.name != HOST or self._has_host_finished
+            if is_due and not self._reaper.has_ended(child):
                 self._reaper.expect_end(child, now_s + limit_s, late)
         self._seats.end(now_s + limit_s)
 
     def _tell_stop(self) -> None:
         command = {"command": "stop", "reason": "the run is over"}
-        for name, child in self._children.items():
-            if name != HOST:
-                child.send(command)
+        self._crew.tell_supervisors(command)
         self._seats.send(command)
-
-    # Machines ---------------------------------------------------------------------------------------
-
-    def machine_lost(self, machine: str, why: str) -> None:
-        """Give up what runs there, and tell the host whose agents they were."""
-        text = f"machine {machine} is lost: {why}"
-        self._talk.problem(text, machine)
-        for name, child in self._children.items():
-            if self._machines.get(name) == machine and not self._reaper.has_ended(child):
-                self._exited.add(name)
-                self._reaper.forget(child)
-                child.close()
-        if self._request.host_machine == machine and not self._has_host_finished:
-            self._close_down(grace_s=0.0)
-        if not self._is_closing:
-            self._agents_lost(self._roll.left_on(machine), text)
-
-    def supervisor_silent(self, machine: str, child: Child) -> None:
-        """End a supervisor that hangs beside a host that does not."""
-        self._reaper.kill(child, "gives no sign of life")
-
-    def machine_slow(self, machine: str, took_s: float) -> None:
-        """Say that a machine was nearly lost."""
-        text = f"{machine} answered only after {took_s:.1f} s; is its link or its processor overloaded?"
-        self._view.say(text, "warning")
-
-    def is_wanted(self, machine: str) -> bool:
-        """Tell whether a lost machine that returns would be given its agents again."""
-        is_open = self._limits.is_open and not self._is_closing and self._interruption == "no"
-        return is_open and bool(self._roll.restartable_on(machine))
-
-    def machine_back(self, machine: str) -> None:
-        """Give a returned machine its agents again, if the run still goes on."""
-        agents = self._roll.restartable_on(machine)
-        if not self.is_wanted(machine):
-            return
-        self._view.say(f"{machine} has returned; its agents {', '.join(agents)} rejoin", "warning")
-        self._limits.not_alone()
-        self._start_supervisor(machine, agents, self._roll.next_life_on(machine))
-
-    def machine_gone(self, machine: str) -> None:
-        """Say of a machine that nothing can be done there, once."""
-        if machine not in self._unreachable:
-            self._unreachable.add(machine)
-            silence_s = max(LIFE_LINE_S, self._timeouts.silence_s)
-            limit_s = math.ceil(silence_s + 2 * self._timeouts.shutdown_s)
-            text = f"{machine} cannot be reached; its agents end by themselves within {limit_s} s"
-            self._view.say(text, "warning")
 
     # The person -----------------------------------------------------------------------------------
 
@@ -448,17 +384,17 @@ class Operator:
     def _interrupt(self, number: signal.Signals) -> None:
         self._interruption = "clean"
         self._watch.stop_seeking()
-        self._view.say("stopping; press Ctrl-C again to end at once", "warning")
+        self._talk.say("stopping; press Ctrl-C again to end at once", "warning")
         by = "the operator" if number is signal.SIGINT else number.name
         self._ask_host_to_stop("interrupted", f"interrupted by {by}")
 
     def _end_at_once(self) -> None:
         self._interruption = "at once"
-        self._view.say("ending at once", "warning")
+        self._talk.say("ending at once", "warning")
         self._is_closing = True
         self._limits.over()
         self._deadlines.cancel("stop")
         self._seats.close()
-        for child in self._children.values():
+        for child in self._crew.everybody():
             if not self._reaper.has_ended(child):
                 self._reaper.kill(child, "was ended at once on the operator's word")

@@ -8,6 +8,7 @@ from typing import Any
 
 from cosmos_cli.launch.loop import Loop
 from cosmos_cli.launch.manual import ManualSeat
+from cosmos_cli.launch.talk import Talk
 
 STILL_CONNECTED = "{}, started by hand, is still connected: its line is being closed"
 
@@ -20,7 +21,8 @@ class Seats:
         loop: The operator's.
         on_line: Called with an agent's name and a line that it says.
         on_left: Called with the name of an agent whose connection has ended before its time.
-        problem: Told who stayed for too long.
+        talk: Where a person is told what to type.
+        within_s: How long the run waits for them.
     """
 
     def __init__(
@@ -29,20 +31,22 @@ class Seats:
         *,
         on_line: Callable[[str, bytes], None],
         on_left: Callable[[str], None],
-        problem: Callable[[str], None],
+        talk: Talk,
+        within_s: float,
     ) -> None:
         self._loop = loop
         self._on_line = on_line
         self._on_left = on_left
-        self._problem = problem
+        self._talk = talk
+        self._within_s = within_s
         self._seats: dict[str, ManualSeat] = {}
         self._is_ending = False
 
     def __len__(self) -> int:
         return len(self._seats)
 
-    def open(self, agent: str, launch: Mapping[str, Any]) -> str:
-        """Open a seat and return the command that takes it."""
+    def open(self, agent: str, launch: Mapping[str, Any]) -> None:
+        """Open a seat and say which command takes it."""
         self._seats[agent] = ManualSeat(
             agent,
             self._loop.selector,
@@ -50,7 +54,9 @@ class Seats:
             on_line=partial(self._on_line, agent),
             on_left=partial(self._left, agent),
         )
-        return self._seats[agent].command()
+        command = self._seats[agent].command()
+        text = f"start {agent} by hand within {self._within_s:g} s, in another terminal:"
+        self._talk.say(f"{text}\n  {command}", "manual")
 
     def send(self, command: Mapping[str, Any]) -> None:
         """Send a command to whoever sits."""
@@ -79,7 +85,7 @@ class Seats:
             self._on_left(agent)
 
     def _abandon(self, agent: str) -> None:
-        self._problem(STILL_CONNECTED.format(agent))
+        self._talk.problem(STILL_CONNECTED.format(agent))
         self._close(agent)
 
     def _close(self, agent: str) -> None:

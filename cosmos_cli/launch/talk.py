@@ -30,6 +30,10 @@ class Talk:
         """What did not go as it should, the first PROBLEMS_MAX."""
         return tuple(self._problems)
 
+    def say(self, text: str, level: str = "info") -> None:
+        """Say a sentence."""
+        self._view.say(text, level)
+
     def problem(self, text: str, machine: str | None = None) -> None:
         """Say what did not go as it should, and keep it."""
         if len(self._problems) < PROBLEMS_MAX:
