@@ -187,17 +187,20 @@ def _ended_before(which: str) -> list[Doomed]:
 
 
 def _end(run: Doomed, fleet: Fleetwide, clean_s: float, say: Callable[[str], None]) -> Ended:
-    """End it where the host is first: who follows the host needs no force."""
-    here = Ending(run=run.run)
-    if run.here is not None:
-        here = end_run(run.here, clean_s=clean_s, forced_s=FORCED_TIMEOUT_S, say=say)
-    there: list[Outcome[Ending]] = []
+    """End it where its operator is first, else its host: who follows them needs no force."""
     if run.there:
-        say(f"{run.run}: asking {len(run.there)} machines to end it")
+        say(f"{run.run}: asking {len(run.there)} machine{'s' * (len(run.there) > 1)} to end it")
     first = [source for name, source in run.there.items() if name == run.host]
     rest = [source for name, source in run.there.items() if name != run.host]
-    for sources in (first, rest):
-        there += fleet.end(sources, clean_s=clean_s, forced_s=FORCED_TIMEOUT_S)
+    here = Ending(run=run.run)
+    there: list[Outcome[Ending]] = []
+    is_led_from_there = bool(first) and (run.here is None or not run.here.of_role("operator"))
+    if is_led_from_there:
+        there += fleet.end(first, clean_s=clean_s, forced_s=FORCED_TIMEOUT_S)
+    if run.here is not None:
+        here = end_run(run.here, clean_s=clean_s, forced_s=FORCED_TIMEOUT_S, say=say)
+    others = rest if is_led_from_there else first + rest
+    there += fleet.end(others, clean_s=clean_s, forced_s=FORCED_TIMEOUT_S)
     return Ended(run=run.run, here=here, there=there)
 
 

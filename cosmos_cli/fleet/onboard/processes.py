@@ -31,6 +31,8 @@ MARK = "COSMOS_RUN_DIRECTORY"
 """Environment variable of everything that a run starts: its directory on that machine."""
 WORKER_SUFFIX = "'s worker"
 CHECK_INTERVAL_S = 0.1
+HOST_LEAD_S = 0.5
+"""A host that is told first tells its agents; told by them, it would take them for lost."""
 NAMES_SHOWN_MAX = 5
 
 
@@ -170,6 +172,9 @@ def end_entries(
         parts = left  # agents whose supervisor is gone
     if parts:
         say(f"{run}: asking {names_of(parts)} to stop")
+        host = [entry for entry in parts if entry.role == "host"]
+        _signal(host, signal.SIGTERM)
+        _wait(host, HOST_LEAD_S)
         _signal(parts, signal.SIGTERM)
         _wait(known, clean_s if not operator else forced_s)
     known = _with_workers(known, directory)
