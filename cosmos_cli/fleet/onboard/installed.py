@@ -141,7 +141,9 @@ def prunable(folders: Mapping[str, str], wanted: Mapping[str, Any]) -> dict[str,
         paths = [os.path.join(folders[kind], name) for name in store.names_in(folders[kind])]
         kept = {os.path.join(folders[kind], name) for name in names}
         rest = [path for path in paths if path not in kept]
-        spared = _newest(paths) if rest else set()
+        spared = _newest(
+            rest
+        )  # beside what is wanted: an `up` must leave the next one nothing to prune
         rest = [path for path in rest if path not in spared]
         in_use = store.used(rest)
         found[kind] = [os.path.basename(path) for path in rest if path not in in_use]
