@@ -1,0 +1,270 @@
+"""`cosmos up` on virtual boards: what it makes, that the second one makes nothing, and everything that can go wrong."""
+
+import pytest
+from up_tower import UpTower
+
+pytestmark = pytest.mark.root
+
+SETTINGS = {
+    "cosmos_receive_buffer_bytes": 8388608,
+    "cosmos_realtime_priority": 50,
+    "cosmos_cpu_governor": "performance",
+    "cosmos_wifi": False,
+    "cosmos_bluetooth": False,
+}
+UNIT = "[Unit]\nDescription=beacon\n[Service]\nExecStart=/bin/sleep 1000000\n[Install]\nWantedBy=multi-user.target\n"
+STEPS = [
+    {"packages": ["cosmos-test-service"]},
+    {"service": {"name": "cosmos-test", "enabled": True, "state": "started"}},
+    {
+        "name": "I2C",
+        "line": {
+            "path": "/boot/firmware/config.txt",
+            "line": "dtparam=i2c_arm=on",
+            "regexp": "^#?dtparam=i2c_arm=",
+        },
+    },
+    {"line": {"path": "/etc/new.conf", "line": "a=1", "create": True}},
+    {"file": {"content": UNIT, "dest": "/etc/systemd/system/beacon.service"}},
+    {"service": {"name": "beacon", "enabled": True, "state": "started"}},
+    {"file": {"content": "for root alone\n", "dest": "/etc/alone", "mode": "0600"}},
+    {"become": False, "file": {"content": "mine\n", "dest": "~/mine.txt", "mode": "0640"}},
+    {"command": {"run": "echo done > /root/once", "creates": "/root/once"}},
+    {
+        "become": False,
+        "command": {"run": "echo more >> ~/log", "unless": "grep -q more ~/log"},
+    },
+]
+BEGUN, GO = "/dev/shm/begun", "/dev/shm/go"
+PAUSE = {
+    "become": False,
+    "command": {
+        "run": f"touch {BEGUN}; while ! test -e {GO}; do sleep 0.05; done; touch ~/paused",
+        "creates": "~/paused",
+    },
+}
+"""Holds `up` in its midst: before the environment is built and code is sent."""
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory):
+    """Return the folder of wheels that the tests of a session share."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def fleet(tower8, tmp_path, cache):
+    return UpTower(tower8, tmp_path, cache)
+
+
+@pytest.fixture
+def own_fleet(make_tower, tmp_path, cache):
+    """Return a function that makes a tower of one's own."""
+    return lambda *arguments, **options: UpTower(make_tower(*arguments, **options), tmp_path, cache)
+
+
+def test_second_up_changes_nothing_file_by_file(fleet):
+    fleet.write(cosmos_packages=["cosmos-test-hello"], cosmos_provision=STEPS, **SETTINGS)
+
+    first = fleet.up()
+    before = {name: fleet.files(name) for name in fleet.tower.boards}
+    second = fleet.up()
+
+    assert (first.code, first.failures) == (0, {})
+    assert set(first.statuses.values()) == {"changed"}
+    assert (second.code, second.document["changed"]) == (0, 0)
+    assert set(second.statuses.values()) == {"ok"}
+    assert {name: fleet.files(name) for name in fleet.tower.boards} == before
+    board = fleet.tower
+    assert "performance" in fleet.values("pi03")
+    assert board.run("pi04", "cosmos-test-hello").returncode == 0
+    assert board.run("pi05", "systemctl is-active beacon cosmos-test").stdout.split() == [
+        "active",
+        "active",
+    ]
+    assert board.run("pi06", "tail -1 /boot/firmware/config.txt").stdout == "dtparam=i2c_arm=on\n"
+    assert board.run("pi07", "cat ~/mine.txt ~/log").stdout == "mine\nmore\n"
+
+
+def test_check_shows_the_plan_and_changes_nothing(fleet):
+    fleet.write(boards=["pi01"], cosmos_provision=STEPS, **SETTINGS)
+    before, values = fleet.files("pi01"), fleet.values("pi01")
+
+    text = fleet.text("--check", "--diff")
+    planned = fleet.up("--check")
+
+    assert fleet.files("pi01") == before
+    assert fleet.values("pi01") == values
+    assert "+dtparam=i2c_arm=on" in text.replace("    ", "")
+    assert text.splitlines()[-1].startswith("1 machine: 1 would change, 0 ok, 0 failed in ")
+    done = fleet.up()
+    assert done.changes("pi01") == planned.changes("pi01")
+
+
+def test_settings_are_made_and_put_back(fleet):
+    fleet.write(boards=["pi01"])
+    fleet.up()
+    before, values = fleet.files("pi01"), fleet.values("pi01")
+
+    fleet.write(boards=["pi01"], **SETTINGS)
+    made = fleet.up()
+    made_values = fleet.values("pi01")
+    fleet.write(boards=["pi01"])
+    put_back = fleet.up()
+
+    assert (made.code, len(made.changes("pi01"))) == (0, 5)
+    assert "8388608" in made_values
+    assert (put_back.code, len(put_back.changes("pi01"))) == (0, 5)
+    assert fleet.values("pi01") == values
+    names = [line.split()[0] for line in fleet.files("pi01")]
+    assert set(names) - {line.split()[0] for line in before} == {
+        "/home/pi/cosmos/state/settings.json"
+    }
+    assert fleet.up().document["changed"] == 0
+
+
+def test_settings_are_made_again_after_a_restart(fleet):
+    fleet.write(boards=["pi01"], **SETTINGS)
+    fleet.up()
+    fleet.tower.fault("pi01", "reboot")
+    fleet.tower.wait_until_on("pi01", boots=fleet.tower.state()["boards"]["pi01"]["boots"] + 1)
+
+    again = fleet.up()
+
+    assert again.code == 0
+    assert "setting cosmos_receive_buffer_bytes: 212992 -> 8388608" in again.changes("pi01")
+    assert fleet.up().document["changed"] == 0
+
+
+def test_each_machine_that_cannot_be_made_ready_says_why_and_the_others_are(fleet):
+    tower = fleet.tower
+    tower.fault("pi02", "down")
+    tower.fault("pi03", "new-host-key")
+    tower.fault("pi04", "wrong-key")
+    tower.fault("pi05", "no-sudo")
+    tower.fault("pi06", "fill", 4096)
+    tower.fault("pi07", "ro")
+    fleet.write(machines={"pi08": {"ansible_user": "nobody-here"}}, cosmos_wifi=False)
+    kinds = {
+        "pi02": "unreachable",
+        "pi03": "host_key_changed",
+        "pi04": "authentication",
+        "pi05": "no_sudo",
+        "pi06": "disk_full",
+        "pi07": "read_only",
+        "pi08": "authentication",
+    }
+
+    result = fleet.up()
+
+    assert result.code == 3
+    assert {name: kind for name, (kind, _) in result.failures.items()} == kinds
+    assert result.statuses["pi01"] == "changed"
+    assert all(machine["failure"]["advice"] for n, machine in result.machines.items() if n in kinds)
+    assert "MB are needed on" in result.failures["pi06"][1]
+    assert "cosmos_wifi: on -> off" in result.failures["pi05"][1]
+
+    for name, cure in (
+        ("pi02", "up"),
+        ("pi03", "own-host-key"),
+        ("pi04", "right-key"),
+        ("pi05", "sudo"),
+        ("pi06", "unfill"),
+        ("pi07", "rw"),
+    ):
+        tower.fault(name, cure)
+    fleet.write(cosmos_wifi=False)
+    repaired = fleet.up()
+    assert (repaired.code, repaired.failures) == (0, {})
+    assert fleet.up().document["changed"] == 0
+
+
+def test_old_python_and_no_python_are_told_with_their_cure(own_fleet):
+    from tower import BoardSpec
+
+    fleet = own_fleet(
+        boards=[BoardSpec(name="old", python="old"), BoardSpec(name="none", python="none")]
+    )
+
+    result = fleet.up()
+
+    assert result.code == 3
+    assert {name: kind for name, (kind, _) in result.failures.items()} == {
+        "old": "python",
+        "none": "python",
+    }
+    assert "3.9" in result.failures["old"][1]
+    assert all(
+        "ansible_python_interpreter" in m["failure"]["advice"] for m in result.machines.values()
+    )
+
+
+def test_whatever_happens_in_the_midst_the_next_up_repairs(fleet):
+    tower = fleet.tower
+    names = list(tower.boards)
+    fleet.write(cosmos_provision=[PAUSE], **SETTINGS)
+    boots = {name: board["boots"] for name, board in tower.state()["boards"].items()}
+
+    process = fleet.start("--json")
+    for name in names:
+        fleet.wait_for_file(name, BEGUN)
+    tower.fault("pi02", "down")
+    tower.fault("pi03", "freeze")
+    tower.fault("pi04", "crash")
+    tower.fault("pi05", "fill", 4096)
+    tower.fault("pi06", "ro")
+    tower.fault("pi07", "cut")
+    for name in ("pi01", "pi05", "pi06", "pi07", "pi08"):
+        tower.run(name, f"touch {GO}")
+    result = fleet.finish(process)
+
+    assert result.code == 3
+    assert {name: kind for name, (kind, _) in result.failures.items()} == {
+        "pi02": "lost",
+        "pi03": "lost",
+        "pi04": "lost",
+        "pi05": "disk_full",
+        "pi06": "read_only",
+        "pi07": "lost",
+    }
+    assert result.statuses["pi01"] == result.statuses["pi08"] == "changed"
+
+    tower.fault("pi02", "up")
+    tower.fault("pi03", "thaw")
+    tower.wait_until_on("pi04", boots=boots["pi04"] + 1)
+    tower.fault("pi05", "unfill")
+    tower.fault("pi06", "rw")
+    for name in ("pi02", "pi03", "pi04"):
+        fleet.wait(lambda name=name: tower.run(name, f"touch {GO}", check=False).returncode == 0)
+    repaired = fleet.up()
+    assert (repaired.code, repaired.failures) == (0, {})
+    assert fleet.up().document["changed"] == 0
+    files = {
+        name: {line.split()[0] for line in fleet.files(name) if "/home/pi/cosmos" in line}
+        for name in names
+    }
+    assert all(found == files["pi01"] for found in files.values())
+
+
+def test_interrupted_command_leaves_what_the_next_one_finishes(fleet):
+    fleet.write(boards=["pi01"], cosmos_provision=[PAUSE])
+    process = fleet.start("--json")
+    fleet.wait_for_file("pi01", BEGUN)
+    process.kill()
+    process.communicate()
+    fleet.tower.run("pi01", f"touch {GO}")
+
+    result = fleet.up()
+
+    assert (result.code, result.failures) == (0, {})
+    assert fleet.up().document["changed"] == 0
+
+
+def test_this_computer_is_left_alone(fleet):
+    fleet.write(boards=["pi01"], machines={"here": {"ansible_connection": "local"}}, **SETTINGS)
+
+    result = fleet.up()
+
+    assert result.code == 0
+    assert result.machines["here"]["local"] is True
+    assert result.machines["here"]["steps"] == []
