@@ -119,7 +119,8 @@ def _check_source(
             found.append(f"{stream} is missing")
     errors = _errors_of(mapping_at(summary, "records"))
     why = f" ({errors[0]})" if errors else ""
-    found.extend(_told(scan) + why for scan in scans if scan.fault)
+    faulty = [_told(scan) for scan in scans if scan.fault]
+    found.extend([faulty[0] + why, *faulty[1:]] if faulty else [])  # one cause, told once
     # A sampler is a process of its own: its trouble, such as having been killed, shows in its own report.
     found.extend(
         f"{HEALTH.name}: {text}" for text in _errors_of(mapping_at(summary, "records", HEALTH.name))

@@ -25,7 +25,7 @@ from cosmos_cli.errors import ExitCode
 from cosmos_cli.fleet.connection import Connection
 from cosmos_cli.fleet.failure import MachineFailure
 from cosmos_cli.fleet.outcome import Outcome
-from cosmos_cli.retrieve.disk import megabytes
+from cosmos_cli.retrieve.disk import size_words
 from cosmos_cli.rundir import runs_root
 from cosmos_cli.wipe import Order, RunThere, Wiped, carry_out, look, make_order, runs_here
 
@@ -105,7 +105,7 @@ def _rows(outcome: Outcome[Order]) -> list[list[str]]:
     rows = [_row(outcome.machine, run, "deleted") for run in order.runs]
     rows += [_row(outcome.machine, run, "kept") for run in order.kept]
     if order.is_root:
-        size = megabytes(order.installed_bytes)
+        size = size_words(order.installed_bytes)
         rows.append([outcome.machine, INSTALLED, "", size, "", "", "deleted"])
     return rows
 
@@ -113,18 +113,23 @@ def _rows(outcome: Outcome[Order]) -> list[list[str]]:
 def _row(machine: str, run: RunThere, fate: str) -> list[str]:
     changed = datetime.fromtimestamp(run.newest_s, UTC).strftime("%Y-%m-%d %H:%M")
     state = f"running: {', '.join(run.living)}" if run.living else run.state
-    return [machine, run.name, str(run.files), megabytes(run.bytes), changed, state, fate]
+    return [machine, run.name, str(run.files), size_words(run.bytes), changed, state, fate]
 
 
 def _question(orders: Sequence[Order]) -> str:
     runs = [run for order in orders for run in order.runs]
     lost = sum(run.state == "not collected" for run in runs)
-    parts = [f"{len(runs)} runs"] if runs else []
+    parts = [_counted(len(runs), "run")] if runs else []
     if any(order.is_root for order in orders):
         parts.append(INSTALLED)
     never = f", {lost} of them NEVER COLLECTED" if lost else ""
-    size = megabytes(sum(order.bytes for order in orders))
-    return f"delete {' and '.join(parts)} ({size}{never}) on {len(orders)} machines?"
+    size = size_words(sum(order.bytes for order in orders))
+    machines = _counted(len(orders), "machine")
+    return f"delete {' and '.join(parts)} ({size}{never}) on {machines}?"
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def _tell(
@@ -139,11 +144,12 @@ def _tell(
     for machine, value in done.items():
         for path in value.left:
             console.say(f"{machine}: kept {path}{_why(path)}")
-    runs = sum(len(value.runs) for value in done.values())
-    size = megabytes(sum(value.bytes for value in done.values()))
+    runs = _counted(sum(len(value.runs) for value in done.values()), "run")
+    size = size_words(sum(value.bytes for value in done.values()))
     kept = sum(len(o.value.kept) for o in found if o.value is not None)
     console.data(
-        f"{len(found)} machines: {runs} runs deleted ({size}), {kept} kept, {len(failures)} failed"
+        f"{_counted(len(found), 'machine')}: {runs} deleted ({size}), {kept} kept,"
+        f" {len(failures)} failed"
     )
     exit_code = ExitCode.MACHINES if failures else ExitCode.OK
     machines = [_mapping(o, done.get(o.machine), failures.get(o.machine)) for o in found]

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from cosmos_cli.retrieve.disk import megabytes
+from cosmos_cli.retrieve.disk import size_words
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,13 +34,15 @@ class Retrieved:
     def words(self) -> str:
         """What people are told."""
         if self.fetched_files:
-            wire = f"{megabytes(self.fetched_bytes)} ({megabytes(self.packed_bytes)} over the wire)"
+            wire = (
+                f"{size_words(self.fetched_bytes)} ({size_words(self.packed_bytes)} over the wire)"
+            )
             resumed = (
-                f", resumed after {megabytes(self.resumed_bytes)}" if self.resumed_bytes else ""
+                f", resumed after {size_words(self.resumed_bytes)}" if self.resumed_bytes else ""
             )
             told = f"{self.fetched_files} of {self.files} files, {wire}{resumed}"
         else:
-            told = f"{self.files} files, {megabytes(self.bytes)}, here already"
+            told = f"{self.files} files, {size_words(self.bytes)}, here already"
         return told + (f"; {self.remark}" if self.remark else "")
 
 
@@ -71,7 +73,7 @@ class Account:
         """How far it is, for the text of a failure; empty before anything is known."""
         if not self.files:
             return ""
-        here, total = megabytes(self.here_bytes), megabytes(self.total_bytes)
+        here, total = size_words(self.here_bytes), size_words(self.total_bytes)
         return f" ({self.here_files} of {self.files} files and {here} of {total} are here)"
 
     def retrieved(self, *, is_released: bool, remark: str = "") -> Retrieved:

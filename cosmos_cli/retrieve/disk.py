@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import math
 import os
 import shutil
 from collections.abc import Iterable, Iterator
@@ -13,6 +14,8 @@ from pathlib import Path
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 
 READ_BYTES = 1_048_576
+KILO = 1000.0
+UNITS = ("kB", "MB", "GB", "TB")
 SPARE_BYTES = 16 * 1024 * 1024
 """Room that is left on the disk for the run's summary and tables."""
 
@@ -44,7 +47,7 @@ def check_room(folder: Path, needed_bytes: int) -> None:
     """
     free_bytes = shutil.disk_usage(folder).free
     if needed_bytes and needed_bytes + SPARE_BYTES > free_bytes:
-        needed, free = megabytes(needed_bytes + SPARE_BYTES), megabytes(free_bytes)
+        needed, free = size_words(needed_bytes + SPARE_BYTES), size_words(free_bytes)
         raise no_room(folder, f"{needed} needed, {free} free")
 
 
@@ -55,9 +58,12 @@ def no_room(folder: Path, what: str | None) -> MachineFailure:
     )
 
 
-def megabytes(size_bytes: float) -> str:
-    """Return a size for people."""
-    return f"{size_bytes / 1e6:.1f} MB"
+def size_words(size_bytes: float) -> str:
+    """Return a size for people, such as 17 B, 1.2 kB or 340.5 MB."""
+    if size_bytes < KILO:
+        return f"{size_bytes:.0f} B"
+    power = min(int(math.log(size_bytes, KILO)), len(UNITS))
+    return f"{size_bytes / KILO**power:.1f} {UNITS[power - 1]}"
 
 
 def hash_of(path: Path, size_bytes: int) -> str | None:

@@ -1,8 +1,9 @@
-"""Pieces are packed when that is quicker, and not when the board's processor is what is slow."""
+"""Pieces are packed when that is quicker, and not when the board's processor is what is slow; sizes in words."""
 
 import pytest
 
 from cosmos_cli.fleet.onboard.evidence import Pace
+from cosmos_cli.retrieve.disk import size_words
 
 
 def ways(pace, count, *, packed_s, plain_s):
@@ -30,3 +31,11 @@ def test_a_link_that_changes_is_tried_anew():
     found = ways(pace, Pace.SETTLED_PIECES, packed_s=1.0, plain_s=9.0)
 
     assert found[-1] is True
+
+
+@pytest.mark.parametrize(
+    ("size_bytes", "words"),
+    [(0, "0 B"), (999, "999 B"), (1000, "1.0 kB"), (2_345_678, "2.3 MB"), (7e15, "7000.0 TB")],
+)
+def test_sizes_are_told_in_a_fitting_unit(size_bytes, words):
+    assert size_words(size_bytes) == words

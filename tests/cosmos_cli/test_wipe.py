@@ -76,7 +76,7 @@ def test_what_was_never_collected_is_kept(split, wipe):
     code, out, err = wipe("--yes")
 
     assert code == 0, err
-    assert out.splitlines()[-1] == "3 machines: 0 runs deleted (0.0 MB), 2 kept, 0 failed"
+    assert out.splitlines()[-1] == "3 machines: 0 runs deleted (0 B), 2 kept, 0 failed"
     assert "not collected" in out
     assert {name: split.there(name) for name in split.names} == before
 
@@ -105,7 +105,7 @@ def test_what_is_no_longer_what_was_collected_is_kept(split, wipe, tmp_path, har
     code, out, _ = wipe("--yes")
 
     assert code == 0
-    assert "1 runs deleted" in out
+    assert "1 run deleted" in out
     assert split.directory("pi01").exists()
     assert not split.directory("pi02").exists()
 
@@ -268,7 +268,7 @@ def test_nothing_there_is_nothing_to_ask(split, wipe, tmp_path):
     code, out, _ = wipe()
 
     assert code == 0
-    assert out == "3 machines: 0 runs deleted (0.0 MB), 0 kept, 0 failed\n"
+    assert out == "3 machines: 0 runs deleted (0 B), 0 kept, 0 failed\n"
     assert not (tmp_path / "boards").exists()
 
 

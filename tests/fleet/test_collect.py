@@ -192,7 +192,7 @@ def test_wipe_deletes_what_was_collected_and_keeps_the_rest(tower8, tmp_path):
     done = run.cosmos(*wipe)
 
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1].startswith("2 machines: 1 runs deleted")
+    assert done.stdout.splitlines()[-1].startswith("2 machines: 1 run deleted")
     assert not run.lies_on("pi01")
     assert run.is_there("pi02", run.directory.replace("0001", "0099"))
     assert run.cosmos(*wipe, "--all", "--uncollected").returncode == 0

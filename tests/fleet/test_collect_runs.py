@@ -1,0 +1,162 @@
+"""Real runs on virtual boards whose records are in trouble: a disk that fills, power that goes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from tower import Tower
+from tower.fixtures import need_tower
+
+pytestmark = pytest.mark.root
+
+COSMOS = (sys.executable, "-m", "cosmos_cli.app")
+PATIENCE_S = 120.0
+SCENARIO = """
+name: fleet
+simulation: counter
+agents: {count: 4, tick_hz: 50}
+time: {mode: realtime, duration_s: DURATION}
+"""
+
+
+class Operator:
+    """A person at the tower of two boards, which are ready for runs."""
+
+    def __init__(self, tower, folder):
+        self.tower = tower
+        self.folder = folder
+        self.inventory = folder / "tower.yaml"
+        tower.write_inventory(self.inventory)
+        self.environment = {
+            **os.environ,
+            **tower.operator_environment(),
+            "COSMOS_STATE_DIR": str(folder / "state"),
+            "COSMOS_RUNS": str(folder / "runs"),
+            "COSMOS_CACHE": str(folder / "cache"),
+        }
+
+    def cosmos(self, *arguments):
+        return subprocess.run(
+            [*COSMOS, *map(str, arguments)],
+            env=self.environment,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
+        )
+
+    def start(self, name, duration_s):
+        """Start a run, and wait until its agents record."""
+        scenario = self.folder / f"{name}.yaml"
+        scenario.write_text(SCENARIO.replace("DURATION", str(duration_s)))
+        arguments = ("run", scenario, "-i", self.inventory)
+        process = subprocess.Popen(
+            [*COSMOS, *map(str, arguments)],
+            env=self.environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        heard = []
+        for line in process.stderr:
+            heard.append(line)
+            if line == "running\n":
+                return process
+        raise AssertionError(f"it did not start: {''.join(heard)}")
+
+    def last_run(self):
+        return max((self.folder / "runs").glob("[0-9]*/run.json")).parent
+
+    def document(self):
+        return json.loads((self.last_run() / "run.json").read_bytes())
+
+    def named(self):
+        return {line.split(":")[0] for line in self.document()["data"]["missing"]}
+
+    def living(self):
+        runs = json.loads(self.cosmos("ps", "--json").stdout)["runs"]
+        return [process for run in runs for process in run["processes"]]
+
+
+@pytest.fixture(scope="module")
+def operator(tmp_path_factory):
+    need_tower()
+    with Tower(count=2) as tower:
+        operator = Operator(tower, tmp_path_factory.mktemp("operator"))
+        made = operator.cosmos("up", "-i", operator.inventory)
+        assert made.returncode == 0, made.stdout + made.stderr
+        yield operator
+
+
+def test_board_whose_disk_fills_during_a_run_is_named_and_its_records_are_cut_where_they_end(
+    operator,
+):
+    process = operator.start("full", 8)
+    time.sleep(3.0)  # so that there is something to cut
+    operator.tower.fault("pi01", "fill")
+
+    _, talk = process.communicate(timeout=PATIENCE_S)
+    operator.tower.fault("pi01", "unfill")
+
+    assert process.returncode == 5, talk
+    assert operator.named() == {"agent-01", "agent-02"}
+    missing = " ".join(operator.document()["data"]["missing"])
+    assert "cut after" in missing
+    assert "No space left on device" in missing
+    assert operator.tower.run("pi01", "ls cosmos/runs").stdout == ""
+    assert operator.cosmos("collect").returncode == 5
+
+
+def test_run_that_lost_the_power_of_everything_is_collected_afterwards(operator):
+    process = operator.start("power", 60)
+    time.sleep(3.0)
+    boots = operator.tower.state()["boards"]["pi01"]["boots"]
+    own = [entry["pid"] for entry in operator.living() if entry["role"] in ("operator", "host")]
+    assert process.pid in own
+    for name in ("pi01", "pi02"):
+        operator.tower.run(name, "sync")  # else the kernel keeps the records for half a minute
+        operator.tower.fault(name, "crash")
+    for pid in own:
+        os.kill(pid, signal.SIGKILL)
+    process.communicate(timeout=PATIENCE_S)
+    for name in ("pi01", "pi02"):
+        operator.tower.wait_until_on(name, boots=boots + 1)
+    assert operator.document()["status"] == "running"
+
+    done = operator.cosmos("collect")
+
+    assert done.returncode == 5, done.stderr
+    document = operator.document()
+    assert document["status"] == "failed"
+    assert operator.named() >= {"host", "agent-01", "agent-02", "agent-03", "agent-04"}
+    assert document["records"]["written"] > 0
+    assert document["records"]["truncated"] > 0
+    assert (operator.last_run() / "tables/ticks.parquet").exists()
+    assert operator.last_run().with_name(f"{operator.last_run().name}.tar.zst").exists()
+    for name in ("pi01", "pi02"):
+        assert operator.tower.run(name, "ls cosmos/runs").stdout == ""
+    again = operator.cosmos("collect")
+    assert (again.returncode, operator.document()) == (5, document)
+
+
+def test_run_that_is_left_to_itself_is_collected_when_it_is_over(operator):
+    scenario = operator.folder / "alone.yaml"
+    scenario.write_text(SCENARIO.replace("DURATION", "6"))
+    assert operator.cosmos("run", scenario, "-i", operator.inventory, "--detach").returncode == 0
+
+    early = operator.cosmos("collect")
+    until_s = time.monotonic() + PATIENCE_S
+    while operator.cosmos("collect", "--json", "--quiet").returncode == 2:
+        assert time.monotonic() < until_s
+        time.sleep(0.5)
+    done = operator.cosmos("collect")
+
+    assert early.returncode == 2
+    assert "is still running" in early.stderr
+    assert done.returncode == 0, done.stderr
+    assert operator.document()["status"] == "complete"
