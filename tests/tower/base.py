@@ -35,15 +35,15 @@ VAR_NEW = {
     **dict.fromkeys(("var/lib/apt/lists/partial", "var/lib/sudo", "var/log/apt"), 0o755),
     "var/tmp": 0o1777,
 }
-ETC_NEW = (
-    "apt",
-    "apt/apt.conf.d",
-    "apt/sources.list.d",
-    "profile.d",
-    "ssh",
-    "sudoers.d",
-    "sysctl.d",
+APT_NEW = (
+    "apt.conf.d",
+    "auth.conf.d",
+    "keyrings",
+    "preferences.d",
+    "sources.list.d",
+    "trusted.gpg.d",
 )
+ETC_NEW = ("apt", *(f"apt/{name}" for name in APT_NEW), "profile.d", "ssh", "sudoers.d", "sysctl.d")
 GROUPS = ("adm", "dialout", "sudo", "audio", "video", "plugdev", "gpio", "i2c", "spi")
 SHADOW_AGE = "19700:0:99999:7:::"
 NO_PASSWORD_NEEDED = "etc/sudoers.d/010_pi-nopasswd"

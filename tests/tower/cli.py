@@ -38,7 +38,7 @@ def _make_parser() -> argparse.ArgumentParser:
         "--tower",
         type=int,
         default=int(chosen) if chosen else None,
-        help="index, where several run (default: COSMOS_TOWER, or the only one)",
+        help="index, where several run (default: COSMOS_TOWER, or the only one; `up`: a free one)",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     up = commands.add_parser("up", help="make a tower; Ctrl-C takes it down")
@@ -99,6 +99,7 @@ def _up(arguments: argparse.Namespace) -> None:
         boot_delay_s=arguments.boot_delay,
         disk_mib=arguments.disk,
         network=arguments.network,
+        index=arguments.tower,
     )
     Supervisor(Options(spec=spec)).run(lambda state: _tell_up(state, arguments.json))
 
@@ -121,7 +122,11 @@ def _status(arguments: argparse.Namespace) -> None:
         if not is_owned(places):
             say(f"tower {places.index}: killed; `down` removes what is left")
             continue
-        state = ask(places, {"verb": "status"})
+        try:
+            state = ask(places, {"verb": "status"})
+        except TowerError:
+            say(f"tower {places.index}: starting or ending")
+            continue
         for name, board in state["boards"].items():
             link = "" if board["is_link_up"] else " unplugged"
             boots = f"boot {board['boots']}"

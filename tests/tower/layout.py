@@ -21,12 +21,13 @@ from .specification import NATIVE, BoardSpec, TowerSpec
 TEMPLATE = "template"
 
 
-def claim(network: str | None) -> tuple[Places, Network, int]:
+def claim(network: str | None, index: int | None) -> tuple[Places, Network, int]:
     """
     Take a free index and network.
 
     Args:
         network: The wanted one; None takes that of the index.
+        index: The wanted one; None takes the first that is free, with a network that is free.
 
     Returns:
         The tower's places, its network, and the descriptor that owns the index.
@@ -35,8 +36,8 @@ def claim(network: str | None) -> tuple[Places, Network, int]:
         NetworkError: The wanted network is in use, or none is free.
     """
     wanted = check_network(network) if network else None
-    for index in range(TOWERS_MAX):
-        places = Places(index)
+    for number in range(TOWERS_MAX) if index is None else (index,):
+        places = Places(number)
         owner = lock(places)
         if owner is None:
             continue
@@ -46,12 +47,16 @@ def claim(network: str | None) -> tuple[Places, Network, int]:
             owner = lock(places)
             if owner is None:
                 continue
-        free = wanted or find_network(index)
+        free = wanted or find_network(number)
         if free is not None:
             places.loops.write_text(json.dumps(sorted(list_loop_devices())))
             return places, free, owner
         places.remove()
         os.close(owner)
+    if index is not None:
+        raise NetworkError(
+            f"tower {index} runs already, or its network is in use; leave out --tower"
+        )
     raise NetworkError(f"no free network among {TOWERS_MAX}; `python -m tests.tower status`")
 
 

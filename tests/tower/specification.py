@@ -52,13 +52,15 @@ class TowerSpec:
         boards: In the order of their addresses.
         boot_delay_s: Time between a board's going away in a reboot and the start of its next boot.
         disk_mib: Size of each board's disk; only what is written takes memory.
-        network: `10.77`: the first two numbers of its /16; None takes the first free one from there on.
+        network: `10.77`: the first two numbers of its /16; None takes the one of the index.
+        index: Which of the computer's towers this is; None takes the first that is free.
     """
 
     boards: Sequence[BoardSpec]
     boot_delay_s: float = 1.0
     disk_mib: int = 1024
     network: str | None = None
+    index: int | None = None
 
     def __post_init__(self) -> None:
         names = [board.name for board in self.boards]

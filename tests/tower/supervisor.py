@@ -78,7 +78,8 @@ class Supervisor:
             NetworkError: No network is free.
         """
         self._watch_signals()
-        self._places, network, lock = layout.claim(self._options.spec.network)
+        spec = self._options.spec
+        self._places, network, lock = layout.claim(spec.network, spec.index)
         with contextlib.ExitStack() as stack:
             stack.callback(os.close, lock)
             stack.callback(os.close, cleaning.start_guardian(self._places, lock))
@@ -89,7 +90,7 @@ class Supervisor:
             kernel.make_mounts_private()
             stack.callback(cleaning.unmount, self._places)
             groups = cleaning.mount_groups(self._places)
-            self._boards = layout.make_boards(self._options.spec, self._places, network, groups)
+            self._boards = layout.make_boards(spec, self._places, network, groups)
             stack.callback(self._end_boards)
             self._listen()
             self._start_all()

@@ -235,6 +235,13 @@ def test_network_in_use_is_refused(make_tower):
         make_tower(count=1, network="8.8")
 
 
+def test_index_in_use_is_refused(make_tower):
+    taken = make_tower(count=1).places.index
+    command = [*CLI, "--tower", str(taken), "up", "1"]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert (run.returncode, "runs already" in run.stderr) == (1, True)
+
+
 def test_networks_of_this_computer_are_known():
     assert any(network.is_loopback for network in list_networks())
 
