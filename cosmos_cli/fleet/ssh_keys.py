@@ -41,9 +41,9 @@ OPENSSH_MAGIC = b"openssh-key-v1\0"
 _LOADING = threading.Lock()
 
 
-class FewKeys:
+class KeyLogin:
     """
-    Logs in with the first key that the machine takes; what paramiko calls a strategy.
+    Logs in with the first key that the machine takes.
 
     Args:
         settings: Of the machine.

@@ -81,7 +81,7 @@ class SshTransport(Transport):
         self._send_user_message(message)  # type: ignore[attr-defined]
 
 
-def make_transport(wire: Wire, known_kinds: Sequence[str]) -> SshTransport:
+def make_transport(wire: Wire, known_kinds: Sequence[str], *, timeout_s: float) -> SshTransport:
     """
     Return a transport that asks for a host key of a kind that is known of this machine.
 
@@ -92,6 +92,7 @@ def make_transport(wire: Wire, known_kinds: Sequence[str]) -> SshTransport:
         default_window_size=WINDOW_BYTES,
         default_max_packet_size=PACKET_BYTES,
     )
+    transport.banner_timeout = transport.handshake_timeout = transport.auth_timeout = timeout_s
     options = transport.get_security_options()
     options.key_types = ordered(tuple(options.key_types), known_kinds)
     return transport
