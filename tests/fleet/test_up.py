@@ -1,6 +1,7 @@
 """`cosmos up` on virtual boards: what it makes, that the second one makes nothing, and everything that can go wrong."""
 
 import pytest
+from tower import BoardSpec
 from up_tower import UpTower
 
 pytestmark = pytest.mark.root
@@ -35,15 +36,25 @@ STEPS = [
         "command": {"run": "echo more >> ~/log", "unless": "grep -q more ~/log"},
     },
 ]
-BEGUN, GO = "/dev/shm/begun", "/dev/shm/go"
+BEGUN, GO, GONE_ON = "/dev/shm/begun", "/dev/shm/go", "/dev/shm/gone-on"
 PAUSE = {
     "become": False,
     "command": {
-        "run": f"touch {BEGUN}; while ! test -e {GO}; do sleep 0.05; done; touch ~/paused",
-        "creates": "~/paused",
+        "run": f"touch {BEGUN}; while ! test -e {GO}; do sleep 0.05; done; touch {GONE_ON}",
+        "creates": GONE_ON,
     },
 }
 """Holds `up` in its midst: before the environment is built and code is sent."""
+
+
+OLD_PYTHON = """#!/usr/bin/python3 -S
+import sys
+sys.version_info = (3, 9, 2, "final", 0)
+code = sys.argv.index("-c") + 1
+program, sys.argv = sys.argv[code], ["-c", *sys.argv[code + 1:]]
+exec(program, {"__name__": "__main__"})
+"""
+"""Says of itself that it is old; a really old one is not to be had here."""
 
 
 @pytest.fixture(scope="session")
@@ -180,20 +191,19 @@ def test_each_machine_that_cannot_be_made_ready_says_why_and_the_others_are(flee
 
 
 def test_old_python_and_no_python_are_told_with_their_cure(own_fleet):
-    from tower import BoardSpec
-
-    fleet = own_fleet(
-        boards=[BoardSpec(name="old", python="old"), BoardSpec(name="none", python="none")]
-    )
+    fleet = own_fleet(count=1, boards=[BoardSpec(name="none", python="none")])
+    fleet.tower.run("pi01", f"cat > ~/python3.9 <<'EOF'\n{OLD_PYTHON}EOF\nchmod +x ~/python3.9")
+    fleet.write(machines={"pi01": {"ansible_python_interpreter": "/home/pi/python3.9"}})
 
     result = fleet.up()
 
     assert result.code == 3
     assert {name: kind for name, (kind, _) in result.failures.items()} == {
-        "old": "python",
+        "pi01": "python",
         "none": "python",
     }
-    assert "3.9" in result.failures["old"][1]
+    assert "is Python 3.9.2, expected 3.11 or later" in result.failures["pi01"][1]
+    assert result.failures["none"][1] == "no Python 3 found"
     assert all(
         "ansible_python_interpreter" in m["failure"]["advice"] for m in result.machines.values()
     )
@@ -233,8 +243,9 @@ def test_whatever_happens_in_the_midst_the_next_up_repairs(fleet):
     tower.fault("pi03", "thaw")
     tower.wait_until_on("pi04", boots=boots["pi04"] + 1)
     tower.fault("pi05", "unfill")
-    tower.fault("pi06", "rw")
-    for name in ("pi02", "pi03", "pi04"):
+    tower.fault("pi06", "crash")  # a card that failed works again after a new start
+    tower.wait_until_on("pi06", boots=boots["pi06"] + 1)
+    for name in ("pi02", "pi03", "pi04", "pi06"):
         fleet.wait(lambda name=name: tower.run(name, f"touch {GO}", check=False).returncode == 0)
     repaired = fleet.up()
     assert (repaired.code, repaired.failures) == (0, {})
@@ -244,6 +255,59 @@ def test_whatever_happens_in_the_midst_the_next_up_repairs(fleet):
         for name in names
     }
     assert all(found == files["pi01"] for found in files.values())
+
+
+def test_power_and_connections_cut_while_code_and_packages_come_leave_nothing_half(fleet):
+    """The moments differ from run to run; what must come of it does not."""
+    tower = fleet.tower
+    names = list(tower.boards)
+    fleet.write(cosmos_provision=[PAUSE], cosmos_packages=["cosmos-test-hello"])
+    boots = {name: board["boots"] for name, board in tower.state()["boards"].items()}
+    process = fleet.start("--json")
+    for name in names:
+        fleet.wait_for_file(name, BEGUN)
+
+    for name in names:
+        tower.run(name, f"touch {GO}")
+    for index, name in enumerate(names):
+        tower.fault(name, "cut" if index % 2 else "crash")
+    fleet.finish(process)
+
+    for name in names[::2]:
+        tower.wait_until_on(name, boots=boots[name] + 1)
+    for name in names:
+        tower.run(name, f"touch {GO}")
+    repaired = fleet.up()
+    assert (repaired.code, repaired.failures) == (0, {})
+    assert fleet.up().document["changed"] == 0
+    for name in names:
+        assert tower.run(name, "cosmos-test-hello").returncode == 0
+        assert "cosmos-new" not in "".join(fleet.files(name))
+
+
+def test_edited_scenarios_are_sent_and_old_ones_pruned_once(fleet, tmp_path):
+    fleet.write(boards=["pi01"])
+    folder = tmp_path / "scenario"
+    folder.mkdir()
+    scenario = folder / "a.yaml"
+
+    def up(seed):
+        scenario.write_text(f"name: a\nsimulation: counter\nagents: {{count: 1}}\nseed: {seed}\n")
+        return fleet.up(str(scenario)).changes("pi01")
+
+    first = up(0)
+    changes = [up(seed) for seed in range(1, 5)]
+    again = up(4)
+
+    assert "tree scenario a" in first[-1]
+    assert all(any("tree scenario a" in title for title in each) for each in changes)
+    assert [any("prune" in title for title in each) for each in changes] == [
+        False,
+        False,
+        True,
+        True,
+    ]
+    assert again == []
 
 
 def test_interrupted_command_leaves_what_the_next_one_finishes(fleet):

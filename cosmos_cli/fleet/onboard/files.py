@@ -279,7 +279,7 @@ def set_values(request: Request) -> None:
     for path, value in request.arguments["values"]:
         try:
             with open(path, "w") as file:
-                file.write(value)
+                file.write(f"{value}\n")  # as `echo` would
         except OSError as error:
             text = f"{path}: {error.strerror}, when {value!r} was written"
             raise Refusal("step", text) from None

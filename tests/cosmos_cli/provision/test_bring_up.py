@@ -333,8 +333,8 @@ def test_settings_are_made_on_a_system_and_put_back(place):
         "setting cosmos_bluetooth: keep off after a restart, too",
     ]
     assert again.changed_count == 0
-    assert (place / "system/proc/sys/net/core/rmem_max").read_text() == "8388608"
-    assert (place / "system/sys/class/rfkill/rfkill0/soft").read_text() == "1"
+    assert (place / "system/proc/sys/net/core/rmem_max").read_text() == "8388608\n"
+    assert (place / "system/sys/class/rfkill/rfkill0/soft").read_text() == "1\n"
     limits = (place / "system/etc/security/limits.d/90-cosmos.conf").read_text()
     assert limits.splitlines()[1] == f"{made.facts.user} - rtprio 50"
 
