@@ -56,7 +56,7 @@ def open_ssh(
     while True:
         try:
             connection = _open_once(target, settings, options, until_s=until_s, trail=trail)
-            connection.opening_s = time.monotonic() - start_s
+            connection.opening_s += time.monotonic() - start_s
             return connection
         except MachineFailure as failure:
             pause_s = next(pauses_s, timeout_s)
@@ -77,10 +77,13 @@ def _open_once(
     with contextlib.ExitStack() as opened:
         hops = _hops(settings, options, trail, opened)
         wire = _wire(settings, hops, max(TIMEOUT_S_MIN, until_s - time.monotonic()))
+        importing_s = time.monotonic()
         import_paramiko()  # now that the servers of the first machines have begun to start
         from cosmos_cli.fleet.ssh import SshConnection, log_in
 
+        importing_s -= time.monotonic()  # negative: not the machine's time
         connection = SshConnection(target, log_in(settings, options, wire, until_s), wire, hops)
+        connection.opening_s = importing_s
         opened.pop_all()
         return connection
 

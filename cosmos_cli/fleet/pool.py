@@ -16,8 +16,9 @@ from cosmos_cli.fleet.target import Target
 
 T = TypeVar("T")
 
-FORKS_DEFAULT = 10
-"""More threads than this gain little: the operator's processors are the limit (measured with 24 machines)."""
+FORKS_DEFAULT = 32
+"""A real board keeps the operator waiting while it logs in: with 0.3 s each, 24 take 0.9 s at once and 1.6 s
+with 10 forks. Where the operator's processors are the limit, as with virtual boards, more cost nothing."""
 WAIT_S = 0.5
 """Between looks at what is done, so that Ctrl-C is heard on every platform."""
 

@@ -1,0 +1,46 @@
+"""What is sent to a machine must run there, where nothing is installed: the standard library and its neighbours."""
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+ONBOARD = ROOT / "cosmos_cli" / "fleet" / "onboard"
+PACKAGE = "cosmos_cli.fleet.onboard"
+SENT_TOO = ("madns_runtime.processes",)
+"""Modules from elsewhere that are sent by their full name, and bound by the same."""
+FILES = sorted(ONBOARD.rglob("*.py"))
+
+
+def imported(file):
+    """Every module that a file imports anywhere, also in functions."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file}: a relative import is not understood there"
+            yield node.module
+
+
+def is_allowed(name):
+    if name in SENT_TOO or name == PACKAGE or name.startswith(f"{PACKAGE}."):
+        return True
+    return name.split(".")[0] in sys.stdlib_module_names
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_part_imports_the_standard_library_and_its_neighbours_only(file):
+    assert [name for name in imported(file) if not is_allowed(name)] == []
+
+
+@pytest.mark.parametrize("name", SENT_TOO)
+def test_module_that_is_sent_from_elsewhere_imports_the_standard_library_only(name):
+    file = ROOT.joinpath(*name.split(".")).with_suffix(".py")
+
+    assert [n for n in imported(file) if n.split(".")[0] not in sys.stdlib_module_names] == []
+
+
+def test_there_are_parts():
+    assert ONBOARD / "core.py" in FILES
