@@ -116,6 +116,19 @@ class Incoming:
                 faults += self._install_some(whole[start : start + FILES_AT_ONCE_MAX])
         return faults
 
+    def settle(self, files: Sequence[OfferedFile]) -> None:
+        """
+        Bring files to the disk for good that lay here before: who put them there may have been cut off.
+
+        Raises:
+            MachineFailure: The disk here fails.
+        """
+        with local_disk(self._top):
+            paths = [self._top / file.path for file in files]
+            for start in range(0, len(paths), FILES_AT_ONCE_MAX):
+                sync_files(paths[start : start + FILES_AT_ONCE_MAX])
+            sync_folders({path.parent for path in paths}, self._top)
+
     def tidy(self) -> None:
         """Take away parts that nobody will go on with."""
         shutil.rmtree(self._folder, ignore_errors=True)

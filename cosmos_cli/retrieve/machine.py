@@ -86,6 +86,8 @@ class MachineRetrieval:
         faults = [*offer.faults, *self._fetch(board, transfers)]
         if faults:
             raise self._refusal(faults)
+        came = {transfer.file for transfer in transfers}
+        self._incoming.settle([file for file in offer.files if file not in came])
         write_manifest(self._run, self._source.machine, entries, manifest_sha256)
         note = Note(
             state="verified",

@@ -4,6 +4,7 @@ import contextlib
 import os
 import shutil
 import threading
+from pathlib import Path
 
 import orjson
 import pytest
@@ -286,6 +287,41 @@ def test_unreadable_file_does_not_keep_the_others(tmp_path):
 
     assert outcome.is_ok, outcome.failure  # listed anew, without it
     assert (split.run.path / "agents/agent-01/ticks.jsonl").exists()
+
+
+def test_every_byte_and_name_is_on_the_disk_before_a_machine_deletes_its_copy(
+    tmp_path, monkeypatch
+):
+    split = SplitRun(tmp_path, machines=1)
+    already = split.run.path / "agents/agent-01/log.jsonl"
+    already.parent.mkdir(parents=True)
+    shutil.copy(split.directory("pi01") / "agents/agent-01/log.jsonl", already)
+    synced, log = set(), []
+    fsync, rename, call = os.fsync, Path.replace, Board.call
+
+    def note_sync(descriptor):
+        synced.add(os.fstat(descriptor).st_ino)
+        fsync(descriptor)
+
+    def note_rename(path, target):
+        assert path.stat().st_ino in synced, f"{target} got its name before its content was safe"
+        synced.discard(Path(target).parent.stat().st_ino)
+        return rename(path, target)
+
+    def note_call(board, verb, *arguments, **more):
+        if verb == "release":
+            for path in (split.run.path / "agents/agent-01").iterdir():
+                log.append(path.name)
+                assert path.stat().st_ino in synced, f"{path} is not safe"
+                assert path.parent.stat().st_ino in synced, f"the name of {path} is not safe"
+        return call(board, verb, *arguments, **more)
+
+    monkeypatch.setattr(os, "fsync", note_sync)
+    monkeypatch.setattr(Path, "replace", note_rename)
+    monkeypatch.setattr(Board, "call", note_call)
+
+    assert split.retrieve()["pi01"].is_ok
+    assert len(log) == 6
 
 
 def test_only_one_command_retrieves_a_run(tmp_path):
