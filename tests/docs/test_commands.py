@@ -1,0 +1,89 @@
+"""Every command, option and variable of the environment that the guides name exists."""
+
+import re
+
+import pytest
+from guides import GUIDES, ROOT, commands, spans
+from tower.faults import FAULTS
+
+from cosmos_cli.app import COMMANDS, load_command
+
+ENVIRONMENT = re.compile(r"\bCOSMOS_[A-Z_]+")
+OTHERS_OPTIONS = {"--privileged"}
+"""Options of other programs that the guides name by themselves."""
+
+
+@pytest.fixture(scope="module")
+def options():
+    """The options of each command, long and short."""
+    found = {}
+    for verb in COMMANDS:
+        parameters = load_command(verb).params
+        names = [name for each in parameters for name in (*each.opts, *each.secondary_opts)]
+        found[verb] = {name for name in names if name.startswith("-")} | {"--help"}
+    return found
+
+
+def unknown(words, options):
+    """Return what is wrong with one command."""
+    verb, given = words[1], words[2:]
+    if verb not in options:
+        return [verb]
+    given = given[: given.index("--")] if "--" in given else given
+    named = [re.split(r"[=\[|]", word)[0] for word in given if re.match(r"-{1,2}[a-z]", word)]
+    return [name for name in named if name not in options[verb]]
+
+
+@pytest.mark.parametrize("guide", GUIDES, ids=lambda path: path.name)
+def test_every_command_and_option_of_a_guide_exists(guide, options):
+    text = guide.read_text("utf-8")
+
+    assert {" ".join(w): unknown(w, options) for w in commands(text) if unknown(w, options)} == {}
+
+
+@pytest.mark.parametrize("guide", GUIDES, ids=lambda path: path.name)
+def test_every_option_that_a_guide_names_alone_exists(guide, options):
+    known = set().union(*options.values()) | OTHERS_OPTIONS
+    alone = [re.split(r"[ =]", span)[0] for span in spans(guide.read_text("utf-8"))]
+
+    assert {name for name in alone if name.startswith("--") and name not in known} - {"--"} == set()
+
+
+def test_what_does_not_exist_is_found(options):
+    text = (
+        "`cosmos rnu x` and `cosmos run --fast x`\n\n    cosmos up -i a.yaml --diff  # --comment\n"
+    )
+
+    assert [unknown(words, options) for words in commands(text)] == [[], ["rnu"], ["--fast"]]
+
+
+def test_guides_are_read_as_they_are_written():
+    """A change of their form must not leave nothing to look at."""
+    named = {words[1] for path in GUIDES for words in commands(path.read_text("utf-8"))}
+
+    assert set(COMMANDS) - named == set()
+
+
+def test_readme_table_has_every_command():
+    readme = GUIDES[0].read_text("utf-8")
+    table = readme.split("\n## Commands\n", 1)[1].split("\n## ", 1)[0]
+
+    assert {verb for verb in COMMANDS if f"cosmos {verb}" not in table} == set()
+
+
+def test_every_variable_of_the_environment_exists():
+    sources = [*ROOT.glob("cosmos_cli/**/*.py"), *ROOT.glob("madns_runtime/**/*.py")]
+    sources += ROOT.glob("tests/tower/*.py")
+    known = {name for path in sources for name in ENVIRONMENT.findall(path.read_text("utf-8"))}
+    named = {name for path in GUIDES for name in ENVIRONMENT.findall(path.read_text("utf-8"))}
+
+    assert named
+    assert named - known == set()
+
+
+def test_every_fault_of_the_tower_that_a_guide_names_exists():
+    texts = "".join(path.read_text("utf-8") for path in GUIDES)
+    named = set(re.findall(r"fault pi\d+ ([a-z-]+)", texts))
+
+    assert named
+    assert named - set(FAULTS) == set()
