@@ -3,35 +3,33 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cosmos_cli.background import Background
 from cosmos_cli.commands.fleet_options import (
     FORKS_DEFAULT,
     AcceptHostKeysOption,
-    Fleet,
     ForksOption,
     InventoryOption,
     LimitOption,
     fleet_of,
 )
 from cosmos_cli.console import Console, JsonOption, QuietOption
-from cosmos_cli.errors import ExitCode, InputError
-from cosmos_cli.fleet.connection import Connection
-from cosmos_cli.fleet.outcome import Outcome
-from cosmos_cli.models.inventory import Machine
-from cosmos_cli.provision import up_table
-from cosmos_cli.provision.bring_up import Brought, UpOptions, bring_up
+from cosmos_cli.errors import ExitCode
+from cosmos_cli.fleet.board import Board
+from cosmos_cli.fleet.silence import WatchedConnection
 from cosmos_cli.provision.echo import Echo
-from cosmos_cli.provision.kit import Workshop
-from cosmos_cli.provision.up_table import MachineResult
+from cosmos_cli.provision.parts import HELPER_PARTS
 from cosmos_cli.provision.up_view import UpView
 
 if TYPE_CHECKING:
-    from cosmos_cli.models.loading import ScenarioFile
+    from cosmos_cli.fleet.connection import Connection
+    from cosmos_cli.provision.brought import Brought
+    from cosmos_cli.provision.fleet_up import FleetUp
+    from cosmos_cli.provision.up_table import MachineResult
 
 
 def up(
@@ -66,55 +64,54 @@ def up(
     start_s = time.monotonic()
     console = Console(json=json, quiet=quiet)
     fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
-    if host is not None and host not in {machine.name for machine in fleet.machines}:
-        raise InputError(f"--host {host}: there is no such machine among those to be made ready")
-    files = _load(scenarios or ())
-    options = UpOptions(is_check=check, has_texts=diff)
-    with Echo() as echo, UpView(console, [m.name for m in fleet.machines]) as view:
-        kit = Workshop(files, host=host, echo=echo, options=fleet.options)
-        results = _bring_all(fleet, kit, options, view)
-    _show(console, results, options)
-    duration_s = time.monotonic() - start_s
-    console.data(up_table.verdict(results, is_check=check, duration_s=duration_s))
-    is_failed = any(result.status == "failed" for result in results)
-    exit_code = ExitCode.MACHINES if is_failed else ExitCode.OK
-    console.print_json({**up_table.document(results, is_check=check), "exit_code": int(exit_code)})
-    return int(exit_code)
+    names = [target.name for target in fleet.targets]
+
+    def gather() -> FleetUp:
+        from cosmos_cli.provision.brought import UpOptions
+        from cosmos_cli.provision.fleet_up import FleetUp
+
+        options = UpOptions(is_check=check, has_texts=diff, host=host)
+        return FleetUp(fleet, scenarios or (), options, echo=echo, view=view)
+
+    with Echo() as echo, UpView(console, names) as view:
+        # Logging in takes as long as validating the inventory and reading scenarios: both go on at once.
+        fleet_up = Background(gather)
+        outcomes = fleet.each_target(
+            lambda connection: _bring(connection, fleet_up),
+            lambda outcome: view.done(outcome.machine),
+        )
+        results = [fleet_up.result().result(outcome) for outcome in outcomes]
+    _show(console, results, is_check=check, has_diffs=diff)
+    return _end(console, results, is_check=check, duration_s=time.monotonic() - start_s)
 
 
-def _load(paths: Sequence[Path]) -> list[ScenarioFile]:
-    if not paths:
-        return []
-    from cosmos_cli.models.loading import load_scenario  # not needed for the runtime alone
-
-    return [load_scenario(path) for path in paths]
-
-
-def _bring_all(
-    fleet: Fleet, kit: Workshop, options: UpOptions, view: UpView
-) -> list[MachineResult]:
-    def work(connection: Connection, machine: Machine) -> Brought:
-        if connection.target.connection == "local":
-            return Brought(is_local=True)
-        return bring_up(connection, machine, kit, options, view.teller(machine.name))
-
-    def done(outcome: Outcome[Brought]) -> None:
-        result = _result(outcome)
-        view.done(outcome.machine, result.row(is_check=options.is_check)[-1])
-
-    return [_result(outcome) for outcome in fleet.each(work, done)]
+def _bring(connection: Connection, fleet_up: Background[FleetUp]) -> Brought | None:
+    if connection.target.connection == "local":
+        return None
+    with Board.start(WatchedConnection(connection), HELPER_PARTS) as board:
+        return fleet_up.result().bring(connection, board)
 
 
-def _result(outcome: Outcome[Brought]) -> MachineResult:
-    brought = outcome.value or Brought(failure=outcome.failure)
-    return MachineResult(machine=outcome.machine, brought=brought, duration_s=outcome.duration_s)
+def _show(
+    console: Console, results: list[MachineResult], *, is_check: bool, has_diffs: bool
+) -> None:
+    from cosmos_cli.provision import up_table
 
-
-def _show(console: Console, results: list[MachineResult], options: UpOptions) -> None:
-    if options.is_check or options.has_texts:
-        for line in up_table.plan_lines(results, has_diffs=options.has_texts):
+    if is_check or has_diffs:
+        for line in up_table.plan_lines(results, has_diffs=has_diffs):
             console.data(line)
-    rows = [result.row(is_check=options.is_check) for result in results]
-    console.table(up_table.COLUMNS, rows)
+    console.table(up_table.COLUMNS, [result.row(is_check=is_check) for result in results])
     for line in up_table.note_lines(results):
         console.say(f"note: {line}")
+
+
+def _end(
+    console: Console, results: list[MachineResult], *, is_check: bool, duration_s: float
+) -> int:
+    from cosmos_cli.provision import up_table
+
+    console.data(up_table.verdict(results, is_check=is_check, duration_s=duration_s))
+    is_failed = any(result.status == "failed" for result in results)
+    exit_code = int(ExitCode.MACHINES if is_failed else ExitCode.OK)
+    console.print_json({**up_table.document(results, is_check=is_check), "exit_code": exit_code})
+    return exit_code

@@ -15,6 +15,7 @@ from cosmos_cli.fleet.layout import Layout
 
 PARTS = (
     "files",
+    "links",
     "facts",
     "madns_runtime.processes",
     "processes",

@@ -42,22 +42,10 @@ def _throttled(facts: Facts) -> Iterator[str]:
 
 
 def _priority(facts: Facts, wanted: Wanted) -> Iterator[str]:
-    priority = wanted.settings.realtime_priority
-    if priority is not None:
-        yield from priority_notes(facts, priority, facts.realtime_priority_max)
-
-
-def priority_notes(facts: Facts, wanted: int, granted: int | None) -> Iterator[str]:
-    """
-    Yield a note if a login is not granted what the inventory asks for.
-
-    Args:
-        facts: Of the machine.
-        wanted: By the inventory.
-        granted: To a login that began after the limit was set; None for no limit.
-    """
-    if facts.uid != 0 and granted is not None and granted < wanted:
+    """Yield a note if a login is not granted what the inventory asks for; root needs no grant."""
+    priority, granted = wanted.settings.realtime_priority, facts.realtime_priority_max
+    if priority is not None and facts.uid != 0 and granted is not None and granted < priority:
         yield (
-            f"a login is granted real-time priority {granted}, not {wanted}: its SSH server does not"
-            " read /etc/security/limits.d; set `UsePAM yes` in /etc/ssh/sshd_config there"
+            f"a login is granted real-time priority {granted}, not {priority}: perhaps its SSH server"
+            " does not read /etc/security/limits.d; set `UsePAM yes` in /etc/ssh/sshd_config there"
         )

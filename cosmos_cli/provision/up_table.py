@@ -9,7 +9,7 @@ from typing import Any, Literal
 from cosmos_cli.console import Column
 from cosmos_cli.fleet.failure import MachineFailure
 from cosmos_cli.fleet.names import compact
-from cosmos_cli.provision.bring_up import Brought
+from cosmos_cli.provision.brought import Brought
 from cosmos_cli.provision.step import Change, Step
 
 COLUMNS = (Column("machine"), Column("board"), Column("result"))

@@ -82,9 +82,9 @@ class UpView:
             elif is_step:
                 self._console.say(f"{machine}: {text}")
 
-    def done(self, machine: str, words: str) -> None:
-        """Show what became of a machine."""
-        self.tell(machine, words)
+    def done(self, machine: str) -> None:
+        """Show that a machine is done with; the table will tell how."""
+        self.tell(machine, "done")
 
     def close(self) -> None:
         """Give the terminal back; what was shown goes, for the table follows."""

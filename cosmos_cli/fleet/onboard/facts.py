@@ -18,12 +18,18 @@ from collections.abc import Mapping, Sequence
 
 from cosmos_cli.fleet.onboard.core import Refusal, Request, handler_of, refusal_of, verb
 from cosmos_cli.fleet.onboard.files import content_hash, look_at
+from cosmos_cli.fleet.onboard.links import (
+    TEXT_BYTES_MAX,
+    names_in,
+    network,
+    read_number,
+    read_text,
+)
 
 TYPE_CHECKING = False  # to import typing takes longer than most that is done here
 if TYPE_CHECKING:
     from typing import Any
 
-TEXT_BYTES_MAX = 262_144
 CONDITION_TIMEOUT_S = 60.0
 SUDO_TIMEOUT_S = 20.0
 TOOL_TIMEOUT_S = 5.0
@@ -67,12 +73,12 @@ def facts(request: Request) -> dict[str, Any]:
         "memory": _memory(proc),
         "temperature_c": _scaled(f"{sys_}/class/thermal/thermal_zone0/temp", 1000),
         "throttled": _throttled(sys_),
-        "network": _network(proc, sys_),
+        "network": network(proc, sys_),
         "realtime_priority_max": _limit(resource.RLIMIT_RTPRIO),
         "memory_lock_bytes_max": _limit(resource.RLIMIT_MEMLOCK),
         "governors": _governors(sys_),
         "governors_available": (
-            _text(f"{sys_}/devices/system/cpu/cpu0/cpufreq/scaling_available_governors") or ""
+            read_text(f"{sys_}/devices/system/cpu/cpu0/cpufreq/scaling_available_governors") or ""
         ).split(),
         "radios": _radios(sys_),
         "files": _files(asked),
@@ -94,22 +100,8 @@ def look(request: Request) -> dict[str, Any]:
     }
 
 
-def _text(path: str) -> str | None:
-    try:
-        with open(path, "rb") as file:
-            return file.read(TEXT_BYTES_MAX).rstrip(b"\0\n ").decode(errors="replace")
-    except OSError:
-        return None
-
-
-def _number(path: str, base: int = 10) -> int | None:
-    with contextlib.suppress(TypeError, ValueError):
-        return int(_text(path), base)  # type: ignore[arg-type]
-    return None
-
-
 def _scaled(path: str, divisor: int) -> float | None:
-    number = _number(path)
+    number = read_number(path)
     return None if number is None else number / divisor
 
 
@@ -127,8 +119,8 @@ def _user() -> dict[str, Any]:
 def _board(sys_: str) -> dict[str, Any]:
     system = os.uname()
     return {
-        "model": _text(f"{sys_}/firmware/devicetree/base/model")
-        or _text(f"{sys_}/class/dmi/id/product_name"),
+        "model": read_text(f"{sys_}/firmware/devicetree/base/model")
+        or read_text(f"{sys_}/class/dmi/id/product_name"),
         "machine": system.machine,
         "bits": 64 if sys.maxsize > 2**32 else 32,
         "node": system.nodename,
@@ -139,7 +131,7 @@ def _board(sys_: str) -> dict[str, Any]:
 
 def _release(etc: str) -> dict[str, str]:
     values = {}
-    for line in (_text(f"{etc}/os-release") or "").splitlines():
+    for line in (read_text(f"{etc}/os-release") or "").splitlines():
         key, _, value = line.partition("=")
         values[key] = value.strip("\"'")
     wanted = {
@@ -166,11 +158,11 @@ def _python() -> dict[str, Any]:
 
 
 def _clock(proc: str) -> dict[str, Any]:
-    uptime = (_text(f"{proc}/uptime") or "").split()
+    uptime = (read_text(f"{proc}/uptime") or "").split()
     return {
         "utc_s": time.clock_gettime(time.CLOCK_REALTIME),
         "uptime_s": float(uptime[0]) if uptime else None,
-        "boot_id": _text(f"{proc}/sys/kernel/random/boot_id"),
+        "boot_id": read_text(f"{proc}/sys/kernel/random/boot_id"),
     }
 
 
@@ -192,7 +184,7 @@ def _disk(root: str) -> dict[str, Any]:
 
 def _memory(proc: str) -> dict[str, int | None]:
     values = {}
-    for line in (_text(f"{proc}/meminfo") or "").splitlines():
+    for line in (read_text(f"{proc}/meminfo") or "").splitlines():
         key, _, value = line.partition(":")
         if value.endswith(" kB"):
             values[key] = int(value[:-3]) * 1024
@@ -201,7 +193,7 @@ def _memory(proc: str) -> dict[str, int | None]:
 
 def _throttled(sys_: str) -> int | None:
     """Return the bits of a Raspberry Pi's firmware: from the kernel, else from its tool."""
-    number = _number(f"{sys_}/{THROTTLED}", 16)
+    number = read_number(f"{sys_}/{THROTTLED}", 16)
     if number is not None:
         return number
     for tool in ("/usr/bin/vcgencmd", "/opt/vc/bin/vcgencmd", "/usr/local/bin/vcgencmd"):
@@ -222,73 +214,6 @@ def _output(command: list[str], timeout_s: float) -> str:
     return done.stdout.decode(errors="replace")
 
 
-def _network(proc: str, sys_: str) -> dict[str, Any]:
-    wireless = {
-        name for name in _names(f"{sys_}/class/net") if _is_wireless(f"{sys_}/class/net/{name}")
-    }
-    interface = _interface_of_connection(proc)
-    up = [name for name in wireless if _text(f"{sys_}/class/net/{name}/operstate") == "up"]
-    return {
-        "receive_buffer_bytes_max": _number(f"{proc}/sys/net/core/rmem_max"),
-        "receive_buffer_bytes_default": _number(f"{proc}/sys/net/core/rmem_default"),
-        "interface": interface,
-        "is_wireless": interface in wireless if interface else None,
-        "wireless_up": sorted(up),
-    }
-
-
-def _names(folder: str) -> list[str]:
-    with contextlib.suppress(OSError):
-        return os.listdir(folder)
-    return []
-
-
-def _is_wireless(interface: str) -> bool:
-    """Tell of an interface, or of a bridge by its members."""
-    if os.path.isdir(f"{interface}/wireless") or os.path.exists(f"{interface}/phy80211"):
-        return True
-    folder = os.path.dirname(interface)
-    return any(_is_wireless(f"{folder}/{member}") for member in _names(f"{interface}/brif"))
-
-
-def _interface_of_connection(proc: str) -> str | None:
-    """Return the interface that has the address by which the operator came; None when nobody knows."""
-    words = os.environ.get("SSH_CONNECTION", "").split()
-    if len(words) != 4:
-        return None
-    own = words[2].partition("%")[0]
-    return _interface_v6(own, proc) if ":" in own else _interface_v4(own)
-
-
-def _interface_v4(own: str) -> str | None:
-    import _socket  # what `socket` adds to it takes longer to import than the rest of this module
-    import fcntl
-
-    get_address = 0x8915  # SIOCGIFADDR
-    asked = _socket.socket(_socket.AF_INET, _socket.SOCK_DGRAM)
-    try:
-        for _, name in _socket.if_nameindex():
-            with contextlib.suppress(OSError):
-                wanted = name.encode()[:15].ljust(256, b"\0")
-                found = fcntl.ioctl(asked.fileno(), get_address, wanted)
-                if _socket.inet_ntoa(found[20:24]) == own:
-                    return name
-    finally:
-        asked.close()
-    return None
-
-
-def _interface_v6(own: str, proc: str) -> str | None:
-    import _socket
-
-    wanted = _socket.inet_pton(_socket.AF_INET6, own).hex()
-    for line in (_text(f"{proc}/net/if_inet6") or "").splitlines():
-        words = line.split()
-        if words[0] == wanted:
-            return words[-1]
-    return None
-
-
 def _limit(which: int) -> int | None:
     """Return the limit up to which this login may go; None for no limit."""
     hard = resource.getrlimit(which)[1]
@@ -297,8 +222,8 @@ def _limit(which: int) -> int | None:
 
 def _governors(sys_: str) -> dict[str, str]:
     found = {}
-    for name in sorted(_names(f"{sys_}/devices/system/cpu")):
-        governor = _text(f"{sys_}/devices/system/cpu/{name}/cpufreq/scaling_governor")
+    for name in sorted(names_in(f"{sys_}/devices/system/cpu")):
+        governor = read_text(f"{sys_}/devices/system/cpu/{name}/cpufreq/scaling_governor")
         if governor is not None and name[3:].isdecimal():  # the others are not processors
             found[name] = governor
     return found
@@ -308,11 +233,11 @@ def _radios(sys_: str) -> list[dict[str, Any]]:
     return [
         {
             "name": name,
-            "type": _text(f"{sys_}/class/rfkill/{name}/type") or "",
-            "is_soft_blocked": _text(f"{sys_}/class/rfkill/{name}/soft") == "1",
-            "is_hard_blocked": _text(f"{sys_}/class/rfkill/{name}/hard") == "1",
+            "type": read_text(f"{sys_}/class/rfkill/{name}/type") or "",
+            "is_soft_blocked": read_text(f"{sys_}/class/rfkill/{name}/soft") == "1",
+            "is_hard_blocked": read_text(f"{sys_}/class/rfkill/{name}/hard") == "1",
         }
-        for name in sorted(_names(f"{sys_}/class/rfkill"))
+        for name in sorted(names_in(f"{sys_}/class/rfkill"))
     ]
 
 

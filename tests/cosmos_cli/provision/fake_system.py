@@ -3,10 +3,14 @@
 import hashlib
 from pathlib import Path
 
+from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.local import LocalConnection
+from cosmos_cli.fleet.silence import WatchedConnection
 from cosmos_cli.fleet.target import Target
-from cosmos_cli.provision.bring_up import UpOptions, bring_up
+from cosmos_cli.provision.bring_up import Site, bring_up
+from cosmos_cli.provision.brought import Brought, UpOptions
+from cosmos_cli.provision.parts import HELPER_PARTS
 from cosmos_cli.provision.wanted import Content, Paths
 
 FILES = {
@@ -88,9 +92,13 @@ class Listener:
 
 
 def up(connection, machine, kit=None, listener=None, **options):
-    return bring_up(
-        connection, machine, kit or FakeKit(), UpOptions(**options), listener or Listener()
-    )
+    """Return what became of a machine, as the command line does it."""
+    try:
+        with Board.start(WatchedConnection(connection), HELPER_PARTS) as board:
+            site = Site(connection=connection, board=board, machine=machine)
+            return bring_up(site, kit or FakeKit(), UpOptions(**options), listener or Listener())
+    except MachineFailure as failure:
+        return Brought(failure=failure)
 
 
 def contents(folder):

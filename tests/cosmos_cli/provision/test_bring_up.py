@@ -18,7 +18,8 @@ from provision_machines import machine_of
 from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.provision import bring_up
-from cosmos_cli.provision.bring_up import HELPER_PARTS
+from cosmos_cli.provision.environment import PARTS
+from cosmos_cli.provision.parts import HELPER_PARTS
 from cosmos_cli.provision.trees import TreeFile, tree_of
 
 pytestmark = pytest.mark.process
@@ -365,3 +366,7 @@ def test_machine_that_may_not_become_root_is_refused_before_anything_is_done(pla
 
     assert brought.failure.kind is FailureKind.NO_SUDO
     assert not (place / "cosmos").exists()
+
+
+def test_helper_has_all_that_environments_need_in_their_order():
+    assert tuple(part for part in HELPER_PARTS if part in PARTS) == PARTS
