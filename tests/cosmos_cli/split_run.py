@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import os
 import shutil
 import sys
 from collections.abc import Callable
@@ -132,6 +134,62 @@ class CutConnection(LocalConnection):
 
         stream.read = cut_read
         return stream
+
+
+class LyingConnection(LocalConnection):
+    """A machine whose frames are altered: *lie* takes and returns header and body."""
+
+    def __init__(self, target, lie):
+        super().__init__(target)
+        self._lie = lie
+
+    def open(self, command):
+        stream = super().open(command)
+        read, lie = stream.read, self._lie
+        pending, ready = bytearray(), bytearray()
+
+        def lying_read(count):
+            while not ready:
+                data = read(1 << 20)
+                if not data:
+                    return b""
+                pending.extend(data)
+                while (end := pending.find(b"\n")) >= 0:
+                    header = json.loads(pending[:end])
+                    size = end + 1 + header["body"]
+                    if len(pending) < size:
+                        break
+                    header, body = lie(header, bytes(pending[end + 1 : size]))
+                    del pending[:size]
+                    ready.extend(json.dumps(header | {"body": len(body)}).encode() + b"\n" + body)
+                if not ready:
+                    raise BlockingIOError
+            data = bytes(ready[:count])
+            del ready[:count]
+            return data
+
+        def lying_read_some(count, *, timeout_s):
+            while True:
+                try:
+                    return lying_read(count)
+                except BlockingIOError:
+                    os.sched_yield()
+
+        stream.read, stream.read_some = lying_read, lying_read_some
+        return stream
+
+
+def pieces(change):
+    """Return a lie about pieces of files."""
+
+    def lie(header, body):
+        value = header.get("value")
+        if isinstance(value, dict) and "offset" in value:
+            value, body = change(value, body)
+            header = header | {"value": value}
+        return header, body
+
+    return lie
 
 
 def hashes(folder: Path) -> dict[str, str]:

@@ -1,13 +1,11 @@
 """A machine's manifest is input: nothing it says leads out of the run directory or over another's files."""
 
-import json
-import os
+import hashlib
 
 import pytest
-from split_run import SplitRun, hashes
+from split_run import LyingConnection, SplitRun, hashes, pieces
 
 from cosmos_cli.fleet.failure import FailureKind
-from cosmos_cli.fleet.local import LocalConnection
 from cosmos_cli.fleet.onboard.evidence import entry_line
 from cosmos_cli.retrieve.offer import check_offer
 from cosmos_cli.retrieve.sources import Sources
@@ -122,75 +120,17 @@ def test_host_of_a_named_machine_brings_the_hosts_records():
     assert others.faults == ("host/events.jsonl: pi02 offers it, but it is of pi01",)
 
 
-class LyingConnection(LocalConnection):
-    """A machine whose frames are altered: *lie* takes and returns header and body."""
-
-    def __init__(self, target, lie):
-        super().__init__(target)
-        self._lie = lie
-
-    def open(self, command):
-        stream = super().open(command)
-        read, lie = stream.read, self._lie
-        pending, ready = bytearray(), bytearray()
-
-        def lying_read(count):
-            while not ready:
-                data = read(1 << 20)
-                if not data:
-                    return b""
-                pending.extend(data)
-                while (end := pending.find(b"\n")) >= 0:
-                    header = json.loads(pending[:end])
-                    size = end + 1 + header["body"]
-                    if len(pending) < size:
-                        break
-                    header, body = lie(header, bytes(pending[end + 1 : size]))
-                    del pending[:size]
-                    ready.extend(json.dumps(header | {"body": len(body)}).encode() + b"\n" + body)
-                if not ready:
-                    raise BlockingIOError
-            data = bytes(ready[:count])
-            del ready[:count]
-            return data
-
-        def lying_read_some(count, *, timeout_s):
-            while True:
-                try:
-                    return lying_read(count)
-                except BlockingIOError:
-                    os.sched_yield()
-
-        stream.read, stream.read_some = lying_read, lying_read_some
-        return stream
-
-
 def listing(change):
     """Return a lie about the list of files, whose hash fits again."""
 
     def lie(header, body):
         value = header.get("value")
         if isinstance(value, dict) and "sha256" in value:
-            import hashlib
-
             change(value["files"])
             digest = hashlib.sha256()
             for each in value["files"]:
                 digest.update(entry_line(each))
             value["sha256"] = digest.hexdigest()
-        return header, body
-
-    return lie
-
-
-def pieces(change):
-    """Return a lie about pieces of files."""
-
-    def lie(header, body):
-        value = header.get("value")
-        if isinstance(value, dict) and "offset" in value:
-            value, body = change(value, body)
-            header = header | {"value": value}
         return header, body
 
     return lie

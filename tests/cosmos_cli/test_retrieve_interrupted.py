@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from split_run import CutConnection, SplitRun, hashes
+from split_run import CutConnection, LyingConnection, SplitRun, hashes, pieces
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.local import LocalConnection
@@ -173,16 +173,16 @@ def test_part_of_other_content_is_not_taken_for_the_file(tmp_path, length):
 def test_byte_that_is_flipped_on_the_way_is_noticed_and_fetched_anew(tmp_path):
     split = large_run(tmp_path)
     whole = split.there("pi01")
-    target = split.targets["pi01"]
     flipped = []
 
-    def flip(data):
-        if len(data) > 10_000 and not flipped and b'"packed":false' in data[:200]:
-            flipped.append(True)
-            return data[:5000] + bytes([data[5000] ^ 1]) + data[5001:]
-        return data
+    def flip(value, body):
+        if not value["packed"] and not flipped:
+            flipped.append(value)
+            body = body[:100] + bytes([body[100] ^ 1]) + body[101:]
+        return value, body
 
-    outcome = split.retrieve({"pi01": CutConnection(target, change=flip)})["pi01"]
+    connection = LyingConnection(split.targets["pi01"], pieces(flip))
+    outcome = split.retrieve({"pi01": connection})["pi01"]
 
     assert flipped
     assert outcome.is_ok
