@@ -6,7 +6,6 @@ Imported after a wire is open: importing paramiko takes longer than the servers 
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Sequence
 
@@ -61,7 +60,6 @@ class SshConnection:
         self._transport = transport
         self._wire = wire
         self._hops = tuple(hops)
-        self._asking = threading.Lock()
 
     @property
     def own_address(self) -> str:
@@ -98,20 +96,7 @@ class SshConnection:
 
     def is_alive(self, *, timeout_s: float = 2.0) -> bool:
         """Ask for a sign of life; paramiko's own keepalive notices neither a dead link nor a frozen machine."""
-        sign = self._wire.expect_sign()
-        # Asking may wait behind an upload that has come to a standstill; the answer is not waited for there.
-        threading.Thread(target=self._ask_for_sign, name="sign-of-life", daemon=True).start()
-        was_heard = sign.wait(timeout_s)
-        return was_heard and not self._wire.is_ended and self._transport.is_active()
-
-    def _ask_for_sign(self) -> None:
-        if self._asking.acquire(blocking=False):
-            try:
-                self._transport.ask_for_sign()
-            except (SSHException, OSError, EOFError):
-                self._wire.close()
-            finally:
-                self._asking.release()
+        return self._transport.gives_sign(timeout_s=timeout_s)
 
     def close(self) -> None:
         """Close it."""

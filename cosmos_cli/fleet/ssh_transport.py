@@ -6,24 +6,33 @@ What is used of paramiko beyond its public names stands here and in `ssh_stream`
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import logging
 import signal
-from collections.abc import Sequence
+import threading
+import time
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 from paramiko.channel import Channel
 from paramiko.common import (
     MSG_CHANNEL_REQUEST,
+    MSG_REQUEST_FAILURE,
+    MSG_REQUEST_SUCCESS,
     cMSG_CHANNEL_REQUEST,
     cMSG_GLOBAL_REQUEST,
 )
 from paramiko.message import Message
+from paramiko.ssh_exception import SSHException
 from paramiko.transport import Transport
 
 from cosmos_cli.fleet.wire import Wire
 
 WINDOW_BYTES = 4 * 1024 * 1024
 PACKET_BYTES = 32 * 1024
+ACTIVE_CHECK_S = 0.1
+"""Between looks whether a connection still stands; paramiko's own waits look as often."""
 
 RSA_KINDS = ("rsa-sha2-512", "rsa-sha2-256")
 
@@ -46,12 +55,30 @@ def _request(channel: Channel, message: Message) -> None:
 
 
 class SshTransport(Transport):
-    """A connection's protocol."""
+    """
+    A connection's protocol.
+
+    Args:
+        wire: To the machine's SSH server.
+    """
 
     _channel_handler_table: ClassVar[Any] = {
         **Transport._channel_handler_table,  # type: ignore[attr-defined]
         MSG_CHANNEL_REQUEST: _request,
     }
+
+    def __init__(self, wire: Wire) -> None:
+        super().__init__(
+            wire,  # type: ignore[arg-type]
+            default_window_size=WINDOW_BYTES,
+            default_max_packet_size=PACKET_BYTES,
+        )
+        self._news = threading.Condition()
+        self._asked = 0
+        self._answered = 0
+        handlers: dict[int, Callable[[Message], None]] = self._handler_table  # type: ignore[attr-defined]
+        for kind in (MSG_REQUEST_SUCCESS, MSG_REQUEST_FAILURE):
+            handlers[kind] = functools.partial(self._count_answer, handlers[kind])
 
     def start_command(self, command: str, *, timeout_s: float) -> Channel:
         """
@@ -72,13 +99,42 @@ class SshTransport(Transport):
         self._send_user_message(message)  # type: ignore[attr-defined]
         return channel
 
-    def ask_for_sign(self) -> None:
+    def gives_sign(self, *, timeout_s: float) -> bool:
+        """
+        Ask the server for an answer to a request and wait for it.
+
+        Only an answer counts: other bytes may have been on their way when a machine froze.
+        """
+        with self._news:
+            is_asking = self._asked == self._answered
+            self._asked += is_asking
+            wanted = self._asked
+        if is_asking:
+            # Sending may wait behind an upload that has come to a standstill; this wait has a deadline.
+            threading.Thread(target=self._ask, name="sign-of-life", daemon=True).start()
+        until_s = time.monotonic() + timeout_s
+        with self._news:
+            while self._answered < wanted and self.is_active():
+                remaining_s = until_s - time.monotonic()
+                if remaining_s <= 0:
+                    return False
+                self._news.wait(min(remaining_s, ACTIVE_CHECK_S))
+            return self._answered >= wanted
+
+    def _ask(self) -> None:
         """Send a request that every server answers, if only by refusing it."""
         message = Message()
         message.add_byte(cMSG_GLOBAL_REQUEST)
         message.add_string("keepalive@openssh.com")
         message.add_boolean(True)
-        self._send_user_message(message)  # type: ignore[attr-defined]
+        with contextlib.suppress(SSHException, OSError, EOFError):  # then it is not active any more
+            self._send_user_message(message)  # type: ignore[attr-defined]
+
+    def _count_answer(self, handle: Callable[[Message], None], message: Message) -> None:
+        handle(message)
+        with self._news:
+            self._answered += 1
+            self._news.notify_all()
 
 
 def make_transport(wire: Wire, known_kinds: Sequence[str], *, timeout_s: float) -> SshTransport:
@@ -87,11 +143,7 @@ def make_transport(wire: Wire, known_kinds: Sequence[str], *, timeout_s: float) 
 
     Left to its own order, paramiko would get another one and take a known machine for unknown.
     """
-    transport = SshTransport(
-        wire,  # type: ignore[arg-type]
-        default_window_size=WINDOW_BYTES,
-        default_max_packet_size=PACKET_BYTES,
-    )
+    transport = SshTransport(wire)
     transport.banner_timeout = transport.handshake_timeout = transport.auth_timeout = timeout_s
     options = transport.get_security_options()
     options.key_types = ordered(tuple(options.key_types), known_kinds)
