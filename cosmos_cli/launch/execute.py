@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ from cosmos_cli.launch.fleet_run import (
     plan_mapping,
     reach,
 )
-from cosmos_cli.launch.machines import RemoteMachine, close_machines
+from cosmos_cli.launch.machines import RETURN_TIMEOUT_S, RemoteMachine, close_machines
 from cosmos_cli.launch.operator import Operator
 from cosmos_cli.launch.outcome import (
     LaunchOutcome,
@@ -236,7 +237,8 @@ def _retrieve(
 
     outcomes = retrieve(
         prepared.run,
-        options=options.connecting,
+        # Who is connected still is not asked again; who is not has been looked for already.
+        options=dataclasses.replace(options.connecting, timeout_s=RETURN_TIMEOUT_S),
         forks=options.forks,
         progress=view.work,
         connections={name: machine.connection for name, machine in prepared.remote.items()},
