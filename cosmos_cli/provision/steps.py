@@ -105,7 +105,7 @@ def _declared(facts: Facts, wanted: Wanted) -> Iterator[Step]:
 
 
 def _environments(facts: Facts, wanted: Wanted) -> Iterator[Step]:
-    for environment in wanted.environments:
+    for environment in wanted.distinct_environments:
         if environment.key not in facts.environments:
             yield Step(
                 kind=Kind.ENVIRONMENT,
@@ -142,7 +142,7 @@ def installed_question(wanted: Wanted, *, touch: bool = False) -> dict[str, Any]
     return installed_request(
         wanted.layout,
         trees=[tree.hash for tree in wanted.trees],
-        environments=[environment.key for environment in wanted.environments],
+        environments=[environment.key for environment in wanted.distinct_environments],
         touch=touch,
     )
 

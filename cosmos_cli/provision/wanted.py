@@ -73,7 +73,7 @@ class Wanted:
     declared: tuple[Declared, ...] = ()
     settings: Settings = field(default_factory=Settings)
     environments: tuple[Any, ...] = ()
-    """Of `provision.wheelhouse.Environment`: one for each set of requirements."""
+    """Of `provision.wheelhouse.Environment`: one for each scenario, or one for the runtime alone."""
     trees: tuple[Any, ...] = ()
     """Of `provision.trees.Tree`."""
 
@@ -94,6 +94,11 @@ class Wanted:
     def memory_path(self) -> str:
         """The file there that remembers what settings were before."""
         return f"{self.layout.state}/{MEMORY_FILE}"
+
+    @property
+    def distinct_environments(self) -> tuple[Any, ...]:
+        """Each environment once; most scenarios share one."""
+        return tuple({each.key: each for each in self.environments}.values())
 
     @property
     def all_packages(self) -> tuple[str, ...]:
