@@ -1,7 +1,7 @@
 """
 The bytes below SSH: a TCP socket, a proxy command's pipe or a channel through a jump host, with two things added.
 
-It tells when the machine is heard again, and it gives up on a machine that takes no more bytes; paramiko
+It acknowledges at once what sshd waits for, and it gives up on a machine that takes no more bytes; paramiko
 alone would try for ever.
 """
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import socket
 import subprocess
-import threading
 import time
 from typing import Protocol
 
@@ -61,11 +60,8 @@ class Wire:
         if isinstance(pipe, socket.socket) and pipe.family != socket.AF_UNIX:
             self._quick = pipe if hasattr(socket, "TCP_QUICKACK") else None
         self._stalled_since_s: float | None = None
-        self._sign = threading.Event()
         self._closed = False  # paramiko asks for a socket's own
         self.own_address, self.peer_address = addresses
-        self.is_ended = False
-        """Whether the other side has closed it."""
 
     def send(self, data: bytes) -> int:
         """Send what fits; raise when nothing has fitted for SEND_STALL_S_MAX."""
@@ -83,28 +79,10 @@ class Wire:
 
     def recv(self, count: int) -> bytes:
         """Wait for bytes."""
-        try:
-            data = self._pipe.recv(count)
-        except TimeoutError:
-            raise
-        except OSError:
-            self._end()
-            raise
+        data = self._pipe.recv(count)
         if data and self._quick is not None:
             self._quick.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
-        if not data:
-            self._end()
-        self._sign.set()
         return data
-
-    def _end(self) -> None:
-        self.is_ended = True
-        self._sign.set()
-
-    def expect_sign(self) -> threading.Event:
-        """Return an event that is set when the next bytes come, or their end."""
-        self._sign.clear()
-        return self._sign
 
     def settimeout(self, timeout_s: float | None) -> None:
         """Bound `send` and `recv`."""
