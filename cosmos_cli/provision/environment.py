@@ -20,7 +20,9 @@ from cosmos_cli.provision.wheelhouse import Environment
 
 PARTS = ("store", "installed", "keep", "trees", "wheels", "environment")
 """What a `Board` must be started with for trees and environments."""
-PIECE_BYTES = 4 * 1024 * 1024
+PIECE_BYTES = 1024 * 1024
+"""More at once makes the SSH server there copy what it holds back over and over: measured 65 ms against 207 ms of its
+processor for numpy in pieces of 4 MB."""
 BUILD_TIMEOUT_S = 900.0
 """A slow card writes some megabytes a second, and an emulated board unpacks as slowly."""
 LOOK_TIMEOUT_S = 120.0

@@ -8,6 +8,7 @@ unpacked once and stays as it is; environments are made of links to its files (`
 from __future__ import annotations
 
 import base64
+import contextlib
 import csv
 import hashlib
 import io
@@ -86,6 +87,8 @@ def _settle(partial: str, folder: str, sha256: str, filename: str) -> None:
         os.rename(new, path)
     except (OSError, Refusal):
         keep.remove(new)
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(partial)  # a full disk needs the room; a wheel that is faulty is no use
         raise
     keep.sync_names(folder)
 
