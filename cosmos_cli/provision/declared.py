@@ -17,7 +17,7 @@ from cosmos_cli.models.provision_steps import Command, FileContent, LineInFile, 
 from cosmos_cli.provision.facts import Facts, FileFact, condition_key
 from cosmos_cli.provision.packages import package_step
 from cosmos_cli.provision.step import Change, Kind, Request, Step
-from cosmos_cli.provision.wanted import Declared, condition_of
+from cosmos_cli.provision.wanted import Declared
 
 COMMAND_TIMEOUT_S = 1800.0
 SERVICE_TIMEOUT_S = 120.0
@@ -219,7 +219,8 @@ def _service_step(title: str, asked: Mapping[str, Any], declared: Declared) -> S
 def _command(declared: Declared, facts: Facts, sketch: Sketch) -> Iterator[Step]:
     action, as_root = declared.step.action, declared.step.become
     assert isinstance(action, Command)
-    condition = condition_of(action, home=facts.home, as_root=as_root)
+    condition = declared.condition
+    assert condition is not None
     if facts.conditions.get(condition_key(condition)):
         return
     asked = {**condition, "run": action.run, "timeout_s": COMMAND_TIMEOUT_S}

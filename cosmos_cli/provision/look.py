@@ -56,7 +56,6 @@ def look(
     wanted = question.wanted
     asked = questions(
         wanted,
-        home=str(board.greeting["home"]),
         setting_files=setting_files(wanted.paths),
         has_texts=question.has_texts,
     )

@@ -56,6 +56,8 @@ class Declared:
     step: ProvisionStep
     path: str | None = None
     """Of the file, or of the one that the line is in."""
+    condition: Mapping[str, Any] | None = None
+    """Of a command: what the machine is asked to learn whether it is done."""
     content: Content | None = None
 
 
@@ -132,7 +134,7 @@ def wanted_of(
         layout=Layout(at_home(machine.root, home)),
         may_become_root=machine.may_become_root,
         packages=tuple(dict.fromkeys([*machine.packages, *distribution])),
-        declared=tuple(_declared(step, home, read_file) for step in machine.provision),
+        declared=tuple(_declared(step, machine, home, read_file) for step in machine.provision),
         settings=Settings(
             receive_buffer_bytes=machine.receive_buffer_bytes,
             realtime_priority=machine.realtime_priority,
@@ -150,33 +152,36 @@ def at_home(path: str, home: str) -> str:
     return home + path[1:] if path == "~" or path.startswith("~/") else path
 
 
-def _declared(step: ProvisionStep, home: str, read_file: Callable[[Path], Content]) -> Declared:
+def _declared(
+    step: ProvisionStep, machine: Machine, home: str, read_file: Callable[[Path], Content]
+) -> Declared:
     match step.action:
         case FileContent(dest=dest, src=src, content=content):
             data = read_file(Path(src)) if src is not None else Content.of((content or "").encode())
             return Declared(step=step, path=at_home(dest, home), content=data)
         case LineInFile(path=path):
             return Declared(step=step, path=at_home(path, home))
+        case Command() as command:
+            as_root = step.become and machine.may_become_root
+            return Declared(step=step, condition=_condition(command, home=home, as_root=as_root))
         case _:
             return Declared(step=step)
 
 
-def condition_of(command: Command, *, home: str, as_root: bool) -> dict[str, Any]:
-    """Return what the machine is asked about a command: is it done already?"""
+def _condition(command: Command, *, home: str, as_root: bool) -> dict[str, Any]:
     if command.creates is not None:
         return {"creates": at_home(command.creates, home)}
     return {"unless": command.unless, "root": as_root}
 
 
 def questions(
-    wanted: Wanted, *, home: str, setting_files: Sequence[str], has_texts: bool = False
+    wanted: Wanted, *, setting_files: Sequence[str], has_texts: bool = False
 ) -> dict[str, Any]:
     """
     Return the arguments of the verb "facts": what the plan needs to know.
 
     Args:
         wanted: What the machine should be like.
-        home: Of who logs in there.
         setting_files: Files that settings are written to.
         has_texts: Whether contents of files are wanted too, for --diff.
     """
@@ -191,7 +196,11 @@ def questions(
         "services": sorted(
             {d.step.service.name for d in wanted.declared if d.step.service is not None}
         ),
-        "conditions": {condition_key(c): c for c in _conditions(wanted, home)},
+        "conditions": {
+            condition_key(d.condition): d.condition
+            for d in wanted.declared
+            if d.condition is not None
+        },
     }
 
 
@@ -207,9 +216,3 @@ def _files(
     for declared in files:  # later ones win: a line needs the text
         if declared.content is None:
             yield str(declared.path), "text"
-
-
-def _conditions(wanted: Wanted, home: str) -> Iterator[Mapping[str, Any]]:
-    for declared in wanted.declared:
-        if isinstance(declared.step.action, Command):
-            yield condition_of(declared.step.action, home=home, as_root=declared.step.become)
