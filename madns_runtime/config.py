@@ -142,6 +142,8 @@ class Recording:
 
     flush_interval_s: Annotated[float, Gt(0), Le(60)] = 0.25
     """The most that a killed process loses, s."""
+    sync_interval_s: Annotated[float, Ge(0), Le(600)] | None = None
+    """Time between syncs to the disk, s: what a power cut costs at most; 0 leaves it to the kernel. Not given: 5 on other machines, 0 on this one."""
     buffer_bytes: Annotated[int, Ge(65_536)] = 4 * 1024 * 1024
     """Bound of the buffer between loop and disk; what does not fit is dropped and counted."""
     verbosity: Annotated[int, Ge(0), Le(5)] = 3

@@ -12,6 +12,9 @@ from madns_runtime.config import RunConfig
 ANY_ADDRESSES = ("0.0.0.0", "::", "")
 LOOPBACK = "127.0.0.1"
 
+SYNC_INTERVAL_S = 5.0
+"""Boards lose their power more often than computers do, and their kernel keeps writes back for half a minute."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
@@ -34,6 +37,9 @@ def config_at(config: RunConfig, place: Place) -> RunConfig:
         config = dataclasses.replace(config, scheduling=scheduling)
     if place.base_directory is not None:
         config = dataclasses.replace(config, base_directory=place.base_directory)
+        if config.recording.sync_interval_s is None:
+            recording = dataclasses.replace(config.recording, sync_interval_s=SYNC_INTERVAL_S)
+            config = dataclasses.replace(config, recording=recording)
     return config
 
 

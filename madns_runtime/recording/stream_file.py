@@ -88,6 +88,7 @@ class StreamFile:
         "_descriptor",
         "_pending",
         "_pending_cost",
+        "_synced_bytes",
         "_whole_bytes",
         "bytes_written",
         "direct",
@@ -127,6 +128,7 @@ class StreamFile:
         self._pending_cost = 0
         self._control_left = 0
         self._whole_bytes = 0
+        self._synced_bytes = 0
 
     @property
     def dropped(self) -> int:
@@ -229,6 +231,25 @@ class StreamFile:
         self._control_left -= control
         self.written += lines - control
         self.bytes_written += len(taken)
+
+    def sync(self) -> None:
+        """
+        Make what was written durable, if there is anything new; a first time also the file's name.
+
+        Raises:
+            OSError: The disk refuses.
+        """
+        if self.bytes_written == self._synced_bytes:
+            return
+        if not self._synced_bytes:
+            folder = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
+        written = self.bytes_written
+        os.fdatasync(self._descriptor)
+        self._synced_bytes = written
 
     def finish(self) -> list[OSError]:
         """Give up what the disk did not take, end the file on a whole line, say the counts in it, close it."""

@@ -9,11 +9,13 @@ and a recorder does not survive a fork: make one in the child.
 from __future__ import annotations
 
 import logging
+import math
 import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import orjson
@@ -234,11 +236,16 @@ class Recorder:
     def _write_on(self) -> None:
         _schedule_normally()
         is_troubled = False
+        interval_s = self._settings.sync_interval_s or math.inf
+        synced_s = monotonic()
         while not self._stop.is_set():
             # In trouble only the interval counts: a full buffer would wake without pause.
             (self._stop if is_troubled else self._wake).wait(self._settings.flush_interval_s)
             self._wake.clear()
             is_troubled = not self._flush()
+            if monotonic() - synced_s >= interval_s:
+                is_troubled |= not self._sync()
+                synced_s = monotonic()
         self._flush()
         for file in self._files.values():
             for error in file.finish():
@@ -255,6 +262,17 @@ class Recorder:
                 self._troubles.add(_describe(file, error))
                 is_well = False
         self._freed_bytes = sum(file.freed_bytes for file in files)
+        return is_well
+
+    def _sync(self) -> bool:
+        """Bring what is written to the disk itself, where a power cut leaves it."""
+        is_well = True
+        for file in self._files.values():
+            try:
+                file.sync()
+            except OSError as error:
+                self._troubles.add(_describe(file, error))
+                is_well = False
         return is_well
 
     def _head(self, file: StreamFile, t0_utc: str | None) -> bytes:

@@ -466,3 +466,41 @@ def wait_until(condition, deadline_s=60.0):
     while not condition():
         assert time.monotonic() < end_s, "condition not met in time"
         time.sleep(0.005)
+
+
+def test_records_are_brought_to_the_disk_at_the_interval_and_only_when_there_are_new_ones(
+    tmp_path, monkeypatch
+):
+    synced = []
+    has_synced = threading.Event()
+
+    def sync(descriptor):
+        synced.append(os.readlink(f"/proc/self/fd/{descriptor}"))
+        has_synced.set()
+
+    monkeypatch.setattr(stream_file.os, "fdatasync", sync)
+    recorder = make_recorder(tmp_path, sync_interval_s=0.001)
+    recorder.open_stream(TICKS)
+    recorder.open_stream(PAIR)
+    recorder.record("ticks", (0, 12, 900, 0))
+    recorder.start()
+
+    assert has_synced.wait(30)
+    recorder.close(30)
+    assert sorted(set(map(os.path.basename, synced))) == ["pair.jsonl", "ticks.jsonl"]
+    assert len(synced) == 2
+
+
+@pytest.mark.parametrize("interval_s", [None, 0])
+def test_records_are_left_to_the_kernel_where_no_interval_is_given(
+    tmp_path, monkeypatch, interval_s
+):
+    synced = []
+    monkeypatch.setattr(stream_file.os, "fdatasync", synced.append)
+    recorder = make_recorder(tmp_path, sync_interval_s=interval_s, flush_interval_s=0.001)
+    recorder.open_stream(TICKS)
+    recorder.start()
+    recorder.record("ticks", (0, 12, 900, 0))
+    recorder.close(30)
+
+    assert synced == []
