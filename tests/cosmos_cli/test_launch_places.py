@@ -11,12 +11,12 @@ import pytest
 
 from cosmos_cli.launch.fleet_run import host_config, inventory_text, places_of, plan_mapping
 from cosmos_cli.launch.outcome import LaunchRequest, Life
-from cosmos_cli.launch.places import Place, config_at, expanded, listening_config
+from cosmos_cli.launch.places import SYNC_INTERVAL_S, Place, config_at, expanded, listening_config
 from cosmos_cli.launch.roll import Roll
 from cosmos_cli.models.inventory import Machine
 from cosmos_cli.plan import LaunchPlan, MachinePlan
 from cosmos_cli.rundir import RunDirectory
-from madns_runtime.config import Agents, Network, RunConfig
+from madns_runtime.config import Agents, Network, Recording, RunConfig
 
 CONFIG = RunConfig(
     run="0007-x", scenario="x", simulation="counter", base_directory="/here", agents=Agents(count=4)
@@ -213,3 +213,11 @@ def test_each_life_of_a_machine_counts_on_from_what_its_agents_had() -> None:
     assert (first.number, second.number) == (2, 3)
     assert first.incarnations == {"agent-01": 3, "agent-02": 1, "agent-03": 1}
     assert made.next_life_on("pi3").number == 2
+
+
+def test_records_on_another_machine_are_synced_unless_the_scenario_says_how() -> None:
+    there = Place(directory="/d", base_directory="/there")
+    own = dataclasses.replace(CONFIG, recording=Recording(sync_interval_s=0))
+
+    assert config_at(CONFIG, there).recording.sync_interval_s == SYNC_INTERVAL_S
+    assert config_at(own, there).recording.sync_interval_s == 0
