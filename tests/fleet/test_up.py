@@ -190,6 +190,37 @@ def test_each_machine_that_cannot_be_made_ready_says_why_and_the_others_are(flee
     assert fleet.up().document["changed"] == 0
 
 
+def test_slow_sudo_is_waited_for_and_forbidden_sudo_is_not_asked(fleet):
+    fleet.tower.fault("pi01", "slow-sudo", 2)
+    fleet.write(
+        boards=["pi01", "pi02", "pi03"],
+        machines={
+            "pi02": {"ansible_become": False},
+            "pi03": {"ansible_become": False, "cosmos_wifi": None},
+        },
+        cosmos_wifi=False,
+    )
+
+    result = fleet.up()
+
+    assert result.failures.get("pi01") is None
+    assert result.statuses == {"pi01": "changed", "pi02": "failed", "pi03": "changed"}
+    assert result.failures["pi02"][0] == "no_sudo"
+    assert fleet.tower.run("pi02", "ls -A ~/cosmos", check=False).returncode != 0
+
+
+def test_closed_firewall_is_told_by_each_machine_that_needs_it_open(fleet):
+    fleet.write(boards=["pi01", "pi02"], machines={"pi02": {"cosmos_host_address": "203.0.113.1"}})
+
+    result = fleet.up()
+
+    assert result.code == 3
+    assert result.statuses["pi01"] == "changed"
+    assert "no UDP from here to 203.0.113.1:" in result.failures["pi02"][1]
+    assert "cosmos_host_address" in result.machines["pi02"]["failure"]["advice"]
+    assert result.changes("pi02")
+
+
 def test_old_python_and_no_python_are_told_with_their_cure(own_fleet):
     fleet = own_fleet(count=1, boards=[BoardSpec(name="none", python="none")])
     fleet.tower.run("pi01", f"cat > ~/python3.9 <<'EOF'\n{OLD_PYTHON}EOF\nchmod +x ~/python3.9")
