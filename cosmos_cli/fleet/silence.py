@@ -16,6 +16,8 @@ FULL_S = 0.005
 """Between looks whether there is room again for what is sent."""
 SILENCE_S = 4.0
 """After so long without a byte the machine is asked for a sign of life."""
+SIGN_S = 5.0
+"""For the sign to come: a board that is busy to the brim must not be taken for a dead one."""
 
 
 class WatchedStream:
@@ -81,7 +83,7 @@ class WatchedStream:
             time.sleep(FULL_S)
 
     def _see_that_it_lives(self) -> None:
-        if not self._connection.is_alive():
+        if not self._connection.is_alive(timeout_s=SIGN_S):
             raise MachineFailure(FailureKind.LOST, "the machine stopped answering")
 
 
