@@ -106,8 +106,10 @@ class MachineCare:
 
     def machine_back(self, machine: str) -> None:
         """Give a returned machine its agents again, if the run still goes on."""
-        if self.is_wanted(machine):
-            agents = self._roll.restartable_on(machine)
+        agents = self._roll.restartable_on(machine)
+        if not self.is_wanted(machine):
+            self._talk.say(f"{machine} answers; nothing of the run lives there any more")
+        else:
             text = f"{machine} has returned; its agents {', '.join(agents)} rejoin"
             self._talk.say(text, "warning")
             self._decisions.start_supervisor(machine, agents, self._roll.next_life_on(machine))

@@ -15,8 +15,10 @@ from functools import partial
 from pathlib import PurePosixPath
 from typing import Any
 
+import orjson
+
 from cosmos_cli.fleet.connection import Stream
-from cosmos_cli.fleet.failure import MachineFailure
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.onboard.processes import MARK
 from cosmos_cli.launch.children import ENVIRONMENT, STDERR_BYTES, STDERR_LINES
 from cosmos_cli.launch.events import ProcessKnown, parse_event
@@ -29,6 +31,7 @@ STATUS_TRIES = 10
 STATUS_PAUSE_S = 0.1
 """A program's exit status comes a moment after the end of its output."""
 KILL_TIMEOUT_S = 4.0
+LAUNCH_TIMEOUT_S = 20.0
 NO_STATUS = "ended, and nobody knows how"
 
 
@@ -98,7 +101,7 @@ class RemoteChild:
         self._machine = machine
         self._loop = loop
         self._on_line = on_line
-        self._waiting: list[Mapping[str, Any]] = [launch]
+        self._waiting: list[Mapping[str, Any]] = []
         self._stream: Stream | None = None
         self._channel: StreamChannel | None = None
         self._is_closed = False
@@ -108,7 +111,7 @@ class RemoteChild:
         self._members: list[int] = []
         self._is_asking = False
         command = start_command(program, machine.paths)
-        loop.background.submit(lambda: machine.open(command), self._opened)
+        loop.background.submit(partial(_start, machine, command, launch), self._opened)
 
     @property
     def stderr(self) -> str:
@@ -276,6 +279,18 @@ class RemoteChild:
     def _signalled(self, members: Any, failure: MachineFailure | None) -> None:
         if failure is not None and self._loss is None:
             self._on_unreachable(failure.text)
+
+
+def _start(machine: RemoteMachine, command: str, launch: Mapping[str, Any]) -> Stream:
+    """Start a program there and hand over its launch line, which may be long."""
+    stream = machine.open(command)
+    try:
+        stream.write_all(orjson.dumps(launch) + b"\n", timeout_s=LAUNCH_TIMEOUT_S)
+    except MachineFailure as failure:
+        if failure.kind is not FailureKind.LOST:  # of one that has ended, its output tells why
+            stream.close()
+            raise
+    return stream
 
 
 def _fate(stream: Stream, machine: RemoteMachine) -> tuple[int | None, bool]:

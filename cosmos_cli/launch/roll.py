@@ -44,10 +44,12 @@ class Roll:
 
     def restartable_on(self, machine: str) -> tuple[str, ...]:
         """Return a machine's agents that were cut off and may be started once more."""
+        if self._lives.get(machine, 1) > self._restarts_max:
+            return ()  # also a machine on which nothing starts any more has an end
         return tuple(
             agent
             for agent in self._own(machine)
-            if agent not in self._done and 0 < self._restarts_max >= self._count(agent)
+            if agent not in self._done and self._count(agent) <= self._restarts_max
         )
 
     def next_life_on(self, machine: str) -> Life:

@@ -106,7 +106,8 @@ def make_ready(connection, board, target, cargo, *, machine=None, is_host=False)
 
     Path(target.root).mkdir(parents=True, exist_ok=True)
     base = str(Path(cargo.scenario_path).resolve().parent)
-    return Ready(python=sys.executable, python_path=PACKAGES, base_directory=base)
+    python = os.environ.get(f"COSMOS_TEST_PYTHON_{target.name}", sys.executable)
+    return Ready(python=python, python_path=PACKAGES, base_directory=base)
 
 
 def patch() -> None:

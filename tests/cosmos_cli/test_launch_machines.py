@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import secrets
 import signal
 import subprocess
@@ -266,6 +267,17 @@ def test_machine_that_cannot_be_reached_is_named_and_nothing_is_started(fleet: F
     assert not fleet.runs.exists()
 
 
+def test_program_that_cannot_be_started_on_a_machine_is_quoted(fleet: Fleet) -> None:
+    fleet.environment["COSMOS_TEST_PYTHON_pi02"] = "/nonexistent/python"
+    fleet.start()
+
+    code = fleet.finish()
+
+    assert code == 1
+    assert "exited with code 127 before its agents" in fleet.problems("pi02")[0]
+    assert re.search(r"/nonexistent/python.*No such file or directory", fleet.talk), fleet.talk
+
+
 def test_killed_supervisor_ends_the_run_and_is_named(fleet: Fleet) -> None:
     fleet.start()
     fleet.wait_until_running()
@@ -370,6 +382,45 @@ def test_detached_run_is_seen_and_ended_from_another_folder(fleet: Fleet, tmp_pa
     assert (again.returncode, again.stdout.count("nothing of it lives")) == (0, 2)
     assert collected.returncode == 0, collected.stderr
     assert fleet.document["status"] == "interrupted"
+
+
+def test_machine_that_does_not_answer_is_named_by_ps_and_down(fleet: Fleet) -> None:
+    fleet.start("--detach")
+    assert fleet.finish() == 0
+    fleet.break_link("pi02", "cut")
+
+    listed = fleet.cosmos("ps")
+    ended = fleet.cosmos("down", "1")
+
+    assert (listed.returncode, ended.returncode) == (3, 3)
+    assert "pi02: no answer" in listed.stderr
+    assert " pi01 " in listed.stdout
+    assert "0001-tiny: pi02: failed: no answer" in ended.stdout
+
+
+def test_inventory_finds_a_run_of_which_this_user_knows_nothing(fleet: Fleet) -> None:
+    fleet.start("--detach", "--host", "pi01")
+    assert fleet.finish() == 0
+    state = fleet.environment["COSMOS_STATE_DIR"]
+    fleet.environment["COSMOS_STATE_DIR"] = str(fleet.folder / "stranger")
+    fleet.environment["COSMOS_RUNS"] = str(fleet.folder / "strangers-runs")
+
+    unknown = fleet.cosmos("down", "1")
+    listed = fleet.cosmos("ps", "-i", str(fleet.inventory), "--json")
+    ended = fleet.cosmos("down", "1", "-i", str(fleet.inventory))
+    fleet.environment["COSMOS_STATE_DIR"] = state
+    here = fleet.cosmos("down", "--all")
+
+    assert unknown.returncode == 2
+    (machines,) = [
+        {process["machine"] for process in run["processes"]}
+        for run in json.loads(listed.stdout)["runs"]
+        if any(process["role"] == "host" for process in run["processes"])
+    ]
+    assert machines == {"pi01"}
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.startswith("0001-tiny: pi01: ended ")
+    assert here.returncode == 0, here.stderr
 
 
 def test_detached_run_ends_by_itself_and_is_collected_whole(fleet: Fleet) -> None:

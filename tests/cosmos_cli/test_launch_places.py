@@ -215,6 +215,16 @@ def test_each_life_of_a_machine_counts_on_from_what_its_agents_had() -> None:
     assert made.next_life_on("pi3").number == 2
 
 
+def test_machine_on_which_nothing_starts_is_given_up_after_as_many_lives_as_an_agent_has() -> None:
+    made = roll(2)
+    for _ in range(2):
+        assert made.restartable_on("pi2")
+        made.next_life_on("pi2")
+
+    assert made.restartable_on("pi2") == ()
+    assert made.restartable_on("pi3")
+
+
 def test_records_on_another_machine_are_synced_unless_the_scenario_says_how() -> None:
     there = Place(directory="/d", base_directory="/there")
     own = dataclasses.replace(CONFIG, recording=Recording(sync_interval_s=0))
