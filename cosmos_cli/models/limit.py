@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from cosmos_cli.models.inventory.machine import Machine
 
 PATTERN_CHARACTERS_MAX = 4096
+NAMES_SHOWN_MAX = 4
 ALL = "all"
 
 _PIECES = re.compile(r"(?:[^\s:\[\]]|\[[^\]]*\])+")
@@ -135,10 +136,10 @@ class _Matcher:
         match = _SUBSCRIPT.fullmatch(piece)
         if match is None:
             return self._matches(piece)
-        found = self._matches(match.group(1), piece)
+        found = self._matches(match.group(1), match)
         return self._cut(found, match) if found else []
 
-    def _matches(self, text: str, piece: str = "") -> list[str]:
+    def _matches(self, text: str, subscript: re.Match[str] | None = None) -> list[str]:
         try:
             if text[0] == "~":
                 fits = re.compile(text[1:]).match
@@ -152,8 +153,7 @@ class _Matcher:
         if not groups or text[0] == "~" or _is_glob(text) or "." in text:
             found += [name for name in self.machines if fits(name)]
         if not found and not groups:
-            places = f" ({piece} counts places in a group; for names: ~REGEXP or a glob)"
-            self.faults.append(self._unknown(text) + (places if piece else ""))
+            self.faults.append(self._no_places(subscript) if subscript else self._unknown(text))
         return found
 
     def _cut(self, found: list[str], match: re.Match[str]) -> list[str]:
@@ -165,6 +165,34 @@ class _Matcher:
         except IndexError:
             self.faults.append(f"{match.group()}: {match.group(1)} has {len(found)} machines")
             return []
+
+    def _no_places(self, subscript: re.Match[str]) -> str:
+        """Say that brackets count places, and how to write the names that were perhaps meant."""
+        base, only, first, last = subscript.groups()
+        meant = self._numbered(base, only or first, last if only is None else only)
+        if not meant:
+            hint = did_you_mean(base, list(self.groups))
+            hint = hint if hint.endswith("?") else f"; there are {_some(list(self.groups))}"
+            return f"{subscript.group()} counts places in a group, and none is named {base}{hint}"
+        shown = meant if len(meant) <= NAMES_SHOWN_MAX else [*meant[:2], "...", meant[-1]]
+        digits = len(meant[0]) - len(base)
+        return (
+            f"{subscript.group()} counts places in a group, and none is named {base}; for machines write"
+            f" {':'.join(shown)}, or a glob such as {base}{'?' * digits}"
+        )
+
+    def _numbered(self, base: str, first: str, last: str) -> list[str]:
+        """Return the machines that an inventory would mean by base[first:last]; an empty *last* is any."""
+        numbers = {
+            name: rest
+            for name in self.machines
+            if name.startswith(base) and (rest := name[len(base) :]).isdecimal()
+        }
+        return [
+            name
+            for name, rest in numbers.items()
+            if len(rest) >= len(first) and int(first) <= int(rest) <= int(last or rest)
+        ]
 
     def _unknown(self, text: str) -> str:
         names = [*self.groups, *self.machines]

@@ -61,8 +61,19 @@ def test_group_without_machines_is_known_where_it_is_told():
         ("x*", "no machine or group is like x*; there are all, tower"),
         ("~x", "no machine or group is like ~x; there are"),
         ("~(", "~(: not a regular expression"),
-        ("pi[01:05]", "no machine or group is named pi"),
-        ("pi[01:05]", "(pi[01:05] counts places in a group; for names: ~REGEXP or a glob)"),
+        (
+            "pi0[1:2]",
+            "--limit pi0[1:2]: pi0[1:2] counts places in a group, and none is named pi0;"
+            " for machines write pi01:pi02, or a glob such as pi0?",
+        ),
+        ("pi[01:06]", "for machines write pi01:pi02:...:pi06, or a glob such as pi??"),
+        ("pi0[5:]", "for machines write pi05:pi06, or a glob such as pi0?"),
+        ("pi0[3]", "for machines write pi03, or a glob such as pi0?"),
+        (
+            "pi0[-1]",
+            "counts places in a group, and none is named pi0; there are all, tower, chiefs",
+        ),
+        ("twer[0:1]", "counts places in a group, and none is named twer, did you mean tower?"),
         ("tower[1-3]", "write tower[1:3] for places, ~tower[1-3] for names"),
         ("tower[9]", "tower[9]: tower has 6 machines"),
         ("tower[7:9]", "means no machine; there are pi01"),
