@@ -20,7 +20,7 @@ from typing import Any
 
 from cosmos_cli.bundle import pack_run
 from cosmos_cli.earlier import Earlier
-from cosmos_cli.errors import ExitCode, InputError, RunFailedError
+from cosmos_cli.errors import ExitCode, RunFailedError
 from cosmos_cli.expectation import HOST, Expected, find_missing, mapping_at
 from cosmos_cli.gather import Gathered, Progress, gather
 from cosmos_cli.manifest import build_manifest
@@ -30,11 +30,11 @@ from cosmos_cli.retrieve.sources import Sources
 from cosmos_cli.rundir import RunDirectory, write_json
 from cosmos_cli.runjson import Evidence
 from cosmos_cli.statistics import clock_statistics, round_trip_statistics, tick_statistics
+from cosmos_cli.still_running import still_running
 from cosmos_cli.tables import open_tables
 from cosmos_cli.verdict import Verdict
 from madns_runtime.processes import ProcessEntry, list_processes
 
-LIVING_SHOWN_MAX = 5
 LivingProcesses = Callable[[], Sequence[ProcessEntry]]
 
 
@@ -179,13 +179,7 @@ def refuse_living(run: RunDirectory, processes: Sequence[ProcessEntry]) -> None:
         if Path(entry.run_directory).resolve().is_relative_to(run.path)
     ]
     if living:
-        shown = ", ".join(living[:LIVING_SHOWN_MAX])
-        more = (
-            f" and {len(living) - LIVING_SHOWN_MAX} more" if len(living) > LIVING_SHOWN_MAX else ""
-        )
-        raise InputError(
-            f"{run.name} is still running: {shown}{more}; wait for its end, or end it with: cosmos down"
-        )
+        raise still_running(run.name, {"": living})
 
 
 @dataclass(frozen=True, slots=True)

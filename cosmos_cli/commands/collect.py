@@ -10,11 +10,13 @@ import typer
 from cosmos_cli.commands.fleet_options import FORKS_DEFAULT, AcceptHostKeysOption, ForksOption
 from cosmos_cli.commands.runs import RunsOption
 from cosmos_cli.console import Console, JsonOption, QuietOption, losing_output
+from cosmos_cli.counted import counted
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.problem import Problem
 from cosmos_cli.progress import told_progress
 from cosmos_cli.rundir import RunDirectory, find_run, runs_root
+from cosmos_cli.still_running import still_running
 from madns_runtime.processes import list_processes
 
 if TYPE_CHECKING:
@@ -81,17 +83,19 @@ def _retrieved(
             return tuple(
                 Problem(machine=each.machine, text=NOT_ASKED, step="collect") for each in due
             )
-        outcomes = _fetch(retrieval, progress)
+        outcomes = _fetch(run, retrieval, progress)
     tell_outcomes(console, [o for o in outcomes if o.machine in {each.machine for each in due}])
     return problems_of(outcomes)
 
 
 def _fetch(
-    retrieval: Retrieval, progress: Callable[[str, float], None]
+    run: RunDirectory, retrieval: Retrieval, progress: Callable[[str, float], None]
 ) -> list[Outcome[Retrieved]]:
     with retrieval:
-        progress(f"asking {len(retrieval.due)} machines", 0.0)
-        retrieval.refuse_living()
+        progress(f"asking {counted(len(retrieval.due), 'machine')}", 0.0)
+        living = retrieval.find_living()
+        if living:
+            raise still_running(run.name, living)
         return retrieval.fetch()
 
 
