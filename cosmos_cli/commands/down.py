@@ -14,8 +14,8 @@ from cosmos_cli.commands.fleet_options import (
     AcceptHostKeysOption,
     ForksOption,
     LimitOption,
+    SomeInventoryOption,
 )
-from cosmos_cli.commands.run import SomeInventoryOption
 from cosmos_cli.console import Console, JsonOption, QuietOption
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.fleet.connection import ConnectOptions

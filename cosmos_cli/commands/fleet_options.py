@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cosmos_cli.errors import InputError
 from cosmos_cli.fleet.fleet import Fleet, fleet_of
 from cosmos_cli.fleet.pool import FORKS_DEFAULT
+
+if TYPE_CHECKING:
+    from cosmos_cli.models.inventory import Machine
 
 __all__ = [
     "FORKS_DEFAULT",
     "AcceptHostKeysOption",
     "Fleet",
     "ForksOption",
+    "HostOption",
     "InventoryOption",
     "LimitOption",
+    "SomeInventoryOption",
     "fleet_of",
+    "some_machines",
 ]
 
 InventoryOption = Annotated[
@@ -28,6 +35,22 @@ InventoryOption = Annotated[
         metavar="FILE",
         envvar="COSMOS_INVENTORY",
         help="Inventory: the machines to work on.",
+    ),
+]
+SomeInventoryOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--inventory",
+        "-i",
+        metavar="FILE",
+        envvar="COSMOS_INVENTORY",
+        help="Inventory: the machines to run on; default: this computer alone.",
+    ),
+]
+HostOption = Annotated[
+    str | None,
+    typer.Option(
+        "--host", metavar="MACHINE", help="Machine that runs the host; default: this computer."
     ),
 ]
 LimitOption = Annotated[
@@ -54,3 +77,25 @@ AcceptHostKeysOption = Annotated[
         help="Record unknown host keys in known_hosts; a changed one is always refused.",
     ),
 ]
+
+
+def some_machines(
+    inventory: Path | None, limit: str | None, host: str | None
+) -> tuple[Machine, ...]:
+    """
+    Return the machines that a run would have: the inventory's, or this computer alone.
+
+    Raises:
+        InputError: Faults of the inventory or the pattern; or a host, and no inventory that it could be in.
+    """
+    # Imported late: most commands that have the options above never read an inventory's models.
+    from cosmos_cli.models.inventory import load_machines
+    from cosmos_cli.plan import LOOPBACK
+
+    if inventory is not None:
+        return load_machines(inventory, limit)
+    if host is not None:
+        raise InputError(
+            f"--host {host}: there is no machine without an inventory; give one with -i"
+        )
+    return (LOOPBACK,)

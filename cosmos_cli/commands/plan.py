@@ -9,12 +9,18 @@ from typing import Annotated
 
 import typer
 
+from cosmos_cli.commands.fleet_options import (
+    HostOption,
+    LimitOption,
+    SomeInventoryOption,
+    some_machines,
+)
 from cosmos_cli.console import Column, Console, JsonOption, SetOption
+from cosmos_cli.counted import counted
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.feasibility import BITS_PER_BYTE, Feasibility, Inequality, Resources, judge
-from cosmos_cli.models.inventory import load_inventory
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
-from cosmos_cli.plan import LOOPBACK, LaunchPlan, make_plan
+from cosmos_cli.plan import LaunchPlan, make_plan
 from madns_runtime.plugin.api import Flow
 from madns_runtime.plugin.questions import ask_demand
 
@@ -49,16 +55,9 @@ INEQUALITIES = (
 
 def plan(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Scenario file.")],
-    inventory: Annotated[
-        Path | None,
-        typer.Option(
-            "--inventory",
-            "-i",
-            metavar="FILE",
-            envvar="COSMOS_INVENTORY",
-            help="Inventory file; without one, agents run on this computer.",
-        ),
-    ] = None,
+    inventory: SomeInventoryOption = None,
+    limit: LimitOption = None,
+    host: HostOption = None,
     set_: SetOption = None,
     bandwidth_mbit: Annotated[
         float, typer.Option(min=0.001, help="Bandwidth of the host's link, Mbit/s (B_n).")
@@ -82,7 +81,8 @@ def plan(
     scenario_file = load_scenario(file, set_ or ())
     launch_plan = make_plan(
         scenario_file.scenario,
-        load_inventory(inventory) if inventory else (LOOPBACK,),
+        some_machines(inventory, limit, host),
+        host=host,
         fault_at=scenario_file.fault,
     )
     latency_s, latency_source = _latency(latency_ms, launch_plan)
@@ -167,6 +167,8 @@ def _show_placement(console: Console, launch_plan: LaunchPlan) -> None:
         for machine in launch_plan.machines
     ]
     console.table(PLACEMENT, rows)
+    if launch_plan.host:
+        console.data(f"the host runs on {launch_plan.host.name}")
     if launch_plan.idle:
         console.data(f"without an agent: {', '.join(launch_plan.idle)}")
     for note in launch_plan.notes:
@@ -194,14 +196,15 @@ def _show_feasibility(
 
 
 def _verdict(feasibility: Feasibility) -> str:
-    binding = feasibility.binding
+    agents, binding = counted(feasibility.agents, "agent"), feasibility.binding
     if not feasibility.holds:
         broken = ", ".join(item.number for item in feasibility.inequalities if not item.holds)
-        return f"{feasibility.agents} agents cannot keep real time: inequality {broken} is broken"
+        return f"{agents} cannot keep real time: inequality {broken} is broken"
     limit = f"binds first, at {binding.breaks_at:g} agents"
     if math.isinf(binding.breaks_at):
         limit = "is the closest, and sets no limit in agents"
-    return f"{feasibility.agents} agents keep real time; {binding.number} {limit}"
+    verb = "keeps" if feasibility.agents == 1 else "keep"
+    return f"{agents} {verb} real time; {binding.number} {limit}"
 
 
 def _row(item: Inequality) -> tuple[str, ...]:

@@ -14,9 +14,10 @@ from cosmos_cli.commands.fleet_options import (
     AcceptHostKeysOption,
     ForksOption,
     LimitOption,
+    SomeInventoryOption,
 )
-from cosmos_cli.commands.run import SomeInventoryOption
 from cosmos_cli.console import Column, Console, JsonOption, QuietOption
+from cosmos_cli.counted import counted
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.onboard.processes import age_s
@@ -31,13 +32,13 @@ from madns_runtime.processes import ProcessEntry
 
 HERE = "(here)"
 COLUMNS = (
-    Column("RUN"),
-    Column("MACHINE"),
-    Column("ROLE"),
-    Column("NAME"),
-    Column("PID", is_number=True),
-    Column("AGE", is_number=True),
-    Column("DIRECTORY"),
+    Column("run"),
+    Column("machine"),
+    Column("role"),
+    Column("name"),
+    Column("pid", is_number=True),
+    Column("age", is_number=True),
+    Column("directory"),
 )
 
 
@@ -56,7 +57,8 @@ class Part:
 
 def ps(
     run: Annotated[
-        str | None, typer.Argument(metavar="RUN", help="Number, name or directory of a run; all.")
+        str | None,
+        typer.Argument(metavar="RUN", help="Number, name or directory of a run; default: all."),
     ] = None,
     inventory: SomeInventoryOption = None,
     limit: LimitOption = None,
@@ -157,7 +159,9 @@ def _rows(part: Part, *, is_every_agent: bool) -> list[list[str]]:
         # One process may hold several agents; its name lists them.
         count = sum(len(entry.name.split(",")) for entry in agents)
         oldest = age_words(max(part.ages_s[entry.pid] for entry in agents))
-        rows.append([part.run, machine, "agents", f"{count} agents", "", oldest, part.directory])
+        rows.append(
+            [part.run, machine, "agents", counted(count, "agent"), "", oldest, part.directory]
+        )
     return rows
 
 

@@ -12,38 +12,24 @@ from cosmos_cli.commands.fleet_options import (
     FORKS_DEFAULT,
     AcceptHostKeysOption,
     ForksOption,
+    HostOption,
     LimitOption,
+    SomeInventoryOption,
+    some_machines,
 )
 from cosmos_cli.console import Console, JsonOption, QuietOption, SetOption, losing_output
-from cosmos_cli.errors import InputError
 from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.launch.execute import Detached, RunOptions, execute
-from cosmos_cli.models.inventory import Machine, load_machines
 from cosmos_cli.models.loading import load_scenario
-from cosmos_cli.plan import LOOPBACK
 from cosmos_cli.rundir import runs_root
 from cosmos_cli.view.factory import make_view
-
-SomeInventoryOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--inventory",
-        "-i",
-        metavar="FILE",
-        envvar="COSMOS_INVENTORY",
-        help="Inventory: the machines to run on; without one, this computer alone.",
-    ),
-]
 
 
 def run(
     scenario: Annotated[Path, typer.Argument(metavar="SCENARIO", help="Scenario file.")],
     inventory: SomeInventoryOption = None,
     limit: LimitOption = None,
-    host: Annotated[
-        str | None,
-        typer.Option(metavar="MACHINE", help="Machine that runs the host; this computer."),
-    ] = None,
+    host: HostOption = None,
     detach: Annotated[
         bool, typer.Option("--detach", help="Leave the run to itself once it is under way.")
     ] = False,
@@ -56,7 +42,9 @@ def run(
     ] = None,
     runs: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", envvar="COSMOS_RUNS", help="Folder of all runs; ./runs."),
+        typer.Option(
+            metavar="DIR", envvar="COSMOS_RUNS", help="Folder of all runs; default: ./runs."
+        ),
     ] = None,
     manual: Annotated[
         list[str] | None,
@@ -79,7 +67,7 @@ def run(
         runs=runs_root(runs),
         manual=tuple(dict.fromkeys(manual or ())),
         has_report=report,
-        machines=_machines(inventory, limit, host),
+        machines=some_machines(inventory, limit, host),
         host=host,
         is_detached=detach,
         forks=forks,
@@ -95,13 +83,3 @@ def run(
         console.print_json(dict(summary.document))
         (console.say if json else console.data)(summary.last_line)
     raise typer.Exit(int(summary.exit_code))
-
-
-def _machines(inventory: Path | None, limit: str | None, host: str | None) -> tuple[Machine, ...]:
-    if inventory is not None:
-        return load_machines(inventory, limit)
-    if host is not None:
-        raise InputError(
-            f"--host {host}: there is no machine without an inventory; give one with -i"
-        )
-    return (LOOPBACK,)

@@ -104,7 +104,7 @@ def test_ps_groups_by_run_and_counts_agents(
 
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert code == 0
-    assert lines[0] == ["RUN", "MACHINE", "ROLE", "NAME", "PID", "AGE", "DIRECTORY"]
+    assert lines[0] == ["run", "machine", "role", "name", "pid", "age", "directory"]
     assert [line[:4] for line in lines[1:]] == [
         ["0001-a", "(here)", "operator", "operator"],
         ["0002-b", "(here)", "host", "host"],

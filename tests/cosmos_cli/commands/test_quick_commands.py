@@ -22,7 +22,7 @@ TEMPLATES = ("benchmark", "constellation", "plugin")
 def cosmos(tmp_path, monkeypatch, capsys):
     """Return a function that runs the command line in an empty folder: (exit code, stdout, stderr)."""
     monkeypatch.chdir(tmp_path)
-    for name in ("COSMOS_DEBUG", "COSMOS_INVENTORY", "NO_COLOR"):
+    for name in ("COSMOS_DEBUG", "COSMOS_INVENTORY", "COSMOS_LIMIT", "NO_COLOR"):
         monkeypatch.delenv(name, raising=False)
     (tmp_path / "a.yaml").write_text(SCENARIO)
 
@@ -150,6 +150,44 @@ def test_plan_over_an_inventory_as_json(cosmos):
     assert result["resources"]["latency_source"] == "assumed"
     assert result["resources"]["workers"] == 2
     assert result["feasibility"]["holds"] is True
+
+
+def test_plan_shows_what_a_run_with_the_same_options_will_do(cosmos):
+    tower = ROOT / "inventory/tower.yaml"
+    some = ("-i", tower, "--limit", "pi01,pi02,pi05", "--host", "pi02", "--latency-ms", "0.5")
+
+    code, out, _ = cosmos("plan", "a.yaml", *some)
+    plan = json.loads(cosmos("plan", "a.yaml", *some, "--json")[1])["plan"]
+
+    assert code == 0
+    assert "the host runs on pi02" in out
+    assert plan["host"]["name"] == "pi02"
+    assert {name: len(machine["agents"]) for name, machine in plan["machines"].items()} == {
+        "pi01": 2,
+        "pi05": 1,
+    }
+
+
+def test_plan_of_a_host_without_an_inventory_is_bad_input(cosmos):
+    code, _, err = cosmos("plan", "a.yaml", "--host", "pi02")
+
+    assert code == ExitCode.BAD_INPUT
+    assert "--host pi02: there is no machine without an inventory; give one with -i" in err
+
+
+def test_plan_of_one_agent_speaks_of_one(cosmos):
+    _, out, _ = cosmos("plan", "a.yaml", "--set", "agents.count=1", "--latency-ms", "0.5")
+
+    assert "\n1 agent keeps real time; " in out
+
+
+@pytest.mark.parametrize("verb", ["run", "plan"])
+def test_help_says_what_holds_by_default(cosmos, verb):
+    _, out, _ = cosmos(verb, "--help")
+
+    words = " ".join(out.replace("│", " ").split())
+    assert "Machine that runs the host; default: this computer." in words
+    assert "the machines to run on; default: this computer alone." in words
 
 
 def test_plan_without_a_latency_measures_loopback(cosmos):
