@@ -14,6 +14,7 @@ import typer
 
 from cosmos_cli.commands.fleet_options import AcceptHostKeysOption, ForksOption, LimitOption
 from cosmos_cli.console import Column, Console, JsonOption, QuietOption, SetOption
+from cosmos_cli.counted import counted
 from cosmos_cli.doctor.case import Wants
 from cosmos_cli.doctor.finding import HERE, Finding, Level, grouped
 from cosmos_cli.doctor.judge import judge
@@ -31,11 +32,11 @@ from cosmos_cli.models.inventory import Machine
 FORKS_DEFAULT = 100
 """All at once: a machine is measured for some seconds, in which there is nothing to do here."""
 COLUMNS = (
-    Column("LEVEL"),
-    Column("CHECK"),
-    Column("MACHINES"),
-    Column("FOUND"),
-    Column("CURE"),
+    Column("level"),
+    Column("check"),
+    Column("machines"),
+    Column("found"),
+    Column("cure"),
 )
 HERE_ADDRESS = "127.0.0.1"
 LATENCY_S_UNKNOWN = 0.5e-3
@@ -234,7 +235,7 @@ def _verdict(
     findings: Sequence[Finding], outcomes: Sequence[Outcome[Told]], duration_s: float
 ) -> str:
     parts = [
-        f"{number} {level.value}{'' if number == 1 else 's'}"
+        counted(number, level.value)
         for level in (Level.ERROR, Level.WARNING, Level.NOTE)
         if (number := len([g for g in grouped(findings) if g.level == level]))
     ]
@@ -245,7 +246,7 @@ def _verdict(
 
 
 def _who(machines: int) -> str:
-    return f"{machines} machine{'' if machines == 1 else 's'} and {HERE}" if machines else HERE
+    return f"{counted(machines, 'machine')} and {HERE}" if machines else HERE
 
 
 def _count(findings: Sequence[Finding], level: Level) -> int:

@@ -17,6 +17,7 @@ from cosmos_cli.commands.fleet_options import (
     fleet_of,
 )
 from cosmos_cli.console import Console, JsonOption, QuietOption
+from cosmos_cli.counted import counted
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.fleet.connection import Completed, Connection
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
@@ -142,5 +143,5 @@ def _verdict(outcomes: Sequence[Outcome[Completed]]) -> str:
     count = len(outcomes)
     parts = [f"{count - bad - nonzero} ok"]
     parts += [f"{nonzero} exit status not 0"] if nonzero else []
-    parts += [f"{bad} machines failed"] if bad else []
-    return f"{count} machine{'' if count == 1 else 's'}: {', '.join(parts)}"
+    parts += [f"{counted(bad, 'machine')} failed"] if bad else []
+    return f"{counted(count, 'machine')}: {', '.join(parts)}"

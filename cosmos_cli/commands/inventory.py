@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from cosmos_cli.commands.fleet_options import InventoryOption, LimitOption
 from cosmos_cli.console import Column, Console, JsonOption
+from cosmos_cli.counted import counted
 from cosmos_cli.models.inventory import Machine, load_machines
 
 COLUMNS = (
@@ -25,7 +26,7 @@ def inventory(
     console = Console(json=json)
     machines = load_machines(inventory, limit)
     console.table(COLUMNS, [_row(machine) for machine in machines])
-    console.data(f"{len(machines)} machine{'s' if len(machines) > 1 else ''}")
+    console.data(counted(len(machines), "machine"))
     console.print_json({"machines": [_shown(machine) for machine in machines]})
 
 

@@ -20,6 +20,7 @@ from cosmos_cli.commands.fleet_options import (
     fleet_of,
 )
 from cosmos_cli.console import Console, JsonOption, QuietOption
+from cosmos_cli.counted import counted
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.connection import Connection
@@ -198,7 +199,7 @@ def _change_words(change: dict[str, Any]) -> str:
 def _verdict(outcomes: Sequence[Outcome[Changed]], duration_s: float, *, is_check: bool) -> str:
     count, bad = len(outcomes), len(failed(outcomes))
     changed = sum(map(_is_changed, outcomes))
-    machines = f"{count} machine{'' if count == 1 else 's'}"
+    machines = counted(count, "machine")
     would = "would be " if is_check else ""
     return (
         f"{machines}: {changed} {would}changed, {count - changed - bad} ok, {bad} failed"

@@ -15,6 +15,7 @@ from cosmos_cli.commands.fleet_options import (
     fleet_of,
 )
 from cosmos_cli.console import Console, JsonOption, QuietOption
+from cosmos_cli.counted import counted
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.fleet.connection import Connection
 from cosmos_cli.fleet.outcome import Outcome, failed
@@ -103,7 +104,7 @@ def _mapping(fleet: Fleet, index: int, times: Times | None) -> dict[str, Any]:
 
 
 def _verdict(count: int, bad: int) -> str:
-    machines = f"{count} machine{'' if count == 1 else 's'}"
+    machines = counted(count, "machine")
     return (
         f"{machines}: {count - bad} answered, {bad} failed" if bad else f"{machines}: all answered"
     )

@@ -18,6 +18,7 @@ from cosmos_cli.commands.fleet_options import (
     fleet_of,
 )
 from cosmos_cli.console import Console, JsonOption, QuietOption
+from cosmos_cli.counted import counted
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.fleet.connect import connect
 from cosmos_cli.fleet.fleet import Fleet
@@ -128,7 +129,7 @@ def _verdict(outcomes: Sequence[Outcome[Rebooted]], duration_s: float) -> str:
     parts = [f"{back} back"]
     parts += [f"{count - back - bad} left alone"] if count > back + bad else []
     parts += [f"{bad} failed"] if bad else []
-    machines = f"{count} machine{'' if count == 1 else 's'}"
+    machines = counted(count, "machine")
     return f"{machines}: {', '.join(parts)} in {duration_s:.1f} s"
 
 

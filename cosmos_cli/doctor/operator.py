@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from cosmos_cli.counted import counted
 from cosmos_cli.doctor.case import Case
 from cosmos_cli.doctor.finding import Level, Remark
 
@@ -106,10 +107,12 @@ def feasibility(case: Case) -> Iterator[Remark]:
         limit = item["breaks_at_agents"]
         yield Remark(
             level=Level.ERROR,
-            found=f"{told['agents']} agents cannot keep real time: inequality {item['equation']} is broken"
+            found=f"{counted(told['agents'], 'agent')} cannot keep real time: inequality {item['equation']} is broken"
             f" ({item['name']}: {item['left']:.4g} {item['relation']} {item['right']:.4g} {item['unit']})",
             cure="`cosmos plan` shows all four"
             + (f"; fewer than {limit:g} agents keep it" if limit and limit > 1 else ""),
         )
     if not broken:
-        yield Remark(found=f"{told['agents']} agents keep real time (the four inequalities hold)")
+        yield Remark(
+            found=f"{counted(told['agents'], 'agent')} can keep real time (the four inequalities hold)"
+        )

@@ -13,6 +13,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from cosmos_cli.counted import counted
 from cosmos_cli.expectation import mapping_at
 from cosmos_cli.report.build import build_sections, figures_of, open_source
 from cosmos_cli.report.model import Figure, Remark, Section, TableBlock, format_cell
@@ -198,7 +199,8 @@ def _head(document: Mapping[str, Any]) -> str:
 def _facts(document: Mapping[str, Any]) -> Iterator[str]:
     agents = mapping_at(document, "agents")
     yield f"scenario {document.get('scenario')}"
-    yield f"{agents.get('count')} agents"
+    count = agents.get("count")
+    yield counted(count, "agent") if isinstance(count, int) else "agents not counted"
     duration_s = document.get("duration_s")
     if isinstance(duration_s, int | float):
         yield f"{duration_s:g} s simulated"

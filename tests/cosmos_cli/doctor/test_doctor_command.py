@@ -87,7 +87,7 @@ def test_this_computer_alone(told: Callable[..., None], capsys: pytest.CaptureFi
 
     out = capsys.readouterr().out
     assert code == 0
-    assert out.splitlines()[0].split() == ["LEVEL", "CHECK", "MACHINES", "FOUND", "CURE"]
+    assert out.splitlines()[0].split() == ["level", "check", "machines", "found", "cure"]
     assert "SCHED_FIFO with priority 11 is permitted" in out
     assert out.splitlines()[-1].startswith(f"{HERE}: ")
 
