@@ -110,12 +110,10 @@ class Sshd:
 
     def __exit__(self, *exc: object) -> None:
         assert self.process is not None
-        sessions = self.sessions()
+        os.kill(self.process.pid, signal.SIGSTOP)
+        self.cut()
         self.process.kill()
         self.process.wait()
-        for pid in sessions:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
 
     def sessions(self) -> list[int]:
         """Pids of the server's children, and theirs: one tree a connection."""
@@ -124,21 +122,33 @@ class Sshd:
 
     def cut(self) -> None:
         """Kill what serves the open connections; the server itself goes on."""
-        for pid in self.sessions():
+        for pid in self._signal(
+            signal.SIGSTOP
+        ):  # who is stopped starts nobody that would be missed
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
 
     def freeze(self) -> None:
         """Stop the server and its sessions, as a hung machine would be."""
         assert self.process is not None
-        for pid in (*self.sessions(), self.process.pid):
-            os.kill(pid, signal.SIGSTOP)
+        os.kill(self.process.pid, signal.SIGSTOP)
+        self._signal(signal.SIGSTOP)
 
     def thaw(self) -> None:
         """Let them go on."""
         assert self.process is not None
-        for pid in (*self.sessions(), self.process.pid):
-            os.kill(pid, signal.SIGCONT)
+        self._signal(signal.SIGCONT)
+        os.kill(self.process.pid, signal.SIGCONT)
+
+    def _signal(self, number: int) -> set[int]:
+        """Send a signal to all sessions, also to a process that one of them is just starting."""
+        told: set[int] = set()
+        while new := set(self.sessions()) - told:
+            for pid in new:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, number)
+            told |= new
+        return told
 
     def _listens(self) -> bool:
         return "Server listening" in self.log.read_text(encoding="utf-8")

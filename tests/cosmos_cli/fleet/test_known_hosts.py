@@ -1,6 +1,7 @@
 """Which host keys are known, changed, revoked; and how an unknown one is recorded."""
 
 import base64
+import fcntl
 import os
 import stat
 import subprocess
@@ -193,6 +194,21 @@ def test_many_threads_record_whole_lines(tmp_path):
 
     found = [entry.patterns for entry in parse(file.read_text())]
     assert sorted(f"pi{n}" for n in range(20)) == sorted(found)
+
+
+def test_who_records_waits_for_another_process_and_sees_what_it_wrote(tmp_path):
+    file = tmp_path / "known_hosts"
+    recording = threading.Thread(target=lambda: KnownHosts([file]).record("pi", A))
+    with file.open("ab") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)  # a lock of its own to each open file, as to each process
+        recording.start()
+        recording.join(0.2)
+        is_waiting = recording.is_alive()
+        held.write(line("pi", A).encode())
+    recording.join(20.0)
+
+    assert is_waiting
+    assert file.read_text() == line("pi", A)
 
 
 def test_hashed_name_tells_nobody_which_machine_it_is_but_is_found(tmp_path):

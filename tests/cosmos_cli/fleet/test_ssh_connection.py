@@ -429,15 +429,18 @@ def test_machine_behind_a_jump_host_that_is_not_reached_is_told(known, home):
     assert "the jump host does not reach it" in caught.value.text
 
 
-def test_jump_host_for_all_hosts_is_not_its_own(known, home):
+def test_jump_host_for_all_hosts_is_not_its_own(own_sshd, home):
     write_configuration(
         home / ".ssh" / "config",
         "Host *",
-        f"  ProxyJump {known.user}@127.0.0.1:{known.port}",
-        f"  IdentityFile {known.user_key}",
+        f"  ProxyJump {own_sshd.user}@127.0.0.1:{own_sshd.port}",
+        f"  IdentityFile {own_sshd.user_key}",
     )
 
-    assert says(target_of(known, address="localhost", key_file=None), options=ACCEPT) == b"hello\n"
+    assert (
+        says(target_of(own_sshd, address="localhost", key_file=None), options=ACCEPT) == b"hello\n"
+    )
+    assert own_sshd.log.read_text().count("Accepted publickey") == 2
 
 
 PIPE = (

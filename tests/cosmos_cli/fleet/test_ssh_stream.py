@@ -1,5 +1,6 @@
 """A program over a real SSH connection: bytes both ways, its end, its errors, and a connection that breaks."""
 
+import contextlib
 import os
 import selectors
 import signal
@@ -126,6 +127,34 @@ def test_loop_sees_every_byte_beside_a_flood_of_errors(connection):
 
     assert bytes(data).split(b"\n")[:-1] == [b"out %d" % n for n in range(300)]
     assert len(stream.errors()) <= 16384
+    stream.close()
+
+
+def test_loop_is_woken_by_errors_that_would_fill_the_window(connection):
+    stream = connection.open("head -c 12000000 /dev/zero >&2; echo done")
+    said = b""
+    with selectors.DefaultSelector() as selector:
+        selector.register(stream, selectors.EVENT_READ)
+        while not said:
+            assert selector.select(WAIT_S), "nobody was woken to make room"
+            with contextlib.suppress(BlockingIOError):
+                said = stream.read(100)
+
+    assert said == b"done\n"
+    stream.close()
+
+
+def test_loop_is_woken_again_for_what_it_left(connection):
+    stream = connection.open("echo 0123456789; read line")
+    pieces = []
+    with selectors.DefaultSelector() as selector:
+        selector.register(stream, selectors.EVENT_READ)
+        while b"".join(pieces) != b"0123456789\n":
+            assert selector.select(WAIT_S), "what was left is forgotten"
+            with contextlib.suppress(BlockingIOError):
+                pieces.append(stream.read(3))
+
+    assert max(map(len, pieces)) == 3
     stream.close()
 
 

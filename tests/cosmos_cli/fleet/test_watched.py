@@ -88,6 +88,19 @@ def test_end_of_standard_input_ends_it_and_its_children(here, command):
     stream.close()
 
 
+def test_command_is_asked_to_end_before_it_is_made_to(here, tmp_path):
+    command = f"trap 'echo asked > {tmp_path}/asked; exit' TERM; echo ready; sleep 60 & wait"
+    stream = here.open(watched(command))
+    assert stream.read_some(100, timeout_s=WAIT_S) == b"ready\n"
+    stream.close_writing()
+
+    until_s = time.monotonic() + WAIT_S
+    while not (tmp_path / "asked").exists() and time.monotonic() < until_s:
+        time.sleep(0.02)
+    assert (tmp_path / "asked").exists()
+    stream.close()
+
+
 def test_local_command_has_a_deadline_that_its_children_keep(here, tmp_path):
     with pytest.raises(MachineFailure) as caught:
         here.run(f"echo $$ > {tmp_path}/group; sleep 60 & sleep 61", timeout_s=0.3)

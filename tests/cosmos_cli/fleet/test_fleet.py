@@ -1,0 +1,74 @@
+"""A fleet connects, works and closes: also when a task fails, and when the operator interrupts it."""
+
+import _thread
+import threading
+
+import pytest
+
+from cosmos_cli.fleet import fleet as module
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.fleet import Fleet, fleet_of
+from cosmos_cli.fleet.target import Target
+
+WAIT_S = 20.0
+TARGETS = tuple(Target(name=f"pi{n}", address=f"10.0.0.{n}") for n in range(3))
+
+
+class Pretended:
+    """A connection that notes whether it was closed."""
+
+    def __init__(self, target):
+        self.target = target
+        self.closed = threading.Event()
+
+    def close(self):
+        self.closed.set()
+
+
+@pytest.fixture
+def connections(monkeypatch):
+    made = {}
+
+    def connect(target, options):
+        if target.name == "pi2":
+            raise MachineFailure(FailureKind.REFUSED, "refused")
+        made[target.name] = Pretended(target)
+        return made[target.name]
+
+    monkeypatch.setattr(module, "connect", connect)
+    return made
+
+
+def test_every_connection_is_closed_whatever_its_task_did(connections):
+    def task(connection):
+        if connection.target.name == "pi1":
+            raise MachineFailure(FailureKind.STEP, "failed")
+        return connection.target.address
+
+    outcomes = Fleet(targets=TARGETS).each_target(task)
+
+    assert [outcome.value for outcome in outcomes] == ["10.0.0.0", None, None]
+    kinds = [outcome.failure.kind for outcome in outcomes if outcome.failure]
+    assert kinds == [FailureKind.STEP, FailureKind.REFUSED]
+    assert all(connection.closed.is_set() for connection in connections.values())
+
+
+def test_interrupt_closes_what_is_open_so_that_what_runs_there_ends(connections):
+    def task(connection):
+        if connection.target.name == "pi1":
+            _thread.interrupt_main()
+        assert connection.closed.wait(WAIT_S)
+
+    with pytest.raises(KeyboardInterrupt):
+        Fleet(targets=TARGETS[:2]).each_target(task)
+
+    assert all(connection.closed.is_set() for connection in connections.values())
+
+
+def test_task_is_given_what_the_inventory_says_of_its_machine(connections, tmp_path):
+    inventory = tmp_path / "tower.yaml"
+    inventory.write_text("all:\n  hosts:\n    pi0: {cosmos_devices: [sense_hat]}\n    pi1:\n")
+
+    outcomes = fleet_of(inventory, forks=2).each(lambda _, machine: machine.devices)
+
+    assert [outcome.value for outcome in outcomes] == [("sense_hat",), ()]
