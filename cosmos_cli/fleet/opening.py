@@ -8,9 +8,6 @@ word was said, as one does that is just starting; a refused login never is.
 from __future__ import annotations
 
 import contextlib
-import importlib
-import sys
-import threading
 import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -24,9 +21,6 @@ from cosmos_cli.fleet.wire import Wire, connect_tcp, connect_through_command
 
 if TYPE_CHECKING:
     from cosmos_cli.fleet.ssh import SshConnection
-
-UNWANTED = "invoke"
-_IMPORTING = threading.Lock()
 
 PAUSES_S = (0.2, 0.5, 1.0)
 """Before the second and each further attempt."""
@@ -78,7 +72,7 @@ def _open_once(
         hops = _hops(settings, options, trail, opened)
         wire = _wire(settings, hops, max(TIMEOUT_S_MIN, until_s - time.monotonic()))
         importing_s = time.monotonic()
-        import_paramiko()  # now that the servers of the first machines have begun to start
+        # Here, when the servers of the first machines have begun to start: see `ssh`.
         from cosmos_cli.fleet.ssh import SshConnection, log_in
 
         importing_s -= time.monotonic()  # negative: not the machine's time
@@ -86,24 +80,6 @@ def _open_once(
         connection.opening_s = importing_s
         opened.pop_all()
         return connection
-
-
-def import_paramiko() -> None:
-    """
-    Import paramiko without the task runner that it loads for one criterion of ssh configurations.
-
-    We read those ourselves, and that runner (with a YAML parser, asyncio and a mock library) takes as long
-    to import as all the rest: 0.06 s. paramiko does without it where it is not installed, and so it is here
-    while paramiko is imported.
-    """
-    with _IMPORTING:
-        if "paramiko" in sys.modules or UNWANTED in sys.modules:
-            return
-        sys.modules[UNWANTED] = None  # type: ignore[assignment]
-        try:
-            importlib.import_module("paramiko")
-        finally:
-            del sys.modules[UNWANTED]
 
 
 def _hops(

@@ -1,14 +1,19 @@
 """
-A machine over SSH: paramiko's transport with strict host keys and few login attempts.
+A machine over SSH: Fabric's connection with strict host keys and few login attempts.
 
-Imported after a wire is open: importing paramiko takes longer than the servers need to start.
+Imported after a wire is open: importing paramiko and Fabric takes longer than the servers need to start.
 """
 
 from __future__ import annotations
 
+import functools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
+import fabric
+from paramiko.client import MissingHostKeyPolicy
+from paramiko.config import SSHConfig
 from paramiko.pkey import PKey
 from paramiko.ssh_exception import ChannelException, SSHException
 
@@ -23,7 +28,7 @@ from cosmos_cli.fleet.ssh_failures import (
     lost,
     opening_failure,
 )
-from cosmos_cli.fleet.ssh_keys import KeyLogin
+from cosmos_cli.fleet.ssh_keys import FewKeys
 from cosmos_cli.fleet.ssh_settings import SshSettings
 from cosmos_cli.fleet.ssh_stream import READ_BYTES, SshStream, wait_for
 from cosmos_cli.fleet.ssh_transport import SshTransport, make_transport
@@ -43,7 +48,7 @@ class SshConnection:
 
     Args:
         target: Its entry in the inventory.
-        transport: Logged in.
+        connection: Fabric's, open.
         wire: Below it.
         hops: The jump hosts' connections, closed with this one.
     """
@@ -51,15 +56,21 @@ class SshConnection:
     def __init__(
         self,
         target: Target,
-        transport: SshTransport,
+        connection: fabric.Connection,
         wire: Wire,
         hops: Sequence[SshConnection] = (),
     ) -> None:
         self.target = target
         self.opening_s = 0.0
-        self._transport = transport
+        self._connection = connection
         self._wire = wire
         self._hops = tuple(hops)
+
+    @property
+    def transport(self) -> SshTransport:
+        """Return paramiko's part."""
+        transport: SshTransport = self._connection.transport
+        return transport
 
     @property
     def own_address(self) -> str:
@@ -86,7 +97,7 @@ class SshConnection:
         finally:
             stream.close()
         if status is None:
-            raise lost() if not self._transport.is_active() else _unknown_end()
+            raise lost() if not self.transport.is_active() else _unknown_end()
         return Completed(
             exit_status=status,
             stdout=output.data,
@@ -96,11 +107,11 @@ class SshConnection:
 
     def is_alive(self, *, timeout_s: float = 2.0) -> bool:
         """Ask for a sign of life; paramiko's own keepalive notices neither a dead link nor a frozen machine."""
-        return self._transport.gives_sign(timeout_s=timeout_s)
+        return self.transport.gives_sign(timeout_s=timeout_s)
 
     def close(self) -> None:
         """Close it."""
-        self._transport.close()
+        self._connection.close()
         self._wire.close()
         for hop in reversed(self._hops):
             hop.close()
@@ -113,7 +124,7 @@ class SshConnection:
             MachineFailure: The machine does not reach it, or may not.
         """
         try:
-            channel = self._transport.open_channel(
+            channel = self.transport.open_channel(
                 "direct-tcpip", (host, port), (LOOPBACK, 0), timeout=timeout_s
             )
         except ChannelException as error:
@@ -124,7 +135,7 @@ class SshConnection:
 
     def _start(self, command: str, errors: BoundedOutput | None = None) -> SshStream:
         try:
-            channel = self._transport.start_command(command, timeout_s=OPEN_TIMEOUT_S)
+            channel = self.transport.start_command(command, timeout_s=OPEN_TIMEOUT_S)
         except ChannelException as error:
             raise MachineFailure(
                 FailureKind.BUSY,
@@ -133,7 +144,7 @@ class SshConnection:
             ) from error
         except (SSHException, OSError, EOFError) as error:
             raise lost(error) from error
-        return SshStream(channel, self._transport, errors)
+        return SshStream(channel, self.transport, errors)
 
 
 def _unknown_end() -> MachineFailure:
@@ -181,7 +192,7 @@ def _feed(stream: SshStream, pending: memoryview) -> memoryview:
 
 def log_in(
     settings: SshSettings, options: ConnectOptions, wire: Wire, until_s: float
-) -> SshTransport:
+) -> fabric.Connection:
     """
     Log in at a machine whose wire is open.
 
@@ -196,30 +207,60 @@ def log_in(
     """
     known = KnownHosts(settings.known_hosts)
     timeout_s = max(TIMEOUT_S_MIN, until_s - time.monotonic())
-    transport = make_transport(wire, known.kinds(settings.names), timeout_s=timeout_s)
+    connection = fabric.Connection(
+        settings.host,
+        user=settings.user,
+        port=settings.port,
+        config=_config(),
+        forward_agent=False,
+        connect_kwargs={
+            "sock": wire,
+            "timeout": timeout_s,
+            "banner_timeout": timeout_s,
+            "auth_timeout": timeout_s,
+            "transport_factory": _factory(known.kinds(settings.names)),
+            "auth_strategy": FewKeys(settings),
+        },
+    )
+    connection.client.set_missing_host_key_policy(_StrictHostKeys(settings, options, known))
     try:
-        transport.start_client(timeout=timeout_s)
-        _check_host_key(transport.get_remote_server_key(), known, settings, options)
-        KeyLogin(settings).authenticate(transport)
-    except BaseException as error:
-        transport.close()
-        wire.close()
-        if not isinstance(error, SSHException | OSError | EOFError):
-            raise
-        has_spoken = bool(transport.remote_version)
+        connection.open()
+    except (SSHException, OSError, EOFError) as error:
+        transport = connection.client.get_transport()
+        has_spoken = transport is not None and bool(transport.remote_version)
         raise opening_failure(error, settings.where, timeout_s, has_spoken=has_spoken) from error
-    return transport
+    finally:
+        if connection.transport is None:
+            connection.client.close()
+            wire.close()
+    return connection
 
 
-def _check_host_key(
-    key: PKey, known: KnownHosts, settings: SshSettings, options: ConnectOptions
-) -> None:
-    """Accept a known key, record an unknown one if that is wanted, refuse every other."""
-    shown = HostKey(kind=key.get_name(), blob=key.asbytes())
-    verdict = known.judge(settings.names, shown)
-    accepts_new = options.accept_new_host_keys or settings.accepts_new_host_keys
-    if verdict.standing is Standing.UNKNOWN and accepts_new:
-        is_hashed = settings.hashes_known_hosts
-        verdict = known.record(settings.names[0], shown, is_hashed=is_hashed)
-    if verdict.standing is not Standing.KNOWN:
-        raise host_key_failure(verdict, shown, settings.names, settings.where)
+def _factory(known_kinds: list[str]) -> Callable[..., SshTransport]:
+    return lambda sock, disabled_algorithms: make_transport(sock, known_kinds)
+
+
+@functools.lru_cache(maxsize=1)
+def _config() -> fabric.Config:
+    """Return one empty configuration for all: Fabric's files and ssh's are none of its business here."""
+    return fabric.Config(ssh_config=SSHConfig(), lazy=True)
+
+
+class _StrictHostKeys(MissingHostKeyPolicy):
+    """Judges every host key: Fabric's own lists stay empty, so that it always asks here."""
+
+    def __init__(self, settings: SshSettings, options: ConnectOptions, known: KnownHosts) -> None:
+        self._settings = settings
+        self._accepts_new = options.accept_new_host_keys or settings.accepts_new_host_keys
+        self._known = known
+
+    def missing_host_key(self, client: Any, hostname: str, key: PKey) -> None:
+        """Accept a known key, record an unknown one if that is wanted, refuse every other."""
+        settings = self._settings
+        shown = HostKey(kind=key.get_name(), blob=key.asbytes())
+        verdict = self._known.judge(settings.names, shown)
+        if verdict.standing is Standing.UNKNOWN and self._accepts_new:
+            is_hashed = settings.hashes_known_hosts
+            verdict = self._known.record(settings.names[0], shown, is_hashed=is_hashed)
+        if verdict.standing is not Standing.KNOWN:
+            raise host_key_failure(verdict, shown, settings.names, settings.where)

@@ -41,9 +41,9 @@ OPENSSH_MAGIC = b"openssh-key-v1\0"
 _LOADING = threading.Lock()
 
 
-class KeyLogin:
+class FewKeys:
     """
-    Logs in with the first key that the machine takes.
+    Logs in with the first key that the machine takes; what paramiko calls a strategy.
 
     Args:
         settings: Of the machine.

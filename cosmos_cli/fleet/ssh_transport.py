@@ -137,14 +137,13 @@ class SshTransport(Transport):
             self._news.notify_all()
 
 
-def make_transport(wire: Wire, known_kinds: Sequence[str], *, timeout_s: float) -> SshTransport:
+def make_transport(wire: Wire, known_kinds: Sequence[str]) -> SshTransport:
     """
     Return a transport that asks for a host key of a kind that is known of this machine.
 
     Left to its own order, paramiko would get another one and take a known machine for unknown.
     """
     transport = SshTransport(wire)
-    transport.banner_timeout = transport.handshake_timeout = transport.auth_timeout = timeout_s
     options = transport.get_security_options()
     options.key_types = ordered(tuple(options.key_types), known_kinds)
     return transport

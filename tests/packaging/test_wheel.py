@@ -16,7 +16,7 @@ from madns_runtime.plugin.registry import registered_names, resolve, load_half
 from pathlib import Path
 for name in registered_names():
     load_half(resolve(name, Path(".")), "agent", Path("."))
-heavy = {"scipy", "sgp4", "pydantic", "typer", "rich", "yaml", "paramiko", "pyarrow", "plotly"}
+heavy = {"scipy", "sgp4", "pydantic", "typer", "rich", "yaml", "fabric", "pyarrow", "plotly"}
 found = sorted(heavy & {module.partition(".")[0] for module in sys.modules})
 assert not found, found
 print(",".join(registered_names()))

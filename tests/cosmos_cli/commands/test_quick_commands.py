@@ -386,7 +386,7 @@ def test_validate_imports_only_what_it_needs(tmp_path):
     (tmp_path / "a.yaml").write_text(SCENARIO)
     code = (
         "import sys; from cosmos_cli import app; app.run(['validate', 'a.yaml']);"
-        "print([m for m in ('numpy', 'scipy', 'rich', 'pyarrow', 'paramiko', 'asyncio') if m in sys.modules])"
+        "print([m for m in ('numpy', 'scipy', 'rich', 'pyarrow', 'fabric', 'asyncio') if m in sys.modules])"
     )
 
     result = subprocess.run(

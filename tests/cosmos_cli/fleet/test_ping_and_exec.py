@@ -148,7 +148,7 @@ def test_exec_on_a_machine_that_fails_ends_with_3_and_shows_the_others(inventory
     said = capsys.readouterr()
     assert sorted(said.out.splitlines()) == ["pi1 | 1", "pi2 | 2", "pi3 | 3"]
     assert "bad ! 127.0.0.1 port" in said.err
-    assert "4 machines: 0 ok, 3 exit status not 0, 1 machines failed" in said.err
+    assert "4 machines: 0 ok, 3 exit status not 0, 1 machine failed" in said.err
 
 
 def test_exec_tells_scripts_all_of_it(inventory, capsys):
