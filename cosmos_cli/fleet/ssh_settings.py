@@ -30,7 +30,9 @@ TAKES_UNKNOWN_KEYS = ("accept-new", "no", "off")
 """A changed key is refused whatever stands here."""
 
 _READING = threading.Lock()
-_HOP = re.compile(r"(?:ssh://)?(?:(?P<user>[^@]+)@)?(?P<host>\[[^]]+\]|[^:@]+)(?::(?P<port>\d+))?/?")
+_HOP = re.compile(
+    r"(?:ssh://)?(?:(?P<user>[^@]+)@)?(?P<host>\[[^]]+\]|[^:@]+)(?::(?P<port>\d+))?/?"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
