@@ -11,6 +11,7 @@ import orjson
 from cosmos_cli.expectation import Expected, mapping_at
 from cosmos_cli.packets import SERVICES, duplicates_by_service, packet_counts
 from cosmos_cli.problem import Problem
+from cosmos_cli.refusals import affinity_remarks
 from cosmos_cli.rundir import SCHEMA
 from cosmos_cli.statistics import TickStatistics, TickTotals, tick_totals
 from cosmos_cli.streams import StreamScan
@@ -96,6 +97,7 @@ class Evidence:
             records_dropped=sum(scan.dropped for scan in self.scans),
             records_truncated=sum(scan.truncated for scan in self.scans),
             plugin_checks=tuple(self._plugin_checks()),
+            remarks=affinity_remarks(mapping_at(result, "agents")),
         )
 
     def _plugin_checks(self) -> list[Any]:

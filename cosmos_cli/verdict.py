@@ -76,6 +76,8 @@ class Facts:
     records_dropped: int = 0
     records_truncated: int = 0
     plugin_checks: tuple[CheckResult, ...] = ()
+    remarks: tuple[str, ...] = ()
+    """What should be known of the run and decides nothing, such as processors that were refused."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,7 +92,7 @@ class Verdict:
     reason: str | None
     checks: tuple[CheckResult, ...]
     remarks: tuple[str, ...] = ()
-    """What was not judged, and why."""
+    """What was not judged, and why; what agents were refused."""
 
     @property
     def broken(self) -> tuple[CheckResult, ...]:
@@ -116,7 +118,7 @@ def judge(facts: Facts, limits: Limits) -> Verdict:
         who=who,
         reason=reason,
         checks=tuple(checks),
-        remarks=() if _is_rate_judged(facts) else (NO_RATE,),
+        remarks=(*(() if _is_rate_judged(facts) else (NO_RATE,)), *facts.remarks),
     )
 
 

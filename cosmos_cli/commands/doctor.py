@@ -109,8 +109,11 @@ class _Examination:
         self._fleet = fleet and _remote_part(fleet)
         self._scenario_file: Any = None
         self.wants = Wants(machines=len(self._fleet.targets) if self._fleet else 0)
+        machines = fleet.machines if fleet else ()
         if scenario is not None:
-            self._read_scenario(scenario, overrides, fleet.machines if fleet else ())
+            self._read_scenario(scenario, overrides, machines)
+        affinity = _affinity(machines, self._scenario_file)
+        self.wants = dataclasses.replace(self.wants, affinity=affinity)
 
     def _read_scenario(
         self, path: Path, overrides: Sequence[str], machines: Sequence[Machine]
@@ -193,6 +196,17 @@ class _Examination:
         )
         found = feasibility_of(self._scenario_file, resources)
         return None if found is None else found.to_mapping()
+
+
+def _affinity(machines: Sequence[Machine], scenario_file: Any) -> dict[str, tuple[int, ...]]:
+    """Return the processors that agents are to use on each machine that has agents, where anybody says it."""
+    common = scenario_file.scenario.scheduling.cpu_affinity if scenario_file else ()
+    found: dict[str, tuple[int, ...]] = {} if machines else {HERE: common}
+    for machine in machines:
+        name = HERE if machine.connection == "local" else machine.name
+        own = machine.cpu_affinity or common
+        found[name] = tuple(sorted({*found.get(name, ()), *own}))
+    return found
 
 
 def _remote_part(fleet: Fleet) -> Fleet:

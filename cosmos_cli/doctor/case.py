@@ -31,6 +31,8 @@ class Wants:
     agents: Mapping[str, int] = field(default_factory=dict)
     """Agents by machine, as the scenario would place them."""
     agents_per_process: int = 1
+    affinity: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    """By machine, the processors that agents are to use there, where the inventory or the scenario says it."""
     machines: int = 0
     """Machines that are reached over SSH."""
 

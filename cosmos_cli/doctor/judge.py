@@ -31,6 +31,7 @@ CHECKS: Mapping[str, Check] = {
     "steal": realtime.steal,
     "cpu_quota": realtime.cpu_quota,
     "processors": realtime.processors,
+    "cpu_affinity": realtime.cpu_affinity,
     "timer": realtime.timer,
     "clock_source": realtime.clock_source,
     "clock": board.clock,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from cosmos_cli.doctor.case import Case
 from cosmos_cli.doctor.finding import Level, Remark
@@ -238,3 +238,28 @@ def processors(case: Case) -> Iterator[Remark]:
         if is_much
         else "",
     )
+
+
+def cpu_affinity(case: Case) -> Iterator[Remark]:
+    """Processors that agents are to use there, against those that there are."""
+    wanted = case.wants.affinity.get(case.machine, ())
+    numbers = case.part("limits").get("processor_numbers")
+    if not wanted or not numbers:
+        return
+    lacking = [number for number in wanted if number not in numbers]
+    if not lacking:
+        yield Remark(found=f"agents use its {_processor_words(wanted)}")
+        return
+    yield Remark(
+        level=Level.WARNING,
+        found=f"agents are to use its {_processor_words(lacking)}, and it has {_listed(numbers)}",
+        cure="correct cosmos_cpu_affinity in the inventory, or scheduling.cpu_affinity in the scenario",
+    )
+
+
+def _processor_words(numbers: Sequence[int]) -> str:
+    return f"processor{'' if len(numbers) == 1 else 's'} {_listed(numbers)}"
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers))

@@ -178,7 +178,14 @@ def _set_affinity(processors: tuple[int, ...]) -> str | None:
             f"processors {list(processors)} refused ({error});"
             f" this process may use {list(_affinity())}"
         )
-    return None
+    # The kernel takes a list of which it has only a part, and says nothing of the rest.
+    granted = _affinity()
+    lacking = sorted(set(processors) - set(granted))
+    return (
+        f"processors {lacking} are not there; this process may use {list(granted)}"
+        if lacking
+        else None
+    )
 
 
 def _affinity() -> tuple[int, ...]:

@@ -133,6 +133,12 @@ def test_processor_that_does_not_exist_is_a_warning(kernel, monkeypatch):
     assert "this process may use" in grant.warning
 
 
+def test_processors_of_which_only_some_exist_are_a_warning_that_names_the_others(kernel):
+    grant = apply(Scheduling(cpu_affinity=(1, 4000)), is_host=False)
+
+    assert "processors [4000] are not there; this process may use [0, 1]" in grant.warning
+
+
 def test_refused_timer_slack_and_memory_are_notes(kernel, monkeypatch):
     monkeypatch.setattr(libc, "prctl", refuse)
     monkeypatch.setattr(libc, "mlockall", refuse)

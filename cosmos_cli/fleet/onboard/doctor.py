@@ -109,6 +109,7 @@ def _limits(proc: str) -> dict[str, Any]:
     return {
         "capabilities": capabilities,
         "usable_processors": len(os.sched_getaffinity(0)),
+        "processor_numbers": sorted(os.sched_getaffinity(0)),
         "cpu_quota": _cpu_quota(
             sys_cgroup="/sys/fs/cgroup", own=_text(f"{proc}/self/cgroup") or ""
         ),

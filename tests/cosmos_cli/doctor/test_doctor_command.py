@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -168,6 +169,30 @@ def test_wants_are_the_scenarios(
     assert answer["scenario"] == "two"
     assert any(f["check"] == "feasibility" and f["level"] == "ok" for f in here["findings"])
     assert any("2 agents at 20 Hz" in f["found"] for f in machine["findings"])
+
+
+def test_processors_that_a_machine_has_not_are_told_whoever_asks_for_them(
+    told: Callable[..., None],
+    inventory: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    inventory.write_text(inventory.read_text().replace("{}", "{cosmos_cpu_affinity: [0, 4001]}"))
+    (tmp_path / "two.yaml").write_text(SCENARIO + "scheduling: {cpu_affinity: [4002]}\n")
+
+    cosmos(["doctor", "-i", str(inventory), "--limit", "pi01,here"])
+    without = capsys.readouterr().out
+    cosmos(["doctor", str(tmp_path / "two.yaml"), "-i", str(inventory), "--limit", "pi01,here"])
+    with_scenario = capsys.readouterr().out
+
+    def found(out: str) -> list[tuple[str, str]]:
+        lines = [re.split(r"  +", line) for line in out.splitlines()]
+        return [(line[2], line[3].split(",")[0]) for line in lines if line[1:2] == ["cpu_affinity"]]
+
+    of_inventory = ("pi01", "agents are to use its processor 4001")
+    of_scenario = (HERE, "agents are to use its processor 4002")
+    assert found(without) == [of_inventory]
+    assert sorted(found(with_scenario)) == sorted([of_inventory, of_scenario])
 
 
 def test_nothing_is_left_in_the_runs_folder(told: Callable[..., None], tmp_path: Path) -> None:
