@@ -108,7 +108,7 @@ class LocalStream:
 
     def read_some(self, count: int, *, timeout_s: float) -> bytes:
         """Wait for bytes."""
-        if not select.select([self._stdout], [], [], timeout_s)[0]:
+        if not _is_ready(self._stdout.fileno(), select.POLLIN, timeout_s):
             raise MachineFailure(FailureKind.TIMEOUT, f"no answer in {timeout_s:g} s")
         return self.read(count)
 
@@ -119,7 +119,7 @@ class LocalStream:
             try:
                 view = view[self.write(view) :]  # type: ignore[arg-type]
             except BlockingIOError:
-                if not select.select([], [self._stdin], [], timeout_s)[1]:
+                if not _is_ready(self._stdin.fileno(), select.POLLOUT, timeout_s):
                     raise MachineFailure(
                         FailureKind.TIMEOUT, f"took no more input for {timeout_s:g} s"
                     ) from None
@@ -156,6 +156,13 @@ class LocalStream:
             self._process.kill()
             self._process.wait()
         self._errors.close()
+
+
+def _is_ready(descriptor: int, event: int, timeout_s: float) -> bool:
+    """Wait for a pipe; select() would fail for a descriptor above 1023."""
+    poll = select.poll()
+    poll.register(descriptor, event)
+    return bool(poll.poll(timeout_s * 1000.0))
 
 
 def _converse(
