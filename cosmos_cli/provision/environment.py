@@ -17,6 +17,7 @@ from cosmos_cli.fleet.layout import Layout
 from cosmos_cli.provision.lock import Locked, normal_name
 from cosmos_cli.provision.trees import Progress, no_progress
 from cosmos_cli.provision.wheelhouse import Environment
+from cosmos_cli.provision.wheels import see_verified
 
 PARTS = ("store", "installed", "keep", "trees", "wheels", "environment")
 """What a `Board` must be started with for trees and environments."""
@@ -268,6 +269,8 @@ def _send_wheels(
     whole_bytes = sum(wheel.size_bytes - have for wheel, have in wheels)
     sent_bytes = 0
     for wheel, have in wheels:
+        path = environment.wheel(wheel)
+        see_verified(path, wheel)
         arguments = {
             "folder": layout.wheels,
             "sha256": wheel.sha256,
@@ -275,7 +278,7 @@ def _send_wheels(
             "size": wheel.size_bytes,
         }
         with (
-            environment.wheel(wheel).open("rb") as file,
+            path.open("rb") as file,
             mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
         ):
             offsets = range(have, wheel.size_bytes, PIECE_BYTES)

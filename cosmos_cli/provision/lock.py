@@ -130,7 +130,8 @@ class Chosen:
     """A package whose wheel for a platform is known."""
 
     locked: Locked
-    url: str
+    url: str = ""
+    """Empty for one that was locked earlier: the index is asked for it by its hash."""
 
 
 def normal_name(name: str) -> str:

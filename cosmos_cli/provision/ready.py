@@ -22,7 +22,7 @@ from cosmos_cli.models.loading import ScenarioFile
 from cosmos_cli.provision.environment import ask_installed, installed_request
 from cosmos_cli.provision.platform import greeted_platform
 from cosmos_cli.provision.trees import Tree, runtime_tree, scenario_tree, send_tree
-from cosmos_cli.provision.wheelhouse import Environment, prepare, sees_system_packages
+from cosmos_cli.provision.wheelhouse import environment_key, sees_system_packages
 
 BASE_VARIABLE = "COSMOS_BASE_DIRECTORY"
 
@@ -105,18 +105,18 @@ def make_ready(  # noqa: PLR0913 - which machine, and what of; all but the first
         )
     cargo = scenario if isinstance(scenario, Cargo) else cargo_of(scenario)
     layout = Layout(_absolute_root(target.root, board.greeting))
-    environment = _environment(board, cargo, machine, is_host=is_host)
+    key = _environment_key(board, cargo, machine, is_host=is_host)
     trees = (cargo.runtime, cargo.scenario)
     found = ask_installed(
         board,
         installed_request(
             layout,
             trees=[tree.hash for tree in trees],
-            environments=[environment.key],
+            environments=[key],
             touch=True,
         ),
     )
-    if not found.environments[environment.key]:
+    if not found.environments[key]:
         as_host = f" --host {target.name}" if is_host else ""
         raise MachineFailure(
             FailureKind.STEP,
@@ -127,18 +127,16 @@ def make_ready(  # noqa: PLR0913 - which machine, and what of; all but the first
         if not found.trees[tree.hash]:
             send_tree(board, layout, tree)
     return Ready(
-        python=layout.python(environment.key),
+        python=layout.python(key),
         python_path=layout.tree(cargo.runtime.hash),
         base_directory=layout.tree(cargo.scenario.hash),
     )
 
 
-def _environment(
-    board: Board, cargo: Cargo, machine: Machine | None, *, is_host: bool
-) -> Environment:
+def _environment_key(board: Board, cargo: Cargo, machine: Machine | None, *, is_host: bool) -> str:
     own = machine.requirements if machine is not None else ()
     packages = machine.packages if machine is not None else ()
-    return prepare(
+    return environment_key(
         greeted_platform(board.greeting),
         (*own, *cargo.requirements),
         is_host=is_host,

@@ -81,12 +81,7 @@ def download(chosen: Sequence[Chosen], folder: Path, platform: Platform) -> None
     """
     with tempfile.TemporaryDirectory(prefix="cosmos-") as private:
         wanted = Path(private, "wheels.txt")  # not in argv: an address may hold a password
-        wanted.write_text(
-            "".join(
-                f"{each.locked.name} @ {each.url} --hash=sha256:{each.locked.sha256}\n"
-                for each in chosen
-            )
-        )
+        wanted.write_text("".join(f"{_pin(each)}\n" for each in chosen))
         command = [*PIP, "download", "--quiet", "--no-deps", "--require-hashes"]
         command += ["--requirement", str(wanted), "--dest", str(folder), *_pip_platform(platform)]
         done = _run(command, timeout_s=DOWNLOAD_TIMEOUT_S, environment=pip_environment(os.environ))
@@ -230,6 +225,12 @@ def _unreachable(said: str) -> MachineFailure:
         "connect it to the internet, or name an index that it can reach (pip config set global.index-url"
         " URL); once this has worked, it works without for machines of this kind",
     )
+
+
+def _pin(chosen: Chosen) -> str:
+    locked = chosen.locked
+    where = f"{locked.name} @ {chosen.url}" if chosen.url else f"{locked.name}=={locked.version}"
+    return f"{where} --hash=sha256:{locked.sha256}"
 
 
 def _name_of(requirement: str) -> str:

@@ -15,12 +15,9 @@ import hashlib
 import importlib.metadata
 import json
 import os
-import tempfile
 import time
-import zipfile
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from email.parser import HeaderParser
+from dataclasses import dataclass
 from pathlib import Path
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
@@ -38,6 +35,7 @@ from cosmos_cli.provision.lock import (
 )
 from cosmos_cli.provision.platform import Platform
 from cosmos_cli.provision.trees import DISTRIBUTION, Progress, no_progress
+from cosmos_cli.provision.wheels import fetch, lacking, requirements_of, wheel_path
 from cosmos_cli.rundir import write_atomically
 
 CACHE_VARIABLE = "COSMOS_CACHE"
@@ -88,7 +86,7 @@ class Environment:
 
     def wheel(self, locked: Locked) -> Path:
         """Return where one of its wheels is here."""
-        return _wheel(self.wheels, locked)
+        return wheel_path(self.wheels, locked)
 
 
 def cache_folder() -> Path:
@@ -125,19 +123,38 @@ def prepare(
     Raises:
         MachineFailure: A requirement has no wheel for such a machine, or the index cannot be reached.
     """
-    need = _Need(
-        platform=platform,
-        requirements=tuple(sorted({text.strip() for text in requirements})),
-        is_host=is_host,
-        sees_system=sees_system,
+    need, cache = (
+        _need(platform, requirements, is_host=is_host, sees_system=sees_system),
+        cache_folder(),
     )
-    cache = cache_folder()
-    path = cache / "locks" / f"{need.name()}.json"
-    content = _read_lock(path, cache)
-    if content is None:
+    path = need.path(cache)
+    content = _read_lock(path)
+    if content is None or lacking(content.wheels, cache / "wheels"):
         with _locked(path.with_suffix(".lock")):
-            content = _read_lock(path, cache) or _make_lock(path, need, cache, progress)
+            content = _read_lock(path) or _make_lock(path, need, cache, progress)
+            chosen = [Chosen(locked=wheel) for wheel in content.wheels]
+            fetch(chosen, cache / "wheels", platform, progress)
     return Environment(content=content, wheels=cache / "wheels")
+
+
+def environment_key(
+    platform: Platform,
+    requirements: Sequence[str],
+    *,
+    is_host: bool = False,
+    sees_system: bool = False,
+) -> str:
+    """
+    Return the key of an environment; its wheels may be gone from the cache, as machines have them.
+
+    Raises:
+        MachineFailure: As `prepare`, for one that was never prepared here.
+    """
+    need = _need(platform, requirements, is_host=is_host, sees_system=sees_system)
+    content = _read_lock(need.path(cache_folder()))
+    if content is None:
+        return prepare(platform, requirements, is_host=is_host, sees_system=sees_system).key
+    return content.key
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,8 +166,8 @@ class _Need:
     is_host: bool
     sees_system: bool
 
-    def name(self) -> str:
-        """Return the name of the answer in the cache."""
+    def path(self, cache: Path) -> Path:
+        """Return where the answer is remembered."""
         platform = self.platform
         asked = {
             "schema": SCHEMA,
@@ -160,7 +177,8 @@ class _Need:
             "is_host": self.is_host,
             "sees_system": self.sees_system,
         }
-        return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+        name = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+        return cache / "locks" / f"{name}.json"
 
     def runtime_requirements(self) -> tuple[str, ...]:
         """Return what the installed distribution says that the runtime needs on such a machine."""
@@ -174,6 +192,17 @@ class _Need:
             if requirement.marker is None or requirement.marker.evaluate(environment):
                 needed.append(f"{requirement.name}{requirement.specifier}")
         return tuple(sorted(needed))
+
+
+def _need(
+    platform: Platform, requirements: Sequence[str], *, is_host: bool, sees_system: bool
+) -> _Need:
+    return _Need(
+        platform=platform,
+        requirements=tuple(sorted({text.strip() for text in requirements})),
+        is_host=is_host,
+        sees_system=sees_system,
+    )
 
 
 def _make_lock(path: Path, need: _Need, cache: Path, progress: Progress) -> Lock:
@@ -197,9 +226,9 @@ def _resolve(need: _Need, cache: Path, progress: Progress) -> Lock:
     chosen, missing = choose(resolver.resolve(everything, platform), platform)
     distributed = _distributed(missing, platform)
     _refuse_ancient(need, {candidate.name for candidate in missing})
-    wheels = _fetch(chosen, cache, platform, progress)
+    wheels = fetch(chosen, cache / "wheels", platform, progress)
     for wheel in wheels:
-        everything += _requirements_of(_wheel(cache / "wheels", wheel))
+        everything += requirements_of(wheel_path(cache / "wheels", wheel))
     return Lock(
         platform=platform,
         wheels=wheels,
@@ -265,71 +294,12 @@ def _refuse_ancient(need: _Need, missing: set[str]) -> None:
             raise resolver.no_wheel(name, text, platform, pin=usable)
 
 
-def _fetch(
-    chosen: Sequence[Chosen], cache: Path, platform: Platform, progress: Progress
-) -> tuple[Locked, ...]:
-    """Return the wheels with their sizes; those that the cache lacks are downloaded."""
-    folder = cache / "wheels"
-    lacking = [each for each in chosen if not _wheel(folder, each.locked).exists()]
-    if lacking:
-        progress(f"downloading {len(lacking)} wheels for {platform.label}", 0.5)
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".new-", dir=folder) as private:
-            resolver.download(lacking, Path(private), platform)
-            for each in lacking:
-                _keep(Path(private, each.locked.filename), each.locked, folder)
-    return tuple(_sized(each.locked, _wheel(folder, each.locked)) for each in chosen)
-
-
-def _keep(downloaded: Path, locked: Locked, folder: Path) -> None:
+def _read_lock(path: Path) -> Lock | None:
+    """Return what is remembered; None if nothing is."""
     try:
-        with downloaded.open("rb") as file:
-            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-            os.fsync(file.fileno())
-    except FileNotFoundError:
-        sha256 = ""
-    if sha256 != locked.sha256:
-        raise MachineFailure(
-            FailureKind.DATA,
-            f"{locked.filename}: what the package index gave is not what it announced",
-            "repeat; if that does not help, the index or a proxy before it is broken",
-        )
-    path = _wheel(folder, locked)
-    path.parent.mkdir(exist_ok=True)
-    downloaded.replace(path)
-
-
-def _sized(locked: Locked, path: Path) -> Locked:
-    with zipfile.ZipFile(path) as wheel:
-        installed_bytes = sum(entry.file_size for entry in wheel.infolist())
-    size_bytes = path.stat().st_size
-    return replace(locked, size_bytes=size_bytes, installed_bytes=installed_bytes)
-
-
-def _requirements_of(path: Path) -> list[str]:
-    """Return what a wheel says that it needs."""
-    with zipfile.ZipFile(path) as wheel:
-        for name in wheel.namelist():
-            if name.endswith(".dist-info/METADATA"):
-                metadata = HeaderParser().parsestr(wheel.read(name).decode())
-                return [str(text) for text in metadata.get_all("Requires-Dist", [])]
-    return []
-
-
-def _wheel(folder: Path, locked: Locked) -> Path:
-    return folder / locked.sha256 / locked.filename
-
-
-def _read_lock(path: Path, cache: Path) -> Lock | None:
-    """Return what is remembered; None if nothing is, or if a wheel of it is gone."""
-    try:
-        content = Lock.from_mapping(json.loads(path.read_bytes()))
-        for wheel in content.wheels:
-            if _wheel(cache / "wheels", wheel).stat().st_size != wheel.size_bytes:
-                return None
+        return Lock.from_mapping(json.loads(path.read_bytes()))
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return content
 
 
 @contextlib.contextmanager

@@ -295,8 +295,20 @@ def test_wheel_changed_on_the_machine_is_sent_again(machine, house, navlib, tmp_
     assert python(machine, other, "import nav_lib; print(nav_lib.version)") == "1.2"
 
 
-def test_wheel_that_rots_in_the_operators_cache_is_refused(machine, house, navlib):
+def test_wheel_that_rots_in_the_operators_cache_is_thrown_away(machine, house, navlib):
     environment = house.environment(navlib)
+    path = environment.wheel(environment.lock[0])
+    path.write_bytes(path.read_bytes()[:-1] + b"!")
+
+    with pytest.raises(MachineFailure, match="is not what was downloaded; it was removed"):
+        install(machine, environment)
+    assert not path.exists()
+    assert not any(verb == "wheel" for verb, _, _ in machine.calls)
+
+
+def test_wheel_that_changed_on_its_way_is_refused(machine, house, navlib, monkeypatch):
+    environment = house.environment(navlib)
+    monkeypatch.setattr(module, "see_verified", lambda *_: None)
     path = environment.wheel(environment.lock[0])
     path.write_bytes(path.read_bytes()[:-1] + b"!")
 

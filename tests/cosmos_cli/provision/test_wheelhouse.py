@@ -14,7 +14,7 @@ from cosmos_cli.provision import resolver, wheelhouse
 from cosmos_cli.provision.lock import Distributed
 from cosmos_cli.provision.platform import Platform
 from cosmos_cli.provision.resolver import pip_environment, uv_environment
-from cosmos_cli.provision.wheelhouse import prepare, sees_system_packages
+from cosmos_cli.provision.wheelhouse import environment_key, prepare, sees_system_packages
 
 PI = Platform(python=(3, 11), machine="aarch64", libc_version=(2, 36))
 LAPTOP = Platform(python=(3, 13), machine="x86_64", libc_version=(2, 41))
@@ -109,6 +109,47 @@ def test_wheel_that_left_the_cache_is_fetched_again(index):
 
     assert environment == again
     assert again.wheel(again.lock[0]).exists()
+
+
+def test_lost_wheels_are_fetched_as_they_were_locked_though_newer_ones_exist(index):
+    make_wheel(index, "pyproj", "3.0")
+    first = prepare(PI, ["pyproj"])
+    make_wheel(index, "pyproj", "4.0")
+    for wheel in first.lock:
+        first.wheel(wheel).unlink()
+
+    again = prepare(PI, ["pyproj"])
+
+    assert again == first
+    assert all(again.wheel(wheel).exists() for wheel in again.lock)
+
+
+def test_key_needs_no_wheels(index, no_process):
+    first = prepare(PI, [])
+    for wheel in first.lock:
+        first.wheel(wheel).unlink()
+    no_process()
+
+    assert environment_key(PI, []) == first.key
+
+
+def test_key_of_what_was_never_prepared_is_found_out(index):
+    assert environment_key(PI, []) == prepare(PI, []).key
+
+
+def test_index_that_gives_something_else_than_it_announced_is_found_out(index, monkeypatch):
+    download = resolver.download
+
+    def swap(chosen, folder, platform):
+        download(chosen, folder, platform)
+        (folder / chosen[0].locked.filename).write_bytes(b"something else")
+
+    monkeypatch.setattr(resolver, "download", swap)
+
+    failure = refused(PI, [])
+
+    assert failure.kind is FailureKind.DATA
+    assert "not what it announced" in failure.text
 
 
 def test_newer_release_changes_nothing_that_is_locked(index):
