@@ -16,7 +16,8 @@ from cosmos_cli.models.limit import select_machines
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.models.provision_steps import KINDS
 from cosmos_cli.plan import make_plan
-from cosmos_cli.provision.settings import setting_files
+from cosmos_cli.provision.settings import SETTINGS, setting_files
+from cosmos_cli.provision.steps import PLANNERS
 from cosmos_cli.provision.wanted import Paths
 
 INVENTORY, PROVISION, PLACEMENT = blocks(FLEET, "yaml")
@@ -73,6 +74,21 @@ def test_every_keyword_of_the_ssh_configuration_is_documented_and_no_other():
 def test_every_file_of_a_setting_is_documented():
     for path in setting_files(Paths()):
         assert path in FLEET or f"`{path.rsplit('/', 1)[1]}`" in FLEET
+
+
+def test_table_of_settings_says_where_each_is_kept():
+    heading = "### Settings and how they are put back"
+    section = FLEET.split(heading, 1)[1].split("\n#", 1)[0]
+    rows = re.findall(r"^\| `(cosmos_\w+)` \| `([^`]+)`", section, flags=re.M)
+
+    assert rows == [(setting.variable, setting.file(Paths())) for setting in SETTINGS]
+
+
+def test_every_kind_of_planned_step_has_its_place_in_the_order_of_up():
+    section = FLEET.split("\n## What up does\n", 1)[1].split("\n#", 1)[0]
+    numbers = re.findall(r"^(\d)\. ", section, flags=re.M)
+
+    assert len(numbers) == len(PLANNERS) + 1  # and the check at the end
 
 
 def test_every_folder_on_a_machine_is_documented_and_no_other():
