@@ -12,8 +12,8 @@ import time
 from cosmos_cli.fleet.connection import Connection, Stream
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 
-FULL_S = 0.005
-"""Between looks whether there is room again for what is sent."""
+FULL_S_MIN, FULL_S_MAX = 0.0005, 0.02
+"""Between looks whether there is room again for what is sent; each wait is twice the one before."""
 SILENCE_S = 4.0
 """After so long without a byte the machine is asked for a sign of life."""
 SIGN_S = 5.0
@@ -68,10 +68,12 @@ class WatchedStream:
         """
         view = memoryview(data)
         taken_s = asked_s = time.monotonic()
+        wait_s = FULL_S_MIN
         while view:
             try:
                 view = view[self.write(view) :]  # type: ignore[arg-type]
-                taken_s = asked_s = time.monotonic()
+                taken_s, wait_s = time.monotonic(), FULL_S_MIN
+                asked_s = taken_s
                 continue
             except BlockingIOError:
                 now_s = time.monotonic()
@@ -80,7 +82,8 @@ class WatchedStream:
             if now_s - asked_s > SILENCE_S:
                 self._see_that_it_lives()
                 asked_s = now_s
-            time.sleep(FULL_S)
+            time.sleep(wait_s)
+            wait_s = min(2 * wait_s, FULL_S_MAX)
 
     def _see_that_it_lives(self) -> None:
         if not self._connection.is_alive(timeout_s=SIGN_S):
