@@ -1,5 +1,6 @@
 """`cosmos collect` of runs that recorded on machines: all there, partly there, cut off, still alive."""
 
+import contextlib
 import json
 
 import pytest
@@ -132,6 +133,20 @@ def test_run_that_still_lives_on_a_machine_is_refused_and_nothing_is_touched(spl
         assert split.there("pi01")
 
     assert app.run(["collect"]) == 0
+
+
+def test_run_that_lives_in_many_processes_is_refused_in_one_short_line(split, capsys):
+    with contextlib.ExitStack() as lives:
+        for number in range(3):
+            lives.enter_context(split.living("pi01", "agent", f"agent-{number}"))
+            lives.enter_context(split.living("pi02", "agent", f"agent-{number}"))
+        code = app.run(["collect"])
+
+    [line] = [line for line in capsys.readouterr().err.splitlines() if "still running" in line]
+    assert code == 2
+    assert " on pi01, pi02: 6 processes, such as " in line
+    assert line.count("(pid ") == 3
+    assert line.endswith(f"end it with: cosmos down {split.run.name}")
 
 
 def test_machines_are_left_alone_when_asked_to(split, network, capsys):
