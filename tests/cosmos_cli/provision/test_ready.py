@@ -40,17 +40,22 @@ def scenario(tmp_path):
     return load_scenario(folder / "small.yaml")
 
 
-@pytest.fixture
-def index(machine, tmp_path, monkeypatch):
-    with machine.board() as board:
+@pytest.fixture(scope="module")
+def made_index(tmp_path_factory):
+    """A folder of wheels for this computer; what is resolved from it is remembered for all of these tests."""
+    folder = tmp_path_factory.mktemp("ready")
+    with OwnMachine(folder / "root").board() as board:
         platform = greeted_platform(board.greeting)
-    folder = tmp_path / "index"
     digits = "".join(map(str, platform.python))
-    make_runtime_wheels(folder, digits, machines=[platform.machine])
+    make_runtime_wheels(folder / "index", digits, machines=[platform.machine])
     for name in ("navlib", "maplib", "scipy", "sgp4"):
-        make_wheel(folder, name)
-    only_index(monkeypatch, tmp_path, folder)
+        make_wheel(folder / "index", name)
     return folder
+
+
+@pytest.fixture
+def index(made_index, monkeypatch):
+    only_index(monkeypatch, made_index, made_index / "index")
 
 
 def installed(machine, *requirements, **how):
