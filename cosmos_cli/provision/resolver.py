@@ -55,7 +55,7 @@ def resolve(requirements: Sequence[str], platform: Platform) -> tuple[Candidate,
     command = [
         *(uv.find_uv_bin(), "pip", "compile", "-", "--quiet", "--no-header", "--no-annotate"),
         *("--format", "pylock.toml", "--only-binary", ":all:", "--no-python-downloads"),
-        *("--python-version", platform.python_text),
+        *("--python", sys.executable, "--python-version", platform.python_text),
         *(where or ["--universal"]),  # uv knows no 32-bit ARM: ask for all, choose here
     ]
     settings = pip_settings()
