@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from cosmos_cli.counted import counted
 from cosmos_cli.errors import CosmosError, ExitCode, InputError
 from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.pool import FORKS_DEFAULT
@@ -269,8 +270,8 @@ def _check_manual(options: RunOptions, plan: LaunchPlan) -> None:
 
 def _greeting(prepared: _Prepared) -> str:
     config, run = prepared.request.config, prepared.run
-    where = f" on {len(prepared.plan.machines)} machines" if prepared.remote else ""
+    where = f" on {counted(len(prepared.plan.machines), 'machine')}" if prepared.remote else ""
     return (
-        f"{run.name}: {config.agents.count} agents{where} at {config.agents.tick_hz:g} Hz for"
+        f"{run.name}: {counted(config.agents.count, 'agent')}{where} at {config.agents.tick_hz:g} Hz for"
         f" {config.time.duration_s:g} s; records go to {run.path}"
     )
