@@ -236,20 +236,6 @@ def remove_file(request: Request) -> bool:
     return True
 
 
-@verb("own_file")
-def own_file(request: Request) -> bool:
-    """Give a file or folder another mode or owner; tell whether anything changed."""
-    path = os.path.expanduser(request.arguments["path"])
-    before = os.stat(path)
-    mode, uid, gid = _wanted_of(request.arguments, before)
-    if _state_of(before) == (mode, uid, gid):
-        return False
-    if (before.st_uid, before.st_gid) != (uid, gid):
-        os.chown(path, uid, gid)  # takes set-id bits away, so the mode comes after it
-    os.chmod(path, mode)
-    return True
-
-
 @verb("edit_line")
 def edit_line(request: Request) -> bool:
     """Have a line in a file or not; tell whether anything changed."""

@@ -1,0 +1,150 @@
+"""What works on a machine changes files whole or not at all, and sees its commands through."""
+
+import errno
+import os
+import stat
+import time
+from pathlib import Path
+
+import pytest
+from fake_system import connection_to
+
+from cosmos_cli.fleet.board import Board
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.onboard import files, system
+from cosmos_cli.fleet.onboard.core import Refusal
+from cosmos_cli.fleet.onboard.files import replace_file
+from cosmos_cli.provision.parts import HELPER_PARTS
+
+PATIENCE_S = 30.0
+
+
+def wait_until(condition):
+    until_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < until_s, "waited in vain"
+        time.sleep(0.02)
+
+
+def test_new_file_has_the_usual_mode_and_folders_above(tmp_path):
+    path = tmp_path / "a/b/c.conf"
+
+    assert replace_file(str(path), b"x\n", {}) is True
+
+    assert path.read_bytes() == b"x\n"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o644
+
+
+def test_mode_stays_and_same_content_is_no_change(tmp_path):
+    path = tmp_path / "a"
+    path.write_text("x\n")
+    path.chmod(0o640)
+    before = path.stat()
+
+    assert replace_file(str(path), b"x\n", {}) is False
+    assert path.stat().st_ino == before.st_ino
+    assert replace_file(str(path), b"y\n", {}) is True
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    assert replace_file(str(path), b"y\n", {"mode": 0o600}) is True
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+@pytest.mark.parametrize("function", ["fsync", "rename", "fchmod"])
+def test_failure_at_any_point_leaves_the_old_file_alone(tmp_path, monkeypatch, function):
+    path = tmp_path / "a"
+    path.write_text("old")
+
+    def fail(*_arguments):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(files.os, function, fail)
+    with pytest.raises(OSError, match="No space"):
+        replace_file(str(path), b"new", {})
+
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["a"]
+
+
+def test_nobody_sees_a_half_written_file(tmp_path, monkeypatch):
+    path = tmp_path / "a"
+    path.write_text("old")
+    seen = []
+    rename = os.rename
+
+    def watch(source, target):
+        seen.append((path.read_text(), Path(source).read_text()))
+        rename(source, target)
+
+    monkeypatch.setattr(files.os, "rename", watch)
+    replace_file(str(path), b"new", {})
+
+    assert seen == [("old", "new")]
+
+
+def test_unknown_owner_and_special_files_are_refused(tmp_path):
+    with pytest.raises(Refusal, match="there is no user 'nobody-here'"):
+        replace_file(str(tmp_path / "a"), b"", {"owner": "nobody-here"})
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(Refusal, match="expected a file"):
+        replace_file(str(tmp_path / "pipe"), b"", {})
+
+    assert os.listdir(tmp_path) == ["pipe"]
+
+
+@pytest.mark.process
+def test_long_command_gives_signs_of_life(tmp_path, monkeypatch):
+    with Board.start(connection_to(tmp_path), HELPER_PARTS) as board:
+        asked = {"run": f"sleep 2.5; touch {tmp_path}/a", "creates": f"{tmp_path}/a"}
+        parts = [p.value for p in board.parts("command", {**asked, "timeout_s": PATIENCE_S})]
+
+    assert parts[-1] == {"ran": True, "notes": []}
+    assert parts[:-1]
+    assert all(part == {"is_running": True} for part in parts[:-1])
+
+
+@pytest.mark.process
+def test_command_that_takes_too_long_is_ended_with_its_children(tmp_path):
+    asked = {"run": f"sleep 1000 & echo $! > {tmp_path}/pid; wait", "creates": f"{tmp_path}/a"}
+    with Board.start(connection_to(tmp_path), HELPER_PARTS) as board:
+        with pytest.raises(MachineFailure, match="not done in 0.1 s") as failure:
+            list(board.parts("command", {**asked, "timeout_s": 0.1}))
+        pid = int((tmp_path / "pid").read_text())
+
+        assert failure.value.kind is FailureKind.TIMEOUT
+        wait_until(lambda: not is_alive(pid))
+
+
+def is_alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    with open(f"/proc/{pid}/stat") as file:
+        return file.read().rpartition(")")[2].split()[0] != "Z"
+
+
+@pytest.mark.process
+def test_command_whose_operator_is_gone_is_seen_through(tmp_path):
+    done = tmp_path / "done"
+    asked = {
+        "run": f"while ! test -e {tmp_path}/go; do sleep 0.05; done; echo x > {done}",
+        "creates": str(done),
+        "timeout_s": PATIENCE_S,
+    }
+    board = Board.start(connection_to(tmp_path), HELPER_PARTS)
+    parts = board.parts("command", asked)
+    assert next(parts).value == {"is_running": True}
+
+    board._stream.close_writing()
+    board._stream._stdout.close()  # the connection is cut: nobody reads any more
+    (tmp_path / "go").touch()
+
+    wait_until(done.exists)
+    board.close()
+
+
+def test_output_is_kept_to_its_end(monkeypatch):
+    (*_, last) = system.running(["/bin/sh", "-c", "seq 20; exit 3"], timeout_s=PATIENCE_S)
+
+    assert last.value["exit_status"] == 3
+    assert last.value["output"].splitlines() == [str(n) for n in range(11, 21)]
