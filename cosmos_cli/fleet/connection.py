@@ -12,7 +12,7 @@ from typing import Protocol
 
 from cosmos_cli.fleet.target import Target
 
-OUTPUT_BYTES_MAX = 16 * 1024 * 1024
+OUTPUT_BYTES_MAX = 4 * 1024 * 1024
 """What `Connection.run` keeps of each output: one half of its begin, one of its end."""
 
 
