@@ -21,10 +21,9 @@ from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.onboard.processes import Ending
 from cosmos_cli.fleet.outcome import Outcome, failed
-from cosmos_cli.fleet.target import Target, target_of
-from cosmos_cli.launch.elsewhere import Fleetwide, Seen, unfinished_runs
+from cosmos_cli.fleet.target import Target
+from cosmos_cli.launch.elsewhere import Fleetwide, Seen, targets_of, unfinished_runs
 from cosmos_cli.launch.living import LivingRun, end_run, is_called, living_runs
-from cosmos_cli.models.inventory import load_machines
 from cosmos_cli.retrieve.sources import Source, Sources
 from cosmos_cli.rundir import RunDirectory, find_run, runs_root
 from madns_runtime.processes import ProcessEntry
@@ -95,8 +94,7 @@ def down(
     fleet = Fleetwide(
         options=ConnectOptions(accept_new_host_keys=accept_new_host_keys), forks=forks
     )
-    machines = load_machines(inventory, limit) if inventory is not None else ()
-    targets = [target_of(machine) for machine in machines if machine.connection != "local"]
+    targets = [t for t in targets_of(inventory, limit) if t.connection != "local"]
     outcomes = fleet.look(targets)
     known = known_runs(living_runs(), unfinished_runs())
     known += found_runs(known, targets, outcomes)

@@ -22,10 +22,9 @@ from cosmos_cli.errors import ExitCode
 from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.onboard.processes import age_s
 from cosmos_cli.fleet.outcome import Outcome, failed
-from cosmos_cli.fleet.target import Target, target_of
-from cosmos_cli.launch.elsewhere import Fleetwide, Seen, distinct, unfinished_runs
+from cosmos_cli.fleet.target import Target
+from cosmos_cli.launch.elsewhere import Fleetwide, Seen, distinct, targets_of, unfinished_runs
 from cosmos_cli.launch.living import LivingRun, in_order, is_called, living_runs
-from cosmos_cli.models.inventory import load_machines
 from cosmos_cli.retrieve.sources import Sources
 from cosmos_cli.rundir import RunDirectory
 from madns_runtime.processes import ProcessEntry
@@ -79,8 +78,7 @@ def ps(
     here = living_runs()
     directories = _directories(here, run)
     targets = [source.target for each in directories for source in Sources.read(each).remote]
-    if inventory is not None:
-        targets += [target_of(machine) for machine in load_machines(inventory, limit)]
+    targets += targets_of(inventory, limit)
     fleet = Fleetwide(
         options=ConnectOptions(accept_new_host_keys=accept_new_host_keys), forks=forks
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 from cosmos_cli.fleet.board import Board
@@ -104,6 +105,16 @@ def unfinished_runs() -> list[RunDirectory]:
         for run in runs
         if (run.read_json(run.run_json) or {}).get("status") == RUNNING and Sources.read(run).remote
     ]
+
+
+def targets_of(inventory: Path | None, limit: str | None) -> list[Target]:
+    """Return the machines of an inventory; none without one."""
+    if inventory is None:
+        return []
+    from cosmos_cli.fleet.target import target_of
+    from cosmos_cli.models.inventory import load_machines  # what checks inventories takes its time
+
+    return [target_of(machine) for machine in load_machines(inventory, limit)]
 
 
 def distinct(targets: Iterable[Target]) -> list[Target]:
