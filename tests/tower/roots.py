@@ -23,7 +23,8 @@ from .console import say
 from .specification import debian_architecture
 
 SUITE = "bookworm"
-PACKAGES = ("python3", "python3-venv", "openssh-server", "sudo")
+PACKAGES = ("python3", "openssh-server", "sudo")
+"""No python3-venv: nothing here needs pip, and its certificates take minutes to unpack under emulation."""
 PACKAGES_MORE = {"armhf": ("python3-numpy", "python3-msgpack", "python3-psutil")}
 """There are no wheels of these for 32-bit ARM: its runtime lives on the distribution's."""
 DPKG_OPTIONS = (
