@@ -125,8 +125,11 @@ class Board:
             board._stream.write_all(package, timeout_s=timeout_s)
             board.greeting = board._read_answer(timeout_s).value
         except MachineFailure as failure:
-            board.close()
-            raise board._explain(failure, connection) from None
+            explained = board._explain(failure, connection)
+            board.close()  # of a channel that is closed nobody learns how it ended; of a process here, sooner
+            if explained is failure:
+                explained = board._explain(failure, connection)
+            raise explained from None
         return board
 
     def call(

@@ -1,5 +1,6 @@
 """`cosmos up` on one machine: this computer, with a folder for its system, through the real helper."""
 
+import dataclasses
 import hashlib
 import time
 
@@ -17,6 +18,7 @@ from provision_machines import machine_of
 
 from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.local import LocalConnection
 from cosmos_cli.provision import bring_up
 from cosmos_cli.provision.environment import PARTS
 from cosmos_cli.provision.parts import HELPER_PARTS
@@ -370,3 +372,13 @@ def test_machine_that_may_not_become_root_is_refused_before_anything_is_done(pla
 
 def test_helper_has_all_that_environments_need_in_their_order():
     assert tuple(part for part in HELPER_PARTS if part in PARTS) == PARTS
+
+
+def test_missing_interpreter_is_told_however_soon_its_shell_ends(place):
+    """The shell there may end before or after the last byte was sent to it, hence often."""
+    target = dataclasses.replace(connection_to(place).target, python="/nowhere/python3")
+
+    for _ in range(20):
+        with pytest.raises(MachineFailure, match="no such interpreter") as caught:
+            Board.start(LocalConnection(target), HELPER_PARTS)
+        assert caught.value.kind is FailureKind.PYTHON
