@@ -8,7 +8,8 @@ contender starts from bare boards of its own and does the same job: folders, som
 code, a virtual environment from wheels without internet, a first start of what is in it. It does that
 again, runs a command on all boards, and fetches what they recorded. See benchmarks/rivals.py for what
 the others are given. cosmos brings along all it needs, checks the content of every file, and has each
-board send a datagram here and back; its `collect` also verifies, judges, packages and clears up.
+board send a datagram here and back. Its `fetch` verifies and clears up: it is the time of `collect` less
+that of a second one, which judges, reports and packages alike but has nothing to fetch.
 """
 
 from __future__ import annotations
