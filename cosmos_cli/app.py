@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from cosmos_cli.errors import CosmosError, ExitCode, InputError, describe
+from cosmos_cli.fleet import headstart
 from madns_runtime.errors import MadnsError
 
 try:
@@ -137,6 +138,7 @@ def run(arguments: list[str]) -> int:
     """Run the command line and return its exit code; every error has become text by then."""
     wants_json = "--json" in arguments
     try:
+        headstart.begin(arguments)
         code = typer.main.get_command(make_app()).main(
             arguments, prog_name="cosmos", standalone_mode=False
         )
@@ -154,6 +156,8 @@ def run(arguments: list[str]) -> int:
         return _report_lost_output(error, wants_json)
     except Exception as error:  # noqa: BLE001 - the last seam: a defect of ours still ends in one line
         return _report_unexpected(error, wants_json)
+    finally:
+        headstart.close()
 
 
 def _plain(kind: str, message: str, exit_code: int) -> dict[str, Any]:

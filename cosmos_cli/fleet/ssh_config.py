@@ -240,9 +240,15 @@ def _expanded(value: str, tokens: Mapping[str, str]) -> str:
 
 def _split(line: Line) -> list[str]:
     try:
-        return shlex.split(line.value, comments=True)
+        return list(_words(line.value))
     except ValueError as error:
         raise InputError(f"{line.place}: {error}, got {line.value!r}") from error
+
+
+@functools.lru_cache(maxsize=1024)
+def _words(text: str) -> tuple[str, ...]:
+    """Return a line's words; each machine of a fleet asks for the same lines."""
+    return tuple(shlex.split(text, comments=True))
 
 
 def read_config(files: Sequence[Path]) -> SshConfig:

@@ -13,6 +13,8 @@ import subprocess
 import time
 from typing import Protocol
 
+from cosmos_cli.fleet import headstart
+
 SEND_STALL_S_MAX = 15.0
 """A machine that took no byte for so long is taken for lost; a busy card delays sshd by less."""
 PROXY_END_TIMEOUT_S = 1.0
@@ -106,6 +108,9 @@ def connect_tcp(host: str, port: int, *, timeout_s: float) -> Wire:
     Raises:
         OSError: Of the last address that the name stands for.
     """
+    begun = headstart.take(host, port, timeout_s=timeout_s)
+    if begun is not None:
+        return _tcp_wire(begun)
     until_s = time.monotonic() + timeout_s
     error = OSError(f"{host} stands for no address")
     try:
@@ -119,13 +124,16 @@ def connect_tcp(host: str, port: int, *, timeout_s: float) -> Wire:
             share_s = (until_s - time.monotonic()) / (len(found) - index)
             sock.settimeout(max(TIMEOUT_S_MIN, share_s))
             sock.connect(address)
-            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            addresses = (sock.getsockname()[0], sock.getpeername()[0])
-            return Wire(sock, addresses=addresses)
+            return _tcp_wire(sock)
         except OSError as failed:
             sock.close()
             error = failed
     raise error
+
+
+def _tcp_wire(sock: socket.socket) -> Wire:
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return Wire(sock, addresses=(sock.getsockname()[0], sock.getpeername()[0]))
 
 
 def connect_through_command(command: str) -> Wire:
