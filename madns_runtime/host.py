@@ -44,7 +44,7 @@ from madns_runtime.protocol.link import LinkLimits
 from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.states import HOST_LIVE, HostState
 from madns_runtime.protocol.wire import Wire
-from madns_runtime.reactor.lines import OperatorLink, read_launch
+from madns_runtime.reactor.lines import OPERATOR_SIDE_GONE, OperatorLink, read_launch
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import apply as apply_scheduling
 from madns_runtime.reactor.scheduling import die_with_parent, freeze_garbage, outlive_parent
@@ -65,6 +65,8 @@ FLUSH_TIMEOUT_S = 5.0
 PACE_TOTAL_BYTES_PER_S = 100e6
 """What all agents together are sent in RELIABLE fragments, beyond bursts: most of a gigabit network."""
 OPERATOR_GONE = "the operator's process is gone"
+HANG_UP_WAIT_S = 0.5
+"""On a busy computer, from the end of a dead operator's line to an agent until the end of that to the host."""
 HANG_GRACE_S = 2.0
 """Beyond the time for shutdown: a loop that hangs in a plug-in, without an operator, ends by force."""
 RESULT_BYTES_MAX = 1024 * 1024
@@ -334,7 +336,8 @@ class HostRuntime:
     def _emergency(self, event: told.EmergencyDeclared) -> None:
         who, reason = event.who, event.reason
         self._takes_data = False
-        if event.who in self._names and self._operator.has_hung_up():
+        wait_s = HANG_UP_WAIT_S if OPERATOR_SIDE_GONE in event.reason else 0.0
+        if event.who in self._names and self._operator.has_hung_up(wait_s):
             # An agent that ended with its operator may be heard before the operator's own silence.
             who, reason, self._report.ending_status = "operator", OPERATOR_GONE, "aborted"
         self._report.fail(who, reason)

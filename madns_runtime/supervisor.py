@@ -25,7 +25,7 @@ from madns_runtime.health.sampler import SAMPLER_TIMEOUT_S, start_sampler, stop_
 from madns_runtime.health.stress import start_stress, stop_stress
 from madns_runtime.plugin.registry import load_half, parse_parameters, resolve
 from madns_runtime.processes import register
-from madns_runtime.reactor.lines import OperatorLink
+from madns_runtime.reactor.lines import OPERATOR_SIDE_GONE, OperatorLink
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import apply as apply_scheduling
 from madns_runtime.reactor.scheduling import outlive_parent
@@ -348,7 +348,7 @@ class AgentProcess:
     def _life_ended(self) -> None:
         self._reactor.remove_reader(self._life_fd)
         if os.read(self._life_fd, 1):
-            self._end("the operator's side is gone or has ended the run")
+            self._end(OPERATOR_SIDE_GONE)
         else:
             self._end(f"its supervisor (pid {self._supervisor_pid}) is gone")
 

@@ -27,6 +27,8 @@ LAUNCH_TIMEOUT_S = 30.0
 OUT_BYTES_MAX = 4 * 1024 * 1024
 """What may wait for an operator who does not read; more is dropped, oldest first, and counted."""
 READ_BYTES = 65_536
+OPERATOR_SIDE_GONE = "the operator's side is gone or has ended the run"
+"""What an agent says that ends because its supervisor's line to the operator has ended."""
 PING_SILENCE_S = 30.0
 """An operator that has sent pings and sends none for this long is gone."""
 PING_LATE_S = 2.0
@@ -128,13 +130,18 @@ class OperatorLink:
             self._out.appendleft(first)
             self.dropped_count += 1
 
-    def has_hung_up(self) -> bool:
-        """Tell whether the operator's end is closed though it should not be, before the loop has come to see it."""
+    def has_hung_up(self, wait_s: float = 0.0) -> bool:
+        """
+        Tell whether the operator's end is closed though it should not be, before the loop has come to see it.
+
+        Args:
+            wait_s: The kernel closes a dead process's lines one after the other: wait so long for this one.
+        """
         if self._is_detached:
             return False
         poll = select.poll()
         poll.register(self._read_fd, 0)
-        return self.is_gone or bool(poll.poll(0))
+        return self.is_gone or bool(poll.poll(wait_s * 1e3))
 
     @property
     def is_late(self) -> bool:
