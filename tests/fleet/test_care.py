@@ -108,7 +108,9 @@ def test_doctor_finds_what_is_wrong_with_each_board(care: Care) -> None:
     assert (first["throttled"], first["temperature"], first["udp"]) == ("error", "error", "error")
     assert (first["governor"], first["receive_buffer"]) == ("warning", "warning")
     assert second["disk_space"] == "error"
-    assert (second["throttled"], second["udp"], second["udp_unasked"]) == ("ok", "ok", "ok")
+    # A busy computer may lose one of the fifty datagrams: that is a warning.
+    assert second["udp"] in ("ok", "warning")
+    assert (second["throttled"], second["udp_unasked"]) == ("ok", "ok")
     assert (third["governor"], third["receive_buffer"]) == ("ok", "ok")
     assert "error" not in third.values()
     assert {found["realtime"] for found in (first, second, third)} <= {"ok", "warning"}
