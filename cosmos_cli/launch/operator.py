@@ -20,7 +20,7 @@ from cosmos_cli.launch import events
 from cosmos_cli.launch.children import Child
 from cosmos_cli.launch.crew import Crew
 from cosmos_cli.launch.deadlines import STALL_S
-from cosmos_cli.launch.host_limits import RUNNING_STATE, HostLimits
+from cosmos_cli.launch.host_limits import OPEN_STATES, RUNNING_STATE, HostLimits
 from cosmos_cli.launch.loop import Loop
 from cosmos_cli.launch.machine_care import Company, Decisions, MachineCare
 from cosmos_cli.launch.machines import RemoteMachine
@@ -260,6 +260,8 @@ class Operator:
         elif isinstance(event, events.StateChanged):
             self._view.state(event.state)
             self._limits.entered(event.state)
+            if event.state not in OPEN_STATES:
+                self._watch.expect_ends()
             if event.state == RUNNING_STATE and self._interruption == "no":
                 self._is_detached = self._request.is_detached
         elif isinstance(event, events.Listening):

@@ -99,6 +99,7 @@ class MachineWatch:
         self._loop = loop
         self._owner = owner
         self._is_seeking = True
+        self._are_ending = False
         if machines:
             self._check_later()
 
@@ -171,6 +172,10 @@ class MachineWatch:
                 self._loop.deadlines.cancel(f"return {name}")
                 self._owner.machine_gone(name)
 
+    def expect_ends(self) -> None:
+        """Ask the connections from now on: a supervisor that closes its records leaves its loop before it ends."""
+        self._are_ending = True
+
     # Signs of life --------------------------------------------------------------------------------
 
     def _check_later(self) -> None:
@@ -189,7 +194,7 @@ class MachineWatch:
             if pulse.is_due(now_s):
                 child.send({"command": "ping", "n": pulse.ping(now_s)})
         for child, pulse in tuple(watched.supervisors.values()):
-            if not pulse.is_lost(now_s):
+            if self._are_ending or not pulse.is_lost(now_s):
                 continue
             if watched.host is None:
                 self.lose(name, f"no sign of life for {SILENCE_S:g} s")
@@ -197,6 +202,7 @@ class MachineWatch:
             del watched.supervisors[child.name]
             self._owner.supervisor_silent(name, child)
         is_heard = any(pulse.was_heard for _, pulse in watched.supervisors.values())
+        is_heard = is_heard and not self._are_ending
         if not is_heard and not watched.is_asked and now_s - watched.asked_s >= PING_INTERVAL_S:
             watched.is_asked, watched.asked_s = True, now_s
             self._loop.background.submit(watched.machine.is_alive, partial(self._answered, name))
