@@ -30,7 +30,7 @@ STEPS = [
     {"service": {"name": "beacon", "enabled": True, "state": "started"}},
     {"file": {"content": "for root alone\n", "dest": "/etc/alone", "mode": "0600"}},
     {"become": False, "file": {"content": "mine\n", "dest": "~/mine.txt", "mode": "0640"}},
-    {"command": {"run": "echo done > /root/once", "creates": "/root/once"}},
+    {"command": {"run": "echo done > /var/once", "creates": "/var/once"}},
     {
         "become": False,
         "command": {"run": "echo more >> ~/log", "unless": "grep -q more ~/log"},
