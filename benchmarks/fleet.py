@@ -31,6 +31,7 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
+# Behind the line that says where they are:
 import uv  # noqa: E402
 from rivals import Ansible, Job, Pyinfra, install_rivals, run  # noqa: E402
 from tower import Tower  # noqa: E402

@@ -2,6 +2,7 @@
 
 import json
 import os
+import threading
 
 import pytest
 
@@ -207,3 +208,13 @@ def test_operator_is_late_when_its_pings_are(reactor, pipes, monkeypatch):
 
     assert seen[0] is False
     assert seen[2] is True
+
+
+def test_end_that_comes_a_moment_later_is_waited_for(reactor, pipes):
+    line = link(reactor, pipes, [], [])
+    closing = threading.Timer(0.05, os.close, [pipes[1]])
+    closing.start()
+
+    assert not line.has_hung_up()
+    assert line.has_hung_up(30.0)
+    closing.join()
