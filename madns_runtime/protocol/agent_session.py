@@ -47,6 +47,9 @@ PING_INTERVAL_S = 0.25
 PING_INTERVAL_FIRST_S = 0.02
 PINGS_FIRST = 12
 """The first exchanges follow closely, so that a clock estimate stands before T0."""
+CLOCK_ERROR_S_MAX = 0.02
+CLOCK_WAIT_S = 2.0
+"""An agent is ready once it knows the host's clock this well, or has tried for this long."""
 STALL_S = 1.0
 """A session that was not called for this long was itself frozen, and blames nobody for silence."""
 LINGER_S = 1.0
@@ -179,6 +182,8 @@ class AgentSession:
         self._state_deadline_s: float | None = (
             now_s + timeouts.agents_ready_s + timeouts.host_setup_s + timeouts.agent_setup_s
         )
+        self._ready_due_s: float | None = None
+        """Until when readiness waits for the clock; None while it does not wait."""
         self._started_s = now_s
         self._held: list[DataReceived] = []
         self.held_dropped_count = 0
@@ -195,13 +200,13 @@ class AgentSession:
     # What the composition root reports ------------------------------------------------------
 
     def setup_finished(self, now_s: float) -> None:
-        """Say that the agent's half is set up; the host's start is awaited."""
-        self._fire(AgentEvent.SETUP_FINISHED)
-        self._state_deadline_s = now_s + self._timeouts.agent_setup_s + self._timeouts.silence_s
-        self._heard_s = now_s
-        self._send(SimulationReady(), Service.SYNC, now_s)
-        self._events.extend(self._held)
-        self._held.clear()
+        """Take note that the agent's half is set up; the host is told once its clock is known here."""
+        if self._is_clock_known(now_s):
+            self._say_ready(now_s)
+            return
+        # Work in this process may have kept the answers waiting: what they say of the clock is worth little.
+        self._ready_due_s = now_s + CLOCK_WAIT_S
+        self._ping_due_s, self._ping_count = now_s, 0
 
     def run_finished(self, summary: Mapping[str, Any], now_s: float) -> None:
         """Say that the simulated time is over; the host's stop is awaited."""
@@ -287,7 +292,12 @@ class AgentSession:
         """Return when `handle_timer` wants to be called, at the latest."""
         if self.state is AgentState.EXIT:
             return None
-        times = (self.link.get_timer(), self._ping_due_s, self._state_deadline_s)
+        times = (
+            self.link.get_timer(),
+            self._ping_due_s,
+            self._ready_due_s,
+            self._state_deadline_s,
+        )
         return min(t for t in times if t is not None)
 
     def handle_timer(self, now_s: float) -> None:
@@ -300,6 +310,8 @@ class AgentSession:
         self.link.handle_timer(now_s)
         if now_s >= self._ping_due_s:
             self._ping(now_s)
+        if self._ready_due_s is not None and now_s >= self._ready_due_s:
+            self._say_ready(now_s)
         self._check_deadlines(now_s)
 
     def next_event(self) -> AgentSessionEvent | None:
@@ -334,10 +346,14 @@ class AgentSession:
                 message.t_agent_s, message.t_host_received_s, message.t_host_sent_s, now_s
             )
             self._events.append(ClockEstimated())
+            if self._ready_due_s is not None and self._is_clock_known(now_s):
+                self._say_ready(now_s)
         elif isinstance(message, SimulationSetup):
             self._move(AgentEvent.SETUP_RECEIVED, SetupReceived(message.initial))
             self._state_deadline_s = None  # the agent's own work now; the host times it
         elif isinstance(message, SimulationStart):
+            if self._machine.allows(AgentEvent.START_RECEIVED):
+                self.clock.settle(now_s)
             self._move(AgentEvent.START_RECEIVED, StartReceived(message.t0_host_s))
             self._state_deadline_s = None  # from here on, the host's silence is the limit
         elif isinstance(message, SystemStop):
@@ -367,14 +383,26 @@ class AgentSession:
     def _enter_emergency(self, who: str, reason: str) -> None:
         if self._machine.allows(AgentEvent.EMERGENCY):
             self._fire(AgentEvent.EMERGENCY)
-            self._state_deadline_s = None
+            self._state_deadline_s = self._ready_due_s = None
             self._events.append(EmergencyDeclared(who, reason))
 
     def _expelled(self, reason: str) -> None:
         if self._machine.allows(AgentEvent.EMERGENCY):
             self._fire(AgentEvent.EMERGENCY)
-            self._state_deadline_s = None
+            self._state_deadline_s = self._ready_due_s = None
             self._events.append(ExpelledFromRun(reason))
+
+    def _is_clock_known(self, now_s: float) -> bool:
+        return self.clock.is_valid and self.clock.error_s(now_s) <= CLOCK_ERROR_S_MAX
+
+    def _say_ready(self, now_s: float) -> None:
+        self._ready_due_s = None
+        self._fire(AgentEvent.SETUP_FINISHED)
+        self._state_deadline_s = now_s + self._timeouts.agent_setup_s + self._timeouts.silence_s
+        self._heard_s = now_s
+        self._send(SimulationReady(), Service.SYNC, now_s)
+        self._events.extend(self._held)
+        self._held.clear()
 
     def _ping(self, now_s: float) -> None:
         self._ping_count += 1

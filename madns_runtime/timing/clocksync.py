@@ -197,6 +197,21 @@ class ClockEstimate:
             return math.inf
         return self._line.error_at(at_local_s) + self._served.correction_left_s(at_local_s)
 
+    def error_s(self, at_local_s: float) -> float:
+        """Return how far the estimate itself may be from the truth, s, whatever is served meanwhile."""
+        return math.inf if self._line is None else self._line.error_at(at_local_s)
+
+    def settle(self, now_s: float) -> None:
+        """
+        Serve the estimate as it stands, at once; for the moment before anything relies on the clock.
+
+        Exchanges that waited behind a long piece of work may have been far off; what they taught is not
+        slewed out of a run that has only just begun.
+        """
+        if self._line is not None:
+            self._served, self._asked_s = None, -math.inf
+            self._serve(self._line, now_s, may_jump_ahead=False)
+
     def to_host_s(self, local_s: float) -> float:
         """
         Return the host's time at a local time, s.

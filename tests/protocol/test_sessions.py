@@ -15,6 +15,7 @@ from madns_runtime.protocol.host_session import HostSession
 from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.states import AgentState, HostState
 from madns_runtime.protocol.wire import Wire
+from madns_runtime.timing.clocksync import ClockEstimate
 
 WIRE = Wire(run_key=b"k" * 32, session=b"s" * 8)
 TIMEOUTS = Timeouts(
@@ -172,6 +173,54 @@ def test_a_run_goes_from_hello_to_exit_on_both_sides(loss):
     assert [p.records for p in w.host.peers.values()] == [{"written": 7}] * 3
     starts = [w.agent_saw(n, a.StartReceived) for n in w.names]
     assert [s.t0_host_s for s in starts] == [w.t0_s] * 3
+
+
+class BusyInSetup(World):
+    """One whose agents' answers waited 4 s in the socket while others in their process were set up."""
+
+    def __init__(self, names):
+        super().__init__(names)
+        self.was_busy = set()
+
+    def deliver_to_agent(self, name, data):
+        session = self.agents[name]
+        super().deliver_to_agent(name, data)
+        if session.state is AgentState.SIMULATION_SETUP and name not in self.was_busy:
+            self.was_busy.add(name)
+            session.clock = ClockEstimate()
+            for _ in range(3):
+                session.clock.add_exchange(
+                    self.now_s - 4, self.now_s - 4, self.now_s - 4, self.now_s
+                )
+
+
+def test_agents_are_ready_only_when_their_clocks_stand():
+    names = ("agent-1", "agent-2")
+    w = BusyInSetup(names)
+    for name in names:
+        w.join(name)
+
+    while w.t0_s is None:
+        w.run_for(0.05)
+
+    w.run_for(0.2)
+    for name, session in w.agents.items():
+        assert session.state is AgentState.RUN_SIMULATION
+        assert name in w.was_busy
+        assert abs(session.clock.offset_s(w.now_s)) < 0.005  # both clocks are one here
+        assert session.clock.uncertainty_s(w.now_s) < a.CLOCK_ERROR_S_MAX
+
+
+def test_agent_whose_clock_never_stands_is_ready_all_the_same_and_says_so():
+    w = world(1)
+    session = w.agents["agent-1"]
+    session.clock.add_exchange = lambda *times: False
+
+    while w.t0_s is None:
+        w.run_for(0.05)
+
+    assert w.now_s > 100.0 + a.CLOCK_WAIT_S
+    assert not session.clock.is_valid
 
 
 def test_clock_estimate_stands_before_time_zero():

@@ -285,6 +285,28 @@ def test_step_back_is_slewed_while_time_goes_on(step_s):
     assert abs(estimate.offset_s(now_s) - wire.offset_s(now_s)) < 100e-6
 
 
+def test_settled_clock_serves_what_it_knows_at_once():
+    wire = Wire(14)
+    estimate = ClockEstimate()
+    for _ in range(5):  # the answers waited 4 s in the socket
+        sent_s, received_s, answered_s, _ = wire.exchange(0.0)
+        estimate.add_exchange(sent_s, received_s, answered_s, 4.0)
+    now_s = feed(estimate, wire, 4.0, 4.2, interval_s=0.02)
+    assert abs(estimate.offset_s(now_s) - wire.offset_s(now_s)) > 0.5  # still slewing
+    assert estimate.error_s(now_s) < 0.02 < estimate.uncertainty_s(now_s)
+
+    estimate.settle(now_s)
+
+    assert abs(estimate.offset_s(now_s) - wire.offset_s(now_s)) < estimate.error_s(now_s)
+    assert estimate.uncertainty_s(now_s) == estimate.error_s(now_s)
+
+
+def test_nothing_known_settles_nothing():
+    estimate = ClockEstimate()
+    estimate.settle(1.0)
+    assert estimate.error_s(1.0) == estimate.uncertainty_s(1.0) == math.inf
+
+
 def test_single_exchange_that_lies_is_not_a_step():
     wire = Wire(13)
     estimate = ClockEstimate()
