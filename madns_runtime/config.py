@@ -26,7 +26,7 @@ SEED_MAX = 2**63 - 1
 """A seed travels in messages as a signed integer of 64 bits."""
 DURATION_S_MAX = 10 * 365.25 * 86_400.0
 """Ten years: a tick's number and every clock of a run stay exact far beyond it."""
-FORBID_EXTRA = {"extra": "forbid", "use_attribute_docstrings": True}
+FORBID_EXTRA = {"extra": "forbid"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

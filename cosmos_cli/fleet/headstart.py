@@ -1,27 +1,51 @@
 """
-A head start: the ways to machines are opened while the command that will use them is still being imported.
+A head start: machines are spoken to while the command that wants them is still being imported.
 
-A machine's SSH server needs about as long to begin as this program needs for its libraries; begun first,
-both happen at once. Only machines that are known from the last time (`remembered`) and named by a number
-are begun with. Whatever fails here fails again, and is told, where the way is wanted.
+A machine's SSH server needs about as long to begin, and to agree on keys, as this program needs for its
+libraries; begun first, both happen at once. Only machines that are known from the last time (`remembered`)
+and named by a number are begun with. Nothing is believed or told to a machine here: its host key is judged,
+and a login tried, where the way is wanted. Whatever fails here fails again there, and is told.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import select
 import socket
+import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from cosmos_cli.fleet.ssh_settings import SshSettings
+    from cosmos_cli.fleet.ssh_transport import SshTransport
 
 VERBS = ("ping", "exec", "up")
-"""Commands that connect to every machine at once."""
+"""Commands that connect to every machine at once, and leave nothing to be done here."""
 WAYS_MAX = 64
 SILENT = ("--help",)
 INVENTORY = ("-i", "--inventory", "COSMOS_INVENTORY")
 LIMIT = ("-l", "--limit", "COSMOS_LIMIT")
 
-_ways: dict[tuple[str, int], socket.socket] = {}
+SWITCH_S = 0.02
+"""How long a thread runs before others may: with two for each machine, Python's own 5 ms cost more than they
+give. A thread that waits for a machine makes way at once all the same."""
+
+
+@dataclass(slots=True)
+class Way:
+    """A way to a machine that was begun."""
+
+    sock: socket.socket
+    settings: SshSettings
+    transport: SshTransport | None = None
+    """What already agrees on keys over it."""
+
+
+_ways: dict[tuple[str, int], Way] = {}
 
 
 def begin(arguments: Sequence[str]) -> None:
@@ -31,7 +55,7 @@ def begin(arguments: Sequence[str]) -> None:
     Args:
         arguments: What stands behind `cosmos`.
     """
-    if not arguments or arguments[0] not in VERBS or any(word in arguments for word in SILENT):
+    if not is_quick(arguments) or any(word in arguments for word in SILENT):
         return
     inventory = option(arguments, INVENTORY)
     if not inventory:
@@ -50,7 +74,15 @@ def begin(arguments: Sequence[str]) -> None:
         except (CosmosError, OSError):
             return  # told, with its place, by the command itself
         if settings is not None and not settings.jumps and settings.proxy_command is None:
-            _begin_one(settings.host, settings.port)
+            _begin_one(settings)
+    if _ways:
+        with contextlib.suppress(ModuleNotFoundError):  # an agent's board has the base install only
+            _speak()
+
+
+def is_quick(arguments: Sequence[str]) -> bool:
+    """Whether a command line is one of those that every millisecond is told of."""
+    return bool(arguments) and arguments[0] in VERBS
 
 
 def option(arguments: Sequence[str], names: tuple[str, str, str]) -> str | None:
@@ -66,7 +98,7 @@ def option(arguments: Sequence[str], names: tuple[str, str, str]) -> str | None:
     return os.environ.get(variable) or None
 
 
-def take(host: str, port: int, *, timeout_s: float) -> socket.socket | None:
+def take(host: str, port: int, *, timeout_s: float) -> Way | None:
     """
     Return the way to a machine if it was begun, open; None if it was not.
 
@@ -74,18 +106,18 @@ def take(host: str, port: int, *, timeout_s: float) -> socket.socket | None:
         OSError: As connecting would.
     """
     way = _ways.pop((host, port), None)
-    if way is None:
-        return None
+    if way is None or way.transport is not None:
+        return way
     try:
         poll = select.poll()
-        poll.register(way, select.POLLOUT)
+        poll.register(way.sock, select.POLLOUT)
         if not poll.poll(timeout_s * 1e3):
             raise TimeoutError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT))
-        number = way.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        number = way.sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
         if number:
             raise OSError(number, os.strerror(number))
     except OSError:
-        way.close()
+        way.sock.close()
         raise
     return way
 
@@ -93,11 +125,15 @@ def take(host: str, port: int, *, timeout_s: float) -> socket.socket | None:
 def close() -> None:
     """Close what nobody took."""
     while _ways:
-        _ways.popitem()[1].close()
+        way = _ways.popitem()[1]
+        if way.transport is not None:
+            way.transport.close()
+        way.sock.close()
 
 
-def _begin_one(host: str, port: int) -> None:
+def _begin_one(settings: SshSettings) -> None:
     """Begin one way; a name is left to who may wait for its address."""
+    host, port = settings.host, settings.port
     try:
         numeric = socket.AI_NUMERICHOST
         family, kind, protocol, _, address = socket.getaddrinfo(
@@ -108,6 +144,26 @@ def _begin_one(host: str, port: int) -> None:
         return
     way.setblocking(False)
     if way.connect_ex(address) in (0, errno.EINPROGRESS) and (host, port) not in _ways:
-        _ways[host, port] = way
+        _ways[host, port] = Way(way, settings)
     else:
         way.close()
+
+
+def _speak() -> None:
+    """Let every machine that is connected by now agree on keys, in a thread of its own."""
+    from cosmos_cli.fleet.known_hosts import KnownHosts
+    from cosmos_cli.fleet.ssh_transport import make_transport
+    from cosmos_cli.fleet.wire import tcp_wire
+
+    sys.setswitchinterval(SWITCH_S)
+    poll = select.poll()
+    for way in _ways.values():
+        poll.register(way.sock, select.POLLOUT)
+    connected = {number for number, happened in poll.poll(0) if happened == select.POLLOUT}
+    for way in _ways.values():
+        if way.sock.fileno() in connected:
+            with contextlib.suppress(OSError):
+                kinds = KnownHosts(way.settings.known_hosts).kinds(way.settings.names)
+                transport = make_transport(tcp_wire(way.sock), kinds)
+                transport.begin()
+                way.transport = transport

@@ -6,7 +6,6 @@ Imported after a wire is open: importing paramiko and Fabric takes longer than t
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -218,7 +217,7 @@ def log_in(
             "timeout": timeout_s,
             "banner_timeout": timeout_s,
             "auth_timeout": timeout_s,
-            "transport_factory": _factory(known.kinds(settings.names)),
+            "transport_factory": _factory(known, settings),
             "auth_strategy": FewKeys(settings),
         },
     )
@@ -236,13 +235,19 @@ def log_in(
     return connection
 
 
-def _factory(known_kinds: list[str]) -> Callable[..., SshTransport]:
-    return lambda sock, disabled_algorithms: make_transport(sock, known_kinds)
+def _factory(known: KnownHosts, settings: SshSettings) -> Callable[..., SshTransport]:
+    def make(sock: Wire, disabled_algorithms: Any) -> SshTransport:
+        return sock.transport or make_transport(sock, known.kinds(settings.names))
+
+    return make
 
 
-@functools.lru_cache(maxsize=1)
 def _config() -> fabric.Config:
-    """Return one empty configuration for all: Fabric's files and ssh's are none of its business here."""
+    """
+    Return an empty configuration: Fabric's files and ssh's are none of its business here.
+
+    Each connection has one of its own: reading one writes to it, and threads would meet there.
+    """
     return fabric.Config(ssh_config=SSHConfig(), lazy=True)
 
 

@@ -196,11 +196,17 @@ def matches(patterns: Sequence[str], name: str) -> bool:
     fits = False
     for pattern in patterns:
         if pattern.startswith("!"):
-            if glob_of(pattern[1:].lower()).fullmatch(name.lower()):
+            if _fits(pattern[1:].lower(), name.lower()):
                 return False
         elif not fits:
-            fits = glob_of(pattern.lower()).fullmatch(name.lower()) is not None
+            fits = _fits(pattern.lower(), name.lower())
     return fits
+
+
+def _fits(pattern: str, name: str) -> bool:
+    if "*" in pattern or "?" in pattern:
+        return glob_of(pattern).fullmatch(name) is not None
+    return pattern == name  # most are plain names, one a machine
 
 
 @functools.lru_cache(maxsize=4096)

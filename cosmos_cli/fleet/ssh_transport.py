@@ -75,12 +75,39 @@ class SshTransport(Transport):
             default_window_size=WINDOW_BYTES,
             default_max_packet_size=PACKET_BYTES,
         )
+        self.wire = wire
+        self._begun: threading.Event | None = None
         self._news = threading.Condition()
         self._asked = 0
         self._answered = 0
         handlers: dict[int, Callable[[Message], None]] = self._handler_table  # type: ignore[attr-defined]
         for kind in (MSG_REQUEST_SUCCESS, MSG_REQUEST_FAILURE):
             handlers[kind] = functools.partial(self._count_answer, handlers[kind])
+
+    def begin(self) -> None:
+        """Begin to agree on keys; `start_client` then waits until that is done."""
+        self._begun = threading.Event()
+        super().start_client(self._begun)
+
+    def start_client(
+        self, event: threading.Event | None = None, timeout: float | None = None
+    ) -> None:
+        """
+        Agree on keys, or wait until what was begun has done so.
+
+        Raises:
+            SSHException: Keys could not be agreed on.
+            OSError: The wire broke.
+        """
+        if self._begun is None:
+            super().start_client(event, timeout)
+            return
+        until_s = None if timeout is None else time.monotonic() + timeout
+        while not self._begun.wait(ACTIVE_CHECK_S) and self.active:
+            if until_s is not None and time.monotonic() >= until_s:
+                return  # as paramiko's own does: what asks for the keys next finds none
+        if not self.active:
+            raise self.get_exception() or SSHException("Negotiation failed.")
 
     def start_command(self, command: str, *, timeout_s: float) -> Channel:
         """

@@ -11,9 +11,12 @@ import contextlib
 import socket
 import subprocess
 import time
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from cosmos_cli.fleet import headstart
+
+if TYPE_CHECKING:
+    from cosmos_cli.fleet.ssh_transport import SshTransport
 
 SEND_STALL_S_MAX = 15.0
 """A machine that took no byte for so long is taken for lost; a busy card delays sshd by less."""
@@ -64,6 +67,8 @@ class Wire:
         self._stalled_since_s: float | None = None
         self._closed = False  # paramiko asks for a socket's own
         self.own_address, self.peer_address = addresses
+        self.transport: SshTransport | None = None
+        """What speaks over it already."""
 
     def send(self, data: bytes) -> int:
         """Send what fits; raise when nothing has fitted for SEND_STALL_S_MAX."""
@@ -110,7 +115,9 @@ def connect_tcp(host: str, port: int, *, timeout_s: float) -> Wire:
     """
     begun = headstart.take(host, port, timeout_s=timeout_s)
     if begun is not None:
-        return _tcp_wire(begun)
+        wire = tcp_wire(begun.sock) if begun.transport is None else begun.transport.wire
+        wire.transport = begun.transport
+        return wire
     until_s = time.monotonic() + timeout_s
     error = OSError(f"{host} stands for no address")
     try:
@@ -124,14 +131,15 @@ def connect_tcp(host: str, port: int, *, timeout_s: float) -> Wire:
             share_s = (until_s - time.monotonic()) / (len(found) - index)
             sock.settimeout(max(TIMEOUT_S_MIN, share_s))
             sock.connect(address)
-            return _tcp_wire(sock)
+            return tcp_wire(sock)
         except OSError as failed:
             sock.close()
             error = failed
     raise error
 
 
-def _tcp_wire(sock: socket.socket) -> Wire:
+def tcp_wire(sock: socket.socket) -> Wire:
+    """Return a connected socket as a wire, without Nagle's delay."""
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return Wire(sock, addresses=(sock.getsockname()[0], sock.getpeername()[0]))
 

@@ -29,7 +29,7 @@ KINDS = ("packages", "file", "line", "service", "command")
 StepFault = tuple[tuple[str | int, ...], str]
 """The path within `cosmos_provision`, and what is wrong there."""
 
-_CONFIG = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+_CONFIG = ConfigDict(extra="forbid", frozen=True)
 
 
 class FileContent(BaseModel):

@@ -40,7 +40,7 @@ SectionFault = tuple[tuple[str | int, ...], str]
 class Scenario(BaseModel):
     """What to simulate. On which machines is the inventory's; `placement` says what belongs where."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: Annotated[str, Field(pattern=NAME_PATTERN, max_length=64)]
     """Name of the scenario; runs are named after it: lower-case letters, digits and hyphens."""

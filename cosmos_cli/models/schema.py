@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from pydantic import TypeAdapter
-from pydantic.json_schema import GenerateJsonSchema
 
+from cosmos_cli.models.docstrings import DescribedSchema
 from cosmos_cli.models.parameters import adapter_of
 from cosmos_cli.models.scenario import Scenario
 
@@ -16,7 +16,7 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 FILE_PATTERN = ":[A-Za-z_][A-Za-z_0-9]*$"
 
 
-class _Untitled(GenerateJsonSchema):
+class _Untitled(DescribedSchema):
     """Without titles that only repeat the field's name."""
 
     def field_title_should_be_set(self, schema: Any) -> bool:

@@ -27,7 +27,7 @@ import zstandard
 
 from madns_runtime.recording.reader import read_stream
 
-COSMOS = (sys.executable, "-m", "cosmos_cli.app")
+COSMOS = (sys.executable, "-m", "cosmos_cli.start")
 PLUGIN = Path(__file__).with_name("faulty_simulation.py")
 TEST_ID = "COSMOS_TEST_ID"
 PATIENCE_S = 90.0

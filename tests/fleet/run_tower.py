@@ -19,7 +19,7 @@ from tower import Tower
 
 PATIENCE_S = 150.0
 POLL_S = 0.05
-COSMOS = (sys.executable, "-m", "cosmos_cli.app")
+COSMOS = (sys.executable, "-m", "cosmos_cli.start")
 MARK = "COSMOS_TEST_RUN_TOWER"
 SCENARIO: dict[str, Any] = {
     "name": "board",

@@ -16,7 +16,7 @@ from tower import Tower
 
 PATIENCE_S = 180.0
 POLL_S = 0.05
-COSMOS = (sys.executable, "-m", "cosmos_cli.app")
+COSMOS = (sys.executable, "-m", "cosmos_cli.start")
 PLACES = "/home/pi /etc /boot/firmware /root /var/lib/dpkg/status /proc/sys/net /sys/class/rfkill"
 """All that `up` may change; contents of the kernel's files are compared by `SHOW_VALUES`."""
 LIST = f"sudo find {PLACES} -xdev ! -type d -printf '%p %m %u %s %T@ %i\\n' | LC_ALL=C sort"

@@ -49,7 +49,7 @@ RootFolder = Annotated[
 class Variables(BaseModel):
     """The variables that COSMoS knows; others pass through untouched."""
 
-    model_config = ConfigDict(extra="allow", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="allow", frozen=True)
 
     ansible_host: Address | None = None
     """Address of the machine; its name if not given."""

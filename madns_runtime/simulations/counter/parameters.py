@@ -12,7 +12,7 @@ from annotated_types import Ge, Le
 class CounterParameters:
     """How the counting packets travel."""
 
-    __pydantic_config__ = {"extra": "forbid", "use_attribute_docstrings": True}
+    __pydantic_config__ = {"extra": "forbid"}
 
     service: Literal["best", "reliable", "sync"] = "best"
     """Class of service: best as a bare datagram, reliable and sync with delivery guaranteed."""

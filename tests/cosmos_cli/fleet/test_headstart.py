@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import errno
 import socket
+import sys
 
 import pytest
 
 from cosmos_cli.fleet import headstart
+from cosmos_cli.fleet.connect import ConnectOptions, connect
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.fleet import fleet_of
 from cosmos_cli.fleet.wire import connect_tcp
 
 
 @pytest.fixture(autouse=True)
 def nothing_is_left():
+    before_s = sys.getswitchinterval()
     yield
     headstart.close()
+    sys.setswitchinterval(before_s)
 
 
 @pytest.fixture
@@ -44,7 +49,27 @@ def begun():
     return list(headstart._ways)
 
 
-def test_known_machine_is_connected_to_before_the_command_asks(inventory, server):
+def test_known_machine_is_spoken_to_before_the_command_asks(inventory, server):
+    headstart.begin(["exec", "-i", str(inventory), "--", "true"])
+    accepted, _ = server.accept()
+
+    with accepted:
+        accepted.settimeout(5)
+        assert accepted.recv(8) == b"SSH-2.0-"
+        wire = connect_tcp(*server.getsockname(), timeout_s=5)
+
+        assert wire.transport is not None
+        assert wire.transport.wire is wire
+        assert wire.peer_address == "127.0.0.1"
+        assert begun() == []
+        wire.transport.close()
+        wire.close()
+
+
+def test_machine_that_was_not_connected_in_time_is_left_to_the_command(
+    inventory, server, monkeypatch
+):
+    monkeypatch.setattr(headstart, "_speak", lambda: None)
     headstart.begin(["exec", "-i", str(inventory), "--", "true"])
     accepted, _ = server.accept()
 
@@ -53,9 +78,34 @@ def test_known_machine_is_connected_to_before_the_command_asks(inventory, server
         wire.send(b"hello")
 
         assert accepted.recv(5) == b"hello"
-        assert wire.peer_address == "127.0.0.1"
-        assert begun() == []
+        assert wire.transport is None
         wire.close()
+
+
+def test_what_fails_while_it_is_spoken_to_fails_where_it_is_wanted(inventory, server):
+    headstart.begin(["exec", "-i", str(inventory), "--", "true"])
+    accepted, _ = server.accept()
+    accepted.sendall(b"HTTP/1.0 400 no such thing\r\n" * 200)
+    accepted.close()
+    (target,) = fleet_of(inventory).targets
+
+    with pytest.raises(MachineFailure) as caught:
+        connect(target, ConnectOptions(timeout_s=3))
+
+    assert caught.value.kind is FailureKind.LOST
+    assert "Indecipherable protocol version" in str(caught.value)
+
+
+def test_machine_that_says_nothing_more_ends_at_the_deadline(inventory, server):
+    headstart.begin(["exec", "-i", str(inventory), "--", "true"])
+    accepted, _ = server.accept()
+    (target,) = fleet_of(inventory).targets
+
+    with accepted, pytest.raises(MachineFailure) as caught:
+        accepted.sendall(b"SSH-2.0-silent\r\n")
+        connect(target, ConnectOptions(timeout_s=1.0))
+
+    assert caught.value.kind is FailureKind.FROZEN
 
 
 @pytest.mark.parametrize(
@@ -118,4 +168,5 @@ def test_what_nobody_took_is_closed(inventory, server):
 
     with accepted:
         accepted.settimeout(5)
-        assert accepted.recv(1) == b""
+        while accepted.recv(4096):
+            pass

@@ -244,7 +244,7 @@ def test_unknown_host_keys_are_accepted_when_that_is_wanted(
 @contextlib.contextmanager
 def cosmos(*arguments):
     process = subprocess.Popen(
-        [sys.executable, "-m", "cosmos_cli.app", *arguments],
+        [sys.executable, "-m", "cosmos_cli.start", *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         start_new_session=True,
