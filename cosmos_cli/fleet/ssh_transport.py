@@ -103,10 +103,10 @@ class SshTransport(Transport):
             super().start_client(event, timeout)
             return
         until_s = None if timeout is None else time.monotonic() + timeout
-        while not self._begun.wait(ACTIVE_CHECK_S) and self.active:
+        while not self._begun.wait(ACTIVE_CHECK_S) and self.is_active():
             if until_s is not None and time.monotonic() >= until_s:
                 return  # as paramiko's own does: what asks for the keys next finds none
-        if not self.active:
+        if not self.is_active():
             raise self.get_exception() or SSHException("Negotiation failed.")
 
     def start_command(self, command: str, *, timeout_s: float) -> Channel:
