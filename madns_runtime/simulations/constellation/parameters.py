@@ -16,6 +16,9 @@ from annotated_types import Ge, Gt, Le, Lt, MinLen
 
 from madns_runtime.config import FORBID_EXTRA
 
+Force = Literal["two_body", "j2", "j3", "j4", "drag"]
+Setting = bool | int | float | str | list[float] | list[str]
+"""A value of one's own that a scenario hands to code of one's own."""
 SATELLITES_MAX = 5000
 KNOTS_MAX = 100_000
 """Knots in one segment: more is a mistake, not a plan."""
@@ -89,7 +92,7 @@ class ScipyPropagator:
 
     kind: Literal["scipy"]
     """scipy"""
-    forces: tuple[Literal["two_body", "j2"], ...] = ("two_body", "j2")
+    forces: tuple[Force, ...] = ("two_body", "j2")
     """Accelerations to sum; two_body must be among them."""
     rtol: Annotated[float, Ge(1e-13), Le(1e-6)] = 1e-12
     """Relative tolerance of a step, held for every vehicle by itself however many there are."""
@@ -100,6 +103,26 @@ class ScipyPropagator:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class NumbaPropagator:
+    """Numerical integration compiled to machine code, each vehicle at its own steps: extra `fast`."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    kind: Literal["numba"]
+    """numba"""
+    forces: tuple[Force, ...] = ("two_body", "j2")
+    """Accelerations to sum; two_body must be among them."""
+    rtol: Annotated[float, Ge(1e-13), Le(1e-6)] = 1e-12
+    """Relative tolerance of a step."""
+    atol_m: Annotated[float, Ge(1e-9), Le(1)] = 1e-6
+    """Absolute tolerance of a step in position, m; in velocity a thousandth of it a second."""
+    step_s_max: Annotated[float, Gt(0)] = 30.0
+    """Longest step, s."""
+    threads: Annotated[int, Ge(1), Le(256)] = 1
+    """Threads that share the vehicles."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sgp4Propagator:
     """SGP4 from the element sets themselves (WGS-72, as the sets were fitted)."""
 
@@ -107,6 +130,281 @@ class Sgp4Propagator:
 
     kind: Literal["sgp4"]
     """sgp4"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BasiliskPropagator:
+    """The Basilisk framework's spacecraft dynamics at a fixed step: extra `basilisk`."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    kind: Literal["basilisk"]
+    """basilisk"""
+    forces: tuple[Literal["two_body", "j2"], ...] = ("two_body", "j2")
+    """Accelerations to sum; two_body must be among them."""
+    step_s: Annotated[float, Ge(1e-3), Le(60)] = 0.1
+    """Integration step (RK4), s."""
+    simulations: Literal["one", "per_vehicle"] = "one"
+    """All vehicles in one simulation with one clock, or one simulation for each."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CustomPropagator:
+    """A propagator of one's own: a class with `propagate`, see `truth.propagation.Propagator`."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    kind: Literal["custom"]
+    """custom"""
+    implementation: Annotated[str, MinLen(3)]
+    """module:Class, or file.py:Class beside the scenario."""
+    can_maneuver: bool = True
+    """Whether it propagates from any state, as a maneuver needs."""
+    settings: dict[str, Setting] = field(default_factory=dict)
+    """For the class to read: PropagationParameters.settings.settings."""
+
+
+AnyPropagator = (
+    ScipyPropagator | NumbaPropagator | Sgp4Propagator | BasiliskPropagator | CustomPropagator
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Thruster:
+    """What turns a commanded delta-v into a real one."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    isp_s: Annotated[float, Gt(0)]
+    """Specific impulse, s."""
+    propellant_kg: Annotated[float, Ge(0)]
+    """Propellant at the epoch, kg; part of the vehicle's mass."""
+    thrust_n: Annotated[float, Gt(0)] | None = None
+    """Thrust, N: delta-v is a finite burn centred on its time; none for an impulse."""
+    magnitude_error: Annotated[float, Ge(0), Lt(1)] = 0.0
+    """Standard deviation of the delta-v's magnitude, as a share of it."""
+    direction_error_deg: Annotated[float, Ge(0), Le(45)] = 0.0
+    """Standard deviation of the delta-v's direction about each of two axes, deg."""
+    minimum_impulse_n_s: Annotated[float, Ge(0)] = 0.0
+    """A smaller impulse is not executed, N s."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReactionWheels:
+    """What turns a commanded torque into a real one."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    torque_n_m_max: Annotated[float, Gt(0)]
+    """Largest torque about each body axis, N m."""
+    momentum_n_m_s_max: Annotated[float, Gt(0)]
+    """Momentum about each body axis at which the wheels are saturated, N m s."""
+    torque_error: Annotated[float, Ge(0), Lt(1)] = 0.0
+    """Standard deviation of the torque, as a share of it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Attitude:
+    """A rigid body: quaternion (scalar last, inertial to body) and body rates are propagated as well."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    inertia_kg_m2: tuple[Annotated[float, Gt(0)], Annotated[float, Gt(0)], Annotated[float, Gt(0)]]
+    """Principal moments of inertia about body x, y, z, kg m^2."""
+    initial: Literal["nadir", "inertial"] = "nadir"
+    """nadir: body z to the Earth, y against the orbit normal, turning with the orbit; inertial: body axes
+    on the frame's, at rest."""
+    rates_deg_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Added to the body rates at the epoch, deg/s."""
+    has_gravity_gradient: bool = True
+    """Whether the Earth's gravity turns it."""
+    wheels: ReactionWheels | None = None
+    """Actuators of commanded torques; none for exact torques without limit."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorNoise:
+    """What every sensor may have. Units of the noise are those of the sensor's values."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    rate_hz: Annotated[float, Gt(0)] = 1.0
+    """Measurements a second; at most one a tick."""
+    noise: Annotated[float, Ge(0)] = 0.0
+    """Standard deviation of white noise on each value."""
+    bias: Annotated[float, Ge(0)] = 0.0
+    """Standard deviation of a constant error of each value."""
+    bias_walk: Annotated[float, Ge(0)] = 0.0
+    """Standard deviation of the bias's walk over one square root of a second."""
+    latency_s: Annotated[float, Ge(0)] = 0.0
+    """From the moment measured until flight software has it, s."""
+    dropout: Annotated[float, Ge(0), Le(1)] = 0.0
+    """Share of measurements that never come."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gnss(SensorNoise):
+    """Position (m) and velocity (m/s) in the run's frame; `noise` and biases are those of position."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    velocity_noise_m_s: Annotated[float, Ge(0)] = 0.0
+    """Standard deviation of white noise on each component of velocity, m/s."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Magnetometer(SensorNoise):
+    """Magnetic field in body axes, T; in the run's frame for a vehicle without attitude."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    field: Literal["dipole", "igrf"] = "dipole"
+    """dipole: tilted dipole; igrf: the extra `igrf`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sensors:
+    """What a vehicle measures; absent sensors measure nothing."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    gnss: Gnss | None = None
+    gyro: SensorNoise | None = None
+    """Body rates, rad/s."""
+    accelerometer: SensorNoise | None = None
+    """Acceleration other than gravity, in body axes, m/s^2."""
+    magnetometer: Magnetometer | None = None
+    star_tracker: SensorNoise | None = None
+    """Quaternion, scalar last, inertial to body; noise in rad about each body axis."""
+    sun_sensor: SensorNoise | None = None
+    """Unit vector to the Sun in body axes; nothing in eclipse; noise in rad."""
+    clock: SensorNoise | None = None
+    """Time since the epoch, s."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Vehicle:
+    """What some of the vehicles are like."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    agents: Annotated[tuple[str, ...], MinLen(1)] = ("*",)
+    """Globs of agents' or satellites' names; a vehicle is described by the first entry that fits."""
+    mass_kg: Annotated[float, Gt(0)] = 100.0
+    """Mass at the epoch, propellant included, kg."""
+    ballistic_m2_kg: Annotated[float, Ge(0)] = 0.01
+    """Ballistic coefficient Cd A / m, m^2/kg: what drag acts on."""
+    ballistic_m2_kg_range: tuple[float, float] | None = None
+    """Smallest and largest one that flight software may command by turning the vehicle; none for neither."""
+    thruster: Thruster | None = None
+    """None: no delta-v is executed."""
+    attitude: Attitude | None = None
+    """None: a point mass."""
+    sensors: Sensors = field(default_factory=Sensors)
+    """What it measures."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Maneuvers:
+    """How commands that change truth are treated."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    late: Literal["postpone", "refuse"] = "postpone"
+    """What becomes of a command that cannot be in truth by its time: executed at the first feasible time,
+    or not at all."""
+    propagation_s: Annotated[float, Gt(0)] = 0.02
+    """T_p: time allowed for propagating one vehicle anew; more is counted against the inequality."""
+    network_s: Annotated[float, Ge(0)] = 0.02
+    """T_n: time allowed for one way of a message."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Crosslinks:
+    """Radio between vehicles: the host is the medium."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    range_km_max: Annotated[float, Gt(0)] = 5000.0
+    """Longest link, km."""
+    atmosphere_km: Annotated[float, Ge(0)] = 100.0
+    """Height below which the Earth's atmosphere blocks a link, km."""
+    rate_bit_s: Annotated[float, Gt(0)] = 1e6
+    """Rate of every transmitter; its messages wait for each other, bit/s."""
+    processing_s: Annotated[float, Ge(0)] = 0.0
+    """Added to light time and transmission, s."""
+    loss: Annotated[float, Ge(0), Le(1)] = 0.0
+    """Share of messages lost on the way."""
+    queue_max: Annotated[int, Ge(1)] = 256
+    """Messages that may wait at one transmitter; further ones are refused and counted."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GroundStation:
+    """A place on the ground that vehicles may speak to while it sees them."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    name: Annotated[str, MinLen(1)]
+    """Messages to it go to ground:NAME, messages to any station to ground."""
+    latitude_deg: Annotated[float, Ge(-90), Le(90)]
+    """Geodetic latitude on WGS-84, deg."""
+    longitude_deg: Annotated[float, Ge(-180), Le(360)]
+    """East longitude, deg."""
+    altitude_m: Annotated[float, Ge(-500), Le(9000)] = 0.0
+    """Height above the ellipsoid, m."""
+    elevation_deg_min: Annotated[float, Ge(0), Lt(90)] = 10.0
+    """Elevation mask, deg."""
+    rate_bit_s: Annotated[float, Gt(0)] = 1e6
+    """Rate of each way of a contact, bit/s."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Uplink:
+    """A message that the ground has for a vehicle; it leaves in the first pass from its time on."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    at_s: Annotated[float, Ge(0)]
+    """Simulated time from which it waits, s."""
+    to: Annotated[str, MinLen(1)]
+    """Agent or satellite."""
+    text: str
+    """What flight software receives."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightSoftware:
+    """Flight software in Python: one class in one file."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    software: Annotated[str, MinLen(3)]
+    """guidance.py:Guidance beside the scenario, or module:Class."""
+    agents: Annotated[tuple[str, ...], MinLen(1)] = ("*",)
+    """Globs of agents' or satellites' names that fly it; the others are not commanded."""
+    input: Literal["measurements", "truth"] = "measurements"
+    """What it is given every tick."""
+    settings: dict[str, Setting] = field(default_factory=dict)
+    """For the class to read: context.settings."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightProcess:
+    """Flight software in any language: a program that speaks JSON lines on stdin and stdout."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    command: Annotated[tuple[str, ...], MinLen(1)]
+    """The program and its arguments; a relative path is found from the scenario's folder."""
+    agents: Annotated[tuple[str, ...], MinLen(1)] = ("*",)
+    """Globs of agents' or satellites' names that fly it."""
+    input: Literal["measurements", "truth"] = "measurements"
+    """What it is given every tick."""
+    settings: dict[str, Setting] = field(default_factory=dict)
+    """In the first line that it reads."""
+    answer_s: Annotated[float, Gt(0)] = 1.0
+    """Time for the answer to a tick; in real time a later one is counted as late and taken when it comes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,10 +445,20 @@ class ConstellationParameters:
     """Frame of every position and velocity: true equator, mean equinox of date."""
     gravity: Literal["EGM-96", "WGS-84", "WGS-72"] = "EGM-96"
     """Gravity constants of numerical propagation and of the recorded elements."""
-    propagator: ScipyPropagator | Sgp4Propagator = field(
-        default_factory=lambda: ScipyPropagator(kind="scipy")
-    )
+    propagator: AnyPropagator = field(default_factory=lambda: ScipyPropagator(kind="scipy"))
     """Who computes truth."""
+    vehicles: tuple[Vehicle, ...] = (Vehicle(),)
+    """What the vehicles are like; the first entry that fits a vehicle describes it."""
+    maneuvers: Maneuvers = field(default_factory=Maneuvers)
+    """How commands that change truth are treated."""
+    flight: str | FlightSoftware | FlightProcess | None = None
+    """Flight software of the agents: file.py:Class, or with settings; none for vehicles that only coast."""
+    crosslinks: Crosslinks | None = None
+    """Radio between vehicles; none for no radio."""
+    stations: tuple[GroundStation, ...] = ()
+    """Ground stations."""
+    uplinks: tuple[Uplink, ...] = ()
+    """What the ground has to say."""
     segments: SegmentSettings = field(default_factory=SegmentSettings)
     """How truth travels."""
     record: RecordSettings = field(default_factory=RecordSettings)

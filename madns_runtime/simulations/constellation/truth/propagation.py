@@ -18,7 +18,10 @@ from numpy.typing import NDArray
 
 from madns_runtime.simulations.constellation.orbit.constants import GravityModel
 from madns_runtime.simulations.constellation.orbit.invariants import invariants
-from madns_runtime.simulations.constellation.parameters import ScipyPropagator, Sgp4Propagator
+from madns_runtime.simulations.constellation.parameters import (
+    AnyPropagator,
+    ScipyPropagator,
+)
 from madns_runtime.simulations.constellation.truth.element_sets import ElementSet
 
 _TRUTH = "madns_runtime.simulations.constellation.truth"
@@ -34,7 +37,7 @@ PROPAGATORS = {
 class PropagationParameters:
     """All that a propagator may need besides states and times; travels to the executor."""
 
-    settings: ScipyPropagator | Sgp4Propagator
+    settings: AnyPropagator
     gravity: GravityModel
     epoch_utc: datetime
     """UTC of t = 0."""

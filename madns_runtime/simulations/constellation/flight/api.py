@@ -1,0 +1,112 @@
+"""
+The contract between a vehicle and its flight software: what is under test sees this and nothing else.
+
+Flight software is one class in one file; each vehicle has an object of it, made without arguments. It
+subclasses `FlightSoftware`, or merely looks like it. Times are simulated seconds since the epoch; vectors
+are in the run's inertial frame unless it says otherwise.
+
+    class Guidance(FlightSoftware):
+        def step(self, t_s, readings):
+            if (gnss := readings.get("gnss")) is not None and self.is_time(t_s, gnss.values):
+                self.context.delta_v((0.0, 0.1, 0.0), at_s=t_s + 3.0, frame="rtn")
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+from madns_runtime.simulations.constellation.messages import (
+    CommandFrame,
+    CommandResult,
+    Delivery,
+)
+
+if TYPE_CHECKING:
+    import numpy as np
+
+TRUTH = "truth"
+"""Name of the reading that is the truth itself, when the scenario says input: truth. Its values are x, y, z, m,
+vx, vy, vz, m/s; for a rigid body also the quaternion, scalar last, and the body rates, rad/s."""
+MASS = "mass"
+"""Name of the reading that a tank gauge gives with each command's result: mass, kg, and propellant, kg."""
+
+
+class Reading(NamedTuple):
+    """One measurement."""
+
+    t_s: float
+    """When it was valid."""
+    values: tuple[float, ...]
+    """Units and frame: see the sensor in `parameters.Sensors`."""
+
+
+Readings = Mapping[str, Reading]
+"""By the sensor's name, those that became known since the tick before: a sensor without news is not in it."""
+
+
+class FlightContext(Protocol):
+    """What a vehicle offers to its flight software."""
+
+    name: str
+    """The agent's."""
+    satellite: str
+    agents: tuple[str, ...]
+    """All agents of the run, in order."""
+    index: int
+    """Place of this one among them, from 0."""
+    tick_hz: float
+    duration_s: float
+    epoch_utc: str
+    """UTC of simulated time zero, ISO 8601."""
+    frame: str
+    settings: Mapping[str, Any]
+    """From the scenario: flight.settings."""
+    random: np.random.Generator
+    """Seeded from the run's seed and the agent's name."""
+
+    def delta_v(
+        self, delta_v_m_s: Sequence[float], *, at_s: float, frame: CommandFrame = "rtn"
+    ) -> int:
+        """Command a change of velocity and return the command's number; `command_result` tells what became of it."""
+
+    def torque(self, torque_n_m: Sequence[float], *, at_s: float, duration_s: float) -> int:
+        """Command a torque about the body axes and return the command's number."""
+
+    def ballistic(self, ballistic_m2_kg: float, *, at_s: float) -> int:
+        """Command another ballistic coefficient, m^2/kg, from *at_s* on; within the vehicle's range."""
+
+    def send(self, to: str, payload: Any) -> None:
+        """Send a message by radio to an agent or satellite, to ground:NAME or to ground."""
+
+    def broadcast(self, payload: Any) -> None:
+        """Send a message by radio to every vehicle in view."""
+
+    def estimate(self, values: Mapping[str, float]) -> None:
+        """Record what flight software believes now; names with units, such as slot_error_deg."""
+
+    def log(self, level: str, text: str) -> None:
+        """Log a sentence at critical, error, warning, info or debug."""
+
+
+class FlightSoftware(Protocol):
+    """What is under test. Subclass it and override what is needed."""
+
+    context: FlightContext
+
+    def setup(self, context: FlightContext) -> None:
+        """Prepare; called once, before the first tick."""
+        self.context = context
+
+    def step(self, t_s: float, readings: Readings) -> None:
+        """Do one tick's work."""
+
+    def receive(self, message: Delivery) -> None:
+        """Take a message by radio; called right before the tick in which it is heard."""
+
+    def command_result(self, result: CommandResult) -> None:
+        """Take what became of a command; called right before a tick."""
+
+    def finish(self) -> Mapping[str, Any]:
+        """Return a summary: plain numbers and texts."""
+        return {}
