@@ -46,6 +46,7 @@ class RunContext:
         recorder: Where its streams go.
         now_s: Returns the simulated time.
         send: Takes messages.
+        is_lockstep: Whether simulated time waits for everybody.
     """
 
     def __init__(  # noqa: PLR0913 - the collaborators of a seam, all keyword-only
@@ -57,8 +58,10 @@ class RunContext:
         recorder: Recorder,
         now_s: Callable[[], float],
         send: Sender,
+        is_lockstep: bool = False,
     ) -> None:
         self.name = name
+        self.is_lockstep = is_lockstep
         self.agents = config.agents.resolved_names()
         self.parameters = parameters
         self.tick_hz = config.agents.tick_hz

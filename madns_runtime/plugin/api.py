@@ -54,6 +54,8 @@ class Context(Protocol):
     """Folder of the scenario: relative files are found from here."""
     random: np.random.Generator
     """Seeded from the run's seed and `name`."""
+    is_lockstep: bool
+    """Whether simulated time waits for everybody: nothing recorded may then depend on the wall clock."""
 
     def now_s(self) -> float:
         """Return the simulated time, s: negative before T0; -timeouts.start_lead_s before that is set."""
