@@ -20,7 +20,8 @@ from madns_runtime.simulations.constellation.orbit.constants import GravityModel
 from madns_runtime.simulations.constellation.orbit.invariants import invariants
 from madns_runtime.simulations.constellation.parameters import (
     AnyPropagator,
-    ScipyPropagator,
+    CustomPropagator,
+    Sgp4Propagator,
 )
 from madns_runtime.simulations.constellation.truth.element_sets import ElementSet
 
@@ -42,11 +43,36 @@ class PropagationParameters:
     epoch_utc: datetime
     """UTC of t = 0."""
     element_sets: tuple[ElementSet, ...] = ()
+    """One a vehicle, in the order of the states; empty for others than sgp4."""
+    ballistic_m2_kg: NDArray[np.float64] | None = None
+    """Cd A / m of each vehicle, shape (N,), m^2/kg; None for no drag whatever the forces."""
+    thrust_m_s2: NDArray[np.float64] | None = None
+    """Acceleration of each vehicle's thruster, shape (N, 3), m/s^2, TEME, constant all through the call."""
+    base_directory: str = "."
+    """Folder of the scenario, which a custom propagator's file is found from."""
+
+    @property
+    def forces(self) -> tuple[str, ...]:
+        """Accelerations at work; SGP4 and propagators of one's own are judged as if they had J2."""
+        return getattr(self.settings, "forces", ("two_body", "j2"))
 
     @property
     def has_j2(self) -> bool:
         """Whether the dynamics contain J2, and the energy its potential."""
-        return not isinstance(self.settings, ScipyPropagator) or "j2" in self.settings.forces
+        return "j2" in self.forces
+
+    @property
+    def conserves_energy(self) -> bool:
+        """Whether energy is to stay: numerical propagation of known forces without drag or thrust."""
+        drags = "drag" in self.forces and self.ballistic_m2_kg is not None
+        return hasattr(self.settings, "forces") and not drags and self.thrust_m_s2 is None
+
+
+def can_maneuver(settings: AnyPropagator) -> bool:
+    """Tell whether a propagator starts from any state, as a vehicle after a maneuver needs."""
+    if isinstance(settings, CustomPropagator):
+        return settings.can_maneuver
+    return not isinstance(settings, Sgp4Propagator)
 
 
 class Propagator(Protocol):
