@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from madns_runtime.config import RunConfig
-from madns_runtime.errors import PluginError
+from madns_runtime.errors import BlamedError, PluginError
 from madns_runtime.protocol.messages import Service
 from madns_runtime.recording.records import Field, StreamSchema
 from madns_runtime.recording.writer import Recorder
@@ -89,6 +89,7 @@ class JobContext(RunContext):
     """The host's view: it can also hand long work to the executor."""
 
     submit: Callable[..., int]
+    wake: Callable[[float], None]
 
 
 def check_service(service: Service) -> None:
@@ -125,6 +126,8 @@ def describe_exception(error: BaseException, doing: str) -> str:
         error: What was caught, one call above the plug-in.
         doing: The call, such as FleetHost.setup.
     """
+    if isinstance(error, BlamedError):
+        return clean_text(str(error))
     frames = traceback.extract_tb(error.__traceback__)
     place = ""
     if frames:

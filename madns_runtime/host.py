@@ -151,6 +151,7 @@ class HostRuntime:
             send=self._send,
         )
         self._context.submit = self._jobs.submit
+        self._context.wake = self._wake
         self._report = HostReport(config.time.duration_s)
         self._t0_s: float | None = None
         # Infinite is never: each timer is made once and moved.
@@ -312,6 +313,11 @@ class HostRuntime:
         if next_s is not None and self._t0_s is not None:
             self._plugin_timer.reschedule(self._t0_s + next_s)
         self._pump()
+
+    def _wake(self, t_s: float) -> None:
+        due_s = math.inf if self._t0_s is None else self._t0_s + t_s
+        if not self._plugin_timer.is_pending or due_s < self._plugin_timer.when_s:
+            self._plugin_timer.reschedule(due_s)
 
     def _job_done(self, job: int, future: Future[Any]) -> None:
         error = future.exception()

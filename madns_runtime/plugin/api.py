@@ -103,6 +103,9 @@ class HostContext(Context, Protocol):
         Its value comes back through `HostSimulation.result`. An exception in it is one in the plug-in.
         """
 
+    def wake(self, t_s: float) -> None:
+        """Have `HostSimulation.timer` called at simulated time *t_s* if it wanted a later one, or none."""
+
 
 class AgentContext(Context, Protocol):
     """What the framework offers to an agent's half."""

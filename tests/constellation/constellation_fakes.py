@@ -1,5 +1,6 @@
 """A context without a runtime: a clock moved by hand, records in lists, jobs run when told."""
 
+import math
 from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,6 +37,9 @@ class FakeContext:
     streams: dict = field(default_factory=dict)
     logs: list = field(default_factory=list)
     jobs: list = field(default_factory=list)
+    is_lockstep: bool = False
+    wake_s: float = math.inf
+    random: np.random.Generator = field(default_factory=lambda: np.random.default_rng(7))
 
     def now_s(self):
         return self.clock_s
@@ -56,6 +60,9 @@ class FakeContext:
     def submit(self, function, *arguments):
         self.jobs.append((function, arguments))
         return len(self.jobs)
+
+    def wake(self, t_s):
+        self.wake_s = min(self.wake_s, t_s)
 
 
 class Star:
@@ -98,7 +105,8 @@ class Star:
             for context in self.contexts.values():
                 context.clock_s = t_s
             self._run_jobs()
-            while timer_s is not None and timer_s <= t_s:
+            while min(math.inf if timer_s is None else timer_s, self.context.wake_s) <= t_s:
+                self.context.wake_s = math.inf
                 timer_s = self.host.timer(t_s)
                 assert timer_s is None or timer_s > t_s
             self._deliver(t_s)

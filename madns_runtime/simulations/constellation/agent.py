@@ -70,6 +70,8 @@ class ConstellationAgent(AgentSimulation):
         self._buffer = TruthBuffer()
         if first.segment is not None:
             self._buffer.add(first.segment)
+        for part in first.more:
+            self._buffer.add(part)
         context.open_stream("state", STATE)
         context.open_stream("elements", ELEMENTS)
 

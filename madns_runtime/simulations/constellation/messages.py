@@ -117,6 +117,8 @@ class Initial:
     """UTC of simulated time zero, ISO 8601."""
     segment: Segment | None
     """Truth from now on; None if the host itself has none yet."""
+    more: tuple[Segment, ...] = ()
+    """What follows it, where maneuvers have cut truth into pieces."""
 
     def to_message(self) -> dict[str, Any]:
         """Return the mapping that travels."""
@@ -125,6 +127,7 @@ class Initial:
             "frame": self.frame,
             "epoch_utc": self.epoch_utc,
             "segment": None if self.segment is None else self.segment.to_message(),
+            "more": [segment.to_message() for segment in self.more],
         }
 
     @classmethod
@@ -142,6 +145,7 @@ class Initial:
                 frame=str(message["frame"]),
                 epoch_utc=str(message["epoch_utc"]),
                 segment=None if segment is None else Segment.from_message(segment),
+                more=tuple(Segment.from_message(part) for part in message.get("more", ())),
             )
         except (KeyError, TypeError) as error:
             raise PluginError(
@@ -166,6 +170,8 @@ class Command:
     vector: tuple[float, float, float]
     duration_s: float = 0.0
     """Of a torque, s."""
+    phase_s: float = 0.0
+    """By how much this agent's ticks lie behind their nominal time, s: its T_m comes that much later, too."""
 
     def to_message(self) -> dict[str, Any]:
         """Return the mapping that travels."""
@@ -178,30 +184,32 @@ class Command:
             "frame": self.frame,
             "vector": list(self.vector),
             "duration_s": self.duration_s,
+            "phase_s": self.phase_s,
         }
 
     @classmethod
     def from_message(cls, message: Mapping[str, Any]) -> Command:
         """
-        Read a command back.
+        Read a command back; its numbers need not be finite: what is not is refused, and said so.
 
         Raises:
             PluginError: It is not a command as `to_message` writes it.
         """
         try:
+            x, y, z = (float(value) for value in message["vector"])
             command = cls(
                 number=int(message["number"]),
                 kind=message["command"],
                 commanded_s=float(message["commanded_s"]),
                 at_s=float(message["at_s"]),
                 frame=message["frame"],
-                vector=_vector(message["vector"]),
+                vector=(x, y, z),
                 duration_s=float(message["duration_s"]),
+                phase_s=float(message.get("phase_s", 0.0)),
             )
         except (KeyError, TypeError, ValueError) as error:
             raise PluginError(f"constellation: expected a command, got {message!r:.200}") from error
-        numbers = (command.commanded_s, command.at_s, command.duration_s)
-        if not np.isfinite(numbers).all() or command.kind not in CommandKind.__args__:  # type: ignore[attr-defined]
+        if command.kind not in CommandKind.__args__:  # type: ignore[attr-defined]
             raise PluginError(f"constellation: expected a command, got {message!r:.200}")
         if command.frame not in CommandFrame.__args__:  # type: ignore[attr-defined]
             raise PluginError(f"constellation: no frame {command.frame!r}")
