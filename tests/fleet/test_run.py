@@ -144,9 +144,10 @@ def test_board_that_is_cut_off_ends_the_run_by_name_and_is_collected_later(
     code = tower.finish()
     tower.tower.fault("pi02", mending)
 
-    text = "machine pi02 is lost: no sign of life for 2.5 s"
+    # Who notices first, its host or its operator, is chance; each says it in words of its own.
+    text = "machine pi02 is lost: "
     assert code == 1, tower.talk
-    assert text in tower.problems("pi02")
+    assert any(problem.startswith(text) for problem in tower.problems("pi02"))
     assert tower.document["status"] == "failed"
     assert any(name in tower.document["reason"] for name in (text, "silent for 2.5 s"))
     tower.wait_until(lambda: not tower.living(), "end of the board's agents by themselves")
