@@ -26,6 +26,10 @@ class MissingExtraError(MadnsError):
         self.extra = extra
 
 
+class BlamedError(PluginError):
+    """Code that a plug-in itself had called raised; the text says already whose, what, and in which line."""
+
+
 class PeerError(MadnsError):
     """The other side did not do what was agreed."""
 
