@@ -32,7 +32,6 @@ ATTEMPTS_MAX = 5
 """So often a broken link is made anew, as long as every attempt brings something."""
 PAUSE_S = 1.0
 TOLD_INTERVAL_S = 0.1
-LIVING_SHOWN_MAX = 5
 BROKEN = (FailureKind.LOST, FailureKind.TIMEOUT)
 
 Progress = Callable[[str, float], None]
@@ -138,23 +137,6 @@ class Retrieval:
             elif outcome.value:
                 found[outcome.machine] = outcome.value
         return found
-
-    def refuse_living(self) -> None:
-        """
-        See that nothing of the run lives on a machine that answers.
-
-        Raises:
-            InputError: It does; the message names who lives where.
-        """
-        living = self.find_living()
-        if living:
-            shown = list(living.items())[:LIVING_SHOWN_MAX]
-            told = "; ".join(f"on {name}: {', '.join(words)}" for name, words in shown)
-            more = len(living) - len(shown)
-            raise InputError(
-                f"{self._run.name} is still running {told}{f' and on {more} more' if more else ''};"
-                " wait for its end, or end it with: cosmos down"
-            )
 
     def fetch(self) -> list[Outcome[Retrieved]]:
         """Bring everything here that is not here yet; an outcome for every machine of the run."""
