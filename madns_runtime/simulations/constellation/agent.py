@@ -1,5 +1,5 @@
 """
-An agent's half of the constellation: one vehicle that looks up its truth every tick and records it.
+An agent's half of the constellation: one vehicle with its truth, its sensors and its flight software.
 
 Needs numpy and nothing of the host's side. A tick costs about 3 us besides recording, 8 us with
 elements; values are rounded to 0.1 mm and 0.1 um/s, which keeps a tick's records near 91 B at 10 Hz.
@@ -14,11 +14,23 @@ from typing import Any
 from madns_runtime.errors import PluginError
 from madns_runtime.plugin.api import AgentContext, AgentSimulation, Tick
 from madns_runtime.recording.records import Field
-from madns_runtime.simulations.constellation.messages import SEGMENT, Initial, Segment
+from madns_runtime.simulations.constellation.messages import (
+    DELIVERY,
+    RESULT,
+    SEGMENT,
+    CommandResult,
+    Delivery,
+    Initial,
+    Segment,
+)
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
 from madns_runtime.simulations.constellation.orbit.elements import elements_from_state
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
+from madns_runtime.simulations.constellation.vehicle.cockpit import Cockpit
+from madns_runtime.simulations.constellation.vehicle.fitting import fit_out
+from madns_runtime.simulations.constellation.vehicle.streams import ATTITUDE
 from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBuffer
+from madns_runtime.simulations.constellation.vehicles import vehicle_of
 
 STATE = (
     Field("tick", "", "int"),
@@ -66,6 +78,7 @@ class ConstellationAgent(AgentSimulation):
         self._stride = max(1, round(context.tick_hz / parameters.record.elements_hz))
         self._elements_tick = 0
         self._served = 0
+        self._unheard = 0
         self._left_s_min = math.inf
         self._buffer = TruthBuffer()
         if first.segment is not None:
@@ -74,14 +87,22 @@ class ConstellationAgent(AgentSimulation):
             self._buffer.add(part)
         context.open_stream("state", STATE)
         context.open_stream("elements", ELEMENTS)
+        vehicle = vehicle_of(parameters, context.name, first.satellite)
+        if vehicle.attitude is not None:
+            context.open_stream("attitude", ATTITUDE)
+        self._cockpit: Cockpit | None = fit_out(context, first, vehicle)
 
     def step(self, tick: Tick) -> None:
         """Record the truth of this tick; a tick without truth is counted and nothing is made up."""
         state = self._buffer.lookup(tick.t_s)
-        if state is None:
-            return
+        if state is not None:
+            self._record_truth(tick, state)
+        if self._cockpit is not None:
+            self._cockpit.step(tick.index, tick.t_s, state, {})
+
+    def _record_truth(self, tick: Tick, state: tuple[float, ...]) -> None:
         self._served += 1
-        x, y, z, vx, vy, vz = state
+        x, y, z, vx, vy, vz = state[:6]
         self._context.record(
             "state",
             (
@@ -94,19 +115,33 @@ class ConstellationAgent(AgentSimulation):
                 round(vz, 7),
             ),
         )
+        if len(state) > 6:
+            attitude = [round(value, 12) for value in state[6:]]
+            self._context.record("attitude", (tick.index, *attitude))
         if tick.index >= self._elements_tick:
             self._elements_tick = tick.index - tick.index % self._stride + self._stride
             self._record_elements(tick.index, (x, y, z), (vx, vy, vz))
 
     def receive(self, message: Any) -> None:
         """
-        Take the next segment.
+        Take the next segment, a message by radio or what became of a command.
 
         Raises:
             PluginError: The host sent something else.
         """
-        if not isinstance(message, Mapping) or message.get("kind") != SEGMENT:
+        kind = message.get("kind") if isinstance(message, Mapping) else None
+        if kind == SEGMENT:
+            self._take_segment(message)
+        elif kind == DELIVERY and self._cockpit is not None:
+            self._cockpit.deliver(Delivery.from_message(message))
+        elif kind == RESULT and self._cockpit is not None:
+            self._cockpit.tell(CommandResult.from_message(message))
+        elif kind in (DELIVERY, RESULT):
+            self._unheard += 1  # a broadcast also reaches those who fly nothing
+        else:
             raise PluginError(f"constellation: expected a segment, got {message!r:.200}")
+
+    def _take_segment(self, message: Mapping[str, Any]) -> None:
         left_s = self._buffer.end_s - self._context.now_s()
         if self._buffer.add(Segment.from_message(message)):
             self._left_s_min = min(self._left_s_min, left_s)
@@ -129,6 +164,8 @@ class ConstellationAgent(AgentSimulation):
             "segments_superseded": buffer.superseded,
             "left_at_refill_s_min": self._left_s_min if math.isfinite(self._left_s_min) else None,
             "joint_gap_m_max": buffer.joint_gap_m_max,
+            **({} if self._cockpit is None else self._cockpit.finish()),
+            "messages_unheard": self._unheard,
             "checks": [underruns],
         }
 

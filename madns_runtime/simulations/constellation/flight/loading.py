@@ -1,0 +1,59 @@
+"""Finds the class of flight software that a scenario names."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from madns_runtime.errors import PluginError
+from madns_runtime.plugin.registry import load_function
+from madns_runtime.simulations.constellation.flight.api import FlightSoftware
+
+METHODS = ("setup", "step", "receive", "command_result", "finish")
+"""Of the contract; flight software may lack any of them, but not all."""
+
+
+def load_flight_class(spec: str, base_directory: Path) -> Callable[[], Any]:
+    """
+    Import a class of flight software; it is made without arguments.
+
+    Args:
+        spec: file.py:Class beside the scenario, or module:Class.
+        base_directory: Folder of the scenario.
+
+    Raises:
+        PluginError: It cannot be found, its file does not load, or it does not look like flight software.
+        MissingExtraError: It needs an optional dependency that is not installed.
+    """
+    found = load_function(spec, base_directory)
+    faults = contract_faults(found)
+    if faults:
+        raise PluginError(f"{spec}: {'; '.join(faults)}")
+    return found
+
+
+def contract_faults(found: Any) -> list[str]:
+    """Return what keeps a class from being flight software."""
+    if not isinstance(found, type):
+        return [f"expected a class, got {type(found).__name__}"]
+    there = [name for name in METHODS if callable(getattr(found, name, None))]
+    if not there:
+        return [f"expected at least one of the methods {', '.join(METHODS)}"]
+    faults = []
+    try:
+        inspect.signature(found).bind()
+    except TypeError:
+        faults.append("it must be made without arguments; take what it needs in setup(context)")
+    except ValueError:  # a class written in C tells no signature
+        return []
+    for name in there:
+        wanted = list(inspect.signature(getattr(FlightSoftware, name)).parameters)
+        try:
+            inspect.signature(getattr(found, name)).bind(*wanted)
+        except TypeError:
+            faults.append(f"{name}() must take ({', '.join(wanted)})")
+        except ValueError:
+            continue
+    return faults

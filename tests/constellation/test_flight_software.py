@@ -1,0 +1,354 @@
+"""Flight software on its board: what it is given, what leaves it, and who is blamed."""
+
+import re
+
+import numpy as np
+import pytest
+from constellation_fakes import WALKER, FakeContext, parameters
+
+from madns_runtime.context import describe_exception
+from madns_runtime.errors import BlamedError, PluginError
+from madns_runtime.plugin.api import Tick
+from madns_runtime.protocol.messages import Service
+from madns_runtime.simulations.constellation.agent import ConstellationAgent
+from madns_runtime.simulations.constellation.messages import (
+    Command,
+    CommandResult,
+    Delivery,
+    Initial,
+    Segment,
+    Transmission,
+)
+
+HZ = 10.0
+RESULT = {
+    "status": "executed",
+    "at_s": 3.0,
+    "revision": 1,
+    "delta_v_m_s": 0.1,
+    "propellant_kg": 4.0,
+}
+
+
+class BoardContext(FakeContext):
+    """Remembers how messages were sent, and has chance."""
+
+    def __init__(self, params, **rest):
+        agents = ("agent-01", "agent-02")
+        super().__init__("agent-01", agents, params, tick_hz=HZ, **rest)
+        self.random = np.random.default_rng([7, 1])
+        self.services = []
+
+    def send(self, to, message, service=None, *, deadline_s=None):
+        super().send(to, message, service, deadline_s=deadline_s)
+        self.services.append((service, deadline_s))
+
+
+def segment(until_s=60):
+    """Straight and uniform motion: knots of 1 s."""
+    times_s = np.arange(0.0, until_s + 1.0)
+    velocity = np.array([10.0, 7400.0, 0.0])
+    position = np.array([7.0e6, 0.0, 0.0]) + times_s[:, None] * velocity
+    states = np.hstack([position, np.tile(velocity, (len(times_s), 1))])
+    return Segment(revision=0, t0_s=0.0, knot_s=1.0, states=states)
+
+
+class Ship:
+    """One agent with flight software from a text."""
+
+    def __init__(self, folder, text="class G:\n    def step(self, t_s, readings): pass", **rest):
+        (folder / "guidance.py").write_text(text)
+        flight = {"software": "guidance.py:G", **rest.pop("flight", {})}
+        params = parameters(rest.pop("satellites", WALKER), flight=flight, **rest)
+        self.context = BoardContext(params, base_directory=folder)
+        initial = Initial(satellite="SAT-1", frame="TEME", epoch_utc="2026", segment=segment())
+        self.agent = ConstellationAgent()
+        self.agent.setup(self.context, initial.to_message())
+
+    def run(self, until_s, from_s=0.0):
+        for index in range(round(from_s * HZ), round(until_s * HZ)):
+            self.context.clock_s = index / HZ
+            self.agent.step(Tick(index, index / HZ, 1.0 / HZ, 0.0, 0))
+        return self
+
+    def tell(self, message):
+        self.agent.receive(message.to_message())
+        return self
+
+    @property
+    def flight(self):
+        """The flight software's own summary."""
+        return self.agent.finish()["flight"]
+
+    def sent(self, kind):
+        return [m for _, _, m in self.context.sent if m["kind"] == kind]
+
+
+def test_it_is_given_truth_where_the_scenario_says_so(tmp_path):
+    text = """
+class G:
+    seen = []
+    def step(self, t_s, readings):
+        self.seen.append([t_s, *readings["truth"].values])
+    def finish(self):
+        return {"seen": self.seen}
+"""
+    ship = Ship(tmp_path, text, flight={"input": "truth"}).run(0.3)
+
+    seen = np.array(ship.flight["seen"])
+    assert seen[:, 0] == pytest.approx([0.0, 0.1, 0.2])
+    assert seen[2, 1:] == pytest.approx([7.0e6 + 2.0, 1480.0, 0, 10.0, 7400.0, 0.0])
+
+
+def test_it_is_given_no_truth_otherwise(tmp_path):
+    text = "class G:\n    def step(self, t_s, readings):\n        assert 'truth' not in readings"
+
+    Ship(tmp_path, text).run(1.0)
+
+
+def test_a_command_leaves_at_once_with_its_time_as_deadline(tmp_path):
+    text = """
+class G:
+    def setup(self, context):
+        self.context = context
+    def step(self, t_s, readings):
+        if t_s == 1.0:
+            self.number = self.context.delta_v((0.0, 0.1, 0.0), at_s=t_s + 3.0)
+    def finish(self):
+        return {"number": self.number}
+"""
+    ship = Ship(tmp_path, text).run(2.0)
+
+    command = Command.from_message(ship.sent("command")[0])
+    assert ship.context.services == [(Service.SYNC, 4.0)]
+    assert command == Command(
+        number=0,
+        kind="delta_v",
+        commanded_s=1.0,
+        at_s=4.0,
+        frame="rtn",
+        vector=(0.0, 0.1, 0.0),
+    )
+    assert ship.flight == {"number": 0}
+    assert ship.context.records["commands"] == [(10, 0, "delta_v", 4.0, "rtn", 0.0, 0.1, 0.0, 0.0)]
+
+
+def test_a_result_is_told_right_before_the_next_tick_with_the_tank_gauge(tmp_path):
+    text = """
+class G:
+    calls = []
+    def command_result(self, result):
+        self.calls.append(result.status)
+    def step(self, t_s, readings):
+        self.calls.append([t_s, list(readings["mass"].values) if "mass" in readings else None])
+    def finish(self):
+        return {"calls": self.calls}
+"""
+    thruster = {"isp_s": 220.0, "propellant_kg": 5.0}
+    ship = Ship(tmp_path, text, vehicles=[{"mass_kg": 50.0, "thruster": thruster}]).run(0.1)
+    ship.tell(CommandResult(number=0, **RESULT)).run(0.3, 0.1)
+
+    assert ship.flight["calls"] == [[0.0, None], "executed", [0.1, [49.0, 4.0]], [0.2, None]]
+    assert ship.context.records["command_results"] == [(1, 0, "executed", 3.0, 1, 0.1, 4.0, "")]
+
+
+LISTENER = """
+class G:
+    heard = []
+    def receive(self, message):
+        self.heard.append([message.sender, message.payload])
+    def step(self, t_s, readings):
+        if self.heard:
+            self.heard[-1].append(t_s)
+    def finish(self):
+        return {"heard": self.heard}
+"""
+
+
+def delivery(arrives_s, sender="agent-02", sent_s=0.0, payload=None):
+    return Delivery(sender=sender, sent_s=sent_s, arrives_s=arrives_s, payload=payload)
+
+
+def test_a_message_is_held_until_the_first_tick_at_or_after_its_arrival(tmp_path):
+    ship = Ship(tmp_path, LISTENER, crosslinks={}).run(0.1)
+    ship.tell(delivery(0.31, payload="later")).tell(delivery(0.2, payload="on a tick"))
+    ship.run(1.0, 0.1)
+
+    heard = ship.flight["heard"]
+    assert [row[:3] for row in heard] == [
+        ["agent-02", "on a tick", 0.2],
+        ["agent-02", "later", 0.4],
+    ]
+    assert ship.agent.finish()["messages_late"] == 0
+
+
+def test_messages_of_one_moment_are_heard_in_the_order_of_their_senders(tmp_path):
+    ship = Ship(tmp_path, LISTENER, crosslinks={})
+    for sender in ("c", "a", "b"):
+        ship.tell(delivery(0.5, sender=sender))
+
+    ship.run(1.0)
+
+    assert [row[0] for row in ship.flight["heard"]] == ["a", "b", "c"]
+
+
+def test_a_message_that_missed_its_tick_is_heard_in_the_next_and_counted(tmp_path):
+    ship = Ship(tmp_path, LISTENER, crosslinks={}).run(1.0)
+    ship.tell(delivery(0.85)).tell(delivery(0.95)).run(2.0, 1.0)
+
+    assert ship.agent.finish()["messages_late"] == 1
+    assert ship.agent.finish()["messages_received"] == 2
+    assert [row[0] for row in ship.context.records["messages"]] == [10, 10]
+
+
+def test_messages_leave_numbered_and_stamped_with_their_tick(tmp_path):
+    text = """
+class G:
+    def setup(self, context):
+        self.context = context
+    def step(self, t_s, readings):
+        self.context.send("agent-02", {"t": t_s})
+        self.context.broadcast("all")
+"""
+    ship = Ship(tmp_path, text, crosslinks={}).run(0.2)
+
+    sent = [Transmission.from_message(message) for message in ship.sent("transmission")]
+    assert [(m.to, m.sent_s, m.number, m.payload) for m in sent] == [
+        ("agent-02", 0.0, 0, {"t": 0.0}),
+        ("*", 0.0, 1, "all"),
+        ("agent-02", 0.1, 2, {"t": 0.1}),
+        ("*", 0.1, 3, "all"),
+    ]
+    assert {service for service, _ in ship.context.services} == {Service.RELIABLE}
+
+
+def test_estimates_are_recorded_apart_with_the_units_of_their_names(tmp_path):
+    text = """
+class G:
+    def setup(self, context):
+        self.context = context
+    def step(self, t_s, readings):
+        self.context.estimate({"slot_error_deg": t_s, "a_m": 7e6})
+"""
+    ship = Ship(tmp_path, text).run(0.2)
+
+    fields = ship.context.streams["estimates"]
+    assert [(f.name, f.unit) for f in fields] == [
+        ("tick", ""),
+        ("slot_error_deg", "deg"),
+        ("a_m", "m"),
+    ]
+    assert ship.context.records["estimates"] == [(0, 0.0, 7e6), (1, 0.1, 7e6)]
+
+
+def body(*lines):
+    return "\n".join(
+        [
+            "class G:",
+            "    def setup(self, context):",
+            "        self.context = context",
+            "    def step(self, t_s, readings):",
+            *[f"        {line}" for line in lines],
+        ]
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("self.context.delta_v((1, 2), at_s=1.0)", "expected three numbers in m/s, got (1, 2)"),
+        ("self.context.delta_v((1, 2, float('nan')), at_s=1.0)", "expected a finite number"),
+        ("self.context.delta_v((1, 2, 3), at_s=None)", "expected a finite number for at_s"),
+        ("self.context.delta_v((1, 2, 3), at_s=1.0, frame='RTN')", "inertial, rtn, body"),
+        ("self.context.delta_v((1, 2, 3), at_s=1.0, frame='body')", "vehicles.attitude"),
+        ("self.context.torque((1, 2, 3), at_s=1.0, duration_s=1.0)", "vehicles.attitude"),
+        ("self.context.ballistic(0.5, at_s=1.0)", "0.01 to 0.02 m^2/kg, got 0.5"),
+        ("[self.context.delta_v((1, 2, 3), at_s=9.0) for _ in range(17)]", "at most 16 commands"),
+        ("[self.context.broadcast(1) for _ in range(65)]", "at most 64 messages"),
+        ("self.context.broadcast('x' * 20_000)", "at most 16384 bytes, got 20003"),
+        ("self.context.broadcast(object())", "send: "),
+        ("self.context.send('ground', 1)", "no stations"),
+        ("self.context.send(3, 1)", "expected a receiver's name, got 3"),
+        ("self.context.estimate({})", "a mapping of 1 to 64 names"),
+        ("self.context.estimate({'a': 1}); self.context.estimate({'b': 1})", "numbers for a,"),
+        ("self.context.estimate({'a': 'x'})", "numbers for a,"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_with_its_line(tmp_path, line, words):
+    ship = Ship(
+        tmp_path,
+        body("pass", line),
+        crosslinks={},
+        vehicles=[{"ballistic_m2_kg_range": [0.01, 0.02]}],
+    )
+
+    with pytest.raises(BlamedError, match=re.escape(words)) as caught:
+        ship.run(0.1)
+
+    assert str(caught.value).startswith("G.step raised PluginError: ")
+    assert str(caught.value).endswith("(guidance.py:6)")
+
+
+def test_an_error_names_class_method_file_and_line_once(tmp_path):
+    ship = Ship(tmp_path, body("self.helper()") + "\n    def helper(self):\n        1 / 0\n")
+
+    with pytest.raises(BlamedError) as caught:
+        ship.run(0.1)
+
+    told = describe_exception(caught.value, "ConstellationAgent.step")
+    assert told == "G.step raised ZeroDivisionError: division by zero (guidance.py:7)"
+
+
+def test_commands_before_the_first_tick_are_refused(tmp_path):
+    text = "class G:\n    def setup(self, context):\n        context.delta_v((1, 1, 1), at_s=1.0)"
+
+    with pytest.raises(BlamedError, match="before the first tick"):
+        Ship(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("G = 3", "guidance.py:G"),
+        ("def G(): pass", "expected a class, got function"),
+        ("class G: pass", "at least one of the methods setup, step"),
+        ("class G:\n    def __init__(self, x): pass\n    def step(self, t, r): pass", "arguments"),
+        ("class G:\n    def step(self, t_s): pass", r"step\(\) must take \(self, t_s, readings\)"),
+        ("class H: pass", "no 'G'|has no"),
+        ("import no_such_module_here", "no_such_module_here"),
+    ],
+)
+def test_what_is_no_flight_software_is_named_at_set_up(tmp_path, text, words):
+    with pytest.raises(PluginError, match=words):
+        Ship(tmp_path, text)
+
+
+def test_a_vehicle_that_only_coasts_counts_what_nobody_hears(tmp_path):
+    ship = Ship(tmp_path, flight={"agents": ["agent-02"]})
+    ship.tell(delivery(0.1)).run(1.0)
+
+    summary = ship.agent.finish()
+    assert summary["messages_unheard"] == 1
+    assert "flight" not in summary
+    assert len(ship.context.records["state"]) == 10
+
+
+def test_flight_software_runs_on_without_truth(tmp_path):
+    text = (
+        body("self.n = getattr(self, 'n', 0) + 1") + "\n    def finish(self): return {'n': self.n}"
+    )
+    ship = Ship(tmp_path, text, flight={"input": "truth"}).run(62.0)
+
+    assert ship.flight == {"n": 620}
+    assert ship.agent.finish()["underruns"] > 0
+
+
+def test_chance_is_the_same_in_every_run(tmp_path):
+    text = """
+class G:
+    def setup(self, context):
+        self.drawn = context.random.normal()
+    def finish(self):
+        return {"drawn": self.drawn}
+"""
+    assert Ship(tmp_path, text).flight == Ship(tmp_path, text).flight
