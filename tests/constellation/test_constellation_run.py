@@ -13,7 +13,6 @@ from madns_runtime.errors import PluginError
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
 from madns_runtime.simulations.constellation.truth.fleet import load_fleet
 from madns_runtime.simulations.constellation.truth.propagation import (
-    PROPAGATORS,
     PropagationParameters,
     load_propagator,
 )
@@ -21,7 +20,7 @@ from madns_runtime.simulations.constellation.truth.propagation import (
 BYTES_PER_TICK_MAX = 110
 
 
-@pytest.mark.parametrize("kind", PROPAGATORS)
+@pytest.mark.parametrize("kind", ["scipy", "sgp4"])
 def test_sixty_seconds_serve_every_tick_with_the_propagators_own_states(kind):
     params = parameters(IRIDIUM, propagator={"kind": kind})
     star = Star(params, 10)

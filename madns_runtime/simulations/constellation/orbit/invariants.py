@@ -8,6 +8,8 @@ the Earth's axis stays.
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +20,11 @@ ENERGY, MOMENTUM, MOMENTUM_Z = range(3)
 
 
 def specific_energy(
-    states: NDArray[np.float64], gravity: GravityModel, *, with_j2: bool
+    states: NDArray[np.float64],
+    gravity: GravityModel,
+    *,
+    with_j2: bool,
+    also: Collection[str] = (),
 ) -> NDArray[np.float64]:
     """
     Return kinetic plus potential energy per mass.
@@ -28,6 +34,7 @@ def specific_energy(
             is the Earth's.
         gravity: Constants.
         with_j2: Whether the potential includes the J2 term.
+        also: Further terms of the potential: j3, j4.
 
     Returns:
         Energy, shape (...), J/kg; negative for bound orbits.
@@ -38,6 +45,13 @@ def specific_energy(
     if with_j2:
         scale = 0.5 * gravity.mu_m3_s2 * gravity.j2 * gravity.radius_m**2
         energy = energy + scale / (r2 * radius) * (3.0 * states[..., 2] ** 2 / r2 - 1.0)
+    sine = states[..., 2] / radius
+    if "j3" in also:
+        scale = 0.5 * gravity.mu_m3_s2 * gravity.j3 * gravity.radius_m**3
+        energy = energy + scale / r2**2 * (5.0 * sine**3 - 3.0 * sine)
+    if "j4" in also:
+        scale = 0.125 * gravity.mu_m3_s2 * gravity.j4 * gravity.radius_m**4
+        energy = energy + scale / (r2**2 * radius) * (35.0 * sine**4 - 30.0 * sine**2 + 3.0)
     return np.asarray(energy, dtype=np.float64)
 
 
@@ -47,7 +61,11 @@ def angular_momentum(states: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def invariants(
-    states: NDArray[np.float64], gravity: GravityModel, *, with_j2: bool
+    states: NDArray[np.float64],
+    gravity: GravityModel,
+    *,
+    with_j2: bool,
+    also: Collection[str] = (),
 ) -> NDArray[np.float64]:
     """
     Return energy (J/kg), magnitude and z component of angular momentum (m^2/s).
@@ -56,11 +74,12 @@ def invariants(
         states: Shape (..., 6), m and m/s.
         gravity: Constants.
         with_j2: Whether the potential includes the J2 term.
+        also: Further terms of the potential: j3, j4.
 
     Returns:
         Shape (..., 3), columns ENERGY, MOMENTUM, MOMENTUM_Z.
     """
     momentum = angular_momentum(states)
-    energy = specific_energy(states, gravity, with_j2=with_j2)
+    energy = specific_energy(states, gravity, with_j2=with_j2, also=also)
     magnitude = np.linalg.norm(momentum, axis=-1)
     return np.stack((energy, magnitude, momentum[..., 2]), axis=-1)

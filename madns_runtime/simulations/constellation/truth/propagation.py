@@ -11,12 +11,17 @@ from __future__ import annotations
 import importlib
 from dataclasses import dataclass
 from datetime import datetime
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from madns_runtime.simulations.constellation.orbit.constants import GravityModel
+from madns_runtime.errors import ConfigurationError
+from madns_runtime.simulations.constellation.orbit.constants import (
+    EARTH_POLAR_RADIUS_M,
+    GravityModel,
+)
 from madns_runtime.simulations.constellation.orbit.invariants import invariants
 from madns_runtime.simulations.constellation.parameters import (
     AnyPropagator,
@@ -30,8 +35,11 @@ _TRUTH = "madns_runtime.simulations.constellation.truth"
 PROPAGATORS = {
     "scipy": f"{_TRUTH}.scipy_propagator:ScipyDop853",
     "sgp4": f"{_TRUTH}.sgp4_propagator:Sgp4",
+    "custom": f"{_TRUTH}.custom_propagator:Custom",
 }
 """The kind in a scenario -> module:class."""
+FAULTS_MAX = 5
+"""Vehicles that one message names."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,6 +58,8 @@ class PropagationParameters:
     """Acceleration of each vehicle's thruster, shape (N, 3), m/s^2, TEME, constant all through the call."""
     base_directory: str = "."
     """Folder of the scenario, which a custom propagator's file is found from."""
+    names: tuple[str, ...] = ()
+    """What messages call the vehicles, in the order of the states; empty for their numbers."""
 
     @property
     def forces(self) -> tuple[str, ...]:
@@ -127,9 +137,10 @@ class StretchRequest:
     """Shape (N, 6), m and m/s, TEME."""
 
 
+@lru_cache(maxsize=len(PROPAGATORS))
 def load_propagator(kind: str) -> Propagator:
     """
-    Return the propagator of a kind in PROPAGATORS.
+    Return the propagator of a kind in PROPAGATORS, one a process: some have much to set up.
 
     Raises:
         MissingExtraError: The library behind it is not installed.
@@ -139,12 +150,107 @@ def load_propagator(kind: str) -> Propagator:
     return propagator
 
 
+def propagate(
+    states: NDArray[np.float64],
+    t0_s: float,
+    knots_s: NDArray[np.float64],
+    parameters: PropagationParameters,
+) -> NDArray[np.float64]:
+    """
+    Return the states of all vehicles at all knots by the propagator of the settings.
+
+    Arguments and result are those of `Propagator.propagate`, and are judged here for all kinds.
+
+    Raises:
+        ConfigurationError: Arguments do not fit each other, a vehicle cannot be propagated, or one
+            is inside the Earth; the message names it and says when and why.
+        MissingExtraError: The library behind the propagator is not installed.
+    """
+    _check_arguments(states, t0_s, knots_s, parameters)
+    shape = (len(states), len(knots_s), 6)
+    if 0 in shape:
+        return np.empty(shape)
+    found = load_propagator(parameters.settings.kind).propagate(states, t0_s, knots_s, parameters)
+    if getattr(found, "shape", None) != shape:
+        got = getattr(found, "shape", type(found).__name__)
+        raise ConfigurationError(
+            f"parameters.propagator: expected states of shape {shape}, got {got}"
+        )
+    _check_states(found, knots_s, parameters)
+    return found
+
+
 def propagate_stretch(request: StretchRequest, parameters: PropagationParameters) -> Stretch:
     """Compute a stretch of truth and what it should conserve; runs in the executor."""
     numbers = np.arange(request.first_knot, request.first_knot + request.knots)
     # Times are products, not sums, so that knots stay on the grid however long the run.
     times_s = numbers.astype(np.float64) * request.knot_s
-    propagator = load_propagator(parameters.settings.kind)
-    states = propagator.propagate(request.states, float(times_s[0]), times_s, parameters)
-    conserved = invariants(states, parameters.gravity, with_j2=parameters.has_j2)
+    states = propagate(request.states, float(times_s[0]), times_s, parameters)
+    conserved = conserved_by(states, parameters)
     return Stretch(first_knot=request.first_knot, states=states, invariants=conserved)
+
+
+def conserved_by(
+    states: NDArray[np.float64], parameters: PropagationParameters
+) -> NDArray[np.float64]:
+    """Return the invariants, shape (..., 3), of states (..., 6) under the forces of *parameters*."""
+    also = [force for force in parameters.forces if force in ("j3", "j4")]
+    return invariants(states, parameters.gravity, with_j2=parameters.has_j2, also=also)
+
+
+def _check_arguments(
+    states: NDArray[np.float64],
+    t0_s: float,
+    knots_s: NDArray[np.float64],
+    parameters: PropagationParameters,
+) -> None:
+    count = len(states)
+    wanted: dict[str, tuple[NDArray[np.float64], tuple[int, ...]]] = {
+        "states": (states, (count, 6))
+    }
+    if parameters.ballistic_m2_kg is not None:
+        wanted["ballistic_m2_kg"] = (parameters.ballistic_m2_kg, (count,))
+    if parameters.thrust_m_s2 is not None:
+        wanted["thrust_m_s2"] = (parameters.thrust_m_s2, (count, 3))
+    faults = [
+        f"propagation: expected {name} of shape {shape}, got {values.shape}"
+        for name, (values, shape) in wanted.items()
+        if values.shape != shape
+    ]
+    if "two_body" not in parameters.forces:
+        faults.append(
+            f"parameters.propagator.forces: expected two_body among them, got {list(parameters.forces)}"
+        )
+    if not np.isfinite(knots_s).all() or (np.diff(knots_s, prepend=t0_s) < 0.0).any():
+        faults.append(f"propagation: expected knots that ascend from {t0_s:g} s on, got {knots_s}")
+    if faults:
+        raise ConfigurationError("\n".join(faults))
+    _check_states(states[:, None], np.array([t0_s]), parameters)
+
+
+def _check_states(
+    states: NDArray[np.float64], times_s: NDArray[np.float64], parameters: PropagationParameters
+) -> None:
+    """Raise ConfigurationError for states (N, K, 6) that are not finite or lie inside the Earth."""
+    r2 = np.einsum("nki,nki->nk", states[..., :3], states[..., :3])
+    # Written so that what is not a number is a fault, too; velocities fail with positions.
+    sound = (
+        (r2 >= EARTH_POLAR_RADIUS_M**2) & (r2 < np.inf) & np.isfinite(states[..., 3:]).all(axis=2)
+    )
+    if sound.all():
+        return
+    vehicles = np.flatnonzero(~sound.all(axis=1))
+    faults = []
+    for vehicle in vehicles[:FAULTS_MAX].tolist():
+        knot = int(np.argmin(sound[vehicle]))
+        name = parameters.names[vehicle] if parameters.names else f"vehicle {vehicle}"
+        distance_km = float(np.sqrt(r2[vehicle, knot])) / 1000.0
+        what = (
+            f"is inside the Earth, {distance_km:.1f} km from its centre"
+            if np.isfinite(states[vehicle, knot]).all()
+            else f"expected a finite state, got {states[vehicle, knot].tolist()}"
+        )
+        faults.append(f"{name}: {what}, at {times_s[knot]:g} s")
+    if len(vehicles) > FAULTS_MAX:
+        faults.append(f"and {len(vehicles) - FAULTS_MAX} more")
+    raise ConfigurationError("\n".join(faults))
