@@ -1,19 +1,26 @@
 """
-What crosslinks and ground stations have in common: a transmitter's queue, chance, messages on their
-way, and the account of what became of each. Pure: no clock; chance is drawn from numbers, not in turn.
+What crosslinks and ground stations have in common.
+
+A transmitter's queue, chance, messages on their way, and the account of what became of each. Pure: no
+clock, and chance is drawn for names, not in turn.
 """
 
 from __future__ import annotations
 
 import heapq
+import math
 import struct
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
 from typing import Any, Literal, get_args
 
+import numpy as np
+
+from madns_runtime.errors import PluginError
 from madns_runtime.recording.records import Field
-from madns_runtime.simulations.constellation.messages import Delivery
+from madns_runtime.simulations.constellation.messages import Delivery, Transmission
 
 Outcome = Literal[
     "delivered",
@@ -35,7 +42,7 @@ OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 LEAD_S = 1.0
 """How long before their arrival messages are handed out, s: far more than a network takes."""
 
-_KEY = struct.Struct("<4Q")
+_KEY = struct.Struct("<3q")
 _CHANCES = float(2**64)
 
 
@@ -84,6 +91,43 @@ LINK_FIELDS = (
     Field("size_bytes", "B", "int"),
 )
 """Stream "links": one record a LinkEvent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """A message that a transmitter was given, on its way to become events."""
+
+    sender: int
+    """What chance is drawn for: a vehicle's index, or a station's after those of all vehicles."""
+    name: str
+    """The sender's."""
+    message: Transmission
+    size_bytes: int
+    """Of the encoded payload."""
+
+    def failed(
+        self, outcome: Outcome, to: str | None = None, distance_m: float | None = None
+    ) -> LinkEvent:
+        """Return why it does not arrive, at one receiver or (None) at whomever it was meant for."""
+        return self._event(outcome, self.message.to if to is None else to, None, distance_m)
+
+    def delivered(self, to: str, distance_m: float, arrives_s: float) -> LinkEvent:
+        """Return that it arrives."""
+        return self._event("delivered", to, arrives_s, distance_m)
+
+    def _event(
+        self, outcome: Outcome, to: str, arrives_s: float | None, distance_m: float | None
+    ) -> LinkEvent:
+        return LinkEvent(
+            number=self.message.number,
+            sender=self.name,
+            to=to,
+            sent_s=self.message.sent_s,
+            arrives_s=arrives_s,
+            outcome=outcome,
+            distance_m=distance_m,
+            size_bytes=self.size_bytes,
+        )
 
 
 class Transmitter:
@@ -136,12 +180,13 @@ class Chance:
 
     __slots__ = ("_key",)
 
-    def __init__(self, seed: int) -> None:
-        self._key = seed.to_bytes(8, "little")
+    def __init__(self, random: np.random.Generator) -> None:
+        """Take one number from *random*, now, as the seed."""
+        self._key = random.bytes(16)
 
     def draw(self, sender: int, number: int, receiver: int) -> float:
         """Return a number within [0, 1)."""
-        drawn = blake2b(_KEY.pack(sender, number, receiver, 0), digest_size=8, key=self._key)
+        drawn = blake2b(_KEY.pack(sender, number, receiver), digest_size=8, key=self._key)
         return int.from_bytes(drawn.digest(), "little") / _CHANCES
 
 
@@ -181,27 +226,57 @@ class InFlight:
 class Account:
     """How many messages there were and what became of each: nothing is dropped without a count."""
 
-    __slots__ = ("_counts", "sent", "size_bytes", "transmissions")
+    __slots__ = ("_counts", "_delivered_bytes", "_heard_late", "sent", "transmissions")
 
     def __init__(self) -> None:
         self.transmissions = 0
-        """Messages that vehicles handed over; a broadcast is one."""
+        """Messages that were handed over; a broadcast is one."""
         self.sent = 0
         """Ways of a message to one receiver, possible or not: always the sum of all outcomes."""
-        self.size_bytes = 0
-        """Payload that was delivered."""
         self._counts: Counter[Outcome] = Counter()
+        self._delivered_bytes = 0
+        self._heard_late = 0
 
-    def enter(self, event: LinkEvent) -> None:
-        """Count one way of a message."""
+    def enter(self, event: LinkEvent, now_s: float) -> None:
+        """Count one way of a message that the host hears of at *now_s*."""
         self.sent += 1
         self._counts[event.outcome] += 1
-        if event.outcome == "delivered":
-            self.size_bytes += event.size_bytes
+        if event.arrives_s is not None:
+            self._delivered_bytes += event.size_bytes
+            self._heard_late += event.arrives_s < now_s
 
-    def to_summary(self) -> dict[str, int]:
-        """Return all counts by name."""
+    def to_summary(self, in_flight: InFlight) -> dict[str, int]:
+        """
+        Return all counts by name.
+
+        delivered = handed_over + in_flight; heard_late are those delivered that should have arrived
+        before the host heard of them: they reach their receiver late.
+        """
         counts: dict[str, int] = {"transmissions": self.transmissions, "sent": self.sent}
         counts.update({outcome: self._counts[outcome] for outcome in OUTCOMES})
-        counts["delivered_bytes"] = self.size_bytes
+        counts["handed_over"] = in_flight.handed_over
+        counts["in_flight"] = len(in_flight)
+        counts["heard_late"] = self._heard_late
+        counts["delivered_bytes"] = self._delivered_bytes
         return counts
+
+
+def checked_sent_s(transmission: Transmission) -> float:
+    """
+    Return when a message was sent.
+
+    Raises:
+        PluginError: That is no time.
+    """
+    if not math.isfinite(transmission.sent_s):
+        raise PluginError(
+            f"constellation: expected a transmission's time in s, got {transmission.sent_s!r}"
+        )
+    return transmission.sent_s
+
+
+def index_of_names(agents: Sequence[str], satellites: Sequence[str]) -> dict[str, int]:
+    """Return who is meant by a name: an agent, or the one that flies the satellite of that name."""
+    index = {name: number for number, name in enumerate(satellites[: len(agents)])}
+    index.update({name: number for number, name in enumerate(agents)})
+    return index
