@@ -17,11 +17,17 @@ from madns_runtime.simulations.constellation.orbit.hermite import (
     coefficients,
     evaluate,
 )
+from madns_runtime.simulations.constellation.orbit.quaternions import IDENTITY
+from madns_runtime.simulations.constellation.orbit.turning import (
+    Turn,
+    evaluate_turn,
+    turn_between,
+)
 
 SEGMENTS_MAX = 64
 """Segments held; a host that sends more is refused and counted."""
 KNOTS_HELD_MAX = 200_000
-"""Knots held over all segments: about 70 MB at worst."""
+"""Knots held over all segments: about 70 MB at worst, 150 MB with attitude."""
 TIME_EPSILON_S = 1e-9
 """Rounding of tick and knot times, so that a tick on a joint falls into no gap."""
 
@@ -35,6 +41,8 @@ class _Piece:
     knot_s: float
     end_s: float
     rows: list[list[float]]
+    turns: list[list[float]] | None
+    thrust_m_s2: tuple[float, float, float] | None
 
 
 class TruthBuffer:
@@ -54,11 +62,12 @@ class TruthBuffer:
         self._pieces: deque[_Piece] = deque()
         self._now_s = -math.inf
         self._knots = 0
-        self._revision = 0
-        self._revision_start_s = -math.inf
+        self._starts: list[tuple[int, float]] = []
         self._low_s = self._high_s = math.inf
         self._cubics: Coefficients = ()
         self._knot_s = 1.0
+        self._turn: Turn | None = None
+        self._quaternion = IDENTITY
 
     @property
     def end_s(self) -> float:
@@ -67,9 +76,8 @@ class TruthBuffer:
 
     def add(self, segment: Segment) -> bool:
         """Take a segment; False if it was refused or is worthless by now."""
-        start_s, end_s = segment.t0_s, segment.end_s
-        if segment.revision < self._revision:
-            end_s = min(end_s, self._revision_start_s)
+        start_s = segment.t0_s
+        end_s = min(segment.end_s, self._replaced_from_s(segment.revision))
         if end_s <= max(start_s, self._now_s):
             self.superseded += 1
             return False
@@ -77,10 +85,16 @@ class TruthBuffer:
         if held or self._knots + len(segment.states) > KNOTS_HELD_MAX:
             self.refused += 1
             return False
-        if segment.revision > self._revision:
-            self._revision, self._revision_start_s = segment.revision, start_s
-            self._cut_future(start_s)
-        piece = _Piece(segment.revision, start_s, segment.knot_s, end_s, segment.states.tolist())
+        self._begin(segment.revision, start_s)
+        piece = _Piece(
+            segment.revision,
+            start_s,
+            segment.knot_s,
+            end_s,
+            segment.states.tolist(),
+            None if segment.attitude is None else segment.attitude.tolist(),
+            segment.thrust_m_s2,
+        )
         self._insert(piece)
         self.segments += 1
         # The interval in use may have been replaced.
@@ -91,13 +105,32 @@ class TruthBuffer:
         """
         Return position (m) and velocity (m/s) at *t_s*, six numbers.
 
+        Of a rigid body thirteen: quaternion (scalar last, inertial to body, its sign continuous)
+        and body rates (rad/s) after them.
+
         None if no truth is held for that time: an underrun, which is counted and never filled in by
         guesswork, since a made-up state would look like truth in every record after it.
         """
         if not self._low_s <= t_s < self._high_s and not self._seek(t_s):
             self.underruns += 1
             return None
-        return evaluate(self._cubics, (t_s - self._low_s) / self._knot_s, self._knot_s)
+        part = (t_s - self._low_s) / self._knot_s
+        if self._turn is None:
+            return evaluate(self._cubics, part, self._knot_s)
+        turned = evaluate_turn(self._turn, part, self._knot_s)
+        return evaluate(self._cubics, part, self._knot_s) + turned
+
+    def thrust_at(self, t_s: float) -> tuple[float, float, float] | None:
+        """
+        Return the acceleration other than gravity and drag at *t_s*, m/s^2, inertial.
+
+        None where the vehicle coasts, and where no truth is held; of the time before the last
+        lookup nothing is known any more.
+        """
+        for piece in reversed(self._pieces):
+            if piece.t0_s <= t_s:
+                return piece.thrust_m_s2 if t_s <= piece.end_s + TIME_EPSILON_S else None
+        return None
 
     def _seek(self, t_s: float) -> bool:
         """Make the interval that holds *t_s* the one in use and forget what lies before."""
@@ -117,17 +150,55 @@ class TruthBuffer:
         self._low_s = piece.t0_s + index * piece.knot_s
         self._high_s = min(self._low_s + piece.knot_s, piece.end_s)
         self._cubics = coefficients(piece.rows[index], piece.rows[index + 1], piece.knot_s)
+        self._turn = None
+        if piece.turns is not None:
+            self._seek_turn(piece.turns[index], piece.turns[index + 1])
         return True
 
-    def _cut_future(self, start_s: float) -> None:
-        """Drop what the held pieces say of *start_s* and later."""
-        while self._pieces and self._pieces[-1].end_s > start_s:
-            last = self._pieces[-1]
-            if last.t0_s < start_s:
-                last.end_s = start_s
-                break
-            self._knots -= len(self._pieces.pop().rows)
-            self.superseded += 1
+    def _seek_turn(self, first: list[float], second: list[float]) -> None:
+        """Make the interval's attitude the one in use; it goes on from the last with the same sign."""
+        if sum(a * b for a, b in zip(first, self._quaternion, strict=False)) < 0.0:
+            first = [-number for number in first[:4]] + first[4:]
+        self._turn = turn_between(first, second, self._knot_s)
+        x, y, z, w = second[:4]
+        is_same = sum(a * b for a, b in zip(first, second[:4], strict=False)) >= 0.0
+        self._quaternion = (x, y, z, w) if is_same else (-x, -y, -z, -w)
+
+    def _replaced_from_s(self, revision: int) -> float:
+        """Return from when on a newer revision has replaced *revision*; infinity for nowhere."""
+        newer = (start_s for number, start_s in self._starts if number > revision)
+        return min(newer, default=math.inf)
+
+    def _begin(self, revision: int, start_s: float) -> None:
+        """
+        Let *revision* replace what older ones say of *start_s* and later, if it is not known yet.
+
+        Its segments may come in any order, and later than those of a revision after it.
+        """
+        starts = self._starts
+        if not revision or any(n >= revision and at_s <= start_s for n, at_s in starts):
+            return
+        kept = [(n, at_s) for n, at_s in starts if n > revision or at_s < start_s]
+        kept.append((revision, start_s))
+        kept.sort()
+        # Of the past, the newest is enough: what older ones say of later times is worthless.
+        while len(kept) > 1 and kept[1][1] <= self._now_s:
+            kept.pop(0)
+        self._starts = kept
+        self._cut_older(revision, start_s)
+
+    def _cut_older(self, revision: int, start_s: float) -> None:
+        """Drop what pieces of older revisions say of *start_s* and later."""
+        pieces: deque[_Piece] = deque()
+        for piece in self._pieces:
+            if piece.revision < revision and piece.t0_s >= start_s:
+                self._knots -= len(piece.rows)
+                self.superseded += 1
+                continue
+            if piece.revision < revision:
+                piece.end_s = min(piece.end_s, start_s)
+            pieces.append(piece)
+        self._pieces = pieces
 
     def _insert(self, piece: _Piece) -> None:
         """Put a piece where its time belongs; what two pieces of one revision share is the later one's."""
