@@ -34,6 +34,7 @@ _TRUTH = "madns_runtime.simulations.constellation.truth"
 
 PROPAGATORS = {
     "scipy": f"{_TRUTH}.scipy_propagator:ScipyDop853",
+    "numba": f"{_TRUTH}.numba_propagator:NumbaDop853",
     "sgp4": f"{_TRUTH}.sgp4_propagator:Sgp4",
     "custom": f"{_TRUTH}.custom_propagator:Custom",
 }
@@ -60,6 +61,10 @@ class PropagationParameters:
     """Folder of the scenario, which a custom propagator's file is found from."""
     names: tuple[str, ...] = ()
     """What messages call the vehicles, in the order of the states; empty for their numbers."""
+
+    def name_of(self, vehicle: int) -> str:
+        """Return what messages call a vehicle."""
+        return self.names[vehicle] if self.names else f"vehicle {vehicle}"
 
     @property
     def forces(self) -> tuple[str, ...]:
@@ -243,14 +248,13 @@ def _check_states(
     faults = []
     for vehicle in vehicles[:FAULTS_MAX].tolist():
         knot = int(np.argmin(sound[vehicle]))
-        name = parameters.names[vehicle] if parameters.names else f"vehicle {vehicle}"
         distance_km = float(np.sqrt(r2[vehicle, knot])) / 1000.0
         what = (
             f"is inside the Earth, {distance_km:.1f} km from its centre"
             if np.isfinite(states[vehicle, knot]).all()
             else f"expected a finite state, got {states[vehicle, knot].tolist()}"
         )
-        faults.append(f"{name}: {what}, at {times_s[knot]:g} s")
+        faults.append(f"{parameters.name_of(vehicle)}: {what}, at {times_s[knot]:g} s")
     if len(vehicles) > FAULTS_MAX:
         faults.append(f"and {len(vehicles) - FAULTS_MAX} more")
     raise ConfigurationError("\n".join(faults))
