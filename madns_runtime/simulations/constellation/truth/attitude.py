@@ -25,7 +25,7 @@ from madns_runtime.simulations.constellation.orbit.quaternions import (
 from madns_runtime.simulations.constellation.parameters import Attitude
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
-    load_propagator,
+    propagate,
 )
 
 try:
@@ -129,8 +129,7 @@ def propagate_attitude(  # noqa: PLR0913 - beside `Propagator.propagate`, whose 
     """
     span_s = float(knots_s[-1]) - t0_s
     times_s = _support(t0_s, knots_s)
-    propagator = load_propagator(parameters.settings.kind)
-    orbit = propagator.propagate(states[:, STATE], t0_s, times_s, parameters)
+    orbit = propagate(states[:, STATE], t0_s, times_s, parameters)
     result = np.empty((len(bodies), len(knots_s), 13))
     result[:, :, STATE] = orbit[:, np.searchsorted(times_s, knots_s)]
     if span_s == 0.0:
