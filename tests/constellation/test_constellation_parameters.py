@@ -251,12 +251,12 @@ def test_the_store_cuts_windows_that_share_their_joints():
     store = TruthStore(2, knots_per_window=5, knot_s=2.0)
     store.add(stretch(0, 16))
 
-    segment = store.segment(1, 1, 2)
+    (segment,) = store.segments(1, 1, 2)
 
     assert segment.t0_s == 10.0
     assert segment.end_s == 30.0
     assert segment.states[:, 0].tolist() == list(range(5, 16))
-    assert store.segment(1, 3, 5) is None
+    assert store.segments(1, 3, 5) == []
 
 
 def test_the_store_refuses_a_stretch_that_does_not_follow():
@@ -274,7 +274,7 @@ def test_the_store_drops_old_windows_but_never_the_last():
 
     store.drop_before(2)
     assert (store.oldest, store.end) == (2, 3)
-    assert store.segment(0, 0, 2).t0_s == 20.0
+    assert store.segments(0, 0, 2)[0].t0_s == 20.0
 
     store.drop_before(9)
     assert store.last_states()[0, 0] == 15.0

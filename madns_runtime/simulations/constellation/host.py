@@ -19,7 +19,7 @@ from madns_runtime.errors import PluginError
 from madns_runtime.plugin.api import HostContext, HostSimulation
 from madns_runtime.protocol.messages import Service
 from madns_runtime.recording.records import Field
-from madns_runtime.simulations.constellation.messages import Initial, Segment
+from madns_runtime.simulations.constellation.messages import Initial
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
 from madns_runtime.simulations.constellation.orbit.invariants import (
     ENERGY,
@@ -120,13 +120,14 @@ class ConstellationHost(HostSimulation):
         now = self._window_at(self._context.now_s())
         # What its turn has passed already will not come again.
         last = max(now + 1, self._turns_passed(vehicle) - 1)
-        segment = self._store.segment(vehicle, now, last)
+        segments = self._store.segments(vehicle, now, last)
         self._sent_until[vehicle] = min(last + 1, self._store.end)
         initial = Initial(
             satellite=self._fleet.names[vehicle],
             frame=self._parameters.frame,
             epoch_utc=self._fleet.epoch_utc.isoformat().replace("+00:00", "Z"),
-            segment=segment,
+            segment=segments[0] if segments else None,
+            more=tuple(segments[1:]),
         )
         return initial.to_message()
 
@@ -237,13 +238,11 @@ class ConstellationHost(HostSimulation):
         first = self._sent_until[vehicle]
         if not self._active[vehicle] or first > window:
             return
-        segment: Segment | None = self._store.segment(vehicle, first, window)
-        if segment is None:
-            return
-        self._sent_until[vehicle] = min(window + 1, self._store.end)
+        self._sent_until[vehicle] = max(first, min(window + 1, self._store.end))
         agent = self._context.agents[vehicle]
-        self._context.send(agent, segment.to_message(), Service.RELIABLE)
-        self._counts.segments_sent += 1
+        for segment in self._store.segments(vehicle, first, window):
+            self._context.send(agent, segment.to_message(), Service.RELIABLE)
+            self._counts.segments_sent += 1
 
     def _record_invariants(self, vehicle: int, window: int) -> None:
         """Record what the window's last knot conserves; the worst knot counts for the summary."""

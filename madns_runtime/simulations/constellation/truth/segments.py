@@ -2,37 +2,76 @@
 The host's store of truth: stretches cut into windows, windows into each vehicle's segments. Pure.
 
 Simulated time is divided into windows of equal length, half an agent's buffer. Window w covers the
-knots w n to (w + 1) n, both included, so that every segment can be interpolated by itself.
+knots w n to (w + 1) n, both included, so that every segment can be interpolated by itself. Beside the
+grid of knots, a vehicle that was commanded has pieces with knots of its own (`truth.pieces`); what is
+known of it is one revision, and each change makes a new one.
 """
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from madns_runtime.simulations.constellation.messages import Segment
+from madns_runtime.simulations.constellation.orbit.hermite import (
+    coefficients,
+    evaluate,
+    interpolate,
+)
+from madns_runtime.simulations.constellation.truth.pieces import (
+    Piece,
+    VehicleTruth,
+    knot_at_or_after,
+)
 from madns_runtime.simulations.constellation.truth.propagation import Stretch
+
+Array = NDArray[np.float64]
 
 
 class TruthStore:
-    """Windows of truth, oldest dropped first; bounded by who drops them."""
+    """
+    Windows of truth, oldest dropped first; bounded by who drops them.
 
-    def __init__(self, vehicles: int, *, knots_per_window: int, knot_s: float) -> None:
+    Args:
+        vehicles: How many.
+        knots_per_window: Intervals of the grid in a window.
+        knot_s: Time between knots.
+        rigid: Indices of the rigid bodies, in the order of a stretch's attitude.
+    """
+
+    def __init__(
+        self, vehicles: int, *, knots_per_window: int, knot_s: float, rigid: Sequence[int] = ()
+    ) -> None:
         self.knots_per_window = knots_per_window
         self.knot_s = knot_s
         self.window_s = knots_per_window * knot_s
         self.revisions = [0] * vehicles
-        """One a vehicle, raised by whoever replaces its future."""
+        """One a vehicle, raised whenever its future is replaced."""
         self.oldest = 0
         """The first window kept."""
         self.end = 0
         """The first window not yet known."""
-        self._states: dict[int, NDArray[np.float64]] = {}
-        self._invariants: dict[int, NDArray[np.float64]] = {}
+        self._rigid = {vehicle: row for row, vehicle in enumerate(rigid)}
+        self._states: dict[int, Array] = {}
+        self._attitude: dict[int, Array] = {}
+        self._invariants: dict[int, Array] = {}
+        self._pieces: dict[int, list[Piece]] = {}
 
-    def add(self, stretch: Stretch) -> None:
+    @property
+    def end_s(self) -> float:
+        """Simulated time of the last knot known."""
+        return self.end * self.knots_per_window * self.knot_s
+
+    def add(self, stretch: Stretch, attitude: Array | None = None) -> None:
         """
         Take the windows that follow the last known one.
+
+        Args:
+            stretch: All vehicles' truth on the grid.
+            attitude: Of the rigid bodies, shape (M, K, 7).
 
         Raises:
             ValueError: The stretch does not begin there, or does not end with a window.
@@ -45,39 +84,222 @@ class TruthStore:
                 f"from {stretch.first_knot}"
             )
         for first in range(0, intervals, n):
-            self._states[self.end] = stretch.states[:, first : first + n + 1]
-            self._invariants[self.end] = stretch.invariants[:, first : first + n + 1]
+            # Copies: a window that outlives its stretch must not keep all of it in memory.
+            self._states[self.end] = stretch.states[:, first : first + n + 1].copy()
+            self._invariants[self.end] = stretch.invariants[:, first : first + n + 1].copy()
+            if attitude is not None:
+                self._attitude[self.end] = attitude[:, first : first + n + 1].copy()
             self.end += 1
 
-    def last_states(self) -> NDArray[np.float64]:
+    def replace(self, vehicle: int, truth: VehicleTruth) -> None:
+        """Put other truth in the place of a vehicle's, from truth.change_s on, under a new revision."""
+        self.revisions[vehicle] += 1
+        self._keep_until(vehicle, truth.change_s)
+        self.put(vehicle, truth)
+
+    def put(self, vehicle: int, truth: VehicleTruth) -> None:
+        """Take a vehicle's truth as it is, pieces and grid, for a time of which nothing was sent."""
+        if truth.pieces:
+            self._pieces.setdefault(vehicle, []).extend(truth.pieces)
+        n = self.knots_per_window
+        for place in range(len(truth.states)):
+            window, at = divmod(truth.first_knot + place, n)
+            # Windows share their joints.
+            for which, row in ((window, at), (window - 1, n)) if at == 0 else ((window, at),):
+                if which not in self._states:
+                    continue
+                self._states[which][vehicle, row] = truth.states[place]
+                self._invariants[which][vehicle, row] = truth.invariants[place]
+                if truth.attitude is not None:
+                    self._attitude[which][self._rigid[vehicle], row] = truth.attitude[place]
+
+    def last_states(self) -> Array:
         """Return the states at the last knot known, shape (N, 6): where the next stretch begins."""
-        last: NDArray[np.float64] = self._states[self.end - 1][:, -1]
+        last: Array = self._states[self.end - 1][:, -1]
         return last.copy()
 
-    def segment(self, vehicle: int, first: int, last: int) -> Segment | None:
-        """Return a vehicle's segment over windows *first* to *last*, as far as they are kept."""
+    def last_attitude(self) -> Array | None:
+        """Return quaternions and rates of the rigid bodies at the last knot known, shape (M, 7)."""
+        if not self._rigid:
+            return None
+        last: Array = self._attitude[self.end - 1][:, -1]
+        return last.copy()
+
+    def restart(self, vehicle: int, t_s: float) -> tuple[float, Array] | None:
+        """
+        Return the last knot before *t_s*, its time and state: where propagation can begin anew.
+
+        The state has 6 numbers, 13 for a rigid body; all that was changed by that time is in it. None
+        if nothing is kept of that time.
+        """
+        piece = self._piece_at(vehicle, t_s, before=True)
+        if piece is not None:
+            index = piece.knot_before(t_s)
+            parts = [piece.states[index]]
+            if piece.attitude is not None:
+                parts.append(piece.attitude[index])
+            return piece.t0_s + index * piece.knot_s, np.concatenate(parts)
+        knot = knot_at_or_after(t_s, self.knot_s) - 1
+        if not self._holds_knot(knot):
+            return None
+        return knot * self.knot_s, self._knot(vehicle, knot)
+
+    def state(self, vehicle: int, t_s: float) -> tuple[float, ...] | None:
+        """Return position (m) and velocity (m/s) at *t_s*, six numbers; None where nothing is known."""
+        piece = self._piece_at(vehicle, t_s)
+        if piece is not None:
+            index = min(max(int((t_s - piece.t0_s) / piece.knot_s), 0), len(piece.states) - 2)
+            first, second = piece.states[index].tolist(), piece.states[index + 1].tolist()
+            s = (t_s - piece.t0_s) / piece.knot_s - index
+            return evaluate(coefficients(first, second, piece.knot_s), s, piece.knot_s)
+        place = self._interval(t_s)
+        if place is None:
+            return None
+        window, index = place
+        first, second = self._states[window][vehicle, index : index + 2].tolist()
+        s = t_s / self.knot_s - (window * self.knots_per_window + index)
+        return evaluate(coefficients(first, second, self.knot_s), s, self.knot_s)
+
+    def states(self, t_s: float) -> Array | None:
+        """Return all vehicles' positions (m) and velocities (m/s) at *t_s*, shape (N, 6); None if not known."""
+        place = self._interval(t_s)
+        if place is None:
+            return None
+        window, index = place
+        knots = self._states[window][:, index : index + 2]
+        t0_s = (window * self.knots_per_window + index) * self.knot_s
+        found = interpolate(knots, np.array([t_s]), t0_s=t0_s, knot_s=self.knot_s)[:, 0]
+        for vehicle in self._pieces:
+            if self._piece_at(vehicle, t_s) is not None:
+                found[vehicle] = self.state(vehicle, t_s)
+        return found
+
+    def segments(self, vehicle: int, first: int, last: int) -> list[Segment]:
+        """Return a vehicle's segments over windows *first* to *last*, as far as they are kept, in order."""
         first, last = max(first, self.oldest), min(last, self.end - 1)
         if first > last:
-            return None
-        parts = [self._states[first][vehicle]]
-        parts += [self._states[window][vehicle, 1:] for window in range(first + 1, last + 1)]
-        return Segment(
-            revision=self.revisions[vehicle],
-            t0_s=first * self.knots_per_window * self.knot_s,
-            knot_s=self.knot_s,
-            states=np.concatenate(parts),
-        )
+            return []
+        n = self.knots_per_window
+        return self._segments(vehicle, first * n * self.knot_s, (last + 1) * n)
 
-    def invariants(self, vehicle: int, window: int) -> NDArray[np.float64]:
+    def segments_from(self, vehicle: int, change_s: float, window: int) -> list[Segment]:
+        """Return a vehicle's segments from a change on, which is a knot or a piece's first, up to *window*, excluded."""
+        return self._segments(vehicle, change_s, min(window, self.end) * self.knots_per_window)
+
+    def invariants(self, vehicle: int, window: int) -> Array:
         """Return what is conserved, at every knot of a window, shape (knots_per_window + 1, 3)."""
-        values: NDArray[np.float64] = self._invariants[window][vehicle]
+        values: Array = self._invariants[window][vehicle]
         return values
 
     def drop_before(self, window: int) -> None:
         """Forget the windows before *window*; the last known one is always kept."""
+        if self.oldest >= min(window, self.end - 1):
+            return
         while self.oldest < min(window, self.end - 1):
             del self._states[self.oldest], self._invariants[self.oldest]
+            self._attitude.pop(self.oldest, None)
             self.oldest += 1
+        oldest_s = self.oldest * self.window_s
+        for vehicle in list(self._pieces):
+            kept = [piece for piece in self._pieces[vehicle] if piece.end_s > oldest_s]
+            if kept:
+                self._pieces[vehicle] = kept
+            else:
+                del self._pieces[vehicle]
+
+    def _segments(self, vehicle: int, from_s: float, last_knot: int) -> list[Segment]:
+        """Return pieces, and runs of the grid between them, from a time up to a knot."""
+        result: list[Segment] = []
+        at_s, end_s, revision = from_s, last_knot * self.knot_s, self.revisions[vehicle]
+        for piece in self._pieces.get(vehicle, ()):
+            if piece.end_s <= from_s or piece.t0_s >= end_s:
+                continue
+            if piece.t0_s > at_s:
+                result.append(self._run(vehicle, at_s, piece.t0_s))
+            result.append(piece.to_segment(revision))
+            at_s = piece.end_s
+        if at_s < end_s:
+            result.append(self._run(vehicle, at_s, end_s))
+        return result
+
+    def _run(self, vehicle: int, start_s: float, end_s: float) -> Segment:
+        """Return a segment of the grid between two of its knots."""
+        n = self.knots_per_window
+        first, last = round(start_s / self.knot_s), round(end_s / self.knot_s)
+        return Segment(
+            revision=self.revisions[vehicle],
+            t0_s=first * self.knot_s,
+            knot_s=self.knot_s,
+            states=_gather(self._states, vehicle, (first, last), n),
+            attitude=_gather(self._attitude, self._rigid[vehicle], (first, last), n)
+            if vehicle in self._rigid
+            else None,
+        )
+
+    def _keep_until(self, vehicle: int, change_s: float) -> None:
+        """Let what was known before *change_s* end there, in a piece of its own: its knot may change."""
+        pieces = [p for p in self._pieces.get(vehicle, ()) if p.t0_s < change_s]
+        if pieces and pieces[-1].end_s >= change_s:
+            pieces[-1] = pieces[-1].cut_at(change_s)
+        else:
+            knot = knot_at_or_after(change_s, self.knot_s) - 1
+            if self._holds_knot(knot) and self._holds_knot(knot + 1):
+                rows = np.stack([self._knot(vehicle, knot), self._knot(vehicle, knot + 1)])
+                pieces.append(
+                    Piece(
+                        t0_s=knot * self.knot_s,
+                        knot_s=self.knot_s,
+                        states=rows[:, :6],
+                        end_s=change_s,
+                        attitude=rows[:, 6:] if vehicle in self._rigid else None,
+                    )
+                )
+        self._pieces[vehicle] = pieces
+
+    def _piece_at(self, vehicle: int, t_s: float, *, before: bool = False) -> Piece | None:
+        """Return the piece that holds at *t_s*, or (*before*) until it: at a joint the later one holds."""
+        for piece in reversed(self._pieces.get(vehicle, ())):
+            if before and piece.t0_s < t_s <= piece.end_s:
+                return piece
+            if not before and piece.t0_s <= t_s < piece.end_s:
+                return piece
+        return None
+
+    def _interval(self, t_s: float) -> tuple[int, int] | None:
+        """Return the window and the interval in it that hold *t_s*."""
+        if not self.oldest * self.window_s <= t_s <= self.end_s or self.end == 0:
+            return None
+        knot = min(math.floor(t_s / self.knot_s), self.end * self.knots_per_window - 1)
+        window, index = divmod(knot, self.knots_per_window)
+        return (window, index) if window in self._states else None
+
+    def _holds_knot(self, knot: int) -> bool:
+        n = self.knots_per_window
+        return self.oldest * n <= knot <= self.end * n and self.end > 0
+
+    def _knot(self, vehicle: int, knot: int) -> Array:
+        """Return the state at a knot held, 6 numbers or 13."""
+        window, at = self._place(knot)
+        state: Array = self._states[window][vehicle, at]
+        if vehicle in self._rigid:
+            return np.concatenate((state, self._attitude[window][self._rigid[vehicle], at]))
+        return state.copy()
+
+    def _place(self, knot: int) -> tuple[int, int]:
+        window, at = divmod(knot, self.knots_per_window)
+        return (window, at) if window in self._states else (window - 1, self.knots_per_window)
+
+
+def _gather(windows: dict[int, Array], row: int, knots: tuple[int, int], n: int) -> Array:
+    """Return one vehicle's rows at the knots from the first to the last, both included."""
+    first, last = knots
+    parts: list[Array] = []
+    for window in range(first // n, (last - 1) // n + 1):
+        start, stop = max(first, window * n), min(last, (window + 1) * n)
+        # What a window shares with the one before it is taken once.
+        skip = 1 if parts else 0
+        parts.append(windows[window][row, start - window * n + skip : stop - window * n + 1])
+    return np.concatenate(parts)
 
 
 class RefillSchedule:
