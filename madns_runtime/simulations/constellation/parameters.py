@@ -357,6 +357,8 @@ class GroundStation:
     """Elevation mask, deg."""
     rate_bit_s: Annotated[float, Gt(0)] = 1e6
     """Rate of each way of a contact, bit/s."""
+    loss: Annotated[float, Ge(0), Le(1)] = 0.0
+    """Share of messages of either way that are lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,64 +1,63 @@
 """
-Ground stations: passes over them, and messages that pass between them and vehicles.
+Ground stations: passes over them, and messages between them and vehicles.
 
-Pure: states come from a function, times from the caller.
+Pure: states come from a function, times from the caller. Downlinks are judged by truth at the time they
+were sent, as crosslinks are. Uplinks leave by themselves: passes are looked for a little ahead of time,
+so that what they carry is on its way before it is due.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from madns_runtime.recording.records import Field
-from madns_runtime.simulations.constellation.messages import Delivery, Transmission
-from madns_runtime.simulations.constellation.parameters import GroundStation, Uplink
-from madns_runtime.simulations.constellation.truth.links import LinkEvent, States
-
-CONTACT_FIELDS = (
-    Field("event", "", "str"),
-    Field("agent", "", "str"),
-    Field("station", "", "str"),
-    Field("rise_s", "s"),
-    Field("set_s", "s"),
-    Field("elevation_deg_max", "deg"),
+from madns_runtime.errors import ConfigurationError
+from madns_runtime.protocol.codec import pack
+from madns_runtime.simulations.constellation.messages import GROUND, Delivery, Transmission
+from madns_runtime.simulations.constellation.orbit.visibility import (
+    LIGHT_SPEED_M_S,
+    coast,
+    signal_way,
 )
-"""Stream "contacts": one record when a pass begins, one when it ends."""
+from madns_runtime.simulations.constellation.parameters import GroundStation, Uplink
+from madns_runtime.simulations.constellation.truth.contacts import (
+    CONTACT_FIELDS,
+    Contact,
+    PassWatch,
+    Stretch,
+)
+from madns_runtime.simulations.constellation.truth.links import LinkEvent, States
+from madns_runtime.simulations.constellation.truth.medium import (
+    LEAD_S,
+    Account,
+    Attempt,
+    Chance,
+    InFlight,
+    Transmitter,
+    checked_sent_s,
+    index_of_names,
+)
+from madns_runtime.simulations.constellation.truth.passes import PassFinder, Sites, Window
 
+__all__ = ["CONTACT_FIELDS", "Contact", "GroundSegment", "ground_faults"]
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Contact:
-    """A vehicle in view of a station."""
-
-    event: Literal["rise", "set"]
-    agent: str
-    station: str
-    rise_s: float
-    """When it rose above the mask, s; of one in view from the start, the start."""
-    set_s: float | None = None
-    """When it set; None at its rise."""
-    elevation_deg_max: float | None = None
-    """Highest it stood; None at its rise."""
-
-    def to_record(self) -> tuple[Any, ...]:
-        """Return one value for each of CONTACT_FIELDS."""
-        return (
-            self.event,
-            self.agent,
-            self.station,
-            self.rise_s,
-            self.set_s,
-            self.elevation_deg_max,
-        )
+DOWNLINK_QUEUE_MAX = 256
+"""Messages that may wait at one vehicle's transmitter to the ground; further ones are refused."""
+PREFIX = f"{GROUND}:"
 
 
 class GroundSegment:
-    """All ground stations."""
+    """
+    All ground stations: each may speak to, and hear, every vehicle in its view at the same time.
 
-    def __init__(
+    Every vehicle has one transmitter to the ground beside that of its crosslinks.
+    """
+
+    def __init__(  # noqa: PLR0913 - all but two by name, and each of them another collaborator
         self,
         stations: Sequence[GroundStation],
         uplinks: Sequence[Uplink],
@@ -69,28 +68,256 @@ class GroundSegment:
         random: np.random.Generator,
         states: States,
     ) -> None:
-        raise NotImplementedError
+        """
+        Prepare stations and their messages.
+
+        Args:
+            stations: From the scenario.
+            uplinks: From the scenario; those to one vehicle leave in the order of their times.
+            agents: Names, in the order of the states' rows.
+            satellites: The same, of what they fly.
+            epoch_utc: UTC of simulated time zero, with its time zone.
+            random: One number is drawn from it, now, as the seed of all chance.
+            states: Where the vehicles are at a time.
+
+        Raises:
+            ConfigurationError: Two stations have one name, or an uplink is for nobody.
+        """
+        index = index_of_names(agents, satellites)
+        faults = ground_faults(stations, uplinks, index)
+        if faults:
+            raise ConfigurationError("\n".join(faults))
+        self._stations = tuple(stations)
+        self._agents = agents
+        self._states = states
+        self._sites = Sites(stations, epoch_utc)
+        names = tuple(station.name for station in stations)
+        self._watch = PassWatch(PassFinder(self._sites, states), agents, names)
+        self._chance = Chance(random)
+        self._transmitters = [Transmitter(DOWNLINK_QUEUE_MAX) for _ in agents]
+        self._uplinks = _uplink_queues(uplinks, index)
+        self._uplinks_waiting = len(uplinks)
+        self._free_s: dict[tuple[int, int], float] = {}
+        """By station and vehicle: when what the station says to it is said."""
+        self._in_flight = InFlight(LEAD_S)
+        self._account = Account()
+        self._uplink_events: list[LinkEvent] = []
 
     def send(self, sender: int, transmission: Transmission, now_s: float) -> list[LinkEvent]:
-        """Send a vehicle's message to the ground and return what becomes of it."""
-        raise NotImplementedError
+        """
+        Send a vehicle's message to the ground and return what becomes of it.
+
+        It reaches one station: the one named, or the one over which the vehicle stands highest. A message
+        that cannot begin and end within a pass is refused.
+
+        Args:
+            sender: Index of the vehicle.
+            transmission: To ground or ground:NAME. Messages of one sender must come in the order of
+                (sent_s, number); one out of order is refused.
+            now_s: Simulated time at which the host hears of it; only to count what it hears too late.
+
+        Raises:
+            PluginError: The message's time is not finite.
+        """
+        sent_s = checked_sent_s(transmission)
+        self._account.transmissions += 1
+        size_bytes = len(pack(transmission.payload))
+        attempt = Attempt(sender, self._agents[sender], transmission, size_bytes)
+        stations = self._stations_meant(transmission.to)
+        if not self._transmitters[sender].is_in_order(sent_s, transmission.number):
+            event = attempt.failed("out_of_order")
+        elif not stations:
+            event = attempt.failed("unknown_receiver")
+        elif (states := self._states(sent_s)) is None:
+            event = attempt.failed("no_truth")
+        else:
+            event = self._downlink(attempt, stations, states[sender : sender + 1])
+        self._account.enter(event, now_s)
+        return [event]
 
     def due(self, t_s: float) -> list[tuple[int, Delivery]]:
-        """Return vehicles and what they hear from the ground soon after *t_s*; each once."""
-        raise NotImplementedError
-
-    def events(self) -> list[LinkEvent]:
-        """Return what became of uplinks since the call before."""
-        raise NotImplementedError
+        """Return vehicles and what they hear from the ground up to LEAD_S after *t_s*; each once."""
+        self._look_ahead(t_s)
+        return self._in_flight.due(t_s)
 
     def contacts(self, t_s: float) -> list[Contact]:
-        """Return the passes that began or ended until *t_s* and were not returned before."""
-        raise NotImplementedError
+        """Return the passes that began or ended until *t_s*, in order; each event once."""
+        self._look_ahead(t_s)
+        return self._watch.contacts(t_s)
+
+    def uplink_events(self) -> list[LinkEvent]:
+        """Return what became of uplinks since the call before."""
+        events, self._uplink_events = self._uplink_events, []
+        return events
 
     def next_s(self) -> float | None:
-        """Return when `due` and `contacts` are to be called next."""
-        raise NotImplementedError
+        """Return when `due`, `uplink_events` and `contacts` are to be called next; None: there is no station."""
+        if not self._stations:
+            return None
+        look_s, delivery_s = self._watch.next_s(), self._in_flight.next_s()
+        return look_s if delivery_s is None else min(look_s, delivery_s)
 
     def summary(self) -> Mapping[str, int]:
-        """Return the account."""
-        raise NotImplementedError
+        """
+        Return the account of both ways.
+
+        sent is the sum of all outcomes, delivered what a station or vehicle got or will get; an uplink
+        that still waits for a pass is not sent.
+        """
+        counts = self._account.to_summary(self._in_flight)
+        counts["uplinks_waiting"] = self._uplinks_waiting
+        counts["passes"] = self._watch.passes
+        counts["passes_open"] = self._watch.open
+        return counts
+
+    # Vehicles to stations.
+
+    def _stations_meant(self, to: str) -> list[int]:
+        """Return the stations that a message may be for."""
+        name = to.removeprefix(PREFIX)
+        return [
+            number
+            for number, station in enumerate(self._stations)
+            if to == GROUND or (to.startswith(PREFIX) and name == station.name)
+        ]
+
+    def _downlink(
+        self, attempt: Attempt, stations: list[int], state: NDArray[np.float64]
+    ) -> LinkEvent:
+        sent_s = attempt.message.sent_s
+        clear, _ = self._sites.clearances(state, sent_s)
+        in_view = [number for number in stations if clear[number, 0] >= 0.0]
+        if not in_view:
+            return attempt.failed("no_contact")
+        sines = clear[:, 0] + self._sites.mask_sines
+        station = max(in_view, key=lambda number: float(sines[number]))
+        transmitter = self._transmitters[attempt.sender]
+        leaves_s = transmitter.leaves_s(sent_s)
+        if leaves_s is None:
+            return attempt.failed("queue_full")
+        duration_s = attempt.size_bytes * 8.0 / self._stations[station].rate_bit_s
+        ends_s = leaves_s + duration_s
+        if not self._is_in_view(station, state, sent_s, ends_s):
+            return attempt.failed("no_contact")
+        transmitter.occupy(sent_s, leaves_s, duration_s)
+        start = coast(state, leaves_s - sent_s)[0].tolist()
+        distance_m, _ = signal_way(start, self._site_state(station, leaves_s))
+        name = PREFIX + self._stations[station].name
+        receiver = len(self._agents) + station
+        if self._chance.draw(attempt.sender, attempt.message.number, receiver) < self._loss(
+            station
+        ):
+            return attempt.failed("lost", name, distance_m)
+        return attempt.delivered(name, distance_m, ends_s + distance_m / LIGHT_SPEED_M_S)
+
+    def _is_in_view(
+        self, station: int, state: NDArray[np.float64], t_s: float, later_s: float
+    ) -> bool:
+        """Return whether one vehicle, shape (1, 6), at *t_s*, stands above a mask a little later."""
+        later = coast(state, later_s - t_s)
+        clear, _ = self._sites.clearances(later, later_s, slice(station, station + 1))
+        return bool(clear[0, 0] >= 0.0)
+
+    def _site_state(self, station: int, t_s: float) -> tuple[float, ...]:
+        """Return a station's position, m, and velocity, m/s, TEME: it turns with the Earth."""
+        x, y, z = self._sites.at(t_s)[0, station].tolist()
+        turn = self._sites.turn_rad_s
+        return (x, y, z, -turn * y, turn * x, 0.0)
+
+    def _loss(self, station: int) -> float:
+        return self._stations[station].loss
+
+    # Passes, and stations to vehicles.
+
+    def _look_ahead(self, t_s: float) -> None:
+        """Look for passes, and let uplinks leave in those found."""
+        for stretch in self._watch.look_ahead(t_s):
+            for window in sorted(stretch.windows, key=lambda found: (found.rise_s, found.station)):
+                self._uplink(window, stretch)
+
+    def _uplink(self, window: Window, stretch: Stretch) -> None:
+        """Let what waits for a vehicle leave in this stretch of a pass, one after the other."""
+        queue = self._uplinks.get(window.vehicle)
+        pair = window.station, window.vehicle
+        ends_s = stretch.until_s if window.set_s is None else window.set_s
+        while queue:
+            number, uplink = queue[0]
+            begins_s = max(stretch.from_s, window.rise_s, uplink.at_s, self._free_s.get(pair, 0.0))
+            if begins_s >= ends_s:
+                return
+            message = Transmission(
+                to=self._agents[window.vehicle],
+                sent_s=begins_s,
+                number=number,
+                payload=uplink.text,
+            )
+            sender = len(self._agents) + window.station
+            name = PREFIX + self._stations[window.station].name
+            attempt = Attempt(sender, name, message, len(pack(uplink.text)))
+            duration_s = attempt.size_bytes * 8.0 / self._stations[window.station].rate_bit_s
+            event = self._send_up(attempt, window, begins_s + duration_s)
+            if event is None:
+                return
+            self._free_s[pair] = begins_s + duration_s
+            queue.popleft()
+            self._uplinks_waiting -= 1
+            self._uplink_events.append(event)
+            self._account.transmissions += 1
+            self._account.enter(event, begins_s)
+
+    def _send_up(self, attempt: Attempt, window: Window, ends_s: float) -> LinkEvent | None:
+        """Return what becomes of an uplink; None: the pass, or what is known of it, ends before it does."""
+        begins_s = attempt.message.sent_s
+        states = self._states(begins_s)
+        if states is None:
+            return None
+        state = states[window.vehicle : window.vehicle + 1]
+        if not self._is_in_view(window.station, state, begins_s, ends_s):
+            return None
+        site = self._site_state(window.station, begins_s)
+        distance_m, _ = signal_way(site, state[0].tolist())
+        agent = self._agents[window.vehicle]
+        drawn = self._chance.draw(attempt.sender, attempt.message.number, window.vehicle)
+        if drawn < self._loss(window.station):
+            return attempt.failed("lost", agent, distance_m)
+        arrives_s = ends_s + distance_m / LIGHT_SPEED_M_S
+        delivery = Delivery(
+            sender=attempt.name,
+            sent_s=begins_s,
+            arrives_s=arrives_s,
+            payload=attempt.message.payload,
+        )
+        self._in_flight.add(attempt.sender, attempt.message.number, window.vehicle, delivery)
+        return attempt.delivered(agent, distance_m, arrives_s)
+
+
+def ground_faults(
+    stations: Sequence[GroundStation], uplinks: Sequence[Uplink], names: Mapping[str, int]
+) -> list[str]:
+    """Return what bounds cannot tell of stations and uplinks; *names* are all that messages may be for."""
+    counts: dict[str, int] = {}
+    for station in stations:
+        counts[station.name] = counts.get(station.name, 0) + 1
+    faults = [
+        f"parameters.stations: expected one station named {name!r}, got {count}"
+        for name, count in counts.items()
+        if count > 1
+    ]
+    if uplinks and not stations:
+        faults.append("parameters.uplinks: expected stations to send them from, got none")
+    faults += [
+        f"parameters.uplinks.{number}.to: expected an agent or a satellite that flies, got {uplink.to!r}"
+        for number, uplink in enumerate(uplinks)
+        if uplink.to not in names
+    ]
+    return faults
+
+
+def _uplink_queues(
+    uplinks: Sequence[Uplink], index: Mapping[str, int]
+) -> dict[int, deque[tuple[int, Uplink]]]:
+    """Return by vehicle what waits for it, with its place in the scenario, in the order of its times."""
+    queues: dict[int, deque[tuple[int, Uplink]]] = {}
+    for number, uplink in sorted(enumerate(uplinks), key=lambda entry: entry[1].at_s):
+        queues.setdefault(index[uplink.to], deque()).append((number, uplink))
+    return queues
