@@ -48,9 +48,9 @@ def to_satrec(element_set: ElementSet) -> Satrec:
     return record
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=64)
 def _fleet_records(element_sets: tuple[ElementSet, ...]) -> SatrecArray:
-    """Cached, since a worker gets the same fleet with every window."""
+    """Cached, since a worker gets the same parts of the fleet with every window."""
     return SatrecArray([to_satrec(element_set) for element_set in element_sets])
 
 
