@@ -63,6 +63,7 @@ class RunContext:
         self.name = name
         self.is_lockstep = is_lockstep
         self.agents = config.agents.resolved_names()
+        self.workers = config.executor.workers
         self.parameters = parameters
         self.tick_hz = config.agents.tick_hz
         self.duration_s = config.time.duration_s

@@ -96,6 +96,9 @@ class Context(Protocol):
 class HostContext(Context, Protocol):
     """What the framework offers to the host's half."""
 
+    workers: int
+    """Workers of the executor, N_p: jobs that may be under way at once."""
+
     def submit(self, function: Callable[..., Any], *arguments: Any) -> int:
         """
         Run a module-level function in the executor and return the job's number.

@@ -30,6 +30,7 @@ class FakeContext:
     parameters: ConstellationParameters
     tick_hz: float = 10.0
     duration_s: float = 60.0
+    workers: int = 1
     base_directory: Path = SCENARIOS
     clock_s: float = -1.0
     sent: list = field(default_factory=list)
