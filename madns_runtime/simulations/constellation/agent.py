@@ -26,7 +26,6 @@ from madns_runtime.simulations.constellation.messages import (
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
 from madns_runtime.simulations.constellation.orbit.elements import elements_from_state
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
-from madns_runtime.simulations.constellation.vehicle.cockpit import Cockpit
 from madns_runtime.simulations.constellation.vehicle.fitting import fit_out
 from madns_runtime.simulations.constellation.vehicle.streams import ATTITUDE
 from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBuffer
@@ -90,15 +89,18 @@ class ConstellationAgent(AgentSimulation):
         vehicle = vehicle_of(parameters, context.name, first.satellite)
         if vehicle.attitude is not None:
             context.open_stream("attitude", ATTITUDE)
-        self._cockpit: Cockpit | None = fit_out(context, first, vehicle)
+        self._sensors, self._cockpit = fit_out(context, first, vehicle=vehicle, buffer=self._buffer)
 
     def step(self, tick: Tick) -> None:
         """Record the truth of this tick; a tick without truth is counted and nothing is made up."""
         state = self._buffer.lookup(tick.t_s)
         if state is not None:
             self._record_truth(tick, state)
+        readings = None
+        if self._sensors is not None:
+            readings = self._sensors.step(tick.index, tick.t_s, state)
         if self._cockpit is not None:
-            self._cockpit.step(tick.index, tick.t_s, state, {})
+            self._cockpit.step(tick.index, tick.t_s, state, readings or {})
 
     def _record_truth(self, tick: Tick, state: tuple[float, ...]) -> None:
         self._served += 1
@@ -164,6 +166,7 @@ class ConstellationAgent(AgentSimulation):
             "segments_superseded": buffer.superseded,
             "left_at_refill_s_min": self._left_s_min if math.isfinite(self._left_s_min) else None,
             "joint_gap_m_max": buffer.joint_gap_m_max,
+            **({} if self._sensors is None else {"sensors": self._sensors.summary()}),
             **({} if self._cockpit is None else self._cockpit.finish()),
             "messages_unheard": self._unheard,
             "checks": [underruns],

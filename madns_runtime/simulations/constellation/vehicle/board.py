@@ -220,7 +220,7 @@ class Board:
         elif not self._has_crosslinks:
             raise PluginError(f"send: no radio to reach {to!r}; the scenario has no crosslinks")
 
-    def _open_estimates(self, values: Mapping[str, float]) -> tuple[str, ...]:
+    def _open_estimates(self, values: Any) -> tuple[str, ...]:
         if not isinstance(values, Mapping) or not 1 <= len(values) <= ESTIMATES_MAX:
             raise PluginError(
                 f"estimate: expected a mapping of 1 to {ESTIMATES_MAX} names, got {values!r:.200}"

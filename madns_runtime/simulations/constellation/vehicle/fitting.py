@@ -1,39 +1,67 @@
-"""Fits a vehicle out before the run: its flight software and its sensors, from what the scenario says."""
+"""Fits a vehicle out before the run: its sensors and its flight software, from what the scenario says."""
 
 from __future__ import annotations
 
-import numpy as np
+import dataclasses
+from typing import Any
 
 from madns_runtime.plugin.api import AgentContext
 from madns_runtime.simulations.constellation.flight.loading import load_flight_class
 from madns_runtime.simulations.constellation.flight.pilot import Pilot
 from madns_runtime.simulations.constellation.messages import Initial
-from madns_runtime.simulations.constellation.parameters import FlightProcess, Vehicle
+from madns_runtime.simulations.constellation.parameters import (
+    FlightProcess,
+    FlightSoftware,
+    Vehicle,
+)
 from madns_runtime.simulations.constellation.vehicle.board import Board
 from madns_runtime.simulations.constellation.vehicle.cockpit import Cockpit
+from madns_runtime.simulations.constellation.vehicle.sensors.errors import generator_of
+from madns_runtime.simulations.constellation.vehicle.sensors.scene import Scene
+from madns_runtime.simulations.constellation.vehicle.sensors.suite import SensorSuite
+from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBuffer
 from madns_runtime.simulations.constellation.vehicles import flight_of
 
+CHANCE_BYTES = 32
 
-def fit_out(context: AgentContext, initial: Initial, vehicle: Vehicle) -> Cockpit | None:
+
+def fit_out(
+    context: AgentContext, initial: Initial, *, vehicle: Vehicle, buffer: TruthBuffer
+) -> tuple[SensorSuite | None, Cockpit | None]:
     """
-    Load an agent's flight software and let it prepare; None for a vehicle that only coasts.
+    Mount sensors and flight software, and let the latter prepare; None for what the vehicle has not.
 
     Raises:
-        PluginError: It does not load.
-        BlamedError: It raised.
+        PluginError: Flight software does not load.
+        MissingExtraError: A sensor, or flight software, needs what is not installed.
+        BlamedError: Flight software raised.
     """
     flight = flight_of(context.parameters, context.name, initial.satellite)
-    if flight is None:
-        return None
+    wanted = vehicle.sensors
+    has_sensors = any(getattr(wanted, field.name) for field in dataclasses.fields(wanted))
+    if flight is None and not has_sensors:
+        return None, None
+    # All that is left to chance on board hangs on these bytes and on a name, not on an order.
+    chance = context.random.bytes(CHANCE_BYTES)
+    suite = cockpit = None
+    if has_sensors:
+        scene = Scene(initial.epoch_utc, buffer.thrust_at)
+        suite = SensorSuite(wanted, scene, context=context, chance=chance)
+    if flight is not None:
+        board = Board(
+            context,
+            initial,
+            vehicle=vehicle,
+            settings=flight.settings,
+            random=generator_of(chance, "flight"),
+        )
+        pilot = Pilot(_software(flight, context))
+        is_truth_fed = flight.input == "truth"
+        cockpit = Cockpit(pilot, board, vehicle=vehicle, is_truth_fed=is_truth_fed)
+    return suite, cockpit
+
+
+def _software(flight: FlightSoftware | FlightProcess, context: AgentContext) -> Any:
     if isinstance(flight, FlightProcess):
         raise NotImplementedError
-    software = load_flight_class(flight.software, context.base_directory)()
-    board = Board(
-        context,
-        initial,
-        vehicle=vehicle,
-        settings=flight.settings,
-        random=np.random.Generator(np.random.Philox(context.random.integers(2**63))),
-    )
-    is_truth_fed = flight.input == "truth"
-    return Cockpit(Pilot(software), board, vehicle=vehicle, is_truth_fed=is_truth_fed)
+    return load_flight_class(flight.software, context.base_directory)()

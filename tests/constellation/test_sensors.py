@@ -1,0 +1,308 @@
+"""Sensors: what they measure of a known truth, with which errors, and when flight software hears of it."""
+
+import math
+from datetime import datetime
+
+import numpy as np
+import pytest
+from constellation_fakes import FakeContext, parameters
+
+from madns_runtime.config import from_mapping
+from madns_runtime.plugin.api import Tick
+from madns_runtime.simulations.constellation.agent import ConstellationAgent
+from madns_runtime.simulations.constellation.messages import Initial, Segment
+from madns_runtime.simulations.constellation.orbit.earth import days_since_j2000
+from madns_runtime.simulations.constellation.orbit.quaternions import rotate, rotation_between
+from madns_runtime.simulations.constellation.orbit.sun import sun_m
+from madns_runtime.simulations.constellation.parameters import Sensors
+from madns_runtime.simulations.constellation.vehicle.sensors.errors import (
+    BLOCK,
+    ErrorModel,
+    Errors,
+    key_of,
+)
+from madns_runtime.simulations.constellation.vehicle.sensors.scene import Scene
+from madns_runtime.simulations.constellation.vehicle.sensors.suite import SensorSuite
+
+EPOCH = "2026-03-20T12:00:00Z"
+CHANCE = bytes(range(32))
+HZ = 10.0
+LEO = (7.158e6, 0.0, 0.0, 0.0, 1000.0, 7390.0)
+TURNED = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
+"""Body x on inertial y."""
+RIGID = (*LEO, *TURNED, 0.001, -0.002, 0.003)
+
+
+class Bench:
+    """A suite of sensors on a still vehicle."""
+
+    def __init__(self, *, chance=CHANCE, thrust=None, epoch=EPOCH, **sensors):
+        self.context = FakeContext("agent-01", ("agent-01",), parameters())
+        settings = from_mapping(Sensors, sensors)
+        scene = Scene(epoch, lambda t_s: thrust)
+        self.suite = SensorSuite(settings, scene, context=self.context, chance=chance)
+
+    def run(self, ticks, state=LEO, *, hz=HZ):
+        """Return the readings of the ticks with these numbers."""
+        return [self.suite.step(tick, tick / hz, state) for tick in ticks]
+
+    def values(self, name, ticks, state=LEO):
+        return np.array([r[name].values for r in self.run(ticks, state) if name in r])
+
+
+def test_gnss_measures_position_and_velocity_with_noise_of_their_own():
+    bench = Bench(gnss={"rate_hz": HZ, "noise": 5.0, "velocity_noise_m_s": 0.1})
+
+    errors = bench.values("gnss", range(4000)) - LEO
+
+    assert errors.mean(axis=0) == pytest.approx(0.0, abs=0.4)
+    assert errors.std(axis=0) == pytest.approx([5.0] * 3 + [0.1] * 3, rel=0.05)
+    assert abs(np.corrcoef(errors.T) - np.eye(6)).max() < 0.06
+
+
+def test_a_gyro_measures_body_rates():
+    assert Bench(gyro={}).run([0], RIGID)[0]["gyro"].values == RIGID[10:]
+
+
+def test_an_accelerometer_feels_thrust_in_body_axes_and_nothing_while_coasting():
+    burning = Bench(accelerometer={}, thrust=(0.0, 0.02, 0.0))
+    coasting = Bench(accelerometer={})
+
+    assert burning.values("accelerometer", [0], RIGID)[0] == pytest.approx([0.02, 0.0, 0.0])
+    assert burning.values("accelerometer", [10])[0] == pytest.approx([0.0, 0.02, 0.0])
+    assert coasting.values("accelerometer", [0], RIGID)[0] == pytest.approx([0.0, 0.0, 0.0])
+
+
+def test_a_magnetometer_measures_some_microteslas_in_body_axes():
+    still, turned = Bench(magnetometer={}), Bench(magnetometer={})
+
+    inertial = still.values("magnetometer", [0])[0]
+    body = turned.values("magnetometer", [0], RIGID)[0]
+
+    assert 2.0e-5 < np.linalg.norm(inertial) < 3.0e-5  # over the equator, 780 km up
+    assert body == pytest.approx(rotate(TURNED, inertial))
+
+
+def test_the_magnetic_pole_turns_with_the_earth():
+    north = (1.0, 0.0, 7.158e6, 0.0, 7460.0, 0.0)
+    hours = Bench(magnetometer={"rate_hz": 1.0}).values(
+        "magnetometer", range(0, 86_164 * 10, 21_541 * 10), north
+    )
+
+    # A quarter of a turn each: the field's horizontal part goes round.
+    angles = np.unwrap(np.arctan2(hours[:, 1], hours[:, 0]))
+    assert np.diff(angles) == pytest.approx(math.pi / 2, abs=1e-3)
+
+
+def test_a_star_tracker_errs_by_small_rotations():
+    bench = Bench(star_tracker={"rate_hz": HZ, "noise": 1e-4})
+
+    found = bench.values("star_tracker", range(2000), RIGID)
+
+    errors = np.array([rotation_between(TURNED, q) for q in found])
+    assert np.linalg.norm(found, axis=1) == pytest.approx(1.0, abs=1e-12)
+    assert errors.std(axis=0) == pytest.approx([1e-4] * 3, rel=0.08)
+
+
+def test_a_sun_sensor_points_at_the_sun_and_sees_nothing_in_the_shadow():
+    sun = np.array(sun_m(days_since_j2000(datetime.fromisoformat(EPOCH))))
+    sun /= np.linalg.norm(sun)
+    lit = (*(7.158e6 * sun), 0.0, 0.0, 0.0)
+    dark = (*(-7.158e6 * sun), 0.0, 0.0, 0.0)
+    bench = Bench(sun_sensor={})
+
+    assert bench.values("sun_sensor", [0], lit)[0] == pytest.approx(sun, abs=1e-6)
+    assert bench.run([10], dark) == [{}]
+    assert bench.suite.summary()["sun_sensor"] == {"samples": 1, "dropped": 0, "blind": 1}
+
+
+def test_a_sun_sensor_errs_by_an_angle():
+    sun = np.array(sun_m(days_since_j2000(datetime.fromisoformat(EPOCH))))
+    lit = (*(7.158e6 * sun / np.linalg.norm(sun)), 0.0, 0.0, 0.0)
+    bench = Bench(sun_sensor={"rate_hz": HZ, "noise": 0.01})
+
+    found = bench.values("sun_sensor", range(2000), lit)
+
+    angles = np.arccos(found @ (sun / np.linalg.norm(sun)))
+    assert np.sqrt((angles**2).mean() / 2) == pytest.approx(0.01, rel=0.05)
+
+
+def test_a_clock_reads_time_with_its_offset():
+    bench = Bench(clock={"bias": 1e-3})
+
+    read = bench.values("clock", [0, 10, 20])[:, 0]
+
+    assert np.diff(read) == pytest.approx(1.0)
+    assert 0.0 < abs(read[0]) < 5e-3
+    assert "clock_sensor" in bench.context.records
+
+
+# What all sensors share ------------------------------------------------------------------------
+
+
+def test_a_sensor_measures_at_its_rate():
+    bench = Bench(clock={"rate_hz": 2.5})
+
+    readings = bench.run(range(20))
+
+    assert [tick for tick, reading in enumerate(readings) if reading] == [0, 4, 8, 12, 16]
+
+
+def test_a_rate_above_the_ticks_measures_once_a_tick():
+    bench = Bench(clock={"rate_hz": 1000.0})
+
+    assert all("clock" in reading for reading in bench.run(range(20)))
+    assert bench.suite.summary()["clock"]["samples"] == 20
+
+
+def test_latency_delays_a_measurement_and_keeps_its_time():
+    bench = Bench(clock={"rate_hz": 5.0, "latency_s": 0.25})
+
+    known = [(tick, r["clock"].t_s) for tick, r in enumerate(bench.run(range(9))) if r]
+
+    assert known == [(3, 0.0), (5, 0.2), (7, 0.4)]
+    assert [row[:2] for row in bench.context.records["clock_sensor"]] == known
+
+
+def test_several_measurements_of_one_tick_are_recorded_and_the_newest_is_read():
+    bench = Bench(clock={"rate_hz": HZ, "latency_s": 0.2})
+
+    readings = bench.run([0, 1, 2, 7])
+
+    assert readings[-1]["clock"].t_s == 0.2
+    assert [row[:2] for row in bench.context.records["clock_sensor"]] == [
+        (2, 0.0),
+        (7, 0.1),
+        (7, 0.2),
+    ]
+
+
+def test_dropouts_are_counted_and_have_the_share_asked_for():
+    bench = Bench(clock={"rate_hz": HZ, "dropout": 0.25})
+
+    readings = bench.run(range(4000))
+
+    counts = bench.suite.summary()["clock"]
+    assert counts["samples"] == sum(1 for reading in readings if reading)
+    assert counts["samples"] + counts["dropped"] == 4000
+    assert counts["dropped"] / 4000 == pytest.approx(0.25, abs=0.03)
+
+
+NOISY = {"rate_hz": HZ, "noise": 1.0, "bias": 2.0, "bias_walk": 0.5, "dropout": 0.1}
+
+
+def test_missed_ticks_change_nothing_of_later_measurements():
+    every, some = Bench(gnss=NOISY), Bench(gnss=NOISY)
+    later = range(3 * BLOCK + 7, 3 * BLOCK + 40)
+
+    every.run(range(3 * BLOCK + 7))
+    some.run([0, 5, BLOCK + 3])
+
+    assert every.run(later) == some.run(later)
+
+
+def test_another_sensor_changes_nothing_of_the_first():
+    alone, together = Bench(gnss=NOISY), Bench(gnss=NOISY, clock=NOISY, magnetometer=NOISY)
+
+    assert (alone.values("gnss", range(50)) == together.values("gnss", range(50))).all()
+
+
+def test_two_sensors_have_errors_of_their_own():
+    bench = Bench(gyro={"noise": 1.0}, accelerometer={"noise": 1.0})
+
+    reading = bench.run([0], (*LEO, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))[0]
+
+    assert reading["gyro"].values != reading["accelerometer"].values
+
+
+def test_another_setting_leaves_the_noise_as_it_is():
+    white = Bench(clock={"rate_hz": HZ, "noise": 1.0}).values("clock", range(30))
+    walking = {"rate_hz": HZ, "noise": 1.0, "bias": 1.0, "bias_walk": 1e-12, "dropout": 1e-9}
+    both = Bench(clock=walking).values("clock", range(30))
+
+    assert np.ptp(both - white) == pytest.approx(0.0, abs=1e-9)
+
+
+def model(**rest):
+    plain = {"white": (0.0,), "bias": (0.0,), "walk": (0.0,), "dropout": 0.0, "period_s": 0.25}
+    return ErrorModel(**{**plain, **rest})
+
+
+def test_a_bias_walks_with_the_square_root_of_time():
+    ends = []
+    for agent in range(400):
+        errors = Errors(model(walk=(0.5,)), key_of(CHANCE, str(agent)))
+        assert errors.at(0) == [0.0]
+        ends.append(errors.at(400)[0])
+
+    # 400 samples of 0.25 s are 100 s.
+    assert np.std(ends) == pytest.approx(0.5 * 10.0, rel=0.12)
+    assert np.mean(ends) == pytest.approx(0.0, abs=1.0)
+
+
+def test_a_walk_is_continuous_over_blocks_and_the_same_from_anywhere():
+    whole = Errors(model(walk=(1.0,)), CHANCE[:16])
+    values = [whole.at(number)[0] for number in range(3 * BLOCK)]
+    late = Errors(model(walk=(1.0,)), CHANCE[:16])
+
+    assert max(abs(b - a) for a, b in zip(values, values[1:], strict=False)) < 0.5 * 4.5
+    assert late.at(3 * BLOCK - 1)[0] == pytest.approx(values[-1], abs=1e-12)
+
+
+def test_a_bias_stays_the_same_for_the_whole_run():
+    errors = Errors(model(bias=(3.0,)), CHANCE[:16])
+
+    assert {errors.at(number)[0] for number in (0, 1, BLOCK, 50 * BLOCK)} == {
+        errors.at(50 * BLOCK)[0]
+    }
+
+
+# On the agent -------------------------------------------------------------------------------------
+
+
+def agent(seed, **sensors):
+    params = parameters(vehicles=[{"sensors": sensors}])
+    context = FakeContext("agent-01", ("agent-01",), params, tick_hz=HZ)
+    context.random = np.random.default_rng([seed, 1])
+    states = np.tile(LEO, (61, 1))
+    segment = Segment(revision=0, t0_s=0.0, knot_s=1.0, states=states)
+    initial = Initial(satellite="X", frame="TEME", epoch_utc=EPOCH, segment=segment)
+    made = ConstellationAgent()
+    made.setup(context, initial.to_message())
+    return made, context
+
+
+def fly(made, until):
+    for index in range(until):
+        made.step(Tick(index, index / HZ, 1 / HZ, 0.0, 0))
+
+
+def test_measurements_are_recorded_apart_from_truth_and_repeat_under_a_seed():
+    runs = []
+    for seed in (1, 1, 2):
+        made, context = agent(seed, gnss=NOISY, magnetometer={"noise": 1e-8})
+        fly(made, 100)
+        runs.append(dict(context.records))
+
+    assert runs[0] == runs[1]
+    assert runs[0]["state"] == runs[2]["state"]
+    assert runs[0]["gnss"] != runs[2]["gnss"]
+    assert len(runs[0]["magnetometer"]) == 10
+    assert made.finish()["sensors"]["magnetometer"]["samples"] == 10
+
+
+def test_without_truth_nothing_is_measured():
+    made, context = agent(1, clock={"rate_hz": HZ})
+
+    fly(made, 700)
+
+    assert len(context.records["clock_sensor"]) == 601
+
+
+def test_a_vehicle_without_sensors_draws_no_chance():
+    made, context = agent(1)
+    context.random = None
+
+    fly(made, 10)
+
+    assert "sensors" not in made.finish()
