@@ -48,6 +48,7 @@ COMMANDS = (
     "runs",
     "collect",
     "report",
+    "diff",
 )
 GARBAGE_AFTER = 50_000
 """Objects made between two looks for garbage: what is imported later makes many, too."""

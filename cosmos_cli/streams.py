@@ -8,7 +8,7 @@ counted, never guessed.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -163,7 +163,7 @@ def scan_stream(
         raise MachineError(f"{file.path}: cannot be read: {error.strerror}") from error
     reading = StreamReading(file.path)
     if file.fields:
-        for columns, count in _batches(file, reading):
+        for columns, count in read_batches(file, reading):
             if consume is not None:
                 consume(columns, count)
             if progress is not None:
@@ -181,7 +181,8 @@ def scan_stream(
     )
 
 
-def _batches(file: StreamFile, reading: StreamReading) -> Any:
+def read_batches(file: StreamFile, reading: StreamReading) -> Iterator[tuple[Columns, int]]:
+    """Give the records block by block, by columns, with their number."""
     if file.is_array:
         for columns in reading.column_chunks():
             yield columns, len(columns[file.fields[0].name])

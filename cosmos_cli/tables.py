@@ -225,6 +225,15 @@ class TableReader:
         table = self._file.read_row_groups(self._groups.get(source, []), columns=wanted)
         return {name: table.column(name).to_numpy() for name in wanted}
 
+    def batches(self, source: str, names: Iterable[str], rows_max: int) -> Iterator[Columns]:
+        """Yield columns of one source as `read` returns them, at most *rows_max* records at a time."""
+        wanted, groups = list(names), self._groups.get(source, [])
+        if not groups:
+            return
+        for batch in self._file.iter_batches(rows_max, row_groups=groups, columns=wanted):
+            table = pa.Table.from_batches([batch])
+            yield {name: table.column(name).to_numpy() for name in wanted}
+
     def each(self, names: Iterable[str]) -> Iterator[tuple[str, Columns]]:
         """Yield every source with its columns."""
         wanted = list(names)

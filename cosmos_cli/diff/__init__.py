@@ -1,0 +1,1 @@
+"""What differs between two runs: settings, timing, and record by record what they recorded."""

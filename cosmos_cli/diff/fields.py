@@ -1,0 +1,139 @@
+"""Differences of the fields of matched records: counted, squared, and the largest kept. Pure numpy."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosmos_cli.diff.matching import Rows
+from cosmos_cli.report.style import as_array
+from madns_runtime.recording.records import Field
+
+TURN = {"deg": 360.0, "rad": 2.0 * math.pi}
+"""A whole turn: angles differ by the shorter way round."""
+TEXT_CHARACTERS_MAX = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where something was found: key of the record (tick or time), and whom it is about."""
+
+    key: float
+    who: str = ""
+
+
+class FieldDifference:
+    """
+    One field over all matched records of a stream.
+
+    Args:
+        field: The field, as the first run has it.
+    """
+
+    def __init__(self, field: Field) -> None:
+        self.field = field
+        self.different = 0
+        """Records in which the values are not the same."""
+        self.null_in_one = 0
+        """Records in which only one has a value."""
+        self.compared = 0
+        """Records in which both have a number."""
+        self.max = 0.0
+        self.at: Place | None = None
+        """Where the largest difference is; of texts, the first one."""
+        self.first: Place | None = None
+        """The first record that differs."""
+        self.values: tuple[Any, Any] | None = None
+        """Both values there."""
+        self._squares = 0.0
+
+    @property
+    def is_number(self) -> bool:
+        """Whether there is a difference to compute."""
+        return self.field.kind in ("float", "int")
+
+    @property
+    def rms(self) -> float | None:
+        """Root mean square of the differences; None without numbers."""
+        return math.sqrt(self._squares / self.compared) if self.compared else None
+
+    def add(self, a: Rows, b: Rows) -> None:
+        """Take pairs of records, row for row."""
+        left, right = a.columns[self.field.name], b.columns[self.field.name]
+        if self.is_number:
+            self._add_numbers(a, as_array(left), as_array(right))
+        else:
+            self._add_texts(a, left, right)
+
+    def merge(self, other: FieldDifference, who: str) -> None:
+        """Take what was found in another source's records of the same stream."""
+        self.different += other.different
+        self.null_in_one += other.null_in_one
+        self.compared += other.compared
+        self._squares += other._squares
+        if other.first is not None and (self.first is None or other.first.key < self.first.key):
+            self.first = Place(other.first.key, other.first.who or who)
+        if other.at is not None and (self.at is None or other.max > self.max):
+            self.max, self.values = other.max, other.values
+            self.at = Place(other.at.key, other.at.who or who)
+
+    def _add_numbers(self, a: Rows, left: NDArray[np.float64], right: NDArray[np.float64]) -> None:
+        is_one_null = np.isnan(left) != np.isnan(right)
+        is_both = ~np.isnan(left) & ~np.isnan(right)
+        difference = np.where(is_both, left - right, 0.0)
+        turn = TURN.get(self.field.unit)
+        if turn is not None:
+            is_long = np.abs(difference) > turn / 2.0
+            difference[is_long] -= turn * np.round(difference[is_long] / turn)
+        self.null_in_one += int(is_one_null.sum())
+        self.compared += int(is_both.sum())
+        self._squares += float(np.dot(difference, difference))
+        is_different = is_one_null | (difference != 0.0)
+        self.different += int(is_different.sum())
+        self._note_first(a, is_different)
+        if len(difference):
+            worst = int(np.abs(difference).argmax())
+            size = abs(float(difference[worst]))
+            if size > self.max:
+                self.max, self.at = size, _place(a, worst)
+                self.values = (float(left[worst]), float(right[worst]))
+
+    def _add_texts(self, a: Rows, left: NDArray[Any], right: NDArray[Any]) -> None:
+        pairs = zip(left.tolist(), right.tolist(), strict=True)
+        is_different = np.array([x != y and _plain(x) != _plain(y) for x, y in pairs], dtype=bool)
+        self.different += int(is_different.sum())
+        self._note_first(a, is_different)
+        if self.values is None and is_different.any():
+            index = int(is_different.argmax())
+            self.at, self.values = _place(a, index), (_told(left[index]), _told(right[index]))
+
+    def _note_first(self, a: Rows, is_different: NDArray[np.bool_]) -> None:
+        if self.first is None and is_different.any():
+            self.first = _place(a, int(is_different.argmax()))
+
+
+def _place(rows: Rows, index: int) -> Place:
+    who = rows.who[index]
+    return Place(float(rows.keys[index]), who if isinstance(who, str) else "")
+
+
+def _plain(value: Any) -> Any:
+    """Return what a JSON value is, whether it comes from a line or, as text, from a table."""
+    if isinstance(value, str) and value[:1] in ("{", "["):
+        try:
+            return json.loads(value)
+        except ValueError:
+            return value
+    return value
+
+
+def _told(value: Any) -> str | None:
+    if value is None:
+        return None
+    text = value if isinstance(value, str) else json.dumps(value, default=str)
+    return text if len(text) <= TEXT_CHARACTERS_MAX else f"{text[: TEXT_CHARACTERS_MAX - 3]}..."

@@ -1,0 +1,187 @@
+"""One stream of one source in one run: read in bounded batches, from its table or from its lines."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from cosmos_cli.rundir import RunDirectory
+from cosmos_cli.streams import DETAILS, Columns, Role, StreamFile, find_streams, read_batches
+from cosmos_cli.tables import TableReader, open_tables
+from madns_runtime.errors import MachineError
+from madns_runtime.recording.reader import StreamReading
+from madns_runtime.recording.records import Field
+
+ROWS_READ_MAX = 16_384
+"""Records of one stream that are read at a time."""
+BLOCK_BYTES = 1 << 20
+END_LINE = b'{"end":'
+CONTROL_LINE = re.compile(rb'^\{"(?:t0_utc|end)":[^\n]*\n?', re.MULTILINE)
+"""Lines that are no records: they tell when a run was, not what was recorded."""
+Key = tuple[str, str]
+"""Table and source, such as ("state", "agent-03")."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lines:
+    """What a look at the lines of a stream tells without decoding them."""
+
+    sha256: str
+    """Of all records, without the lines that name the run and its time."""
+    records: int
+    cut: tuple[str, ...]
+    """Files without an end line: the recorder was cut off."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recorded:
+    """One stream of one source."""
+
+    table: str
+    role: Role
+    source: str
+    fields: tuple[Field, ...]
+    files: tuple[StreamFile, ...]
+    """In the order of incarnations; empty if only the table is left."""
+    reader: TableReader | None
+    """None if there is no table, or one that is older than the lines."""
+
+    @property
+    def key(self) -> Key:
+        """What the same stream of the other run is found by."""
+        return self.table, self.source
+
+    @property
+    def stream(self) -> str:
+        """The stream's name as it was recorded, without the role that its table's name begins with."""
+        return self.table if self.role == "agent" else self.table.removeprefix(f"{self.role}_")
+
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the fields."""
+        return tuple(field.name for field in self.fields)
+
+    def batches(self, names: Iterable[str]) -> Iterator[Columns]:
+        """
+        Give columns of all records in the order of recording.
+
+        Raises:
+            MachineError: A file cannot be read.
+        """
+        wanted = list(names)
+        if self.reader is not None and self.reader.has(*wanted):
+            yield from self.reader.batches(self.source, wanted, ROWS_READ_MAX)
+            return
+        for file in self.files:
+            for columns, _ in read_batches(file, StreamReading(file.path)):
+                yield {name: columns[name] for name in wanted}
+
+    def lines(self) -> Lines | None:
+        """
+        Hash the records as they were written; None if the lines are gone.
+
+        Raises:
+            MachineError: A file cannot be read.
+        """
+        if not self.files:
+            return None
+        digest, records, cut = hashlib.sha256(), 0, []
+        for file in self.files:
+            has_end = False
+            for block in _record_blocks(file.path):
+                if END_LINE in block or b'{"t0_utc":' in block:
+                    has_end = has_end or block.rpartition(b"\n{")[2].startswith(b'"end":')
+                    has_end = has_end or block.startswith(END_LINE)
+                    block = CONTROL_LINE.sub(b"", block)  # noqa: PLW2901 - the same block without them
+                digest.update(block)
+                records += block.count(b"\n")
+            if not has_end:
+                cut.append(file.label)
+        return Lines(sha256=digest.hexdigest(), records=records, cut=tuple(cut))
+
+
+def recorded_streams(run: RunDirectory) -> dict[Key, Recorded]:
+    """Return every stream of a run that has a schema, by table and source."""
+    files: dict[Key, list[StreamFile]] = {}
+    for file in find_streams(run.path):
+        if file.fields:
+            files.setdefault((file.table, file.source), []).append(file)
+    tables = open_tables(run.tables)
+    found = {
+        key: _from_lines(key, group, _fresh(tables.get(key[0]), group))
+        for key, group in files.items()
+    }
+    for reader in tables.values():
+        for source in reader.sources:
+            found.setdefault((reader.name, source), _from_table(reader, source))
+    return found
+
+
+def _from_lines(key: Key, files: Sequence[StreamFile], reader: TableReader | None) -> Recorded:
+    fields: dict[str, Field] = {}
+    for file in files:
+        for field in (*file.fields, *(() if file.is_array else (DETAILS,))):
+            fields.setdefault(field.name, field)
+    same = all(_names(file) == _names(files[0]) for file in files)
+    if not same and reader is None:
+        # Incarnations of different builds: what all of them have.
+        common = set.intersection(*(set(_names(file)) for file in files))
+        fields = {name: field for name, field in fields.items() if name in common}
+    return Recorded(
+        table=key[0],
+        role=files[0].role,
+        source=key[1],
+        fields=tuple(fields.values()),
+        files=tuple(files),
+        reader=reader if reader is not None and key[1] in reader.sources else None,
+    )
+
+
+def _from_table(reader: TableReader, source: str) -> Recorded:
+    role: Mapping[str, Role] = {"host": "host", "machine": "machine"}
+    names = {field.name for field in reader.fields}
+    fields = tuple(f for f in reader.fields if not (f.name == "t_s" and "tick" in names))
+    return Recorded(
+        table=reader.name,
+        role=role.get(reader.role, "agent"),
+        source=source,
+        fields=fields,
+        files=(),
+        reader=reader,
+    )
+
+
+def _names(file: StreamFile) -> tuple[str, ...]:
+    return tuple(field.name for field in file.fields)
+
+
+def _fresh(reader: TableReader | None, files: Sequence[StreamFile]) -> TableReader | None:
+    """Return the table unless a line was written after it: then the lines tell more."""
+    if reader is None:
+        return None
+    try:
+        newest = max(file.path.stat().st_mtime_ns for file in files)
+        return reader if reader.path.stat().st_mtime_ns >= newest else None
+    except OSError:
+        return None
+
+
+def _record_blocks(path: Path) -> Iterator[bytes]:
+    """Give all lines but the schema's, in blocks that end with a line."""
+    try:
+        with path.open("rb") as file:
+            file.readline()
+            held = b""
+            while block := file.read(BLOCK_BYTES):
+                end = block.rfind(b"\n") + 1
+                if end:
+                    yield held + block[:end]
+                    held = block[end:]
+                else:
+                    held += block
+            if held:
+                yield held
+    except OSError as error:
+        raise MachineError(f"{path}: cannot be read: {error.strerror}") from error

@@ -1,0 +1,274 @@
+"""One stream of one source in both runs: its records matched, and what differs in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from typing import Any, Literal
+
+import numpy as np
+
+from cosmos_cli.diff.fields import FieldDifference, Place
+from cosmos_cli.diff.matching import Floats, Matched, Rows, joined, match
+from cosmos_cli.diff.recorded import ROWS_READ_MAX, Recorded
+from cosmos_cli.report.style import as_array
+from madns_runtime.recording.records import Field
+
+TICK_TOLERANCE = 0.25
+"""Ticks are whole numbers."""
+SAME_TIME_S = 1e-6
+"""Of ticks at different rates those are matched that mean the same instant, s."""
+IDENTITY = ("agent", "satellite", "sender", "to", "receiver", "station", "kind", "event")
+"""Text fields that tell whom or what a record is about; records match only where they agree."""
+OWNERS = ("agent", "sender")
+"""Of these the first is the agent that a record of the host belongs to."""
+By = Literal["tick", "time", "order"]
+Observer = Callable[[str, Matched], None]
+"""Takes a source's name and what is matched of its records, piece by piece."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pairing:
+    """How records of a stream find each other."""
+
+    by: By
+    column: str
+    """Field that holds the key; empty for the number of the record."""
+    scales: tuple[float, float] = (1.0, 1.0)
+    """What the key is multiplied with, in the first and in the second run."""
+    tolerance: float = TICK_TOLERANCE
+    identity: tuple[str, ...] = ()
+
+
+@dataclass(slots=True, kw_only=True)
+class Alone:
+    """Records that only one run has."""
+
+    count: int = 0
+    first: Place | None = None
+    last: Place | None = None
+
+    def add(self, rows: Rows) -> None:
+        """Count them; the first and the last by key are kept."""
+        if not len(rows):
+            return
+        self.count += len(rows)
+        low, high = int(np.nanargmin(_finite(rows.keys))), int(np.nanargmax(_finite(rows.keys)))
+        first, last = _place(rows, low), _place(rows, high)
+        if self.first is None or first.key < self.first.key:
+            self.first = first
+        if self.last is None or last.key > self.last.key:
+            self.last = last
+
+    def merge(self, other: Alone, who: str) -> None:
+        """Take those of another source."""
+        self.count += other.count
+        for place, name in ((other.first, "first"), (other.last, "last")):
+            if place is None:
+                continue
+            named = Place(place.key, place.who or who)
+            if name == "first" and (self.first is None or named.key < self.first.key):
+                self.first = named
+            if name == "last" and (self.last is None or named.key > self.last.key):
+                self.last = named
+
+
+@dataclass(slots=True, kw_only=True)
+class StreamDifference:
+    """What a comparison of one stream found; of one source, or of all together."""
+
+    table: str
+    source: str
+    by: By = "tick"
+    rows_a: int = 0
+    rows_b: int = 0
+    matched: int = 0
+    is_identical: bool = False
+    """Whether the records are the same bit by bit, by their hashes, or, without lines, by their values."""
+    only_a: Alone = field(default_factory=Alone)
+    only_b: Alone = field(default_factory=Alone)
+    fields: dict[str, FieldDifference] = field(default_factory=dict)
+    fields_only_a: tuple[str, ...] = ()
+    fields_only_b: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def has_same_values(self) -> bool:
+        """Whether every record has its partner, with the same values."""
+        return (
+            not self.only_a.count
+            and not self.only_b.count
+            and not self.fields_only_a
+            and not self.fields_only_b
+            and not any(found.different for found in self.fields.values())
+        )
+
+    def merge(self, other: StreamDifference) -> None:
+        """Take what was found for another source of the same stream."""
+        self.rows_a += other.rows_a
+        self.rows_b += other.rows_b
+        self.matched += other.matched
+        self.is_identical = self.is_identical and other.is_identical
+        self.only_a.merge(other.only_a, other.source)
+        self.only_b.merge(other.only_b, other.source)
+        for name, found in other.fields.items():
+            mine = self.fields.setdefault(name, FieldDifference(found.field))
+            mine.merge(found, other.source)
+        self.fields_only_a = _union(self.fields_only_a, other.fields_only_a)
+        self.fields_only_b = _union(self.fields_only_b, other.fields_only_b)
+        self.remarks = _union(self.remarks, other.remarks)
+
+
+def choose_pairing(a: Sequence[Field], b: Sequence[Field], tick_hz: tuple[float, float]) -> Pairing:
+    """
+    Return how the records of a stream with these fields find each other.
+
+    By tick where both runs tick alike, at different rates by the instant that a tick means; what has no
+    tick by its time, to half a tick; what has no time by its number.
+    """
+    common = {f.name: f for f in a if any(f.name == other.name for other in b)}
+    identity = tuple(n for n in IDENTITY if n in common and common[n].kind == "str")
+    for name in ("tick", "packet"):
+        if name in common and tick_hz[0] == tick_hz[1]:
+            return Pairing(by="tick", column=name, identity=identity)
+        if name in common:
+            scales = (1.0 / tick_hz[0], 1.0 / tick_hz[1])
+            return Pairing(
+                by="time", column=name, scales=scales, tolerance=SAME_TIME_S, identity=identity
+            )
+    if "t_s" in common:
+        tolerance_s = 0.5 / max(tick_hz)
+        return Pairing(by="time", column="t_s", tolerance=tolerance_s, identity=identity)
+    return Pairing(by="order", column="", identity=())
+
+
+def diff_stream(
+    a: Recorded,
+    b: Recorded,
+    pairing: Pairing,
+    *,
+    agents: Sequence[str] = (),
+    observe: Observer | None = None,
+) -> StreamDifference:
+    """
+    Compare one stream of one source, in bounded memory.
+
+    Args:
+        a: The stream in the first run.
+        b: The same stream in the second.
+        pairing: How its records find each other.
+        agents: Globs of the agents whose records count, where they are one of many; empty for all.
+        observe: Told of everything that is matched.
+
+    Raises:
+        MachineError: A file cannot be read.
+    """
+    found = StreamDifference(table=a.table, source=a.source, by=pairing.by)
+    of_b = {f.name: f for f in b.fields}
+    found.fields_only_a = tuple(n for n in a.names() if n not in of_b)
+    found.fields_only_b = tuple(n for n in b.names() if n not in a.names())
+    values = [f for f in a.fields if f.name in of_b and f.name != pairing.column]
+    values = [f for f in values if f.name not in pairing.identity]
+    found.fields = {f.name: FieldDifference(f) for f in values}
+    names = tuple(f.name for f in a.fields if f.name in of_b)
+    sides = (
+        _rows(a, names, pairing, scale=pairing.scales[0], agents=agents),
+        _rows(b, names, pairing, scale=pairing.scales[1], agents=agents),
+    )
+    for piece in match(*sides, tolerance=pairing.tolerance):
+        _take(found, piece)
+        if observe is not None:
+            observe(a.source, piece)
+    found.is_identical = found.has_same_values and not (a.files and b.files)
+    return found
+
+
+def identical_stream(a: Recorded, by: By, records: int) -> StreamDifference:
+    """Return what is found where the hashes of all records agree."""
+    return StreamDifference(
+        table=a.table,
+        source=a.source,
+        by=by,
+        rows_a=records,
+        rows_b=records,
+        matched=records,
+        is_identical=True,
+    )
+
+
+def _take(found: StreamDifference, piece: Matched) -> None:
+    found.matched += len(piece.a)
+    found.rows_a += len(piece.a) + len(piece.only_a)
+    found.rows_b += len(piece.b) + len(piece.only_b)
+    found.only_a.add(piece.only_a)
+    found.only_b.add(piece.only_b)
+    if len(piece.a):
+        for one in found.fields.values():
+            one.add(piece.a, piece.b)
+
+
+def _rows(
+    recorded: Recorded,
+    names: tuple[str, ...],
+    pairing: Pairing,
+    *,
+    scale: float,
+    agents: Sequence[str],
+) -> Iterator[Rows]:
+    """Give a stream's records in batches, the first of them empty if there are none."""
+    owner = next((n for n in OWNERS if n in names), None) if recorded.role == "host" else None
+    chosen: dict[str, bool] = {}
+    counted = 0
+
+    def rows_of(columns: Mapping[str, Any]) -> Rows:
+        nonlocal counted
+        count = len(columns[names[0]])
+        keys = _keys(columns, pairing, counted, count) * scale
+        counted += count
+        rows = Rows(keys=keys, who=_who(columns, pairing.identity, count), columns=dict(columns))
+        if not agents or owner is None:
+            return rows
+        owners = columns[owner].tolist()
+        for name in owners:
+            if name not in chosen:
+                chosen[name] = any(fnmatchcase(str(name), glob) for glob in agents)
+        return rows.take(np.array([chosen[name] for name in owners], dtype=bool))
+
+    batches = (rows_of(columns) for columns in recorded.batches(names))
+    is_empty = True
+    for rows in joined(batches, ROWS_READ_MAX):
+        is_empty = False
+        yield rows
+    if is_empty:
+        nothing = {name: np.empty(0, dtype=object) for name in names}
+        yield Rows(keys=np.empty(0), who=np.empty(0, dtype=object), columns=nothing)
+
+
+def _keys(columns: Mapping[str, Any], pairing: Pairing, counted: int, count: int) -> Floats:
+    if not pairing.column:
+        return np.arange(counted, counted + count, dtype=np.float64)
+    return as_array(columns[pairing.column])
+
+
+def _who(columns: Mapping[str, Any], identity: tuple[str, ...], count: int) -> Any:
+    """Return whom each record is about; all the same without a field that tells."""
+    if not identity:
+        return np.zeros(count, dtype=np.int8)
+    parts = [columns[name].tolist() for name in identity]
+    who = np.empty(count, dtype=object)
+    who[:] = [" ".join(str(p) for p in row if p is not None) for row in zip(*parts, strict=True)]
+    return who
+
+
+def _finite(keys: Floats) -> Floats:
+    return np.where(np.isfinite(keys), keys, 0.0)
+
+
+def _place(rows: Rows, index: int) -> Place:
+    who = rows.who[index]
+    return Place(float(rows.keys[index]), who if isinstance(who, str) else "")
+
+
+def _union(first: tuple[str, ...], second: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys((*first, *second)))
