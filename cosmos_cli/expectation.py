@@ -16,6 +16,8 @@ from madns_runtime.recording.records import CLOCK, EVENTS, HEALTH, LOG, PROCESS,
 AGENT_STREAMS = tuple(schema.name for schema in (TICKS, CLOCK, EVENTS, LOG, PROCESS))
 HOST_STREAMS = tuple(schema.name for schema in (EVENTS, LOG, HEALTH))
 MACHINE_STREAMS = (HEALTH.name,)
+LOCKSTEP_STREAMS = (EVENTS.name, LOG.name)
+"""Of host and agents where no time is kept: there are no machines' clocks, lateness or health to record."""
 FAULTS_SHOWN_MAX = 3
 HOST = "host"
 NOTHING: Mapping[str, str] = MappingProxyType({})
@@ -34,7 +36,11 @@ class Expected:
     @classmethod
     def of(cls, config: RunConfig, machines: Iterable[str]) -> Expected:
         """Return what a run of this configuration on these machines must have recorded."""
-        return cls(agents=config.agents.resolved_names(), machines=tuple(machines))
+        agents = config.agents.resolved_names()
+        if config.time.is_lockstep:
+            streams = LOCKSTEP_STREAMS
+            return cls(agents=agents, agent_streams=streams, host_streams=streams)
+        return cls(agents=agents, machines=tuple(machines))
 
     @classmethod
     def read(cls, run: RunDirectory) -> Expected:

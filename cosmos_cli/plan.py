@@ -24,6 +24,10 @@ from cosmos_cli.models.scenario import Scenario
 LOOPBACK = Machine(name="loopback", address="127.0.0.1", connection="local")
 """This computer, where a run without an inventory takes place."""
 NAMES_SHOWN_MAX = 8
+LOCKSTEP_IS_HERE = (
+    "time.mode: lockstep runs on this computer alone: leave out the inventory and --host, or run in"
+    " real time on them with --set time.mode=realtime"
+)
 
 FaultAt = Callable[[ValuePath, str], Fault]
 """Tells where a path of the scenario stands in its file."""
@@ -78,6 +82,8 @@ class LaunchPlan:
     """The machine of the run's host; None for the operator's own."""
     notes: tuple[str, ...] = ()
     """What a person should know about the placement."""
+    is_lockstep: bool = False
+    """Whether the host runs the agents in workers of its own, and simulated time waits for all."""
 
     @property
     def agents_by_machine(self) -> Mapping[str, tuple[str, ...]]:
@@ -99,6 +105,7 @@ class LaunchPlan:
             "machines": {machine.name: machine.to_mapping() for machine in self.machines},
             "idle": list(self.idle),
             "notes": list(self.notes),
+            "is_lockstep": self.is_lockstep,
         }
 
 
@@ -127,6 +134,8 @@ def make_plan(
     """
     if not machines:
         raise InputError("expected at least one machine, got none; check the inventory")
+    if scenario.time.is_lockstep and (tuple(machines) != (LOOPBACK,) or host is not None):
+        raise InputError(LOCKSTEP_IS_HERE)
     dealer = _Dealer(machines, _host_of(machines, host), fault_at or _fault_without_place)
     names = scenario.agents.resolved_names()
     claims = claim_agents(names, scenario.placement)
@@ -152,6 +161,7 @@ def make_plan(
         idle=dealer.idle(),
         host=dealer.host,
         notes=tuple(dealer.notes),
+        is_lockstep=scenario.time.is_lockstep,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -91,6 +92,7 @@ class Evidence:
             overrun_ratio=totals.overrun_ratio,
             rtf=_number(result.get("rtf")),
             has_rate=self._has_rate(),
+            is_lockstep=self._is_lockstep(),
             reliable_lost=_count(messages, "reliable", "lost"),
             sync_lost=_count(messages, "sync", "lost"),
             sync_deadlines_broken=_count(messages, "sync", "deadlines_broken"),
@@ -109,6 +111,18 @@ class Evidence:
     def _has_rate(self) -> bool:
         time, agents = (self.config.time, self.config.agents) if self.config else (None, None)
         return time is None or agents is None or time.duration_s * agents.tick_hz >= TICKS_OF_A_RATE
+
+    def _is_lockstep(self) -> bool:
+        return self.config is not None and self.config.time.is_lockstep
+
+    def _records_sha256(self) -> str | None:
+        """Return what two lockstep runs of one seed have in common: a hash over all that was recorded."""
+        if not self._is_lockstep():
+            return None
+        digest = hashlib.sha256()
+        for scan in sorted(self.scans, key=_place_of):
+            digest.update(f"{_place_of(scan)} {scan.sha256}\n".encode())
+        return digest.hexdigest()
 
     def _lost(self) -> tuple[str, ...]:
         lost = (self.result or {}).get("lost")
@@ -131,6 +145,7 @@ class Evidence:
             "t0_utc": result.get("t0_utc"),
             "duration_s": result.get("duration_s"),
             "rtf": result.get("rtf"),
+            "time_mode": config.time.mode if config else self.started.get("time_mode"),
             "seed": config.seed if config else self.started.get("seed"),
             "versions": self.started.get("versions", {}),
             "timing": self._timing(totals),
@@ -139,6 +154,7 @@ class Evidence:
             "round_trip_ms": self.round_trip_ms,
             "clock": self.clock,
             "records": self._records(),
+            "records_sha256": self._records_sha256(),
             "data": {"complete": not self.missing, "missing": list(self.missing)},
             "problems": [problem.to_mapping() for problem in self.problems],
             "checks": [check.to_mapping() for check in verdict.checks],
@@ -199,6 +215,10 @@ def _plain(document: Mapping[str, Any]) -> dict[str, Any]:
 
 def _last_resort(value: Any) -> Any:
     return dict(value) if isinstance(value, Mapping) else str(value)
+
+
+def _place_of(scan: StreamScan) -> str:
+    return f"{scan.file.role}/{scan.file.source}/{scan.file.path.name}"
 
 
 def _text(value: object) -> str | None:

@@ -70,6 +70,8 @@ class Facts:
     rtf: float | None = None
     has_rate: bool = True
     """Whether there were ticks enough to tell a real-time factor: two."""
+    is_lockstep: bool = False
+    """Whether simulated time waited for everybody: nothing can be late then, whatever the clock shows."""
     reliable_lost: int | None = None
     sync_lost: int | None = None
     sync_deadlines_broken: int | None = None
@@ -118,11 +120,20 @@ def judge(facts: Facts, limits: Limits) -> Verdict:
         who=who,
         reason=reason,
         checks=tuple(checks),
-        remarks=(*(() if _is_rate_judged(facts) else (NO_RATE,)), *facts.remarks),
+        remarks=(*_unjudged(facts), *facts.remarks),
     )
 
 
 NO_RATE = "time.rtf: not judged: a single tick has no rate"
+LOCKSTEP = (
+    "time.rtf, deadline.miss_ratio, deadline.overrun_ratio: not judged: in lockstep time waits"
+)
+
+
+def _unjudged(facts: Facts) -> tuple[str, ...]:
+    if facts.is_lockstep:
+        return (LOCKSTEP,)
+    return () if _is_rate_judged(facts) else (NO_RATE,)
 
 
 def _is_rate_judged(facts: Facts) -> bool:
@@ -140,12 +151,9 @@ def run_status(facts: Facts) -> str:
 
 def run_checks(facts: Facts, limits: Limits) -> list[CheckResult]:
     """Return every check of the framework, then those of the simulation."""
-    rtf_error = None if facts.rtf is None else abs(facts.rtf - 1.0)
     checks = [
         at_most("agents.lost", 0, len(facts.lost_agents)),
-        at_most("deadline.miss_ratio", limits.miss_ratio_max, facts.miss_ratio),
-        at_most("deadline.overrun_ratio", limits.miss_ratio_max, facts.overrun_ratio),
-        *([at_most("time.rtf", limits.rtf_error_max, rtf_error)] if _is_rate_judged(facts) else []),
+        *([] if facts.is_lockstep else _real_time_checks(facts, limits)),
         at_most("messages.reliable.lost", 0, facts.reliable_lost),
         at_most("messages.sync.lost", 0, facts.sync_lost),
         at_most("messages.sync.deadlines_broken", 0, facts.sync_deadlines_broken),
@@ -153,6 +161,15 @@ def run_checks(facts: Facts, limits: Limits) -> list[CheckResult]:
         at_most("records.truncated", 0, facts.records_truncated),
     ]
     return checks + list(facts.plugin_checks)
+
+
+def _real_time_checks(facts: Facts, limits: Limits) -> list[CheckResult]:
+    rtf_error = None if facts.rtf is None else abs(facts.rtf - 1.0)
+    return [
+        at_most("deadline.miss_ratio", limits.miss_ratio_max, facts.miss_ratio),
+        at_most("deadline.overrun_ratio", limits.miss_ratio_max, facts.overrun_ratio),
+        *([at_most("time.rtf", limits.rtf_error_max, rtf_error)] if _is_rate_judged(facts) else []),
+    ]
 
 
 def at_most(name: str, limit: float, got: float | None) -> CheckResult:

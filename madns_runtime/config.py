@@ -62,12 +62,17 @@ class TimeSettings:
 
     __pydantic_config__ = FORBID_EXTRA
 
-    mode: Literal["realtime"] = "realtime"
-    """Simulated seconds pass as wall seconds do."""
+    mode: Literal["realtime", "lockstep"] = "realtime"
+    """realtime: simulated seconds pass as wall seconds do; lockstep: as fast as all agents allow, here, the same under a seed."""
     duration_s: Annotated[float, Gt(0), Le(DURATION_S_MAX)] = 60.0
     """Simulated time of the run, s."""
     rtf_tolerance: Annotated[float, Gt(0)] = 1e-3
     """Largest deviation of the real-time factor from 1."""
+
+    @property
+    def is_lockstep(self) -> bool:
+        """Whether simulated time waits for everybody instead of following the clock."""
+        return self.mode == "lockstep"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,6 +121,8 @@ class Timeouts:
     """From the end of the simulated time until every agent has reported it complete."""
     shutdown_s: Annotated[float, Gt(0)] = 10.0
     """For shutdown: the last reports, and flushing of records."""
+    tick_s: Annotated[float, Gt(0)] = 30.0
+    """time.mode lockstep: wall time for one tick of all agents of a process, or one call of the host's half."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,9 +176,11 @@ class ExecutorSettings:
     __pydantic_config__ = FORBID_EXTRA
 
     kind: str = "process"
-    """process, thread, or module:callable that returns a concurrent.futures.Executor."""
+    """process, thread, dask, or module:callable that returns a concurrent.futures.Executor."""
     workers: Annotated[int, Ge(1), Le(1024)] = 1
-    """Workers: N_p of the thesis's inequalities."""
+    """Workers: N_p of the thesis's inequalities; of a cluster, how many jobs it is given at once."""
+    address: str = ""
+    """dask: the scheduler, such as tcp://10.0.0.1:8786; empty for a cluster of our own on this machine."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -556,7 +556,7 @@ def main() -> None:
         document, pending = read_launch(0)
         launch = from_mapping(HostLaunch, document)
         with register(launch.config.run, "host", HOST, Path(launch.directory).parent):
-            code = HostRuntime(launch, (0, out_fd), pending).run()
+            code = _run(launch, (0, out_fd), pending)
     except MadnsError as error:
         code = _fail(out_fd, str(error))
     except BaseException as error:  # noqa: BLE001 - the last frame of a process; it is told below
@@ -564,6 +564,14 @@ def main() -> None:
         code = _fail(out_fd, describe_exception(error, "madns-host"))
     sys.stderr.flush()
     os._exit(code)  # no executor's or plug-in's thread may hold the process
+
+
+def _run(launch: HostLaunch, fds: tuple[int, int], pending: bytes) -> int:
+    if launch.config.time.is_lockstep:
+        from madns_runtime.lockstep.host import LockstepHost  # a real-time run needs none of it
+
+        return LockstepHost(launch, fds, pending).run()
+    return HostRuntime(launch, fds, pending).run()
 
 
 def _fail(out_fd: int, reason: str) -> int:

@@ -25,6 +25,7 @@ from madns_runtime.health.sampler import SAMPLER_TIMEOUT_S, start_sampler, stop_
 from madns_runtime.health.stress import start_stress, stop_stress
 from madns_runtime.plugin.registry import load_half, parse_parameters, resolve
 from madns_runtime.processes import register
+from madns_runtime.reactor.forking import leave_parent
 from madns_runtime.reactor.lines import OPERATOR_SIDE_GONE, OperatorLink
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import apply as apply_scheduling
@@ -136,7 +137,7 @@ class Supervisor:
         """Run as a child, and never return."""
         code = 1
         try:
-            _leave_parent(keep={self._life_read_fd, self._reason_write_fd})
+            leave_parent(keep={self._life_read_fd, self._reason_write_fd})
             process = AgentProcess(
                 self._launch,
                 agents,
@@ -369,19 +370,6 @@ def _failed(agents: Sequence[str], reason: str) -> dict[str, Outcome]:
 
 def _groups(agents: Sequence[str], per_process: int) -> list[tuple[str, ...]]:
     return [tuple(agents[i : i + per_process]) for i in range(0, len(agents), per_process)]
-
-
-def _leave_parent(keep: set[int]) -> None:
-    """Make a forked child independent of its parent's descriptors and signals."""
-    signal.set_wakeup_fd(-1)
-    for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, signal.SIG_DFL)
-    null_fd = os.open(os.devnull, os.O_RDWR)
-    os.dup2(null_fd, 0)
-    first = 3
-    for fd in (*sorted(keep), 1 << 20):
-        os.closerange(first, fd)
-        first = fd + 1
 
 
 def _drain(fd: int, read: Any) -> None:

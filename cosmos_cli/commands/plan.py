@@ -92,9 +92,13 @@ def plan(
         latency_s=latency_s,
         maneuvers_at_once=maneuvers_at_once,
     )
-    feasibility = feasibility_of(scenario_file, resources)
+    is_lockstep = launch_plan.is_lockstep
+    feasibility = None if is_lockstep else feasibility_of(scenario_file, resources)
     _show_placement(console, launch_plan)
-    _show_feasibility(console, feasibility, resources, latency_source)
+    if is_lockstep:
+        console.data(_lockstep_words(scenario_file))
+    else:
+        _show_feasibility(console, feasibility, resources, latency_source)
     console.print_json(
         {
             "plan": launch_plan.to_mapping(),
@@ -173,6 +177,19 @@ def _show_placement(console: Console, launch_plan: LaunchPlan) -> None:
         console.data(f"without an agent: {', '.join(launch_plan.idle)}")
     for note in launch_plan.notes:
         console.say(f"note: {note}")
+
+
+def _lockstep_words(scenario_file: ScenarioFile) -> str:
+    """Return what the inequalities are replaced by where nothing has to keep real time."""
+    agents = scenario_file.scenario.agents
+    if agents.per_process > 1:
+        workers = counted(-(-agents.count // agents.per_process), "worker")
+    else:
+        workers = "as many workers as it has processors"
+    return (
+        f"lockstep: the host runs the agents here in {workers}, as fast as they allow;"
+        " the inequalities of real time do not apply"
+    )
 
 
 def _ends(names: tuple[str, ...]) -> str:

@@ -10,7 +10,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -44,6 +44,8 @@ class Program:
     arguments: Sequence[str]
     stderr: Path
     run_directory: str
+    environment: Mapping[str, str] = field(default_factory=dict)
+    """Beyond that of every program."""
 
 
 class Child(Protocol):
@@ -129,7 +131,12 @@ class LocalChild:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=stderr,
-                env={**os.environ, **ENVIRONMENT, MARK: program.run_directory},
+                env={
+                    **os.environ,
+                    **ENVIRONMENT,
+                    **program.environment,
+                    MARK: program.run_directory,
+                },
                 start_new_session=True,
                 close_fds=True,
                 bufsize=0,

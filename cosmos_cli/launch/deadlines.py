@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 from madns_runtime.config import RunConfig
@@ -51,6 +52,8 @@ class Deadlines:
 def state_limit_s(state: str, config: RunConfig) -> float:
     """Return how long the host may stay in *state* before the operator steps in, s."""
     timeouts = config.timeouts
+    if config.time.is_lockstep and state == "SIMULATION_START":
+        return math.inf  # it goes as fast as it can, which may be slow; its silence is limited
     limits = {
         "HOST_STARTUP": timeouts.agents_ready_s,
         "SIMULATION_SETUP": timeouts.host_setup_s + timeouts.agent_setup_s,

@@ -58,6 +58,8 @@ class Progress:
     lateness_us_p99: float | None = None
     lost_messages: int = 0
     records_dropped: int = 0
+    is_lockstep: bool = False
+    """Simulated time waits for everybody: rtf is the speed, and no tick has a lateness."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +180,7 @@ def _progress(d: Mapping[str, Any]) -> Event:
         lateness_us_p99=_float(d.get("lateness_us_p99")),
         lost_messages=int(d.get("lost_messages") or 0),
         records_dropped=int(d.get("records_dropped") or 0),
+        is_lockstep=bool(d.get("is_lockstep")),
     )
 
 

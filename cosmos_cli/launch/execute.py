@@ -252,6 +252,11 @@ def _retrieve(
 
 def _check_manual(options: RunOptions, plan: LaunchPlan) -> None:
     manual = options.manual
+    if manual and plan.is_lockstep:
+        raise InputError(
+            "--manual: in lockstep the host starts its agents itself; leave it out, or run in real"
+            " time with --set time.mode=realtime"
+        )
     if manual and options.is_detached:
         raise InputError("--manual and --detach: a hand-started agent needs its operator")
     names = [name for agents in plan.agents_by_machine.values() for name in agents]
@@ -271,7 +276,8 @@ def _check_manual(options: RunOptions, plan: LaunchPlan) -> None:
 def _greeting(prepared: _Prepared) -> str:
     config, run = prepared.request.config, prepared.run
     where = f" on {counted(len(prepared.plan.machines), 'machine')}" if prepared.remote else ""
+    how = " in lockstep" if config.time.is_lockstep else ""
     return (
         f"{run.name}: {counted(config.agents.count, 'agent')}{where} at {config.agents.tick_hz:g} Hz for"
-        f" {config.time.duration_s:g} s; records go to {run.path}"
+        f" {config.time.duration_s:g} s{how}; records go to {run.path}"
     )

@@ -73,8 +73,9 @@ class HostLimits:
         if self.state != RUNNING_STATE or self._is_over:
             self._deadlines.cancel("silence")
             return
-        action = partial(self._give_up, f"has said nothing for {HOST_SILENCE_S:g} s")
-        self._deadlines.set("silence", time.monotonic() + HOST_SILENCE_S, action)
+        limit_s = self._silence_s()
+        action = partial(self._give_up, f"has said nothing for {limit_s:g} s")
+        self._deadlines.set("silence", time.monotonic() + limit_s, action)
 
     def told_to_stop(self) -> None:
         """Expect it to heed."""
@@ -96,6 +97,11 @@ class HostLimits:
         """Expect nothing more of it."""
         self._is_over = True
         self._deadlines.cancel("phase", "silence", "alone")
+
+    def _silence_s(self) -> float:
+        if self._config.time.is_lockstep:  # it is silent during a call of its own half
+            return max(HOST_SILENCE_S, self._config.timeouts.tick_s + MARGIN_S)
+        return HOST_SILENCE_S
 
     def _limit_phase(self, limit_s: float, late: str) -> None:
         """Give up on the host unless its state changes within *limit_s*; *late* says what it did not do."""

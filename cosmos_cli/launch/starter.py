@@ -17,6 +17,8 @@ from cosmos_cli.launch.remote import RemoteChild, RemoteProgram
 HOST = "host"
 HOST_MODULE = "madns_runtime.host"
 AGENT_MODULE = "madns_runtime.agent"
+LOCKSTEP_ENVIRONMENT: Mapping[str, str] = {"PYTHONHASHSEED": "0"}
+"""The order of a set of names depends on it: with it, that is the same in every run."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,6 +78,7 @@ class Starter:
             arguments=arguments,
             stderr=Path(directory, folder, "stderr.txt"),
             run_directory=str(directory),
+            environment=LOCKSTEP_ENVIRONMENT if self.request.config.time.is_lockstep else {},
         )
         return LocalChild(program, self.loop.selector, launch=launch, on_line=told.on_line)
 

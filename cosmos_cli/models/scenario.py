@@ -31,7 +31,7 @@ from madns_runtime.config import (
 
 AGENT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 RESERVED_NAMES = ("host",)
-EXECUTOR_KINDS = ("process", "thread")
+EXECUTOR_KINDS = ("process", "thread", "dask")
 
 SectionFault = tuple[tuple[str | int, ...], str]
 """The path within the scenario, and what is wrong there."""
@@ -169,12 +169,22 @@ def _restarts(scenario: Scenario) -> Iterator[SectionFault]:
         yield ("agents", "restarts_max"), f"{text}, got {scenario.agents.restarts_max}: {why}"
 
 
+def _lockstep(scenario: Scenario) -> Iterator[SectionFault]:
+    if scenario.time.is_lockstep and scenario.on_agent_loss == "continue":
+        text = "expected abort with time.mode: lockstep, got continue"
+        why = "a run that repeats to the bit cannot depend on when an agent was lost"
+        yield ("on_agent_loss",), f"{text}: {why}; drop it, or simulate the loss in the simulation"
+
+
 def _executor(scenario: Scenario) -> Iterator[SectionFault]:
     kind = scenario.executor.kind
     module, _, attribute = kind.partition(":")
     is_path = attribute.isidentifier() and all(part.isidentifier() for part in module.split("."))
     if kind not in EXECUTOR_KINDS and not is_path:
-        yield ("executor", "kind"), f"expected process, thread or module:callable, got {kind!r}"
+        text = f"expected process, thread, dask or module:callable, got {kind!r}"
+        yield ("executor", "kind"), text
+    if scenario.executor.address and kind != "dask":
+        yield ("executor", "address"), f"expected nothing with executor.kind {kind}; say kind: dask"
 
 
 def _placement(scenario: Scenario) -> Iterator[SectionFault]:
@@ -189,6 +199,7 @@ _CHECKS: tuple[tuple[frozenset[str], Callable[[Scenario], Iterator[SectionFault]
     (frozenset({"agents"}), _processes),
     (frozenset({"agents", "time"}), _duration),
     (frozenset({"agents", "on_agent_loss"}), _restarts),
+    (frozenset({"time", "on_agent_loss"}), _lockstep),
     (frozenset({"executor"}), _executor),
     (frozenset({"agents", "placement"}), _placement),
 )

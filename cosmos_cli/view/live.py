@@ -132,11 +132,7 @@ class LiveView:
         )
         style = "yellow" if words.has_trouble(progress) else ""
         agents = (words.agent_words(progress), words.loss_words(progress))
-        timing = (
-            words.rtf_words(progress),
-            words.tick_words(progress),
-            words.lateness_words(progress),
-        )
+        timing = words.timing_words(progress)
         return Group(
             head,
             Text("  ".join(agents), style, no_wrap=True, overflow="ellipsis"),

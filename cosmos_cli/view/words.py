@@ -36,6 +36,8 @@ def simulated_s(progress: Progress) -> float:
 
 def rtf_words(progress: Progress) -> str:
     """Return the real-time factor; a dash before there is one."""
+    if progress.is_lockstep:
+        return "- x real time" if progress.rtf is None else f"{progress.rtf:.4g} x real time"
     return "RTF -" if progress.rtf is None else f"RTF {progress.rtf:.4f}"
 
 
@@ -61,6 +63,13 @@ def lateness_words(progress: Progress) -> str:
     return f"lateness p50 {p50} p99 {p99} ms"
 
 
+def timing_words(progress: Progress) -> tuple[str, ...]:
+    """Return how simulated time goes: in lockstep its speed alone, for no tick is ever late or missed."""
+    if progress.is_lockstep:
+        return (rtf_words(progress), f"{progress.ticks} ticks")
+    return rtf_words(progress), tick_words(progress), lateness_words(progress)
+
+
 def loss_words(progress: Progress) -> str:
     """Return lost messages, and dropped records where there are any."""
     text = f"{progress.lost_messages} messages lost"
@@ -81,12 +90,12 @@ def has_trouble(progress: Progress) -> bool:
 
 def progress_line(progress: Progress, duration_s: float) -> str:
     """Return all of it on one line."""
+    speed, *timing = timing_words(progress)
     parts = (
         clock_words(progress, duration_s),
-        rtf_words(progress),
+        speed,
         agent_words(progress),
-        tick_words(progress),
-        lateness_words(progress),
+        *timing,
         loss_words(progress),
     )
     return "; ".join(parts)

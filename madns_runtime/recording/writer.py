@@ -167,7 +167,7 @@ class Recorder:
         self._queued_bytes = queued_bytes
         file.lines.append(line)
         if waiting_bytes > WAKE_BYTES and not self._wake.is_set():
-            self._wake.set()
+            self._hurry()
 
     def log(self, level: str, text: str, t_s: float | None = None) -> None:
         """
@@ -189,8 +189,7 @@ class Recorder:
         # A lone surrogate, as in a file name that is no UTF-8, has no place in JSON.
         text = text.encode("utf-8", "backslashreplace").decode("utf-8")
         if LOG.name in self._files:
-            utc = datetime.now(UTC).isoformat(timespec="milliseconds")
-            self.record(LOG.name, (t_s, utc, level, text))
+            self.record(LOG.name, (t_s, self._utc(), level, text))
         if self._log_echo is not None:
             self._log_echo(level, text)
 
@@ -233,6 +232,14 @@ class Recorder:
                 self._troubles.add(f"{self._directory}: records not on disk after {timeout_s:g} s")
         return self.counts()
 
+    def _hurry(self) -> None:
+        """Much waits."""
+        self._wake.set()
+
+    def _utc(self) -> str:
+        """Return the time that a logged sentence carries."""
+        return datetime.now(UTC).isoformat(timespec="milliseconds")
+
     def _write_on(self) -> None:
         _schedule_normally()
         is_troubled = False
@@ -247,6 +254,9 @@ class Recorder:
                 is_troubled |= not self._sync()
                 synced_s = monotonic()
         self._flush()
+        self._finish_files()
+
+    def _finish_files(self) -> None:
         for file in self._files.values():
             for error in file.finish():
                 self._troubles.add(_describe(file, error))

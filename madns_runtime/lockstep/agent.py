@@ -1,0 +1,100 @@
+"""One agent of a worker: its half of the simulation, its context, its records."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from madns_runtime.config import RunConfig
+from madns_runtime.context import RunContext, check_deadline, check_service
+from madns_runtime.errors import PluginError
+from madns_runtime.lockstep.clock import SimulatedClock
+from madns_runtime.lockstep.frames import POSITIONS, STEPPING, Sent
+from madns_runtime.lockstep.post import Allowance, encode
+from madns_runtime.lockstep.recorder import LockstepRecorder
+from madns_runtime.plugin.api import HOST, AgentSimulation
+from madns_runtime.protocol.messages import Service
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Crewmates:
+    """What the agents of one worker share."""
+
+    config: RunConfig
+    directory: Path
+    """The run directory."""
+    simulation: Callable[[], AgentSimulation]
+    parameters: Any
+    clock: SimulatedClock
+    outbox: list[Sent] = field(default_factory=list)
+    """What was sent since the last answer to the host, in order."""
+
+
+class LockstepAgent:
+    """
+    One agent.
+
+    Args:
+        index: Its number among the run's agents, from 0.
+        mates: What it shares with the others of its process.
+
+    Raises:
+        MachineError: It cannot record.
+    """
+
+    def __init__(self, index: int, mates: Crewmates) -> None:
+        self.index = index
+        self.name = mates.config.agents.resolved_names()[index]
+        self._clock = mates.clock
+        self._outbox = mates.outbox
+        self.recorder = LockstepRecorder(
+            mates.directory / "agents" / self.name,
+            mates.config,
+            source=self.name,
+            clock=mates.clock,
+        )
+        self.simulation = mates.simulation()
+        self.step = self.simulation.step
+        self.receive = self.simulation.receive
+        self.stepping = index * POSITIONS + STEPPING
+        self.is_running = False
+        self.deadlines_broken = 0
+        self._allowance = Allowance()
+        self._context = RunContext(
+            name=self.name,
+            config=mates.config,
+            parameters=mates.parameters,
+            recorder=self.recorder,
+            now_s=mates.clock.now_s,
+            send=self.send,
+            is_lockstep=True,
+        )
+
+    def set_up(self, initial: Mapping[str, Any]) -> None:
+        """Let the plug-in prepare itself."""
+        self.recorder.event("start")
+        self.simulation.setup(self._context, initial)
+
+    def send(
+        self,
+        to: str,
+        message: Any,
+        service: Service = Service.RELIABLE,
+        *,
+        deadline_s: float | None = None,
+    ) -> None:
+        """Send to the host's half; see `plugin.api.Context.send`."""
+        if to != HOST:
+            raise PluginError(f"an agent sends to {HOST!r}, not to {to!r}")
+        check_service(service)
+        t_s = self._clock.t_s
+        if deadline_s is not None:
+            check_deadline(service, is_running=self.is_running)
+        body = encode(message, service)
+        self._allowance.take(len(body), t_s)
+        if deadline_s is not None and deadline_s < t_s:  # it arrives when it is sent
+            self.deadlines_broken += 1
+            self.recorder.event("sync_deadline_broken", late_s=t_s - deadline_s)
+        self._outbox.append(Sent(self.index, int(service), body))

@@ -1,0 +1,90 @@
+"""
+Records of a run that does not wait for the disk by itself: here the disk holds up the run, and nothing is dropped.
+
+No thread, and no byte that depends on the wall clock: a run recorded twice is recorded the same.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from madns_runtime.config import RunConfig
+from madns_runtime.errors import MachineError
+from madns_runtime.lockstep.clock import T0_UTC, SimulatedClock
+from madns_runtime.recording.counts import RecordCounts
+from madns_runtime.recording.records import EVENTS, LOG
+from madns_runtime.recording.writer import CLOSE_TIMEOUT_S, Recorder
+
+T_S_DIGITS = 6
+
+
+class LockstepRecorder(Recorder):
+    """
+    The record streams of the host or of one agent, written by whoever records.
+
+    The schema lines name the scenario where those of other runs name the run: its number would
+    differ from one run to the next.
+
+    Args:
+        directory: Where the files go.
+        config: The run.
+        source: host, or the agent's name.
+        clock: What events and logged sentences carry the time of.
+
+    Raises:
+        MachineError: The directory cannot be made.
+    """
+
+    def __init__(
+        self, directory: Path, config: RunConfig, *, source: str, clock: SimulatedClock
+    ) -> None:
+        super().__init__(directory, run=config.scenario, source=source, settings=config.recording)
+        self._clock = clock
+        self._is_closed = False
+        # A line that is longer than the bound is dropped and counted, in every run alike.
+        self.set_t0(T0_UTC)
+        self.open_stream(EVENTS)
+        self.open_stream(LOG)
+
+    def start(self) -> None:
+        """Do nothing: there is no thread."""
+
+    def event(self, event: str, **values: Any) -> None:
+        """Record that something happened; nothing once the records are closed."""
+        if not self._is_closed:
+            t_s = round(self._clock.t_s, T_S_DIGITS)
+            fields = {"t_s": t_s, "utc": self._clock.utc(), "event": event, **values}
+            self.record(EVENTS.name, fields)
+
+    def flush(self) -> None:
+        """
+        Write what waits.
+
+        Raises:
+            MachineError: The disk refuses: a run that goes on would only lose records.
+        """
+        if not self._flush():
+            raise MachineError(f"records cannot be written: {self.problem}")
+
+    def close(self, timeout_s: float = CLOSE_TIMEOUT_S) -> RecordCounts:
+        """Write what waits and the end lines, make it durable, and return the last counts."""
+        del timeout_s  # the host waits, not this process
+        if not self._is_closed:
+            self.event("end")
+            self._is_closed = self._is_closing = True
+            self._flush()
+            self._finish_files()
+        return self.counts()
+
+    def _hurry(self) -> None:
+        self.flush()
+
+    def _utc(self) -> str:
+        return self._clock.utc()
+
+
+def t_s_or_none(clock: SimulatedClock) -> float | None:
+    """Return the simulated time as a logged sentence carries it, s."""
+    return round(clock.t_s, T_S_DIGITS) if math.isfinite(clock.t_s) else None

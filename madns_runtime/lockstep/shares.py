@@ -1,0 +1,19 @@
+"""Which worker runs which agents. Pure."""
+
+from __future__ import annotations
+
+from madns_runtime.config import Agents
+
+
+def share_out(agents: Agents, processors: int) -> list[range]:
+    """
+    Return the indices of each worker's agents: neighbours, in order, at most one more here than there.
+
+    Args:
+        agents: How many agents; with per_process above 1, how many at most share a worker.
+        processors: As many workers as these otherwise, but never more than agents.
+    """
+    wanted = processors if agents.per_process == 1 else -(-agents.count // agents.per_process)
+    workers = max(1, min(wanted, agents.count))
+    bounds = [agents.count * number // workers for number in range(workers + 1)]
+    return [range(first, last) for first, last in zip(bounds, bounds[1:], strict=False)]

@@ -1,0 +1,300 @@
+"""
+A worker: the process of some of the run's agents, which does one thing after the other as the host says.
+
+It blocks on its line to the host and on nothing else, and ends when that line closes. What it is doing
+stands in memory that the host can read, so that a worker that hangs or is killed can be blamed exactly.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import os
+import signal
+import socket
+import sys
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from time import monotonic
+from typing import Any, NoReturn
+
+from madns_runtime.config import RunConfig
+from madns_runtime.context import clean_text, describe_exception
+from madns_runtime.errors import MachineError, MadnsError, PluginError
+from madns_runtime.lockstep import frames
+from madns_runtime.lockstep.agent import Crewmates, LockstepAgent
+from madns_runtime.lockstep.clock import SimulatedClock
+from madns_runtime.lockstep.frames import POSITIONS, FrameReader, encode_frame
+from madns_runtime.lockstep.post import decode
+from madns_runtime.plugin import returned
+from madns_runtime.plugin.api import Tick
+from madns_runtime.plugin.registry import load_half, parse_parameters, resolve
+from madns_runtime.processes import register
+from madns_runtime.protocol.codec import unpack
+from madns_runtime.reactor.forking import leave_parent
+from madns_runtime.reactor.scheduling import freeze_garbage
+from madns_runtime.reactor.watchdog import end_after_hang_up
+
+READ_BYTES = 1 << 18
+HANG_GRACE_S = 2.0
+"""Beyond the time for shutdown: a worker that hangs in a plug-in ends by force when its host is gone."""
+STACK_SIGNAL = signal.SIGUSR1
+"""Makes a worker write where it is to standard error."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Assignment:
+    """What one worker is to run."""
+
+    config: RunConfig
+    directory: Path
+    """The run directory."""
+    agents: range
+    position: memoryview
+    """One integer that the host reads: agent's index times POSITIONS, plus what is done with it."""
+
+
+class AgentFailed(Exception):
+    """An agent cannot go on; the text says why."""
+
+    def __init__(self, index: int, reason: str) -> None:
+        super().__init__(reason)
+        self.index = index
+        self.reason = reason
+
+
+class _Terminated(BaseException):
+    """SIGTERM came while nothing was under way."""
+
+
+def run_worker(assignment: Assignment, line: socket.socket) -> NoReturn:
+    """Run as a forked child; never returns."""
+    code = 1
+    try:
+        leave_parent(keep={line.fileno()})
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's Ctrl-C is the operator's
+        faulthandler.register(STACK_SIGNAL, file=sys.__stderr__ or 2)
+        timeouts = assignment.config.timeouts
+        end_after_hang_up(line.fileno(), timeouts.shutdown_s + HANG_GRACE_S)
+        names = assignment.config.agents.resolved_names()
+        own = ",".join(names[index] for index in assignment.agents)
+        with register(assignment.config.run, "agent", own, assignment.directory):
+            code = Worker(assignment, line).run()
+    except BaseException:  # noqa: BLE001 - the last frame of a process; the host sees the line close
+        traceback.print_exc()
+    finally:
+        sys.stderr.flush()
+        os._exit(code)
+
+
+class Worker:
+    """
+    The agents of one process.
+
+    Args:
+        assignment: Whom to run.
+        line: To the host.
+    """
+
+    def __init__(self, assignment: Assignment, line: socket.socket) -> None:
+        config = assignment.config
+        self._assignment = assignment
+        self._line = line
+        self._reader = FrameReader()
+        self._position = assignment.position
+        self._clock = SimulatedClock(-config.timeouts.start_lead_s)
+        self._period_s = 1.0 / config.agents.tick_hz
+        self._tick_hz = config.agents.tick_hz
+        self._agents: list[LockstepAgent] = []
+        self._mates: Crewmates
+        self._flush_interval_s = config.recording.flush_interval_s
+        self._flushed_s = monotonic()
+        self._is_waiting = False
+        self._is_terminated = False
+        self._orders: dict[int, Callable[..., bytes]] = {
+            frames.SETUP: self._set_up,
+            frames.TICK: self._tick,
+            frames.DRAIN: self._drain,
+            frames.FINISH: self._finish,
+        }
+
+    def run(self) -> int:
+        """Carry out orders until the last, and return the exit code."""
+        signal.signal(signal.SIGTERM, self._on_sigterm)
+        self._answer(self._load)
+        while True:
+            order = self._next_order()
+            if order is None:
+                self._close_all("its host is gone", is_told=False)
+                return 1
+            if order[0] == frames.STOP:
+                self._close_all(order[1], is_told=True)
+                return 0 if order[1] is None else 1
+            carry_out = self._orders[order[0]]
+            self._answer(partial(carry_out, *order[1:]))
+
+    def _answer(self, carry_out: Callable[[], bytes]) -> None:
+        try:
+            self._check_terminated()
+            answer = carry_out()
+        except AgentFailed as failure:
+            answer = self._failed(failure)
+        self._position[0] = frames.IDLE
+        self._line.sendall(answer)
+
+    def _failed(self, failure: AgentFailed) -> bytes:
+        return encode_frame(frames.FAILED, failure.index, clean_text(failure.reason))
+
+    def _next_order(self) -> list[Any] | None:
+        try:
+            self._is_waiting = True
+            while True:
+                for order in self._reader.feed(b""):
+                    return order
+                data = self._line.recv(READ_BYTES)
+                if not data:
+                    return None
+                for order in self._reader.feed(data):
+                    return order
+        except _Terminated:
+            return [frames.DRAIN, []]  # whose answer tells it
+        except OSError:
+            return None
+        finally:
+            self._is_waiting = False
+
+    def _on_sigterm(self, number: int, frame: object) -> None:
+        self._is_terminated = True
+        if self._is_waiting:
+            self._is_waiting = False
+            raise _Terminated
+
+    def _check_terminated(self) -> None:
+        if self._is_terminated:
+            raise AgentFailed(self._assignment.agents[0], "its process was ended by SIGTERM")
+
+    # Orders -----------------------------------------------------------------------------------------
+
+    def _load(self) -> bytes:
+        config, first = self._assignment.config, self._assignment.agents[0]
+        self._position[0] = first * POSITIONS + frames.LOADING
+        base = Path(config.base_directory)
+        try:
+            descriptor = resolve(config.simulation, base)
+            self._mates = Crewmates(
+                config=config,
+                directory=self._assignment.directory,
+                simulation=load_half(descriptor, "agent", base),
+                parameters=parse_parameters(descriptor, config.parameters),
+                clock=self._clock,
+            )
+        except MadnsError as error:
+            raise AgentFailed(first, str(error)) from error
+        return encode_frame(frames.READY)
+
+    def _set_up(self, initial: list[tuple[int, bytes]]) -> bytes:
+        for index, packed in initial:
+            self._position[0] = index * POSITIONS + frames.SETTING_UP
+            try:
+                agent = LockstepAgent(index, self._mates)
+            except (Exception, SystemExit) as error:  # noqa: BLE001 - a plug-in may raise anything
+                kind = getattr(self._mates.simulation, "__name__", "the agent's half")
+                raise AgentFailed(index, _told(error, f"{kind}.__init__")) from error
+            self._agents.append(agent)
+            self._guard(agent, "setup", agent.set_up, unpack(packed))
+        freeze_garbage()  # what set-up made stays: no collection walks it in mid-run
+        return self._done()
+
+    def _tick(self, number: int, messages: list[tuple[int, bytes]]) -> bytes:
+        if number == 0:
+            for agent in self._agents:
+                agent.is_running = True
+        self._clock.t_s = t_s = number / self._tick_hz
+        if messages:
+            self._hand_out(messages)
+        tick = Tick(number, t_s, self._period_s, 0.0, 0, t_s)
+        position = self._position
+        agent = self._agents[0]
+        try:
+            for agent in self._agents:
+                position[0] = agent.stepping
+                agent.step(tick)
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - a plug-in may raise anything
+            raise self._failure(agent, "step", error) from error
+        if monotonic() - self._flushed_s > self._flush_interval_s:
+            self._flush()
+        return self._done()
+
+    def _drain(self, messages: list[tuple[int, bytes]]) -> bytes:
+        self._check_terminated()
+        self._clock.t_s = self._assignment.config.time.duration_s
+        self._hand_out(messages)
+        return self._done()
+
+    def _finish(self) -> bytes:
+        summaries = []
+        for agent in self._agents:
+            self._position[0] = agent.index * POSITIONS + frames.FINISHING
+            value = self._guard(agent, "finish", agent.simulation.finish)
+            try:
+                summary = returned.summary(value)
+            except PluginError as error:
+                kind = type(agent.simulation).__name__
+                reason = f"{kind}.finish returned {clean_text(str(error))}"
+                raise AgentFailed(agent.index, reason) from error
+            summaries.append((agent.index, summary, agent.deadlines_broken))
+        return encode_frame(frames.SUMMARIES, summaries)
+
+    def _done(self) -> bytes:
+        outbox = self._mates.outbox
+        answer = encode_frame(frames.DONE, outbox)
+        outbox.clear()
+        return answer
+
+    def _hand_out(self, messages: list[tuple[int, bytes]]) -> None:
+        first = self._assignment.agents[0]
+        for index, body in messages:
+            self._position[0] = index * POSITIONS + frames.RECEIVING
+            agent = self._agents[index - first]
+            self._guard(agent, "receive", agent.receive, decode(body))
+
+    # Faults and records ------------------------------------------------------------------------------
+
+    def _guard(
+        self, agent: LockstepAgent, name: str, method: Callable[..., Any], *arguments: Any
+    ) -> Any:
+        try:
+            return method(*arguments)
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - a plug-in may raise anything
+            raise self._failure(agent, name, error) from error
+
+    def _failure(self, agent: LockstepAgent, name: str, error: BaseException) -> AgentFailed:
+        if not isinstance(error, MachineError):
+            text = "".join(traceback.format_exception(error))
+            agent.recorder.log("critical", text, self._clock.t_s)
+        return AgentFailed(agent.index, _told(error, f"{type(agent.simulation).__name__}.{name}"))
+
+    def _flush(self) -> None:
+        for agent in self._agents:
+            try:
+                agent.recorder.flush()
+            except MachineError as error:
+                raise AgentFailed(agent.index, str(error)) from error
+        self._flushed_s = monotonic()
+
+    def _close_all(self, reason: str | None, *, is_told: bool) -> None:
+        for agent in self._agents:
+            self._position[0] = agent.index * POSITIONS + frames.CLOSING
+            if reason is not None:
+                agent.recorder.event("emergency", reason=reason)
+                agent.recorder.log("critical", f"emergency shutdown: {reason}", self._clock.t_s)
+            counts = agent.recorder.close().to_mapping()
+            if is_told:
+                self._line.sendall(encode_frame(frames.CLOSED, agent.index, counts))
+
+
+def _told(error: BaseException, doing: str) -> str:
+    """Return why an agent cannot go on: the disk's own words, or which call of the plug-in raised what."""
+    return str(error) if isinstance(error, MachineError) else describe_exception(error, doing)

@@ -1,0 +1,19 @@
+"""What a forked child leaves behind of its parent."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+
+def leave_parent(keep: set[int]) -> None:
+    """Make a forked child independent of its parent's descriptors, but those of *keep*, and of its signals."""
+    signal.set_wakeup_fd(-1)
+    for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_DFL)
+    null_fd = os.open(os.devnull, os.O_RDWR)
+    os.dup2(null_fd, 0)
+    first = 3
+    for fd in (*sorted(keep), 1 << 20):
+        os.closerange(first, fd)
+        first = fd + 1
