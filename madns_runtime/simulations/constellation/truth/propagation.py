@@ -36,6 +36,7 @@ PROPAGATORS = {
     "scipy": f"{_TRUTH}.scipy_propagator:ScipyDop853",
     "numba": f"{_TRUTH}.numba_propagator:NumbaDop853",
     "sgp4": f"{_TRUTH}.sgp4_propagator:Sgp4",
+    "basilisk": f"{_TRUTH}.basilisk_propagator:Basilisk",
     "custom": f"{_TRUTH}.custom_propagator:Custom",
 }
 """The kind in a scenario -> module:class."""
