@@ -227,6 +227,9 @@ def _check_arguments(
         faults.append(
             f"parameters.propagator.forces: expected two_body among them, got {list(parameters.forces)}"
         )
+    if parameters.thrust_m_s2 is not None and not can_maneuver(parameters.settings):
+        kind = parameters.settings.kind
+        faults.append(f"parameters.propagator: {kind} cannot follow a thrust, see can_maneuver")
     if not np.isfinite(knots_s).all() or (np.diff(knots_s, prepend=t0_s) < 0.0).any():
         faults.append(f"propagation: expected knots that ascend from {t0_s:g} s on, got {knots_s}")
     if faults:

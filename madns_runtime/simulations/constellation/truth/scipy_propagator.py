@@ -64,6 +64,8 @@ class ScipyDop853:
         span_s = float(knots_s[-1]) - t0_s
         if span_s == 0.0:
             return np.repeat(states[:, None, :], len(knots_s), axis=1)
+        # solve_ivp takes no time twice.
+        times_s, place = np.unique(knots_s - t0_s, return_inverse=True)
         step_s = first_step_s(states, parameters.gravity.mu_m3_s2, rtol)
         solution = solve_ivp(
             derivative,
@@ -71,7 +73,7 @@ class ScipyDop853:
             (0.0, span_s),
             states.T.ravel(),
             method="DOP853",
-            t_eval=knots_s - t0_s,
+            t_eval=times_s,
             rtol=rtol,
             atol=atol.ravel(),
             first_step=min(step_s, settings.step_s_max, span_s),
@@ -79,8 +81,8 @@ class ScipyDop853:
         )
         if not solution.success:
             raise ConfigurationError(f"scipy DOP853 from {t0_s:g} s: {solution.message}")
-        result = solution.y.reshape(6, count, len(knots_s))
-        return np.ascontiguousarray(result.transpose(1, 2, 0))
+        result = solution.y.reshape(6, count, len(times_s)).transpose(1, 2, 0)
+        return np.ascontiguousarray(result if len(times_s) == len(knots_s) else result[:, place])
 
 
 def first_step_s(states: Array, mu_m3_s2: float, rtol: float) -> float:

@@ -1,0 +1,426 @@
+"""What every propagator keeps, whoever computes."""
+
+import importlib.util
+import math
+import pickle  # noqa: TID251 - as executors do with arguments
+import sys
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from constellation_fakes import SCENARIOS
+
+from madns_runtime.errors import ConfigurationError, MissingExtraError, PluginError
+from madns_runtime.simulations.constellation import truth
+from madns_runtime.simulations.constellation.orbit.constants import EGM_96
+from madns_runtime.simulations.constellation.orbit.invariants import ENERGY
+from madns_runtime.simulations.constellation.parameters import (
+    BasiliskPropagator,
+    CustomPropagator,
+    NumbaPropagator,
+    ScipyPropagator,
+    Sgp4Propagator,
+)
+from madns_runtime.simulations.constellation.truth.element_sets import read_element_sets
+from madns_runtime.simulations.constellation.truth.propagation import (
+    PROPAGATORS,
+    PropagationParameters,
+    can_maneuver,
+    conserved_by,
+    load_propagator,
+    propagate,
+)
+
+EXTRAS = {"numba": "numba", "basilisk": "Basilisk"}
+OWN = """
+from madns_runtime.simulations.constellation.parameters import ScipyPropagator
+from madns_runtime.simulations.constellation.truth.scipy_propagator import ScipyDop853
+from dataclasses import replace
+
+class Mine:
+    def propagate(self, states, t0_s, knots_s, parameters):
+        forces = tuple(parameters.settings.settings["forces"])
+        settings = ScipyPropagator(kind="scipy", forces=forces)
+        return ScipyDop853().propagate(states, t0_s, knots_s, replace(parameters, settings=settings))
+
+class Flat:
+    def propagate(self, states, t0_s, knots_s, parameters):
+        return states
+
+class Demanding:
+    def __init__(self, orbit):
+        pass
+
+class Idle:
+    pass
+"""
+
+
+class Kind(NamedTuple):
+    settings: object
+    base_directory: str
+    element_sets: tuple
+
+    def parameters(self, **rest):
+        return PropagationParameters(
+            settings=self.settings,
+            gravity=EGM_96,
+            epoch_utc=datetime(2017, 3, 7, 12, tzinfo=UTC),
+            element_sets=self.element_sets,
+            base_directory=self.base_directory,
+            **rest,
+        )
+
+    @property
+    def is_numerical(self):
+        return not isinstance(self.settings, Sgp4Propagator)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "own.py").write_text(OWN)
+    return tmp_path
+
+
+def make_kind(name, folder, forces=("two_body", "j2"), **settings):
+    if name in EXTRAS and importlib.util.find_spec(EXTRAS[name]) is None:
+        pytest.skip(f"{EXTRAS[name]} is not installed")
+    if name == "sgp4":
+        sets = read_element_sets(SCENARIOS / "data/iridium10.tle")[:4]
+        return Kind(Sgp4Propagator(kind="sgp4"), str(folder), sets)
+    if name == "custom":
+        own = CustomPropagator(
+            kind="custom", implementation="own.py:Mine", settings={"forces": list(forces)}
+        )
+        return Kind(own, str(folder), ())
+    classes = {
+        "scipy": ScipyPropagator,
+        "numba": NumbaPropagator,
+        "basilisk": BasiliskPropagator,
+    }
+    return Kind(classes[name](kind=name, forces=forces, **settings), str(folder), ())
+
+
+@pytest.fixture(params=sorted(PROPAGATORS))
+def kind(request, folder):
+    return make_kind(request.param, folder)
+
+
+@pytest.fixture(params=sorted(set(PROPAGATORS) - {"sgp4"}))
+def numerical(request, folder):
+    return make_kind(request.param, folder)
+
+
+@pytest.fixture(params=["scipy", "numba", "custom"])
+def dragged(request, folder):
+    return make_kind(request.param, folder, forces=("two_body", "drag"))
+
+
+def orbits(count=4, radius_m=6.9e6):
+    """Circular orbits, as different as can be."""
+    rng = np.random.default_rng(5)
+    r = rng.normal(size=(count, 3))
+    r /= np.linalg.norm(r, axis=1, keepdims=True)
+    v = np.cross(r, rng.normal(size=(count, 3)))
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    return np.hstack((r * radius_m, v * math.sqrt(EGM_96.mu_m3_s2 / radius_m)))
+
+
+def distance_m(a, b):
+    return float(np.linalg.norm((a - b)[..., :3], axis=-1).max())
+
+
+def test_states_come_by_vehicle_knot_and_component(kind):
+    found = propagate(orbits(), 0.0, np.array([0.0, 1.0, 2.5, 30.0, 61.0]), kind.parameters())
+
+    assert found.shape == (4, 5, 6)
+    assert found.dtype == np.float64
+    assert np.isfinite(found).all()
+
+
+def test_a_knot_at_the_start_is_the_state_itself(numerical):
+    states = orbits()
+
+    found = propagate(states, 7.0, np.array([7.0, 7.0, 8.0]), numerical.parameters())
+
+    assert np.array_equal(found[:, 0], states)
+    assert np.array_equal(found[:, 1], states)
+
+
+def test_no_knot_and_no_vehicle_give_nothing(kind):
+    assert propagate(orbits(), 0.0, np.array([]), kind.parameters()).shape == (4, 0, 6)
+    no_sets = replace(kind.parameters(), element_sets=())
+    assert propagate(np.empty((0, 6)), 0.0, np.array([1.0]), no_sets).shape == (0, 1, 6)
+
+
+def test_one_knot_alone_is_the_same_as_among_others(kind):
+    many = propagate(orbits(), 0.0, np.arange(0.0, 60.5, 0.5), kind.parameters())
+
+    one = propagate(orbits(), 0.0, np.array([60.0]), kind.parameters())
+
+    assert distance_m(one[:, 0], many[:, 120]) < 1e-7
+
+
+def test_velocities_are_the_derivatives_of_positions(kind):
+    knots_s = np.array([9.0, 9.5, 10.0, 10.5, 11.0])
+
+    found = propagate(orbits(), 0.0, knots_s, kind.parameters())
+
+    r = found[..., :3]
+    slope = (8.0 * (r[:, 3] - r[:, 1]) - (r[:, 4] - r[:, 0])) / 6.0
+    # SGP4's positions carry noise of 1e-5 m.
+    assert np.abs(slope - found[:, 2, 3:]).max() < (1e-7 if kind.is_numerical else 1e-4)
+
+
+def test_a_vehicle_moves_alone_as_it_does_among_others(kind):
+    knots_s = np.arange(0.0, 301.0, 10.0)
+    among = propagate(orbits(), 0.0, knots_s, kind.parameters())
+
+    for n in range(4):
+        parameters = kind.parameters()
+        parameters = replace(parameters, element_sets=parameters.element_sets[n : n + 1])
+        alone = propagate(orbits()[n : n + 1], 0.0, knots_s, parameters)
+        # scipy has one step for all; the others give the same digits.
+        assert distance_m(alone[0], among[n]) < 1e-7
+
+
+def test_two_calls_make_one(kind):
+    knots_s = np.arange(0.0, 601.0, 10.0)
+    whole = propagate(orbits(), 0.0, knots_s, kind.parameters())
+
+    first = propagate(orbits(), 0.0, knots_s[:24], kind.parameters())
+    second = propagate(first[:, -1], 230.0, knots_s[24:], kind.parameters())
+
+    assert distance_m(np.concatenate((first, second), axis=1), whole) < 1e-6
+
+
+def test_a_start_off_the_grid_of_knots_costs_nothing(numerical):
+    odd_s = 3.123456789
+    at_odd = propagate(orbits(), 0.0, np.array([odd_s]), numerical.parameters())[:, 0]
+
+    found = propagate(at_odd, odd_s, np.arange(4.0, 20.0), numerical.parameters())
+
+    expected = propagate(orbits(), 0.0, np.arange(4.0, 20.0), numerical.parameters())
+    assert distance_m(found, expected) < 1e-6
+
+
+def test_energy_stays(numerical):
+    parameters = numerical.parameters()
+    found = propagate(orbits(), 0.0, np.arange(0.0, 601.0, 20.0), parameters)
+
+    energy = conserved_by(found, parameters)[..., ENERGY]
+
+    assert np.abs(energy / energy[:, :1] - 1.0).max() < 1e-12
+    assert parameters.conserves_energy == (not isinstance(numerical.settings, CustomPropagator))
+
+
+@pytest.mark.parametrize("forces", [("two_body",), ("two_body", "j2")], ids="+".join)
+@pytest.mark.parametrize("name", ["numba", "basilisk", "custom"])
+def test_all_agree_with_scipy(name, forces, folder):
+    knots_s = np.arange(0.0, 901.0, 60.0)
+    expected = propagate(
+        orbits(), 0.0, knots_s, make_kind("scipy", folder, forces=forces).parameters()
+    )
+
+    found = propagate(orbits(), 0.0, knots_s, make_kind(name, folder, forces=forces).parameters())
+
+    assert distance_m(found, expected) < 1e-6
+
+
+def test_the_same_call_gives_the_same_digits(kind):
+    knots_s = np.arange(0.0, 120.0, 7.0)
+    first = propagate(orbits(), 0.0, knots_s, kind.parameters())
+    propagate(orbits(radius_m=8.0e6), 0.0, knots_s, kind.parameters())
+
+    again = propagate(orbits(), 0.0, knots_s, kind.parameters())
+
+    assert np.array_equal(first, again)
+
+
+def test_states_given_are_not_changed(kind):
+    states = orbits()
+
+    propagate(states, 0.0, np.array([0.0, 10.0]), kind.parameters())
+
+    assert np.array_equal(states, orbits())
+
+
+def test_the_ballistic_coefficient_is_each_vehicles_own(dragged):
+    states = np.repeat(orbits(1, radius_m=6.7e6), 3, axis=0)
+    ballistic = np.array([0.0, 0.01, 0.02])
+    parameters = dragged.parameters(ballistic_m2_kg=ballistic)
+
+    found = propagate(states, 0.0, np.array([600.0]), parameters)
+    free = propagate(states, 0.0, np.array([600.0]), dragged.parameters())
+
+    behind = np.linalg.norm((found - free)[:, 0, :3], axis=1)
+    assert behind[0] < 1e-6
+    # Small enough to be linear.
+    assert behind[2] / behind[1] == pytest.approx(2.0, rel=1e-3)
+    assert behind[1] > 0.5
+    drifts = dragged.parameters(ballistic_m2_kg=ballistic).conserves_energy
+    assert not drifts
+
+
+def test_a_thrust_arc_far_from_the_earth_is_analytic(numerical):
+    states = np.zeros((2, 6))
+    states[:, 0] = 1e11
+    states[:, 3:] = (1.0, 2.0, 3.0)
+    thrust = np.array([[1e-3, -2e-3, 5e-4], [0.0, 0.0, 1e-2]])
+
+    found = propagate(
+        states, 0.0, np.array([50.0, 100.0]), numerical.parameters(thrust_m_s2=thrust)
+    )
+
+    # Gravity is 4e-8 m/s^2 there.
+    given = found[:, :, 3:] - states[:, None, 3:]
+    assert given[:, 0] == pytest.approx(50.0 * thrust, abs=5e-6)
+    assert given[:, 1] == pytest.approx(100.0 * thrust, abs=5e-6)
+    # Steps of a float64 of 1e11 m are 1.5e-5 m.
+    moved = found[:, 1, 1:3] - 100.0 * states[:, 4:]
+    assert moved == pytest.approx(5000.0 * thrust[:, 1:], abs=1e-6)
+
+
+def test_a_thrust_arc_in_orbit_adds_to_gravity(numerical):
+    thrust = np.full((4, 3), 2e-3)
+    burnt = propagate(orbits(), 0.0, np.array([10.0]), numerical.parameters(thrust_m_s2=thrust))
+    free = propagate(orbits(), 0.0, np.array([10.0]), numerical.parameters())
+
+    gained = (burnt - free)[:, 0, 3:]
+
+    # The gravity gradient bends it by (n t)^2.
+    assert gained == pytest.approx(10.0 * thrust, rel=1.5e-4)
+
+
+def test_who_cannot_maneuver_says_so(kind, folder):
+    own = replace(make_kind("custom", folder).settings, can_maneuver=False)
+
+    assert can_maneuver(kind.settings) == kind.is_numerical
+    assert not can_maneuver(own)
+
+
+def test_a_thrust_is_refused_by_who_cannot_maneuver(folder):
+    sgp4 = make_kind("sgp4", folder).parameters(thrust_m_s2=np.zeros((4, 3)))
+
+    with pytest.raises(ConfigurationError, match="sgp4 cannot follow a thrust"):
+        propagate(orbits(), 0.0, np.array([1.0]), sgp4)
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (lambda s: s.__setitem__((2, 4), math.nan), "C: expected a finite state, got .*nan"),
+        (lambda s: s.__setitem__((2, 0), math.inf), "C: expected a finite state, got .*inf"),
+        (lambda s: s.__setitem__((2, slice(0, 3)), 3e6), "C: is inside the Earth, 5196.2 km"),
+        (lambda s: s.__setitem__((2, slice(0, 3)), 0.0), "C: is inside the Earth, 0.0 km"),
+    ],
+)
+def test_bad_states_are_named(kind, change, what):
+    states = orbits()
+    change(states)
+
+    with pytest.raises(ConfigurationError, match=f"^{what}.* at 5 s$"):
+        propagate(states, 5.0, np.array([6.0]), kind.parameters(names=("A", "B", "C", "D")))
+
+
+def test_a_vehicle_that_meets_the_earth_is_named_with_the_time(numerical):
+    states = orbits()
+    states[1, 3:] *= 0.5
+
+    with pytest.raises(ConfigurationError, match=r"^vehicle 1: is inside the Earth, .* at 600 s$"):
+        propagate(states, 0.0, np.array([10.0, 600.0]), numerical.parameters())
+
+
+@pytest.mark.parametrize("name", ["scipy", "numba"])
+def test_a_tolerance_out_of_reach_is_said(name, folder):
+    kind = make_kind(name, folder, step_s_max=1e-13)
+    states = orbits()
+    states[:, :3] *= 1e-6
+
+    # Straight to the class: so near the centre nothing passes the check before it.
+    with pytest.raises(ConfigurationError, match=f"{name} DOP853 from 5 s"):
+        load_propagator(name).propagate(states, 5.0, np.array([1e6]), kind.parameters())
+
+
+def test_what_does_not_fit_is_said_all_at_once(kind):
+    parameters = kind.parameters(ballistic_m2_kg=np.zeros(3), thrust_m_s2=np.zeros((4, 2)))
+
+    with pytest.raises(ConfigurationError) as error:
+        propagate(orbits(), 5.0, np.array([6.0, 5.5]), parameters)
+
+    text = str(error.value)
+    assert "expected ballistic_m2_kg of shape (4,), got (3,)" in text
+    assert "expected thrust_m_s2 of shape (4, 3), got (4, 2)" in text
+    assert "expected knots that ascend from 5 s on" in text
+
+
+def test_knots_before_the_start_are_refused(kind):
+    with pytest.raises(ConfigurationError, match="ascend from 5 s on"):
+        propagate(orbits(), 5.0, np.array([4.0]), kind.parameters())
+
+
+@pytest.mark.parametrize("name", ["scipy", "numba", "basilisk"])
+def test_forces_without_the_earth_are_refused(name, folder):
+    kind = make_kind(name, folder, forces=("j2",))
+
+    with pytest.raises(ConfigurationError, match="expected two_body among them, got \\['j2'\\]"):
+        propagate(orbits(), 0.0, np.array([1.0]), kind.parameters())
+
+
+def test_parameters_travel_to_another_process(kind):
+    parameters = kind.parameters(ballistic_m2_kg=np.full(4, 0.01))
+
+    there = pickle.loads(pickle.dumps(parameters))
+
+    knots_s = np.array([0.0, 30.0])
+    expected = propagate(orbits(), 0.0, knots_s, parameters)
+    assert np.array_equal(propagate(orbits(), 0.0, knots_s, there), expected)
+
+
+@pytest.mark.parametrize(
+    ("implementation", "error", "what"),
+    [
+        ("own.py:Flat", ConfigurationError, r"expected states of shape \(4, 1, 6\), got \(4, 6\)"),
+        ("own.py:Idle", PluginError, "expected a class with the method propagate"),
+        ("own.py:Demanding", PluginError, "own.py:Demanding: TypeError: .*orbit"),
+        ("own.py:Missing", PluginError, "Missing"),
+        ("absent.py:Mine", PluginError, "no file .*absent.py"),
+    ],
+)
+def test_a_propagator_of_ones_own_that_is_none_is_refused(folder, implementation, error, what):
+    settings = CustomPropagator(kind="custom", implementation=implementation)
+    kind = make_kind("custom", folder)._replace(settings=settings)
+
+    with pytest.raises(error, match=what):
+        propagate(orbits(), 0.0, np.array([1.0]), kind.parameters())
+
+
+def test_a_propagator_of_ones_own_may_be_an_installed_module(folder):
+    module = "madns_runtime.simulations.constellation.truth.sgp4_propagator:Sgp4"
+    settings = CustomPropagator(kind="custom", implementation=module, can_maneuver=False)
+    sgp4 = make_kind("sgp4", folder)
+
+    found = propagate(orbits(), 0.0, np.array([1.0]), sgp4._replace(settings=settings).parameters())
+
+    assert np.array_equal(found, propagate(orbits(), 0.0, np.array([1.0]), sgp4.parameters()))
+
+
+@pytest.mark.parametrize(("name", "extra"), [("numba", "fast"), ("basilisk", "basilisk")])
+def test_a_missing_extra_is_named(name, extra, monkeypatch):
+    monkeypatch.setitem(sys.modules, EXTRAS[name], None)
+    for module in [m for m in sys.modules if m.startswith(f"{EXTRAS[name]}.")]:
+        monkeypatch.delitem(sys.modules, module)
+    for module in (
+        "numba_propagator",
+        "numba_dop853",
+        "basilisk_propagator",
+        "basilisk_simulation",
+    ):
+        monkeypatch.delitem(sys.modules, f"{truth.__name__}.{module}", raising=False)
+        monkeypatch.delattr(truth, module, raising=False)
+    load_propagator.cache_clear()
+
+    with pytest.raises(MissingExtraError, match=rf"cosmos-madns\[{extra}\]"):
+        load_propagator(name)
