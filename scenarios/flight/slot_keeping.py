@@ -38,7 +38,7 @@ class SlotKeeping(FlightSoftware):
     """One satellite of the ring."""
 
     def setup(self, context: FlightContext) -> None:
-        """Read the settings; the first command comes after half an orbit."""
+        """Read the settings; the first command waits until neighbours agree on the ring."""
         self.context = context
         self._ring = RingMember(context, follows_sma=False)
         settings = context.settings
@@ -49,7 +49,7 @@ class SlotKeeping(FlightSoftware):
         self._orbit_s = math.tau / self._ring.rate_rad_s
         # Neighbours' burns are spread over the orbit, and so is their traffic.
         share = (context.index * 0.618) % 1.0
-        self._next_command_s = (0.5 + share) * self._orbit_s
+        self._next_command_s = (1.5 + share) * self._orbit_s
         self._second_s, self._second_m_s = math.inf, 0.0
         self._quiet_s = 0.0
         self._sma_sum_m, self._samples = 0.0, 0

@@ -3,7 +3,7 @@ What a satellite knows of its ring: its own place, and through its two neighbour
 
 Shared by the flight software that keeps slots. No satellite knows all others: each exchange, it tells
 its two neighbours where it is and what it takes the ring's common phase (and semi-major axis) to be,
-and averages what it hears with what it held itself: a dynamic average consensus. Each one's value then
+and averages what it hears with what it held itself: a dynamic average consensus with momentum. Each one's value then
 tends to the average over the ring, although nobody computes that.
 
 Phases are measured in a frame that turns with the design orbit, so that they stand nearly still. Pure.
@@ -78,17 +78,30 @@ class RingSettings:
         return CircularElements(a_m=a_m, ex=0.0, ey=0.0, i_rad=i_rad, raan_rad=0.0, lam_rad=0.0)
 
 
-@dataclass(slots=True)
 class _Average:
-    """One's value of the ring's average of something that everybody measures."""
+    """
+    One's value of the ring's average of something that everybody measures.
 
-    value: float
-    input: float
+    Drawing towards neighbours alone, an error as long as the ring dies out over N^2 exchanges; with the
+    momentum of the values before, over N: 18 instead of 650 for a ring of 93. Source: Muthukrishnan,
+    Ghosh and Schultz, First- and second-order diffusive methods, Theory of Computing Systems 31 (1998).
+
+    Args:
+        first: One's own measurement.
+        momentum: 0 for none, below 1.
+    """
+
+    def __init__(self, first: float, momentum: float) -> None:
+        self.value = self.input = first
+        self._momentum = momentum
+        self._before, self._change = first, 0.0
 
     def update(self, measured: float, differences: list[float]) -> None:
-        """Follow one's own measurement and draw towards the neighbours' values."""
-        self.value += measured - self.input + WEIGHT * sum(differences)
-        self.input = measured
+        """Follow one's own measurement and draw towards the neighbours' values; the sum over all stays."""
+        drawn, change = self.value + WEIGHT * sum(differences), measured - self.input
+        pushed = self._momentum * (drawn - self._before - self._change)
+        self._before, self._change = self.value, change
+        self.value, self.input = drawn + pushed + change, measured
 
 
 class RingMember:
@@ -140,7 +153,10 @@ class RingMember:
     def hear(self, message: Delivery) -> None:
         """Take a message by radio; one that is not of the ring's is none of its business."""
         payload = message.payload
-        if isinstance(payload, Mapping) and {"round", "lam", "a", "phase", "sma"} <= payload.keys():
+        if (
+            isinstance(payload, Mapping)
+            and {"round", "t_s", "lam", "a", "phase", "sma"} <= payload.keys()
+        ):
             self._heard[message.sender] = payload
 
     def exchange(self, reading: Reading) -> None:
@@ -156,10 +172,10 @@ class RingMember:
         self.next_s = (self._round + 1) * self.settings.exchange_s
         turned = wrapped(mean.lam_rad - self.rate_rad_s * reading.t_s)
         if self._place is None or self._sma is None:
-            self._begin(turned, mean)
+            self._begin(turned, mean, reading.t_s)
             return
         if not self._neighbours:
-            self._neighbours = self._choose(mean)
+            self._neighbours = self._choose(mean, reading.t_s)
         fresh = [
             heard
             for name in self._neighbours
@@ -171,17 +187,18 @@ class RingMember:
         follows = mean.a_m if self._follows_sma else sma.input
         sma.update(follows, [heard["sma"] - sma.value for heard in fresh])
         for name in self._neighbours:
-            self._context.send(name, self._message(mean))
+            self._context.send(name, self._message(mean, reading.t_s))
             self.sent += 1
 
-    def _begin(self, turned_rad: float, mean: CircularElements) -> None:
+    def _begin(self, turned_rad: float, mean: CircularElements, t_s: float) -> None:
         """Take one's own values for the ring's and tell the neighbours, or everybody in view."""
         if self.settings.slots == "kept":
             self._slot_rad = turned_rad
         first = wrapped(turned_rad - self._slot_rad)
-        self._place = _Average(first, first)
-        self._sma = _Average(mean.a_m, mean.a_m)
-        message = self._message(mean)
+        momentum = best_momentum(len(self._context.agents))
+        self._place = _Average(first, momentum)
+        self._sma = _Average(mean.a_m, momentum)
+        message = self._message(mean, t_s)
         if self._neighbours:
             for name in self._neighbours:
                 self._context.send(name, message)
@@ -189,18 +206,19 @@ class RingMember:
             self._context.broadcast(message | {"normal": list(_normal(mean))})
         self.sent += max(1, len(self._neighbours))
 
-    def _message(self, mean: CircularElements) -> dict[str, Any]:
-        """Return what neighbours are told: mean argument of latitude (rad), mean a (m), and the ring's."""
+    def _message(self, mean: CircularElements, t_s: float) -> dict[str, Any]:
+        """Return what neighbours are told: time, mean argument of latitude (rad), mean a (m), and the ring's."""
         assert self._place is not None and self._sma is not None
         return {
             "round": self._round,
+            "t_s": t_s,
             "lam": mean.lam_rad,
             "a": mean.a_m,
             "phase": self._place.value,
             "sma": self._sma.value,
         }
 
-    def _choose(self, mean: CircularElements) -> tuple[str, ...]:
+    def _choose(self, mean: CircularElements, t_s: float) -> tuple[str, ...]:
         """Return the nearest one ahead and the nearest one behind of those heard in one's own plane."""
         normal, cosine = _normal(mean), math.cos(math.radians(self.settings.plane_deg))
         beside: list[tuple[float, str]] = []
@@ -209,11 +227,18 @@ class RingMember:
             if not theirs or sum(p * q for p, q in zip(normal, theirs, strict=True)) < cosine:
                 continue
             if abs(heard["a"] - mean.a_m) <= 1e3 * self.settings.sma_km:
-                beside.append((wrapped(heard["lam"] - mean.lam_rad), name))
+                moved = heard["lam"] + self.rate_rad_s * (t_s - heard["t_s"])
+                beside.append((wrapped(moved - mean.lam_rad), name))
         self._heard.clear()
         ahead = min((item for item in beside if item[0] >= 0.0), default=None)
         behind = max((item for item in beside if item[0] < 0.0), default=None)
         return tuple(item[1] for item in (behind, ahead) if item is not None)
+
+
+def best_momentum(count: int) -> float:
+    """Return the momentum with which a ring of *count* agrees soonest."""
+    slowest = 1.0 - 2.0 * WEIGHT * (1.0 - math.cos(math.tau / max(count, 2)))
+    return 2.0 / (1.0 + math.sqrt(1.0 - slowest * slowest)) - 1.0
 
 
 def position_reading(readings: Mapping[str, Reading]) -> Reading | None:

@@ -208,7 +208,7 @@ def _sma_of_energy(
     kinetic = 0.5 * (v_m_s[0] ** 2 + v_m_s[1] ** 2 + v_m_s[2] ** 2)
     energy = kinetic - mu / radius * (1.0 - oblate)
     cube = (1.0 - mean.ex**2 - mean.ey**2) ** -1.5
-    return -0.5 * mu / energy * (1.0 + g * (3.0 * c * c - 1.0) * cube)
+    return float(-0.5 * mu / energy * (1.0 + g * (3.0 * c * c - 1.0) * cube))
 
 
 def secular_rates(mean: CircularElements, gravity: GravityModel) -> Rates:

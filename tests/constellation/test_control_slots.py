@@ -1,0 +1,199 @@
+"""Slots of a ring, kept by burns and by drag, each satellite knowing two neighbours: converging, and not if wrong."""
+
+import math
+
+import numpy as np
+import pytest
+from control_harness import Fleet, flight_class
+
+from madns_runtime.simulations.constellation.flight.ring import RingSettings
+from madns_runtime.simulations.constellation.orbit.constants import EGM_96
+from madns_runtime.simulations.constellation.orbit.mean_elements import (
+    CircularElements,
+    mean_from_state,
+    osculating_from_mean,
+    state_from_circular,
+)
+from madns_runtime.simulations.constellation.truth.atmosphere import density_kg_m3, height_m
+
+RING = 12
+SLOTS = {"slots": "even", "altitude_km": 780.0, "inclination_deg": 86.4, "exchange_s": 300.0}
+DRAG = SLOTS | {"altitude_km": 400.0, "density_kg_m3": 3.7e-12}
+BALLISTIC = (0.01, 0.06)
+DAY_S = 86_400.0
+
+
+def mean_orbit(altitude_km, latitude_rad, *, sma_m=0.0):
+    return CircularElements(
+        a_m=EGM_96.radius_m + altitude_km * 1e3 + sma_m,
+        ex=0.0,
+        ey=0.0,
+        i_rad=math.radians(86.4),
+        raan_rad=0.3,
+        lam_rad=latitude_rad,
+    )
+
+
+def state(mean):
+    return state_from_circular(osculating_from_mean(mean, EGM_96), EGM_96.mu_m3_s2)
+
+
+def ring(altitude_km, *, rms_deg=0.2, count=RING, phase_rad=3.1):
+    """A ring with slot errors; its common phase is nobody's business."""
+    errors = np.random.default_rng(7).normal(size=count)
+    errors -= errors.mean()
+    errors *= math.radians(rms_deg) / np.sqrt(np.mean(errors**2))
+    places = phase_rad + math.tau * np.arange(count) / count + errors
+    return [state(mean_orbit(altitude_km, place)) for place in places.tolist()]
+
+
+def latitudes_rad(states):
+    return np.array([mean_from_state(tuple(s[:3]), tuple(s[3:]), EGM_96).lam_rad for s in states])
+
+
+def slot_error_deg(states):
+    """Root mean square error against even spacing, whatever the common phase; from truth."""
+    place = latitudes_rad(np.asarray(states).tolist()) - math.tau * np.arange(len(states)) / len(
+        states
+    )
+    turned = np.exp(1j * place)
+    error = np.angle(turned / turned.mean())
+    return math.degrees(float(np.sqrt(np.mean((error - error.mean()) ** 2))))
+
+
+def density_at(state):
+    r = state[:3, None]
+    return density_kg_m3(height_m(r, np.sum(r * r, axis=0), EGM_96.radius_m))[0]
+
+
+def slot_keepers(**options):
+    return Fleet(
+        flight_class("slot_keeping.py", "SlotKeeping"), ring(780.0), settings=SLOTS, **options
+    )
+
+
+def drag_keepers(**options):
+    return Fleet(
+        flight_class("drag_phasing.py", "DragPhasing"),
+        ring(400.0),
+        settings=DRAG,
+        tick_s=300.0,
+        forces=("two_body", "j2", "drag"),
+        ballistic=0.035,
+        ballistic_range=BALLISTIC,
+        **options,
+    )
+
+
+def test_slot_keeping_brings_the_ring_to_even_spacing_in_a_day_with_little_delta_v():
+    fleet = slot_keepers(tick_s=60.0)
+    before_deg = slot_error_deg(fleet.states)
+
+    fleet.run(DAY_S)
+    finished = [one.finish() for one in fleet.software]
+
+    assert before_deg == pytest.approx(0.2, rel=1e-3)
+    assert slot_error_deg(fleet.states) < 0.02
+    # Up and down again for 0.16 deg on average: 2/3 a dlam / tau twice is 0.45 m/s at most.
+    assert 0.1 < float(fleet.delta_v_m_s.mean()) < 0.5
+    assert [one["delta_v_m_s"] for one in finished] == pytest.approx(fleet.delta_v_m_s.tolist())
+    # What it believes of itself is what is true.
+    assert max(abs(one["slot_error_deg"]) for one in finished) < 0.05
+    # Two neighbours, once an exchange: nobody speaks to anybody else.
+    assert {one["messages"] for one in finished} == {2 * int(DAY_S / 300.0)}
+    assert {one["neighbours"] for one in finished} == {2}
+
+
+def test_slot_keeping_leaves_orbits_round():
+    fleet = slot_keepers(tick_s=60.0)
+
+    fleet.run(DAY_S / 2)
+    means = [mean_from_state(tuple(s[:3]), tuple(s[3:]), EGM_96) for s in fleet.states.tolist()]
+
+    # Burns of some 0.1 m/s would each leave e = 2 dv / v = 3e-5 if not undone half an orbit later.
+    assert max(math.hypot(mean.ex, mean.ey) for mean in means) < 6e-5
+
+
+def test_slot_keeping_with_burns_of_the_wrong_sign_scatters_the_ring():
+    fleet = slot_keepers(tick_s=60.0, sign=-1.0)
+
+    fleet.run(DAY_S / 2)
+
+    assert slot_error_deg(fleet.states) > 0.3
+
+
+def test_drag_phasing_brings_the_ring_to_even_spacing_without_propellant():
+    fleet = drag_keepers()
+
+    fleet.run(2 * DAY_S)
+
+    assert slot_error_deg(fleet.states) < 0.04
+    assert not fleet.delta_v_m_s.any()
+    assert all(one.finish()["commands"] > 1 for one in fleet.software)
+
+
+def test_drag_phasing_with_high_and_low_exchanged_scatters_the_ring():
+    fleet = drag_keepers(sign=-1.0)
+
+    fleet.run(DAY_S)
+
+    assert slot_error_deg(fleet.states) > 0.3
+
+
+def test_phase_gained_under_differential_drag_is_theorys():
+    # theta'' = 3/2 rho v^2 / a dB between a high-drag and a low-drag satellite of one orbit.
+    class Held:
+        def setup(self, context):
+            context.ballistic(BALLISTIC[context.index], at_s=0.0)
+
+        def step(self, t_s, readings):
+            """Fly as it is."""
+
+        def command_result(self, result):
+            """Nothing to learn."""
+
+    start = mean_orbit(450.0, 1.0)
+    fleet = Fleet(
+        Held,
+        [state(start)] * 2,
+        tick_s=60.0,
+        forces=("two_body", "j2", "drag"),
+        ballistic=0.0,
+        ballistic_range=BALLISTIC,
+    )
+    densities = []
+    fleet.run(DAY_S / 4, lambda _t, states: densities.append(density_at(states[0])))
+    low, high = latitudes_rad(fleet.states.tolist())
+
+    speed2 = EGM_96.mu_m3_s2 / start.a_m
+    acceleration = 1.5 * np.mean(densities) * speed2 / start.a_m * (BALLISTIC[1] - BALLISTIC[0])
+    # The atmosphere turns with the Earth: in a polar orbit that takes v^2 up by 0.5 %, and e moves too.
+    assert high - low == pytest.approx(0.5 * acceleration * (DAY_S / 4) ** 2, rel=0.05)
+
+
+def test_satellites_keep_the_phases_of_the_start_with_the_neighbours_of_their_plane():
+    # Up to 300 m apart in height, they would drift apart by 0.3 deg in the day.
+    places = [0.0, 0.3, 0.5, 1.0]
+    heights_m = [150.0, -150.0, 100.0, -100.0]
+    states = [state(mean_orbit(780.0, p, sma_m=h)) for p, h in zip(places, heights_m, strict=True)]
+    settings = SLOTS | {"slots": "kept", "time_constant_h": 5.0}
+    kept = Fleet(
+        flight_class("slot_keeping.py", "SlotKeeping"), states, settings=settings, tick_s=60.0
+    )
+
+    kept.run(DAY_S)
+    drift = latitudes_rad(kept.states.tolist()) - np.array(places)
+    means = [mean_from_state(tuple(s[:3]), tuple(s[3:]), EGM_96).a_m for s in kept.states.tolist()]
+
+    assert np.degrees(np.ptp(drift)) < 0.05
+    assert np.ptp(means) < 30.0
+    assert [one.finish()["neighbours"] for one in kept.software] == [1, 2, 2, 1]
+
+
+def test_faults_of_a_rings_settings_are_named():
+    with pytest.raises(ValueError, match="altitude_km and inclination_deg"):
+        RingSettings.from_mapping({"slots": "even"})
+    with pytest.raises(ValueError, match="even or kept"):
+        RingSettings.from_mapping(SLOTS | {"slots": "odd"})
+    with pytest.raises(ValueError, match="exchange_s"):
+        RingSettings.from_mapping(SLOTS | {"exchange_s": 0})
