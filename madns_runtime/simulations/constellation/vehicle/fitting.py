@@ -8,6 +8,7 @@ from typing import Any
 from madns_runtime.plugin.api import AgentContext
 from madns_runtime.simulations.constellation.flight.loading import load_flight_class
 from madns_runtime.simulations.constellation.flight.pilot import Pilot
+from madns_runtime.simulations.constellation.flight.process import ExternalFlight
 from madns_runtime.simulations.constellation.messages import Initial
 from madns_runtime.simulations.constellation.parameters import (
     FlightProcess,
@@ -63,5 +64,5 @@ def fit_out(
 
 def _software(flight: FlightSoftware | FlightProcess, context: AgentContext) -> Any:
     if isinstance(flight, FlightProcess):
-        raise NotImplementedError
+        return ExternalFlight(flight, context.base_directory, is_lockstep=context.is_lockstep)
     return load_flight_class(flight.software, context.base_directory)()

@@ -1,0 +1,86 @@
+"""What a flight program answers, read and carried out. Pure but for what the context does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import orjson
+
+from madns_runtime.errors import BlamedError, PluginError
+from madns_runtime.simulations.constellation.flight.api import FlightContext
+
+KEYS = frozenset({"t_s", "commands", "send", "estimate", "log"})
+COMMANDS = {
+    "delta_v_m_s": ({"delta_v_m_s", "at_s"}, {"frame"}),
+    "torque_n_m": ({"torque_n_m", "at_s", "duration_s"}, set()),
+    "ballistic_m2_kg": ({"ballistic_m2_kg", "at_s"}, set()),
+}
+"""By the key that tells the command: which keys it must and may have."""
+
+
+def carry_out(line: bytes, context: FlightContext, program: str) -> None:
+    """
+    Do what one line of a program asks for.
+
+    Args:
+        line: A JSON object; each of its parts may be missing.
+        context: Takes commands, messages, estimates and words.
+        program: Its name, for who is to blame.
+
+    Raises:
+        BlamedError: It is no answer, or asks for what cannot be.
+    """
+    try:
+        answer = orjson.loads(line)
+        _check(answer)
+        for command in answer.get("commands", ()):
+            _command(command, context)
+        for message in answer.get("send", ()):
+            context.send(message["to"], message["payload"])
+        if estimate := answer.get("estimate"):
+            context.estimate(estimate)
+        for words in answer.get("log", ()):
+            context.log(words["level"], words["text"])
+    except orjson.JSONDecodeError as error:
+        raise BlamedError(f"{program}: expected a JSON object, got {_shown(line)}") from error
+    except (PluginError, KeyError, TypeError) as error:
+        told = f"expected a key {error}" if isinstance(error, KeyError) else str(error)
+        raise BlamedError(f"{program}: {told}; it wrote {_shown(line)}") from error
+
+
+def _check(answer: Any) -> None:
+    if not isinstance(answer, Mapping):
+        raise PluginError("expected a JSON object")
+    unknown = set(answer) - KEYS
+    if unknown:
+        raise PluginError(
+            f"expected the keys {', '.join(sorted(KEYS))}, got {', '.join(sorted(unknown))}"
+        )
+    for key in ("commands", "send", "log"):
+        items = answer.get(key, [])
+        if not isinstance(items, list) or not all(isinstance(item, Mapping) for item in items):
+            raise PluginError(f"expected {key} to be a list of objects")
+
+
+def _command(command: Mapping[str, Any], context: FlightContext) -> None:
+    told = [key for key in COMMANDS if key in command]
+    if len(told) != 1:
+        raise PluginError(f"expected a command with one of {', '.join(COMMANDS)}")
+    must, may = COMMANDS[told[0]]
+    if not must <= set(command) <= must | may:
+        raise PluginError(
+            f"expected a command with {', '.join(sorted(must))}, got {', '.join(command)}"
+        )
+    at_s = command["at_s"]
+    if told[0] == "delta_v_m_s":
+        context.delta_v(command["delta_v_m_s"], at_s=at_s, frame=command.get("frame", "rtn"))
+    elif told[0] == "torque_n_m":
+        context.torque(command["torque_n_m"], at_s=at_s, duration_s=command["duration_s"])
+    else:
+        context.ballistic(command["ballistic_m2_kg"], at_s=at_s)
+
+
+def _shown(line: bytes) -> str:
+    text = line[:200].decode("utf-8", "backslashreplace")
+    return repr(text + (" [cut]" if len(line) > 200 else ""))

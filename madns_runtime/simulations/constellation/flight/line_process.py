@@ -1,0 +1,234 @@
+"""
+A program that speaks lines: started, written to and read from without ever blocking.
+
+The pipes end when either side does, so that neither outlives the other for long; the kernel kills the
+program when the agent's own process dies.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import shutil
+import subprocess
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from time import monotonic
+
+from madns_runtime.errors import BlamedError
+from madns_runtime.reactor import libc
+from madns_runtime.reactor.scheduling import die_with_parent
+
+LINE_BYTES_MAX = 262_144
+"""Of one line; a longer one is no answer."""
+WAITING_BYTES_MAX = 1_048_576
+"""Written, but not taken by the program yet."""
+READ_BYTES = 65_536
+END_S = 1.0
+"""For a program to end by itself after its input has; and again after it was asked to by a signal."""
+
+
+def find_program(command: Sequence[str], base_directory: Path) -> list[str] | None:
+    """
+    Return a command with its program's path, or None if there is no such program.
+
+    Args:
+        command: Program and arguments; the program from the scenario's folder, else from PATH.
+        base_directory: Folder of the scenario.
+    """
+    own = base_directory / command[0]
+    if own.is_file() and os.access(own, os.X_OK):
+        return [str(own.resolve()), *command[1:]]
+    found = shutil.which(command[0]) if "/" not in command[0] else None
+    return [found, *command[1:]] if found else None
+
+
+class LineProcess:
+    """
+    A running program.
+
+    Args:
+        command: Program and arguments.
+        base_directory: Folder of the scenario, and the program's working directory.
+
+    Raises:
+        BlamedError: It cannot be started.
+    """
+
+    def __init__(self, command: Sequence[str], base_directory: Path) -> None:
+        self.name = command[0]
+        found = find_program(command, base_directory)
+        if found is None:
+            raise BlamedError(
+                f"{self.name}: expected an executable program in {base_directory} or on PATH"
+            )
+        if libc.IS_LINUX:
+            with contextlib.suppress(OSError):
+                libc.prctl(libc.PR_GET_TIMERSLACK)  # loads libc now, not between fork and exec
+        try:
+            self._process = subprocess.Popen(
+                found,
+                cwd=base_directory,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                bufsize=0,
+                preexec_fn=die_with_parent if libc.IS_LINUX else None,
+            )
+        except (OSError, subprocess.SubprocessError) as error:
+            raise BlamedError(f"{self.name}: cannot be started: {error}") from error
+        assert self._process.stdin and self._process.stdout and self._process.stderr
+        self._in = self._process.stdin.fileno()
+        self._out = _Lines(self._process.stdout.fileno())
+        self._err = _Lines(self._process.stderr.fileno())
+        os.set_blocking(self._in, False)
+        self._waiting = bytearray()
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    def write(self, line: bytes) -> bool:
+        """Send a line, as soon as the program takes it; False if too much waits already."""
+        if len(self._waiting) + len(line) > WAITING_BYTES_MAX:
+            return False
+        self._waiting += line
+        self._waiting += b"\n"
+        self._push()
+        return True
+
+    def lines(self) -> list[bytes]:
+        """
+        Return the lines that it has written by now; never waits.
+
+        Raises:
+            BlamedError: A line has no end.
+        """
+        self._push()
+        self._out.read()
+        if self._out.is_overlong:
+            raise BlamedError(f"{self.name}: expected lines of at most {LINE_BYTES_MAX} bytes")
+        return self._out.take()
+
+    def talk(self) -> list[bytes]:
+        """Return the lines of its standard error by now; never waits."""
+        self._err.read()
+        return self._err.take()
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait until it writes, ends, or talks; or until the time is over."""
+        poller = select.poll()
+        for lines in (self._out, self._err):
+            if not lines.is_closed:
+                poller.register(lines.fd, select.POLLIN)
+        if self._waiting:
+            poller.register(self._in, select.POLLOUT)
+        poller.poll(max(0.0, timeout_s) * 1e3)
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether it writes no more."""
+        return self._out.is_closed
+
+    def how_it_ended(self) -> str:
+        """Return how it ended, in words; waits a moment for the kernel to know."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(END_S)
+        code = self._process.returncode
+        if code is None:
+            return "closed its standard output"
+        return f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+
+    def end(self) -> int | None:
+        """
+        End it: its input ends, then it is asked by SIGTERM, then killed; returns its exit code.
+
+        Waits for at most three times END_S; what it still writes meanwhile is read and kept.
+        """
+        process = self._process
+        for stop in (self._close_input, process.terminate, process.kill):
+            with contextlib.suppress(ProcessLookupError):
+                stop()
+            if self._has_gone_by(monotonic() + END_S):
+                break
+        for stream in (process.stdout, process.stderr):
+            if stream is not None:
+                stream.close()
+        return process.returncode
+
+    def _has_gone_by(self, deadline_s: float) -> bool:
+        while self._process.poll() is None:
+            left_s = deadline_s - monotonic()
+            if left_s <= 0.0:
+                return False
+            # It may not be able to end before its words are read.
+            self.wait(min(left_s, 0.02))
+            self._out.read()
+            self._err.read()
+        self._err.read()
+        return True
+
+    def _close_input(self) -> None:
+        self._waiting.clear()
+        if self._process.stdin is not None:
+            with contextlib.suppress(OSError):
+                self._process.stdin.close()
+
+    def _push(self) -> None:
+        while self._waiting:
+            try:
+                written = os.write(self._in, memoryview(self._waiting)[:READ_BYTES])
+            except BlockingIOError:
+                return
+            except OSError:  # it is gone, which `has_ended` tells
+                self._waiting.clear()
+                return
+            del self._waiting[:written]
+
+
+class _Lines:
+    """Lines from a pipe, bounded: more than LINES_MAX that nobody takes are read later."""
+
+    LINES_MAX = 4096
+
+    def __init__(self, fd: int) -> None:
+        os.set_blocking(fd, False)
+        self.fd = fd
+        self.is_closed = False
+        self._rest = b""
+        self._found: deque[bytes] = deque()
+
+    @property
+    def is_overlong(self) -> bool:
+        """Whether the line under way is too long to be one."""
+        return len(self._rest) > LINE_BYTES_MAX
+
+    def read(self) -> None:
+        """Read what is there, a bounded amount of it."""
+        if self.is_closed or self.is_overlong or len(self._found) > self.LINES_MAX:
+            return
+        try:
+            data = os.read(self.fd, READ_BYTES)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self.is_closed = True
+            if self._rest:
+                self._found.append(self._rest)
+                self._rest = b""
+            return
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        self._found.extend(lines)
+
+    def take(self) -> list[bytes]:
+        """Return the lines found and forget them."""
+        if not self._found:
+            return []
+        lines = list(self._found)
+        self._found.clear()
+        return lines

@@ -1,0 +1,350 @@
+"""Flight software in any language: what the program is told, what it may answer, and how it ends."""
+
+import json
+import os
+import re
+import shutil
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from constellation_fakes import SCENARIOS, WALKER, FakeContext, parameters
+
+from madns_runtime.errors import BlamedError
+from madns_runtime.plugin.api import Tick
+from madns_runtime.simulations.constellation.agent import ConstellationAgent
+from madns_runtime.simulations.constellation.flight import line_process
+from madns_runtime.simulations.constellation.flight.process import LOG_LINES_MAX, UNANSWERED_MAX
+from madns_runtime.simulations.constellation.messages import (
+    Command,
+    CommandResult,
+    Delivery,
+    Initial,
+    Segment,
+)
+
+pytestmark = pytest.mark.process
+
+HZ = 10.0
+PATIENCE_S = 20.0
+CIRCULAR = (7.158137e6, 0.0, 0.0, 0.0, 7462.3, 0.0)
+ECHO = """
+import json, sys
+setup = json.loads(sys.stdin.readline())["setup"]
+for line in sys.stdin:
+    tick = json.loads(line)
+    {body}
+"""
+ANSWER = "print(json.dumps({}), flush=True)"
+
+
+def program(folder, body, text=ECHO):
+    lines = "\n    ".join(body.splitlines())
+    (folder / "program.py").write_text(text.replace("{body}", lines))
+    return [sys.executable, "program.py"]
+
+
+class Ship:
+    """One agent that is flown by a program."""
+
+    def __init__(self, folder, command, *, is_lockstep=True, **rest):
+        flight = {
+            "command": command,
+            "input": "truth",
+            "answer_s": PATIENCE_S,
+            **rest.pop("flight", {}),
+        }
+        self.context = FakeContext(
+            "agent-01",
+            ("agent-01", "agent-02"),
+            parameters(WALKER, flight=flight, **rest),
+            tick_hz=HZ,
+            base_directory=Path(folder),
+            is_lockstep=is_lockstep,
+        )
+        states = np.tile(CIRCULAR, (61, 1))
+        segment = Segment(revision=0, t0_s=0.0, knot_s=1.0, states=states)
+        initial = Initial(
+            satellite="SAT-1", frame="TEME", epoch_utc="2026-01-01T00:00:00Z", segment=segment
+        )
+        self.agent = ConstellationAgent()
+        self.agent.setup(self.context, initial.to_message())
+        self._next = 0
+        self.summary = None
+
+    @property
+    def process(self):
+        return self.agent._cockpit._pilot._software._process
+
+    def run(self, ticks):
+        for _ in range(ticks):
+            index, self._next = self._next, self._next + 1
+            self.agent.step(Tick(index, index / HZ, 1.0 / HZ, 0.0, 0))
+        return self
+
+    def run_until(self, is_done):
+        """Tick like real time does, as long as it takes."""
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not is_done():
+            assert time.monotonic() < deadline_s, "waited in vain"
+            self.run(1)
+            time.sleep(0.002)
+        return self
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_error):
+        self.summary = self.agent.finish()["flight"]
+        assert not Path(f"/proc/{self.process.pid}").exists()
+
+    def commands(self):
+        return [Command.from_message(m) for _, _, m in self.context.sent if m["kind"] == "command"]
+
+
+def test_in_lockstep_every_tick_has_its_answer_before_it_ends(tmp_path):
+    body = """
+answer = {"estimate": {"t": tick["t_s"]}}
+if tick["t_s"] == 0.3:
+    answer["commands"] = [{"delta_v_m_s": [0, 0.5, 0], "at_s": 1.0}]
+print(json.dumps(answer), flush=True)
+"""
+    with Ship(tmp_path, program(tmp_path, body)) as ship:
+        ship.run(10)
+
+    assert ship.context.records["estimates"] == [(n, n / HZ) for n in range(10)]
+    assert ship.commands() == [
+        Command(
+            number=0,
+            kind="delta_v",
+            commanded_s=0.3,
+            at_s=1.0,
+            frame="rtn",
+            vector=(0.0, 0.5, 0.0),
+        )
+    ]
+    assert ship.summary["answers"] == ship.summary["ticks_sent"] == 10
+    assert ship.summary["exit_code"] == 0
+
+
+def test_it_is_told_who_it_is_and_what_it_may_know(tmp_path):
+    body = """
+with open("told.json", "a") as file:
+    file.write(json.dumps(setup) + "\\n" + json.dumps(tick) + "\\n")
+print("{}", flush=True)
+"""
+    command = program(tmp_path, body)
+    with Ship(tmp_path, command, crosslinks={}, flight={"settings": {"k": [1.0]}}) as ship:
+        message = Delivery(sender="agent-02", sent_s=0.0, arrives_s=0.0, payload={"b": b"\x00"})
+        result = CommandResult(number=4, status="refused", at_s=1.0, revision=0, reason="no fuel")
+        ship.agent.receive(message.to_message())
+        ship.agent.receive(result.to_message())
+        ship.run(1)
+
+    setup, tick = map(json.loads, (tmp_path / "told.json").read_text().splitlines())
+    assert setup.pop("seed") >= 0
+    assert setup == {
+        "name": "agent-01",
+        "satellite": "SAT-1",
+        "agents": ["agent-01", "agent-02"],
+        "index": 0,
+        "tick_hz": HZ,
+        "duration_s": 60.0,
+        "epoch_utc": "2026-01-01T00:00:00Z",
+        "frame": "TEME",
+        "input": "truth",
+        "settings": {"k": [1.0]},
+    }
+    assert tick["t_s"] == 0.0
+    assert tick["readings"] == {"truth": {"t_s": 0.0, "values": list(CIRCULAR)}}
+    assert tick["messages"] == [
+        {
+            "sender": "agent-02",
+            "sent_s": 0.0,
+            "arrives_s": 0.0,
+            "payload": {"b": {"base64": "AA=="}},
+        }
+    ]
+    assert tick["results"][0]["reason"] == "no fuel"
+
+
+def test_it_sends_by_radio_and_logs(tmp_path):
+    body = """
+print(json.dumps({"send": [{"to": "*", "payload": [1, "x"]}],
+                  "log": [{"level": "warning", "text": "hello"}]}), flush=True)
+"""
+    with Ship(tmp_path, program(tmp_path, body), crosslinks={}) as ship:
+        ship.run(1)
+
+    message = ship.context.sent[0][2]
+    assert (message["to"], message["payload"]) == ("*", [1, "x"])
+    assert ("warning", "hello") in ship.context.logs
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        ("'nonsense'", "expected a JSON object, got 'nonsense'"),
+        ("'[]'", "expected a JSON object; it wrote"),
+        ("'{\"command\": []}'", "got command"),
+        ("'{\"commands\": {}}'", "commands to be a list"),
+        ('\'{"commands": [{"at_s": 1}]}\'', "one of delta_v_m_s, torque_n_m, ballistic_m2_kg"),
+        ('\'{"commands": [{"delta_v_m_s": [0, 0, 0]}]}\'', "with at_s, delta_v_m_s"),
+        ('\'{"commands": [{"delta_v_m_s": [0, 0], "at_s": 1}]}\'', "three numbers in m/s"),
+        ('\'{"send": [{"to": "x"}]}\'', "expected a key 'payload'"),
+        ("'{\"estimate\": 3}'", "a mapping of 1 to 64"),
+        ("'{}\\n{}'", "one line for each tick"),
+        ("'x' * 300_000", "lines of at most|a JSON object"),
+    ],
+)
+def test_what_is_no_answer_fails_the_agent_by_the_programs_name(tmp_path, answer, words):
+    ship = Ship(tmp_path, program(tmp_path, f"print({answer}, flush=True)"), crosslinks={})
+
+    with pytest.raises(BlamedError, match=words) as caught:
+        ship.run(2)
+
+    assert str(caught.value).startswith(sys.executable)
+    assert not Path(f"/proc/{ship.process.pid}").exists()
+
+
+def test_a_program_that_dies_fails_the_agent_with_its_exit_code_and_its_last_words(tmp_path):
+    body = "print('out of ideas', file=sys.stderr, flush=True)\nsys.exit(7)"
+    ship = Ship(tmp_path, program(tmp_path, body))
+
+    with pytest.raises(BlamedError, match=r"\(pid \d+\) ended with exit code 7"):
+        ship.run(1)
+
+    assert [text for _, text in ship.context.logs if "out of ideas" in text]
+
+
+def test_a_program_that_does_not_answer_in_lockstep_fails_the_agent(tmp_path):
+    command = program(tmp_path, "pass")
+    ship = Ship(tmp_path, command, flight={"answer_s": 0.05})
+
+    with pytest.raises(BlamedError, match=r"the answer to the tick at 0 s within 0\.05 s"):
+        ship.run(1)
+
+    assert not Path(f"/proc/{ship.process.pid}").exists()
+
+
+def test_in_real_time_no_tick_waits_and_answers_are_taken_when_they_come(tmp_path):
+    gate = tmp_path / "gate"
+    body = f"""
+import os, time
+while not os.path.exists({str(gate)!r}):
+    time.sleep(0.001)
+print(json.dumps({{"estimate": {{"of_t": tick["t_s"]}}}}), flush=True)
+"""
+    command = program(tmp_path, body)
+    with Ship(tmp_path, command, is_lockstep=False, flight={"answer_s": 1e-6}) as ship:
+        ship.run(5)
+        assert "estimates" not in ship.context.streams
+        gate.touch()
+        ship.run_until(lambda: len(ship.context.records["estimates"]) >= 5)
+
+    rows = ship.context.records["estimates"]
+    assert [of_t for _, of_t in rows[:5]] == [0.0, 0.1, 0.2, 0.3, 0.4]
+    assert all(tick >= 5 for tick, _ in rows)
+    assert ship.summary["answers_late"] == ship.summary["answers"] >= 5
+
+
+def test_a_program_that_falls_behind_is_sent_no_more_than_it_can_hold(tmp_path):
+    # It reads nothing at all after the setup line.
+    command = program(tmp_path, "sys.stdin.read()")
+    with Ship(tmp_path, command, is_lockstep=False) as ship:
+        ship.run(UNANSWERED_MAX + 30)
+
+    assert ship.summary["ticks_sent"] == UNANSWERED_MAX
+    assert ship.summary["ticks_skipped"] == 30
+    assert ship.summary["unanswered"] == UNANSWERED_MAX
+
+
+def test_what_it_says_on_standard_error_is_logged_within_bounds(tmp_path):
+    body = f"""
+for n in range({LOG_LINES_MAX + 10}):
+    print("word", n, file=sys.stderr)
+sys.stderr.flush()
+print("{{}}", flush=True)
+"""
+    with Ship(tmp_path, program(tmp_path, body)) as ship:
+        ship.run(1)
+
+    words = [text for _, text in ship.context.logs if ": word " in text]
+    assert len(words) == LOG_LINES_MAX
+    assert ship.summary["log_lines"] == LOG_LINES_MAX + 10
+
+
+def test_a_program_that_does_not_end_with_its_input_is_stopped(tmp_path, monkeypatch):
+    monkeypatch.setattr(line_process, "END_S", 0.2)
+    text = """
+import signal, sys, time
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+print("{}", flush=True)
+while True:
+    time.sleep(1)
+"""
+    (tmp_path / "stubborn.py").write_text(text)
+    with Ship(tmp_path, [sys.executable, "stubborn.py"]) as ship:
+        ship.run(1)
+
+    assert ship.summary["exit_code"] == -9
+    assert [level for level, text in ship.context.logs if "exit code -9" in text] == ["warning"]
+
+
+def test_a_missing_program_is_named_at_set_up(tmp_path):
+    with pytest.raises(BlamedError, match=f"no-such: .*{re.escape(str(tmp_path))}"):
+        Ship(tmp_path, ["no-such"])
+
+
+def test_a_program_dies_with_its_agents_process(tmp_path):
+    command = program(tmp_path, "print('{}', flush=True)", "import time\ntime.sleep(600)\n")
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        process = line_process.LineProcess(command, tmp_path)
+        os.write(writer, str(process.pid).encode())
+        os._exit(0)
+    os.close(writer)
+    pid = int(os.read(reader, 20))
+    os.close(reader)
+    os.waitpid(child, 0)
+
+    deadline_s = time.monotonic() + PATIENCE_S
+    while _lives(pid):
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+
+
+def _lives(pid):
+    try:
+        return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return False
+
+
+def test_the_example_in_c_holds_its_semi_major_axis(tmp_path):
+    if shutil.which("cc") is None:
+        pytest.skip("no C compiler")
+    flight = {
+        "input": "measurements",
+        "command": ["flight/hold.sh"],
+        "settings": {"a_m": 7_160_000, "tolerance_m": 50, "lead_s": 3},
+    }
+    sensors = {"gnss": {"rate_hz": HZ}}
+    with Ship(SCENARIOS, flight["command"], flight=flight, vehicles=[{"sensors": sensors}]) as ship:
+        ship.run(11)
+
+    mu = 398600.4418e9
+    a_m = 1.0 / (2.0 / CIRCULAR[0] - CIRCULAR[4] ** 2 / mu)
+    rows = ship.context.records["estimates"]
+    assert [row[0] for row in rows] == list(range(11))
+    assert rows[0][1] == pytest.approx(a_m, abs=0.01)
+    first = ship.commands()[0]
+    assert first.at_s == 3.0
+    # Vis viva: after the burn the semi-major axis is the one wanted, but for the square of delta-v.
+    after_m_s = CIRCULAR[4] + first.vector[1]
+    reached_m = 1.0 / (2.0 / CIRCULAR[0] - after_m_s**2 / mu)
+    assert reached_m == pytest.approx(7_160_000, abs=2.0)
+    assert ship.summary["exit_code"] == 0
