@@ -40,7 +40,7 @@ STATE = (
     Field("vy_teme_m_s", "m/s"),
     Field("vz_teme_m_s", "m/s"),
 )
-"""Truth at every tick; a tick without truth has no record."""
+"""Truth at every tick, or as often as the scenario says; a tick without truth has no record."""
 
 ELEMENTS = (
     Field("tick", "", "int"),
@@ -75,6 +75,10 @@ class ConstellationAgent(AgentSimulation):
         self._satellite = first.satellite
         self._mu_m3_s2 = GRAVITY_MODELS[parameters.gravity].mu_m3_s2
         self._stride = max(1, round(context.tick_hz / parameters.record.elements_hz))
+        # A day at 1 Hz is 8 MB an agent: long runs may record less than every tick.
+        state_hz = parameters.record.state_hz or context.tick_hz
+        self._state_stride = max(1, round(context.tick_hz / state_hz))
+        self._state_tick = 0
         self._elements_tick = 0
         self._served = 0
         self._unheard = 0
@@ -105,10 +109,19 @@ class ConstellationAgent(AgentSimulation):
     def _record_truth(self, tick: Tick, state: tuple[float, ...]) -> None:
         self._served += 1
         x, y, z, vx, vy, vz = state[:6]
+        if tick.index >= self._state_tick:
+            self._state_tick = tick.index - tick.index % self._state_stride + self._state_stride
+            self._record_state(tick.index, state)
+        if tick.index >= self._elements_tick:
+            self._elements_tick = tick.index - tick.index % self._stride + self._stride
+            self._record_elements(tick.index, (x, y, z), (vx, vy, vz))
+
+    def _record_state(self, tick: int, state: tuple[float, ...]) -> None:
+        x, y, z, vx, vy, vz = state[:6]
         self._context.record(
             "state",
             (
-                tick.index,
+                tick,
                 round(x, 4),
                 round(y, 4),
                 round(z, 4),
@@ -119,10 +132,7 @@ class ConstellationAgent(AgentSimulation):
         )
         if len(state) > 6:
             attitude = [round(value, 12) for value in state[6:]]
-            self._context.record("attitude", (tick.index, *attitude))
-        if tick.index >= self._elements_tick:
-            self._elements_tick = tick.index - tick.index % self._stride + self._stride
-            self._record_elements(tick.index, (x, y, z), (vx, vy, vz))
+            self._context.record("attitude", (tick, *attitude))
 
     def receive(self, message: Any) -> None:
         """

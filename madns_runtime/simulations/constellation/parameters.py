@@ -423,10 +423,12 @@ class SegmentSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordSettings:
-    """What is recorded beyond every tick's state, and what is judged."""
+    """What is recorded and what is judged."""
 
     __pydantic_config__ = FORBID_EXTRA
 
+    state_hz: Annotated[float, Gt(0), Le(10_000)] | None = None
+    """Rate at which agents record their state, Hz; none for every tick."""
     elements_hz: Annotated[float, Gt(0), Le(1000)] = 1.0
     """Rate at which agents record their osculating elements, Hz; at most the tick rate."""
     energy_drift_max: Annotated[float, Gt(0)] = 1e-9
