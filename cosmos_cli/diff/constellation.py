@@ -17,16 +17,18 @@ import numpy as np
 
 from cosmos_cli.diff.control import Effort, SlotError, efforts_of, slot_errors_of
 from cosmos_cli.diff.matching import Floats, Matched
+from cosmos_cli.diff.measurements import MeasurementError, measurement_errors
 from cosmos_cli.diff.recorded import Key, Recorded
 from cosmos_cli.diff.side import Side
-from cosmos_cli.diff.spread import Spread, Stretch
 from cosmos_cli.diff.stream import Observer, Pairing, StreamDifference
 from cosmos_cli.expectation import mapping_at
 from cosmos_cli.report.style import as_array
+from cosmos_cli.spread import Spread, Stretch
 
 CONSTELLATION, STATE = "constellation", "state"
 POSITION = tuple(re.compile(rf"^{axis}(_[a-z0-9]+)??_m$") for axis in "xyz")
 VELOCITY = tuple(re.compile(rf"^v{axis}(_[a-z0-9]+)??_m_s$") for axis in "xyz")
+Measured = dict[tuple[str, str], MeasurementError]
 AXES = ("radial", "along", "normal")
 
 
@@ -64,6 +66,7 @@ class ConstellationDifference:
     efforts: tuple[dict[str, Effort], dict[str, Effort]] = ({}, {})
     slot_errors: tuple[dict[str, SlotError], dict[str, SlotError]] = ({}, {})
     slot_over_time: tuple[list[Stretch], list[Stretch]] = ([], [])
+    measurements: tuple[Measured, Measured] = field(default_factory=lambda: ({}, {}))
     remarks: list[str] = field(default_factory=list)
 
     def all_positions(self) -> PositionDifference | None:
@@ -132,6 +135,11 @@ class Constellation:
         """Add what is told of each run by itself, and return the comparison."""
         result = self._result
         result.over_time = self._spread.rows()
+        first, second = self._sides
+        result.measurements = (
+            measurement_errors(of_a, first.tick_hz),
+            measurement_errors(of_b, second.tick_hz),
+        )
         result.efforts = (efforts_of(of_a), efforts_of(of_b))
         found_a, found_b = (
             slot_errors_of(streams, side.tick_hz, side.duration_s, Spread(self._duration_s))

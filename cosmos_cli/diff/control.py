@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cosmos_cli.diff.recorded import Key, Recorded
-from cosmos_cli.diff.spread import Spread, Stretch
 from cosmos_cli.report.style import as_array
+from cosmos_cli.spread import Spread, Stretch
 
 ESTIMATES, COMMANDS, MANEUVERS = "estimates", "commands", "host_maneuvers"
 SLOT_ERROR = "slot_error_deg"

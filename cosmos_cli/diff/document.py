@@ -9,7 +9,7 @@ A comparison as JSON: what `cosmos diff --json` prints, schema 1. Pure.
         only_a, only_b               {count, first {key, who}, last {key, who}}
         fields                       {name: {unit, different, compared, null_in_one, rms, max, at {key, who}, first, values}}
     streams_only_a, streams_only_b   lists of [table, source]
-    constellation                    null, or {frame, truth, control, estimates, remarks}
+    constellation                    null, or {frame, truth, measurements, control, estimates, remarks}
     missing, remarks                 lists of sentences
 
 A key is a tick where `by` is tick, a time in s where it is time, and the number of the record where it is order.
@@ -27,6 +27,7 @@ from cosmos_cli.diff.compare import Comparison
 from cosmos_cli.diff.constellation import AXES, ConstellationDifference, PositionDifference
 from cosmos_cli.diff.control import Effort, SlotError, total_effort, total_slot_error
 from cosmos_cli.diff.fields import FieldDifference, Place
+from cosmos_cli.diff.measurements import MeasurementError
 from cosmos_cli.diff.stream import Alone, StreamDifference
 
 SCHEMA = 1
@@ -113,6 +114,7 @@ def _constellation(found: ConstellationDifference) -> dict[str, Any]:
     return {
         "frame": list(found.frame),
         "truth": truth,
+        "measurements": _measurements(found),
         "control": _pairs(found.efforts, _effort, total_effort),
         "estimates": _pairs(found.slot_errors, _slot_error, total_slot_error)
         | {"over_time": [[_stretch(r, "deg") for r in rows] for rows in found.slot_over_time]},
@@ -145,6 +147,23 @@ def _position(found: PositionDifference) -> dict[str, Any]:
 
 def _effort(effort: Effort | None) -> dict[str, Any] | None:
     return None if effort is None else dataclasses.asdict(effort)
+
+
+def _measurements(found: ConstellationDifference) -> list[dict[str, Any]]:
+    a, b = found.measurements
+    return [
+        {
+            "sensor": key[0],
+            "quantity": key[1],
+            "unit": (a.get(key) or b[key]).unit,
+            "errors": [_error(one.get(key)) for one in (a, b)],
+        }
+        for key in dict.fromkeys((*a, *b))
+    ]
+
+
+def _error(error: MeasurementError | None) -> dict[str, Any] | None:
+    return None if error is None else {"count": error.count, "rms": error.rms, "max": error.max}
 
 
 def _slot_error(error: SlotError | None) -> dict[str, Any] | None:

@@ -21,6 +21,8 @@ SAME_TIME_S = 1e-6
 """Of ticks at different rates those are matched that mean the same instant, s."""
 IDENTITY = ("agent", "satellite", "sender", "to", "receiver", "station", "kind", "event")
 """Text fields that tell whom or what a record is about; records match only where they agree."""
+TIMES = ("t_s", "commanded_s", "sent_s", "rise_s", "at_s")
+"""Fields of a time, in the order in which they are tried."""
 OWNERS = ("agent", "sender")
 """Of these the first is the agent that a record of the host belongs to."""
 By = Literal["tick", "time", "order"]
@@ -137,9 +139,10 @@ def choose_pairing(a: Sequence[Field], b: Sequence[Field], tick_hz: tuple[float,
             return Pairing(
                 by="time", column=name, scales=scales, tolerance=SAME_TIME_S, identity=identity
             )
-    if "t_s" in common:
+    time = next((name for name in TIMES if name in common), None)
+    if time is not None:
         tolerance_s = 0.5 / max(tick_hz)
-        return Pairing(by="time", column="t_s", tolerance=tolerance_s, identity=identity)
+        return Pairing(by="time", column=time, tolerance=tolerance_s, identity=identity)
     return Pairing(by="order", column="", identity=())
 
 

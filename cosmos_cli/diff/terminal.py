@@ -12,9 +12,9 @@ from cosmos_cli.diff.constellation import AXES, ConstellationDifference, Positio
 from cosmos_cli.diff.control import total_effort, total_slot_error
 from cosmos_cli.diff.fields import FieldDifference, Place
 from cosmos_cli.diff.settings import KeyDifference
-from cosmos_cli.diff.spread import Stretch
 from cosmos_cli.diff.stream import Alone, By, StreamDifference
 from cosmos_cli.report.model import format_cell
+from cosmos_cli.spread import Stretch
 
 KEYS_SHOWN_MAX = 40
 AGENTS_SHOWN_MAX = 12
@@ -72,6 +72,9 @@ def print_constellation(console: Console, found: ConstellationDifference) -> Non
         _title(console, f"Truth: distance between A and B{frame}, m")
         _print_positions(console, found, total)
         _print_over_time(console, found.over_time, "m")
+    if any(found.measurements):
+        _title(console, "Measurements: error against each run's own truth")
+        _print_measurements(console, found)
     if any(found.efforts):
         _title(console, "Control: delta-v, m/s")
         _print_efforts(console, found)
@@ -106,6 +109,21 @@ def _print_over_time(console: Console, rows: Sequence[Stretch], unit: str) -> No
     columns = [Column("until t, s", True), Column(f"rms, {unit}", True), Column("max", True)]
     console.data("")
     console.table(columns, [[format_cell(cell) for cell in row] for row in rows[step - 1 :: step]])
+
+
+def _print_measurements(console: Console, found: ConstellationDifference) -> None:
+    columns = [Column("sensor"), Column("quantity")]
+    for name in ("measurements", "rms", "max"):
+        columns += [Column(f"{name} A", True), Column(f"{name} B", True)]
+    columns.append(Column("unit"))
+    a, b = found.measurements
+    rows = []
+    for key in dict.fromkeys((*a, *b)):
+        pair = (a.get(key), b.get(key))
+        names = ("count", "rms", "max")
+        cells = [format_cell(getattr(one, name, None)) for name in names for one in pair]
+        rows.append([*key, *cells, (pair[0] or b[key]).unit])
+    console.table(columns, rows)
 
 
 def _print_efforts(console: Console, found: ConstellationDifference) -> None:

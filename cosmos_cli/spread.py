@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosmos_cli.diff.matching import Floats
+from cosmos_cli.report.sampling import Floats
 
 BINS = 24
 """Stretches of time in which differences are told."""
