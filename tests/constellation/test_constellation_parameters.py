@@ -62,7 +62,7 @@ def test_what_is_valid_has_no_faults(mapping):
         {"satellites": WALKER, "propagator": {"kind": "magic"}},
         {"satellites": WALKER, "propagator": {"kind": "sgp4", "rtol": 1e-9}},
         {"satellites": WALKER, "propagator": {"kind": "scipy", "rtol": 1e-15}},
-        {"satellites": WALKER, "propagator": {"kind": "scipy", "forces": ["drag"]}},
+        {"satellites": WALKER, "propagator": {"kind": "scipy", "forces": ["magic"]}},
         {"satellites": WALKER, "frame": "ITRF"},
         {"satellites": WALKER, "speed": 1},
         {"satellites": {"keplerian": []}},

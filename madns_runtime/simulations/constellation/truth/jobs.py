@@ -7,14 +7,16 @@ its knots are those of the grid and of the pieces that the interval needs beside
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from madns_runtime.simulations.constellation.orbit.frames import vector_to_inertial
-from madns_runtime.simulations.constellation.truth.attitude import RigidBody, propagate_attitude
 from madns_runtime.simulations.constellation.truth.effects import Effect, Vector, scaled, total
 from madns_runtime.simulations.constellation.truth.pieces import (
     Piece,
@@ -28,6 +30,10 @@ from madns_runtime.simulations.constellation.truth.propagation import (
     conserved_by,
     propagate,
 )
+
+if TYPE_CHECKING:
+    # It imports scipy, which hosts of point masses may do without.
+    from madns_runtime.simulations.constellation.truth.attitude import RigidBody
 
 Array = NDArray[np.float64]
 ROUNDING_S = 1e-9
@@ -62,7 +68,8 @@ def propagate_vehicle(request: VehicleRequest, parameters: PropagationParameters
 
     Args:
         request: What is wanted.
-        parameters: Settings and constants; what is one a vehicle is the request's.
+        parameters: Settings and constants; names has this vehicle's, what else is one a vehicle is the
+            request's.
 
     Raises:
         ConfigurationError: It cannot be propagated.
@@ -78,14 +85,30 @@ def propagate_vehicle(request: VehicleRequest, parameters: PropagationParameters
     return flight.truth()
 
 
+def propagate_vehicles(
+    requests: Sequence[VehicleRequest], parameters: Sequence[PropagationParameters]
+) -> list[VehicleTruth]:
+    """Do several, in the executor."""
+    return [propagate_vehicle(*both) for both in zip(requests, parameters, strict=True)]
+
+
+def propagate_bodies(
+    bodies: Sequence[RigidBody], states: Array, knots_s: Array, parameters: PropagationParameters
+) -> Array:
+    """Return attitude and rates of rigid bodies that nobody turns, shape (M, K, 7), from (M, 13) at the first knot."""
+    torques = np.zeros((len(bodies), 3))
+    start_s = float(knots_s[0])
+    propagate_attitude = _attitude_module().propagate_attitude
+    rows = propagate_attitude(bodies, states, start_s, knots_s, parameters, torques)
+    return np.asarray(rows[..., 6:], dtype=np.float64)
+
+
 class _Flight:
     """One vehicle on its way through a request."""
 
     def __init__(self, request: VehicleRequest, parameters: PropagationParameters) -> None:
         self._request = request
-        self._parameters = replace(
-            parameters, element_sets=(), names=parameters.names[:1], thrust_m_s2=None
-        )
+        self._parameters = replace(parameters, element_sets=(), thrust_m_s2=None)
         self._t_s = request.start_s
         self._state = np.asarray(request.state, dtype=np.float64)
         self._body = request.body
@@ -218,6 +241,7 @@ class _Flight:
         if self._body is not None:
             torques = np.array([torque])
             states = self._state[None]
+            propagate_attitude = _attitude_module().propagate_attitude
             rows = propagate_attitude([self._body], states, self._t_s, knots, parameters, torques)
         else:
             rows = propagate(self._state[None], self._t_s, knots, parameters)
@@ -235,3 +259,7 @@ class _Flight:
                 thrust_m_s2=total(self._thrusts.values()) if self._thrusts else None,
             )
         )
+
+
+def _attitude_module() -> ModuleType:
+    return importlib.import_module("madns_runtime.simulations.constellation.truth.attitude")
