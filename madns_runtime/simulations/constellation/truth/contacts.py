@@ -83,7 +83,7 @@ class PassWatch:
         """Stations and vehicles in contact where the last look ended."""
         self._contacts: list[Contact] = []
         """Known, not told yet: those of the last SCAN_STEP_S."""
-        self._next_look_s = 0.0
+        self._next_look_s = -math.inf
         self.passes = 0
         """Found so far, open ones included."""
 
@@ -95,19 +95,13 @@ class PassWatch:
     def look_ahead(self, t_s: float) -> list[Stretch]:
         """Look until LOOK_AHEAD_S after *t_s*, as far as truth is known, and return what is new, in order."""
         stretches: list[Stretch] = []
-        if not self._stations or not self._has_begun(t_s, stretches):
-            return stretches
-        wanted_s = t_s + LOOK_AHEAD_S
-        while (from_s := self._finder.scanned_s) is not None and from_s < wanted_s:
-            for until_s in (from_s + SCAN_STEP_S, wanted_s, t_s):
-                windows = self._finder.look(until_s) if until_s > from_s else None
-                if windows is not None:
-                    stretches.append(self._note(windows, from_s, until_s))
-                    break
-            else:
+        while self._stations and self._next_look_s <= t_s:
+            stretch = self._look(t_s)
+            if stretch is None:
                 self._next_look_s = t_s + RETRY_S
-                return stretches
-            self._next_look_s = until_s - LOOK_AHEAD_S
+                break
+            stretches.append(stretch)
+            self._next_look_s = stretch.until_s - LOOK_AHEAD_S
         return stretches
 
     def contacts(self, t_s: float) -> list[Contact]:
@@ -121,17 +115,21 @@ class PassWatch:
         """Return when to look, or to ask for contacts, next."""
         return min([self._next_look_s, *(contact.t_s for contact in self._contacts)])
 
-    def _has_begun(self, t_s: float, stretches: list[Stretch]) -> bool:
-        """Look for the first time: from simulated time zero on, or from now if that is forgotten."""
-        if self._finder.scanned_s is not None:
-            return True
-        for begin_s in dict.fromkeys((0.0, t_s)):
-            windows = self._finder.begin(begin_s)
+    def _look(self, t_s: float) -> Stretch | None:
+        """Look as far as wanted or, where truth is not known so far, at least until now; None: neither."""
+        from_s = self._finder.scanned_s
+        if from_s is None:
+            # From simulated time zero on, or from now if that is forgotten.
+            for begin_s in dict.fromkeys((0.0, t_s)):
+                windows = self._finder.begin(begin_s)
+                if windows is not None:
+                    return self._note(windows, begin_s, begin_s)
+            return None
+        for until_s in (from_s + SCAN_STEP_S, t_s + LOOK_AHEAD_S, t_s):
+            windows = self._finder.look(until_s) if until_s > from_s else None
             if windows is not None:
-                stretches.append(self._note(windows, begin_s, begin_s))
-                return True
-        self._next_look_s = t_s + RETRY_S
-        return False
+                return self._note(windows, from_s, until_s)
+        return None
 
     def _note(self, windows: list[Window], from_s: float, until_s: float) -> Stretch:
         """Note who rose and who set."""

@@ -211,8 +211,9 @@ class InFlight:
     def due(self, t_s: float) -> list[tuple[int, Delivery]]:
         """Return receivers and deliveries that arrive up to `lead_s` after *t_s*, in order."""
         result = []
-        heap, until_s = self._heap, t_s + self.lead_s
-        while heap and heap[0][0] <= until_s:
+        heap = self._heap
+        # As `next_s` rounds it: what it promises is there.
+        while heap and heap[0][0] - self.lead_s <= t_s:
             _, _, _, receiver, delivery = heapq.heappop(heap)
             result.append((receiver, delivery))
         self.handed_over += len(result)

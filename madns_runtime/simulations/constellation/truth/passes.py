@@ -212,23 +212,31 @@ def _root(function: Callable[[float], float], low_s: float, high_s: float) -> fl
     Return where a function changes sign between two times, to ROOT_TOLERANCE_S.
 
     Where it does not, the end that is nearer to doing so: a pass that touches the mask.
-    Source: the Illinois method, Dowell and Jarratt, BIT 11 (1971), 168.
+    Source: Chandrupatla, Advances in Engineering Software 28 (1997), 145; as in Scherer,
+    Computational Physics, 2nd ed., section 6.1.7.
     """
-    low, high = function(low_s), function(high_s)
-    if low == 0.0 or high == 0.0 or (low < 0.0) == (high < 0.0):
-        return low_s if abs(low) < abs(high) else high_s
-    last_s, side = math.inf, 0
+    a, b = high_s, low_s
+    fa, fb = function(a), function(b)
+    if fa == 0.0 or fb == 0.0 or (fa < 0.0) == (fb < 0.0):
+        return a if abs(fa) < abs(fb) else b
+    share = 0.5
     for _ in range(ROOT_STEPS_MAX):
-        middle_s = (low_s * high - high_s * low) / (high - low)
-        middle = function(middle_s)
-        if middle == 0.0 or abs(middle_s - last_s) <= ROOT_TOLERANCE_S:
-            return middle_s
-        last_s = middle_s
-        # An end that stays twice is weighed half, so that the next point falls on its side.
-        if (middle < 0.0) == (low < 0.0):
-            low_s, low, high = middle_s, middle, high / 2.0 if side < 0 else high
-            side = -1
+        x = a + share * (b - a)
+        fx = function(x)
+        if (fx < 0.0) == (fa < 0.0):
+            c, fc = a, fa
         else:
-            high_s, high, low = middle_s, middle, low / 2.0 if side > 0 else low
-            side = 1
-    return last_s
+            c, b, fc, fb = b, a, fb, fa
+        a, fa = x, fx
+        share_min = ROOT_TOLERANCE_S / abs(b - a) if b != a else 1.0
+        if fa == 0.0 or share_min > 0.5:
+            break
+        # Inverse quadratic interpolation where the three points allow it, else bisection.
+        xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
+        share = 0.5
+        if phi * phi < xi and (1.0 - phi) ** 2 < 1.0 - xi:
+            share = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (
+                fc - fb
+            )
+        share = min(1.0 - share_min, max(share_min, share))
+    return a if abs(fa) < abs(fb) else b
