@@ -1,0 +1,229 @@
+"""Truth, for points and for rigid bodies, against Basilisk."""
+
+import math
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+
+pytest.importorskip("Basilisk", reason="the extra `basilisk` is not installed")
+
+from madns_runtime.errors import ConfigurationError
+from madns_runtime.simulations.constellation.orbit.constants import EGM_96
+from madns_runtime.simulations.constellation.orbit.quaternions import normalised, rotate
+from madns_runtime.simulations.constellation.parameters import (
+    Attitude,
+    BasiliskPropagator,
+    ScipyPropagator,
+)
+from madns_runtime.simulations.constellation.truth.attitude import (
+    RigidBody,
+    initial_attitude,
+    propagate_attitude,
+)
+from madns_runtime.simulations.constellation.truth.basilisk_attitude import (
+    propagate_rigid_bodies,
+)
+from madns_runtime.simulations.constellation.truth.basilisk_propagator import (
+    SETS_MAX,
+    Basilisk,
+    drifted,
+    whole_steps,
+)
+from madns_runtime.simulations.constellation.truth.basilisk_simulation import (
+    mrp_of,
+    quaternions_of,
+)
+from madns_runtime.simulations.constellation.truth.propagation import (
+    PropagationParameters,
+    propagate,
+)
+
+
+def make(kind="basilisk", forces=("two_body", "j2"), rest=None, **settings):
+    classes = {"basilisk": BasiliskPropagator, "scipy": ScipyPropagator}
+    return PropagationParameters(
+        settings=classes[kind](kind=kind, forces=forces, **settings),
+        gravity=EGM_96,
+        epoch_utc=datetime(2000, 1, 1, 12, tzinfo=UTC),
+        **(rest or {}),
+    )
+
+
+def orbits(count=3, radius_m=7.0e6):
+    rng = np.random.default_rng(8)
+    r = rng.normal(size=(count, 3))
+    r /= np.linalg.norm(r, axis=1, keepdims=True)
+    v = np.cross(r, rng.normal(size=(count, 3)))
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    return np.hstack((r * radius_m, v * math.sqrt(EGM_96.mu_m3_s2 / radius_m)))
+
+
+@pytest.mark.parametrize("forces", [("two_body",), ("two_body", "j2")], ids="+".join)
+def test_it_agrees_with_scipy_over_four_hours(forces):
+    end = np.array([14_400.0])
+
+    found = propagate(orbits(), 0.0, end, make(forces=forces))
+
+    expected = propagate(orbits(), 0.0, end, make("scipy", forces))
+    assert np.linalg.norm((found - expected)[..., :3], axis=-1).max() < 1e-5
+
+
+def test_vehicles_in_one_simulation_move_as_in_their_own():
+    knots_s = np.arange(0.0, 31.0, 3.0)
+
+    together = propagate(orbits(), 0.0, knots_s, make(simulations="one"))
+
+    assert np.array_equal(
+        together, propagate(orbits(), 0.0, knots_s, make(simulations="per_vehicle"))
+    )
+
+
+def test_a_delta_v_is_taken_up_from_any_state_at_any_time():
+    coasting = propagate(orbits(), 0.0, np.arange(0.0, 21.0), make())
+    burnt = coasting[:, 10].copy()
+    burnt[1, 3:] += (1.0, -2.0, 3.0)
+
+    found = propagate(burnt, 10.0, np.arange(10.0, 21.0), make())
+
+    assert np.array_equal(found[[0, 2]], coasting[[0, 2], 10:])
+    expected = propagate(burnt, 10.0, np.arange(10.0, 21.0), make("scipy"))
+    assert np.abs(found - expected)[..., :3].max() < 1e-7
+
+
+def test_simulations_are_kept_and_bounded():
+    basilisk = Basilisk()
+    for step_s in (0.1, 0.2, 0.25, 0.5, 1.0, 1.25):
+        basilisk.propagate(orbits(), 0.0, np.array([5.0]), make(step_s=step_s))
+    kept = dict(basilisk._sets)
+
+    basilisk.propagate(orbits(), 5.0, np.array([10.0]), make(step_s=1.25))
+
+    assert len(basilisk._sets) == SETS_MAX
+    assert all(basilisk._sets[key] is kept[key] for key in kept)
+
+
+def test_a_coarse_step_costs_accuracy():
+    end, expected = np.array([3600.0]), None
+    errors = []
+    for step_s in (1.0, 10.0):
+        expected = propagate(orbits(), 0.0, end, make("scipy"))
+        found = propagate(orbits(), 0.0, end, make(step_s=step_s))
+        errors.append(float(np.linalg.norm((found - expected)[..., :3], axis=-1).max()))
+
+    # Of fourth order.
+    assert errors[0] < 1e-3
+    assert 3e3 < errors[1] / errors[0] < 3e4
+
+
+@pytest.mark.parametrize(
+    ("gap_ns", "step_ns_max", "expected"),
+    [
+        (1_000_000_000, 100_000_000, (100_000_000, 10)),
+        (1_000_000_000, 300_000_000, (250_000_000, 4)),
+        (50, 100, (50, 1)),
+        (7, 3, (1, 7)),
+        # A prime: none divides it.
+        (999_999_937, 100_000_000, (99_999_993, 10)),
+    ],
+)
+def test_steps_end_on_knots_and_are_no_longer_than_set(gap_ns, step_ns_max, expected):
+    if gap_ns == 999_999_937:
+        step_ns, steps = whole_steps(gap_ns, step_ns_max)
+        assert 0 < gap_ns - step_ns * steps < steps
+        assert step_ns <= step_ns_max
+        return
+
+    assert whole_steps(gap_ns, step_ns_max) == expected
+
+
+def test_what_whole_nanoseconds_leave_is_drifted():
+    states = orbits()
+
+    found = drifted(states, 1e-6, make())
+
+    # 1 us of 7.5 km/s is 7.5 mm; the rest of the series 1e-18 m.
+    assert found[:, :3] - states[:, :3] == pytest.approx(1e-6 * states[:, 3:], abs=2e-9)
+    assert np.linalg.norm(found[:, 3:] - states[:, 3:], axis=1) == pytest.approx(8e-6, rel=0.03)
+
+
+def test_parameters_of_attitude_go_there_and_back():
+    for q in ((0.1, 0.2, 0.3, 0.9), (0.5, -0.5, 0.5, -0.5), (1.0, 0.0, 0.0, 0.0), (0, 0, 0, -1.0)):
+        q = normalised(q)
+
+        mrp = mrp_of(list(q))
+        back = quaternions_of(np.array([mrp]))[0]
+
+        assert np.linalg.norm(mrp) <= 1.0 + 1e-15
+        # Of the two quaternions of an attitude it may be the other one.
+        assert abs(float(np.dot(back, q))) == pytest.approx(1.0, abs=1e-15)
+        assert rotate(back, (1.0, 2.0, 3.0)) == pytest.approx(rotate(q, (1.0, 2.0, 3.0)))
+
+
+def bodies_in_orbit():
+    inertia = (10.0, 24.0, 17.0)
+    attitude = Attitude(inertia_kg_m2=inertia, rates_deg_s=(1.0, -2.0, 0.5))
+    still = Attitude(inertia_kg_m2=inertia)
+    states = [
+        (*row, *initial_attitude(which, row[:3], row[3:]))
+        for row, which in zip(orbits().tolist(), (attitude, attitude, still), strict=True)
+    ]
+    bodies = [
+        RigidBody(inertia_kg_m2=inertia, has_gravity_gradient=has_gradient)
+        for has_gradient in (True, False, True)
+    ]
+    return bodies, np.array(states)
+
+
+def turned_rad(a, b):
+    """Angle between attitudes, shape (M, K); good for small ones."""
+    same = np.sign(np.einsum("mki,mki->mk", a, b))[..., None]
+    return 2.0 * np.linalg.norm(a * same - b, axis=-1)
+
+
+def test_our_rigid_bodies_turn_as_basilisks():
+    bodies, states = bodies_in_orbit()
+    torques = np.array([[1e-3, 0.0, -5e-4], [0.0, 2e-4, 0.0], [0.0, 0.0, 0.0]])
+    knots_s = np.arange(1, 61) * 10.0
+
+    ours = propagate_attitude(bodies, states, 0.0, knots_s, make("scipy"), torques)
+
+    basilisks = propagate_rigid_bodies(
+        bodies, states, knots_s=knots_s, parameters=make(step_s=0.05), torques=torques
+    )
+    assert turned_rad(ours[..., 6:10], basilisks[..., 6:10]).max() < 1e-9
+    assert np.abs(ours[..., 10:] - basilisks[..., 10:]).max() < 1e-12
+    assert np.abs(ours[..., :3] - basilisks[..., :3]).max() < 1e-6
+
+
+def test_the_comparison_sees_a_missing_gravity_gradient():
+    bodies, states = bodies_in_orbit()
+    blind = [RigidBody(inertia_kg_m2=b.inertia_kg_m2, has_gravity_gradient=False) for b in bodies]
+    knots_s, torques = np.array([300.0]), np.zeros((3, 3))
+
+    ours = propagate_attitude(blind, states, 0.0, knots_s, make("scipy"), torques)
+
+    basilisks = propagate_rigid_bodies(
+        bodies, states, knots_s=knots_s, parameters=make(), torques=torques
+    )
+    turned = turned_rad(ours[..., 6:10], basilisks[..., 6:10])[:, 0]
+    assert turned[0] > 1e-4
+    assert turned[1] < 1e-9
+
+
+def test_bodies_that_basilisk_does_not_do_here_are_refused():
+    bodies, states = bodies_in_orbit()
+    wheeled = [RigidBody(inertia_kg_m2=(1.0, 1.0, 1.0), wheels_n_m_s=(0.0, 0.0, 1.0))] * 3
+
+    with pytest.raises(ConfigurationError, match="without wheels"):
+        propagate_rigid_bodies(
+            wheeled, states, knots_s=np.array([1.0]), parameters=make(), torques=np.zeros((3, 3))
+        )
+    with pytest.raises(ConfigurationError, match="multiples of the first knot"):
+        propagate_rigid_bodies(
+            bodies,
+            states,
+            knots_s=np.array([1.0, 3.0]),
+            parameters=make(),
+            torques=np.zeros((3, 3)),
+        )

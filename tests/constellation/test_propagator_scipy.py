@@ -1,0 +1,71 @@
+"""How much work scipy is given."""
+
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+
+from madns_runtime.simulations.constellation.orbit.constants import EGM_96
+from madns_runtime.simulations.constellation.parameters import ScipyPropagator
+from madns_runtime.simulations.constellation.truth import scipy_propagator
+from madns_runtime.simulations.constellation.truth.propagation import PropagationParameters
+from madns_runtime.simulations.constellation.truth.scipy_propagator import (
+    ScipyDop853,
+    first_step_s,
+)
+
+STAGES = 12
+DENSE_STAGES = 3
+ORBIT = np.array([[7.0e6, 0.0, 0.0, 0.0, 1000.0, 7479.0]])
+
+
+@pytest.fixture
+def solutions(monkeypatch):
+    kept = []
+    solve = scipy_propagator.solve_ivp
+
+    def keep(*arguments, **options):
+        kept.append(solve(*arguments, **options))
+        return kept[-1]
+
+    monkeypatch.setattr(scipy_propagator, "solve_ivp", keep)
+    return kept
+
+
+def propagate(states, knots_s, **settings):
+    parameters = PropagationParameters(
+        settings=ScipyPropagator(kind="scipy", **settings),
+        gravity=EGM_96,
+        epoch_utc=datetime(2000, 1, 1, tzinfo=UTC),
+    )
+    return ScipyDop853().propagate(states, 0.0, knots_s, parameters)
+
+
+def test_a_short_stretch_is_one_step(solutions):
+    propagate(ORBIT, np.arange(0.0, 10.05, 0.1))
+
+    assert solutions[0].nfev == 1 + STAGES + DENSE_STAGES
+
+
+def test_a_fleet_in_low_orbit_takes_no_more_steps_than_one_vehicle(solutions):
+    propagate(np.repeat(ORBIT, 1000, axis=0), np.arange(0.0, 10.05, 0.1))
+
+    assert solutions[0].nfev == 1 + STAGES + DENSE_STAGES
+
+
+def test_long_stretches_are_cut_at_the_longest_step(solutions):
+    propagate(ORBIT, np.arange(0.0, 121.0), step_s_max=30.0)
+
+    assert solutions[0].nfev == 1 + 4 * (STAGES + DENSE_STAGES)
+
+
+def test_the_first_step_is_not_refused_at_any_height(solutions):
+    for radius_m in (6.6e6, 8.0e6, 2.6e7, 4.2e7):
+        speed = (EGM_96.mu_m3_s2 / radius_m) ** 0.5
+        state = np.array([[radius_m, 0.0, 0.0, 0.0, speed, 0.0]])
+        step_s = first_step_s(state, EGM_96.mu_m3_s2, 1e-12)
+
+        propagate(state, np.array([step_s]), step_s_max=1e4)
+
+        assert solutions[-1].nfev == 1 + STAGES + DENSE_STAGES
+        assert step_s > 50.0
