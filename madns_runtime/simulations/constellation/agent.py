@@ -104,6 +104,8 @@ class ConstellationAgent(AgentSimulation):
         if self._sensors is not None:
             readings = self._sensors.step(tick.index, tick.t_s, state)
         if self._cockpit is not None:
+            # Its ticks lie that much behind their nominal times, and so do its maneuvers.
+            self._cockpit.phase_s = max(0.0, tick.deadline_s - tick.t_s)
             self._cockpit.step(tick.index, tick.t_s, state, readings or {})
 
     def _record_truth(self, tick: Tick, state: tuple[float, ...]) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,8 @@ class Board:
         self.frame = initial.frame
         self.settings = settings
         self.random = random
+        self.phase_s = 0.0
+        """By how much the vehicle's ticks lie behind their nominal times, s: so do its maneuvers."""
         self.log_refused = 0
         self._context = context
         self._has_crosslinks = parameters.crosslinks is not None
@@ -195,8 +198,8 @@ class Board:
         return self._tick
 
     def _send_command(self, tick: int, command: Command) -> int:
-        message = command.to_message()
-        self._context.send(HOST, message, Service.SYNC, deadline_s=command.at_s)
+        message = replace(command, phase_s=self.phase_s).to_message()
+        self._context.send(HOST, message, Service.SYNC, deadline_s=command.at_s + self.phase_s)
         self._context.record(
             "commands",
             (

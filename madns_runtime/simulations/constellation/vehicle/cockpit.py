@@ -41,6 +41,8 @@ class Cockpit:
         self._receiver = Receiver()
         self._results: deque[CommandResult] = deque(maxlen=RESULTS_MAX)
         self._results_dropped = 0
+        self.phase_s = 0.0
+        """By how much the vehicle's ticks lie behind their nominal times, s."""
         pilot.setup(board)
 
     def step(
@@ -64,6 +66,7 @@ class Cockpit:
         """
         board, pilot = self._board, self._pilot
         board.begin(tick, t_s)
+        board.phase_s = self.phase_s
         readings = dict(measured) if not self._is_truth_fed else {}
         if self._is_truth_fed and state is not None:
             readings[TRUTH] = Reading(t_s, state)
