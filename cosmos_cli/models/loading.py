@@ -17,7 +17,7 @@ from cosmos_cli.models.parameters import adapter_of
 from cosmos_cli.models.scenario import Scenario, cross_faults
 from cosmos_cli.models.translate import faults_of
 from cosmos_cli.models.yaml_source import Source, read_source
-from madns_runtime.config import RunConfig, to_mapping
+from madns_runtime.config import Agents, RunConfig, to_mapping
 from madns_runtime.errors import MadnsError, PluginError
 from madns_runtime.plugin.api import Simulation
 from madns_runtime.plugin.guard import blame, said
@@ -103,7 +103,7 @@ def _check(
         parameters, parameter_faults = _parameters(document, simulation)
         if parameters is not None and scenario is not None:
             parameter_faults += _plugin_faults(
-                document, simulation, parameters, scenario.agents.count, base_directory
+                document, simulation, parameters, scenario.agents, base_directory
             )
         faults += parameter_faults
     if scenario is None or simulation is None or faults:
@@ -194,14 +194,20 @@ def _plugin_faults(
     document: Document,
     simulation: Simulation,
     parameters: Any,
-    agents: int,
+    agents: Agents,
     base_directory: Path,
 ) -> list[Fault]:
     """Ask the simulation itself: it knows of missing files and of what fits together."""
     if simulation.check is None:
         return []
     try:
-        texts = ask_check(simulation.check, base_directory, parameters=parameters, agents=agents)
+        texts = ask_check(
+            simulation.check,
+            base_directory,
+            parameters=parameters,
+            agents=agents.count,
+            names=agents.resolved_names(),
+        )
     except PluginError as error:
         return [document.fault(("simulation",), str(error))]
     return [_plugin_fault(document, text) for text in texts]

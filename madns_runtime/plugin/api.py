@@ -224,4 +224,5 @@ class Simulation:
     """module:function of (parameters, agents: int, tick_hz: float, base_directory: Path) -> Demand, or None."""
     check: str | None = None
     """module:function of (parameters, agents: int, base_directory: Path) -> list[str]: faults beyond bounds,
-    such as a missing file, each starting with the dotted parameter name and a colon."""
+    such as a missing file, each starting with the dotted parameter name and a colon. A fourth parameter
+    called names is given the agents' names."""

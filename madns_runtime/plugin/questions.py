@@ -7,7 +7,8 @@ What comes back is checked here, so that a slip in a plug-in is told as such and
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+import inspect
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,14 @@ NO_FIGURES = ("name", "flows", "measured")
 """Fields of a Demand or a Flow that are no amounts."""
 
 
-def ask_check(where: str, base_directory: Path, *, parameters: Any, agents: int) -> list[str]:
+def ask_check(
+    where: str,
+    base_directory: Path,
+    *,
+    parameters: Any,
+    agents: int,
+    names: tuple[str, ...] = (),
+) -> list[str]:
     """
     Return the faults that a simulation's `check` finds.
 
@@ -29,13 +37,17 @@ def ask_check(where: str, base_directory: Path, *, parameters: Any, agents: int)
         base_directory: Folder of the scenario.
         parameters: An instance of the simulation's parameters.
         agents: How many there are.
+        names: Their names, for a `check` whose fourth parameter is called names.
 
     Raises:
         PluginError: It cannot be found, raised, or did not return a list of texts.
         MissingExtraError: It needs an optional dependency that is not installed.
     """
     function = load_function(where, base_directory)
-    found = call_plugin("check", function, parameters, agents, base_directory, finish=_unfolded)
+    arguments = [parameters, agents, base_directory]
+    if _takes_names(function):
+        arguments.append(names)
+    found = call_plugin("check", function, *arguments, finish=_unfolded)
     if not isinstance(found, list) or not all(isinstance(text, str) for text in found):
         raise PluginError(
             f"{place_of(function)}: check() must return a list of texts, empty if nothing is wrong;"
@@ -67,6 +79,13 @@ def ask_demand(
     if fault:
         raise PluginError(f"{place_of(function)}: demand() {fault}")
     return demand  # type: ignore[no-any-return]
+
+
+def _takes_names(function: Callable[..., Any]) -> bool:
+    try:
+        return "names" in list(inspect.signature(function).parameters)[3:4]
+    except (TypeError, ValueError):  # a function written in C tells no signature
+        return False
 
 
 def _unfolded(found: Any) -> Any:

@@ -101,6 +101,15 @@ def test_question_that_raises_is_told_with_its_line(plugin, question, body, said
     assert refusal(path, question) == f"{path}:{LAST_LINE + 2}: {question}(): {said}"
 
 
+def test_check_with_a_fourth_parameter_names_is_given_the_agents_names(plugin):
+    path = plugin("def check(p, n, base, names): return [*names, str(n)]")
+    where = f"{path}:check"
+
+    found = ask_check(where, path.parent, parameters=None, agents=2, names=("a", "b"))
+
+    assert found == ["a", "b", "2"]
+
+
 def test_check_that_raises_while_it_yields_is_told_with_its_line(plugin):
     path = plugin("def check(*_):\n    yield 'a: b'\n    raise ValueError('late')\n")
 

@@ -10,17 +10,31 @@ import importlib.util
 from pathlib import Path
 
 from madns_runtime.errors import ConfigurationError
+from madns_runtime.simulations.constellation.check_board import board_faults
+from madns_runtime.simulations.constellation.check_code import code_faults
 from madns_runtime.simulations.constellation.parameters import (
     KNOTS_MAX,
     ConstellationParameters,
+    CustomPropagator,
     ElementSetSatellites,
-    ScipyPropagator,
+    Sgp4Propagator,
 )
 from madns_runtime.simulations.constellation.truth.choice import choose
 
+LIBRARIES = {
+    "scipy": ("scipy", "host"),
+    "sgp4": ("sgp4", "host"),
+    "numba": ("numba", "fast"),
+    "basilisk": ("Basilisk", "basilisk"),
+}
+"""By the kind of propagator: the module that it needs, and the extra that brings it."""
+
 
 def find_faults(
-    parameters: ConstellationParameters, agents: int, base_directory: Path
+    parameters: ConstellationParameters,
+    agents: int,
+    base_directory: Path,
+    names: tuple[str, ...] = (),
 ) -> list[str]:
     """
     Return every fault as a line that starts with the dotted parameter name and a colon.
@@ -29,21 +43,29 @@ def find_faults(
         parameters: Of the scenario, within their bounds.
         agents: Number of agents, each of which needs a satellite.
         base_directory: Folder of the scenario.
+        names: The agents' names; globs are not judged without them.
     """
     faults: list[str] = []
+    folder = Path(base_directory)
+    pairs: list[tuple[str, str]] = []
     try:
-        choose(parameters, agents, Path(base_directory))
+        satellites = choose(parameters, agents, folder).names
+        pairs = list(zip(names, satellites, strict=False))
     except ConfigurationError as error:
         faults += str(error).splitlines()
-    faults += _propagator_faults(parameters)
+    faults += _propagator_faults(parameters, folder)
     faults += _segment_faults(parameters)
     faults += _missing_libraries(parameters)
+    faults += board_faults(parameters, pairs, folder)
     return faults
 
 
-def _propagator_faults(parameters: ConstellationParameters) -> list[str]:
+def _propagator_faults(parameters: ConstellationParameters, base_directory: Path) -> list[str]:
     propagator = parameters.propagator
-    if isinstance(propagator, ScipyPropagator):
+    if isinstance(propagator, CustomPropagator):
+        field = "parameters.propagator.implementation"
+        return code_faults(field, propagator.implementation, base_directory)
+    if not isinstance(propagator, Sgp4Propagator):
         faults = []
         if "two_body" not in propagator.forces:
             faults.append("parameters.propagator.forces: expected two_body among them")
@@ -75,8 +97,10 @@ def _missing_libraries(parameters: ConstellationParameters) -> list[str]:
     wanted = {parameters.propagator.kind: "parameters.propagator.kind"}
     if isinstance(parameters.satellites, ElementSetSatellites):
         wanted["sgp4"] = "parameters.satellites.elements"
-    return [
-        f"{field}: {library} is not installed here; install it with: pip install 'cosmos-madns[host]'"
-        for library, field in wanted.items()
-        if importlib.util.find_spec(library) is None
-    ]
+    faults = []
+    for kind, field in wanted.items():
+        module, extra = LIBRARIES.get(kind, (None, None))
+        if module is not None and importlib.util.find_spec(module) is None:
+            install = f"pip install 'cosmos-madns[{extra}]'"
+            faults.append(f"{field}: {module} is not installed here; install it with: {install}")
+    return faults

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import os
 import select
-import shutil
 import subprocess
 from collections import deque
 from collections.abc import Sequence
@@ -20,6 +19,7 @@ from time import monotonic
 from madns_runtime.errors import BlamedError
 from madns_runtime.reactor import libc
 from madns_runtime.reactor.scheduling import die_with_parent
+from madns_runtime.simulations.constellation.flight.programs import find_program
 
 LINE_BYTES_MAX = 262_144
 """Of one line; a longer one is no answer."""
@@ -28,21 +28,6 @@ WAITING_BYTES_MAX = 1_048_576
 READ_BYTES = 65_536
 END_S = 1.0
 """For a program to end by itself after its input has; and again after it was asked to by a signal."""
-
-
-def find_program(command: Sequence[str], base_directory: Path) -> list[str] | None:
-    """
-    Return a command with its program's path, or None if there is no such program.
-
-    Args:
-        command: Program and arguments; the program from the scenario's folder, else from PATH.
-        base_directory: Folder of the scenario.
-    """
-    own = base_directory / command[0]
-    if own.is_file() and os.access(own, os.X_OK):
-        return [str(own.resolve()), *command[1:]]
-    found = shutil.which(command[0]) if "/" not in command[0] else None
-    return [found, *command[1:]] if found else None
 
 
 class LineProcess:

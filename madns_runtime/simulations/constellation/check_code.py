@@ -1,0 +1,60 @@
+"""
+Finds out, without running any of it, whether code that a scenario names is there.
+
+For `cosmos validate`: a file is parsed, not imported. What it does when it is imported shows on the agent.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+from collections.abc import Iterator
+from pathlib import Path
+
+from madns_runtime.plugin.registry import is_file
+
+
+def code_faults(field: str, spec: str, base_directory: Path) -> list[str]:
+    """
+    Return what is wrong with a class that a scenario names.
+
+    Args:
+        field: Dotted name of the parameter.
+        spec: file.py:Class beside the scenario, or module:Class.
+        base_directory: Folder of the scenario.
+    """
+    place, _, name = spec.rpartition(":")
+    if not place or not name.isidentifier():
+        return [f"{field}: expected file.py:Class or module:Class, got {spec!r}"]
+    if not is_file(spec):
+        top = place.partition(".")[0]
+        if not top.isidentifier() or importlib.util.find_spec(top) is None:
+            return [f"{field}: no module {top!r} here; a file is written {place}.py:{name}"]
+        return []
+    path = base_directory / place
+    if not path.is_file():
+        return [f"{field}: no such file: {path}"]
+    try:
+        tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
+    except SyntaxError as error:
+        return [f"{field}: {path}:{error.lineno}: {error.msg}"]
+    except (OSError, ValueError) as error:
+        return [f"{field}: {path} cannot be read: {error}"]
+    names = set(_names(tree))
+    if name in names or "*" in names:
+        return []
+    classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
+    told = f"; it has {', '.join(classes)}" if classes else ""
+    return [f"{field}: {path} has no class {name!r}{told}"]
+
+
+def _names(tree: ast.Module) -> Iterator[str]:
+    """Yield what a module's own lines bind, wherever below an if or a try they stand."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            yield node.name
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            for alias in node.names:
+                yield (alias.asname or alias.name).partition(".")[0]
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.id

@@ -1,0 +1,176 @@
+"""What `cosmos validate` finds in vehicles, flight software, sensors and the ground, before anything runs."""
+
+import importlib.util
+import re
+import sys
+
+import pytest
+from constellation_fakes import SCENARIOS, WALKER, parameters
+
+from madns_runtime.simulations.constellation.check import find_faults
+
+AGENTS = ("agent-01", "agent-02")
+GUIDANCE = """
+import math
+class Guidance:
+    def step(self, t_s, readings): pass
+class Other: pass
+Alias = Guidance
+raise SystemExit("validating runs nothing")
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "guidance.py").write_text(GUIDANCE)
+    (tmp_path / "broken.py").write_text("x = 1\nclass G(:\n")
+    (tmp_path / "program").write_text("#!/bin/sh\n")
+    (tmp_path / "run.sh").write_text("#!/bin/sh\n")
+    (tmp_path / "run.sh").chmod(0o755)
+    return tmp_path
+
+
+def faults(folder, **rest):
+    satellites = rest.pop("satellites", WALKER)
+    return find_faults(parameters(satellites, **rest), 2, folder, AGENTS)
+
+
+@pytest.mark.parametrize(
+    "rest",
+    [
+        {"flight": "guidance.py:Guidance"},
+        {"flight": "./guidance.py:Alias"},
+        {"flight": {"software": "json:JSONDecoder", "agents": ["agent-02", "P1S*", "*"]}},
+        {"flight": {"command": ["run.sh"]}},
+        {"flight": {"command": ["./run.sh", "x"]}},
+        {"flight": {"command": [sys.executable]}},
+        {"flight": {"command": ["sh"]}},
+        {"flight": {"command": ["/opt/on/the/board/alone"]}},
+        {"propagator": {"kind": "custom", "implementation": "guidance.py:Guidance"}},
+        {"stations": [{"name": "A", "latitude_deg": 0, "longitude_deg": 0}]},
+        {
+            "stations": [{"name": "A", "latitude_deg": 0, "longitude_deg": 0}],
+            "uplinks": [{"at_s": 0, "to": "agent-02", "text": "x"}],
+        },
+        {"vehicles": [{"sensors": {"gnss": {}, "clock": {}, "sun_sensor": {}}}]},
+        {
+            "vehicles": [
+                {
+                    "sensors": {"gyro": {}, "star_tracker": {}},
+                    "attitude": {"inertia_kg_m2": [1, 1, 2]},
+                }
+            ]
+        },
+        {"vehicles": [{"ballistic_m2_kg_range": [0.01, 0.02]}]},
+    ],
+    ids=str,
+)
+def test_what_fits_together_has_no_faults(folder, rest):
+    assert faults(folder, **rest) == []
+
+
+@pytest.mark.parametrize(
+    ("rest", "fault"),
+    [
+        ({"flight": "guidance.py"}, "flight: expected file.py:Class or module:Class"),
+        ({"flight": "missing.py:G"}, "flight: no such file: .*missing.py"),
+        (
+            {"flight": "guidance.py:guidance"},
+            "flight: .*guidance.py has no class 'guidance'; it has Guidance, Other",
+        ),
+        ({"flight": {"software": "broken.py:G"}}, "flight.software: .*broken.py:2: "),
+        ({"flight": {"software": "no_such_module:G"}}, r"flight.software: no module .*\.py:G"),
+        (
+            {"flight": {"software": "guidance.py:Guidance", "agents": ["agent-03"]}},
+            "flight.agents: 'agent-03' fits no agent and no satellite, such as agent-01",
+        ),
+        ({"flight": {"command": ["program"]}}, "flight.command: .*program is not executable"),
+        ({"flight": {"command": ["bin/no"]}}, "flight.command: no program 'bin/no' in"),
+        ({"flight": {"command": ["no-such-prg"]}}, "flight.command: no program .* or on PATH"),
+        (
+            {"propagator": {"kind": "custom", "implementation": "missing.py:P"}},
+            "propagator.implementation: no such file",
+        ),
+        (
+            {"propagator": {"kind": "numba", "forces": ["j2"]}},
+            "propagator.forces: expected two_body among them",
+        ),
+        ({"vehicles": [{}, {"agents": ["X*"]}]}, r"vehicles\[1\].agents: 'X\*' fits no agent"),
+        (
+            {"vehicles": [{"sensors": {"gyro": {}}}]},
+            r"vehicles\[0\].sensors.gyro: needs a vehicle with attitude",
+        ),
+        (
+            {"vehicles": [{"sensors": {"star_tracker": {}}}]},
+            r"vehicles\[0\].sensors.star_tracker: needs a vehicle with attitude",
+        ),
+        (
+            {"vehicles": [{"sensors": {"clock": {"rate_hz": 100, "latency_s": 1000}}}]},
+            r"vehicles\[0\].sensors.clock.latency_s: expected at most 10000 measurements",
+        ),
+        (
+            {"vehicles": [{"mass_kg": 5, "thruster": {"isp_s": 220, "propellant_kg": 5}}]},
+            r"vehicles\[0\].thruster.propellant_kg: expected less than",
+        ),
+        (
+            {"vehicles": [{"ballistic_m2_kg_range": [0.02, 0.03]}]},
+            r"vehicles\[0\].ballistic_m2_kg_range: expected smallest and largest",
+        ),
+        (
+            {"vehicles": [{"attitude": {"inertia_kg_m2": [1, 1, 2.1]}}]},
+            r"vehicles\[0\].attitude.inertia_kg_m2: no body",
+        ),
+        (
+            {"stations": [{"name": "A", "latitude_deg": 0, "longitude_deg": 0}] * 2},
+            r"stations\[1\].name: expected every name once, got 'A' again",
+        ),
+        (
+            {"uplinks": [{"at_s": 0, "to": "agent-01", "text": "x"}]},
+            "uplinks: need parameters.stations",
+        ),
+        (
+            {
+                "stations": [{"name": "A", "latitude_deg": 0, "longitude_deg": 0}],
+                "uplinks": [{"at_s": 0, "to": "agent-1", "text": "x"}],
+            },
+            r"uplinks\[0\].to: no agent and no satellite is called 'agent-1'",
+        ),
+    ],
+)
+def test_faults_of_the_board_are_named_by_parameter(folder, rest, fault):
+    found = faults(folder, **rest)
+
+    assert len(found) == 1
+    assert re.match(f"parameters.{fault}", found[0]), found[0]
+
+
+@pytest.mark.parametrize(
+    ("rest", "module", "extra"),
+    [
+        ({"propagator": {"kind": "numba"}}, "numba", "fast"),
+        ({"propagator": {"kind": "basilisk"}}, "Basilisk", "basilisk"),
+        ({"vehicles": [{"sensors": {"magnetometer": {"field": "igrf"}}}]}, "ppigrf", "igrf"),
+    ],
+)
+def test_a_missing_extra_is_named_with_the_command_that_installs_it(
+    folder, monkeypatch, rest, module, extra
+):
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == module else find_spec(name)
+    )
+
+    (found,) = faults(folder, **rest)
+
+    assert f"{module} is not installed here" in found
+    assert f"pip install 'cosmos-madns[{extra}]'" in found
+
+
+def test_without_names_globs_are_not_judged(folder):
+    params = parameters(vehicles=[{"agents": ["X*"]}])
+
+    assert find_faults(params, 2, folder) == []
+
+
+def test_the_shipped_example_in_c_has_no_faults():
+    assert find_faults(parameters(flight={"command": ["flight/hold.sh"]}), 2, SCENARIOS) == []
