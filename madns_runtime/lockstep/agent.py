@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -62,7 +62,7 @@ class LockstepAgent:
         self.is_running = False
         self.deadlines_broken = 0
         self._allowance = Allowance()
-        self._context = RunContext(
+        self.context = RunContext(
             name=self.name,
             config=mates.config,
             parameters=mates.parameters,
@@ -71,11 +71,6 @@ class LockstepAgent:
             send=self.send,
             is_lockstep=True,
         )
-
-    def set_up(self, initial: Mapping[str, Any]) -> None:
-        """Let the plug-in prepare itself."""
-        self.recorder.event("start")
-        self.simulation.setup(self._context, initial)
 
     def send(
         self,

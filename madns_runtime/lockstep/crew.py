@@ -94,6 +94,11 @@ class Crew:
         return all(worker.answer is not None or worker.has_ended for worker in self.workers)
 
     @property
+    def have_all_ended(self) -> bool:
+        """Whether no worker is left."""
+        return all(worker.has_ended for worker in self.workers)
+
+    @property
     def awaited(self) -> WorkerProcess | None:
         """The first of those whose answer has not come."""
         return next((w for w in self.workers if w.answer is None and not w.has_ended), None)

@@ -6,7 +6,6 @@ No thread, and no byte that depends on the wall clock: a run recorded twice is r
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -48,14 +47,18 @@ class LockstepRecorder(Recorder):
         self.open_stream(EVENTS)
         self.open_stream(LOG)
 
+    @property
+    def t_s(self) -> float:
+        """The simulated time, as events carry it, s."""
+        return round(self._clock.t_s, T_S_DIGITS)
+
     def start(self) -> None:
         """Do nothing: there is no thread."""
 
     def event(self, event: str, **values: Any) -> None:
         """Record that something happened; nothing once the records are closed."""
         if not self._is_closed:
-            t_s = round(self._clock.t_s, T_S_DIGITS)
-            fields = {"t_s": t_s, "utc": self._clock.utc(), "event": event, **values}
+            fields = {"t_s": self.t_s, "utc": self._clock.utc(), "event": event, **values}
             self.record(EVENTS.name, fields)
 
     def flush(self) -> None:
@@ -83,8 +86,3 @@ class LockstepRecorder(Recorder):
 
     def _utc(self) -> str:
         return self._clock.utc()
-
-
-def t_s_or_none(clock: SimulatedClock) -> float | None:
-    """Return the simulated time as a logged sentence carries it, s."""
-    return round(clock.t_s, T_S_DIGITS) if math.isfinite(clock.t_s) else None

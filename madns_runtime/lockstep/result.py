@@ -1,4 +1,4 @@
-"""The result of a lockstep run, in the shape of every run's. Pure."""
+"""The account of a lockstep run, and its result in the shape of every run's. Pure."""
 
 from __future__ import annotations
 
@@ -7,6 +7,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from madns_runtime.lockstep.post import SERVICES
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ending:
+    """Why a run ends before its time."""
+
+    who: str
+    reason: str
+    status: str = "failed"
 
 
 @dataclass(slots=True)
@@ -23,6 +32,11 @@ class AgentAccount:
     summary: Mapping[str, Any] = field(default_factory=dict)
     records: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def is_open(self) -> bool:
+        """Whether there is no word that its records are closed."""
+        return self.state != "stopped"
+
     def to_mapping(self, ticks: int, reason: str | None) -> dict[str, Any]:
         """
         Return the agent's part of the result.
@@ -38,12 +52,13 @@ class AgentAccount:
             "ticks": {"due": ticks, "run": ticks, "missed": 0, "not_run": 0, "overrun_errors": 0},
             "rtf": None,
             "clock": None,
-            "messages": self._messages(),
+            "messages": self.messages(),
             "records": dict(self.records),
             "simulation": dict(self.summary),
         }
 
-    def _messages(self) -> dict[str, Any]:
+    def messages(self) -> dict[str, Any]:
+        """Return both directions' counts together; what is sent has arrived."""
         messages: dict[str, Any] = {}
         for number, service in enumerate(SERVICES):
             count = self.up[number] + self.down[number]
@@ -53,12 +68,88 @@ class AgentAccount:
         return messages
 
 
-def totals(accounts: Mapping[str, AgentAccount]) -> dict[str, dict[str, int]]:
-    """Return the messages of all agents together, by class of service."""
-    added: dict[str, dict[str, int]] = {service: {} for service in SERVICES}
-    for account in accounts.values():
-        messages = account.to_mapping(0, None)["messages"]
-        for service in SERVICES:
-            for name, count in messages[service].items():
-                added[service][name] = added[service].get(name, 0) + count
-    return added
+@dataclass(slots=True, kw_only=True)
+class RunAccount:
+    """What a run has come to."""
+
+    names: tuple[str, ...]
+    duration_s: float
+    agents: list[AgentAccount] = field(init=False)
+    workers: int = 0
+    ticks: int = 0
+    """Run by every agent."""
+    lost: dict[str, str] = field(default_factory=dict)
+    not_stopped: tuple[str, ...] = ()
+    ending: Ending | None = None
+    t0_utc: str | None = None
+    began_s: float | None = None
+    """When simulated time began, on a monotonic clock."""
+    wall_s: float | None = None
+    """What all of the simulated time took."""
+    simulation: Mapping[str, Any] = field(default_factory=dict)
+    records: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Open an account for every agent."""
+        self.agents = [AgentAccount() for _ in self.names]
+
+    def set_states(self, state: str) -> None:
+        """Note how far all agents are."""
+        for agent in self.agents:
+            agent.state = state
+
+    def progress(self, t_s: float, now_s: float) -> dict[str, Any]:
+        """Return the progress event at simulated time *t_s* and *now_s* of the monotonic clock."""
+        speed = None
+        if self.began_s is not None and now_s > self.began_s:
+            speed = max(t_s, 0.0) / (now_s - self.began_s)
+        counts = {
+            state: sum(agent.state == state for agent in self.agents)
+            for state in ("ready", "running", "complete")
+        }
+        return {
+            "event": "progress",
+            "is_lockstep": True,
+            "t_s": None if self.began_s is None else round(t_s, 3),
+            "rtf": None if speed is None else round(speed, 3),
+            **counts,
+            "lost": len(self.lost),
+            "ticks": self.ticks * len(self.names),
+        }
+
+    def result(self) -> dict[str, Any]:
+        """Return the result as the operator's side expects it."""
+        ending, wall_s = self.ending, self.wall_s if self.ending is None else None
+        by_name = dict(zip(self.names, self.agents, strict=True))
+        return {
+            "status": "complete" if ending is None else ending.status,
+            "who": ending.who if ending else None,
+            "reason": ending.reason if ending else None,
+            "t0_utc": self.t0_utc,
+            "duration_s": self.duration_s,
+            "completed_s": self.duration_s if ending is None else None,
+            "wall_s": None if wall_s is None else round(wall_s, 6),
+            "rtf": round(self.duration_s / wall_s, 3) if wall_s else None,
+            "workers": self.workers,
+            "agents": {
+                name: agent.to_mapping(self.ticks, self.lost.get(name))
+                for name, agent in by_name.items()
+            },
+            "lost": sorted(self.lost),
+            "not_stopped": list(self.not_stopped),
+            "network": {},
+            "messages": self._totals(),
+            "refused": {},
+            "records": dict(self.records),
+            "simulation": dict(self.simulation),
+            "scheduling": {},
+        }
+
+    def _totals(self) -> dict[str, dict[str, int]]:
+        added: dict[str, dict[str, int]] = {service: {} for service in SERVICES}
+        for agent in self.agents:
+            messages = agent.messages()
+            for service in SERVICES:
+                for name, count in messages[service].items():
+                    added[service][name] = added[service].get(name, 0) + count
+        return added

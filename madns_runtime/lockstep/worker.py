@@ -192,18 +192,19 @@ class Worker:
             )
         except MadnsError as error:
             raise AgentFailed(first, str(error)) from error
-        return encode_frame(frames.READY)
-
-    def _set_up(self, initial: list[tuple[int, bytes]]) -> bytes:
-        for index, packed in initial:
-            self._position[0] = index * POSITIONS + frames.SETTING_UP
+        for index in self._assignment.agents:
             try:
-                agent = LockstepAgent(index, self._mates)
+                self._agents.append(LockstepAgent(index, self._mates))
             except (Exception, SystemExit) as error:  # noqa: BLE001 - a plug-in may raise anything
                 kind = getattr(self._mates.simulation, "__name__", "the agent's half")
                 raise AgentFailed(index, _told(error, f"{kind}.__init__")) from error
-            self._agents.append(agent)
-            self._guard(agent, "setup", agent.set_up, unpack(packed))
+        return encode_frame(frames.READY)
+
+    def _set_up(self, initial: list[tuple[int, bytes]]) -> bytes:
+        for agent, (index, packed) in zip(self._agents, initial, strict=True):
+            self._position[0] = index * POSITIONS + frames.SETTING_UP
+            agent.recorder.event("start")
+            self._guard(agent, "setup", agent.simulation.setup, agent.context, unpack(packed))
         freeze_garbage()  # what set-up made stays: no collection walks it in mid-run
         return self._done()
 
@@ -273,7 +274,7 @@ class Worker:
     def _failure(self, agent: LockstepAgent, name: str, error: BaseException) -> AgentFailed:
         if not isinstance(error, MachineError):
             text = "".join(traceback.format_exception(error))
-            agent.recorder.log("critical", text, self._clock.t_s)
+            agent.recorder.log("critical", text, agent.recorder.t_s)
         return AgentFailed(agent.index, _told(error, f"{type(agent.simulation).__name__}.{name}"))
 
     def _flush(self) -> None:
@@ -289,10 +290,13 @@ class Worker:
             self._position[0] = agent.index * POSITIONS + frames.CLOSING
             if reason is not None:
                 agent.recorder.event("emergency", reason=reason)
-                agent.recorder.log("critical", f"emergency shutdown: {reason}", self._clock.t_s)
+                text = f"emergency shutdown: {reason}"
+                agent.recorder.log("critical", text, agent.recorder.t_s)
             counts = agent.recorder.close().to_mapping()
             if is_told:
                 self._line.sendall(encode_frame(frames.CLOSED, agent.index, counts))
+        for index in self._assignment.agents[len(self._agents) :] if is_told else ():
+            self._line.sendall(encode_frame(frames.CLOSED, index, {}))  # it never opened any
 
 
 def _told(error: BaseException, doing: str) -> str:

@@ -1,0 +1,179 @@
+"""What goes wrong in lockstep is named: who, in which call, why; and nothing of the run lives on."""
+
+import os
+import signal
+import time
+
+import pytest
+
+from madns_runtime.config import Timeouts
+from madns_runtime.processes import list_processes
+
+pytestmark = pytest.mark.process
+
+IMPATIENT = Timeouts(tick_s=0.6, agent_setup_s=0.6, host_setup_s=0.6, shutdown_s=5.0)
+
+
+def is_alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def workers_of(run):
+    """Return the process numbers of a living host's children."""
+    pid = run.process.pid
+    with open(f"/proc/{pid}/task/{pid}/children", encoding="ascii") as file:
+        return [int(number) for number in file.read().split()]
+
+
+def wait_until(is_so, what):
+    until_s = time.monotonic() + 30.0
+    while not is_so():
+        assert time.monotonic() < until_s, what
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize(
+    ("fault", "who", "expected"),
+    [
+        (
+            "setup_raise",
+            "agent-04",
+            "Agent.setup raised ValueError: told to (lockstep_simulation.py",
+        ),
+        ("step_raise", "agent-04", "Agent.step raised ValueError: told to (lockstep_simulation.py"),
+        ("receive_raise", "agent-04", "Agent.receive raised ValueError: told to"),
+        ("finish_raise", "agent-04", "Agent.finish raised ValueError: told to"),
+        (
+            "hostsetup_raise",
+            "host",
+            "Host.setup raised ValueError: told to (lockstep_simulation.py",
+        ),
+        ("hostreceive_raise", "host", "Host.receive raised ValueError: told to"),
+        ("timer_raise", "host", "Host.timer raised ValueError: told to"),
+        ("timer_stands", "host", "Host.timer asked 100000 times in a row for t = -0.5 s"),
+        ("job_raise", "host", "Host: job 13: square raised ValueError: no such job"),
+        (
+            "send_set",
+            "agent-04",
+            "Agent.step raised UnencodableValue: a message cannot carry a set",
+        ),
+        ("send_large", "agent-04", "Agent.step raised MessageTooLarge: a BEST message must fit"),
+        ("step_term", "agent-04", "its process was ended by SIGTERM"),
+    ],
+)
+def test_a_fault_of_a_plug_in_is_named(start_host, fault, who, expected):
+    run = start_host(fault=fault)
+    result = run.result()
+
+    assert (result["status"], run.process.returncode) == ("failed", 1)
+    # A process of two agents that is told to end blames the first of them.
+    assert result["who"] == (who if fault != "step_term" else "agent-03")
+    assert result["reason"].startswith(expected)
+    assert result["not_stopped"] == []
+    ends = [path.read_text().splitlines()[-1] for path in run.folder.rglob("*.jsonl")]
+    assert ends and all(end.startswith('{"end"') for end in ends)
+
+
+@pytest.mark.parametrize(
+    ("fault", "who", "expected"),
+    [
+        ("step_hang", "agent-04", "the agent's step has not returned within 0.6 s, at t = 0.2 s"),
+        ("setup_hang", "agent-04", "the agent's setup has not returned within 0.6 s"),
+        ("timer_hang", "host", "Host.timer has not returned within 0.6 s, at t = 0.2"),
+        ("job_hang", "host", "Host: job 13 has not ended within 0.6 s, at t = 0.2"),
+    ],
+)
+def test_who_hangs_is_named_with_the_place(start_host, fault, who, expected):
+    run = start_host(fault=fault, timeouts=IMPATIENT)
+    result = run.result()
+
+    assert (result["status"], run.process.returncode) == ("failed", 1)
+    assert result["who"] == who
+    assert result["reason"].startswith(expected)
+    if fault != "job_hang":
+        assert "host/stderr.txt shows where it hung" in result["reason"]
+        assert "in go_wrong" in (run.folder / "stderr.txt").read_text()
+
+
+@pytest.mark.parametrize(
+    ("fault", "expected"),
+    [
+        ("step_kill", "was killed by SIGKILL in the agent's step, at t = 0.2 s"),
+        ("step_exit", "ended, exit code 0 in the agent's step, at t = 0.2 s"),
+        ("setup_kill", "was killed by SIGKILL in the agent's setup"),
+    ],
+)
+def test_a_worker_that_dies_is_noticed_at_once_and_named(start_host, fault, expected):
+    run = start_host(fault=fault)
+    result = run.result()
+
+    assert (result["status"], result["who"]) == ("failed", "agent-04")
+    assert result["reason"].startswith("the process of agent-03 to agent-04 (pid ")
+    assert result["reason"].endswith(expected)
+    assert result["lost"] == ["agent-03", "agent-04"]
+    assert result["agents"]["agent-01"]["state"] == "stopped"
+    assert result["not_stopped"] == ["agent-03", "agent-04"]
+
+
+def slow_host(start_host):
+    """Return a run that stands at t = 0.2 s with all its workers, and who they are."""
+    run = start_host(fault="job_hang", timeouts=Timeouts(shutdown_s=5.0))
+    wait_until(lambda: any(e.get("state") == "SIMULATION_START" for e in run.events), "no start")
+    return run, workers_of(run)
+
+
+def test_the_operators_word_ends_it_in_good_order(start_host):
+    run, workers = slow_host(start_host)
+    run.say({"command": "stop", "reason": "interrupted by the operator", "status": "interrupted"})
+    result = run.result()
+
+    assert (result["status"], result["who"]) == ("interrupted", "operator")
+    assert result["reason"] == "interrupted by the operator"
+    assert {agent["state"] for agent in result["agents"].values()} == {"stopped"}
+    assert not any(map(is_alive, workers))
+
+
+def test_sigterm_ends_it_in_good_order(start_host):
+    run, workers = slow_host(start_host)
+    run.process.terminate()
+    result = run.result()
+
+    assert (result["status"], result["reason"]) == ("interrupted", "ended by SIGTERM")
+    assert not any(map(is_alive, workers))
+
+
+def test_it_ends_with_its_operator(start_host):
+    run, workers = slow_host(start_host)
+    run.process.stdin.close()
+    result = run.result()
+
+    assert (result["status"], result["who"]) == ("aborted", "operator")
+    assert result["reason"] == "the operator's process is gone"
+    assert not any(map(is_alive, workers))
+
+
+def test_workers_end_with_a_killed_host_and_keep_their_records(start_host):
+    run, workers = slow_host(start_host)
+    run.process.send_signal(signal.SIGKILL)
+    run.process.wait()
+
+    wait_until(lambda: not any(map(is_alive, workers)), "workers live on")
+    for path in run.folder.glob("agents/*/own.jsonl"):
+        assert path.read_text().splitlines()[-1].startswith('{"end"')
+
+
+def test_its_processes_are_registered_while_they_live(start_host, monkeypatch):
+    run, _ = slow_host(start_host)
+    monkeypatch.setenv("COSMOS_STATE_DIR", str(run.folder.parent / "state"))
+    wait_until(lambda: len(list_processes()) == 4, "not all registered")
+    roles = sorted((entry.role, entry.name) for entry in list_processes())
+    run.say({"command": "stop"})
+    run.result()
+
+    assert roles[0] == ("agent", "agent-01,agent-02")
+    assert roles[-1] == ("host", "host")
+    assert list_processes() == []
