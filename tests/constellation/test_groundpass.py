@@ -1,0 +1,94 @@
+"""The shipped scenario of ground passes, its first minutes: flight software, host and stations together."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+from constellation_fakes import Star
+
+from madns_runtime.config import from_mapping
+from madns_runtime.simulations.constellation.parameters import ConstellationParameters
+from madns_runtime.simulations.constellation.truth.medium import OUTCOMES
+
+SCENARIO = Path(__file__).parents[2] / "scenarios/groundpass.yaml"
+RISE_S = 525.525 - 480.0
+"""Of IRIDIUM 5 over svalbard: tests/authorities/passes.json, whose epoch is 480 s earlier."""
+UNTIL_S = 150.0
+
+
+class TalkingStar(Star):
+    """A star whose agents are heard by the host, a step after they spoke."""
+
+    def _deliver(self, t_s):
+        super()._deliver(t_s)
+        for name, context in self.contexts.items():
+            said, context.sent = context.sent, []
+            for _, _, message in said:
+                self.host.receive(name, message)
+
+
+@pytest.fixture(scope="module")
+def star():
+    mapping = yaml.safe_load(SCENARIO.read_text())["parameters"]
+    params = from_mapping(ConstellationParameters, mapping)
+    star = TalkingStar(params, 10, duration_s=UNTIL_S, tick_hz=1.0)
+    star.run(UNTIL_S, step_s=0.1)
+    return star
+
+
+def messages(star, agent, way):
+    names = [field.name for field in star.contexts[agent].streams["messages"]]
+    rows = [dict(zip(names, row, strict=True)) for row in star.contexts[agent].records["messages"]]
+    return [row for row in rows if row["way"] == way]
+
+
+def links(star, **wanted):
+    names = [field.name for field in star.context.streams["links"]]
+    rows = [dict(zip(names, row, strict=True)) for row in star.context.records["links"]]
+    return [row for row in rows if all(row[key] == value for key, value in wanted.items())]
+
+
+def test_pass_begins_when_skyfield_says(star):
+    ((event, agent, station, rise_s, *_),) = star.context.records["contacts"]
+
+    assert (event, agent, station) == ("rise", "agent-04", "svalbard")
+    assert rise_s == pytest.approx(RISE_S, abs=1e-3)
+
+
+def test_order_goes_up_as_the_pass_begins_and_its_answer_comes_down(star):
+    (order,) = links(star, sender="ground:svalbard")
+    (heard,) = [
+        row for row in messages(star, "agent-04", "received") if row["peer"] == "ground:svalbard"
+    ]
+    (answer,) = links(star, to="ground:svalbard", sent_s=46.0)
+
+    assert order["sent_s"] == pytest.approx(RISE_S, abs=1e-3)
+    # 7 bytes at 9600 bit/s and 2754 km.
+    assert order["arrives_s"] - order["sent_s"] == pytest.approx(7 * 8 / 9600 + 9.19e-3, abs=1e-4)
+    assert (heard["tick"], heard["arrives_s"]) == (46, order["arrives_s"])
+    assert (answer["sender"], answer["outcome"]) == ("agent-04", "delivered")
+
+
+def test_status_comes_down_within_the_pass_only(star):
+    to_ground = [
+        row for row in links(star) if row["to"].startswith("ground") and row["sent_s"] != 46.0
+    ]
+
+    assert len(to_ground) >= 20
+    for row in to_ground:
+        is_in_pass = row["sender"] == "agent-04" and row["sent_s"] > RISE_S
+        assert row["outcome"] == ("delivered" if is_in_pass else "no_contact")
+
+
+def test_beacons_reach_neighbours_and_nothing_is_unaccounted(star):
+    summary = star.host.finish()
+    vehicles = star.summaries()
+
+    for part in ("links", "ground"):
+        assert summary[part]["sent"] == sum(summary[part][name] for name in OUTCOMES)
+    handed_over = summary["links"]["handed_over"] + summary["ground"]["handed_over"]
+    heard = sum(vehicle["messages_received"] for vehicle in vehicles.values())
+    unheard = sum(vehicle["messages_unheard"] for vehicle in vehicles.values())
+    assert heard + unheard == handed_over
+    assert sum(vehicle["flight"]["vehicles_heard"] for vehicle in vehicles.values()) > 20
+    assert sum(vehicle["messages_late"] for vehicle in vehicles.values()) == 0
