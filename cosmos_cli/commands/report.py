@@ -25,7 +25,7 @@ def report(
     quiet: QuietOption = False,
 ) -> None:
     """Show what a run recorded: verdict, checks, tables; with figures in report.html of the run."""
-    from cosmos_cli.report.build import build_sections, open_source
+    from cosmos_cli.report.build import build_sections, open_source, with_control
     from cosmos_cli.report.html import write_report
     from cosmos_cli.report.terminal import print_report
 
@@ -34,7 +34,8 @@ def report(
     document = found.read_json(found.run_json)
     if document is None or document.get("status") == "running":
         raise InputError(f"{found.name} is not collected yet; do that with: cosmos collect {run}")
-    console.print_json(document)
+    if as_json:
+        console.print_json(with_control(found, document))
     if html is not None:
         try:
             console.say(f"report written to {write_report(found, document, html)}")

@@ -6,7 +6,9 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from cosmos_cli.expectation import mapping_at
+from cosmos_cli.report.control import as_document, read_control
 from cosmos_cli.report.figures import FIGURES, TEXT_STREAMS, Chapter, chapter_of
+from cosmos_cli.report.figures.slots import slot_blocks
 from cosmos_cli.report.model import Block, Heading, Remark, Section, TableBlock
 from cosmos_cli.report.source import Source
 from cosmos_cli.rundir import RunDirectory
@@ -14,6 +16,7 @@ from cosmos_cli.statistics import tick_statistics
 from cosmos_cli.tables import TableReader, open_tables
 
 SENTENCES_MAX = 60
+CONTROL = "Control"
 LEVELS_TOLD = ("critical", "error", "warning")
 OF_MACHINES = ("machine_health", "host_health", "process", "clock")
 
@@ -27,14 +30,25 @@ def open_source(run: RunDirectory, document: Mapping[str, Any]) -> Source:
         tables=tables,
         tick_hz=config.agents.tick_hz if config else None,
         ticks=tick_statistics(tables.get("ticks")),
+        control=read_control(tables, config),
     )
+
+
+def with_control(run: RunDirectory, document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return run.json, for a constellation under control with its slots over time."""
+    config = run.read_config()
+    control = as_document(read_control(open_tables(run.tables), config), config)
+    return {**document, **({} if control is None else {"control": control})}
 
 
 def build_sections(source: Source) -> list[Section]:
     """Return the report's sections: known streams in the order of `FIGURES`, then others, then words."""
     sections: dict[str, list[Block]] = {}
+    slots = slot_blocks(source.control)
     for table, chapter in _chapters(source.tables):
-        sections.setdefault(chapter.title, []).extend(_build(table, chapter, source))
+        # What flight software believes, and what it commanded, comes after what became of its slots.
+        first = slots if chapter.title == CONTROL else []
+        sections.setdefault(chapter.title, [*first]).extend(_build(table, chapter, source))
     built = [Section(title=title, blocks=blocks) for title, blocks in sections.items() if blocks]
     return [*built, *_words(source)]
 

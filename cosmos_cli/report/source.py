@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from cosmos_cli.expectation import mapping_at
+from cosmos_cli.report.control import ControlRow
 from cosmos_cli.report.sampling import Floats
 from cosmos_cli.report.style import as_array
 from cosmos_cli.statistics import TickStatistics
@@ -24,6 +25,8 @@ class Source:
     tables: Mapping[str, TableReader]
     tick_hz: float | None
     ticks: TickStatistics
+    control: tuple[ControlRow, ...] = ()
+    """A constellation's slots over time; empty for a run without."""
 
     def agent_summary(self, name: str) -> Mapping[str, Any]:
         """Return what the agent's half of the simulation summed up; empty for one that died."""
