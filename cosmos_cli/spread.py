@@ -7,25 +7,32 @@ import numpy as np
 from cosmos_cli.report.sampling import Floats
 
 BINS = 24
-"""Stretches of time in which differences are told."""
+"""Stretches of time, unless it is said otherwise."""
 Stretch = tuple[float, float, float]
 """Its end, s; rms and largest value in it."""
 
 
 class Spread:
-    """Root mean square and largest value of something over time, in stretches of it."""
+    """
+    Root mean square and largest value of something over time, in stretches of it.
 
-    def __init__(self, duration_s: float) -> None:
-        self._edges_s = np.linspace(0.0, max(duration_s, 1e-9), BINS + 1)
-        self._counts = np.zeros(BINS, dtype=np.int64)
-        self._squares = np.zeros(BINS)
-        self._largest = np.zeros(BINS)
+    Args:
+        duration_s: Where the last one ends, s.
+        bins: How many there are.
+    """
+
+    def __init__(self, duration_s: float, bins: int = BINS) -> None:
+        self._bins = bins
+        self._edges_s = np.linspace(0.0, max(duration_s, 1e-9), bins + 1)
+        self._counts = np.zeros(bins, dtype=np.int64)
+        self._squares = np.zeros(bins)
+        self._largest = np.zeros(bins)
 
     def add(self, t_s: Floats, values: Floats) -> None:
         """Take values, shape (N,), at times, s."""
-        bins = np.clip(np.searchsorted(self._edges_s, t_s, "right") - 1, 0, BINS - 1)
-        self._counts += np.bincount(bins, minlength=BINS)
-        self._squares += np.bincount(bins, weights=values * values, minlength=BINS)
+        bins = np.clip(np.searchsorted(self._edges_s, t_s, "right") - 1, 0, self._bins - 1)
+        self._counts += np.bincount(bins, minlength=self._bins)
+        self._squares += np.bincount(bins, weights=values * values, minlength=self._bins)
         np.maximum.at(self._largest, bins, np.abs(values))
 
     def rows(self) -> list[Stretch]:

@@ -26,6 +26,10 @@ class Place:
     key: float
     who: str = ""
 
+    def within(self, source: str) -> Place:
+        """Return the same place among the records of several sources."""
+        return Place(self.key, f"{source} {self.who}".strip())
+
 
 class FieldDifference:
     """
@@ -77,10 +81,10 @@ class FieldDifference:
         self.compared += other.compared
         self._squares += other._squares
         if other.first is not None and (self.first is None or other.first.key < self.first.key):
-            self.first = Place(other.first.key, other.first.who or who)
+            self.first = other.first.within(who)
         if other.at is not None and (self.at is None or other.max > self.max):
             self.max, self.values = other.max, other.values
-            self.at = Place(other.at.key, other.at.who or who)
+            self.at = other.at.within(who)
 
     def _add_numbers(self, a: Rows, left: NDArray[np.float64], right: NDArray[np.float64]) -> None:
         is_one_null = np.isnan(left) != np.isnan(right)

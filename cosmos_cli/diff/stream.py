@@ -69,7 +69,7 @@ class Alone:
         for place, name in ((other.first, "first"), (other.last, "last")):
             if place is None:
                 continue
-            named = Place(place.key, place.who or who)
+            named = place.within(who)
             if name == "first" and (self.first is None or named.key < self.first.key):
                 self.first = named
             if name == "last" and (self.last is None or named.key > self.last.key):
@@ -112,11 +112,13 @@ class StreamDifference:
         self.rows_b += other.rows_b
         self.matched += other.matched
         self.is_identical = self.is_identical and other.is_identical
-        self.only_a.merge(other.only_a, other.source)
-        self.only_b.merge(other.only_b, other.source)
+        # A record of the host names its agent itself.
+        who = "" if other.source == "host" else other.source
+        self.only_a.merge(other.only_a, who)
+        self.only_b.merge(other.only_b, who)
         for name, found in other.fields.items():
             mine = self.fields.setdefault(name, FieldDifference(found.field))
-            mine.merge(found, other.source)
+            mine.merge(found, who)
         self.fields_only_a = _union(self.fields_only_a, other.fields_only_a)
         self.fields_only_b = _union(self.fields_only_b, other.fields_only_b)
         self.remarks = _union(self.remarks, other.remarks)

@@ -102,7 +102,7 @@ class Guidance(FlightSoftware):
     def setup(self, context: FlightContext) -> None:
         """Read the settings; this satellite's slot is its place among the agents."""
         self.context = context
-        unknown = sorted(set(context.settings) - set(DEFAULTS) - {"gravity"})
+        unknown = sorted(set(context.settings) - set(DEFAULTS) - {"gravity", "slots"})
         if unknown:
             raise ValueError(f"flight.settings: unknown {', '.join(unknown)}")
         given = {name: float(value) for name, value in context.settings.items() if name in DEFAULTS}
@@ -137,7 +137,7 @@ class Guidance(FlightSoftware):
             self.next_estimate_s += self.settings["estimate_s"]
             error_deg = math.degrees(self.navigation.error_rad)
             excess_m = self.navigation.excess_m
-            self.context.estimate({"slot_error_deg": error_deg, "a_excess_m": excess_m})
+            self.context.estimate({"slot_error_deg": error_deg, "sma_excess_m": excess_m})
         if t_s >= self.next_command_s:
             self.next_command_s += self.settings["period_s"]
             self._command(t_s)

@@ -13,7 +13,14 @@ from dataclasses import dataclass
 from cosmos_cli.report.figures.constellation import elements_blocks, invariants_blocks, state_blocks
 from cosmos_cli.report.figures.generic import generic_blocks
 from cosmos_cli.report.figures.health import health_blocks, process_blocks
+from cosmos_cli.report.figures.links import link_blocks, message_blocks
+from cosmos_cli.report.figures.maneuvers import (
+    command_blocks,
+    estimate_blocks,
+    maneuver_blocks,
+)
 from cosmos_cli.report.figures.round_trips import round_trip_blocks
+from cosmos_cli.report.figures.sensors import sensor_blocks
 from cosmos_cli.report.figures.timing import clock_blocks, tick_blocks
 from cosmos_cli.report.model import Block
 from cosmos_cli.report.source import Source
@@ -35,6 +42,23 @@ FIGURES: dict[str, Chapter] = {
     "round_trips": Chapter("Round trips", round_trip_blocks),
     "state": Chapter("Orbits", state_blocks),
     "elements": Chapter("Orbits", elements_blocks),
+    "estimates": Chapter("Control", estimate_blocks),
+    "host_maneuvers": Chapter("Control", maneuver_blocks),
+    "commands": Chapter("Control", command_blocks),
+    "command_results": Chapter("Control", command_blocks),
+    "host_links": Chapter("Links", link_blocks),
+    "messages": Chapter("Links", message_blocks),
+    **{
+        name: Chapter("Sensors", sensor_blocks)
+        for name in (
+            "gnss",
+            "gyro",
+            "accelerometer",
+            "magnetometer",
+            "star_tracker",
+            "sun_sensor",
+        )
+    },
     "host_invariants": Chapter("Health of the model", invariants_blocks),
     "machine_health": Chapter("State of health", health_blocks),
     "host_health": Chapter("State of health of the host", health_blocks),

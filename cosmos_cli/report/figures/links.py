@@ -1,0 +1,113 @@
+"""Figures of radio: what became of messages, over time and by sender."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from cosmos_cli.report.figures.generic import generic_blocks
+from cosmos_cli.report.model import Block, Choice, Figure, Remark, TableBlock, headings
+from cosmos_cli.report.source import Source
+from cosmos_cli.report.style import MUTED, PALETTE, as_array, layout
+from cosmos_cli.tables import TableReader
+
+FIELDS = ("sent_s", "sender", "outcome", "arrives_s", "distance_m")
+DELIVERED = "delivered"
+BINS = 60
+ROWS_READ_MAX = 65_536
+SENDERS_SHOWN_MAX = 100
+
+
+class _Counts:
+    """Messages by outcome, over time and by sender; delays and distances of those that arrived."""
+
+    def __init__(self, duration_s: float) -> None:
+        self.edges_s = np.linspace(0.0, max(duration_s, 1e-9), BINS + 1)
+        self.over_time: dict[str, np.ndarray] = {}
+        self.by_sender: dict[str, Counter[str]] = {}
+        self.delay_s_max = 0.0
+        self.distance_m_max = 0.0
+
+    def add(self, columns: dict[str, np.ndarray]) -> None:
+        sent_s, outcomes = as_array(columns["sent_s"]), columns["outcome"].astype(str)
+        bins = np.clip(np.searchsorted(self.edges_s, sent_s, "right") - 1, 0, BINS - 1)
+        for outcome in np.unique(outcomes).tolist():
+            counts = np.bincount(bins[outcomes == outcome], minlength=BINS)
+            self.over_time[outcome] = self.over_time.get(outcome, np.zeros(BINS, int)) + counts
+        pairs = Counter(zip(columns["sender"].tolist(), outcomes.tolist(), strict=True))
+        for (sender, outcome), count in pairs.items():
+            self.by_sender.setdefault(str(sender), Counter())[outcome] += count
+        is_delivered = outcomes == DELIVERED
+        delay_s = (as_array(columns["arrives_s"]) - sent_s)[is_delivered]
+        distance_m = as_array(columns["distance_m"])[is_delivered]
+        self.delay_s_max = max(self.delay_s_max, float(np.nanmax(delay_s, initial=0.0)))
+        self.distance_m_max = max(self.distance_m_max, float(np.nanmax(distance_m, initial=0.0)))
+
+    def outcomes(self) -> list[str]:
+        """Return what became of messages: delivered first, then the commonest."""
+        totals = {name: int(counts.sum()) for name, counts in self.over_time.items()}
+        return sorted(totals, key=lambda name: (name != DELIVERED, -totals[name], name))
+
+
+def link_blocks(table: TableReader, source: Source) -> list[Block]:
+    """Return messages by outcome over time, and the counts of each sender."""
+    if not table.has(*FIELDS):
+        return generic_blocks(table, source)
+    if not table.rows:
+        return [Remark(text="No message was sent.")]
+    duration_s = source.document.get("duration_s")
+    counts = _Counts(float(duration_s) if isinstance(duration_s, int | float) else 1.0)
+    for columns in table.batches("host", FIELDS, ROWS_READ_MAX):
+        counts.add(columns)
+    return [_over_time(counts), _table(counts)]
+
+
+def message_blocks(table: TableReader, source: Source) -> list[Block]:
+    """Return nothing where the host's account of links is drawn: it tells the same and more."""
+    return [] if "host_links" in source.tables else generic_blocks(table, source)
+
+
+def _over_time(counts: _Counts) -> Figure:
+    middles = (counts.edges_s[1:] + counts.edges_s[:-1]) / 2.0
+    traces = []
+    for index, outcome in enumerate(counts.outcomes()):
+        name = outcome.replace("_", " ")
+        traces.append(
+            {
+                "type": "bar",
+                "name": name,
+                "x": middles,
+                "y": counts.over_time[outcome],
+                "marker": {"color": PALETTE[index] if index < len(PALETTE) else MUTED},
+                "hovertemplate": f"%{{x:.0f}} s: %{{y}} {name}<extra></extra>",
+            }
+        )
+    width_s = counts.edges_s[1] - counts.edges_s[0]
+    figure_layout = layout("sent at simulated time, s", f"messages in {width_s:g} s")
+    figure_layout |= {"barmode": "stack", "bargap": 0.05, "showlegend": True}
+    return Figure(
+        title="Messages by outcome",
+        note="Every message to every receiver.",
+        choices=[Choice(name="", traces=traces)],
+        layout=figure_layout,
+    )
+
+
+def _table(counts: _Counts) -> TableBlock:
+    outcomes = counts.outcomes()
+    rows: list[list[object]] = [
+        [sender, sum(found.values()), *(found[name] for name in outcomes)]
+        for sender, found in sorted(counts.by_sender.items())[:SENDERS_SHOWN_MAX]
+    ]
+    totals = [int(counts.over_time[name].sum()) for name in outcomes]
+    rows.append(["all", sum(totals), *totals])
+    note = f"Longest delay {counts.delay_s_max:.4g} s, longest link {counts.distance_m_max / 1e3:.5g} km."
+    if len(counts.by_sender) > SENDERS_SHOWN_MAX:
+        note += f" The first {SENDERS_SHOWN_MAX} of {len(counts.by_sender)} senders."
+    return TableBlock(
+        title="Messages by sender",
+        headings=headings("sender", "messages", *(name.replace("_", " ") for name in outcomes)),
+        rows=rows,
+        note=note,
+    )
