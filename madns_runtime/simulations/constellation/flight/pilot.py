@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -35,7 +36,8 @@ class Pilot:
         if hasattr(self._software, "setup"):
             self._call("setup", self._software.setup, context)
         else:
-            self._software.context = context
+            with contextlib.suppress(AttributeError):  # a class with slots does without
+                self._software.context = context
 
     def step(self, t_s: float, readings: Readings) -> None:
         """

@@ -122,12 +122,10 @@ class ExternalFlight:
         self._log_talk()
         if code != 0:
             self._context.log("warning", f"{self._process.name} ended with exit code {code}")
-        return {
-            **self._counts,
-            "unanswered": len(self._sent_s),
-            "answer_s_max": round(self._answer_s_max, 6),
-            "exit_code": code,
-        }
+        summary: dict[str, Any] = {**self._counts, "unanswered": len(self._sent_s), "exit_code": code}
+        if not self._is_lockstep:  # where no summary depends on a clock
+            summary["answer_s_max"] = round(self._answer_s_max, 6)
+        return summary
 
     def _send(self, t_s: float, readings: Readings) -> None:
         counts = self._counts

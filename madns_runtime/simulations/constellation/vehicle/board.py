@@ -76,7 +76,6 @@ class Board:
         self.random = random
         self.phase_s = 0.0
         """By how much the vehicle's ticks lie behind their nominal times, s: so do its maneuvers."""
-        self.log_refused = 0
         self._context = context
         self._has_crosslinks = parameters.crosslinks is not None
         self._has_stations = bool(parameters.stations)
