@@ -36,6 +36,17 @@ def ring(*degrees):
     return states, tuple(f"v{number}" for number in range(len(degrees)))
 
 
+class Truth:
+    """What the host knows of the vehicles, from a function of all states."""
+
+    def __init__(self, states):
+        self.states = states
+
+    def state(self, vehicle, t_s):
+        states = self.states(t_s)
+        return None if states is None else tuple(states[vehicle].tolist())
+
+
 def links(*degrees, seed=1, states=None, **rest):
     truth, names = ring(*degrees)
     return Crosslinks(
@@ -43,7 +54,7 @@ def links(*degrees, seed=1, states=None, **rest):
         agents=names,
         satellites=tuple(f"SAT {number}" for number in range(len(names))),
         random=np.random.default_rng(seed),
-        states=states or truth,
+        truth=Truth(states or truth),
     )
 
 

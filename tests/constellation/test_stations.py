@@ -72,6 +72,17 @@ def station(name="here", *, east_deg=0.0, mask_deg=10.0, **rest):
     )
 
 
+class Truth:
+    """What the host knows of the vehicles, from a function of all states."""
+
+    def __init__(self, states):
+        self.states = states
+
+    def state(self, vehicle, t_s):
+        states = self.states(t_s)
+        return None if states is None else tuple(states[vehicle].tolist())
+
+
 def ground(*stations, uplinks=(), vehicles=1, states=None, seed=1):
     names = tuple(f"v{number}" for number in range(vehicles))
     return GroundSegment(
@@ -81,7 +92,7 @@ def ground(*stations, uplinks=(), vehicles=1, states=None, seed=1):
         satellites=tuple(name.upper() for name in names),
         epoch_utc=EPOCH,
         random=np.random.default_rng(seed),
-        states=states or equatorial(vehicles),
+        truth=Truth(states or equatorial(vehicles)),
     )
 
 
@@ -132,7 +143,7 @@ def test_passes_of_iridium_are_skyfields():
         satellites=names,
         epoch_utc=EPOCH,
         random=np.random.default_rng(0),
-        states=states,
+        truth=Truth(states),
     )
 
     contacts, _, _ = fly(segment, AUTHORITY["span_s"], step_s=30.0)
@@ -250,7 +261,7 @@ def test_without_stations_nothing_is_wanted():
         satellites=("V0",),
         epoch_utc=EPOCH,
         random=np.random.default_rng(1),
-        states=equatorial(1),
+        truth=Truth(equatorial(1)),
     )
 
     assert segment.due(0.0) == []

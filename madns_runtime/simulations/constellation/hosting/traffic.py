@@ -47,7 +47,7 @@ class Traffic:
                 agents=context.agents,
                 satellites=satellites,
                 random=context.random,
-                states=store.states,
+                truth=store,
             )
             if parameters.crosslinks is not None
             else None
@@ -59,7 +59,7 @@ class Traffic:
             satellites=satellites,
             epoch_utc=epoch_utc,
             random=context.random,
-            states=store.states,
+            truth=store,
         )
         context.open_stream("links", LINK_FIELDS)
         context.open_stream("contacts", CONTACT_FIELDS)

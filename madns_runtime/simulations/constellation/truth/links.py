@@ -8,7 +8,7 @@ messages, the host hears of it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,17 +34,15 @@ from madns_runtime.simulations.constellation.truth.medium import (
     LinkEvent,
     Outcome,
     Transmitter,
+    Truth,
     checked_sent_s,
     index_of_names,
 )
 
-__all__ = ["LINK_FIELDS", "Crosslinks", "LinkEvent", "States"]
+__all__ = ["LINK_FIELDS", "Crosslinks", "LinkEvent", "Truth"]
 
 _ALL = -1
 """Stands for every receiver."""
-
-States = Callable[[float], NDArray[np.float64] | None]
-"""Truth of all vehicles at a time: shape (N, 6), m and m/s, TEME; None if it is not known (any more)."""
 
 
 class Crosslinks:
@@ -63,17 +61,17 @@ class Crosslinks:
         agents: tuple[str, ...],
         satellites: tuple[str, ...],
         random: np.random.Generator,
-        states: States,
+        truth: Truth,
     ) -> None:
         """
         Prepare the links of *agents*, each of which may also be called by its satellite's name.
 
         Args:
             settings: From the scenario.
-            agents: Names, in the order of the states' rows.
+            agents: Names, in the order of the vehicles' indices.
             satellites: The same, of what they fly.
             random: One number is drawn from it, now, as the seed of all chance.
-            states: Where the vehicles are at a time.
+            truth: Where the vehicles are at a time.
         """
         self._settings = settings
         self._agents = agents
@@ -81,8 +79,7 @@ class Crosslinks:
         self._range_m = settings.range_km_max * 1e3
         self._height_m = settings.atmosphere_km * 1e3
         self._chance = Chance(random)
-        self._states = states
-        self._cached: tuple[float, NDArray[np.float64] | None] = (float("nan"), None)
+        self._truth = truth
         self._transmitters = [Transmitter(settings.queue_max) for _ in agents]
         self._in_flight = InFlight(LEAD_S)
         self._account = Account()
@@ -113,7 +110,7 @@ class Crosslinks:
             events = [attempt.failed("out_of_order")]
         elif receiver is None:
             events = [attempt.failed("unknown_receiver")]
-        elif (states := self._states_at(sent_s)) is None:
+        elif (states := self._states_of(sender, receiver, sent_s)) is None:
             events = [attempt.failed("no_truth")]
         else:
             events = self._transmit(attempt, receiver, states)
@@ -140,11 +137,12 @@ class Crosslinks:
         receiver = self._index.get(to)
         return None if receiver == sender else receiver
 
-    def _states_at(self, t_s: float) -> NDArray[np.float64] | None:
-        """Return truth at a time; a vehicle often sends several messages in one tick."""
-        if self._cached[0] != t_s or self._cached[1] is None:
-            self._cached = (t_s, self._states(t_s))
-        return self._cached[1]
+    def _states_of(self, sender: int, receiver: int, t_s: float) -> NDArray[np.float64] | None:
+        """Return the states of a sender and its receiver, in this order, or of all vehicles."""
+        if receiver == _ALL:
+            return self._truth.states(t_s)
+        start, end = self._truth.state(sender, t_s), self._truth.state(receiver, t_s)
+        return None if start is None or end is None else np.array((start, end))
 
     def _transmit(
         self, attempt: Attempt, receiver: int, states: NDArray[np.float64]
@@ -160,10 +158,9 @@ class Crosslinks:
         ready_s = leaves_s + duration_s + self._settings.processing_s
         if receiver == _ALL:
             return self._to_all(attempt, coast(states, leaves_s - sent_s), ready_s)
-        pair = states[[attempt.sender, receiver]]
         if leaves_s > sent_s:
-            pair = coast(pair, leaves_s - sent_s)
-        start, end = pair.tolist()
+            states = coast(states, leaves_s - sent_s)
+        start, end = states.tolist()
         distance_m, meets_m = signal_way(start, end)
         if not has_line_of_sight(start, meets_m, self._height_m):
             return [attempt.failed("no_line_of_sight", self._agents[receiver], distance_m)]

@@ -14,9 +14,10 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from madns_runtime.errors import PluginError
 from madns_runtime.recording.records import Field
@@ -128,6 +129,16 @@ class Attempt:
             distance_m=distance_m,
             size_bytes=self.size_bytes,
         )
+
+
+class Truth(Protocol):
+    """Where vehicles are: `truth.segments.TruthStore`, or what looks like it."""
+
+    def state(self, vehicle: int, t_s: float) -> tuple[float, ...] | None:
+        """Return one vehicle's position, m, and velocity, m/s, TEME; None if not known (any more)."""
+
+    def states(self, t_s: float) -> NDArray[np.float64] | None:
+        """Return those of all, shape (N, 6)."""
 
 
 class Transmitter:

@@ -26,7 +26,7 @@ from madns_runtime.simulations.constellation.orbit.earth import (
 from madns_runtime.simulations.constellation.orbit.hermite import interpolate
 from madns_runtime.simulations.constellation.orbit.visibility import sines_of_elevation
 from madns_runtime.simulations.constellation.parameters import GroundStation
-from madns_runtime.simulations.constellation.truth.links import States
+from madns_runtime.simulations.constellation.truth.medium import Truth
 
 SCAN_STEP_S = 10.0
 """Time between two looks at all pairs, s: in it no elevation over a place turns round twice."""
@@ -89,9 +89,9 @@ class Window:
 class PassFinder:
     """Looks at every stretch of time once, in order, and tells who is in view in it."""
 
-    def __init__(self, sites: Sites, states: States) -> None:
+    def __init__(self, sites: Sites, truth: Truth) -> None:
         self._sites = sites
-        self._states = states
+        self._truth = truth
         self.scanned_s: float | None = None
         """Until when passes are known; None before the first look."""
         self._ends: NDArray[np.float64] = np.empty((0, 0, 6))
@@ -104,7 +104,7 @@ class PassFinder:
 
     def begin(self, t_s: float) -> list[Window] | None:
         """Look for the first time; who is in view has risen now. None: truth is not known yet."""
-        states = self._states(t_s)
+        states = self._truth.states(t_s)
         if states is None:
             return None
         clear, _ = self._now = self._sites.clearances(states, t_s)
@@ -123,7 +123,7 @@ class PassFinder:
             until then.
         """
         assert self.scanned_s is not None
-        states = self._states(until_s)
+        states = self._truth.states(until_s)
         if states is None:
             return None
         from_s, (clear0, rates0) = self.scanned_s, self._now
@@ -180,15 +180,15 @@ class PassFinder:
     def _at(self, pair: tuple[int, int], t_s: float) -> tuple[float, float]:
         """Return a pair's clearance and its rate within the stretch."""
         station, vehicle = pair
-        states = self._states(t_s)
-        if states is None:
+        known = self._truth.state(vehicle, t_s)
+        if known is None:
             # Forgotten meanwhile, because the host fell behind: 0.2 mm off for a stretch of 10 s.
             from_s, until_s = self._span
             ends = self._ends[:, vehicle : vehicle + 1].swapaxes(0, 1)
             times = np.array([t_s])
             state = interpolate(ends, times, t0_s=from_s, knot_s=until_s - from_s)[:, 0]
         else:
-            state = states[vehicle : vehicle + 1]
+            state = np.array((known,))
         clear, rate = self._sites.clearances(state, t_s, slice(station, station + 1))
         return float(clear[0, 0]), float(rate[0, 0])
 

@@ -30,7 +30,7 @@ from madns_runtime.simulations.constellation.truth.contacts import (
     PassWatch,
     Stretch,
 )
-from madns_runtime.simulations.constellation.truth.links import LinkEvent, States
+from madns_runtime.simulations.constellation.truth.links import LinkEvent
 from madns_runtime.simulations.constellation.truth.medium import (
     LEAD_S,
     Account,
@@ -38,6 +38,7 @@ from madns_runtime.simulations.constellation.truth.medium import (
     Chance,
     InFlight,
     Transmitter,
+    Truth,
     checked_sent_s,
     index_of_names,
 )
@@ -66,7 +67,7 @@ class GroundSegment:
         satellites: tuple[str, ...],
         epoch_utc: datetime,
         random: np.random.Generator,
-        states: States,
+        truth: Truth,
     ) -> None:
         """
         Prepare stations and their messages.
@@ -74,11 +75,11 @@ class GroundSegment:
         Args:
             stations: From the scenario.
             uplinks: From the scenario; those to one vehicle leave in the order of their times.
-            agents: Names, in the order of the states' rows.
+            agents: Names, in the order of the vehicles' indices.
             satellites: The same, of what they fly.
             epoch_utc: UTC of simulated time zero, with its time zone.
             random: One number is drawn from it, now, as the seed of all chance.
-            states: Where the vehicles are at a time.
+            truth: Where the vehicles are at a time.
 
         Raises:
             ConfigurationError: Two stations have one name, or an uplink is for nobody.
@@ -89,10 +90,10 @@ class GroundSegment:
             raise ConfigurationError("\n".join(faults))
         self._stations = tuple(stations)
         self._agents = agents
-        self._states = states
+        self._truth = truth
         self._sites = Sites(stations, epoch_utc)
         names = tuple(station.name for station in stations)
-        self._watch = PassWatch(PassFinder(self._sites, states), agents, names)
+        self._watch = PassWatch(PassFinder(self._sites, truth), agents, names)
         self._chance = Chance(random)
         self._transmitters = [Transmitter(DOWNLINK_QUEUE_MAX) for _ in agents]
         self._uplinks = _uplink_queues(uplinks, index)
@@ -128,10 +129,10 @@ class GroundSegment:
             event = attempt.failed("out_of_order")
         elif not stations:
             event = attempt.failed("unknown_receiver")
-        elif (states := self._states(sent_s)) is None:
+        elif (state := self._truth.state(sender, sent_s)) is None:
             event = attempt.failed("no_truth")
         else:
-            event = self._downlink(attempt, stations, states[sender : sender + 1])
+            event = self._downlink(attempt, stations, np.array((state,)))
         self._account.enter(event, now_s)
         return [event]
 
@@ -268,14 +269,13 @@ class GroundSegment:
     def _send_up(self, attempt: Attempt, window: Window, ends_s: float) -> LinkEvent | None:
         """Return what becomes of an uplink; None: the pass, or what is known of it, ends before it does."""
         begins_s = attempt.message.sent_s
-        states = self._states(begins_s)
-        if states is None:
-            return None
-        state = states[window.vehicle : window.vehicle + 1]
-        if not self._is_in_view(window.station, state, begins_s, ends_s):
+        state = self._truth.state(window.vehicle, begins_s)
+        if state is None or not self._is_in_view(
+            window.station, np.array((state,)), begins_s, ends_s
+        ):
             return None
         site = self._site_state(window.station, begins_s)
-        distance_m, _ = signal_way(site, state[0].tolist())
+        distance_m, _ = signal_way(site, state)
         agent = self._agents[window.vehicle]
         drawn = self._chance.draw(attempt.sender, attempt.message.number, window.vehicle)
         if drawn < self._loss(window.station):
