@@ -34,6 +34,7 @@ class FakeContext:
     base_directory: Path = SCENARIOS
     clock_s: float = -1.0
     sent: list = field(default_factory=list)
+    deadlines: list = field(default_factory=list)
     records: dict = field(default_factory=lambda: defaultdict(list))
     streams: dict = field(default_factory=dict)
     logs: list = field(default_factory=list)
@@ -47,6 +48,8 @@ class FakeContext:
 
     def send(self, to, message, service=None, *, deadline_s=None):
         self.sent.append((self.clock_s, to, unpack(pack(message))))
+        if deadline_s is not None:
+            self.deadlines.append((service, deadline_s))
 
     def open_stream(self, name, fields):
         self.streams[name] = tuple(fields)
@@ -67,14 +70,18 @@ class FakeContext:
 
 
 class Star:
-    """One host and its agents on one simulated clock; messages take *delay_s(sent_s, agent)*, None loses one."""
+    """
+    One host and its agents on one simulated clock.
 
-    def __init__(self, params, count=3, *, duration_s=60.0, tick_hz=10.0, delay_s=None):
+    Messages to agents take *delay_s(sent_s, agent)*, None loses one; those to the host take *up_s*.
+    """
+
+    def __init__(self, params, count=3, *, delay_s=None, **settings):
         names = tuple(f"agent-{n:02d}" for n in range(1, count + 1))
-        settings = {"duration_s": duration_s, "tick_hz": tick_hz}
         self.context = FakeContext("host", names, params, **settings)
         self.delay_s = delay_s or (lambda sent_s, agent: 0.005)
         self.job_s = 0.01
+        self.up_s = 0.005
         self.host = ConstellationHost()
         self.host.setup(self.context)
         self._done = 0
@@ -84,6 +91,7 @@ class Star:
         for name in names:
             self.join(name)
         self._mail = []
+        self._up = []
         self._read = 0
         self._due_jobs = []
 
@@ -111,6 +119,7 @@ class Star:
                 timer_s = self.host.timer(t_s)
                 assert timer_s is None or timer_s > t_s
             self._deliver(t_s)
+            self._hear(t_s)
             if index % ratio == 0:
                 tick = Tick(index // ratio, t_s, ratio * step_s, 0.0, 0)
                 for agent in self.agents.values():
@@ -133,6 +142,15 @@ class Star:
             function, arguments = self.context.jobs[self._done]
             self._done += 1
             self.host.result(self._done, function(*arguments))
+
+    def _hear(self, t_s):
+        for name, context in self.contexts.items():
+            self._up += [(sent_s + self.up_s, name, message) for sent_s, _, message in context.sent]
+            context.sent.clear()
+        due = [mail for mail in self._up if mail[0] <= t_s]
+        self._up = [mail for mail in self._up if mail[0] > t_s]
+        for _, name, message in due:
+            self.host.receive(name, message)
 
     def _deliver(self, t_s):
         for sent_s, to, message in self.context.sent[self._read :]:

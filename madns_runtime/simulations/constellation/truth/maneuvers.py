@@ -263,6 +263,7 @@ class ManeuverDesk:
             late_s = ready_s - command.phase_s - start_s
             reason = f"{late_s:.3f} s too late"
             if rules.settings.late == "refuse":
+                self._enter_refused(refused)
                 return replace(refused, reason=reason)
             # A whole tick: the first time that flight software could have named itself.
             tick = math.ceil((ready_s - command.phase_s) * rules.tick_hz - 1e-9)
@@ -285,6 +286,15 @@ class ManeuverDesk:
             return replace(refused, at_s=at_s, reason=busy)
         taken = replace(refused, status=status, at_s=at_s, reason=reason, effect=effect)
         return self._booked(taken, given)
+
+    def _enter_refused(self, refused: Taken) -> None:
+        """Enter the inequality of a command that is refused for being late, with the T_p allowed."""
+        command = refused.command
+        network_s = max(0.0, refused.heard_s - (command.commanded_s + command.phase_s))
+        needed_s = self._rules.settings.propagation_s + 2.0 * network_s
+        slack_s = command.at_s - command.commanded_s - needed_s
+        self.account.inequality_broken += slack_s < 0.0
+        self.account.slack_s_min = min(self.account.slack_s_min, slack_s)
 
     def _busy(self, vehicle: int, effect: Effect) -> str:
         """Return why an arc cannot be flown: its actuator is at work; empty if it can."""

@@ -1,0 +1,214 @@
+"""What becomes of commands: accepted, postponed or refused with a reason, and the inequality's account."""
+
+import math
+
+import pytest
+
+from madns_runtime.errors import PluginError
+from madns_runtime.simulations.constellation.messages import Command
+from madns_runtime.simulations.constellation.parameters import (
+    Attitude,
+    Maneuvers,
+    ReactionWheels,
+    Thruster,
+    Vehicle,
+)
+from madns_runtime.simulations.constellation.truth.effects import Timeline
+from madns_runtime.simulations.constellation.truth.maneuvers import (
+    WAITING_MAX,
+    ManeuverDesk,
+    Rules,
+)
+
+THRUSTER = Thruster(isp_s=220.0, propellant_kg=20.0)
+PLAIN = Vehicle(thruster=THRUSTER, ballistic_m2_kg_range=(0.01, 0.05))
+RIGID = Vehicle(
+    thruster=THRUSTER,
+    attitude=Attitude(
+        inertia_kg_m2=(1.0, 1.0, 1.0),
+        wheels=ReactionWheels(torque_n_m_max=0.1, momentum_n_m_s_max=1.0),
+    ),
+)
+
+
+def desk(vehicle=PLAIN, *, late="postpone", can_maneuver=True):
+    settings = Maneuvers(late=late, propagation_s=0.02, network_s=0.03)
+    rules = Rules(
+        settings=settings,
+        can_maneuver=can_maneuver,
+        duration_s=100.0,
+        tick_hz=10.0,
+        knot_s=1.0,
+        seed=5,
+    )
+    return ManeuverDesk(rules, ["a"], [vehicle], [Timeline(vehicle.ballistic_m2_kg)])
+
+
+def command(at_s=20.0, number=0, **rest):
+    values = {
+        "kind": "delta_v",
+        "commanded_s": 10.0,
+        "frame": "rtn",
+        "vector": (0.0, 1.0, 0.0),
+        **rest,
+    }
+    return Command(number=number, at_s=at_s, **values)
+
+
+def test_a_command_in_time_is_accepted_at_its_time():
+    taken = desk().decide(0, command(20.3), 10.001)
+
+    assert (taken.status, taken.at_s, taken.reason) == ("accepted", 20.3, "")
+    assert (taken.effect.kind, taken.effect.start_s, taken.effect.frame) == ("impulse", 20.3, "rtn")
+    result = taken.result(3)
+    assert (result.revision, result.delta_v_m_s) == (3, 1.0)
+    assert result.propellant_kg == pytest.approx(20.0 - 0.04634, abs=1e-5)
+
+
+def test_one_ticks_lead_is_feasible_and_less_than_the_margins_is_not():
+    assert desk().decide(0, command(10.1), 10.002).status == "accepted"
+    assert desk().decide(0, command(10.1), 10.049).status == "accepted"
+    late = desk().decide(0, command(10.1), 10.06)
+    assert (late.status, late.at_s) == ("postponed", 10.2)
+    assert late.reason == "0.010 s too late"
+
+
+def test_an_agent_that_lives_behind_has_its_time_later_too():
+    taken = desk().decide(0, command(10.1, phase_s=0.09), 10.092)
+
+    assert (taken.status, taken.at_s) == ("accepted", 10.1)
+
+
+def test_late_commands_are_refused_where_the_scenario_says_so():
+    strict = desk(late="refuse")
+
+    taken = strict.decide(0, command(9.0), 10.0)
+
+    assert (taken.status, taken.effect, taken.reason) == ("refused", None, "1.050 s too late")
+    assert strict.account.refused == 1
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        ({"at_s": 100.1}, "beyond the run"),
+        ({"at_s": math.nan}, "finite"),
+        ({"vector": (math.inf, 0.0, 0.0)}, "finite"),
+        ({"vector": (0.0, 0.0, 0.0)}, "0 m/s"),
+        ({"vector": (900.0, 0.0, 0.0)}, "propellant"),
+        ({"frame": "body"}, "without attitude"),
+        ({"kind": "torque", "frame": "body", "duration_s": 1.0}, "without attitude"),
+        ({"kind": "ballistic", "vector": (0.06, 0.0, 0.0)}, "expected 0.01 to 0.05"),
+        ({"number": -1}, "from 0 on"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_and_says_why(wrong, reason):
+    at = desk()
+
+    taken = at.decide(0, command(**wrong), 10.0)
+
+    assert taken.status == "refused"
+    assert reason in taken.reason
+    assert at._timelines[0].effects == ()
+    assert (at.account.commanded, at.account.refused) == (1, 1)
+
+
+def test_vehicles_without_the_actuator_are_told_so():
+    bare = desk(Vehicle())
+
+    assert "no thruster" in bare.decide(0, command(), 10.0).reason
+    ballistic = command(kind="ballistic", vector=(0.02, 0.0, 0.0))
+    assert "cannot be changed" in bare.decide(0, ballistic, 10.0).reason
+    instant = command(kind="torque", frame="body", duration_s=0.0)
+    assert "duration" in desk(RIGID).decide(0, instant, 10.0).reason
+
+
+def test_truth_that_cannot_be_changed_refuses_all():
+    taken = desk(can_maneuver=False).decide(0, command(), 10.0)
+
+    assert "propagator" in taken.reason
+
+
+def test_waiting_commands_are_bounded_and_make_room_when_executed():
+    at = desk()
+    taken = [
+        at.decide(0, command(20.0 + n, number=n, vector=(0.001, 0, 0)), 10.0)
+        for n in range(WAITING_MAX + 1)
+    ]
+
+    assert [t.status for t in taken[:-1]] == ["accepted"] * WAITING_MAX
+    assert "waiting" in taken[-1].reason
+    at.execute(taken[0])
+    assert at.decide(0, command(99.0, number=99), 10.0).status == "accepted"
+
+
+def test_a_finite_burn_is_centred_on_its_time_and_late_by_its_beginning():
+    slow = Vehicle(thruster=Thruster(isp_s=220.0, propellant_kg=20.0, thrust_n=20.0))
+
+    taken = desk(slow).decide(0, command(20.0), 10.0)
+    late = desk(slow).decide(0, command(12.0), 10.0)
+
+    # 100 kg and 1 m/s at 20 N: 5 s, less what the vehicle gets lighter.
+    length_s = taken.effect.end_s - taken.effect.start_s
+    assert length_s == pytest.approx(4.9988, abs=1e-4)
+    assert (taken.effect.start_s + taken.effect.end_s) / 2 == pytest.approx(20.0)
+    assert (late.status, late.effect.start_s) == ("postponed", 10.1)
+    assert late.at_s == pytest.approx(10.1 + length_s / 2)
+
+
+def test_a_thruster_does_one_burn_at_a_time():
+    at = desk(Vehicle(thruster=Thruster(isp_s=220.0, propellant_kg=20.0, thrust_n=20.0)))
+    at.decide(0, command(20.0), 10.0)
+    left_kg = at.decide(0, command(50.0, number=1), 10.0).propellant_kg
+
+    busy = at.decide(0, command(22.0, number=2), 10.0)
+
+    assert "busy from 17.501 s to 22.499 s" in busy.reason
+    assert busy.propellant_kg == left_kg
+
+
+def test_a_torque_fills_wheels_that_later_ones_find_full():
+    at = desk(RIGID)
+    torque = {"kind": "torque", "frame": "body", "duration_s": 10.0}
+
+    first = at.decide(0, command(20.0, vector=(0.0, 0.0, 0.09), **torque), 10.0)
+    second = at.decide(0, command(40.0, number=1, vector=(0.0, 0.0, 0.09), **torque), 10.0)
+    third = at.decide(0, command(60.0, number=2, vector=(0.0, 0.0, 0.09), **torque), 10.0)
+
+    assert first.effect.vector == (0.0, 0.0, 0.09)
+    assert second.effect.vector[2] == pytest.approx(0.01)
+    assert second.reason == "z: wheels saturate"
+    assert third.reason == "the wheels are saturated"
+
+
+def test_the_inequality_is_measured_in_the_agents_own_time():
+    at = desk()
+    taken = at.decide(0, command(10.1, phase_s=0.05), 10.052)
+
+    times = at.measure(taken, 10.055)
+
+    assert times.network_s == pytest.approx(0.002)
+    assert times.propagation_s == pytest.approx(0.003)
+    assert times.slack_s == pytest.approx(0.1 - 0.003 - 2 * 0.002)
+    assert at.account.inequality_broken == 0
+    at.measure(at.decide(0, command(10.1, number=1), 10.09), 10.095)
+    assert at.account.inequality_broken == 1
+
+
+def test_the_same_command_gets_the_same_error_whatever_came_before():
+    noisy = Vehicle(thruster=Thruster(isp_s=220.0, propellant_kg=20.0, magnitude_error=0.05))
+    first, second = desk(noisy), desk(noisy)
+    second.decide(0, command(30.0, number=7), 10.0)
+
+    given = [d.decide(0, command(20.0, number=4), 10.0).effect.vector for d in (first, second)]
+
+    assert given[0] == given[1] != (0.0, 1.0, 0.0)
+
+
+def test_commands_travel_whole_and_others_are_named():
+    original = command(20.3, number=4, phase_s=0.02)
+
+    assert Command.from_message(original.to_message()) == original
+    for wrong in ({"command": "explode"}, {"frame": "moon"}, {"vector": [1.0]}, {"number": "x"}):
+        with pytest.raises(PluginError, match="command|frame"):
+            Command.from_message({**original.to_message(), **wrong})
