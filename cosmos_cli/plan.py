@@ -20,6 +20,7 @@ from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.limit import PatternError, matching_machines
 from cosmos_cli.models.placement import PlacementRule, claim_agents
 from cosmos_cli.models.scenario import Scenario
+from madns_runtime.lockstep.shares import share_out
 
 LOOPBACK = Machine(name="loopback", address="127.0.0.1", connection="local")
 """This computer, where a run without an inventory takes place."""
@@ -115,6 +116,7 @@ def make_plan(
     *,
     host: str | None = None,
     fault_at: FaultAt | None = None,
+    processors: int = 1,
 ) -> LaunchPlan:
     """
     Place the scenario's agents on machines.
@@ -128,6 +130,7 @@ def make_plan(
         host: Name of the machine that runs the host, None for the operator's own. Agents are placed
             there only by a rule that asks for machines or devices, or when there is no other.
         fault_at: Tells where faults stand in the scenario's file, as `ScenarioFile.fault` does.
+        processors: Of this computer; in lockstep the agents are shared out over them.
 
     Raises:
         InputError: There is no machine, no such host, or the rules cannot be kept: with every fault.
@@ -151,8 +154,8 @@ def make_plan(
         machines=tuple(
             MachinePlan(
                 machine=place.machine,
-                processes=_chunks(
-                    sorted(place.agents, key=order.__getitem__), scenario.agents.per_process
+                processes=_processes(
+                    scenario, sorted(place.agents, key=order.__getitem__), processors
                 ),
             )
             for place in dealer.places
@@ -315,6 +318,15 @@ def _some(places: Sequence[_Place]) -> str:
     if len(names) <= NAMES_SHOWN_MAX:
         return ", ".join(names)
     return f"{', '.join(names[:NAMES_SHOWN_MAX])}, ... ({len(names)})"
+
+
+def _processes(
+    scenario: Scenario, names: Sequence[str], processors: int
+) -> tuple[tuple[str, ...], ...]:
+    if scenario.time.is_lockstep:
+        shares = share_out(scenario.agents, processors)
+        return tuple(tuple(names[share.start : share.stop]) for share in shares)
+    return _chunks(names, scenario.agents.per_process)
 
 
 def _chunks(names: Sequence[str], size: int) -> tuple[tuple[str, ...], ...]:

@@ -21,6 +21,7 @@ from cosmos_cli.errors import ExitCode
 from cosmos_cli.feasibility import BITS_PER_BYTE, Feasibility, Inequality, Resources, judge
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
 from cosmos_cli.plan import LaunchPlan, make_plan
+from madns_runtime.lockstep.shares import processors_here
 from madns_runtime.plugin.api import Flow
 from madns_runtime.plugin.questions import ask_demand
 
@@ -33,6 +34,10 @@ FRAMEWORK_FLOWS = (
     Flow(name="pong", message_bytes=40, rate_hz=4.0),
 )
 """Signs of life and clock exchange, which every agent needs beside the simulation's own messages."""
+LOCKSTEP_WORDS = (
+    "lockstep: the host runs the agents in these processes here, as fast as they allow;"
+    " the inequalities of real time do not apply"
+)
 PLACEMENT = (
     Column("machine"),
     Column("address"),
@@ -84,6 +89,7 @@ def plan(
         some_machines(inventory, limit, host),
         host=host,
         fault_at=scenario_file.fault,
+        processors=processors_here(),
     )
     latency_s, latency_source = _latency(latency_ms, launch_plan)
     resources = Resources(
@@ -96,7 +102,7 @@ def plan(
     feasibility = None if is_lockstep else feasibility_of(scenario_file, resources)
     _show_placement(console, launch_plan)
     if is_lockstep:
-        console.data(_lockstep_words(scenario_file))
+        console.data(LOCKSTEP_WORDS)
     else:
         _show_feasibility(console, feasibility, resources, latency_source)
     console.print_json(
@@ -177,19 +183,6 @@ def _show_placement(console: Console, launch_plan: LaunchPlan) -> None:
         console.data(f"without an agent: {', '.join(launch_plan.idle)}")
     for note in launch_plan.notes:
         console.say(f"note: {note}")
-
-
-def _lockstep_words(scenario_file: ScenarioFile) -> str:
-    """Return what the inequalities are replaced by where nothing has to keep real time."""
-    agents = scenario_file.scenario.agents
-    if agents.per_process > 1:
-        workers = counted(-(-agents.count // agents.per_process), "worker")
-    else:
-        workers = "as many workers as it has processors"
-    return (
-        f"lockstep: the host runs the agents here in {workers}, as fast as they allow;"
-        " the inequalities of real time do not apply"
-    )
 
 
 def _ends(names: tuple[str, ...]) -> str:

@@ -36,6 +36,7 @@ from cosmos_cli.models.loading import ScenarioFile
 from cosmos_cli.plan import LOOPBACK, LaunchPlan, make_plan
 from cosmos_cli.problem import Problem
 from cosmos_cli.rundir import RunDirectory, begin_run, create_run
+from madns_runtime.lockstep.shares import processors_here
 from madns_runtime.processes import register
 
 if TYPE_CHECKING:
@@ -118,7 +119,11 @@ def execute(
         CollectionInterrupted: What is on disk can be collected again.
     """
     plan = make_plan(
-        scenario.scenario, options.machines, host=options.host, fault_at=scenario.fault
+        scenario.scenario,
+        options.machines,
+        host=options.host,
+        fault_at=scenario.fault,
+        processors=processors_here(),
     )
     _check_manual(options, plan)
     remote = reach(plan, scenario, options=options.connecting, forks=options.forks, say=say)

@@ -9,7 +9,6 @@ clock to what comes next. Nothing in it depends on the wall clock but how long i
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 from pathlib import Path
 from time import monotonic
@@ -29,7 +28,7 @@ from madns_runtime.lockstep.meeting import Meeting, RunEnds
 from madns_runtime.lockstep.post import Allowance, decode, encode
 from madns_runtime.lockstep.recorder import LockstepRecorder
 from madns_runtime.lockstep.result import Ending, RunAccount
-from madns_runtime.lockstep.shares import share_out
+from madns_runtime.lockstep.shares import processors_here, share_out
 from madns_runtime.plugin import returned
 from madns_runtime.plugin.api import HOST
 from madns_runtime.plugin.registry import load_half, parse_parameters, resolve
@@ -70,7 +69,7 @@ class LockstepHost:
         self._index = {name: number for number, name in enumerate(names)}
         self._directory = Path(launch.directory)
         _allow_many_files()
-        shares = share_out(config.agents, len(os.sched_getaffinity(0)))
+        shares = share_out(config.agents, processors_here())
         # Everything that forks comes before every thread; workers load their half at the same time.
         self._crew = Crew(config, self._directory.parent, shares)
         base = Path(config.base_directory)

@@ -1,6 +1,8 @@
-"""Which worker runs which agents. Pure."""
+"""Which worker runs which agents."""
 
 from __future__ import annotations
+
+import os
 
 from madns_runtime.config import Agents
 
@@ -17,3 +19,10 @@ def share_out(agents: Agents, processors: int) -> list[range]:
     workers = max(1, min(wanted, agents.count))
     bounds = [agents.count * number // workers for number in range(workers + 1)]
     return [range(first, last) for first, last in zip(bounds, bounds[1:], strict=False)]
+
+
+def processors_here() -> int:
+    """Return how many processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

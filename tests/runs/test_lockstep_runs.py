@@ -1,0 +1,184 @@
+"""Whole runs in lockstep by the real command: what the verdict says, that they repeat, and how they end."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from cosmos_cli.rundir import RunDirectory
+from madns_runtime.processes import list_processes
+
+pytestmark = pytest.mark.process
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+LOCKSTEP = ("--set", "time.mode=lockstep")
+
+
+class Cosmos:
+    """The command in folders of its own."""
+
+    def __init__(self, folder):
+        self.runs = folder / "runs"
+        self.environment = {
+            **os.environ,
+            "COSMOS_STATE_DIR": str(folder / "state"),
+            "COSMOS_RUNS": str(self.runs),
+            "NO_COLOR": "1",
+        }
+
+    def command(self, *arguments):
+        return [sys.executable, "-m", "cosmos_cli.start", *map(str, arguments)]
+
+    def __call__(self, *arguments):
+        return subprocess.run(
+            self.command(*arguments),
+            env=self.environment,
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+
+    def start(self, *arguments):
+        return subprocess.Popen(
+            self.command(*arguments),
+            env=self.environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def run(self, scenario, *settings, options=("--no-report",)):
+        chosen = [part for setting in settings for part in ("--set", setting)]
+        done = self("run", SCENARIOS / scenario, *LOCKSTEP, *chosen, *options, "--json", "--quiet")
+        return done.returncode, json.loads(done.stdout)
+
+
+@pytest.fixture
+def cosmos(tmp_path):
+    return Cosmos(tmp_path)
+
+
+CONSTELLATION = ("agents.tick_hz=1", "time.duration_s=300", "seed=3")
+
+
+def test_constellation_repeats_to_the_bit_and_its_records_are_all_there(cosmos):
+    first = cosmos.run("iridium10.yaml", *CONSTELLATION, options=())
+    second = cosmos.run("iridium10.yaml", *CONSTELLATION, "agents.per_process=4")
+
+    for code, result in (first, second):
+        assert (code, result["status"], result["time_mode"]) == (0, "complete", "lockstep")
+        assert result["data"]["complete"]
+        assert result["timing"]["ticks"] == 10 * 300
+        assert result["timing"]["missed"] == 0
+        assert result["rtf"] > 1
+        names = [check["name"] for check in result["checks"]]
+        assert not {"time.rtf", "deadline.miss_ratio", "deadline.overrun_ratio"} & set(names)
+        assert "messages.reliable.lost" in names and "constellation.underruns" in names
+        assert any("lockstep" in remark for remark in result["remarks"])
+        assert [a["underruns"] for a in result["simulation"]["agents"].values()] == [0] * 10
+    assert first[1]["records_sha256"] == second[1]["records_sha256"]
+    assert first[1]["simulation"] == second[1]["simulation"]
+    run = RunDirectory(cosmos.runs / first[1]["run"])
+    assert (run.tables / "state.parquet").is_file()
+    assert "The figures of" not in run.report_html.read_text()
+    assert run.bundle.is_file()
+
+
+def test_a_run_that_is_collected_again_says_the_same(cosmos):
+    _, result = cosmos.run("counter24.yaml", "agents.count=3", "time.duration_s=1")
+    again = json.loads(cosmos("collect", result["run"], "--json").stdout)
+    listed = json.loads(cosmos("runs", "--json").stdout)
+
+    assert result["exit_code"] == 0
+    assert (again["verdict"], again["records_sha256"]) == (
+        result["verdict"],
+        result["records_sha256"],
+    )
+    assert "complete" in json.dumps(listed)
+
+
+def running(cosmos, *options):
+    """Start a run that would take an hour, and wait until it runs."""
+    endless = ("--set", "time.duration_s=300000", "--no-report", *options)
+    process = cosmos.start("run", SCENARIOS / "counter24.yaml", *LOCKSTEP, *endless)
+    for line in process.stderr:
+        if line.strip() == "running":
+            return process
+    raise AssertionError("it ended before it ran")
+
+
+def nobody_is_left(cosmos, monkeypatch, within_s=10.0):
+    monkeypatch.setenv("COSMOS_STATE_DIR", cosmos.environment["COSMOS_STATE_DIR"])
+    until_s = time.monotonic() + within_s
+    while (left := list_processes()) and time.monotonic() < until_s:
+        time.sleep(0.05)
+    return not left
+
+
+def test_ctrl_c_ends_it_in_good_order(cosmos, monkeypatch):
+    process = running(cosmos)
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=60)
+
+    assert process.returncode == 130
+    assert out.startswith("INTERRUPTED by operator")
+    assert nobody_is_left(cosmos, monkeypatch)
+    (result,) = cosmos.runs.glob("*/run.json")
+    assert json.loads(result.read_text())["data"] == {"complete": True, "missing": []}
+
+
+def test_it_ends_within_seconds_of_its_killed_operator(cosmos, monkeypatch):
+    process = running(cosmos)
+    process.kill()
+    process.communicate(timeout=60)
+
+    assert nobody_is_left(cosmos, monkeypatch)
+    (result,) = cosmos.runs.glob("*/host/result.json")
+    assert json.loads(result.read_text())["reason"] == "the operator's process is gone"
+
+
+def test_it_goes_on_without_its_operator_and_ends_by_down(cosmos, monkeypatch):
+    endless = ("--set", "time.duration_s=300000", "--detach")
+    left = cosmos("run", SCENARIOS / "counter24.yaml", *LOCKSTEP, *endless)
+    shown = cosmos("ps").stdout
+    down = cosmos("down", "--all")
+
+    assert left.returncode == 0, left.stderr
+    assert "24 agents" in shown
+    assert down.returncode == 0
+    assert nobody_is_left(cosmos, monkeypatch)
+
+
+def test_what_cannot_be_done_in_lockstep_is_refused_with_what_to_do(cosmos, tmp_path):
+    inventory = tmp_path / "tower.yaml"
+    inventory.write_text("all:\n  hosts: {pi01: {ansible_host: 10.0.0.1}}\n")
+    scenario = SCENARIOS / "counter24.yaml"
+    refused = {
+        "an inventory": cosmos("run", scenario, *LOCKSTEP, "-i", inventory),
+        "a plan for it": cosmos("plan", scenario, *LOCKSTEP, "-i", inventory),
+        "by hand": cosmos("run", scenario, *LOCKSTEP, "--manual", "agent-01"),
+        "losses": cosmos("validate", scenario, *LOCKSTEP, "--set", "on_agent_loss=continue"),
+    }
+
+    assert [done.returncode for done in refused.values()] == [2, 2, 2, 2]
+    for name in ("an inventory", "a plan for it"):
+        assert "lockstep runs on this computer alone" in refused[name].stderr
+    assert "--set time.mode=realtime" in refused["by hand"].stderr
+    assert "on_agent_loss: expected abort with time.mode: lockstep" in refused["losses"].stderr
+    assert not cosmos.runs.exists()
+
+
+def test_plan_tells_the_processes_and_judges_no_inequality(cosmos):
+    scenario = SCENARIOS / "counter24.yaml"
+    done = cosmos("plan", scenario, *LOCKSTEP, "--set", "agents.per_process=8", "--json")
+    plan = json.loads(done.stdout)
+
+    assert done.returncode == 0
+    assert [len(p) for p in plan["plan"]["machines"]["loopback"]["processes"]] == [8, 8, 8]
+    assert plan["feasibility"] is None
