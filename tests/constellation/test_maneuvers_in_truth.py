@@ -277,12 +277,16 @@ def test_drag_is_not_judged_by_energy_and_a_smaller_area_loses_less(fly):
 
     star.run(60.0)
 
-    lost = {}  # Windows 0 and 1 were recorded before the commands.
+    energies = {}
     for row in star.context.records["invariants"]:
-        lost.setdefault(row[1], []).append(row[2])
-    lost = {name: energies[2] - energies[-1] for name, energies in lost.items()}
-    assert lost["agent-02"] / lost["agent-01"] == pytest.approx(100.0, rel=0.05)
-    assert lost["agent-03"] / lost["agent-01"] == pytest.approx(50.0, rel=0.05)
+        energies.setdefault(row[1], []).append(row[2])
+    # The first two windows were handed out before the commands; the air's density is nearly the same.
+    changes = {name: (e[2] - e[5]) / 3 / (e[0] - e[1]) for name, e in energies.items()}
+    assert changes == {
+        "agent-01": pytest.approx(0.1, rel=0.05),
+        "agent-02": pytest.approx(10.0, rel=0.05),
+        "agent-03": pytest.approx(5.0, rel=0.05),
+    }
     assert [c["name"] for c in star.host.finish()["checks"]] == [
         "constellation.maneuver_deadlines_broken"
     ]

@@ -218,10 +218,10 @@ class ManeuverDesk:
             return "the scenario's propagator starts from no other states than its own"
         if self._waiting[vehicle] >= WAITING_MAX:
             return f"{WAITING_MAX} commands are waiting already"
-        if command.kind != "torque" and command.frame == "body" and described.attitude is None:
-            return "body axes of a vehicle without attitude"
         if command.kind == "delta_v" and described.thruster is None:
             return "the vehicle has no thruster"
+        if command.kind == "delta_v" and command.frame == "body" and described.attitude is None:
+            return "body axes of a vehicle without attitude"
         if command.kind == "torque" and described.attitude is None:
             return "a torque on a vehicle without attitude"
         if command.kind == "torque" and command.duration_s < ARC_S_MIN:
