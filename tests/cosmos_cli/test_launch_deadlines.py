@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 from cosmos_cli.launch.deadlines import MANUAL_READY_S, MARGIN_S, Deadlines, state_limit_s
 from cosmos_cli.launch.outcome import with_manual_agents
@@ -92,3 +93,10 @@ def test_manual_agents_extend_the_time_to_get_ready_only() -> None:
     timeouts = dataclasses.replace(extended.timeouts, agents_ready_s=1)
     assert dataclasses.replace(extended, timeouts=timeouts) == CONFIG
     assert with_manual_agents(CONFIG, ()) == CONFIG
+
+
+def test_lockstep_may_take_as_long_as_it_takes() -> None:
+    config = dataclasses.replace(CONFIG, time=TimeSettings(mode="lockstep", duration_s=100))
+
+    assert state_limit_s("SIMULATION_START", config) == math.inf
+    assert state_limit_s("SIMULATION_SETUP", config) == state_limit_s("SIMULATION_SETUP", CONFIG)

@@ -187,3 +187,15 @@ def test_reason_of_several_lines_is_one_in_the_verdict():
 
     assert verdict.text == "ABORTED: agent-03: ValueError: a ..."
     assert verdict.reason == "ValueError: a\n  b\nc"
+
+
+def test_in_lockstep_nothing_is_late():
+    changes = {"rtf": 500.0, "miss_ratio": None, "overrun_ratio": None}
+    verdict = judged(is_lockstep=True, **changes)
+
+    assert (verdict.exit_code, verdict.broken) == (0, ())
+    assert not any(check.name.startswith(("deadline.", "time.")) for check in verdict.checks)
+    assert verdict.remarks == (
+        "time.rtf, deadline.miss_ratio, deadline.overrun_ratio: not judged: in lockstep time waits",
+    )
+    assert judged(**changes).exit_code == 4

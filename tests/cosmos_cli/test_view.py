@@ -228,3 +228,12 @@ def test_view_fits_standard_error(
     view.close()
 
     assert type(view) is kind
+
+
+def test_lockstep_shows_its_speed_and_no_lateness():
+    progress = Progress(t_s=43_200.0, rtf=412.3456, running=93, ticks=4_017_600, is_lockstep=True)
+
+    assert progress_line(progress, 86_400.0) == (
+        "43200.0 / 86400 s; 412.3 x real time; agents: 93 running, 0 lost; 4017600 ticks;"
+        " 0 messages lost"
+    )
