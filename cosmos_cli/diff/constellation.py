@@ -22,12 +22,15 @@ from cosmos_cli.diff.recorded import Key, Recorded
 from cosmos_cli.diff.side import Side
 from cosmos_cli.diff.stream import Observer, Pairing, StreamDifference
 from cosmos_cli.expectation import mapping_at
+from cosmos_cli.report.control import ControlRow, read_control
 from cosmos_cli.report.style import as_array
 from cosmos_cli.spread import Spread, Stretch
+from cosmos_cli.tables import open_tables
 
 CONSTELLATION, STATE = "constellation", "state"
 POSITION = tuple(re.compile(rf"^{axis}(_[a-z0-9]+)??_m$") for axis in "xyz")
 VELOCITY = tuple(re.compile(rf"^v{axis}(_[a-z0-9]+)??_m_s$") for axis in "xyz")
+Slots = tuple[ControlRow, ...]
 Measured = dict[tuple[str, str], MeasurementError]
 AXES = ("radial", "along", "normal")
 
@@ -66,6 +69,8 @@ class ConstellationDifference:
     efforts: tuple[dict[str, Effort], dict[str, Effort]] = ({}, {})
     slot_errors: tuple[dict[str, SlotError], dict[str, SlotError]] = ({}, {})
     slot_over_time: tuple[list[Stretch], list[Stretch]] = ([], [])
+    slots: tuple[Slots, Slots] = ((), ())
+    """Slot error by truth over time, of runs whose scenario says what a slot is."""
     measurements: tuple[Measured, Measured] = field(default_factory=lambda: ({}, {}))
     remarks: list[str] = field(default_factory=list)
 
@@ -136,6 +141,7 @@ class Constellation:
         result = self._result
         result.over_time = self._spread.rows()
         first, second = self._sides
+        result.slots = (_slots_of(first), _slots_of(second))
         result.measurements = (
             measurement_errors(of_a, first.tick_hz),
             measurement_errors(of_b, second.tick_hz),
@@ -169,6 +175,10 @@ class Constellation:
             found.max_m, found.max_t_s = float(distance_m[worst]), float(t_s[is_there][worst])
         found.last_m = float(distance_m[-1])
         self._spread.add(t_s[is_there], distance_m)
+
+
+def _slots_of(side: Side) -> Slots:
+    return read_control(open_tables(side.run.tables), side.run.read_config())
 
 
 def state_names(recorded: Recorded) -> tuple[list[str], list[str]] | None:

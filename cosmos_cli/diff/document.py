@@ -9,7 +9,7 @@ A comparison as JSON: what `cosmos diff --json` prints, schema 1. Pure.
         only_a, only_b               {count, first {key, who}, last {key, who}}
         fields                       {name: {unit, different, compared, null_in_one, rms, max, at {key, who}, first, values}}
     streams_only_a, streams_only_b   lists of [table, source]
-    constellation                    null, or {frame, truth, measurements, control, estimates, remarks}
+    constellation                    null, or {frame, truth, slots, measurements, control, estimates, remarks}
     missing, remarks                 lists of sentences
 
 A key is a tick where `by` is tick, a time in s where it is time, and the number of the record where it is order.
@@ -114,6 +114,7 @@ def _constellation(found: ConstellationDifference) -> dict[str, Any]:
     return {
         "frame": list(found.frame),
         "truth": truth,
+        "slots": [[dataclasses.asdict(row) for row in rows] for rows in found.slots],
         "measurements": _measurements(found),
         "control": _pairs(found.efforts, _effort, total_effort),
         "estimates": _pairs(found.slot_errors, _slot_error, total_slot_error)
