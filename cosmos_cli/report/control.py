@@ -28,6 +28,8 @@ from madns_runtime.simulations.constellation.orbit.mean_elements import mean_fro
 
 TIMES_MAX = 97
 """Times at which slots are judged: every quarter of an hour of a day."""
+TIME_S = 1e-6
+"""Times nearer each other are one: a tick's time is its number divided by the rate."""
 STATE = ("x_teme_m", "y_teme_m", "z_teme_m", "vx_teme_m_s", "vy_teme_m_s", "vz_teme_m_s")
 PLANE_DEG, SMA_M = 4.0, 5000.0
 """kept: how near each other the planes and heights of satellites are that are judged together; those of
@@ -179,9 +181,9 @@ def _mean_elements(
 
 def _at(recorded_s: Floats, times_s: Floats) -> Iterator[tuple[int, int]]:
     """Yield the places of *times_s* that were recorded, and where."""
-    indices = np.searchsorted(recorded_s, times_s - 1e-6)
+    indices = np.searchsorted(recorded_s, times_s - TIME_S)
     for place, index in enumerate(indices.tolist()):
-        if index < len(recorded_s) and abs(recorded_s[index] - times_s[place]) < 1e-6:
+        if index < len(recorded_s) and abs(recorded_s[index] - times_s[place]) < TIME_S:
             yield place, index
 
 
@@ -195,7 +197,7 @@ def _believed(
     for row, agent in enumerate(agents):
         columns = estimates.read(agent, ("t_s", "slot_error_deg"))
         values = as_array(columns["slot_error_deg"])
-        newest = np.searchsorted(as_array(columns["t_s"]), times_s, side="right") - 1
+        newest = np.searchsorted(as_array(columns["t_s"]), times_s + TIME_S, side="right") - 1
         known = newest >= 0
         found[row, known] = values[newest[known]]
     return found
@@ -215,7 +217,7 @@ def _delta_v(tables: Mapping[str, TableReader], agents: Sequence[str], times_s: 
         total = np.concatenate(
             ([0.0], np.cumsum(as_array(columns["delta_v_m_s"])[executed][order]))
         )
-        found[row] = total[np.searchsorted(at_s[order], times_s, side="right")]
+        found[row] = total[np.searchsorted(at_s[order], times_s + TIME_S, side="right")]
     return found
 
 
@@ -227,7 +229,7 @@ def _messages(tables: Mapping[str, TableReader], times_s: Floats) -> NDArray[np.
         return found
     for _, columns in table.each(("way", "sent_s")):
         sent_s = np.sort(as_array(columns["sent_s"])[columns["way"].astype(str) == "sent"])
-        found += np.searchsorted(sent_s, times_s, side="right")
+        found += np.searchsorted(sent_s, times_s + TIME_S, side="right")
     return found
 
 
