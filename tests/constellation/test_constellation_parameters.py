@@ -11,11 +11,11 @@ from madns_runtime.errors import ConfigurationError
 from madns_runtime.protocol.codec import pack
 from madns_runtime.simulations.constellation import simulation
 from madns_runtime.simulations.constellation.check import find_faults
-from madns_runtime.simulations.constellation.demand import estimate_demand
+from madns_runtime.simulations.constellation.demand import estimate_demand, shortest_lead_s
 from madns_runtime.simulations.constellation.messages import Initial, Segment
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.orbit.elements import elements_from_state
-from madns_runtime.simulations.constellation.parameters import ConstellationParameters
+from madns_runtime.simulations.constellation.parameters import ConstellationParameters, Maneuvers
 from madns_runtime.simulations.constellation.truth.fleet import load_fleet
 from madns_runtime.simulations.constellation.truth.propagation import Stretch
 from madns_runtime.simulations.constellation.truth.segments import RefillSchedule, TruthStore
@@ -302,6 +302,28 @@ def test_demand_is_encoded_and_timed():
     assert demand.buffer_s == 10.0
     assert demand.batch_compute_s > 0.0
     assert demand.measured
+
+
+def test_flight_software_adds_maneuvers_to_the_demand():
+    flight = {"flight": "guidance.py:Guidance"}
+
+    demand = estimate_demand(parameters(**flight), 3, 10.0, SCENARIOS)
+    fixed = estimate_demand(
+        parameters(IRIDIUM, propagator={"kind": "sgp4"}, **flight), 3, 10.0, SCENARIOS
+    )
+
+    # Three windows of ten knots, the interval of the maneuver, and the command.
+    assert 32 * 48 < demand.sync_bytes < 34 * 48 + 400
+    assert demand.sync_compute_s > 0.0
+    assert (demand.lead_s, demand.sync_rate_hz) == (0.1, 1.0)
+    assert (fixed.sync_bytes, fixed.lead_s) == (0, np.inf)
+
+
+@pytest.mark.parametrize(
+    ("tick_hz", "lead_s"), [(1.0, 1.0), (10.0, 0.1), (50.0, 0.06), (100.0, 0.06)]
+)
+def test_the_shortest_lead_is_a_whole_number_of_ticks(tick_hz, lead_s):
+    assert shortest_lead_s(Maneuvers(), tick_hz) == pytest.approx(lead_s)
 
 
 def test_the_descriptor_names_what_exists():
