@@ -6,8 +6,13 @@ import pytest
 import yaml
 from constellation_fakes import Star
 
+from cosmos_cli.models.document import read_document
+from cosmos_cli.models.yaml_source import read_source
 from madns_runtime.config import from_mapping
-from madns_runtime.simulations.constellation.parameters import ConstellationParameters
+from madns_runtime.simulations.constellation.parameters import (
+    ConstellationParameters,
+    Crosslinks,
+)
 from madns_runtime.simulations.constellation.truth.medium import OUTCOMES
 
 SCENARIO = Path(__file__).parents[2] / "scenarios/groundpass.yaml"
@@ -34,6 +39,20 @@ def star():
     star = TalkingStar(params, 10, duration_s=UNTIL_S, tick_hz=1.0)
     star.run(UNTIL_S, step_s=0.1)
     return star
+
+
+def test_documented_settings_are_read_as_they_stand(tmp_path):
+    block = (
+        (SCENARIO.parents[1] / "docs/links.md").read_text().split("```yaml\n")[1].split("```")[0]
+    )
+    (tmp_path / "part.yaml").write_text(block)
+    documented = read_document(read_source(tmp_path / "part.yaml")).value["parameters"]
+    documented["satellites"] = {"elements": "data/iridium10.tle"}
+
+    params = from_mapping(ConstellationParameters, documented)
+
+    assert params.crosslinks == Crosslinks(loss=0.01)
+    assert (params.stations[0].name, params.uplinks[0].to) == ("svalbard", "IRIDIUM 5")
 
 
 def messages(star, agent, way):

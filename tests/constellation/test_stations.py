@@ -216,6 +216,26 @@ def test_passes_are_the_same_however_little_truth_is_known_ahead():
     assert contacts[-1].set_s == pytest.approx(SET_S, abs=1e-3)
 
 
+def test_passes_survive_a_host_that_fell_behind_and_forgot():
+    truth = Truth(equatorial(1))
+    truth.state = lambda vehicle, t_s: None  # between two looks nothing is known any more
+    names = ("v0",)
+    segment = GroundSegment(
+        [station()],
+        [],
+        agents=names,
+        satellites=names,
+        epoch_utc=EPOCH,
+        random=np.random.default_rng(1),
+        truth=truth,
+    )
+
+    contacts, _, _ = fly(segment, SET_S + 5.0)
+
+    assert contacts[1].rise_s == pytest.approx(RISE_S, abs=1e-3)
+    assert contacts[1].set_s == pytest.approx(SET_S, abs=1e-3)
+
+
 def test_looks_are_few():
     asked = []
     truth = equatorial(1)

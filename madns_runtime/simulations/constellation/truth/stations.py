@@ -44,7 +44,7 @@ from madns_runtime.simulations.constellation.truth.medium import (
 )
 from madns_runtime.simulations.constellation.truth.passes import PassFinder, Sites, Window
 
-__all__ = ["CONTACT_FIELDS", "Contact", "GroundSegment", "ground_faults"]
+__all__ = ["CONTACT_FIELDS", "Contact", "GroundSegment"]
 
 DOWNLINK_QUEUE_MAX = 256
 """Messages that may wait at one vehicle's transmitter to the ground; further ones are refused."""
@@ -85,7 +85,7 @@ class GroundSegment:
             ConfigurationError: Two stations have one name, or an uplink is for nobody.
         """
         index = index_of_names(agents, satellites)
-        faults = ground_faults(stations, uplinks, index)
+        faults = _faults(stations, uplinks, index)
         if faults:
             raise ConfigurationError("\n".join(faults))
         self._stations = tuple(stations)
@@ -291,10 +291,10 @@ class GroundSegment:
         return attempt.delivered(agent, distance_m, arrives_s)
 
 
-def ground_faults(
+def _faults(
     stations: Sequence[GroundStation], uplinks: Sequence[Uplink], names: Mapping[str, int]
 ) -> list[str]:
-    """Return what bounds cannot tell of stations and uplinks; *names* are all that messages may be for."""
+    """Return what `cosmos validate` finds as well; *names* are all that messages may be for."""
     counts: dict[str, int] = {}
     for station in stations:
         counts[station.name] = counts.get(station.name, 0) + 1
