@@ -27,16 +27,21 @@ def make_executor(settings: ExecutorSettings) -> Executor:
     Call it before any thread is started: the workers of the process pool are forked.
 
     Raises:
-        ConfigurationError: The kind is unknown, or what it names is no executor.
+        ConfigurationError: The kind is unknown, what it names is no executor, or a cluster does not answer.
+        MissingExtraError: dask is wanted and not installed.
     """
     if settings.kind == "process":
         return _process_pool(settings.workers)
     if settings.kind == "thread":
         return ThreadPoolExecutor(settings.workers, thread_name_prefix="executor")
+    if settings.kind == "dask":
+        from madns_runtime.dask_executor import connect  # a second of imports that few need
+
+        return connect(settings)
     module_name, _, attribute = settings.kind.partition(":")
     if not attribute:
         raise ConfigurationError(
-            f"executor.kind: expected process, thread or module:callable, got {settings.kind!r}"
+            f"executor.kind: expected process, thread, dask or module:callable, got {settings.kind!r}"
         )
     try:
         factory = getattr(importlib.import_module(module_name), attribute)

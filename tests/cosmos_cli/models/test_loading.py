@@ -81,7 +81,7 @@ def test_every_fault_of_a_file_is_shown_at_once_in_order(see):
         name: Iridium10
         simulation: conter
         agents: {count: 10.5, tick_hz: 10, tickhz: 3}
-        time: {mode: lockstep, duration_s: no}
+        time: {mode: lockstp, duration_s: no}
         deadline:
           tolerance_ms: -1
         executor: {kind: proces}
@@ -103,16 +103,16 @@ def test_every_fault_of_a_file_is_shown_at_once_in_order(see):
         a.yaml:3:36: agents.tickhz: unknown key, did you mean tick_hz?
             agents: {count: 10.5, tick_hz: 10, tickhz: 3}
                                                ^
-        a.yaml:4:14: time.mode: expected realtime, got 'lockstep'
-            time: {mode: lockstep, duration_s: no}
+        a.yaml:4:14: time.mode: expected realtime or lockstep, got 'lockstp', did you mean lockstep?
+            time: {mode: lockstp, duration_s: no}
                          ^
         a.yaml:4:36: time.duration_s: expected a number, got 'no'
-            time: {mode: lockstep, duration_s: no}
+            time: {mode: lockstp, duration_s: no}
                                                ^
         a.yaml:6:17: deadline.tolerance_ms: expected >= 0, got -1
               tolerance_ms: -1
                             ^
-        a.yaml:7:18: executor.kind: expected process, thread or module:callable, got 'proces'
+        a.yaml:7:18: executor.kind: expected process, thread, dask or module:callable, got 'proces'
             executor: {kind: proces}
                              ^
         a.yaml:8:1: sed: unknown key, did you mean seed?

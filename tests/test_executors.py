@@ -1,0 +1,236 @@
+"""Executors: the same truth from a process pool and from Dask, and an end to every wait for a cluster."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from datetime import UTC, datetime
+
+import numpy as np
+import psutil
+import pytest
+
+from madns_runtime.config import ExecutorSettings
+from madns_runtime.errors import ConfigurationError, MachineError, MissingExtraError
+from madns_runtime.executor import JobFailed, JobRunner, make_executor, run_job
+from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.simulations.constellation.orbit.constants import EGM_96
+from madns_runtime.simulations.constellation.parameters import ScipyPropagator
+from madns_runtime.simulations.constellation.truth.batches import merge, propagate_part, split
+from madns_runtime.simulations.constellation.truth.propagation import (
+    PropagationParameters,
+    StretchRequest,
+)
+
+distributed = pytest.importorskip("distributed", reason="the extra `dask` is not installed")
+from madns_runtime import dask_executor  # noqa: E402 - needs what was just looked for
+
+pytestmark = pytest.mark.process
+PATIENCE_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Someone else's cluster: a scheduler and two workers on this machine."""
+    with distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        dashboard_address="127.0.0.1:0",
+        host="127.0.0.1",
+    ) as cluster:
+        yield cluster
+
+
+def connected(cluster):
+    return make_executor(ExecutorSettings(kind="dask", address=cluster.scheduler_address))
+
+
+def request_of(count):
+    angles = np.linspace(0.0, 6.0, count)
+    radius_m = 7e6 + 1e5 * np.cos(3.0 * angles)
+    speed = np.sqrt(EGM_96.mu_m3_s2 / radius_m)
+    zero = np.zeros(count)
+    states = np.stack(
+        (
+            radius_m * np.cos(angles),
+            radius_m * np.sin(angles),
+            zero,
+            -0.5 * speed * np.sin(angles),
+            0.5 * speed * np.cos(angles),
+            math.sqrt(0.75) * speed,
+        ),
+        axis=1,
+    )
+    given = PropagationParameters(
+        settings=ScipyPropagator(kind="scipy"),
+        gravity=EGM_96,
+        epoch_utc=datetime(2026, 1, 1, tzinfo=UTC),
+    )
+    return StretchRequest(first_knot=0, knots=6, knot_s=1.0, states=states), given
+
+
+def through_the_loop(executor, parts):
+    """Return the values of jobs as the host gets them: by callbacks of its loop, in order of submission."""
+    reactor, found = Reactor(), {}
+
+    def done(job, future):
+        found[job] = future.result()
+        if len(found) == len(parts):
+            reactor.stop()
+
+    runner = JobRunner(reactor, executor, done)
+    for part in parts:
+        runner.submit(propagate_part, *part)
+    reactor.call_at(reactor.now_s() + PATIENCE_S, reactor.stop)
+    reactor.run()
+    runner.close()
+    return [found[job] for job in sorted(found)]
+
+
+def test_truth_is_the_same_whoever_computes_it(cluster):
+    request, given = request_of(1200)
+    expected = propagate_part(request, given)
+    for executor in (
+        connected(cluster),
+        make_executor(ExecutorSettings(kind="process", workers=2)),
+        make_executor(ExecutorSettings(kind="thread", workers=1)),
+    ):
+        parts = split(request, given, 2)
+        truth = merge(through_the_loop(executor, parts))
+
+        assert len(parts) == 2
+        assert np.array_equal(truth.states, expected.states)
+        assert np.array_equal(truth.invariants, expected.invariants)
+
+
+def test_a_cluster_of_our_own_starts_works_and_leaves_nothing_behind():
+    before = set(psutil.Process().children(recursive=True))
+    executor = make_executor(ExecutorSettings(kind="dask", workers=1))
+    request, given = request_of(501)
+    scratch = executor._scratch.name
+    workers = executor.submit(len, executor.client.nthreads()).result(PATIENCE_S)
+    stretches = through_the_loop(executor, split(request, given, 2))
+
+    assert workers == 1
+    assert np.array_equal(merge(stretches).states, propagate_part(request, given).states)
+    assert not os.path.exists(scratch)
+    # multiprocessing keeps one process to track resources, which ends with this one.
+    left = set(psutil.Process().children(recursive=True)) - before
+    assert [child for child in left if "resource_tracker" not in " ".join(child.cmdline())] == []
+
+
+def test_a_job_that_raises_says_what_and_where(cluster):
+    executor = connected(cluster)
+    with pytest.raises(JobFailed, match="fmod raised ValueError"):
+        executor.submit(run_job, math.fmod, 1.0, 0.0).result(PATIENCE_S)
+    executor.shutdown(wait=False, cancel_futures=True)
+
+
+def test_what_cannot_travel_fails_its_job_instead_of_never_coming_back(cluster):
+    executor = connected(cluster)
+    with pytest.raises(TypeError, match="cannot pickle"):
+        executor.submit(threading.Lock).result(PATIENCE_S)
+    with pytest.raises(TypeError, match="[Cc]ould not serialize|cannot pickle"):
+        executor.submit(id, threading.Lock()).result(PATIENCE_S)
+    executor.shutdown()
+
+
+def test_arguments_reach_the_job_as_they_are(cluster):
+    executor = connected(cluster)
+    argument = {"a": [1, (2, "x")], "b": ("sum", [1, 2]), "c": np.arange(3.0)}
+    found = executor.submit(dict, argument).result(PATIENCE_S)
+    executor.shutdown()
+
+    assert found.pop("c").tolist() == argument.pop("c").tolist()
+    assert found == argument
+
+
+def test_a_cluster_that_somebody_else_started_stays(cluster):
+    connected(cluster).shutdown(wait=False, cancel_futures=True)
+    executor = connected(cluster)
+
+    assert executor.submit(math.sqrt, 4.0).result(PATIENCE_S) == 2.0
+    executor.shutdown()
+    with pytest.raises(RuntimeError):
+        executor.submit(math.sqrt, 4.0)
+
+
+def test_an_address_without_a_scheduler_is_told_in_time(monkeypatch):
+    monkeypatch.setattr(dask_executor, "CONNECT_S", 0.5)
+    settings = ExecutorSettings(kind="dask", address="tcp://127.0.0.1:9")
+    with pytest.raises(ConfigurationError, match=r"scheduler at tcp://127.0.0.1:9, none answered"):
+        make_executor(settings)
+
+    with pytest.raises(ConfigurationError, match="expected a Dask scheduler at nonsense://x"):
+        make_executor(ExecutorSettings(kind="dask", address="nonsense://x"))
+
+
+def test_a_scheduler_without_workers_is_told_in_time(monkeypatch):
+    monkeypatch.setattr(dask_executor, "CONNECT_S", 0.5)
+    with (
+        distributed.LocalCluster(
+            n_workers=0, dashboard_address="127.0.0.1:0", host="127.0.0.1"
+        ) as empty,
+        pytest.raises(ConfigurationError, match=r"expected 1 worker\(s\) .* dask worker"),
+    ):
+        connected(empty)
+
+
+def test_workers_with_another_version_are_refused(cluster, monkeypatch):
+    monkeypatch.setattr(dask_executor.madns_runtime, "__version__", "9.9")
+    with pytest.raises(ConfigurationError, match=r"expected cosmos-madns 9\.9 .*, got 0\."):
+        connected(cluster)
+
+
+def test_jobs_of_a_lost_scheduler_fail_instead_of_never_coming_back():
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0", host="127.0.0.1"
+    ) as lost:
+        executor = connected(lost)
+        job = executor.submit(time.sleep, 30.0)
+        lost.close(timeout=5.0)
+
+        with pytest.raises((MachineError, OSError)):
+            job.result(PATIENCE_S)
+        executor.shutdown(wait=False, cancel_futures=True)
+
+
+def test_jobs_from_a_file_beside_the_scenario_are_refused_before_they_travel(cluster):
+    def of_a_file():
+        pass
+
+    of_a_file.__module__ = "madns_plugin_rover_1"
+    executor = connected(cluster)
+    with pytest.raises(ConfigurationError, match=r"of_a_file from a file beside the scenario"):
+        executor.submit(run_job, of_a_file)
+    executor.shutdown()
+
+
+def test_workers_of_our_own_cluster_die_with_a_killed_host(tmp_path):
+    script = tmp_path / "host.py"
+    script.write_text(
+        "from madns_runtime.config import ExecutorSettings\n"
+        "from madns_runtime.executor import make_executor\n"
+        "import os, time\n"
+        "if __name__ == '__main__':\n"
+        "    executor = make_executor(ExecutorSettings(kind='dask', workers=1))\n"
+        "    print(executor.submit(os.getpid).result(), flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    with subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True) as host:
+        worker = psutil.Process(int(host.stdout.readline()))
+        host.send_signal(signal.SIGKILL)
+
+        worker.wait(PATIENCE_S)
+
+
+def test_without_dask_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.delitem(sys.modules, "madns_runtime.dask_executor", raising=False)
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'cosmos-madns\[dask\]'"):
+        make_executor(ExecutorSettings(kind="dask"))
