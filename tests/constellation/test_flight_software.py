@@ -61,7 +61,9 @@ class Ship:
         flight = {"software": "guidance.py:G", **rest.pop("flight", {})}
         params = parameters(rest.pop("satellites", WALKER), flight=flight, **rest)
         self.context = BoardContext(params, base_directory=folder)
-        initial = Initial(satellite="SAT-1", frame="TEME", epoch_utc="2026", segment=segment())
+        initial = Initial(
+            satellite="SAT-1", frame="TEME", epoch_utc="2026-01-01T00:00:00Z", segment=segment()
+        )
         self.agent = ConstellationAgent()
         self.agent.setup(self.context, initial.to_message())
 
@@ -98,6 +100,24 @@ class G:
     seen = np.array(ship.flight["seen"])
     assert seen[:, 0] == pytest.approx([0.0, 0.1, 0.2])
     assert seen[2, 1:] == pytest.approx([7.0e6 + 2.0, 1480.0, 0, 10.0, 7400.0, 0.0])
+
+
+def test_it_is_given_either_truth_or_measurements(tmp_path):
+    text = """
+class G:
+    def step(self, t_s, readings):
+        self.names = sorted(readings)
+    def finish(self):
+        return {"names": self.names}
+"""
+    vehicles = [{"sensors": {"clock": {"rate_hz": HZ}}}]
+
+    measured = Ship(tmp_path, text, vehicles=vehicles).run(0.1)
+    told = Ship(tmp_path, text, flight={"input": "truth"}, vehicles=vehicles).run(0.1)
+
+    assert measured.flight == {"names": ["clock"]}
+    assert told.flight == {"names": ["truth"]}
+    assert len(told.context.records["clock_sensor"]) == 1
 
 
 def test_it_is_given_no_truth_otherwise(tmp_path):

@@ -22,6 +22,7 @@ from madns_runtime.simulations.constellation.vehicle.sensors.errors import (
     key_of,
 )
 from madns_runtime.simulations.constellation.vehicle.sensors.scene import Scene
+from madns_runtime.simulations.constellation.vehicle.sensors.star_tracker import StarTracker
 from madns_runtime.simulations.constellation.vehicle.sensors.suite import SensorSuite
 
 EPOCH = "2026-03-20T12:00:00Z"
@@ -102,6 +103,15 @@ def test_a_star_tracker_errs_by_small_rotations():
     errors = np.array([rotation_between(TURNED, q) for q in found])
     assert np.linalg.norm(found, axis=1) == pytest.approx(1.0, abs=1e-12)
     assert errors.std(axis=0) == pytest.approx([1e-4] * 3, rel=0.08)
+
+
+def test_a_star_trackers_errors_are_about_the_body_axes():
+    scene = Scene(EPOCH, lambda t_s: None)
+    scene.move(0.0, RIGID)
+
+    measured = StarTracker().measure(scene, [1e-3, 0.0, 0.0])
+
+    assert rotation_between(TURNED, measured) == pytest.approx([1e-3, 0.0, 0.0], abs=1e-12)
 
 
 def test_a_sun_sensor_points_at_the_sun_and_sees_nothing_in_the_shadow():
@@ -247,6 +257,13 @@ def test_a_walk_is_continuous_over_blocks_and_the_same_from_anywhere():
 
     assert max(abs(b - a) for a, b in zip(values, values[1:], strict=False)) < 0.5 * 4.5
     assert late.at(3 * BLOCK - 1)[0] == pytest.approx(values[-1], abs=1e-12)
+
+
+def test_a_bias_is_no_sample_of_the_noise():
+    bias = Errors(model(bias=(1.0,)), CHANCE[:16]).at(0)
+    noise = Errors(model(white=(1.0,)), CHANCE[:16])
+
+    assert bias not in [noise.at(number) for number in range(2 * BLOCK)]
 
 
 def test_a_bias_stays_the_same_for_the_whole_run():
