@@ -81,7 +81,7 @@ def test_every_fault_of_a_file_is_shown_at_once_in_order(see):
         name: Iridium10
         simulation: conter
         agents: {count: 10.5, tick_hz: 10, tickhz: 3}
-        time: {mode: lockstp, duration_s: no}
+        time: {mode: lokstep, duration_s: no}
         deadline:
           tolerance_ms: -1
         executor: {kind: proces}
@@ -103,12 +103,12 @@ def test_every_fault_of_a_file_is_shown_at_once_in_order(see):
         a.yaml:3:36: agents.tickhz: unknown key, did you mean tick_hz?
             agents: {count: 10.5, tick_hz: 10, tickhz: 3}
                                                ^
-        a.yaml:4:14: time.mode: expected realtime or lockstep, got 'lockstp', did you mean lockstep?
-            time: {mode: lockstp, duration_s: no}
+        a.yaml:4:14: time.mode: expected realtime or lockstep, got 'lokstep', did you mean lockstep?
+            time: {mode: lokstep, duration_s: no}
                          ^
-        a.yaml:4:36: time.duration_s: expected a number, got 'no'
-            time: {mode: lockstp, duration_s: no}
-                                               ^
+        a.yaml:4:35: time.duration_s: expected a number, got 'no'
+            time: {mode: lokstep, duration_s: no}
+                                              ^
         a.yaml:6:17: deadline.tolerance_ms: expected >= 0, got -1
               tolerance_ms: -1
                             ^
