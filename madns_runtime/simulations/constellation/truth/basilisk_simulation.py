@@ -51,6 +51,8 @@ class Design:
     """Whether forces and torques act."""
     inertias_kg_m2: tuple[tuple[float, float, float], ...] | None = None
     """Principal moments of each rigid body; None for point masses."""
+    rotates_points: bool = False
+    """Whether rotation is integrated for point masses as well, as Basilisk does unless told otherwise."""
     have_gravity_gradient: tuple[bool, ...] = ()
     """Whether gravity turns each rigid body."""
 
@@ -123,7 +125,7 @@ class Simulation:
         craft.ModelTag = f"vehicle{number}"
         inertias = self._design.inertias_kg_m2
         # Rigid bodies cost more than twice as much; as of Basilisk 2.12 points need not be any.
-        craft.pointMassTranslationalOnly = inertias is None
+        craft.pointMassTranslationalOnly = inertias is None and not self._design.rotates_points
         craft.hub.mHub = 1.0
         moments = _POINT_INERTIA_KG_M2 if inertias is None else inertias[number]
         craft.hub.IHubPntBc_B = np.diag(moments).tolist()
