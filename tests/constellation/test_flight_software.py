@@ -7,7 +7,7 @@ import pytest
 from constellation_fakes import WALKER, FakeContext, parameters
 
 from madns_runtime.context import describe_exception
-from madns_runtime.errors import BlamedError, PluginError
+from madns_runtime.errors import BlamedError
 from madns_runtime.plugin.api import Tick
 from madns_runtime.protocol.messages import Service
 from madns_runtime.simulations.constellation.agent import ConstellationAgent
@@ -339,7 +339,7 @@ def test_commands_before_the_first_tick_are_refused(tmp_path):
     ],
 )
 def test_what_is_no_flight_software_is_named_at_set_up(tmp_path, text, words):
-    with pytest.raises(PluginError, match=words):
+    with pytest.raises(BlamedError, match=f"parameters.flight: .*({words})"):
         Ship(tmp_path, text)
 
 

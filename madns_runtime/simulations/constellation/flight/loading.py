@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from madns_runtime.errors import PluginError
+from madns_runtime.errors import BlamedError, PluginError
 from madns_runtime.plugin.registry import load_function
 from madns_runtime.simulations.constellation.flight.api import FlightSoftware
 
@@ -24,13 +24,16 @@ def load_flight_class(spec: str, base_directory: Path) -> Callable[[], Any]:
         base_directory: Folder of the scenario.
 
     Raises:
-        PluginError: It cannot be found, its file does not load, or it does not look like flight software.
+        BlamedError: It cannot be found, its file does not load, or it does not look like flight software.
         MissingExtraError: It needs an optional dependency that is not installed.
     """
-    found = load_function(spec, base_directory)
+    try:
+        found = load_function(spec, base_directory)
+    except PluginError as error:
+        raise BlamedError(f"parameters.flight: {error}") from error
     faults = contract_faults(found)
     if faults:
-        raise PluginError(f"{spec}: {'; '.join(faults)}")
+        raise BlamedError(f"parameters.flight: {spec}: {'; '.join(faults)}")
     return found
 
 

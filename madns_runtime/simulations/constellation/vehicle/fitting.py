@@ -33,9 +33,8 @@ def fit_out(
     Mount sensors and flight software, and let the latter prepare; None for what the vehicle has not.
 
     Raises:
-        PluginError: Flight software does not load.
+        BlamedError: Flight software does not load, or raised.
         MissingExtraError: A sensor, or flight software, needs what is not installed.
-        BlamedError: Flight software raised.
     """
     flight = flight_of(context.parameters, context.name, initial.satellite)
     wanted = vehicle.sensors
