@@ -102,6 +102,7 @@ class Cockpit:
             "command_results_dropped": self._results_dropped,
             "messages_sent": self._board.messages,
             "messages_received": receiver.received,
+            "messages_held": receiver.held,
             "messages_late": receiver.late,
             "messages_refused": receiver.refused,
             "flight": self._pilot.finish(),

@@ -31,6 +31,11 @@ class Receiver:
         self._tick_s = float("-inf")
         self._serial = 0
 
+    @property
+    def held(self) -> int:
+        """Messages whose time has not come."""
+        return len(self._held)
+
     def add(self, delivery: Delivery) -> None:
         """Take a message whose time is to come, or has come already: the latter is counted late."""
         if len(self._held) >= HELD_MAX:
