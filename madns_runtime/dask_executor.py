@@ -13,7 +13,6 @@ import logging
 import os
 import signal
 import sys
-import tempfile
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from typing import Any, TypeVar
@@ -32,8 +31,8 @@ except ImportError as error:
 
 T = TypeVar("T")
 
-CONNECT_S = 10.0
-"""For the scheduler to answer, and again for the workers: the operator waits 15 s for a host on its machine."""
+CONNECT_S = 20.0
+"""For the scheduler to answer, and again for the workers: the operator waits 60 s for such a host."""
 CLOSE_S = 3.0
 """For saying goodbye; after that connections are dropped, and processes of our own killed."""
 
@@ -49,7 +48,6 @@ class DaskExecutor(Executor):
         client: Connected.
         address: The scheduler's.
         cluster: Our own one, or None.
-        scratch: Folder of its workers.
     """
 
     def __init__(
@@ -57,12 +55,10 @@ class DaskExecutor(Executor):
         client: Client,
         address: str,
         cluster: LocalCluster | None = None,
-        scratch: tempfile.TemporaryDirectory[str] | None = None,
     ) -> None:
         self.client = client
         self.address = address
         self._cluster = cluster
-        self._scratch = scratch
         # Not pure: two jobs with equal arguments are two jobs.
         self._executor = client.get_executor(pure=False)
         self._is_closing = False
@@ -99,8 +95,6 @@ class DaskExecutor(Executor):
             self.client.close(timeout=CLOSE_S)
         if self._cluster is not None:
             _close(self._cluster)
-        if self._scratch is not None:
-            self._scratch.cleanup()
 
     def _pass_on(self, inner: Future[T], outer: Future[T]) -> None:
         if not outer.set_running_or_notify_cancel():
@@ -129,19 +123,17 @@ def connect(settings: ExecutorSettings) -> DaskExecutor:
     if settings.address:
         client = _client(settings.address, settings.address)
         return _checked(DaskExecutor(client, settings.address), 1)
-    scratch = tempfile.TemporaryDirectory(prefix="cosmos-dask-", ignore_cleanup_errors=True)
     cluster = LocalCluster(
         n_workers=0,
         threads_per_worker=1,
         host="127.0.0.1",
         dashboard_address="127.0.0.1:0",
         memory_limit=0,
-        local_directory=scratch.name,
         preload=[__name__],
         silence_logs=logging.CRITICAL,
     )
     address = cluster.scheduler_address
-    executor = DaskExecutor(_client(cluster, address), address, cluster, scratch)
+    executor = DaskExecutor(_client(cluster, address), address, cluster)
     cluster.scale(settings.workers)
     return _checked(executor, settings.workers)
 

@@ -12,7 +12,7 @@ from madns_runtime.config import RunConfig
 LISTEN_TIMEOUT_S = 15.0
 """From the host's start until it listens: imports on a slow board take a few seconds."""
 LISTEN_THERE_TIMEOUT_S = 60.0
-"""The same on another machine, which may be a slow one."""
+"""The same on another machine, which may be a slow one, and where workers elsewhere have to answer first."""
 HOST_SILENCE_S = 20.0
 """A running host reports twice a second; one that is silent for this long is taken for hung."""
 RUNNING_STATE = "SIMULATION_START"
@@ -53,7 +53,8 @@ class HostLimits:
 
     def started(self, *, is_here: bool) -> None:
         """Expect it to listen."""
-        limit_s = LISTEN_TIMEOUT_S if is_here else LISTEN_THERE_TIMEOUT_S
+        is_alone = self._config.executor.kind in ("process", "thread")
+        limit_s = LISTEN_TIMEOUT_S if is_here and is_alone else LISTEN_THERE_TIMEOUT_S
         self._limit_phase(limit_s, "has not listened within {:g} s")
 
     def entered(self, state: str) -> None:
