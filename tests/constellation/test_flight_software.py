@@ -58,9 +58,10 @@ class Ship:
 
     def __init__(self, folder, text="class G:\n    def step(self, t_s, readings): pass", **rest):
         (folder / "guidance.py").write_text(text)
+        joined_s = rest.pop("joined_s", -1.0)
         flight = {"software": "guidance.py:G", **rest.pop("flight", {})}
         params = parameters(rest.pop("satellites", WALKER), flight=flight, **rest)
-        self.context = BoardContext(params, base_directory=folder)
+        self.context = BoardContext(params, base_directory=folder, clock_s=joined_s)
         initial = Initial(
             satellite="SAT-1", frame="TEME", epoch_utc="2026-01-01T00:00:00Z", segment=segment()
         )
@@ -151,6 +152,20 @@ class G:
     )
     assert ship.flight == {"number": 0}
     assert ship.context.records["commands"] == [(10, 0, "delta_v", 4.0, "rtn", 0.0, 0.1, 0.0, 0.0)]
+
+
+def test_an_agent_that_rejoins_gives_no_number_twice(tmp_path):
+    text = body(
+        "for _ in range(16): self.context.delta_v((0, 1, 0), at_s=60.0)",
+        "for _ in range(64): self.context.broadcast(t_s)",
+    )
+    first = Ship(tmp_path, text, crosslinks={}).run(2.0)
+    again = Ship(tmp_path, text, crosslinks={}, joined_s=1.91).run(4.0, 2.0)
+
+    for kind in ("command", "transmission"):
+        numbers = [message["number"] for ship in (first, again) for message in ship.sent(kind)]
+        assert numbers[0] == 0
+        assert len(set(numbers)) == len(numbers) > 40
 
 
 def test_a_result_is_told_right_before_the_next_tick_with_the_tank_gauge(tmp_path):

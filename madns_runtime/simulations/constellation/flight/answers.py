@@ -10,6 +10,8 @@ import orjson
 from madns_runtime.errors import BlamedError, PluginError
 from madns_runtime.simulations.constellation.flight.api import FlightContext
 
+TIME_TOLERANCE_S = 1e-5
+"""Of the time that an answer names, which may have been printed with six decimals."""
 KEYS = frozenset({"t_s", "commands", "send", "estimate", "log"})
 COMMANDS = {
     "delta_v_m_s": ({"delta_v_m_s", "at_s"}, {"frame"}),
@@ -19,7 +21,7 @@ COMMANDS = {
 """By the key that tells the command: which keys it must and may have."""
 
 
-def carry_out(line: bytes, context: FlightContext, program: str) -> None:
+def carry_out(line: bytes, context: FlightContext, program: str, *, t_s: float) -> None:
     """
     Do what one line of a program asks for.
 
@@ -27,13 +29,14 @@ def carry_out(line: bytes, context: FlightContext, program: str) -> None:
         line: A JSON object; each of its parts may be missing.
         context: Takes commands, messages, estimates and words.
         program: Its name, for who is to blame.
+        t_s: Of the tick that it answers; an answer that names a time names this one.
 
     Raises:
         BlamedError: It is no answer, or asks for what cannot be.
     """
     try:
         answer = orjson.loads(line)
-        _check(answer)
+        _check(answer, t_s)
         for command in answer.get("commands", ()):
             _command(command, context)
         for message in answer.get("send", ()):
@@ -49,7 +52,7 @@ def carry_out(line: bytes, context: FlightContext, program: str) -> None:
         raise BlamedError(f"{program}: {told}; it wrote {_shown(line)}") from error
 
 
-def _check(answer: Any) -> None:
+def _check(answer: Any, t_s: float) -> None:
     if not isinstance(answer, Mapping):
         raise PluginError("expected a JSON object")
     unknown = set(answer) - KEYS
@@ -57,6 +60,8 @@ def _check(answer: Any) -> None:
         raise PluginError(
             f"expected the keys {', '.join(sorted(KEYS))}, got {', '.join(sorted(unknown))}"
         )
+    if abs(answer.get("t_s", t_s) - t_s) > TIME_TOLERANCE_S:
+        raise PluginError(f"expected the answer to the tick at {t_s:g} s, got {answer['t_s']!r}")
     for key in ("commands", "send", "log"):
         items = answer.get(key, [])
         if not isinstance(items, list) or not all(isinstance(item, Mapping) for item in items):

@@ -64,6 +64,8 @@ class FlightContext(Protocol):
     """From the scenario: flight.settings."""
     random: np.random.Generator
     """Seeded from the run's seed and the agent's name."""
+    first_number: int
+    """Of its first command: 0, or more in a vehicle that rejoined the run."""
 
     def delta_v(
         self, delta_v_m_s: Sequence[float], *, at_s: float, frame: CommandFrame = "rtn"

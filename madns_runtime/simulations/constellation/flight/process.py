@@ -52,7 +52,8 @@ class ExternalFlight:
         self._settings = settings
         self._base_directory = base_directory
         self._is_lockstep = is_lockstep
-        self._sent_s: deque[float] = deque()
+        self._asked: deque[tuple[float, float]] = deque()
+        """Ticks without an answer: when they were sent, by the computer's clock, and their times."""
         self._messages: deque[dict[str, Any]] = deque(maxlen=MAIL_MAX)
         self._results: deque[dict[str, Any]] = deque(maxlen=MAIL_MAX)
         self._answer_s_max = 0.0
@@ -84,6 +85,7 @@ class ExternalFlight:
             "epoch_utc": context.epoch_utc,
             "frame": context.frame,
             "input": self._settings.input,
+            "first_number": context.first_number,
             "seed": int(context.random.integers(2**31)),
             "settings": dict(context.settings),
         }
@@ -122,7 +124,11 @@ class ExternalFlight:
         self._log_talk()
         if code != 0:
             self._context.log("warning", f"{self._process.name} ended with exit code {code}")
-        summary: dict[str, Any] = {**self._counts, "unanswered": len(self._sent_s), "exit_code": code}
+        summary: dict[str, Any] = {
+            **self._counts,
+            "unanswered": len(self._asked),
+            "exit_code": code,
+        }
         if not self._is_lockstep:  # where no summary depends on a clock
             summary["answer_s_max"] = round(self._answer_s_max, 6)
         return summary
@@ -139,12 +145,12 @@ class ExternalFlight:
             "results": list(self._results),
         }
         line = orjson.dumps(tick, _to_plain, orjson.OPT_SERIALIZE_NUMPY)
-        if len(self._sent_s) >= UNANSWERED_MAX or not self._process.write(line):
+        if len(self._asked) >= UNANSWERED_MAX or not self._process.write(line):
             counts["ticks_skipped"] += 1
             return
         self._messages.clear()
         self._results.clear()
-        self._sent_s.append(monotonic())
+        self._asked.append((monotonic(), t_s))
         counts["ticks_sent"] += 1
 
     def _take_answers(self, t_s: float) -> None:
@@ -159,21 +165,22 @@ class ExternalFlight:
 
     def _take(self, line: bytes, t_s: float) -> None:
         process, counts = self._process, self._counts
-        if not self._sent_s:
+        if not self._asked:
             raise BlamedError(
                 f"{process.name}: expected one line for each tick, got another one before {t_s:g} s: "
                 f"{clean_text(repr(line[:200]))}"
             )
-        took_s = monotonic() - self._sent_s.popleft()
+        sent_s, asked_s = self._asked.popleft()
+        took_s = monotonic() - sent_s
         self._answer_s_max = max(self._answer_s_max, took_s)
         counts["answers"] += 1
         if took_s > self._settings.answer_s:
             counts["answers_late"] += 1
-        carry_out(line, self._context, process.name)
+        carry_out(line, self._context, process.name, t_s=asked_s)
 
     def _await_answer(self, t_s: float) -> None:
         deadline_s = monotonic() + self._settings.answer_s
-        while self._sent_s:
+        while self._asked:
             left_s = deadline_s - monotonic()
             if left_s <= 0.0:
                 raise BlamedError(

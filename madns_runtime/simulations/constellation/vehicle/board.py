@@ -31,7 +31,10 @@ from madns_runtime.simulations.constellation.messages import (
 )
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters, Vehicle
 from madns_runtime.simulations.constellation.vehicle import streams
-from madns_runtime.simulations.constellation.vehicle.commands import CommandDesk
+from madns_runtime.simulations.constellation.vehicle.commands import (
+    COMMANDS_PER_TICK_MAX,
+    CommandDesk,
+)
 
 PAYLOAD_BYTES_MAX = 16_384
 """Of one message by radio, encoded."""
@@ -79,7 +82,12 @@ class Board:
         self._context = context
         self._has_crosslinks = parameters.crosslinks is not None
         self._has_stations = bool(parameters.stations)
-        self._desk = CommandDesk(vehicle)
+        # One that rejoins goes on behind all numbers that it can have given before.
+        rejoined_tick = max(0, math.ceil(context.now_s() * context.tick_hz))
+        self.first_number = rejoined_tick * COMMANDS_PER_TICK_MAX
+        """Of its first command: 0, or more in a vehicle that rejoined the run."""
+        self._first_message = rejoined_tick * MESSAGES_PER_TICK_MAX
+        self._desk = CommandDesk(vehicle, self.first_number)
         self._tick: int | None = None
         self._t_s = -math.inf
         self._messages = 0
@@ -135,7 +143,7 @@ class Board:
                 f"the tick at {self._t_s:g} s wants more"
             )
         size = _payload_bytes(payload)
-        number = self._messages
+        number = self._first_message + self._messages
         self._messages += 1
         self._messages_in_tick += 1
         message = Transmission(to=to, sent_s=self._t_s, number=number, payload=payload)

@@ -25,14 +25,16 @@ class CommandDesk:
 
     Args:
         vehicle: What it is like.
+        first_number: Of its first command.
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: Vehicle, first_number: int = 0) -> None:
         self._vehicle = vehicle
+        self._first_number = first_number
         self._tick_s = -math.inf
         self._in_tick = 0
         self.count = 0
-        """Commands given, and the number of the next one."""
+        """Commands given."""
 
     def delta_v(self, t_s: float, delta_v_m_s: Any, *, at_s: float, frame: str) -> Command:
         """
@@ -103,7 +105,7 @@ class CommandDesk:
         self._in_tick += 1
         self.count += 1
         return Command(
-            number=self.count - 1,
+            number=self._first_number + self.count - 1,
             kind=kind,
             commanded_s=t_s,
             at_s=at_s,
