@@ -200,6 +200,11 @@ def test_missing_keys_are_placed_at_what_lacks_them(see):
             "an agent that shares its process cannot be started again alone",
         ),
         (
+            "agents: {count: 3}\nexecutor: {address: 'tcp://a:8786'}",
+            "a.yaml:4:21: executor.address: expected nothing with executor.kind process; "
+            "say kind: dask",
+        ),
+        (
             "agents: {count: 3}\nseed: 9223372036854775808",
             "a.yaml:4:7: seed: expected <= 9223372036854775807, got 9223372036854775808",
         ),
