@@ -58,7 +58,7 @@ def run(
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Run a scenario in real time, here or on the machines of an inventory, and end with a verdict."""
+    """Run a scenario, in real time or lockstep, here or on the machines of an inventory, and end with a verdict."""
     console = Console(json=json, quiet=quiet)
     overrides = list(set_ or ())
     if duration_s is not None:

@@ -79,6 +79,8 @@ class Host(HostSimulation):
             return t_s
         if self.fault == "job_raise" and t_s >= 0.2:
             self.context.submit(square, -1)
+        if self.fault == "job_kill" and t_s >= 0.2:
+            self.context.submit(go_wrong, self.fault)
         if self.fault == "job_hang" and t_s >= 0.2:
             self.context.submit(time.sleep, 60)
         # The order of a set of names is the interpreter's own affair, unless that is settled.

@@ -90,6 +90,17 @@ def test_constellation_repeats_to_the_bit_and_its_records_are_all_there(cosmos):
     assert run.bundle.is_file()
 
 
+def test_messages_over_links_and_passes_repeat_to_the_bit(cosmos):
+    results = [
+        cosmos.run("groundpass.yaml", "time.duration_s=600", f"agents.per_process={number}")
+        for number in (1, 2)
+    ]
+
+    assert [code for code, _ in results] == [0, 0]
+    assert results[0][1]["simulation"]["host"]["links"]["sent"] > 0
+    assert results[0][1]["records_sha256"] == results[1][1]["records_sha256"]
+
+
 def test_a_run_that_is_collected_again_says_the_same(cosmos):
     _, result = cosmos.run("counter24.yaml", "agents.count=3", "time.duration_s=1")
     again = json.loads(cosmos("collect", result["run"], "--json").stdout)
