@@ -60,6 +60,7 @@ class LineProcess:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 bufsize=0,
+                start_new_session=True,  # a terminal's Ctrl-C is the operator's
                 preexec_fn=die_with_parent if libc.IS_LINUX else None,
             )
         except (OSError, subprocess.SubprocessError) as error:
