@@ -6,7 +6,7 @@ import numpy as np
 
 from cosmos_cli.report.sampling import Floats
 
-BINS = 24
+BINS = 12
 """Stretches of time, unless it is said otherwise."""
 Stretch = tuple[float, float, float]
 """Its end, s; rms and largest value in it."""

@@ -14,7 +14,7 @@ from cosmos_cli.report.sampling import evenly
 from cosmos_cli.spread import Stretch
 
 AGENTS_SHOWN_MAX = 12
-STRETCHES_SHOWN_MAX = 12
+TIMES_SHOWN_MAX = 12
 
 
 def print_constellation(console: Console, found: ConstellationDifference) -> None:
@@ -63,10 +63,9 @@ def _position_row(one: PositionDifference, name: str) -> list[str]:
 def _print_over_time(console: Console, rows: Sequence[Stretch], unit: str) -> None:
     if not rows:
         return
-    step = -(-len(rows) // STRETCHES_SHOWN_MAX)
     columns = [Column("until t, s", True), Column(f"rms, {unit}", True), Column("max", True)]
     console.data("")
-    console.table(columns, [[format_cell(cell) for cell in row] for row in rows[step - 1 :: step]])
+    console.table(columns, [[format_cell(cell) for cell in row] for row in rows])
 
 
 def _print_slots(console: Console, found: ConstellationDifference) -> None:
@@ -79,7 +78,7 @@ def _print_slots(console: Console, found: ConstellationDifference) -> None:
     rows = [
         [f"{t_s:g}"]
         + [format_cell(getattr(one.get(t_s), name, None)) for name in names for one in (a, b)]
-        for t_s in (times_s[place] for place in evenly(len(times_s), STRETCHES_SHOWN_MAX))
+        for t_s in (times_s[place] for place in evenly(len(times_s), TIMES_SHOWN_MAX))
     ]
     console.table(columns, rows)
 
