@@ -1,0 +1,82 @@
+"""The shipped scenarios of control as whole runs in lockstep, shortened: what truth says became of the wishes."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.process
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+
+
+def cosmos(folder, *arguments):
+    environment = {
+        **os.environ,
+        "COSMOS_STATE_DIR": str(folder / "state"),
+        "COSMOS_RUNS": str(folder / "runs"),
+    }
+    done = subprocess.run(
+        [sys.executable, "-m", "cosmos_cli.start", *map(str, arguments), "--json", "--quiet"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=200,
+        check=False,
+    )
+    assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
+    return json.loads(done.stdout)
+
+
+def run(folder, scenario, *settings):
+    chosen = [part for setting in settings for part in ("--set", setting)]
+    cosmos(
+        folder, "run", SCENARIOS / scenario, "--set", "time.mode=lockstep", *chosen, "--no-report"
+    )
+    return cosmos(folder, "report", "last")
+
+
+def flights(document):
+    return [agent.get("flight") for agent in document["simulation"]["agents"].values()]
+
+
+def test_ten_satellites_are_injected_at_once_by_commands_of_one_ticks_lead(tmp_path):
+    settings = ("time.duration_s=64", "parameters.flight.settings.lead_s=0")
+
+    document = run(tmp_path, "hohmann10.yaml", *settings)
+
+    maneuvers = document["simulation"]["host"]["maneuvers"]
+    assert (maneuvers["commanded"], maneuvers["executed"]) == (10, 10)
+    assert (maneuvers["inequality_broken"], maneuvers["refused"]) == (0, 0)
+    for flight in flights(document):
+        assert flight["delta_v_m_s"] == pytest.approx(2295.0, abs=25.0)
+        assert flight["delta_v_m_s"] == pytest.approx(flight["delta_v_asked_m_s"], rel=1e-9)
+        # J2 bends the osculating ellipse by kilometres within seconds of the burn.
+        assert flight["apogee_km"] == pytest.approx(42_164.0, abs=30.0)
+
+
+def test_half_of_ten_leave_and_the_others_stay(tmp_path):
+    document = run(tmp_path, "hohmann5of10.yaml", "time.duration_s=64")
+
+    assert document["simulation"]["host"]["maneuvers"]["executed"] == 5
+    assert sorted(flight is None for flight in flights(document)) == [False] * 5 + [True] * 5
+
+
+def test_ring_of_93_finds_its_slots_over_crosslinks(tmp_path):
+    # A quarter of the day, hastened: coarse ticks, and a shorter time constant at the price of delta-v.
+    settings = ("agents.tick_hz=0.05", "parameters.flight.settings.time_constant_h=1.5")
+
+    document = run(tmp_path, "ring93.yaml", "time.duration_s=21700", *settings)
+
+    first, last = document["control"]["rows"][0], document["control"]["rows"][-1]
+    assert first["slot_error_deg_rms"] == pytest.approx(0.2, abs=1e-3)
+    assert last["slot_error_deg_rms"] < 0.06
+    # Measured at most one exchange ago.
+    believed = last["slot_error_estimated_deg_rms"]
+    assert believed == pytest.approx(last["slot_error_deg_rms"], abs=0.01)
+    assert 0.5 < last["delta_v_m_s_mean"] < 3.0
+    assert last["messages"] == 93 * 2 * 72 + 186
+    assert all(flight["neighbours"] == 2 for flight in flights(document))
