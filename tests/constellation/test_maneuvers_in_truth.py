@@ -9,6 +9,7 @@ from constellation_fakes import SCENARIOS, Star, parameters, state_rows
 
 from madns_runtime.errors import PluginError
 from madns_runtime.protocol.messages import Service
+from madns_runtime.simulations.constellation.messages import Command
 
 SCRIPT = '''
 from madns_runtime.simulations.constellation.flight.api import FlightSoftware
@@ -245,6 +246,49 @@ def test_a_rejoining_agent_gets_truth_with_its_maneuvers_in_it(fly):
     for t_s in np.arange(15.0, 29.0, 0.13).tolist():
         flown = broken.agents["agent-02"]._buffer.lookup(t_s)
         assert flown == pytest.approx(broken.host._store.state(1, t_s), abs=1e-6)
+
+
+def test_a_maneuver_between_initial_data_and_rejoining_is_not_missed(fly):
+    star = fly([])
+    star.run(12.0)
+    star.host.agent_lost("agent-02", "killed")
+    star.join("agent-02")
+    last_words = Command(
+        number=0,
+        kind="delta_v",
+        commanded_s=11.9,
+        at_s=12.5,
+        frame="rtn",
+        vector=(0.0, 5.0, 0.0),
+    )
+    star.host.receive("agent-02", last_words.to_message())
+    star.run(12.3, from_s=12.0)
+
+    star.host.agent_rejoined("agent-02")
+    star.run(30.0, from_s=12.3)
+
+    assert star.host._store.revisions[1] == 1
+    rows, still = state_rows(star, "agent-02"), state_rows(coasting(), "agent-02")
+    assert np.linalg.norm(rows[-1, 4:] - still[299, 4:]) > 4.9
+
+
+@pytest.mark.parametrize("kind", ["numba", "basilisk"])
+def test_every_propagator_that_can_flies_the_same_maneuvers(fly, kind):
+    pytest.importorskip({"numba": "numba", "basilisk": "Basilisk"}[kind])
+    lines = ["agent-01 20 rtn 3.05 0 5 0", "agent-02 20 inertial 5.3 1 0 0"]
+    vehicle = {"thruster": {**THRUSTER, "thrust_n": 50.0}}
+    star, expected = (
+        fly(lines, 2, vehicle=vehicle, propagator={"kind": kind}),
+        fly(lines, 2, vehicle=vehicle),
+    )
+
+    star.run(20.0)
+    expected.run(20.0)
+
+    for name in star.agents:
+        error = state_rows(star, name) - state_rows(expected, name)
+        assert np.abs(error[:, 1:4]).max() < 1e-3
+    assert star.host.finish()["maneuvers"]["executed"] == 2
 
 
 def test_energy_is_judged_between_maneuvers_and_not_across_them(fly):

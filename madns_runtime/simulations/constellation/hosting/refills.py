@@ -51,6 +51,7 @@ class Refills:
         """Windows of the whole run."""
         self._active = [True] * count
         self._sent_until = [0] * count
+        self._revisions_given = [0] * count
         self._cursor = 0
 
     def initial(self, vehicle: int) -> list[Segment]:
@@ -59,6 +60,7 @@ class Refills:
         # What its turn has passed already will not come again.
         last = max(now + 1, self._turns_passed(vehicle) - 1)
         self._sent_until[vehicle] = min(last + 1, self._store.end)
+        self._revisions_given[vehicle] = self._store.revisions[vehicle]
         return self._store.segments(vehicle, now, last)
 
     def timer(self, t_s: float) -> float | None:
@@ -117,6 +119,9 @@ class Refills:
     def rejoined(self, vehicle: int) -> None:
         """Send a vehicle again, and at once what became due while it set itself up."""
         self._active[vehicle] = True
+        if self._store.revisions[vehicle] != self._revisions_given[vehicle]:
+            # A maneuver came in between: what it was given to begin with holds no more.
+            self._sent_until[vehicle] = self._window_at(self._context.now_s())
         self._refill(vehicle, self._turns_passed(vehicle) - 1)
 
     def _window_at(self, t_s: float) -> int:
