@@ -11,7 +11,15 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from madns_runtime.config import Agents, HostLaunch, RunConfig, Timeouts, TimeSettings, to_mapping
+from madns_runtime.config import (
+    Agents,
+    ExecutorSettings,
+    HostLaunch,
+    RunConfig,
+    Timeouts,
+    TimeSettings,
+    to_mapping,
+)
 
 HERE = Path(__file__).parent
 PATIENCE_S = 60.0
@@ -30,7 +38,7 @@ class HostRun:
         seed: int = 7,
         fault: str = "",
         timeouts: Timeouts | None = None,
-        environment: dict[str, str] | None = None,
+        executor: str = "thread",
     ) -> None:
         self.folder = folder
         config = RunConfig(
@@ -42,6 +50,7 @@ class HostRun:
             time=TimeSettings(mode="lockstep", duration_s=1.0),
             timeouts=timeouts or Timeouts(shutdown_s=5.0),
             seed=seed,
+            executor=ExecutorSettings(kind=executor, workers=2),
             parameters={"fault": fault},
         )
         (folder / "host").mkdir(parents=True)
@@ -58,7 +67,6 @@ class HostRun:
                 **os.environ,
                 "COSMOS_STATE_DIR": str(folder.parent / "state"),
                 "PYTHONHASHSEED": "0",
-                **(environment or {}),
             },
         )
         self.say(to_mapping(launch))

@@ -67,7 +67,7 @@ def wait_until(is_so, what):
     ],
 )
 def test_a_fault_of_a_plug_in_is_named(start_host, fault, who, expected):
-    run = start_host(fault=fault)
+    run = start_host(fault=fault, executor="process" if fault == "job_kill" else "thread")
     result = run.result()
 
     assert (result["status"], run.process.returncode) == ("failed", 1)
