@@ -1,7 +1,8 @@
 """
 Truth shared out to workers: the host's own job path, for one worker, two processes, and Dask with two.
 
-    python benchmarks/parallel_truth.py [--vehicles 1000,5000] [--windows 10,60] [--rounds 20] [--json]
+    python benchmarks/parallel_truth.py [--vehicles 1000,5000] [--windows 10,60] [--rounds 20]
+        [--propagator scipy|numba|basilisk] [--json]
 
 A window is a stretch of truth as the host asks for it: parts submitted, computed, carried back and put
 together again. All executors live side by side and take turns, so that what else the machine does hits all
@@ -24,7 +25,11 @@ import numpy as np
 from madns_runtime.config import ExecutorSettings
 from madns_runtime.executor import make_executor, run_job
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
-from madns_runtime.simulations.constellation.parameters import ScipyPropagator
+from madns_runtime.simulations.constellation.parameters import (
+    BasiliskPropagator,
+    NumbaPropagator,
+    ScipyPropagator,
+)
 from madns_runtime.simulations.constellation.truth.batches import merge, propagate_part, split
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
@@ -38,6 +43,11 @@ EXECUTORS = {
     "dask, 2 workers": ExecutorSettings(kind="dask", workers=2),
 }
 FORCES = ("two_body", "j2", "j3", "j4", "drag")
+PROPAGATORS = {
+    "scipy": ScipyPropagator(kind="scipy", forces=FORCES),
+    "numba": NumbaPropagator(kind="numba", forces=FORCES),
+    "basilisk": BasiliskPropagator(kind="basilisk"),
+}
 JOB_TIMEOUT_S = 120.0
 
 
@@ -47,6 +57,7 @@ def main() -> None:
     parser.add_argument("--vehicles", default="1000,5000", help="fleet sizes, comma-separated")
     parser.add_argument("--windows", default="10,60", help="windows, s, comma-separated")
     parser.add_argument("--rounds", type=int, default=20, help="windows measured of each executor")
+    parser.add_argument("--propagator", default="scipy", choices=PROPAGATORS)
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
     arguments = parser.parse_args()
     # The processes are forked: before Dask starts its threads.
@@ -55,7 +66,8 @@ def main() -> None:
     try:
         for vehicles in map(int, arguments.vehicles.split(",")):
             for window_s in map(int, arguments.windows.split(",")):
-                figures = measure(executors, vehicles, window_s, arguments.rounds)
+                work = fleet(vehicles, window_s, arguments.propagator)
+                figures = measure(executors, work, arguments.rounds)
                 rows.append({"vehicles": vehicles, "window_s": window_s, **figures})
     finally:
         for executor in executors.values():
@@ -63,14 +75,16 @@ def main() -> None:
     if arguments.json:
         print(json.dumps(rows, indent=2))
     else:
-        print_table(rows)
+        print_table(rows, arguments.propagator)
 
 
 def measure(
-    executors: dict[str, Executor], vehicles: int, window_s: int, rounds: int
+    executors: dict[str, Executor],
+    work: tuple[StretchRequest, PropagationParameters],
+    rounds: int,
 ) -> dict[str, object]:
     """Return the median time of a window for each executor, ms, and of carrying alone."""
-    request, parameters = fleet(vehicles, window_s)
+    request, parameters = work
     inline: list[float] = []
     times: dict[str, list[float]] = {name: [] for name in executors}
     carried: dict[str, list[float]] = {name: [] for name in executors}
@@ -93,7 +107,9 @@ def measure(
     }
 
 
-def fleet(vehicles: int, window_s: int) -> tuple[StretchRequest, PropagationParameters]:
+def fleet(
+    vehicles: int, window_s: int, propagator: str
+) -> tuple[StretchRequest, PropagationParameters]:
     """Return circular orbits of 500 to 1500 km height, at random, and the parameters."""
     rng = np.random.default_rng(4)
     r = rng.normal(size=(vehicles, 3))
@@ -103,7 +119,7 @@ def fleet(vehicles: int, window_s: int) -> tuple[StretchRequest, PropagationPara
     radius_m = rng.uniform(6.88e6, 7.88e6, size=(vehicles, 1))
     states = np.hstack((r * radius_m, v * np.sqrt(EGM_96.mu_m3_s2 / radius_m)))
     parameters = PropagationParameters(
-        settings=ScipyPropagator(kind="scipy", forces=FORCES),
+        settings=PROPAGATORS[propagator],
         gravity=EGM_96,
         epoch_utc=datetime(2026, 1, 1, tzinfo=UTC),
         ballistic_m2_kg=np.full(vehicles, 0.01),
@@ -143,9 +159,10 @@ def milliseconds(values: list[float]) -> dict[str, float]:
     return {"median": 1e3 * statistics.median(values), "min": 1e3 * min(values)}
 
 
-def print_table(rows: list[dict[str, object]]) -> None:
+def print_table(rows: list[dict[str, object]], propagator: str) -> None:
     """Print one line a fleet, window and executor."""
-    print(f"scipy, {', '.join(FORCES)}; knots of 1 s; ms a window: median (least)\n")
+    forces = ", ".join(PROPAGATORS[propagator].forces)
+    print(f"{propagator}, {forces}; knots of 1 s; ms a window: median (least)\n")
     print("vehicles  window  who                     window         carrying alone  identical")
     for row in rows:
         head = f"{row['vehicles']:>8}  {row['window_s']:>4} s "
