@@ -1,106 +1,33 @@
 """What every propagator keeps, whoever computes."""
 
-import importlib.util
 import math
 import pickle  # noqa: TID251 - as executors do with arguments
 import sys
 from dataclasses import replace
-from datetime import UTC, datetime
-from typing import NamedTuple
 
 import numpy as np
 import pytest
-from constellation_fakes import SCENARIOS
+from propagator_kinds import EXTRAS, OWN, distance_m, make_kind, orbits
 
-from madns_runtime.errors import ConfigurationError, MissingExtraError, PluginError
+from madns_runtime.errors import ConfigurationError, MissingExtraError
 from madns_runtime.simulations.constellation import truth
-from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.orbit.invariants import ENERGY
 from madns_runtime.simulations.constellation.parameters import (
-    BasiliskPropagator,
     CustomPropagator,
-    NumbaPropagator,
-    ScipyPropagator,
-    Sgp4Propagator,
 )
-from madns_runtime.simulations.constellation.truth.element_sets import read_element_sets
 from madns_runtime.simulations.constellation.truth.propagation import (
     PROPAGATORS,
-    PropagationParameters,
     can_maneuver,
     conserved_by,
     load_propagator,
     propagate,
 )
 
-EXTRAS = {"numba": "numba", "basilisk": "Basilisk"}
-OWN = """
-from madns_runtime.simulations.constellation.parameters import ScipyPropagator
-from madns_runtime.simulations.constellation.truth.scipy_propagator import ScipyDop853
-from dataclasses import replace
-
-class Mine:
-    def propagate(self, states, t0_s, knots_s, parameters):
-        forces = tuple(parameters.settings.settings["forces"])
-        settings = ScipyPropagator(kind="scipy", forces=forces)
-        return ScipyDop853().propagate(states, t0_s, knots_s, replace(parameters, settings=settings))
-
-class Flat:
-    def propagate(self, states, t0_s, knots_s, parameters):
-        return states
-
-class Demanding:
-    def __init__(self, orbit):
-        pass
-
-class Idle:
-    pass
-"""
-
-
-class Kind(NamedTuple):
-    settings: object
-    base_directory: str
-    element_sets: tuple
-
-    def parameters(self, **rest):
-        return PropagationParameters(
-            settings=self.settings,
-            gravity=EGM_96,
-            epoch_utc=datetime(2017, 3, 7, 12, tzinfo=UTC),
-            element_sets=self.element_sets,
-            base_directory=self.base_directory,
-            **rest,
-        )
-
-    @property
-    def is_numerical(self):
-        return not isinstance(self.settings, Sgp4Propagator)
-
 
 @pytest.fixture
 def folder(tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     return tmp_path
-
-
-def make_kind(name, folder, forces=("two_body", "j2"), **settings):
-    if name in EXTRAS and importlib.util.find_spec(EXTRAS[name]) is None:
-        pytest.skip(f"{EXTRAS[name]} is not installed")
-    if name == "sgp4":
-        sets = read_element_sets(SCENARIOS / "data/iridium10.tle")[:4]
-        return Kind(Sgp4Propagator(kind="sgp4"), str(folder), sets)
-    if name == "custom":
-        own = CustomPropagator(
-            kind="custom", implementation="own.py:Mine", settings={"forces": list(forces)}
-        )
-        return Kind(own, str(folder), ())
-    classes = {
-        "scipy": ScipyPropagator,
-        "numba": NumbaPropagator,
-        "basilisk": BasiliskPropagator,
-    }
-    return Kind(classes[name](kind=name, forces=forces, **settings), str(folder), ())
 
 
 @pytest.fixture(params=sorted(PROPAGATORS))
@@ -116,20 +43,6 @@ def numerical(request, folder):
 @pytest.fixture(params=["scipy", "numba", "custom"])
 def dragged(request, folder):
     return make_kind(request.param, folder, forces=("two_body", "drag"))
-
-
-def orbits(count=4, radius_m=6.9e6):
-    """Circular orbits, as different as can be."""
-    rng = np.random.default_rng(5)
-    r = rng.normal(size=(count, 3))
-    r /= np.linalg.norm(r, axis=1, keepdims=True)
-    v = np.cross(r, rng.normal(size=(count, 3)))
-    v /= np.linalg.norm(v, axis=1, keepdims=True)
-    return np.hstack((r * radius_m, v * math.sqrt(EGM_96.mu_m3_s2 / radius_m)))
-
-
-def distance_m(a, b):
-    return float(np.linalg.norm((a - b)[..., :3], axis=-1).max())
 
 
 def test_states_come_by_vehicle_knot_and_component(kind):
@@ -377,34 +290,6 @@ def test_parameters_travel_to_another_process(kind):
     knots_s = np.array([0.0, 30.0])
     expected = propagate(orbits(), 0.0, knots_s, parameters)
     assert np.array_equal(propagate(orbits(), 0.0, knots_s, there), expected)
-
-
-@pytest.mark.parametrize(
-    ("implementation", "error", "what"),
-    [
-        ("own.py:Flat", ConfigurationError, r"expected states of shape \(4, 1, 6\), got \(4, 6\)"),
-        ("own.py:Idle", PluginError, "expected a class with the method propagate"),
-        ("own.py:Demanding", PluginError, "own.py:Demanding: TypeError: .*orbit"),
-        ("own.py:Missing", PluginError, "Missing"),
-        ("absent.py:Mine", PluginError, "no file .*absent.py"),
-    ],
-)
-def test_a_propagator_of_ones_own_that_is_none_is_refused(folder, implementation, error, what):
-    settings = CustomPropagator(kind="custom", implementation=implementation)
-    kind = make_kind("custom", folder)._replace(settings=settings)
-
-    with pytest.raises(error, match=what):
-        propagate(orbits(), 0.0, np.array([1.0]), kind.parameters())
-
-
-def test_a_propagator_of_ones_own_may_be_an_installed_module(folder):
-    module = "madns_runtime.simulations.constellation.truth.sgp4_propagator:Sgp4"
-    settings = CustomPropagator(kind="custom", implementation=module, can_maneuver=False)
-    sgp4 = make_kind("sgp4", folder)
-
-    found = propagate(orbits(), 0.0, np.array([1.0]), sgp4._replace(settings=settings).parameters())
-
-    assert np.array_equal(found, propagate(orbits(), 0.0, np.array([1.0]), sgp4.parameters()))
 
 
 @pytest.mark.parametrize(("name", "extra"), [("numba", "fast"), ("basilisk", "basilisk")])
