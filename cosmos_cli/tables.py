@@ -227,12 +227,12 @@ class TableReader:
 
     def batches(self, source: str, names: Iterable[str], rows_max: int) -> Iterator[Columns]:
         """Yield columns of one source as `read` returns them, at most *rows_max* records at a time."""
-        wanted, groups = list(names), self._groups.get(source, [])
-        if not groups:
-            return
-        for batch in self._file.iter_batches(rows_max, row_groups=groups, columns=wanted):
-            table = pa.Table.from_batches([batch])
-            yield {name: table.column(name).to_numpy() for name in wanted}
+        wanted = list(names)
+        for group in self._groups.get(source, []):
+            # One group after the other: given all at once, pyarrow reads ahead without bound.
+            for batch in self._file.iter_batches(rows_max, row_groups=[group], columns=wanted):
+                table = pa.Table.from_batches([batch])
+                yield {name: table.column(name).to_numpy() for name in wanted}
 
     def each(self, names: Iterable[str]) -> Iterator[tuple[str, Columns]]:
         """Yield every source with its columns."""

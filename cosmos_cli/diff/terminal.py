@@ -8,7 +8,7 @@ from cosmos_cli.console import Column, Console
 from cosmos_cli.counted import counted
 from cosmos_cli.diff.compare import Comparison, Timed
 from cosmos_cli.diff.constellation_terminal import print_constellation
-from cosmos_cli.diff.fields import FieldDifference, Place
+from cosmos_cli.diff.fields import Place
 from cosmos_cli.diff.settings import KeyDifference
 from cosmos_cli.diff.stream import Alone, By, StreamDifference
 from cosmos_cli.report.model import format_cell
@@ -31,6 +31,9 @@ def print_comparison(console: Console, found: Comparison) -> None:
     _print_keys(console, "Settings", found.settings)
     _print_keys(console, "Versions", found.versions)
     _print_timing(console, found.timing)
+    if found.summaries:
+        figures = counted(len(found.summaries), "figure")
+        console.data(f"\n{figures} of the simulation's summaries differ; --json has them")
     _print_streams(console, found)
     if found.constellation is not None:
         print_constellation(console, found.constellation)
@@ -93,8 +96,10 @@ def _print_streams(console: Console, found: Comparison) -> None:
         _title(console, "Fields that differ")
         columns = [Column("stream"), Column("field")]
         columns += [Column(n, True) for n in ("records", "rms", "max")]
-        columns += [Column("unit"), Column("largest at"), Column("first at"), Column("A | B there")]
+        columns += [Column("unit"), Column("largest at"), Column("first at")]
         console.table(columns, rows)
+        for line in _text_lines(found, totals):
+            console.data(line)
     for line in _alone_lines(totals):
         console.data(line)
     for name, keys in (("A", found.only_a), ("B", found.only_b)):
@@ -123,7 +128,6 @@ def _field_rows(found: Comparison, total: StreamDifference) -> list[list[str]]:
             one.field.unit,
             _told_place(one.at, total.by, found),
             _told_place(one.first, total.by, found),
-            _told_values(one),
         ]
         for name, one in total.fields.items()
         if one.different
@@ -135,14 +139,20 @@ def _told_place(place: Place | None, by: By, found: Comparison) -> str:
         return "-"
     word = KEY_WORDS[by]
     unit = " s" if by == "time" else ""
-    time = f" ({place.key / found.a.tick_hz:g} s)" if by == "tick" else ""
+    hz = found.a.tick_hz
+    time = f" ({place.key / hz:g} s)" if by == "tick" and hz != 1.0 else ""
     return f"{place.who} {word}{place.key:g}{unit}{time}".strip()
 
 
-def _told_values(one: FieldDifference) -> str:
-    if one.values is None:
-        return ""
-    return " | ".join(_short(value) for value in one.values)
+def _text_lines(found: Comparison, totals: Sequence[StreamDifference]) -> list[str]:
+    """Say what the first different texts are: they have no size."""
+    return [
+        f"{total.table}.{name}, {_told_place(one.at, total.by, found)}:"
+        f" {_short(one.values[0])} in A, {_short(one.values[1])} in B"
+        for total in totals
+        for name, one in total.fields.items()
+        if one.values is not None and not one.is_number
+    ]
 
 
 def _alone_lines(totals: Sequence[StreamDifference]) -> list[str]:
