@@ -233,10 +233,15 @@ def print_times(times_ms: Times) -> None:
                 cells.append("left out")
                 continue
             median, own = statistics.median(row[name]), statistics.median(row[DEFAULT])
-            cells.append(f"{median:.3g} ({median / own:.2g}x)")
+            cells.append(f"{short(median)} ({short(median / own)}x)")
         print(f"  {name:24}" + "".join(f"{cell:>20}" for cell in cells))
     if any(count > BASILISK_COUNT_MAX for count in times_ms):
         print(f"  Basilisk is left out beyond {BASILISK_COUNT_MAX} vehicles.")
+
+
+def short(number: float) -> str:
+    """Return a number with two digits or, above that, whole."""
+    return f"{number:.0f}" if number >= 10.0 else f"{number:.2g}"
 
 
 def print_alone(alone_ms: dict[str, dict[str, float]]) -> None:
