@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,15 +49,22 @@ DONE, STEP_TOO_SHORT, TOO_MANY_STEPS = range(3)
 
 _VECTOR, _MATRIX = float64[::1], float64[:, ::1]
 _TABLES = types.Tuple((_VECTOR, _MATRIX, _MATRIX, _VECTOR))
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 Function = TypeVar("Function", bound=Callable[..., object])
 
 
 def compiled(signature: object) -> Callable[[Function], Function]:
     """Return what compiles a function now, for one signature, to run without Python's lock."""
-    decorate: Callable[[Function], Function] = njit(
-        signature, cache=True, nogil=True, error_model="numpy"
-    )
-    return decorate
+
+    def compile_now(function: Function) -> Function:
+        try:
+            machine_code: Function = njit(signature, cache=True, **_OPTIONS)(function)
+        except RuntimeError:
+            # numba says so if no folder for its cache is writable: every process compiles for itself.
+            machine_code = njit(signature, **_OPTIONS)(function)
+        return machine_code
+
+    return compile_now
 
 
 @compiled(types.void(_VECTOR, _VECTOR, _VECTOR, _MATRIX, _VECTOR))
