@@ -33,7 +33,7 @@ def print_constellation(console: Console, found: ConstellationDifference) -> Non
     if any(found.measurements):
         _title(console, "Measurements: error against each run's own truth")
         _print_measurements(console, found)
-    if any(found.efforts):
+    if any(total_effort(efforts).commands for efforts in found.efforts):
         _title(console, "Control: delta-v, m/s")
         _print_efforts(console, found)
     if any(found.slot_errors):
@@ -49,7 +49,9 @@ def _print_positions(
         Column(n, is_number=True) for n in ("records", "rms", "max", "at t, s", "at the end")
     ]
     columns += [Column(f"{axis} rms", is_number=True) for axis in AXES]
-    shown, rest = _worst(list(found.positions.values()), lambda one: one.rms_m)
+    # Of satellites that were in the same places there is nothing to tell one by one.
+    apart = [one for one in found.positions.values() if one.max_m > 0.0]
+    shown, rest = _worst(apart, lambda one: one.rms_m)
     rows = [_position_row(one, one.agent) for one in shown]
     console.table(columns, [*rows, _position_row(total, "all")])
     _tell_rest(console, rest)

@@ -61,6 +61,7 @@ def flat(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 def _is_same(a: Mapping[str, Any], b: Mapping[str, Any], key: str) -> bool:
     if (key in a) != (key in b):
-        return False
+        # Null here and a mapping there: the keys of the mapping tell, and this one would tell nothing.
+        return a.get(key) is None and b.get(key) is None
     left, right = a[key], b[key]
     return bool(left == right) and is_number(left) == is_number(right)

@@ -183,3 +183,14 @@ def test_attitude_and_its_negative_quaternion_are_one():
     )
 
     assert sizes == pytest.approx([0.0, 1.0])
+
+
+def test_terminal_tells_nothing_one_by_one_of_satellites_in_the_same_places(fly, capsys):
+    fly(), fly(slot_error_deg=0.2)
+
+    app.run(["diff", "1", "2", "--quiet"])
+
+    out = capsys.readouterr().out
+    truth = out[out.index("\nTruth:") : out.index("\nMeasurements:")]
+    assert "all" in truth
+    assert "agent-01" not in truth

@@ -167,3 +167,24 @@ def test_settings_differ_by_dotted_key():
     found = [(one.key, one.a, one.b) for one in differing_keys(a, b, without=("run",))]
 
     assert found == [("agents.count", 2, 3), ("stations[0].h", 1, 2), ("n", None, 0)]
+
+
+def test_a_mapping_against_null_is_told_by_its_keys_alone():
+    a, b = {"thruster": {"isp_s": 220.0, "thrust_n": None}}, {"thruster": None}
+
+    assert [(one.key, one.a, one.b) for one in differing_keys(a, b)] == [
+        ("thruster.isp_s", 220.0, None)
+    ]
+
+
+def test_first_different_text_is_kept_with_its_place():
+    found = FieldDifference(Field("outcome", "", "str"))
+
+    for start in (0, 2):
+        keys = [start, start + 1]
+        found.add(
+            rows(keys, outcome=["delivered", "delivered"]),
+            rows(keys, outcome=["delivered", "lost"]),
+        )
+
+    assert (found.different, found.values, found.at.key) == (2, ("delivered", "lost"), 1.0)
