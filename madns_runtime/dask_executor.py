@@ -79,6 +79,10 @@ class DaskExecutor(Executor):
                     " beside the scenario; install the simulation as a package there, or use kind process"
                 )
         outer: Future[T] = Future()
+        if self.client.status in ("closing", "closed") and not self._is_closing:
+            # Dask takes jobs also when it has given up its scheduler, and never answers.
+            outer.set_exception(self._lost())
+            return outer
         inner = self._executor.submit(_do, functools.partial(fn, *args, **kwargs))
         inner.add_done_callback(lambda done: self._pass_on(done, outer))
         return outer
@@ -100,15 +104,16 @@ class DaskExecutor(Executor):
         if not outer.set_running_or_notify_cancel():
             return
         if inner.cancelled():
-            outer.set_exception(
-                MachineError(
-                    f"executor: Dask's scheduler at {self.address} is gone, and its jobs with it"
-                )
-            )
+            outer.set_exception(self._lost())
         elif (failure := inner.exception()) is not None:
             outer.set_exception(failure)
         else:
             outer.set_result(inner.result())
+
+    def _lost(self) -> MachineError:
+        return MachineError(
+            f"executor: Dask's scheduler at {self.address} is gone, and its jobs with it"
+        )
 
 
 def connect(settings: ExecutorSettings) -> DaskExecutor:

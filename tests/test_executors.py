@@ -184,16 +184,26 @@ def test_workers_with_another_version_are_refused(cluster, monkeypatch):
         connected(cluster)
 
 
-def test_jobs_of_a_lost_scheduler_fail_instead_of_never_coming_back():
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0", host="127.0.0.1"
-    ) as lost:
+def test_jobs_of_a_lost_scheduler_fail_instead_of_never_coming_back(monkeypatch):
+    monkeypatch.setattr(dask_executor, "CONNECT_S", 1.0)
+    lost = distributed.LocalCluster(
+        n_workers=1,
+        processes=False,
+        threads_per_worker=1,
+        dashboard_address="127.0.0.1:0",
+        host="127.0.0.1",
+        protocol="tcp",
+    )
+    with lost:
         executor = connected(lost)
-        job = executor.submit(time.sleep, 30.0)
-        lost.close(timeout=5.0)
+        job = executor.submit(time.sleep, 2.0)
+        lost.close(timeout=1.0)
 
         with pytest.raises((MachineError, OSError)):
             job.result(PATIENCE_S)
+        for _ in range(2):  # while Dask looks for its scheduler, and after it has given up
+            with pytest.raises(MachineError, match=r"scheduler at tcp://127.* is gone"):
+                executor.submit(math.sqrt, 4.0).result(PATIENCE_S)
         executor.shutdown(wait=False, cancel_futures=True)
 
 
