@@ -199,7 +199,9 @@ def test_a_batch_under_way_when_a_command_comes_is_mended(fly):
 
 
 def test_a_whole_constellation_changed_under_a_batch_is_mended_by_another_job(fly):
-    star = fly(["* 102 inertial 6 0 0 3"], count=6)
+    lines = ["* 102 inertial 0.4 0 0 3"]
+    star, quick = fly(lines, count=6), fly(lines, count=6)
+    quick.run(60.0, step_s=0.1)
     star.run(9.9)
     star.job_s = 4.0
     jobs = len(star.context.jobs)
@@ -209,20 +211,43 @@ def test_a_whole_constellation_changed_under_a_batch_is_mended_by_another_job(fl
     functions = [function.__name__ for function, _ in star.context.jobs[jobs:]]
     assert functions[:2] == ["propagate_part", "propagate_vehicles"]
     rows = state_rows(star, "agent-06")
-    assert rows[163, 6] - rows[162, 6] == pytest.approx(3.0, abs=2.0)
+    assert rows[107, 6] - rows[105, 6] == pytest.approx(3.0, abs=1.5)
+    for name in star.agents:
+        assert state_rows(star, name)[-1, 1:4] == pytest.approx(
+            state_rows(quick, name)[-1, 1:4], abs=1e-3
+        )
     assert star.underruns() == 0
 
 
-def test_commands_of_all_with_time_ahead_take_turns(fly):
-    star = fly(["* 100 rtn 5 0 0.1 0"], count=20)
+def test_commands_with_time_ahead_are_made_by_the_executor_and_urgent_ones_in_the_loop(fly):
+    star = fly(["* 103 rtn 5 0 0.1 0", "* 110 rtn 0.2 0 0.1 0"], count=5)
+    star.run(10.8)
+    jobs = [function.__name__ for function, _ in star.context.jobs]
+
+    star.run(30.0, from_s=10.8)
+
+    assert jobs.count("propagate_vehicles") == 5
+    later = [function.__name__ for function, _ in star.context.jobs][len(jobs) :]
+    assert later == ["propagate_part"]
+    assert star.host.finish()["maneuvers"]["executed"] == 10
+    assert star.host._supply._bases == {}
+
+
+def test_a_job_that_is_not_back_in_time_is_overtaken(fly):
+    star = fly(["agent-02 101 inertial 3 0 0 3"])
     star.run(10.0)
-    star.run(10.02, from_s=10.0, step_s=0.001)
-    done = len(star.context.records["maneuvers"])
+    star.job_s = 5.0
 
-    star.run(30.0, from_s=10.02)
+    star.run(40.0, from_s=10.0)
 
-    assert 0 < done < 20
-    assert star.host.finish()["maneuvers"]["executed"] == 20
+    rows = state_rows(star, "agent-02")
+    assert rows[132, 6] - rows[130, 6] == pytest.approx(3.0, abs=1.5)
+    assert rows[130, 6] == pytest.approx(state_rows(coasting(), "agent-02")[130, 6], abs=1e-6)
+    maneuvers = star.host.finish()["maneuvers"]
+    assert (maneuvers["executed"], maneuvers["propagated_anew"]) == (1, 1)
+    assert record(star)["propagation_s"] == pytest.approx(12.85 - 10.11, abs=0.02)
+    assert star.host._maneuvering._overtaken == set()
+    assert star.underruns() == 0
 
 
 def test_a_rejoining_agent_gets_truth_with_its_maneuvers_in_it(fly):

@@ -137,7 +137,9 @@ class ConstellationHost(HostSimulation):
         return min((time_s for time_s in times_s if time_s is not None), default=None)
 
     def result(self, job: int, value: Any) -> None:
-        """Take a part of truth; truth that comes after its first sending was due is counted."""
+        """Take a part of truth or a change of it; truth that comes after its first sending was due is counted."""
+        if self._maneuvering is not None and self._maneuvering.result(job, value):
+            return
         window, now_s = self._store.end, self._context.now_s()
         if not self._supply.result(job, value):
             return

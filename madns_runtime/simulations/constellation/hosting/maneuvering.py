@@ -1,8 +1,8 @@
 """
 Carries commands out: from a vehicle's message to truth that holds it, and what its flight software is told.
 
-What is due soon is propagated at once; what has time waits for its turn, one vehicle a call of the timer,
-so that a whole constellation that commands at once does not stop the loop.
+What is due soon is propagated at once, in the loop; what has time is propagated by the executor, so that a
+whole constellation that commands at once does not stop the loop. A job that is not back in time is overtaken.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ from madns_runtime.simulations.constellation.hosting.refills import Refills
 from madns_runtime.simulations.constellation.hosting.supply import TruthSupply
 from madns_runtime.simulations.constellation.messages import Command, CommandResult
 from madns_runtime.simulations.constellation.truth.maneuvers import ManeuverDesk, Taken, Times
+from madns_runtime.simulations.constellation.truth.pieces import VehicleTruth
 
 URGENT_S = 0.5
 """What is to be executed within this is propagated before anything else is done."""
-TURN_S = 0.001
-"""Between two vehicles that wait for their turn."""
+OVERTAKEN_S = 0.25
+"""What the executor has not made by so long before its time is made in the loop."""
 
 MANEUVERS = (
     Field("commanded_s", "s"),
@@ -64,38 +65,57 @@ class Maneuvering:
         self._supply = supply
         self._refills = refills
         self._desk = desk
-        self._turns: list[tuple[float, int, Taken]] = []
+        self._jobs: dict[int, Taken] = {}
+        self._overtaken: set[int] = set()
+        self._waiting: list[tuple[float, int]] = []
+        """When each job is overtaken, and which; also of those that are done."""
         self._pending: list[tuple[float, int, Taken]] = []
         self._count = 0
         context.open_stream("maneuvers", MANEUVERS)
 
     def receive(self, vehicle: int, command: Command) -> None:
-        """Take a command: decide about it, and carry it out now or in its turn."""
+        """Take a command: decide about it, and carry it out."""
         now_s = self._context.now_s()
         taken = self._desk.decide(vehicle, command, now_s)
         if taken.effect is None:
             self._record(taken, None)
             self._tell(vehicle, taken.result(self._supply.store.revisions[vehicle]))
             return
-        start_s = taken.effect.start_s + command.phase_s
-        if self._context.is_lockstep or start_s - now_s < URGENT_S:
+        if self._context.is_lockstep:
             self._carry_out(taken)
         else:
-            self._push(self._turns, start_s, taken)
-            self._context.wake(now_s + TURN_S)
+            self._make(taken, now_s)
+
+    def result(self, job: int, value: list[VehicleTruth]) -> bool:
+        """Take a job's value; False if it is none of these."""
+        if job in self._overtaken:
+            self._overtaken.remove(job)
+            return True
+        taken = self._jobs.pop(job, None)
+        if taken is None or taken.effect is None:
+            return False
+        if self._supply.take_change(job, taken.vehicle, value[0]):
+            self._hand_out(taken.vehicle, taken.effect.start_s, taken.command.phase_s)
+            self._announce(taken)
+        else:
+            self._make(taken, self._context.now_s())
+        return True
 
     def timer(self, t_s: float) -> float | None:
-        """Carry out the next that waits, report what is over, and return when to come back."""
+        """Report what is over, overtake jobs that are late, and return when to come back."""
         while self._pending and self._pending[0][0] <= t_s:
             taken = heapq.heappop(self._pending)[2]
             self._desk.execute(taken)
             revision = self._supply.store.revisions[taken.vehicle]
             self._tell(taken.vehicle, taken.executed(revision))
-        if self._turns:
-            self._carry_out(heapq.heappop(self._turns)[2])
-        if self._turns:
-            return t_s + TURN_S
-        return self._pending[0][0] if self._pending else None
+        while self._waiting and self._waiting[0][0] <= t_s:
+            _, job = heapq.heappop(self._waiting)
+            if (late := self._jobs.pop(job, None)) is not None:
+                self._overtaken.add(job)
+                self._supply.forget_job(job)
+                self._carry_out(late)
+        times_s = [heap[0][0] for heap in (self._waiting, self._pending) if heap]
+        return min(times_s, default=None)
 
     def finish(self) -> Mapping[str, Any]:
         """Return the account of all commands: numbers only."""
@@ -114,22 +134,41 @@ class Maneuvering:
             "network_s_max": account.network_s_max,
         }
 
-    def _carry_out(self, taken: Taken) -> None:
-        """Change truth, send it, and tell flight software."""
-        effect, vehicle = taken.effect, taken.vehicle
-        assert effect is not None
-        phase_s = taken.command.phase_s
-        if self._supply.change(vehicle, effect.start_s):
-            self._refills.changed(vehicle, effect.start_s, effect.start_s + phase_s)
-        self._record(taken, self._desk.measure(taken, self._context.now_s()))
-        self._tell(vehicle, taken.result(self._supply.store.revisions[vehicle]))
-        over_s = effect.end_s + phase_s
-        self._push(self._pending, over_s, taken)
-        self._context.wake(over_s)
+    def _make(self, taken: Taken, now_s: float) -> None:
+        """Have truth changed by the executor, or here if time is short."""
+        assert taken.effect is not None
+        start_s = taken.effect.start_s
+        due_s = start_s + taken.command.phase_s
+        if due_s - now_s < URGENT_S:
+            self._carry_out(taken)
+        elif (job := self._supply.change_by_job(taken.vehicle, start_s)) is None:
+            self._announce(taken)
+        else:
+            self._jobs[job] = taken
+            heapq.heappush(self._waiting, (due_s - OVERTAKEN_S, job))
+            self._context.wake(due_s - OVERTAKEN_S)
 
-    def _push(self, heap: list[tuple[float, int, Taken]], t_s: float, taken: Taken) -> None:
+    def _carry_out(self, taken: Taken) -> None:
+        """Change truth here and now, send it, and tell flight software."""
+        assert taken.effect is not None
+        start_s = taken.effect.start_s
+        if self._supply.change(taken.vehicle, start_s):
+            self._hand_out(taken.vehicle, start_s, taken.command.phase_s)
+        self._announce(taken)
+
+    def _hand_out(self, vehicle: int, start_s: float, phase_s: float) -> None:
+        self._refills.changed(vehicle, start_s, start_s + phase_s)
+
+    def _announce(self, taken: Taken) -> None:
+        """Record a command that truth holds, or will as soon as it is known so far, and tell flight software."""
+        assert taken.effect is not None
+        self._record(taken, self._desk.measure(taken, self._context.now_s()))
+        revision = self._supply.store.revisions[taken.vehicle]
+        self._tell(taken.vehicle, taken.result(revision))
+        over_s = taken.effect.end_s + taken.command.phase_s
         self._count += 1
-        heapq.heappush(heap, (t_s, self._count, taken))
+        heapq.heappush(self._pending, (over_s, self._count, taken))
+        self._context.wake(over_s)
 
     def _tell(self, vehicle: int, result: CommandResult) -> None:
         self._context.send(self._context.agents[vehicle], result.to_message(), Service.RELIABLE)

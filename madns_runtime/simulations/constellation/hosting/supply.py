@@ -2,8 +2,8 @@
 Truth ahead of time: has the next windows computed for all vehicles, and a commanded one's anew.
 
 One batch is under way at a time, cut into a job for each worker. A vehicle that is commanded is
-propagated anew in the loop: it takes about a millisecond, and a job would have to wait behind a batch
-that takes many. What a batch then still says of it is mended when the batch arrives.
+propagated anew by a job, too, or where there is no time to wait behind others, in the loop: about a
+millisecond for a point mass. What a batch then still says of it is mended when the batch arrives.
 """
 
 from __future__ import annotations
@@ -99,6 +99,8 @@ class TruthSupply:
         self.has_drag = "drag" in propagation.forces
         """Whether ballistic coefficients matter."""
         self._batch: _Batch | None = None
+        self._bases: dict[int, tuple[int, int]] = {}
+        """Of changes that the executor computes: revision and windows known when they were asked for."""
 
     @property
     def is_busy(self) -> bool:
@@ -186,16 +188,44 @@ class TruthSupply:
             PluginError: The time is over.
             ConfigurationError: It cannot be propagated.
         """
-        if self._batch is not None:
-            self._batch.changed.add(vehicle)
+        request = self._change_request(vehicle, change_s)
+        if request is None:
+            return False
+        self._replace(vehicle, propagate_vehicle(request, self._parameters_of(vehicle)))
+        return True
+
+    def change_by_job(self, vehicle: int, change_s: float) -> int | None:
+        """Have the same done by the executor; the job, for `take_change`, or None if nothing is known of that time."""
+        request = self._change_request(vehicle, change_s)
+        if request is None:
+            return None
+        parameters = [self._parameters_of(vehicle)]
+        job = self._context.submit(propagate_vehicles, [request], parameters)
+        self._bases[job] = (self.store.revisions[vehicle], self.store.end)
+        return job
+
+    def take_change(self, job: int, vehicle: int, truth: VehicleTruth) -> bool:
+        """Take what the executor made of a change; False if truth has moved on meanwhile and it must be made again."""
+        if self._bases.pop(job) != (self.store.revisions[vehicle], self.store.end):
+            return False
+        self._replace(vehicle, truth)
+        return True
+
+    def forget_job(self, job: int) -> None:
+        """Let go of a change that is wanted no more from the executor."""
+        del self._bases[job]
+
+    def _change_request(self, vehicle: int, change_s: float) -> VehicleRequest | None:
         store, timeline = self.store, self.timelines[vehicle]
         if change_s > store.end_s:
-            return False
+            if self._batch is not None:
+                self._batch.changed.add(vehicle)
+            return None
         restart = store.restart(vehicle, change_s)
         if restart is None:
             raise PluginError(f"constellation: truth of {change_s:g} s is over and forgotten")
         start_s, state = restart
-        request = VehicleRequest(
+        return VehicleRequest(
             start_s=start_s,
             state=state,
             change_s=change_s,
@@ -206,11 +236,13 @@ class TruthSupply:
             ballistic_m2_kg=timeline.ballistic_at(start_s),
             body=self._body(vehicle, start_s),
         )
-        truth = propagate_vehicle(request, self._parameters_of(vehicle))
-        timeline.directions |= truth.directions
-        store.replace(vehicle, truth)
+
+    def _replace(self, vehicle: int, truth: VehicleTruth) -> None:
+        if self._batch is not None:
+            self._batch.changed.add(vehicle)
+        self.timelines[vehicle].directions |= truth.directions
+        self.store.replace(vehicle, truth)
         self.propagated_anew += 1
-        return True
 
     def drop_before(self, window: int) -> None:
         """Forget truth, and what was done to vehicles, before a window."""
