@@ -77,6 +77,15 @@ def test_how_records_come_in_batches_changes_nothing(size_a, size_b):
     assert len(found["b"]) + len(found["only_b"]) == len(b)
 
 
+def test_a_nearer_record_of_a_later_batch_is_waited_for():
+    a = [rows([1.0]), rows([2.0])]
+    b = [rows([0.6]), rows([1.1]), rows([2.0])]
+
+    found = settled(match(a, b, tolerance=0.5))
+
+    assert (found["a"], found["b"], found["only_b"]) == ([1.0, 2.0], [1.1, 2.0], [0.6])
+
+
 def test_huge_streams_are_held_in_small_part():
     count, size, read, done, held = 200_000, 1000, 0, 0, []
 
