@@ -26,7 +26,15 @@ class H(HostSimulation):
     def initial_data(self, agent):
         return {1, 2} if self.evil == "initial_data" else {}
 
+    def receive(self, agent, message):
+        self.heard_s = self.context.now_s()
+        self.context.wake(self.heard_s + 0.1)
+        self.context.wake(9e9)
+
     def timer(self, t_s):
+        if self.evil == "wake" and hasattr(self, "heard_s"):
+            self.woken = 0.0 <= t_s - (self.heard_s + 0.1)
+            return None
         if self.evil == "timer":
             return float("nan")
         if self.evil == "deadline":
@@ -36,6 +44,8 @@ class H(HostSimulation):
         return None
 
     def finish(self):
+        if self.evil == "wake":
+            return {"woken": self.woken}
         return None if self.evil == "host_finish" else {}
 
 class A(AgentSimulation):
@@ -47,6 +57,8 @@ class A(AgentSimulation):
             os._exit(0)
         if self.evil == "text" and tick.index == 3:
             raise ValueError("\\udcff" + "x" * 100_000)
+        if self.evil == "wake" and self.context.name == "agent-01" and tick.index == 3:
+            self.context.send(HOST, 1)
         if self.evil == "service":
             self.context.send(HOST, 1, "SYNC")
 
@@ -94,12 +106,21 @@ def test_broken_sync_deadline_breaks_its_check(tmp_path):
     assert result["exit_code"] == 4
 
 
-def run(tmp_path, evil):
+@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+def test_a_half_that_hears_something_can_ask_for_its_timer(tmp_path, mode):
+    result = run(tmp_path, "wake", f"time.mode={mode}")
+
+    assert result["simulation"]["host"] == {"woken": True}
+    assert result["exit_code"] == 0
+
+
+def run(tmp_path, evil, *settings):
     (tmp_path / "evil.py").write_text(PLUGIN, "utf-8")
     (tmp_path / "evil.yaml").write_text(SCENARIO, "utf-8")
     command = [sys.executable, "-m", "cosmos_cli.app", "run", str(tmp_path / "evil.yaml")]
     command += ["--json", "--quiet", "--no-report", "--runs", str(tmp_path / "runs")]
-    command += ["--set", f"parameters.evil={evil}"]
+    for setting in (f"parameters.evil={evil}", *settings):
+        command += ["--set", setting]
     done = subprocess.run(
         command,
         capture_output=True,
