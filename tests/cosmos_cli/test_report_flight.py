@@ -41,12 +41,26 @@ LINKS = StreamSchema(
         Field("distance_m", "m"),
     ),
 )
+CONTACTS = StreamSchema(
+    "contacts",
+    (
+        Field("event", "", "str"),
+        Field("agent", "", "str"),
+        Field("station", "", "str"),
+        Field("rise_s", "s"),
+        Field("set_s", "s"),
+        Field("elevation_deg_max", "deg"),
+    ),
+)
 ERROR_M, TICKS, TICK_HZ = 3.0, 100, 10.0
 
 
 def record(made):
     """Two maneuvers and four messages an agent; measurements are 3 m off and known a tick late."""
-    host = made.recorder("host", "host", MANEUVERS, LINKS)
+    host = made.recorder("host", "host", MANEUVERS, LINKS, CONTACTS)
+    host.record("contacts", ("rise", "agent-01", "Kiruna", 1.0, None, None))
+    host.record("contacts", ("set", "agent-01", "Kiruna", 1.0, 9.0, 42.0))
+    host.record("contacts", ("rise", "agent-02", "Kiruna", 5.0, None, None))
     for number, name in enumerate(made.names):
         agent = made.recorder(f"agents/{name}", name, GNSS, ESTIMATES, COMMANDS)
         truth = np.loadtxt(
@@ -119,11 +133,11 @@ def test_a_broken_inequality_is_drawn_apart_and_counted(blocks):
 
 
 def test_slot_error_is_drawn_of_all_and_by_agent(blocks):
-    largest, rms = blocks["Control"]["Slot error of all agents"].choices[0].traces
+    largest, rms = blocks["Control"]["Slot error believed, of all agents"].choices[0].traces
 
     assert largest["y"] == pytest.approx(0.2)
     assert rms["y"] == pytest.approx(np.sqrt((0.1**2 + 0.2**2) / 2))
-    assert "Slot error by agent" in blocks["Control"]
+    assert "Slot error believed, by agent" in blocks["Control"]
     assert "Estimate: sma m" in blocks["Control"]
 
 
@@ -134,6 +148,13 @@ def test_messages_are_counted_by_outcome(blocks):
     assert (delivered["name"], int(sum(delivered["y"]))) == ("delivered", 6)
     assert (lost["name"], int(sum(lost["y"]))) == ("lost", 2)
     assert rows[-1] == {"sender": "all", "messages": 8, "delivered": 6, "lost": 2}
+
+
+def test_passes_are_told_by_station(blocks):
+    (row,) = cells(blocks["Links"]["Passes over ground stations"])
+
+    assert (row["station"], row["begun"], row["ended"], row["vehicles"]) == ("Kiruna", 2, 1, 2)
+    assert (row["longest, s"], row["highest elevation, deg"]) == (8.0, 42.0)
 
 
 def test_error_of_a_sensor_is_against_truth_at_the_time_it_was_valid(blocks):

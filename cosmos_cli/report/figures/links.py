@@ -13,6 +13,7 @@ from cosmos_cli.report.style import MUTED, PALETTE, as_array, layout
 from cosmos_cli.tables import TableReader
 
 FIELDS = ("sent_s", "sender", "outcome", "arrives_s", "distance_m")
+CONTACT_FIELDS = ("event", "agent", "station", "rise_s", "set_s", "elevation_deg_max")
 DELIVERED = "delivered"
 BINS = 60
 ROWS_READ_MAX = 65_536
@@ -66,6 +67,44 @@ def link_blocks(table: TableReader, source: Source) -> list[Block]:
 def message_blocks(table: TableReader, source: Source) -> list[Block]:
     """Return nothing where the host's account of links is drawn: it tells the same and more."""
     return [] if "host_links" in source.tables else generic_blocks(table, source)
+
+
+def contact_blocks(table: TableReader, source: Source) -> list[Block]:
+    """Return the passes over each ground station; nothing for a run without stations."""
+    if not table.has(*CONTACT_FIELDS):
+        return generic_blocks(table, source)
+    if not table.rows:
+        return []
+    columns = table.read("host", CONTACT_FIELDS)
+    is_over = columns["event"].astype(str) == "set"
+    stations, agents = columns["station"].astype(str), columns["agent"].astype(str)
+    lasted_s = as_array(columns["set_s"]) - as_array(columns["rise_s"])
+    height_deg = as_array(columns["elevation_deg_max"])
+    rows: list[list[object]] = []
+    for station in sorted(set(stations.tolist())):
+        passes = np.flatnonzero(is_over & (stations == station))
+        begun = int(((stations == station) & ~is_over).sum())
+        seen = len(set(agents[stations == station].tolist()))
+        ends: list[float | None] = [None, None, None]
+        if len(passes):
+            of_them = lasted_s[passes]
+            ends = [float(of_them.mean()), float(of_them.max()), float(height_deg[passes].max())]
+        rows.append([station, begun, len(passes), seen, *ends])
+    return [
+        TableBlock(
+            title="Passes over ground stations",
+            headings=headings(
+                "station",
+                "begun",
+                "ended",
+                "vehicles",
+                "mean duration, s",
+                "longest, s",
+                "highest elevation, deg",
+            ),
+            rows=rows,
+        )
+    ]
 
 
 def _over_time(counts: _Counts) -> Figure:

@@ -68,7 +68,7 @@ def estimate_blocks(table: TableReader, source: Source) -> list[Block]:
             table,
             source,
             SLOT_ERROR,
-            title="Slot error by agent",
+            title="Slot error believed, by agent",
             unit="deg",
             note="As flight software believed it.",
         ),
@@ -208,8 +208,8 @@ def _slot_errors(table: TableReader, source: Source) -> Block:
         line(rows[:, 0], rows[:, 1], "rms", line={"width": 1.8, "color": ACCENT}),
     ]
     return Figure(
-        title="Slot error of all agents",
-        note="Root mean square and largest, over every estimate of every agent.",
+        title="Slot error believed, of all agents",
+        note="Root mean square and largest, over every estimate of every agent: not what truth says.",
         choices=[Choice(name="", traces=traces)],
         layout=layout("simulated time, s", "deg", showlegend=True),
     )
