@@ -102,6 +102,7 @@ class Guidance(FlightSoftware):
     def setup(self, context: FlightContext) -> None:
         """Read the settings; this satellite's slot is its place among the agents."""
         self.context = context
+        # slots is not for us but for those who judge the run by truth: cosmos report and cosmos diff.
         unknown = sorted(set(context.settings) - set(DEFAULTS) - {"gravity", "slots"})
         if unknown:
             raise ValueError(f"flight.settings: unknown {', '.join(unknown)}")
