@@ -5,7 +5,8 @@ The slot error is worked out here from the recorded truth, by mean elements; wha
 stands beside it and is never taken for it. The scenario says in flight.settings.slots what a slot is:
 
     even   equal spacing of all agents in their order, whatever the ring's common phase
-    kept   the phase at the start, against the mean of those in the same plane and at the same height
+    kept   the phase at the start, against the mean of those in the same plane, at the same height, who could
+           hear each other at the start, directly or over others of them
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from cosmos_cli.tables import TableReader
 from madns_runtime.config import RunConfig
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96, GRAVITY_MODELS
 from madns_runtime.simulations.constellation.orbit.mean_elements import mean_from_state
+from madns_runtime.simulations.constellation.orbit.visibility import have_line_of_sight
+from madns_runtime.simulations.constellation.parameters import Crosslinks
 
 TIMES_MAX = 97
 """Times at which slots are judged: every quarter of an hour of a day."""
@@ -42,8 +45,10 @@ class ControlRow:
 
     t_s: float
     slot_error_deg_rms: float | None
-    """By truth, over all that have a slot; None if nobody's is known."""
+    """By truth, over all that have a slot; None if nobody has."""
     slot_error_deg_max: float | None
+    satellites: int
+    """That have a slot, and truth on record."""
     slot_error_estimated_deg_rms: float | None
     """As flight software believed."""
     delta_v_m_s_mean: float
@@ -69,7 +74,11 @@ def read_control(
     # By the run's agents, not by the table's: one that died early still has its place in the ring.
     agents, times_s = config.agents.resolved_names(), _times(state)
     mean = _mean_elements(state, agents, times_s, str(config.parameters.get("gravity")))
-    errors = even_errors_deg(mean) if slots == "even" else kept_errors_deg(mean, settings)
+    if slots == "even":
+        errors = even_errors_deg(mean)
+    else:
+        heard = _who_hears_whom(state, agents, times_s[:1], config)
+        errors = kept_errors_deg(mean, heard, settings)
     believed = _believed(estimates, agents, times_s)
     given, sent = _delta_v(tables, agents, times_s), _messages(tables, times_s)
     rows = []
@@ -79,6 +88,7 @@ def read_control(
                 t_s=t_s,
                 slot_error_deg_rms=_rms(errors[:, index]),
                 slot_error_deg_max=_largest(errors[:, index]),
+                satellites=int(np.isfinite(errors[:, index]).sum()),
                 slot_error_estimated_deg_rms=None if believed is None else _rms(believed[:, index]),
                 delta_v_m_s_mean=float(given[:, index].mean()),
                 delta_v_m_s_max=float(given[:, index].max()),
@@ -113,13 +123,21 @@ def even_errors_deg(mean: Floats) -> Floats:
     return _about_mean_deg(place, np.zeros(count, dtype=np.int64))
 
 
-def kept_errors_deg(mean: Floats, settings: Mapping[str, Any]) -> Floats:
-    """Return how far each satellite is ahead of its phase at the start, deg; NaN for one alone in its plane."""
+def kept_errors_deg(mean: Floats, heard: NDArray[np.bool_], settings: Mapping[str, Any]) -> Floats:
+    """
+    Return how far each satellite is ahead of its phase at the start, deg; NaN for one that is alone.
+
+    Args:
+        mean: As for `even_errors_deg`.
+        heard: Who hears whom at the start, shape (N, N).
+        settings: Those of flight software.
+    """
     plane = math.cos(math.radians(float(settings.get("plane_deg", PLANE_DEG))))
     sma_m = 1e3 * float(settings.get("sma_km", SMA_M / 1e3))
-    near = (mean[:, 0, 2:] @ mean[:, 0, 2:].T >= plane) & (
-        np.abs(mean[:, 0, 1][:, None] - mean[:, 0, 1]) <= sma_m
-    )
+    in_plane = mean[:, 0, 2:] @ mean[:, 0, 2:].T >= plane
+    at_height = np.abs(mean[:, 0, 1][:, None] - mean[:, 0, 1]) <= sma_m
+    # One that recorded nothing is near nobody but itself.
+    near = (in_plane & at_height & heard) | np.eye(len(mean), dtype=np.bool_)
     groups = _connected(near)
     errors = _about_mean_deg(mean[:, :, 0] - mean[:, :1, 0], groups)
     alone = np.bincount(groups)[groups] < 2
@@ -149,6 +167,26 @@ def _connected(near: NDArray[np.bool_]) -> NDArray[np.int64]:
             break
         groups = joined
     return groups
+
+
+def _who_hears_whom(
+    state: TableReader, agents: Sequence[str], first_s: Floats, config: RunConfig
+) -> NDArray[np.bool_]:
+    """Return whom each agent's radio reached at the start, shape (N, N); everybody if there is none."""
+    crosslinks = mapping_at(config.parameters, "crosslinks")
+    if not crosslinks:
+        return np.ones((len(agents), len(agents)), dtype=np.bool_)
+    r_m = np.full((len(agents), 3), np.nan)
+    for row, agent in enumerate(agents):
+        columns = state.read(agent, ("t_s", *STATE[:3]))
+        for _, index in _at(as_array(columns["t_s"]), first_s):
+            r_m[row] = [float(columns[name][index]) for name in STATE[:3]]
+    known = Crosslinks()
+    range_km = float(crosslinks.get("range_km_max", known.range_km_max))
+    height_km = float(crosslinks.get("atmosphere_km", known.atmosphere_km))
+    near = np.linalg.norm(r_m[:, None] - r_m, axis=2) <= 1e3 * range_km
+    sight = have_line_of_sight(r_m[:, None], r_m[None], 1e3 * height_km)
+    return np.asarray(near & sight)
 
 
 def _times(state: TableReader) -> Floats:

@@ -190,6 +190,23 @@ def test_satellites_keep_the_phases_of_the_start_with_the_neighbours_of_their_pl
     assert [one.finish()["neighbours"] for one in kept.software] == [1, 2, 2, 1]
 
 
+def test_satellite_that_is_nobodys_nearest_is_adopted_and_agrees_with_the_others():
+    # The last one's only neighbour by height is the first, whose own nearest one is the second.
+    places, heights_m = [0.0, 0.3, 0.5], [0.0, 4000.0, -4000.0]
+    states = [state(mean_orbit(780.0, p, sma_m=h)) for p, h in zip(places, heights_m, strict=True)]
+    settings = SLOTS | {"slots": "kept"}
+    kept = Fleet(
+        flight_class("slot_keeping.py", "SlotKeeping"), states, settings=settings, tick_s=60.0
+    )
+
+    kept.run(4 * 3600.0)
+    agreed_km = [one._ring.sma_ring_m / 1e3 for one in kept.software]
+
+    assert [one.finish()["neighbours"] for one in kept.software] == [2, 1, 1]
+    assert np.ptp(agreed_km) < 0.1
+    assert np.mean(agreed_km) == pytest.approx(EGM_96.radius_m / 1e3 + 780.0, abs=1.0)
+
+
 def test_faults_of_a_rings_settings_are_named():
     with pytest.raises(ValueError, match="altitude_km and inclination_deg"):
         RingSettings.from_mapping({"slots": "even"})

@@ -38,13 +38,14 @@ MESSAGES = StreamSchema(
 TICKS = 5
 
 
-def written(tmp_path, places_deg, *, slots="even", sma_m=(), skipped=(), raan_deg=()):
+def written(
+    tmp_path, places_deg, *, slots="even", sma_m=(), skipped=(), raan_deg=(), crosslinks=None
+):
     """A run at 1/600 Hz: satellite i at places_deg[i](tick), the first k of *skipped* without records."""
     count = len(places_deg)
     settings = {"slots": slots} if slots else {}
-    config = make_config(
-        count, ticks=TICKS, tick_hz=1 / 600, parameters={"flight": {"settings": settings}}
-    )
+    parameters = {"flight": {"settings": settings}, "crosslinks": crosslinks}
+    config = make_config(count, ticks=TICKS, tick_hz=1 / 600, parameters=parameters)
     made = SyntheticRun(tmp_path, config).write()
     for number, name in enumerate(made.names):
         if number in skipped:
@@ -134,6 +135,24 @@ def test_kept_slots_are_those_of_the_start_within_each_plane(tmp_path):
 
     expected = [0.1 * tick for tick in range(TICKS)]
     assert [row.slot_error_deg_rms for row in rows] == pytest.approx(expected, abs=2e-3)
+    assert {row.satellites for row in rows} == {2}
+
+
+def test_kept_slots_are_of_those_who_hear_each_other(tmp_path):
+    # 100 deg apart the Earth is between the pairs, which part by 10 deg a tick; each pair by 0.2.
+    places = [
+        lambda t: 0.1 * t,
+        lambda t: 30.0 - 0.1 * t,
+        lambda t: 150.0 + 10.1 * t,
+        lambda t: 180.0 + 9.9 * t,
+    ]
+    made, _ = written(tmp_path, places, slots="kept", crosslinks={"range_km_max": 20_000})
+
+    rows = rows_of(made)
+
+    expected = [0.1 * tick for tick in range(TICKS)]
+    assert [row.slot_error_deg_rms for row in rows] == pytest.approx(expected, abs=2e-3)
+    assert {row.satellites for row in rows} == {4}
 
 
 def test_report_and_json_show_the_slots(tmp_path):

@@ -12,6 +12,7 @@ from cosmos_cli.report.style import layout, line
 ROWS_SHOWN = 13
 """Of a day: every two hours."""
 COLUMNS = (
+    "satellites",
     "slot error rms, deg",
     "max, deg",
     "believed rms, deg",
@@ -69,6 +70,7 @@ def _values(values: list[float | None]) -> Floats:
 def _cells(row: ControlRow) -> list[object]:
     return [
         f"{row.t_s / 3600.0:.4g} h",
+        row.satellites,
         row.slot_error_deg_rms,
         row.slot_error_deg_max,
         row.slot_error_estimated_deg_rms,

@@ -30,7 +30,7 @@ from madns_runtime.simulations.constellation.orbit.mean_elements import (
 
 Slots = Literal["even", "kept"]
 WEIGHT = 1.0 / 3.0
-"""Of a neighbour's value against one's own: the Metropolis weight of a ring, where everybody has two."""
+"""Of a neighbour's value against one's own in a ring, where everybody has two; see `weight`."""
 GNSS = "gnss"
 
 
@@ -97,8 +97,8 @@ class _Average:
         self._before, self._change = first, 0.0
 
     def update(self, measured: float, differences: list[float]) -> None:
-        """Follow one's own measurement and draw towards the neighbours' values; the sum over all stays."""
-        drawn, change = self.value + WEIGHT * sum(differences), measured - self.input
+        """Follow one's own measurement and draw to the neighbours' values, weighted; the sum over all stays."""
+        drawn, change = self.value + sum(differences), measured - self.input
         pushed = self._momentum * (drawn - self._before - self._change)
         self._before, self._change = self.value, change
         self.value, self.input = drawn + pushed + change, measured
@@ -155,7 +155,7 @@ class RingMember:
         payload = message.payload
         if (
             isinstance(payload, Mapping)
-            and {"round", "t_s", "lam", "a", "phase", "sma"} <= payload.keys()
+            and {"round", "t_s", "lam", "a", "phase", "sma", "degree"} <= payload.keys()
         ):
             self._heard[message.sender] = payload
 
@@ -176,16 +176,19 @@ class RingMember:
             return
         if not self._neighbours:
             self._neighbours = self._choose(mean, reading.t_s)
+        if self.settings.slots == "kept":
+            self._adopt()
+        degree = len(self._neighbours)
         fresh = [
-            heard
+            (weight(degree, heard["degree"]), heard)
             for name in self._neighbours
             if (heard := self._heard.get(name)) and heard["round"] == self._round - 1
         ]
         place, sma = self._place, self._sma
         measured = place.input + wrapped(turned - self._slot_rad - place.input)
-        place.update(measured, [wrapped(heard["phase"] - place.value) for heard in fresh])
+        place.update(measured, [w * wrapped(heard["phase"] - place.value) for w, heard in fresh])
         follows = mean.a_m if self._follows_sma else sma.input
-        sma.update(follows, [heard["sma"] - sma.value for heard in fresh])
+        sma.update(follows, [w * (heard["sma"] - sma.value) for w, heard in fresh])
         for name in self._neighbours:
             self._context.send(name, self._message(mean, reading.t_s))
             self.sent += 1
@@ -216,7 +219,18 @@ class RingMember:
             "a": mean.a_m,
             "phase": self._place.value,
             "sma": self._sma.value,
+            "degree": len(self._neighbours),
         }
+
+    def _adopt(self) -> None:
+        """
+        Take those for neighbours who take this one for theirs.
+
+        The nearest one of somebody at the edge of a plane or height may have nearer ones itself. An
+        average stays one only if both sides of a link draw to each other.
+        """
+        speaks = [name for name, heard in self._heard.items() if heard["degree"]]
+        self._neighbours = tuple(dict.fromkeys((*self._neighbours, *speaks)))
 
     def _choose(self, mean: CircularElements, t_s: float) -> tuple[str, ...]:
         """Return the nearest one ahead and the nearest one behind of those heard in one's own plane."""
@@ -229,10 +243,19 @@ class RingMember:
             if abs(heard["a"] - mean.a_m) <= 1e3 * self.settings.sma_km:
                 moved = heard["lam"] + self.rate_rad_s * (t_s - heard["t_s"])
                 beside.append((wrapped(moved - mean.lam_rad), name))
-        self._heard.clear()
         ahead = min((item for item in beside if item[0] >= 0.0), default=None)
         behind = max((item for item in beside if item[0] < 0.0), default=None)
         return tuple(item[1] for item in (behind, ahead) if item is not None)
+
+
+def weight(own_degree: int, their_degree: int) -> float:
+    """
+    Return the weight of a neighbour's value, the same on both sides of a link.
+
+    Source: the Metropolis weights of Xiao, Boyd and Lall, A scheme for robust distributed sensor fusion
+    based on average consensus, IPSN 2005.
+    """
+    return 1.0 / (1.0 + max(own_degree, their_degree))
 
 
 def best_momentum(count: int) -> float:
