@@ -14,13 +14,13 @@ import sgp4
 from numpy.typing import NDArray
 
 from madns_runtime.errors import ConfigurationError, MissingExtraError
+from madns_runtime.simulations.constellation.equipment import Attitude
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.orbit.elements import Elements, state_from_elements
 from madns_runtime.simulations.constellation.orbit.hermite import interpolate
 from madns_runtime.simulations.constellation.orbit.invariants import ENERGY, specific_energy
 from madns_runtime.simulations.constellation.parameters import (
     AnyPropagator,
-    Attitude,
     BasiliskPropagator,
     NumbaPropagator,
     ScipyPropagator,

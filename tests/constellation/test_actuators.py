@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from madns_runtime.simulations.constellation.parameters import ReactionWheels, Thruster, Vehicle
+from madns_runtime.simulations.constellation.equipment import ReactionWheels, Thruster, Vehicle
 from madns_runtime.simulations.constellation.truth.actuators import (
     Burn,
     Refusal,

@@ -5,14 +5,14 @@ import math
 import pytest
 
 from madns_runtime.errors import PluginError
-from madns_runtime.simulations.constellation.messages import Command
-from madns_runtime.simulations.constellation.parameters import (
+from madns_runtime.simulations.constellation.equipment import (
     Attitude,
-    Maneuvers,
     ReactionWheels,
     Thruster,
     Vehicle,
 )
+from madns_runtime.simulations.constellation.messages import Command
+from madns_runtime.simulations.constellation.parameters import Maneuvers
 from madns_runtime.simulations.constellation.truth.effects import Timeline
 from madns_runtime.simulations.constellation.truth.maneuvers import (
     WAITING_MAX,

@@ -9,13 +9,10 @@ import pytest
 pytest.importorskip("Basilisk", reason="the extra `basilisk` is not installed")
 
 from madns_runtime.errors import ConfigurationError
+from madns_runtime.simulations.constellation.equipment import Attitude
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.orbit.quaternions import normalised, rotate
-from madns_runtime.simulations.constellation.parameters import (
-    Attitude,
-    BasiliskPropagator,
-    ScipyPropagator,
-)
+from madns_runtime.simulations.constellation.parameters import BasiliskPropagator, ScipyPropagator
 from madns_runtime.simulations.constellation.truth.attitude import (
     RigidBody,
     initial_attitude,

@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
+from madns_runtime.simulations.constellation.equipment import Attitude
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.orbit.quaternions import (
     IDENTITY,
@@ -16,7 +17,7 @@ from madns_runtime.simulations.constellation.orbit.quaternions import (
     rotate_back,
     rotation_between,
 )
-from madns_runtime.simulations.constellation.parameters import Attitude, ScipyPropagator
+from madns_runtime.simulations.constellation.parameters import ScipyPropagator
 from madns_runtime.simulations.constellation.truth.attitude import (
     ATTITUDE,
     RigidBody,

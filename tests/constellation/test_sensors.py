@@ -10,11 +10,11 @@ from constellation_fakes import FakeContext, parameters
 from madns_runtime.config import from_mapping
 from madns_runtime.plugin.api import Tick
 from madns_runtime.simulations.constellation.agent import ConstellationAgent
+from madns_runtime.simulations.constellation.equipment import Sensors
 from madns_runtime.simulations.constellation.messages import Initial, Segment
 from madns_runtime.simulations.constellation.orbit.earth import days_since_j2000
 from madns_runtime.simulations.constellation.orbit.quaternions import rotate, rotation_between
 from madns_runtime.simulations.constellation.orbit.sun import sun_m
-from madns_runtime.simulations.constellation.parameters import Sensors
 from madns_runtime.simulations.constellation.vehicle.sensors.errors import (
     BLOCK,
     ErrorModel,

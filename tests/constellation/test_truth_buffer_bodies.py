@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from madns_runtime.simulations.constellation.equipment import Attitude
 from madns_runtime.simulations.constellation.messages import Segment
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.orbit.quaternions import (
@@ -15,7 +16,7 @@ from madns_runtime.simulations.constellation.orbit.quaternions import (
     rotation_between,
 )
 from madns_runtime.simulations.constellation.orbit.turning import evaluate_turn, turn_between
-from madns_runtime.simulations.constellation.parameters import Attitude, ScipyPropagator
+from madns_runtime.simulations.constellation.parameters import ScipyPropagator
 from madns_runtime.simulations.constellation.truth.attitude import (
     RigidBody,
     initial_attitude,

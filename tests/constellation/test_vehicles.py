@@ -3,7 +3,8 @@
 import pytest
 from constellation_fakes import parameters
 
-from madns_runtime.simulations.constellation.parameters import FlightSoftware, Vehicle
+from madns_runtime.simulations.constellation.equipment import Vehicle
+from madns_runtime.simulations.constellation.parameters import FlightSoftware
 from madns_runtime.simulations.constellation.vehicles import flight_of, vehicle_of
 
 VEHICLES = [

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from guides import ROOT, blocks, row_keys, spans
 
+from madns_runtime.simulations.constellation.equipment import SensorNoise, Sensors
 from madns_runtime.simulations.constellation.flight import process
 from madns_runtime.simulations.constellation.flight.answers import KEYS
 from madns_runtime.simulations.constellation.flight.api import FlightContext, FlightSoftware
 from madns_runtime.simulations.constellation.flight.loading import METHODS
-from madns_runtime.simulations.constellation.parameters import SensorNoise, Sensors
 from madns_runtime.simulations.constellation.vehicle import board, commands
 
 GUIDE = (ROOT / "docs" / "flight-software.md").read_text("utf-8")

@@ -7,12 +7,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from madns_runtime.simulations.constellation.check_code import code_faults
+from madns_runtime.simulations.constellation.equipment import SensorNoise, Vehicle
 from madns_runtime.simulations.constellation.flight.programs import find_program
 from madns_runtime.simulations.constellation.parameters import (
     ConstellationParameters,
     FlightProcess,
-    SensorNoise,
-    Vehicle,
 )
 from madns_runtime.simulations.constellation.vehicles import fits
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from madns_runtime.errors import PluginError
 from madns_runtime.plugin.api import HostContext, HostSimulation
+from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.hosting.conservation import Conservation
 from madns_runtime.simulations.constellation.hosting.maneuvering import Maneuvering
 from madns_runtime.simulations.constellation.hosting.refills import Refills
@@ -28,7 +29,7 @@ from madns_runtime.simulations.constellation.messages import (
     Transmission,
 )
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
-from madns_runtime.simulations.constellation.parameters import ConstellationParameters, Vehicle
+from madns_runtime.simulations.constellation.parameters import ConstellationParameters
 from madns_runtime.simulations.constellation.truth.fleet import Fleet, load_fleet
 from madns_runtime.simulations.constellation.truth.maneuvers import ManeuverDesk, Rules
 from madns_runtime.simulations.constellation.truth.propagation import (

@@ -15,6 +15,7 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 
 from madns_runtime.config import FORBID_EXTRA
+from madns_runtime.simulations.constellation.equipment import Vehicle
 
 Force = Literal["two_body", "j2", "j3", "j4", "drag"]
 Setting = bool | int | float | str | list[float] | list[str]
@@ -167,141 +168,6 @@ class CustomPropagator:
 AnyPropagator = (
     ScipyPropagator | NumbaPropagator | Sgp4Propagator | BasiliskPropagator | CustomPropagator
 )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Thruster:
-    """What turns a commanded delta-v into a real one."""
-
-    __pydantic_config__ = FORBID_EXTRA
-
-    isp_s: Annotated[float, Gt(0)]
-    """Specific impulse, s."""
-    propellant_kg: Annotated[float, Ge(0)]
-    """Propellant at the epoch, kg; part of the vehicle's mass."""
-    thrust_n: Annotated[float, Gt(0)] | None = None
-    """Thrust, N: delta-v is a finite burn centred on its time; none for an impulse."""
-    magnitude_error: Annotated[float, Ge(0), Lt(1)] = 0.0
-    """Standard deviation of the delta-v's magnitude, as a share of it."""
-    direction_error_deg: Annotated[float, Ge(0), Le(45)] = 0.0
-    """Standard deviation of the delta-v's direction about each of two axes, deg."""
-    minimum_impulse_n_s: Annotated[float, Ge(0)] = 0.0
-    """A smaller impulse is not executed, N s."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReactionWheels:
-    """What turns a commanded torque into a real one."""
-
-    __pydantic_config__ = FORBID_EXTRA
-
-    torque_n_m_max: Annotated[float, Gt(0)]
-    """Largest torque about each body axis, N m."""
-    momentum_n_m_s_max: Annotated[float, Gt(0)]
-    """Momentum about each body axis at which the wheels are saturated, N m s."""
-    torque_error: Annotated[float, Ge(0), Lt(1)] = 0.0
-    """Standard deviation of the torque, as a share of it."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Attitude:
-    """A rigid body: quaternion (scalar last, inertial to body) and body rates are propagated as well."""
-
-    __pydantic_config__ = FORBID_EXTRA
-
-    inertia_kg_m2: tuple[Annotated[float, Gt(0)], Annotated[float, Gt(0)], Annotated[float, Gt(0)]]
-    """Principal moments of inertia about body x, y, z, kg m^2."""
-    initial: Literal["nadir", "inertial"] = "nadir"
-    """nadir: body z to the Earth, y against the orbit normal, turning with the orbit; inertial: body axes
-    on the frame's, at rest."""
-    rates_deg_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Added to the body rates at the epoch, deg/s."""
-    has_gravity_gradient: bool = True
-    """Whether the Earth's gravity turns it."""
-    wheels: ReactionWheels | None = None
-    """Actuators of commanded torques; none for exact torques without limit."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SensorNoise:
-    """What every sensor may have. Units of the noise are those of the sensor's values."""
-
-    __pydantic_config__ = FORBID_EXTRA
-
-    rate_hz: Annotated[float, Gt(0)] = 1.0
-    """Measurements a second; at most one a tick."""
-    noise: Annotated[float, Ge(0)] = 0.0
-    """Standard deviation of white noise on each value."""
-    bias: Annotated[float, Ge(0)] = 0.0
-    """Standard deviation of a constant error of each value."""
-    bias_walk: Annotated[float, Ge(0)] = 0.0
-    """Standard deviation of the bias's walk over one square root of a second."""
-    latency_s: Annotated[float, Ge(0)] = 0.0
-    """From the moment measured until flight software has it, s."""
-    dropout: Annotated[float, Ge(0), Le(1)] = 0.0
-    """Share of measurements that never come."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Gnss(SensorNoise):
-    """Position (m) and velocity (m/s) in the run's frame; `noise` and biases are those of position."""
-
-    __pydantic_config__ = FORBID_EXTRA
-
-    velocity_noise_m_s: Annotated[float, Ge(0)] = 0.0
-    """Standard deviation of white noise on each component of velocity, m/s."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Magnetometer(SensorNoise):
-    """Magnetic field in body axes, T; in the run's frame for a vehicle without attitude."""
-
-    __pydantic_config__ = FORBID_EXTRA
-
-    field: Literal["dipole", "igrf"] = "dipole"
-    """dipole: tilted dipole; igrf: the extra `igrf`."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sensors:
-    """What a vehicle measures; absent sensors measure nothing."""
-
-    __pydantic_config__ = FORBID_EXTRA
-
-    gnss: Gnss | None = None
-    gyro: SensorNoise | None = None
-    """Body rates, rad/s."""
-    accelerometer: SensorNoise | None = None
-    """Acceleration other than gravity, in body axes, m/s^2."""
-    magnetometer: Magnetometer | None = None
-    star_tracker: SensorNoise | None = None
-    """Quaternion, scalar last, inertial to body; noise in rad about each body axis."""
-    sun_sensor: SensorNoise | None = None
-    """Unit vector to the Sun in body axes; nothing in eclipse; noise in rad."""
-    clock: SensorNoise | None = None
-    """Time since the epoch, s."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Vehicle:
-    """What some of the vehicles are like."""
-
-    __pydantic_config__ = FORBID_EXTRA
-
-    agents: Annotated[tuple[str, ...], MinLen(1)] = ("*",)
-    """Globs of agents' or satellites' names; a vehicle is described by the first entry that fits."""
-    mass_kg: Annotated[float, Gt(0)] = 100.0
-    """Mass at the epoch, propellant included, kg."""
-    ballistic_m2_kg: Annotated[float, Ge(0)] = 0.01
-    """Ballistic coefficient Cd A / m, m^2/kg: what drag acts on."""
-    ballistic_m2_kg_range: tuple[float, float] | None = None
-    """Smallest and largest one that flight software may command by turning the vehicle; none for neither."""
-    thruster: Thruster | None = None
-    """None: no delta-v is executed."""
-    attitude: Attitude | None = None
-    """None: a point mass."""
-    sensors: Sensors = field(default_factory=Sensors)
-    """What it measures."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from fnmatch import fnmatchcase
 
+from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.parameters import (
     ConstellationParameters,
     FlightProcess,
     FlightSoftware,
-    Vehicle,
 )
 
 DEFAULT = Vehicle()

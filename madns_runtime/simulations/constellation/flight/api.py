@@ -38,7 +38,7 @@ class Reading(NamedTuple):
     t_s: float
     """When it was valid."""
     values: tuple[float, ...]
-    """Units and frame: see the sensor in `parameters.Sensors`."""
+    """Units and frame: see the sensor in `equipment.Sensors`."""
 
 
 Readings = Mapping[str, Reading]

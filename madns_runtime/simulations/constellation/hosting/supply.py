@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from madns_runtime.errors import PluginError
 from madns_runtime.plugin.api import HostContext
-from madns_runtime.simulations.constellation.parameters import Vehicle
+from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.truth.batches import merge, propagate_part, split
 from madns_runtime.simulations.constellation.truth.effects import Timeline
 from madns_runtime.simulations.constellation.truth.jobs import (

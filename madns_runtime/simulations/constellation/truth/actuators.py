@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from madns_runtime.simulations.constellation.parameters import ReactionWheels, Thruster, Vehicle
+from madns_runtime.simulations.constellation.equipment import ReactionWheels, Thruster, Vehicle
 from madns_runtime.simulations.constellation.truth.effects import Vector, scaled
 
 STANDARD_GRAVITY_M_S2 = 9.80665

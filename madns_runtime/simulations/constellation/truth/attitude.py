@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from madns_runtime.errors import ConfigurationError, MissingExtraError
+from madns_runtime.simulations.constellation.equipment import Attitude
 from madns_runtime.simulations.constellation.orbit.frames import rtn_to_inertial
 from madns_runtime.simulations.constellation.orbit.quaternions import (
     IDENTITY,
@@ -22,7 +23,6 @@ from madns_runtime.simulations.constellation.orbit.quaternions import (
     Vector,
     from_matrix,
 )
-from madns_runtime.simulations.constellation.parameters import Attitude
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
     propagate,

@@ -12,8 +12,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.messages import Command, CommandResult, CommandStatus
-from madns_runtime.simulations.constellation.parameters import Maneuvers, Vehicle
+from madns_runtime.simulations.constellation.parameters import Maneuvers
 from madns_runtime.simulations.constellation.truth.actuators import (
     Burn,
     Refusal,

@@ -19,6 +19,7 @@ from madns_runtime.plugin.api import HOST, AgentContext
 from madns_runtime.protocol.codec import pack
 from madns_runtime.protocol.messages import Service
 from madns_runtime.recording.records import Field
+from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.messages import (
     EVERYBODY,
     GROUND,
@@ -29,7 +30,7 @@ from madns_runtime.simulations.constellation.messages import (
     Initial,
     Transmission,
 )
-from madns_runtime.simulations.constellation.parameters import ConstellationParameters, Vehicle
+from madns_runtime.simulations.constellation.parameters import ConstellationParameters
 from madns_runtime.simulations.constellation.vehicle import streams
 from madns_runtime.simulations.constellation.vehicle.commands import (
     COMMANDS_PER_TICK_MAX,

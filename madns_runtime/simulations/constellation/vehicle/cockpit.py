@@ -11,10 +11,10 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
+from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.flight.api import MASS, TRUTH, Reading
 from madns_runtime.simulations.constellation.flight.pilot import Pilot
 from madns_runtime.simulations.constellation.messages import CommandResult, Delivery
-from madns_runtime.simulations.constellation.parameters import Vehicle
 from madns_runtime.simulations.constellation.vehicle.board import Board
 from madns_runtime.simulations.constellation.vehicle.radio import Receiver
 

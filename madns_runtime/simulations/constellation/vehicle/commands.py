@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from typing import Any, get_args
 
 from madns_runtime.errors import PluginError
+from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.messages import Command, CommandFrame, CommandKind
-from madns_runtime.simulations.constellation.parameters import Vehicle
 
 COMMANDS_PER_TICK_MAX = 16
 """More in one tick is a loop gone wild, not a plan."""

@@ -6,15 +6,12 @@ import dataclasses
 from typing import Any
 
 from madns_runtime.plugin.api import AgentContext
+from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.flight.loading import load_flight_class
 from madns_runtime.simulations.constellation.flight.pilot import Pilot
 from madns_runtime.simulations.constellation.flight.process import ExternalFlight
 from madns_runtime.simulations.constellation.messages import Initial
-from madns_runtime.simulations.constellation.parameters import (
-    FlightProcess,
-    FlightSoftware,
-    Vehicle,
-)
+from madns_runtime.simulations.constellation.parameters import FlightProcess, FlightSoftware
 from madns_runtime.simulations.constellation.vehicle.board import Board
 from madns_runtime.simulations.constellation.vehicle.cockpit import Cockpit
 from madns_runtime.simulations.constellation.vehicle.sensors.errors import generator_of

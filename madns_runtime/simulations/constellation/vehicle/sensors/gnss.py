@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from madns_runtime.recording.records import Field
-from madns_runtime.simulations.constellation.parameters import Gnss
+from madns_runtime.simulations.constellation.equipment import Gnss
 from madns_runtime.simulations.constellation.vehicle.sensors.scene import Scene
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from madns_runtime.errors import MissingExtraError, PluginError
 from madns_runtime.recording.records import Field
+from madns_runtime.simulations.constellation.equipment import Magnetometer
 from madns_runtime.simulations.constellation.orbit.magnetic import (
     NT,
     Coefficients,
@@ -17,7 +18,6 @@ from madns_runtime.simulations.constellation.orbit.magnetic import (
     dipole_at,
     dipole_field_t,
 )
-from madns_runtime.simulations.constellation.parameters import Magnetometer
 from madns_runtime.simulations.constellation.vehicle.sensors.scene import Scene
 
 Vector = tuple[float, float, float]

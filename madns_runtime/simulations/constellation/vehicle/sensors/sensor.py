@@ -13,8 +13,8 @@ from typing import Protocol
 
 from madns_runtime.plugin.api import AgentContext
 from madns_runtime.recording.records import Field
+from madns_runtime.simulations.constellation.equipment import SensorNoise
 from madns_runtime.simulations.constellation.flight.api import Reading
-from madns_runtime.simulations.constellation.parameters import SensorNoise
 from madns_runtime.simulations.constellation.vehicle.sensors.errors import (
     ErrorModel,
     Errors,

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from madns_runtime.plugin.api import AgentContext
+from madns_runtime.simulations.constellation.equipment import SensorNoise, Sensors
 from madns_runtime.simulations.constellation.flight.api import Reading
-from madns_runtime.simulations.constellation.parameters import SensorNoise, Sensors
 from madns_runtime.simulations.constellation.vehicle.sensors.accelerometer import Accelerometer
 from madns_runtime.simulations.constellation.vehicle.sensors.clock import Clock
 from madns_runtime.simulations.constellation.vehicle.sensors.gnss import GnssReceiver
