@@ -3,13 +3,15 @@ Injection into a Hohmann transfer: one burn to an apogee of 42,164 km, if wanted
 
 The thesis (section 6.2.1) gave this to single satellites. Each satellite takes its own state at the time
 of the burn, predicted from its newest reading, and asks for the along-track velocity whose ellipse has
-the apogee wanted.
+the apogee wanted. J2's potential counts: low down it is worth up to 5 m/s, and an osculating apogee
+that leaves it out is up to 300 km away from where the satellite will be.
 
 flight.settings:
 
     burn_s            time of the first burn, s (60)
     lead_s            from command to burn, s (3); 0 for one tick
     apogee_km         distance of the apogee from the Earth's centre, km (42164)
+    has_j2            whether J2 counts (true); false is the textbook's transfer
     circularise       whether a second burn makes the orbit round at the apogee (false)
 """
 
@@ -47,6 +49,7 @@ class Hohmann(FlightSoftware):
         self._lead_s = float(settings.get("lead_s", 3.0)) or 1.0 / context.tick_hz
         self._burn_s = float(settings.get("burn_s", 60.0))
         self._circularises = bool(settings.get("circularise", False))
+        self._j2 = EGM_96.j2 if settings.get("has_j2", True) else 0.0
         self._newest: Reading | None = None
         self._asked_m_s: list[float] = []
         self._given_m_s: list[float] = []
@@ -81,7 +84,9 @@ class Hohmann(FlightSoftware):
             "refused": self._refused,
             "delta_v_asked_m_s": sum(self._asked_m_s),
             "delta_v_m_s": sum(self._given_m_s),
-            "apogee_km": 0.0 if self._newest is None else apogee_m(self._newest.values) / 1e3,
+            "apogee_km": 0.0
+            if self._newest is None
+            else apogee_m(self._newest.values, self._j2) / 1e3,
         }
 
     def _command(self, t_s: float) -> None:
@@ -92,7 +97,7 @@ class Hohmann(FlightSoftware):
             along_m_s = round_m_s(state)
             self._burn_s = math.inf
         else:
-            along_m_s = injection_m_s(state, self._apogee_m)
+            along_m_s = injection_m_s(state, self._apogee_m, self._j2)
             self._burn_s = (
                 self._apogee_s(state, along_m_s, at_s) if self._circularises else math.inf
             )
@@ -105,30 +110,37 @@ class Hohmann(FlightSoftware):
         _, along = axes(state)
         after = tuple(value + along_m_s * axis for value, axis in zip(v, along, strict=True))
         elements = elements_from_state((r[0], r[1], r[2]), (after[0], after[1], after[2]), MU)
-        n_rad_s = math.sqrt(MU / elements.a_m**3)
+        a_m = sma_m((*r, *after), self._j2)
+        n_rad_s = math.sqrt(MU / a_m**3)
         return at_s + (math.pi - elements.mean_anomaly_rad) % math.tau / n_rad_s
+
+    def _apogee_km(self, reading: Reading) -> float:
+        # Of a round orbit J2's potential would be taken for eccentricity: its root is not small.
+        return apogee_m(reading.values, 0.0 if len(self._given_m_s) > 1 else self._j2) / 1e3
 
     def _report(self) -> None:
         assert self._newest is not None
         self.context.estimate(
             {
-                "apogee_km": apogee_m(self._newest.values) / 1e3,
+                "apogee_km": self._apogee_km(self._newest),
                 "delta_v_asked_m_s": sum(self._asked_m_s),
                 "delta_v_m_s": sum(self._given_m_s),
             }
         )
 
 
-def injection_m_s(state: Sequence[float], apogee_m: float) -> float:
+def injection_m_s(state: Sequence[float], apogee_m: float, j2: float) -> float:
     """
     Return the along-track change of velocity after which the ellipse's apogee is *apogee_m*, m/s.
 
     Energy and angular momentum at the state and at the apogee: vis-viva for a state whose radial
-    velocity stays, (1 - r^2/ra^2) vt^2 = 2 mu (1/r - 1/ra) - vr^2.
+    velocity stays, (1 - r^2/ra^2) vt^2 = 2 mu (1/r - 1/ra) - vr^2 - 2 (V - Va), with J2's potential V.
     """
     r, vr, vt = polar(state)
-    wanted = (2.0 * MU * (1.0 / r - 1.0 / apogee_m) - vr * vr) / (1.0 - (r / apogee_m) ** 2)
-    return math.sqrt(wanted) - vt
+    # The apogee is on the other side of the Earth, at the latitude's mirror image.
+    oblate = oblate_j_kg(state, j2) * (1.0 - (r / apogee_m) ** 3)
+    wanted = 2.0 * MU * (1.0 / r - 1.0 / apogee_m) - vr * vr - 2.0 * oblate
+    return math.sqrt(wanted / (1.0 - (r / apogee_m) ** 2)) - vt
 
 
 def round_m_s(state: Sequence[float]) -> float:
@@ -137,11 +149,24 @@ def round_m_s(state: Sequence[float]) -> float:
     return math.sqrt(MU / r) - vt
 
 
-def apogee_m(state: Sequence[float]) -> float:
-    """Return the apogee of the osculating ellipse, m from the Earth's centre."""
-    r, vr, vt = polar(state)
-    a = 1.0 / (2.0 / r - (vr * vr + vt * vt) / MU)
+def apogee_m(state: Sequence[float], j2: float) -> float:
+    """Return the apogee of the ellipse with the state's energy and momentum, m from the Earth's centre."""
+    r, _, vt = polar(state)
+    a = sma_m(state, j2)
     return a * (1.0 + math.sqrt(max(0.0, 1.0 - (r * vt) ** 2 / (MU * a))))
+
+
+def sma_m(state: Sequence[float], j2: float) -> float:
+    """Return the semi-major axis that belongs to the state's energy, J2's potential included, m."""
+    r, vr, vt = polar(state)
+    return 1.0 / (2.0 / r - (vr * vr + vt * vt + 2.0 * oblate_j_kg(state, j2)) / MU)
+
+
+def oblate_j_kg(state: Sequence[float], j2: float) -> float:
+    """Return J2's potential energy per mass, J/kg."""
+    r2 = _dot(state[:3], state[:3])
+    scale = 0.5 * MU * j2 * EGM_96.radius_m**2 / (r2 * math.sqrt(r2))
+    return scale * (3.0 * state[2] ** 2 / r2 - 1.0)
 
 
 def polar(state: Sequence[float]) -> tuple[float, float, float]:

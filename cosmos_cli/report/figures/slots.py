@@ -38,10 +38,6 @@ def slot_blocks(rows: tuple[ControlRow, ...]) -> list[Block]:
             2,
         ),
     ]
-    spent = [
-        line(hours, np.array([row.delta_v_m_s_mean for row in rows]), "mean", 0),
-        line(hours, np.array([row.delta_v_m_s_max for row in rows]), "largest", 1),
-    ]
     shown = [rows[index] for index in evenly(len(rows), ROWS_SHOWN).tolist()]
     return [
         Figure(
@@ -49,17 +45,30 @@ def slot_blocks(rows: tuple[ControlRow, ...]) -> list[Block]:
             choices=[Choice(name="all", traces=errors)],
             layout=layout("simulated time, h", "deg", showlegend=True),
         ),
-        Figure(
-            title="Delta-v given",
-            choices=[Choice(name="all", traces=spent)],
-            layout=layout("simulated time, h", "m/s", showlegend=True),
-        ),
+        *_delta_v(rows, hours),
         TableBlock(
             title="Slots over time",
             headings=headings("time", *COLUMNS),
             rows=[_cells(row) for row in shown],
             note="Slot errors are those of the recorded truth, about the ring's common phase.",
         ),
+    ]
+
+
+def _delta_v(rows: tuple[ControlRow, ...], hours: Floats) -> list[Figure]:
+    """Return the delta-v over time; nothing where none was given, as under control by drag."""
+    if not rows[-1].delta_v_m_s_max:
+        return []
+    spent = [
+        line(hours, np.array([row.delta_v_m_s_mean for row in rows]), "mean", 0),
+        line(hours, np.array([row.delta_v_m_s_max for row in rows]), "largest", 1),
+    ]
+    return [
+        Figure(
+            title="Delta-v given",
+            choices=[Choice(name="all", traces=spent)],
+            layout=layout("simulated time, h", "m/s", showlegend=True),
+        )
     ]
 
 
