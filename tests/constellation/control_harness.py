@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 
@@ -200,8 +199,3 @@ class Fleet:
             number=command.number, status="executed", at_s=command.at_s, revision=self.revision, delta_v_m_s=given
         )  # fmt: skip
         self.software[index].command_result(result)
-
-
-def namespace(**values):
-    """Return a bare object with these attributes."""
-    return SimpleNamespace(**values)

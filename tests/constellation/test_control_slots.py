@@ -1,10 +1,12 @@
 """Slots of a ring, kept by burns and by drag, each satellite knowing two neighbours: converging, and not if wrong."""
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
-from control_harness import Fleet, flight_class
+from control_harness import SCENARIOS, Fleet, flight_class
 
 from madns_runtime.simulations.constellation.flight.ring import RingSettings
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
@@ -205,6 +207,21 @@ def test_satellite_that_is_nobodys_nearest_is_adopted_and_agrees_with_the_others
     assert [one.finish()["neighbours"] for one in kept.software] == [2, 1, 1]
     assert np.ptp(agreed_km) < 0.1
     assert np.mean(agreed_km) == pytest.approx(EGM_96.radius_m / 1e3 + 780.0, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("file", "arguments"),
+    [("ring93.csv", ()), ("dragring93.csv", ("--altitude-km", "450", "--inclination-deg", "97.2"))],
+)
+def test_rings_of_the_scenarios_are_what_their_generator_writes(file, arguments):
+    made = subprocess.run(
+        [sys.executable, SCENARIOS / "data" / "make_ring.py", *arguments],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+
+    assert made.stdout == (SCENARIOS / "data" / file).read_text("utf-8")
 
 
 def test_faults_of_a_rings_settings_are_named():
