@@ -13,7 +13,7 @@ test: $(READY)  ## Lint, types, import contracts and every test.
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
-	$(VENV)/bin/python -m pytest --numprocesses 3 --dist loadfile --cov=madns_runtime.protocol --cov=madns_runtime.timing --cov-branch --cov-fail-under=95
+	$(VENV)/bin/python -m pytest --numprocesses 3 --dist loadfile --no-loadscope-reorder --durations=25 --cov=madns_runtime.protocol --cov=madns_runtime.timing --cov-branch --cov-fail-under=95
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)

@@ -202,7 +202,13 @@ def test_an_old_segment_never_overlays_a_revision_between_it_and_the_newest():
 
 @given(
     st.lists(
-        st.tuples(st.integers(0, 40), st.integers(2, 15), st.integers(0, 4), st.floats(0.0, 3.0)),
+        # Times in quarters of a second: between a tick and a knot lies more than rounding, or nothing.
+        st.tuples(
+            st.integers(0, 40),
+            st.integers(2, 15),
+            st.integers(0, 4),
+            st.integers(0, 12).map(lambda quarters: quarters / 4),
+        ),
         max_size=30,
     )
 )
