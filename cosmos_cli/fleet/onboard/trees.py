@@ -15,7 +15,12 @@ from collections.abc import Iterable, Mapping
 
 from cosmos_cli.fleet.onboard import keep, store
 from cosmos_cli.fleet.onboard.core import Refusal, Request, verb
-from cosmos_cli.fleet.onboard.installed import files_of_tree, hash_of_tree, is_tree_whole
+from cosmos_cli.fleet.onboard.installed import (
+    files_of_tree,
+    hash_of_tree,
+    is_tree_whole,
+    traces_of_tree,
+)
 
 TYPE_CHECKING = False  # to import typing takes longer than most that is done here
 if TYPE_CHECKING:
@@ -125,7 +130,8 @@ def _settle(new: str, folder: str, asked: Mapping[str, Any]) -> None:
         )
     keep.sync(new)
     files = {name: sha256 for name, sha256, _ in asked["files"]}
-    keep.mark_complete(new, {"schema": MARK_SCHEMA, "label": asked["label"], "files": files})
+    mark = {"schema": MARK_SCHEMA, "label": asked["label"], "files": files}
+    keep.mark_complete(new, {**mark, "traces": traces_of_tree(new)})
     path = os.path.join(folder, asked["hash"])
     keep.remove(path)
     try:

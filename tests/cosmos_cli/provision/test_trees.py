@@ -13,6 +13,7 @@ from onboard_machine import OwnMachine, snapshot
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.onboard import installed
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.provision import trees
 from cosmos_cli.provision.environment import ask_installed, installed_request
@@ -314,6 +315,21 @@ def test_any_change_on_the_machine_is_noticed_and_repaired(folder, machine, harm
         assert send_tree(board, machine.layout, tree)
     assert is_whole(machine, tree)
     assert {file.path for file in tree.files} == set(on_machine(machine, tree))
+
+
+def test_tree_that_shows_no_trace_of_a_change_is_not_read_again(folder, machine, monkeypatch):
+    tree = the_tree(folder)
+    with machine.board() as board:
+        send_tree(board, machine.layout, tree)
+    path = machine.layout.tree(tree.hash)
+    read = []
+    monkeypatch.setattr(installed, "hash_of_tree", lambda *_: read.append(1) or tree.hash)
+
+    assert installed.is_tree_whole(path)
+    assert not read
+    (Path(path) / "flight.py").touch()  # the same content, but somebody was there
+    assert installed.is_tree_whole(path)
+    assert read
 
 
 def test_caches_of_imported_modules_are_no_change(folder, machine):
