@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -209,9 +209,9 @@ class Command:
             )
         except (KeyError, TypeError, ValueError) as error:
             raise PluginError(f"constellation: expected a command, got {message!r:.200}") from error
-        if command.kind not in CommandKind.__args__:  # type: ignore[attr-defined]
+        if command.kind not in get_args(CommandKind):
             raise PluginError(f"constellation: expected a command, got {message!r:.200}")
-        if command.frame not in CommandFrame.__args__:  # type: ignore[attr-defined]
+        if command.frame not in get_args(CommandFrame):
             raise PluginError(f"constellation: no frame {command.frame!r}")
         return command
 
