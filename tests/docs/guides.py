@@ -26,6 +26,7 @@ def spans(text):
 
 def commands(text):
     """Return every `cosmos ...` that a text names, as words, without what a comment says."""
+    text = re.sub(r"\\\n\s*", "", text)
     lines = [line for block in blocks(text, "sh") for line in block.splitlines()]
     lines += [line[4:] for line in _FENCE.sub("", text).splitlines() if line.startswith("    ")]
     lines += spans(text)
