@@ -16,6 +16,7 @@ from madns_runtime.simulations.constellation.messages import (
     CommandResult,
     Delivery,
     Initial,
+    Refusal,
     Segment,
     Transmission,
 )
@@ -300,9 +301,7 @@ def body(*lines):
         ("self.context.ballistic(0.5, at_s=1.0)", "0.01 to 0.02 m^2/kg, got 0.5"),
         ("[self.context.delta_v((1, 2, 3), at_s=9.0) for _ in range(17)]", "at most 16 commands"),
         ("[self.context.broadcast(1) for _ in range(65)]", "at most 64 messages"),
-        ("self.context.broadcast('x' * 20_000)", "at most 16384 bytes, got 20003"),
         ("self.context.broadcast(object())", "send: "),
-        ("self.context.send('ground', 1)", "no stations"),
         ("self.context.send(3, 1)", "expected a receiver's name, got 3"),
         ("self.context.estimate({})", "a mapping of 1 to 64 names"),
         ("self.context.estimate({'a': 1}); self.context.estimate({'b': 1})", "numbers for a,"),
@@ -322,6 +321,75 @@ def test_what_cannot_be_meant_is_refused_with_its_line(tmp_path, line, words):
 
     assert str(caught.value).startswith("G.step raised PluginError: ")
     assert str(caught.value).endswith("(guidance.py:6)")
+
+
+TOLD = """
+class G:
+    told, numbers = [], []
+    def setup(self, context):
+        self.context = context
+    def step(self, t_s, readings):
+        if t_s < 0.2:
+            self.numbers.append({call})
+    def message_refused(self, refusal):
+        self.told.append([refusal.number, refusal.to, refusal.sent_s, refusal.reason])
+    def finish(self):
+        return {{"told": self.told, "numbers": self.numbers}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("call", "to", "reason", "radio"),
+    [
+        ("self.context.send('agent-02', 1)", "agent-02", "no_radio", {}),
+        ("self.context.broadcast(1)", "*", "no_radio", {}),
+        ("self.context.send('ground', 1)", "ground", "no_radio", {"crosslinks": {}}),
+        ("self.context.send('ground:x', 1)", "ground:x", "no_radio", {"crosslinks": {}}),
+        ("self.context.broadcast('x' * 20_000)", "*", "too_long", {"crosslinks": {}}),
+    ],
+)
+def test_a_message_that_cannot_leave_is_refused_counted_and_told_in_the_next_tick(
+    tmp_path, call, to, reason, radio
+):
+    ship = Ship(tmp_path, TOLD.format(call=call), **radio).run(1.0)
+
+    assert ship.flight == {
+        "told": [[0, to, 0.0, reason], [1, to, 0.1, reason]],
+        "numbers": [0, 1],
+    }
+    summary = ship.agent.finish()
+    assert (summary["messages_sent"], summary["sends_refused"]) == (0, {reason: 2})
+    assert ship.sent("transmission") == []
+    assert ship.context.records["refusals"] == [(1, 0, to, 0.0, reason), (2, 1, to, 0.1, reason)]
+    ((level, words),) = ship.context.logs
+    assert level == "warning"
+    assert reason.replace("_", " ") in words
+
+
+def test_what_the_host_refuses_is_told_like_what_the_board_does(tmp_path):
+    call = "self.context.send('agent-02', 1)"
+    ship = Ship(tmp_path, TOLD.format(call=call), crosslinks={}).run(0.1)
+    ship.tell(Refusal(number=0, to="agent-02", sent_s=0.0, reason="out_of_range")).run(0.5, 0.1)
+
+    assert ship.flight["told"] == [[0, "agent-02", 0.0, "out_of_range"]]
+    assert ship.agent.finish()["sends_refused"] == {"out_of_range": 1}
+    assert ship.agent.finish()["messages_sent"] == 2
+    assert ship.context.logs == []
+
+
+def test_a_refusal_may_be_answered_by_sending_again(tmp_path):
+    text = body("if t_s == 0.0: self.context.broadcast(1)")
+    text += "\n    def message_refused(self, refusal): self.context.broadcast(1)\n"
+    ship = Ship(tmp_path, text).run(1.0)
+
+    assert ship.agent.finish()["sends_refused"] == {"no_radio": 10}
+
+
+def test_without_refusals_there_is_no_stream_of_them(tmp_path):
+    ship = Ship(tmp_path, body("self.context.broadcast(1)"), crosslinks={}).run(0.2)
+
+    assert "refusals" not in ship.context.streams
+    assert ship.agent.finish()["sends_refused"] == {}
 
 
 def test_an_error_names_class_method_file_and_line_once(tmp_path):

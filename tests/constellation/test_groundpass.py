@@ -113,3 +113,14 @@ def test_beacons_reach_neighbours_and_nothing_is_unaccounted(star):
     )
     assert sum(vehicle["flight"]["vehicles_heard"] for vehicle in vehicles.values()) > 20
     assert sum(vehicle["messages_late"] for vehicle in vehicles.values()) == 0
+
+
+def test_who_spoke_to_nobody_is_told(star):
+    for agent, summary in star.summaries().items():
+        refused = links(star, sender=agent, outcome="no_contact")
+
+        told = [row for row in star.contexts[agent].records["refusals"] if row[-1] == "no_contact"]
+        # The last one may be on its way back yet.
+        assert len(refused) - 1 <= len(told) == summary["sends_refused"]["no_contact"]
+        numbers = {row["number"] for row in refused}
+        assert numbers >= {number for _, number, *_ in told}

@@ -93,7 +93,7 @@ def test_its_json_lines_are_those_of_the_program():
     )
 
     assert list(setup) == ["setup"]
-    assert list(tick) == ["t_s", "readings", "messages", "results"]
+    assert list(tick) == ["t_s", "readings", "messages", "results", "refusals"]
     assert set(answer) == KEYS - {"t_s"}
 
 

@@ -16,11 +16,13 @@ from madns_runtime.plugin.api import AgentContext, AgentSimulation, Tick
 from madns_runtime.recording.records import Field
 from madns_runtime.simulations.constellation.messages import (
     DELIVERY,
+    REFUSAL,
     RESULT,
     SEGMENT,
     CommandResult,
     Delivery,
     Initial,
+    Refusal,
     Segment,
 )
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
@@ -150,6 +152,8 @@ class ConstellationAgent(AgentSimulation):
             self._cockpit.deliver(Delivery.from_message(message))
         elif kind == RESULT and self._cockpit is not None:
             self._cockpit.tell(CommandResult.from_message(message))
+        elif kind == REFUSAL and self._cockpit is not None:
+            self._cockpit.refuse(Refusal.from_message(message))
         elif kind in (DELIVERY, RESULT):
             self._unheard += 1  # a broadcast also reaches those who fly nothing
         else:

@@ -5,26 +5,29 @@ Pure. Segments carry their knots as one flat float64 array: six numbers a knot, 
 body a second one of seven: quaternion (scalar last, inertial to body) and body rates, rad/s.
 
     agent -> host    Command (SYNC, deadline: its time), Transmission
-    host -> agent    Initial, Segment, CommandResult, Delivery
+    host -> agent    Initial, Segment, CommandResult, Delivery, Refusal
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from madns_runtime.config import from_mapping
 from madns_runtime.errors import PluginError
 from madns_runtime.simulations.constellation.parameters import KNOTS_MAX
+from madns_runtime.simulations.constellation.thrust import Thrust
 
 SEGMENT = "segment"
 COMMAND = "command"
 RESULT = "command_result"
 TRANSMISSION = "transmission"
 DELIVERY = "delivery"
+REFUSAL = "refusal"
 EVERYBODY = "*"
 """Receiver of a broadcast."""
 GROUND = "ground"
@@ -49,8 +52,11 @@ class Segment:
     """Shape (K, 6), m and m/s, K >= 2."""
     attitude: NDArray[np.float64] | None = None
     """Shape (K, 7): quaternion, scalar last, inertial to body; body rates, rad/s. None for a point mass."""
-    thrust_m_s2: tuple[float, float, float] | None = None
-    """Acceleration other than gravity and drag all through the segment, inertial, m/s^2: a thrust arc."""
+    thrust: Thrust | None = None
+    """Acceleration other than gravity and drag all through the segment: a thrust arc, or a part of one."""
+    ballistic_m2_kg: float | None = None
+    """Ballistic coefficient that drag acts on all through the segment, m^2/kg, for an accelerometer; None for
+    no drag, or nobody who feels it."""
 
     @property
     def end_s(self) -> float:
@@ -68,8 +74,10 @@ class Segment:
         }
         if self.attitude is not None:
             message["attitude"] = np.ascontiguousarray(self.attitude, dtype=np.float64).ravel()
-        if self.thrust_m_s2 is not None:
-            message["thrust_m_s2"] = list(self.thrust_m_s2)
+        if self.thrust is not None:
+            message["thrust"] = asdict(self.thrust)
+        if self.ballistic_m2_kg is not None:
+            message["ballistic_m2_kg"] = self.ballistic_m2_kg
         return message
 
     @classmethod
@@ -82,7 +90,8 @@ class Segment:
         """
         try:
             flat = np.asarray(message["states"], dtype=np.float64).ravel()
-            attitude, thrust = message.get("attitude"), message.get("thrust_m_s2")
+            attitude, thrust = message.get("attitude"), message.get("thrust")
+            ballistic = message.get("ballistic_m2_kg")
             if attitude is not None:
                 attitude = np.asarray(attitude, dtype=np.float64).reshape(-1, 7)
             segment = cls(
@@ -91,7 +100,8 @@ class Segment:
                 knot_s=float(message["knot_s"]),
                 states=flat.reshape(-1, 6),
                 attitude=attitude,
-                thrust_m_s2=None if thrust is None else _vector(thrust),
+                thrust=None if thrust is None else from_mapping(Thrust, thrust),
+                ballistic_m2_kg=None if ballistic is None else float(ballistic),
             )
         except (KeyError, TypeError, ValueError) as error:
             raise PluginError(f"constellation: expected a segment, got {message!r:.200}") from error
@@ -236,16 +246,7 @@ class CommandResult:
 
     def to_message(self) -> dict[str, Any]:
         """Return the mapping that travels."""
-        return {
-            "kind": RESULT,
-            "number": self.number,
-            "status": self.status,
-            "at_s": self.at_s,
-            "revision": self.revision,
-            "reason": self.reason,
-            "delta_v_m_s": self.delta_v_m_s,
-            "propellant_kg": self.propellant_kg,
-        }
+        return {"kind": RESULT, **asdict(self)}
 
     @classmethod
     def from_message(cls, message: Mapping[str, Any]) -> CommandResult:
@@ -303,10 +304,9 @@ class Transmission:
             PluginError: It is not one as `to_message` writes it.
         """
         try:
-            sent_s = float(message["sent_s"])
             return cls(
                 to=str(message["to"]),
-                sent_s=sent_s,
+                sent_s=float(message["sent_s"]),
                 number=int(message["number"]),
                 payload=message["payload"],
             )
@@ -356,6 +356,46 @@ class Delivery:
             raise PluginError(
                 f"constellation: expected a delivery, got {message!r:.200}"
             ) from error
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Refusal:
+    """A message that a vehicle handed to its radio and that never left it, or met nobody."""
+
+    number: int
+    """The message's."""
+    to: str
+    """As it was sent."""
+    sent_s: float
+    reason: str
+    """no_radio or too_long, found on board; or what the host found, see `truth.medium.REFUSED`."""
+
+    def to_message(self) -> dict[str, Any]:
+        """Return the mapping that travels."""
+        return {"kind": REFUSAL, **asdict(self)}
+
+    @classmethod
+    def from_message(cls, message: Mapping[str, Any]) -> Refusal:
+        """
+        Read a refusal back.
+
+        Raises:
+            PluginError: It is not one as `to_message` writes it.
+        """
+        try:
+            return cls(
+                number=int(message["number"]),
+                to=str(message["to"]),
+                sent_s=float(message["sent_s"]),
+                reason=str(message["reason"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise PluginError(f"constellation: expected a refusal, got {message!r:.200}") from error
+
+
+def is_for_ground(to: str) -> bool:
+    """Return whether a message's receiver is any station, or one of them."""
+    return to == GROUND or to.startswith(f"{GROUND}:")
 
 
 def _vector(values: Any) -> tuple[float, float, float]:

@@ -20,6 +20,7 @@ from madns_runtime.simulations.constellation.messages import (
     CommandFrame,
     CommandResult,
     Delivery,
+    Refusal,
 )
 
 if TYPE_CHECKING:
@@ -78,11 +79,15 @@ class FlightContext(Protocol):
     def ballistic(self, ballistic_m2_kg: float, *, at_s: float) -> int:
         """Command another ballistic coefficient, m^2/kg, from *at_s* on; within the vehicle's range."""
 
-    def send(self, to: str, payload: Any) -> None:
-        """Send a message by radio to an agent or satellite, to ground:NAME or to ground."""
+    def send(self, to: str, payload: Any) -> int:
+        """
+        Send a message by radio to an agent or satellite, to ground:NAME or to ground, and return its number.
 
-    def broadcast(self, payload: Any) -> None:
-        """Send a message by radio to every vehicle in view."""
+        `message_refused` tells if it could not leave, or if nobody was there to hear it.
+        """
+
+    def broadcast(self, payload: Any) -> int:
+        """Send a message by radio to every vehicle in view, and return its number."""
 
     def estimate(self, values: Mapping[str, float]) -> None:
         """Record what flight software believes now; names with units, such as slot_error_deg."""
@@ -108,6 +113,9 @@ class FlightSoftware(Protocol):
 
     def command_result(self, result: CommandResult) -> None:
         """Take what became of a command; called right before a tick."""
+
+    def message_refused(self, refusal: Refusal) -> None:
+        """Take that a message of one's own was refused, and why; called right before a tick."""
 
     def finish(self) -> Mapping[str, Any]:
         """Return a summary: plain numbers and texts."""

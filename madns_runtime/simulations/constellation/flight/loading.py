@@ -11,7 +11,7 @@ from madns_runtime.errors import BlamedError, PluginError
 from madns_runtime.plugin.registry import load_function
 from madns_runtime.simulations.constellation.flight.api import FlightSoftware
 
-METHODS = ("setup", "step", "receive", "command_result", "finish")
+METHODS = ("setup", "step", "receive", "command_result", "message_refused", "finish")
 """Of the contract; flight software may lack any of them, but not all."""
 
 

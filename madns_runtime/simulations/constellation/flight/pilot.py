@@ -10,7 +10,7 @@ from madns_runtime.context import describe_exception
 from madns_runtime.errors import BlamedError, PluginError
 from madns_runtime.plugin import returned
 from madns_runtime.simulations.constellation.flight.api import FlightContext, Readings
-from madns_runtime.simulations.constellation.messages import CommandResult, Delivery
+from madns_runtime.simulations.constellation.messages import CommandResult, Delivery, Refusal
 
 
 class Pilot:
@@ -68,6 +68,16 @@ class Pilot:
             BlamedError: It raised.
         """
         self._call("command_result", getattr(self._software, "command_result", _do_nothing), result)
+
+    def message_refused(self, refusal: Refusal) -> None:
+        """
+        Tell it that a message was refused.
+
+        Raises:
+            BlamedError: It raised.
+        """
+        method = getattr(self._software, "message_refused", _do_nothing)
+        self._call("message_refused", method, refusal)
 
     def finish(self) -> dict[str, Any]:
         """

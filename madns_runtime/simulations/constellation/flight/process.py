@@ -5,7 +5,7 @@ To the vehicle it is flight software like any other. In lockstep a tick waits fo
 time no tick waits for anything: an answer is taken in the first tick after it has come.
 
     to the program      {"setup": {...}}
-                        {"t_s": 0.1, "readings": {...}, "messages": [...], "results": [...]}
+                        {"t_s": 0.1, "readings": {...}, "messages": [...], "results": [...], "refusals": [...]}
     from the program    {"commands": [...], "send": [...], "estimate": {...}, "log": [...]}
 """
 
@@ -26,13 +26,13 @@ from madns_runtime.errors import BlamedError
 from madns_runtime.simulations.constellation.flight.answers import carry_out
 from madns_runtime.simulations.constellation.flight.api import FlightContext, Readings
 from madns_runtime.simulations.constellation.flight.line_process import LineProcess
-from madns_runtime.simulations.constellation.messages import CommandResult, Delivery
+from madns_runtime.simulations.constellation.messages import CommandResult, Delivery, Refusal
 from madns_runtime.simulations.constellation.parameters import FlightProcess
 
 UNANSWERED_MAX = 64
 """Ticks under way to the program in real time; further ones are not sent and counted."""
 MAIL_MAX = 1024
-"""Messages, and results, that wait for the next tick that is sent; older ones are dropped and counted."""
+"""Messages, results, and refusals, that wait for the next tick that is sent; older ones are dropped and counted."""
 LOG_LINES_MAX = 1000
 """Lines of the program's standard error in the log of one run."""
 LOG_CHARACTERS_MAX = 500
@@ -56,6 +56,7 @@ class ExternalFlight:
         """Ticks without an answer: when they were sent, by the computer's clock, and their times."""
         self._messages: deque[dict[str, Any]] = deque(maxlen=MAIL_MAX)
         self._results: deque[dict[str, Any]] = deque(maxlen=MAIL_MAX)
+        self._refusals: deque[dict[str, Any]] = deque(maxlen=MAIL_MAX)
         self._answer_s_max = 0.0
         self._counts = {
             "ticks_sent": 0,
@@ -101,6 +102,11 @@ class ExternalFlight:
         self._counts["mail_dropped"] += len(self._results) == MAIL_MAX
         self._results.append(dataclasses.asdict(result))
 
+    def message_refused(self, refusal: Refusal) -> None:
+        """Keep a refusal for the next line."""
+        self._counts["mail_dropped"] += len(self._refusals) == MAIL_MAX
+        self._refusals.append(dataclasses.asdict(refusal))
+
     def step(self, t_s: float, readings: Readings) -> None:
         """
         Send a tick's line, and carry out the answers that are there.
@@ -143,6 +149,7 @@ class ExternalFlight:
             },
             "messages": list(self._messages),
             "results": list(self._results),
+            "refusals": list(self._refusals),
         }
         line = orjson.dumps(tick, _to_plain, orjson.OPT_SERIALIZE_NUMPY)
         if len(self._asked) >= UNANSWERED_MAX or not self._process.write(line):
@@ -150,6 +157,7 @@ class ExternalFlight:
             return
         self._messages.clear()
         self._results.clear()
+        self._refusals.clear()
         self._asked.append((monotonic(), t_s))
         counts["ticks_sent"] += 1
 

@@ -9,9 +9,15 @@ from typing import Any
 from madns_runtime.errors import PluginError
 from madns_runtime.plugin.api import HostContext
 from madns_runtime.protocol.messages import Service
-from madns_runtime.simulations.constellation.messages import GROUND, Delivery, Transmission
+from madns_runtime.simulations.constellation.messages import (
+    Delivery,
+    Refusal,
+    Transmission,
+    is_for_ground,
+)
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
 from madns_runtime.simulations.constellation.truth.links import LINK_FIELDS, Crosslinks, LinkEvent
+from madns_runtime.simulations.constellation.truth.medium import REFUSED
 from madns_runtime.simulations.constellation.truth.segments import TruthStore
 from madns_runtime.simulations.constellation.truth.stations import CONTACT_FIELDS, GroundSegment
 
@@ -66,19 +72,19 @@ class Traffic:
 
     def receive(self, vehicle: int, transmission: Transmission) -> None:
         """
-        Take what a vehicle says; what is heard soon is handed on at once.
+        Take what a vehicle says; what is heard soon is handed on at once, and what is refused is told.
 
         Raises:
             PluginError: The scenario has no crosslinks and it is not for the ground.
         """
         now_s = self._context.now_s()
-        to = transmission.to
-        if to == GROUND or to.startswith(f"{GROUND}:"):
-            self._record(self._ground.send(vehicle, transmission, now_s))
+        if is_for_ground(transmission.to):
+            self._answer(vehicle, transmission, self._ground.send(vehicle, transmission, now_s))
             return
         if self._crosslinks is None:
+            to = transmission.to
             raise PluginError(f"constellation: {to!r} cannot be reached without crosslinks")
-        self._record(self._crosslinks.send(vehicle, transmission, now_s))
+        self._answer(vehicle, transmission, self._crosslinks.send(vehicle, transmission, now_s))
         self._deliver(self._crosslinks.due(now_s))
         if (next_s := self._crosslinks.next_s()) is not None:
             self._context.wake(max(next_s, now_s + STEP_S))
@@ -107,6 +113,20 @@ class Traffic:
             agent = self._context.agents[vehicle]
             self._context.send(agent, delivery.to_message(), Service.RELIABLE)
             self.deliveries += 1
+
+    def _answer(self, vehicle: int, transmission: Transmission, events: list[LinkEvent]) -> None:
+        """Record what became of a message, and tell its sender if it was refused."""
+        self._record(events)
+        for event in events:
+            if event.outcome in REFUSED:
+                refusal = Refusal(
+                    number=transmission.number,
+                    to=transmission.to,
+                    sent_s=transmission.sent_s,
+                    reason=event.outcome,
+                )
+                agent = self._context.agents[vehicle]
+                self._context.send(agent, refusal.to_message(), Service.RELIABLE)
 
     def _record(self, events: Iterable[LinkEvent]) -> None:
         for event in events:

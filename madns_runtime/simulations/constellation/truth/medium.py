@@ -39,6 +39,8 @@ no_contact: no station in view; lost: by chance; queue_full: the transmitter too
 nobody of that name, or the sender itself; out_of_order: heard after a later one of the same sender; no_truth:
 the host does not know (any more) where the vehicles were."""
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
+REFUSED = frozenset(OUTCOMES) - {"delivered", "lost"}
+"""Of these the sender is told: its radio took no more, or found nobody to speak to. A loss it cannot notice."""
 
 LEAD_S = 1.0
 """How long before their arrival messages are handed out, s: far more than a network takes."""

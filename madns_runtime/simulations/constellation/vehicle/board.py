@@ -8,6 +8,7 @@ given the same readings commands the same things, whatever computer it runs on.
 from __future__ import annotations
 
 import math
+from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -22,13 +23,14 @@ from madns_runtime.recording.records import Field
 from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.messages import (
     EVERYBODY,
-    GROUND,
     Command,
     CommandFrame,
     CommandResult,
     Delivery,
     Initial,
+    Refusal,
     Transmission,
+    is_for_ground,
 )
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
 from madns_runtime.simulations.constellation.vehicle import streams
@@ -40,6 +42,14 @@ from madns_runtime.simulations.constellation.vehicle.commands import (
 PAYLOAD_BYTES_MAX = 16_384
 """Of one message by radio, encoded."""
 MESSAGES_PER_TICK_MAX = 64
+REFUSALS_MAX = 1024
+"""That wait for the next tick to be told; older ones are dropped, but counted as all others."""
+MISTAKES = {
+    "no_radio": "the scenario has no crosslinks, or for the ground no stations",
+    "too_long": f"a payload has at most {PAYLOAD_BYTES_MAX} bytes",
+    "unknown_receiver": "there is no other vehicle and no station of that name",
+}
+"""Refusals that no waiting cures: the first of each is told in the log."""
 ESTIMATES_MAX = 64
 """Names in an estimate."""
 LOG_CHARACTERS_MAX = 2000
@@ -93,6 +103,10 @@ class Board:
         self._t_s = -math.inf
         self._messages = 0
         self._messages_in_tick = 0
+        self._handed_over = 0
+        self._refusals: deque[Refusal] = deque(maxlen=REFUSALS_MAX)
+        self._refused: Counter[str] = Counter()
+        self._has_refusals_stream = False
         self._estimate_names: tuple[str, ...] = ()
         context.open_stream("commands", streams.COMMANDS)
         context.open_stream("command_results", streams.COMMAND_RESULTS)
@@ -107,7 +121,12 @@ class Board:
     @property
     def messages(self) -> int:
         """Messages handed to the radio."""
-        return self._messages
+        return self._handed_over
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Messages refused, by reason: on board, where they never reach the radio, or by the host."""
+        return dict(self._refused)
 
     def begin(self, tick: int, t_s: float) -> None:
         """Begin a tick: from now on everything bears its time."""
@@ -134,10 +153,11 @@ class Board:
         command = self._desk.ballistic(self._t_s, ballistic_m2_kg, at_s=at_s)
         return self._send_command(tick, command)
 
-    def send(self, to: str, payload: Any) -> None:
+    def send(self, to: str, payload: Any) -> int:
         """Send a message by radio."""
         tick = self._running("send")
-        self._check_receiver(to)
+        if not isinstance(to, str):
+            raise PluginError(f"send: expected a receiver's name, got {to!r:.80}")
         if self._messages_in_tick >= MESSAGES_PER_TICK_MAX:
             raise PluginError(
                 f"send: expected at most {MESSAGES_PER_TICK_MAX} messages in one tick; "
@@ -147,13 +167,19 @@ class Board:
         number = self._first_message + self._messages
         self._messages += 1
         self._messages_in_tick += 1
+        reason = self._why_refused(to, size)
+        if reason is not None:
+            self.refuse(Refusal(number=number, to=to, sent_s=self._t_s, reason=reason))
+            return number
+        self._handed_over += 1
         message = Transmission(to=to, sent_s=self._t_s, number=number, payload=payload)
         self._context.send(HOST, message.to_message(), Service.RELIABLE)
         self._context.record("messages", (tick, "sent", to, self._t_s, self._t_s, size))
+        return number
 
-    def broadcast(self, payload: Any) -> None:
+    def broadcast(self, payload: Any) -> int:
         """Send a message to every vehicle in view."""
-        self.send(EVERYBODY, payload)
+        return self.send(EVERYBODY, payload)
 
     def estimate(self, values: Mapping[str, float]) -> None:
         """Record what flight software believes; the first call fixes the names."""
@@ -194,6 +220,31 @@ class Board:
             ),
         )
 
+    def refuse(self, refusal: Refusal) -> None:
+        """Take that a message was refused, to be told in the next tick."""
+        reason = refusal.reason
+        self._refused[reason] += 1
+        self._refusals.append(refusal)
+        if reason in MISTAKES and self._refused[reason] == 1:
+            words = f"{reason.replace('_', ' ')}: {MISTAKES[reason]}"
+            self._context.log(
+                "warning",
+                f"the message to {refusal.to!r:.80} of {refusal.sent_s:g} s was refused, {words}; "
+                "others like it are counted in sends_refused",
+            )
+
+    def take_refusals(self, tick: int) -> list[Refusal]:
+        """Record and return what flight software is about to be told of its messages."""
+        taken = list(self._refusals)
+        self._refusals.clear()
+        if taken and not self._has_refusals_stream:
+            self._context.open_stream("refusals", streams.REFUSALS)
+            self._has_refusals_stream = True
+        for one in taken:
+            row = (tick, one.number, one.to, one.sent_s, one.reason)
+            self._context.record("refusals", row)
+        return taken
+
     def record_received(self, tick: int, message: Delivery) -> None:
         """Record a message that flight software is about to hear."""
         size = len(pack(message.payload))
@@ -222,14 +273,11 @@ class Board:
         )
         return command.number
 
-    def _check_receiver(self, to: object) -> None:
-        if not isinstance(to, str):
-            raise PluginError(f"send: expected a receiver's name, got {to!r:.80}")
-        if to == GROUND or to.startswith(f"{GROUND}:"):
-            if not self._has_stations:
-                raise PluginError(f"send: nobody hears {to!r}; the scenario has no stations")
-        elif not self._has_crosslinks:
-            raise PluginError(f"send: no radio to reach {to!r}; the scenario has no crosslinks")
+    def _why_refused(self, to: str, payload_bytes: int) -> str | None:
+        """Return why a message cannot leave the vehicle; None if it can."""
+        if not (self._has_stations if is_for_ground(to) else self._has_crosslinks):
+            return "no_radio"
+        return "too_long" if payload_bytes > PAYLOAD_BYTES_MAX else None
 
     def _open_estimates(self, values: Any) -> tuple[str, ...]:
         if not isinstance(values, Mapping) or not 1 <= len(values) <= ESTIMATES_MAX:
@@ -245,11 +293,6 @@ class Board:
 
 def _payload_bytes(payload: Any) -> int:
     try:
-        size = len(pack(payload))
+        return len(pack(payload))
     except MadnsError as error:
         raise PluginError(f"send: {error}") from error
-    if size > PAYLOAD_BYTES_MAX:
-        raise PluginError(
-            f"send: expected a payload of at most {PAYLOAD_BYTES_MAX} bytes, got {size}"
-        )
-    return size

@@ -14,7 +14,7 @@ from typing import Any
 from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.flight.api import MASS, TRUTH, Reading
 from madns_runtime.simulations.constellation.flight.pilot import Pilot
-from madns_runtime.simulations.constellation.messages import CommandResult, Delivery
+from madns_runtime.simulations.constellation.messages import CommandResult, Delivery, Refusal
 from madns_runtime.simulations.constellation.vehicle.board import Board
 from madns_runtime.simulations.constellation.vehicle.radio import Receiver
 
@@ -78,6 +78,8 @@ class Cockpit:
             board.record_result(tick, result)
             self._read_gauge(t_s, result, readings)
             pilot.command_result(result)
+        for refusal in board.take_refusals(tick):
+            pilot.message_refused(refusal)
         pilot.step(t_s, readings)
 
     def deliver(self, message: Delivery) -> None:
@@ -88,6 +90,10 @@ class Cockpit:
         """Take what became of a command, to be told in the next tick."""
         self._results_dropped += len(self._results) == RESULTS_MAX
         self._results.append(result)
+
+    def refuse(self, refusal: Refusal) -> None:
+        """Take that the host refused a message, to be told in the next tick."""
+        self._board.refuse(refusal)
 
     def finish(self) -> dict[str, Any]:
         """
@@ -101,6 +107,7 @@ class Cockpit:
             "commands": self._board.commands,
             "command_results_dropped": self._results_dropped,
             "messages_sent": self._board.messages,
+            "sends_refused": self._board.refused,
             "messages_received": receiver.received,
             "messages_held": receiver.held,
             "messages_late": receiver.late,

@@ -51,6 +51,15 @@ MESSAGES = (
 )
 """Messages by radio. way: sent or received; a sent one's arrival is the host's to know: its sent_s stands for it."""
 
+REFUSALS = (
+    Field("tick", "", "int"),
+    Field("number", "", "int"),
+    Field("to", "", "str"),
+    Field("sent_s", "s"),
+    Field("reason", "", "str"),
+)
+"""Messages that were refused, at the tick that told flight software of it; there is none before the first."""
+
 UNITS = {
     "_m": "m",
     "_km": "km",
