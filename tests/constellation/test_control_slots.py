@@ -16,7 +16,7 @@ from madns_runtime.simulations.constellation.orbit.mean_elements import (
     osculating_from_mean,
     state_from_circular,
 )
-from madns_runtime.simulations.constellation.truth.atmosphere import density_kg_m3, height_m
+from madns_runtime.simulations.constellation.orbit.atmosphere import density_kg_m3, height_m
 
 RING = 12
 SLOTS = {"slots": "even", "altitude_km": 780.0, "inclination_deg": 86.4, "exchange_s": 300.0}

@@ -24,7 +24,7 @@ from madns_runtime.simulations.constellation.orbit.invariants import (
     specific_energy,
 )
 from madns_runtime.simulations.constellation.parameters import NumbaPropagator, ScipyPropagator
-from madns_runtime.simulations.constellation.truth.atmosphere import (
+from madns_runtime.simulations.constellation.orbit.atmosphere import (
     BASES,
     SCALE_HEIGHTS_M,
     density_kg_m3,

@@ -12,8 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from madns_runtime.simulations.constellation.orbit.constants import EARTH_RATE_RAD_S
-from madns_runtime.simulations.constellation.truth.atmosphere import density_kg_m3, height_m
+from madns_runtime.simulations.constellation.orbit.atmosphere import drag_m_s2
 from madns_runtime.simulations.constellation.truth.propagation import PropagationParameters
 
 Array = NDArray[np.float64]
@@ -55,19 +54,11 @@ def j4(r: Array, r2: Array, _v: Array, parameters: PropagationParameters) -> Arr
 
 
 def drag(r: Array, r2: Array, v: Array, parameters: PropagationParameters) -> Array:
-    """
-    Return the drag of an atmosphere that turns with the Earth, see `Force`.
-
-    Source: a = -B rho |w| w / 2 with w the velocity relative to the air and B = Cd A / m.
-    """
+    """Return the drag of an atmosphere that turns with the Earth, see `Force`."""
     if parameters.ballistic_m2_kg is None:
         return np.zeros_like(r)
-    wind = v.copy()
-    wind[0] += EARTH_RATE_RAD_S * r[1]
-    wind[1] -= EARTH_RATE_RAD_S * r[0]
-    density = density_kg_m3(height_m(r, r2, parameters.gravity.radius_m))
-    speed = np.sqrt(np.einsum("in,in->n", wind, wind))
-    return np.asarray((-0.5 * parameters.ballistic_m2_kg * density * speed) * wind)
+    ballistic, radius_m = parameters.ballistic_m2_kg, parameters.gravity.radius_m
+    return drag_m_s2(r, r2, v, ballistic_m2_kg=ballistic, radius_m=radius_m)
 
 
 FORCES: dict[str, Force] = {"two_body": two_body, "j2": j2, "j3": j3, "j4": j4, "drag": drag}

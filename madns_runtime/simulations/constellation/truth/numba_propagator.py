@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from madns_runtime.errors import ConfigurationError, MissingExtraError
+from madns_runtime.simulations.constellation.orbit import atmosphere
 from madns_runtime.simulations.constellation.orbit.constants import (
     EARTH_FLATTENING,
     EARTH_RATE_RAD_S,
 )
 from madns_runtime.simulations.constellation.parameters import NumbaPropagator
-from madns_runtime.simulations.constellation.truth import atmosphere, numba_dop853
+from madns_runtime.simulations.constellation.truth import numba_dop853
 from madns_runtime.simulations.constellation.truth.propagation import PropagationParameters
 from madns_runtime.simulations.constellation.truth.scipy_propagator import FIRST_STEP_RAD
 

@@ -1,5 +1,5 @@
 """
-Density of the upper atmosphere, still and the same everywhere at a height. Pure.
+The upper atmosphere, the same everywhere at a height, and its drag. Pure: truth and accelerometers share it.
 
 Between the base heights of a table density falls exponentially, so that it is continuous: steps of
 an integrator see no jump. Sun and season are left out, which at solar maximum is a factor of ten at
@@ -11,7 +11,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from madns_runtime.simulations.constellation.orbit.constants import EARTH_FLATTENING
+from madns_runtime.simulations.constellation.orbit.constants import (
+    EARTH_FLATTENING,
+    EARTH_RATE_RAD_S,
+)
 
 BASES = (
     (0.0, 1.225),
@@ -61,6 +64,37 @@ SCALE_HEIGHTS_M = np.append(
     np.diff(HEIGHTS_M) / -np.diff(np.log(DENSITIES_KG_M3)), TOP_SCALE_HEIGHT_M
 )
 """Scale heights above the bases, shape (28,), m."""
+
+
+def drag_m_s2(
+    r: NDArray[np.float64],
+    r2: NDArray[np.float64],
+    v: NDArray[np.float64],
+    *,
+    ballistic_m2_kg: NDArray[np.float64] | float,
+    radius_m: float,
+) -> NDArray[np.float64]:
+    """
+    Return the acceleration by drag in an atmosphere that turns with the Earth.
+
+    Args:
+        r: Positions, shape (3, N), m; z along the Earth's axis.
+        r2: Their squares, shape (N,), m^2.
+        v: Velocities, shape (3, N), m/s, inertial.
+        ballistic_m2_kg: B = Cd A / m, one for all or shape (N,), m^2/kg.
+        radius_m: The Earth's equatorial radius, m.
+
+    Returns:
+        Shape (3, N), m/s^2, inertial.
+
+    Source: a = -B rho |w| w / 2 with w the velocity relative to the air.
+    """
+    wind = v.copy()
+    wind[0] += EARTH_RATE_RAD_S * r[1]
+    wind[1] -= EARTH_RATE_RAD_S * r[0]
+    density = density_kg_m3(height_m(r, r2, radius_m))
+    speed = np.sqrt(np.einsum("in,in->n", wind, wind))
+    return np.asarray((-0.5 * ballistic_m2_kg * density * speed) * wind)
 
 
 def height_m(
