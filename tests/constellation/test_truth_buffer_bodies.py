@@ -17,6 +17,7 @@ from madns_runtime.simulations.constellation.orbit.quaternions import (
 )
 from madns_runtime.simulations.constellation.orbit.turning import evaluate_turn, turn_between
 from madns_runtime.simulations.constellation.parameters import ScipyPropagator
+from madns_runtime.simulations.constellation.thrust import Thrust
 from madns_runtime.simulations.constellation.truth.attitude import (
     RigidBody,
     initial_attitude,
@@ -151,19 +152,53 @@ def test_a_point_mass_stays_one():
     assert len(buffer.lookup(10.5)) == 6
 
 
-def test_thrust_is_that_of_the_arc_at_the_time():
-    buffer, thrust = TruthBuffer(), (0.1, 0.0, -0.2)
+def test_thrust_and_impulses_add_up_over_time():
+    buffer = TruthBuffer()
+    thrust = Thrust(start_s=5.25, acceleration_m_s2=(0.1, 0.0, -0.2))
     buffer.add(straight(0.0, 21))
-    buffer.add(straight(5.25, 2, knot_s=4.5, revision=1, thrust_m_s2=thrust))
+    # Speeds differ by 10 m/s from revision to revision: an impulse at the beginning of each.
+    buffer.add(straight(5.25, 2, knot_s=4.5, revision=1, thrust=thrust))
     buffer.add(straight(9.75, 12, revision=1))
-    asked = (0.0, 5.2, 5.25, 9.7, 9.75, 20.75)
-    felt = []
-    for t_s in asked:
+    given = []
+    for t_s in (5.0, 5.2, 5.25, 7.25, 9.7, 9.75, 20.75):
         assert buffer.lookup(t_s) is not None
-        felt.append(buffer.thrust_at(t_s))
+        given.append(buffer.given_m_s(t_s))
 
-    assert felt == [None, None, thrust, thrust, None, None]
-    assert buffer.thrust_at(21.0) is None
+    assert np.array(given) == pytest.approx(
+        np.array(
+            [(0, 0, 0)] * 2
+            + [(10, 0, 0), (10.2, 0, -0.4), (10.445, 0, -0.89)]
+            + [(10.45, 0, -0.9)] * 2
+        ),
+        abs=1e-9,
+    )
+
+
+def test_a_burn_between_two_lookups_is_not_lost():
+    buffer = TruthBuffer()
+    buffer.add(straight(0.0, 21))
+    buffer.lookup(5.0)
+    buffer.given_m_s(5.0)
+    thrust = Thrust(start_s=5.01, acceleration_m_s2=(1.0, 2.0, 0.0))
+    buffer.add(straight(5.01, 2, knot_s=0.02, revision=1, thrust=thrust))
+    buffer.add(straight(5.03, 2, knot_s=0.97, revision=1))
+    buffer.lookup(5.1)
+
+    assert buffer.given_m_s(5.1) == pytest.approx((10.02, 0.04, 0.0), abs=1e-9)
+
+
+def test_a_burn_that_is_cut_short_late_is_taken_back():
+    buffer = TruthBuffer()
+    buffer.add(straight(0.0, 11, thrust=Thrust(start_s=0.0, acceleration_m_s2=(1.0, 0.0, 0.0))))
+    buffer.lookup(0.0)
+    buffer.given_m_s(0.0)
+    buffer.lookup(5.0)
+    assert buffer.given_m_s(5.0)[0] == pytest.approx(5.0)
+
+    buffer.add(straight(4.0, 11, revision=1))  # without thrust, and 10 m/s faster
+    buffer.lookup(5.1)
+
+    assert buffer.given_m_s(5.1)[0] == pytest.approx(4.0 + 10.0)
 
 
 def test_a_revision_may_begin_off_the_grid_and_go_on_along_it():

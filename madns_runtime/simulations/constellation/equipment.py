@@ -117,7 +117,7 @@ class Sensors:
     gyro: SensorNoise | None = None
     """Body rates, rad/s."""
     accelerometer: SensorNoise | None = None
-    """Acceleration other than gravity, in body axes, m/s^2."""
+    """Specific force, mean since the measurement before, in body axes, m/s^2."""
     magnetometer: Magnetometer | None = None
     star_tracker: SensorNoise | None = None
     """Quaternion, scalar last, inertial to body; noise in rad about each body axis."""

@@ -11,6 +11,7 @@ from madns_runtime.simulations.constellation.flight.loading import load_flight_c
 from madns_runtime.simulations.constellation.flight.pilot import Pilot
 from madns_runtime.simulations.constellation.flight.process import ExternalFlight
 from madns_runtime.simulations.constellation.messages import Initial
+from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
 from madns_runtime.simulations.constellation.parameters import FlightProcess, FlightSoftware
 from madns_runtime.simulations.constellation.vehicle.board import Board
 from madns_runtime.simulations.constellation.vehicle.cockpit import Cockpit
@@ -42,7 +43,8 @@ def fit_out(
     chance = context.random.bytes(CHANCE_BYTES)
     suite = cockpit = None
     if has_sensors:
-        scene = Scene(initial.epoch_utc, buffer.thrust_at)
+        radius_m = GRAVITY_MODELS[context.parameters.gravity].radius_m
+        scene = Scene(initial.epoch_utc, buffer, radius_m)
         suite = SensorSuite(wanted, scene, context=context, chance=chance)
     if flight is not None:
         board = Board(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from madns_runtime.simulations.constellation.messages import Segment
@@ -17,12 +18,13 @@ from madns_runtime.simulations.constellation.orbit.hermite import (
     coefficients,
     evaluate,
 )
-from madns_runtime.simulations.constellation.orbit.quaternions import IDENTITY
+from madns_runtime.simulations.constellation.orbit.quaternions import IDENTITY, Vector
 from madns_runtime.simulations.constellation.orbit.turning import (
     Turn,
     evaluate_turn,
     turn_between,
 )
+from madns_runtime.simulations.constellation.thrust import Thrust
 
 SEGMENTS_MAX = 64
 """Segments held; a host that sends more is refused and counted."""
@@ -42,7 +44,17 @@ class _Piece:
     end_s: float
     rows: list[list[float]]
     turns: list[list[float]] | None
-    thrust_m_s2: tuple[float, float, float] | None
+    thrust: Thrust | None
+    ballistic_m2_kg: float | None
+
+    def velocity_at_end(self) -> Sequence[float]:
+        """Return the velocity where it ends, m/s: that of its last knot, or between two where it was cut short."""
+        part = (self.end_s - self.t0_s) / self.knot_s
+        if part > len(self.rows) - 1 - TIME_EPSILON_S:
+            return self.rows[-1][3:6]
+        index = int(part)
+        cubics = coefficients(self.rows[index], self.rows[index + 1], self.knot_s)
+        return evaluate(cubics, part - index, self.knot_s)[3:6]
 
 
 class TruthBuffer:
@@ -68,6 +80,8 @@ class TruthBuffer:
         self._knot_s = 1.0
         self._turn: Turn | None = None
         self._quaternion = IDENTITY
+        self._given_m_s = [0.0, 0.0, 0.0]
+        self._given_until_s: float | None = None
 
     @property
     def end_s(self) -> float:
@@ -93,7 +107,8 @@ class TruthBuffer:
             end_s,
             segment.states.tolist(),
             None if segment.attitude is None else segment.attitude.tolist(),
-            segment.thrust_m_s2,
+            segment.thrust,
+            segment.ballistic_m2_kg,
         )
         self._insert(piece)
         self.segments += 1
@@ -120,27 +135,33 @@ class TruthBuffer:
         turned = evaluate_turn(self._turn, part, self._knot_s)
         return evaluate(self._cubics, part, self._knot_s) + turned
 
-    def thrust_at(self, t_s: float) -> tuple[float, float, float] | None:
+    def given_m_s(self, t_s: float) -> Vector:
         """
-        Return the acceleration other than gravity and drag at *t_s*, m/s^2, inertial.
+        Return the change of velocity that thrust and impulses have given until *t_s*, m/s, inertial.
 
-        None where the vehicle coasts, and where no truth is held; of the time before the last
-        lookup nothing is known any more.
+        It counts from the first call on. Call it right after a `lookup` of the same time has found truth:
+        an impulse is the step in velocity where two segments meet.
         """
-        for piece in reversed(self._pieces):
-            if piece.t0_s <= t_s:
-                return piece.thrust_m_s2 if t_s <= piece.end_s + TIME_EPSILON_S else None
-        return None
+        if self._given_until_s is None:
+            self._given_until_s = t_s
+        self._give(self._pieces[0].thrust, t_s)
+        x, y, z = self._given_m_s
+        return x, y, z
+
+    @property
+    def ballistic_m2_kg(self) -> float | None:
+        """What drag acts on at the last lookup, m^2/kg; None where nobody said, or there is no drag."""
+        return self._pieces[0].ballistic_m2_kg if self._pieces else None
 
     def _seek(self, t_s: float) -> bool:
         """Make the interval that holds *t_s* the one in use and forget what lies before."""
         self._now_s = max(self._now_s, t_s)
         pieces = self._pieces
         while pieces and pieces[0].end_s < t_s - TIME_EPSILON_S:
-            self._knots -= len(pieces.popleft().rows)
+            self._leave_first()
         # At a joint the later piece counts: it may be the one after a maneuver.
         if len(pieces) > 1 and pieces[1].t0_s <= t_s:
-            self._knots -= len(pieces.popleft().rows)
+            self._leave_first()
         if not pieces or t_s < pieces[0].t0_s - TIME_EPSILON_S:
             self._low_s = self._high_s = math.inf
             return False
@@ -154,6 +175,30 @@ class TruthBuffer:
         if piece.turns is not None:
             self._seek_turn(piece.turns[index], piece.turns[index + 1])
         return True
+
+    def _leave_first(self) -> None:
+        """Forget the first piece; what it gave is kept, if anybody asks for that."""
+        piece = self._pieces.popleft()
+        self._knots -= len(piece.rows)
+        if self._given_until_s is None:
+            return
+        self._give(piece.thrust, piece.end_s)
+        if not self._pieces:
+            return
+        after = self._pieces[0]
+        self._given_until_s = after.t0_s
+        if after.t0_s - piece.end_s <= TIME_EPSILON_S:
+            before = piece.velocity_at_end()
+            for axis in range(3):
+                self._given_m_s[axis] += after.rows[0][3 + axis] - before[axis]
+
+    def _give(self, thrust: Thrust | None, until_s: float) -> None:
+        """Add what a thrust gives from where the account ends; a thrust that was cut short is taken back."""
+        if thrust is not None and self._given_until_s is not None:
+            gained_s, _ = thrust.gains(self._given_until_s, until_s)
+            for axis in range(3):
+                self._given_m_s[axis] += thrust.acceleration_m_s2[axis] * gained_s
+        self._given_until_s = until_s
 
     def _seek_turn(self, first: list[float], second: list[float]) -> None:
         """Make the interval's attitude the one in use; it goes on from the last with the same sign."""

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from datetime import datetime
+from typing import Protocol
 
+import numpy as np
+
+from madns_runtime.simulations.constellation.orbit.atmosphere import drag_m_s2
 from madns_runtime.simulations.constellation.orbit.earth import days_since_j2000, gmst_rad
-from madns_runtime.simulations.constellation.orbit.quaternions import rotate
+from madns_runtime.simulations.constellation.orbit.quaternions import Vector, rotate
 from madns_runtime.simulations.constellation.orbit.sun import is_in_umbra, sun_m
 
-Vector = tuple[float, float, float]
 SECONDS_PER_DAY = 86_400.0
+
+
+class Pushes(Protocol):
+    """What an accelerometer feels of a vehicle's truth."""
+
+    @property
+    def ballistic_m2_kg(self) -> float | None:
+        """What drag acts on, m^2/kg; None for no drag."""
+
+    def given_m_s(self, t_s: float) -> Vector:
+        """Return the change of velocity by thrust and impulses since the first call, inertial, m/s."""
 
 
 class Scene:
@@ -19,13 +32,14 @@ class Scene:
 
     Args:
         epoch_utc: UTC of simulated time zero, ISO 8601.
-        thrust_at: Returns the acceleration other than gravity and drag at a time, m/s^2, inertial; None
-            where the vehicle coasts.
+        pushes: What thrust, impulses and drag there are: the vehicle's truth buffer.
+        radius_m: The Earth's, of the gravity model: where truth's atmosphere begins.
     """
 
-    def __init__(self, epoch_utc: str, thrust_at: Callable[[float], Vector | None]) -> None:
+    def __init__(self, epoch_utc: str, pushes: Pushes, radius_m: float) -> None:
         self._epoch_days = days_since_j2000(datetime.fromisoformat(epoch_utc))
-        self._thrust_at = thrust_at
+        self._pushes = pushes
+        self._radius_m = radius_m
         self.t_s = 0.0
         self.state: tuple[float, ...] = ()
         """Truth: position, m, velocity, m/s; of a rigid body also quaternion and body rates, rad/s."""
@@ -49,9 +63,21 @@ class Scene:
         state = self.state
         return rotate(state[6:10], vector) if len(state) > 6 else vector
 
-    def thrust_m_s2(self) -> Vector:
-        """Return the acceleration of thrust, inertial, m/s^2."""
-        return self._thrust_at(self.t_s) or (0.0, 0.0, 0.0)
+    def given_m_s(self) -> Vector:
+        """Return the change of velocity by thrust and impulses since the first call, inertial, m/s."""
+        return self._pushes.given_m_s(self.t_s)
+
+    def drag_m_s2(self) -> Vector:
+        """Return the acceleration by drag, inertial, m/s^2; zero where truth has none."""
+        ballistic_m2_kg = self._pushes.ballistic_m2_kg
+        if ballistic_m2_kg is None:
+            return 0.0, 0.0, 0.0
+        state = np.array(self.state[:6]).reshape(6, 1)
+        r, v = state[:3], state[3:]
+        r2 = np.einsum("in,in->n", r, r)
+        drag = drag_m_s2(r, r2, v, ballistic_m2_kg=ballistic_m2_kg, radius_m=self._radius_m)
+        x, y, z = drag[:, 0].tolist()
+        return x, y, z
 
     def sun_direction(self) -> Vector | None:
         """Return the unit vector to the Sun, inertial; None where the Earth hides it."""

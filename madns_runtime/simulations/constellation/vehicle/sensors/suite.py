@@ -48,9 +48,10 @@ class SensorSuite:
                     bias=gnss.bias,
                 )
             )
-        others: list[tuple[Instrument, SensorNoise | None]] = [
+        self._accelerometer = None if settings.accelerometer is None else Accelerometer()
+        others: list[tuple[Instrument | None, SensorNoise | None]] = [
             (Gyro(), settings.gyro),
-            (Accelerometer(), settings.accelerometer),
+            (self._accelerometer, settings.accelerometer),
             (StarTracker(), settings.star_tracker),
             (SunSensor(), settings.sun_sensor),
             (Clock(), settings.clock),
@@ -60,7 +61,7 @@ class SensorSuite:
         self._sensors += [
             Sensor(instrument, wanted, context=context, chance=chance)
             for instrument, wanted in others
-            if wanted is not None
+            if instrument is not None and wanted is not None
         ]
 
     def step(self, tick: int, t_s: float, state: tuple[float, ...] | None) -> dict[str, Reading]:
@@ -75,6 +76,8 @@ class SensorSuite:
         if state is not None:
             scene = self._scene
             scene.move(t_s, state)
+            if self._accelerometer is not None:
+                self._accelerometer.feel(scene)
             for sensor in self._sensors:
                 sensor.sample(scene)
         readings = {}
