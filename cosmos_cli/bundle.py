@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import tarfile
-from collections.abc import Callable
 from pathlib import Path
 
 import zstandard
@@ -17,22 +16,20 @@ LEVEL = 3
 FILE_MODE = 0o644
 
 
-def pack_run(
-    run: RunDirectory, mtime_s: int, progress: Callable[[int], None] | None = None
-) -> Path:
+def pack_run(run: RunDirectory, mtime_s: int) -> Path:
     """
     Package all evidence of a run; the package appears under its name when it is whole.
 
     Args:
-        run: The run.
+        run: The run; nobody else packs it meanwhile (`alone`).
         mtime_s: Time that every member carries, s since 1970: the run's start, so that packing
             twice gives the same bytes.
-        progress: Called with the bytes of each file packed.
 
     Raises:
         OSError: The package cannot be written.
     """
-    partial = run.bundle.with_name(f".{run.bundle.name}.{os.getpid()}.part")
+    # Always the same name: what a killed one left is taken by the next.
+    partial = run.bundle.with_name(f".{run.bundle.name}.part")
     compressor = zstandard.ZstdCompressor(level=LEVEL, write_checksum=True)
     try:
         with partial.open("wb") as raw:
@@ -42,8 +39,6 @@ def pack_run(
             ):
                 for path in run_files(run):
                     _add(archive, run, path, mtime_s)
-                    if progress is not None:
-                        progress(path.stat().st_size)
             raw.flush()
             os.fsync(raw.fileno())
         partial.replace(run.bundle)

@@ -14,7 +14,8 @@ import importlib.metadata
 import os
 import platform
 import re
-from collections.abc import Mapping
+import shutil
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -155,6 +156,7 @@ def create_run(root: Path, scenario_name: str) -> RunDirectory:
         InputError: The folder cannot be made.
     """
     slug = UNSAFE.sub("-", scenario_name).strip("-.") or "run"
+    run: RunDirectory | None = None
     try:
         root.mkdir(parents=True, exist_ok=True)
         with (root / LOCK_NAME).open("wb") as lock:
@@ -167,11 +169,18 @@ def create_run(root: Path, scenario_name: str) -> RunDirectory:
             folder.mkdir()
         _allocate(run.reserve, RESERVE_BYTES)
     except OSError as error:
+        if run is not None:
+            discard_run(run)
         raise InputError(
             f"{root}: cannot make a run directory: {error.strerror or error}; "
             f"choose another folder with --runs or {RUNS_VARIABLE}"
         ) from error
     return run
+
+
+def discard_run(run: RunDirectory) -> None:
+    """Delete a run of which nothing was started: it is no evidence, and nobody should collect it."""
+    shutil.rmtree(run.path, ignore_errors=True)
 
 
 def list_runs(root: Path) -> list[RunDirectory]:
@@ -231,6 +240,27 @@ def find_elsewhere(which: str) -> list[RunDirectory]:
     if which.isdecimal():
         return [run for run in runs if run.number == int(which)]
     return [run for run in runs if run.name == which]
+
+
+@contextlib.contextmanager
+def alone(run: RunDirectory) -> Iterator[None]:
+    """
+    Let one command at a time collect a run; the kernel drops the lock when its holder dies.
+
+    Raises:
+        InputError: Another one is at it.
+    """
+    descriptor = os.open(run.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f"{run.name}: another command is collecting it; wait for its end, then repeat"
+            ) from None
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def write_atomically(path: Path, data: bytes) -> None:

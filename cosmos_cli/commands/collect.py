@@ -15,7 +15,7 @@ from cosmos_cli.errors import ExitCode
 from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.problem import Problem
 from cosmos_cli.progress import told_progress
-from cosmos_cli.rundir import RunDirectory, find_run, runs_root
+from cosmos_cli.rundir import RunDirectory, alone, find_run, runs_root
 from cosmos_cli.still_running import still_running
 from madns_runtime.processes import list_processes
 
@@ -55,9 +55,10 @@ def collect(
     found = find_run(runs_root(folder), run)
     refuse_living(found, list_processes())
     options = ConnectOptions(accept_new_host_keys=accept_new_host_keys)
-    problems = _retrieved(found, console, options, forks if retrieve else None)
-    with told_progress(console, found.name) as progress:
-        summary = collect_run(found, problems=problems, progress=progress)
+    with alone(found):
+        problems = _retrieved(found, console, options, forks if retrieve else None)
+        with told_progress(console, found.name) as progress:
+            summary = collect_run(found, problems=problems, progress=progress)
     for line in summary.missing:
         console.warn(line)
     with losing_output(f"{summary.verdict.text}; it stands in {found.run_json}"):

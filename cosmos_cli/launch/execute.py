@@ -35,7 +35,7 @@ from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.loading import ScenarioFile
 from cosmos_cli.plan import LOOPBACK, LaunchPlan, make_plan
 from cosmos_cli.problem import Problem
-from cosmos_cli.rundir import RunDirectory, begin_run, create_run
+from cosmos_cli.rundir import RunDirectory, alone, begin_run, create_run, discard_run
 from madns_runtime.lockstep.shares import processors_here
 from madns_runtime.processes import register
 
@@ -160,6 +160,7 @@ def _prepare(
         if options.machines != (LOOPBACK,):
             (run.path / "inventory.yaml").write_text(inventory_text(plan), encoding="utf-8")
     except OSError as error:
+        discard_run(run)
         raise InputError(f"{run.path}: cannot write there: {error.strerror or error}") from error
     request = LaunchRequest(
         config=config,
@@ -218,16 +219,17 @@ def _finish(
 
     view.state("COLLECTING")
     is_patient = outcome.interruption != "at once"
-    missing = _retrieve(prepared, options, view, is_wanted=is_patient)
-    return finish_run(
-        prepared.run,
-        outcome.host_result or prepared.run.read_left_result(),
-        Expected.of(prepared.request.config, prepared.plan.agents_by_machine),
-        interrupted=outcome.interruption != "no",
-        problems=(*outcome.problems, *missing),
-        has_report=options.has_report and is_patient,
-        progress=view.work,
-    )
+    with alone(prepared.run):
+        missing = _retrieve(prepared, options, view, is_wanted=is_patient)
+        return finish_run(
+            prepared.run,
+            outcome.host_result or prepared.run.read_left_result(),
+            Expected.of(prepared.request.config, prepared.plan.agents_by_machine),
+            interrupted=outcome.interruption != "no",
+            problems=(*outcome.problems, *missing),
+            has_report=options.has_report and is_patient,
+            progress=view.work,
+        )
 
 
 def _retrieve(

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
-import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
 from typing import Self, TypeVar
 
-from cosmos_cli.errors import InputError
 from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.connection import Connection, ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
@@ -53,7 +49,7 @@ def retrieve(
     May be repeated: what is here already is not fetched again, what was cut goes on where it ended.
 
     Args:
-        run: The run; its plan.json says where its records lie.
+        run: The run; its plan.json says where its records lie. Nobody else collects it meanwhile (`alone`).
         options: How machines are connected to.
         forks: Machines at a time.
         progress: Called as data come.
@@ -61,9 +57,6 @@ def retrieve(
 
     Returns:
         An outcome a machine, in the plan's order; none for a run that was on this computer alone.
-
-    Raises:
-        InputError: Another command retrieves this run.
     """
     with Retrieval(
         run, options=options, forks=forks, progress=progress, connections=connections
@@ -85,7 +78,7 @@ class Retrieval:
     One visit to the machines of a run. Use it as a context manager.
 
     Args:
-        run: The run.
+        run: The run; nobody else collects it meanwhile (`alone`).
         options: How machines are connected to.
         forks: Machines at a time.
         progress: Called as data come.
@@ -110,7 +103,6 @@ class Retrieval:
         self._claims = Claims(run, self._sources)
         self._visits: dict[str, _Visit] = {}
         self._failures: dict[str, MachineFailure] = {}
-        self._lock = contextlib.ExitStack()
 
     @property
     def due(self) -> tuple[Source, ...]:
@@ -144,7 +136,6 @@ class Retrieval:
         return [fetched.get(each.machine) or self._kept(each) for each in self._sources.remote]
 
     def __enter__(self) -> Self:
-        self._lock.enter_context(_alone(self._run))
         return self
 
     def __exit__(
@@ -156,7 +147,6 @@ class Retrieval:
         self._tally.is_over = True
         for visit in list(self._visits.values()):
             visit.close(at_once=kind is not None)
-        self._lock.close()
 
     def _each(self, task: Callable[[Source], T]) -> list[Outcome[T]]:
         by_name = {source.machine: source for source in self.due}
@@ -260,22 +250,6 @@ class _Tally:
                     self._progress(f"retrieving {machine}", here / max(total, 1))
 
         return tell
-
-
-@contextlib.contextmanager
-def _alone(run: RunDirectory) -> Iterator[None]:
-    """Let one command at a time retrieve a run; the kernel drops the lock when its holder dies."""
-    descriptor = os.open(run.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(
-                f"{run.name}: another command is retrieving it; wait for its end, then repeat"
-            ) from None
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def _connect(target: Target, options: ConnectOptions) -> Connection:

@@ -65,3 +65,14 @@ def test_package_that_cannot_be_written_leaves_the_old_one_and_no_rest(tmp_path,
 
     assert made.run.bundle.read_bytes() == before
     assert not list(tmp_path.glob(".*.part"))
+
+
+def test_rest_of_one_that_was_killed_is_taken_by_the_next(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    rest = tmp_path / f".{made.run.bundle.name}.part"
+    rest.write_bytes(b"half" * 1000)
+
+    pack_run(made.run, MTIME_S)
+
+    assert not rest.exists()
+    assert members(made.run)

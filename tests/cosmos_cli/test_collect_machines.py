@@ -6,12 +6,13 @@ import json
 import pytest
 from split_run import SplitRun, hashes
 
-from cosmos_cli import app
+from cosmos_cli import app, collect
 from cosmos_cli.collect import collect_run
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.local import LocalConnection
 from cosmos_cli.problem import Problem
 from cosmos_cli.retrieve import retrieval
+from cosmos_cli.rundir import alone
 
 pytestmark = pytest.mark.process
 
@@ -81,6 +82,24 @@ def test_second_time_is_the_same_and_asks_nobody(split, network):
     assert document(split) == first
     assert hashes(split.run.path) == files
     assert split.run.bundle.read_bytes() == package
+
+
+def test_only_one_command_collects_a_run_from_its_first_machine_to_its_package(
+    split, network, monkeypatch, capsys
+):
+    codes = []
+    pack = collect.pack_run
+    monkeypatch.setattr(
+        collect, "pack_run", lambda *of: (codes.append(app.run(["collect"])), pack(*of))
+    )
+
+    with alone(split.run):
+        assert app.run(["collect"]) == 2
+    assert "another command is collecting it" in capsys.readouterr().err
+    assert network.asked == []
+
+    assert app.run(["collect"]) == 0
+    assert codes == [2]
 
 
 def test_machine_that_is_gone_is_named_and_collected_later(split, network, capsys):

@@ -10,7 +10,6 @@ import orjson
 import pytest
 from split_run import CutConnection, SplitRun, hashes
 
-from cosmos_cli.errors import InputError
 from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.local import LocalConnection
@@ -322,11 +321,3 @@ def test_every_byte_and_name_is_on_the_disk_before_a_machine_deletes_its_copy(
 
     assert split.retrieve()["pi01"].is_ok
     assert len(log) == 6
-
-
-def test_only_one_command_retrieves_a_run(tmp_path):
-    split = SplitRun(tmp_path)
-    with split.visit(), pytest.raises(InputError, match="another command is retrieving it"):
-        split.retrieve()
-
-    assert split.retrieve()["pi01"].is_ok

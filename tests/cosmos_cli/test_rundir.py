@@ -145,3 +145,17 @@ def test_unreadable_json_is_none(tmp_path):
     assert run.read_json(run.run_json) is None
     run.run_json.write_bytes(orjson.dumps([1]))
     assert run.read_json(run.run_json) is None
+
+
+@pytest.mark.parametrize("what", ["_allocate", "remember_run"])
+def test_run_that_could_not_be_made_is_not_there_to_be_collected(tmp_path, monkeypatch, what):
+    create_run(tmp_path, "a")
+
+    def refuse(*_arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(f"cosmos_cli.rundir.{what}", refuse)
+    with pytest.raises(InputError, match="No space"):
+        create_run(tmp_path, "b")
+
+    assert [run.name for run in list_runs(tmp_path)] == ["0001-a"]
