@@ -17,6 +17,7 @@ from cosmos_cli.commands.fleet_options import (
     SomeInventoryOption,
 )
 from cosmos_cli.console import Console, JsonOption, QuietOption
+from cosmos_cli.counted import counted
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.onboard.processes import Ending
@@ -187,7 +188,7 @@ def _ended_before(which: str) -> list[Doomed]:
 def _end(run: Doomed, fleet: Fleetwide, clean_s: float, say: Callable[[str], None]) -> Ended:
     """End it where its operator is first, else its host: who follows them needs no force."""
     if run.there:
-        say(f"{run.run}: asking {len(run.there)} machine{'s' * (len(run.there) > 1)} to end it")
+        say(f"{run.run}: asking {counted(len(run.there), 'machine')} to end it")
     first = [source for name, source in run.there.items() if name == run.host]
     rest = [source for name, source in run.there.items() if name != run.host]
     here = Ending(run=run.run)
@@ -219,7 +220,7 @@ def _words(ending: Ending) -> str:
     if not ending.ended:
         return "nothing of it lives"
     by_force = f", {len(ending.killed)} of them by force" if ending.killed else ""
-    return f"ended {len(ending.ended)} processes{by_force}"
+    return f"ended {counted(len(ending.ended), 'process')}{by_force}"
 
 
 def _mapping(ended: Ended) -> dict[str, Any]:

@@ -86,8 +86,7 @@ def _ask(fleet: Fleet) -> None:
         typer.Abort: The answer is no.
     """
     names = compact(target.name for target in fleet.targets)
-    count = len(fleet.targets)
-    what = f"reboot {count} machine{'' if count == 1 else 's'} ({names})"
+    what = f"reboot {counted(len(fleet.targets), 'machine')} ({names})"
     if not sys.stdin.isatty():
         raise InputError(f"{what}: nobody is there to ask; give --yes")
     typer.confirm(f"{what}?", abort=True, err=True)

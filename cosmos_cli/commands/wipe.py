@@ -21,6 +21,7 @@ from cosmos_cli.commands.fleet_options import (
 from cosmos_cli.commands.runs import RunsOption
 from cosmos_cli.confirm import confirm
 from cosmos_cli.console import Column, Console, JsonOption, QuietOption
+from cosmos_cli.counted import counted
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.fleet.connection import Connection
 from cosmos_cli.fleet.failure import MachineFailure
@@ -119,17 +120,13 @@ def _row(machine: str, run: RunThere, fate: str) -> list[str]:
 def _question(orders: Sequence[Order]) -> str:
     runs = [run for order in orders for run in order.runs]
     lost = sum(run.state == "not collected" for run in runs)
-    parts = [_counted(len(runs), "run")] if runs else []
+    parts = [counted(len(runs), "run")] if runs else []
     if any(order.is_root for order in orders):
         parts.append(INSTALLED)
     never = f", {lost} of them NEVER COLLECTED" if lost else ""
     size = size_words(sum(order.bytes for order in orders))
-    machines = _counted(len(orders), "machine")
+    machines = counted(len(orders), "machine")
     return f"delete {' and '.join(parts)} ({size}{never}) on {machines}?"
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def _tell(
@@ -144,11 +141,11 @@ def _tell(
     for machine, value in done.items():
         for path in value.left:
             console.say(f"{machine}: kept {path}{_why(path)}")
-    runs = _counted(sum(len(value.runs) for value in done.values()), "run")
+    runs = counted(sum(len(value.runs) for value in done.values()), "run")
     size = size_words(sum(value.bytes for value in done.values()))
     kept = sum(len(o.value.kept) for o in found if o.value is not None)
     console.data(
-        f"{_counted(len(found), 'machine')}: {runs} deleted ({size}), {kept} kept,"
+        f"{counted(len(found), 'machine')}: {runs} deleted ({size}), {kept} kept,"
         f" {len(failures)} failed"
     )
     exit_code = ExitCode.MACHINES if failures else ExitCode.OK

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from cosmos_cli.counted import counted
 from cosmos_cli.doctor.case import Case
 from cosmos_cli.doctor.finding import Level, Remark
 
@@ -227,7 +228,7 @@ def processors(case: Case) -> Iterator[Remark]:
     is_much = load_hz > TICKS_A_PROCESSOR_HZ_MAX
     yield Remark(
         level=Level.WARNING if is_much else Level.OK,
-        found=f"{agents} agent{'' if agents == 1 else 's'} at {case.wants.tick_hz:g} Hz on {usable} processors"
+        found=f"{counted(agents, 'agent')} at {case.wants.tick_hz:g} Hz on {counted(usable, 'processor')}"
         + (
             f": a fast one does {TICKS_A_PROCESSOR_HZ_MAX:g} empty steps a second"
             if is_much

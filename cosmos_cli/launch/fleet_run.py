@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from cosmos_cli.counted import counted
 from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.target import Target, target_of
 from cosmos_cli.launch.machines import Prepare, RemoteMachine, reach_machines
@@ -70,7 +71,7 @@ def reach(
             is_host=target.name == host,
         )
 
-    say(f"reaching {len(machines)} machine{'s' * (len(machines) > 1)}")
+    say(f"reaching {counted(len(machines), 'machine')}")
     return reach_machines(
         [target_of(machine) for machine in machines],
         prepare_of,
