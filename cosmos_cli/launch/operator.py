@@ -128,8 +128,6 @@ class Operator:
             is_detached=self._is_detached,
         )
 
-    # The loop -------------------------------------------------------------------------------------
-
     def _turn(self) -> None:
         turned_s = time.monotonic()
         for key, mask in self._loop.selector.select(self._wait_s(turned_s)):
@@ -178,8 +176,6 @@ class Operator:
 
     def _problem_of(self, child: Child, text: str) -> None:
         self._talk.problem(text, self._crew.machine_of(child.name))
-
-    # Starting -------------------------------------------------------------------------------------
 
     def _start_host(self) -> None:
         machine = self._request.host_machine
@@ -235,8 +231,6 @@ class Operator:
         reason = f"{name} cannot be started: {error}"
         self._talk.problem(reason, self._crew.machine_of(name))
         self._ask_host_to_stop("failed", reason)
-
-    # What children say ----------------------------------------------------------------------------
 
     def _said(self, name: str, line: bytes) -> None:
         event = events.parse_event(line)
@@ -305,8 +299,6 @@ class Operator:
         self._talk.last_words(host)
         self._close_down(grace_s=0.0)
 
-    # The end of children --------------------------------------------------------------------------
-
     def _child_exited(self, child: Child) -> None:
         machine = self._crew.machine_of(child.name)
         if machine is not None and child.loss() is not None:
@@ -373,8 +365,6 @@ class Operator:
         command = {"command": "stop", "reason": "the run is over"}
         self._crew.tell_supervisors(command)
         self._seats.send(command)
-
-    # The person -----------------------------------------------------------------------------------
 
     def _signalled(self, mask: int) -> None:
         for number in self._signals.take():

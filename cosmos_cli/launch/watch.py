@@ -153,11 +153,6 @@ class MachineWatch:
             watched.forget()
             self._try_later(machine)
 
-    def is_lost(self, machine: str) -> bool:
-        """Tell whether a machine is lost and has not returned."""
-        watched = self._watched.get(machine)
-        return watched is not None and watched.is_lost
-
     @property
     def is_trying(self) -> bool:
         """Whether a lost machine is being reached for just now; that has an end soon."""
