@@ -332,6 +332,30 @@ def test_uplink_that_does_not_end_within_the_pass_waits_for_the_next():
     assert later[0][1].arrives_s == pytest.approx(RISE_S + PERIOD_S + 2.0, abs=0.1)
 
 
+def test_uplinks_leave_in_their_order_whichever_station_has_time():
+    slow = station("slow", east_deg=-40.0, rate_bit_s=BITS / 13.0)
+    quick = station("quick", east_deg=-40.0, rate_bit_s=BITS / 3.0)
+
+    _, _, events = fly(ground(slow, quick, uplinks=[(0.0, "v0", TEXT)] * 8), 30.0)
+
+    assert [event.number for event in events] == list(range(8))
+    assert {event.sender for event in events} == {"ground:slow", "ground:quick"}
+    assert np.diff([event.sent_s for event in events]).min() >= 0.0
+
+
+def test_message_longer_than_a_pass_is_not_ended_in_the_next_one():
+    # It would begin in this pass and end in the middle of the next.
+    rate_bit_s = BITS / PERIOD_S
+    segment = ground(station(rate_bit_s=rate_bit_s), uplinks=[(0.0, "v0", TEXT)])
+    middle_s = (RISE_S + SET_S) / 2.0
+
+    (down,) = segment.send(0, message(sent_s=middle_s), middle_s)
+    _, _, up = fly(segment, SET_S)
+
+    assert down.outcome == "no_contact"
+    assert up == []
+
+
 def test_uplink_of_a_late_time_waits_for_it():
     segment = ground(uplinks=[(1e6, "v0", TEXT)])
 
@@ -456,7 +480,6 @@ def test_every_message_of_both_ways_is_accounted(sends, uplinks, loss):
     assert len(up) + counts["uplinks_waiting"] == len(uplinks)
     delivered = [event for event in up if event.outcome == "delivered"]
     assert len(deliveries) + counts["in_flight"] == len(delivered)
-    for before, after in itertools.pairwise(
-        sorted((e for e in up if e.outcome != "lost"), key=lambda e: (e.to, e.sent_s))
-    ):
+    in_order = sorted(up, key=lambda event: (event.to, uplinks[event.number][0], event.number))
+    for before, after in itertools.pairwise(in_order):
         assert before.to != after.to or before.sent_s <= after.sent_s

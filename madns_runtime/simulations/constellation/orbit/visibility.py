@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +22,15 @@ from madns_runtime.simulations.constellation.orbit.earth import (
     WGS_84_POLAR_RADIUS_M,
     WGS_84_RADIUS_M,
 )
+from madns_runtime.simulations.constellation.orbit.elements import (
+    elements_from_state,
+    state_from_elements,
+)
 
 LIGHT_SPEED_M_S = 299_792_458.0
 """Exact, by the definition of the metre."""
+SERIES_S_MAX = 10.0
+"""So long a time is coasted by a series, whose error grows with its fourth power."""
 
 
 def has_line_of_sight(first: Sequence[float], second: Sequence[float], height_m: float) -> bool:
@@ -117,10 +124,11 @@ def signal_ways(
 
 def coast(states: NDArray[np.float64], dt_s: float) -> NDArray[np.float64]:
     """
-    Return where vehicles are a short time later, without propagation.
+    Return where vehicles are a while later, under a point mass, without propagation.
 
-    Taylor's series to the third power under a point mass: in LEO 4 mm off after 10 s and 90 m after two
-    minutes, beside 60 cm and 90 m of J2.
+    For up to SERIES_S_MAX by Taylor's series to the third power, in LEO 4 mm off by then beside 60 cm of
+    J2; for longer along the osculating ellipse, which J2 leaves by 90 m in two minutes. An open orbit,
+    which has none, is left to the series.
 
     Args:
         states: Positions and velocities, shape (..., 6), m and m/s.
@@ -131,6 +139,24 @@ def coast(states: NDArray[np.float64], dt_s: float) -> NDArray[np.float64]:
 
     Source: the f and g series, Bate, Mueller and White, Fundamentals of Astrodynamics, section 5.5.
     """
+    if dt_s > SERIES_S_MAX:
+        rows = [_along_orbit(row, dt_s) for row in states.reshape(-1, 6)]
+        return np.array(rows).reshape(states.shape)
+    return _along_series(states, dt_s)
+
+
+def _along_orbit(state: NDArray[np.float64], dt_s: float) -> NDArray[np.float64]:
+    x, y, z, vx, vy, vz = state.tolist()
+    try:
+        now = elements_from_state((x, y, z), (vx, vy, vz), EGM_96.mu_m3_s2)
+    except ValueError:
+        return _along_series(state, dt_s)
+    rate_rad_s = math.sqrt(EGM_96.mu_m3_s2 / now.a_m**3)
+    then = replace(now, mean_anomaly_rad=now.mean_anomaly_rad + rate_rad_s * dt_s)
+    return np.concatenate(state_from_elements(then, EGM_96.mu_m3_s2))
+
+
+def _along_series(states: NDArray[np.float64], dt_s: float) -> NDArray[np.float64]:
     r, v = states[..., :3], states[..., 3:]
     square = (r * r).sum(axis=-1, keepdims=True)
     u = EGM_96.mu_m3_s2 / (square * np.sqrt(square))

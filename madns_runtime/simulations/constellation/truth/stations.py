@@ -8,6 +8,7 @@ so that what they carry is on its way before it is due.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from datetime import datetime
@@ -42,12 +43,19 @@ from madns_runtime.simulations.constellation.truth.medium import (
     checked_sent_s,
     index_of_names,
 )
-from madns_runtime.simulations.constellation.truth.passes import PassFinder, Sites, Window
+from madns_runtime.simulations.constellation.truth.passes import (
+    SCAN_STEP_S,
+    PassFinder,
+    Sites,
+    Window,
+)
 
 __all__ = ["CONTACT_FIELDS", "Contact", "GroundSegment"]
 
 DOWNLINK_QUEUE_MAX = 256
 """Messages that may wait at one vehicle's transmitter to the ground; further ones are refused."""
+LOOKS_MAX = 1000
+"""At the time that one message takes: SCAN_STEP_S apart, or further if it takes more than 10,000 s."""
 PREFIX = f"{GROUND}:"
 
 
@@ -100,6 +108,8 @@ class GroundSegment:
         self._uplinks_waiting = len(uplinks)
         self._free_s: dict[tuple[int, int], float] = {}
         """By station and vehicle: when what the station says to it is said."""
+        self._uplinked_s: dict[int, float] = {}
+        """By vehicle: when the newest uplink to it left."""
         self._in_flight = InFlight(LEAD_S)
         self._account = Account()
         self._uplink_events: list[LinkEvent] = []
@@ -198,35 +208,38 @@ class GroundSegment:
             return attempt.failed("queue_full")
         duration_s = attempt.size_bytes * 8.0 / self._stations[station].rate_bit_s
         ends_s = leaves_s + duration_s
-        if not self._is_in_view(station, state, sent_s, ends_s):
+        if not self._stays_in_view(station, state, sent_s, ends_s):
             return attempt.failed("no_contact")
         transmitter.occupy(sent_s, leaves_s, duration_s)
         start = coast(state, leaves_s - sent_s)[0].tolist()
         distance_m, _ = signal_way(start, self._site_state(station, leaves_s))
         name = PREFIX + self._stations[station].name
         receiver = len(self._agents) + station
-        if self._chance.draw(attempt.sender, attempt.message.number, receiver) < self._loss(
-            station
-        ):
+        drawn = self._chance.draw(attempt.sender, attempt.message.number, receiver)
+        if drawn < self._stations[station].loss:
             return attempt.failed("lost", name, distance_m)
         return attempt.delivered(name, distance_m, ends_s + distance_m / LIGHT_SPEED_M_S)
 
-    def _is_in_view(
-        self, station: int, state: NDArray[np.float64], t_s: float, later_s: float
+    def _stays_in_view(
+        self, station: int, state: NDArray[np.float64], t_s: float, until_s: float
     ) -> bool:
-        """Return whether one vehicle, shape (1, 6), at *t_s*, stands above a mask a little later."""
-        later = coast(state, later_s - t_s)
-        clear, _ = self._sites.clearances(later, later_s, slice(station, station + 1))
-        return bool(clear[0, 0] >= 0.0)
+        """Return whether one vehicle, shape (1, 6), above a mask at *t_s*, stays there until later."""
+        takes_s = until_s - t_s
+        looks = min(max(1, math.ceil(takes_s / SCAN_STEP_S)), LOOKS_MAX)
+        # The end first: most that do not stay are gone by then.
+        for look in range(looks, 0, -1):
+            after_s = takes_s * look / looks
+            later = coast(state, after_s)
+            clear, _ = self._sites.clearances(later, t_s + after_s, slice(station, station + 1))
+            if clear[0, 0] < 0.0:
+                return False
+        return True
 
     def _site_state(self, station: int, t_s: float) -> tuple[float, ...]:
         """Return a station's position, m, and velocity, m/s, TEME: it turns with the Earth."""
         x, y, z = self._sites.at(t_s)[0, station].tolist()
         turn = self._sites.turn_rad_s
         return (x, y, z, -turn * y, turn * x, 0.0)
-
-    def _loss(self, station: int) -> float:
-        return self._stations[station].loss
 
     # Passes, and stations to vehicles.
 
@@ -243,7 +256,13 @@ class GroundSegment:
         ends_s = stretch.until_s if window.set_s is None else window.set_s
         while queue:
             number, uplink = queue[0]
-            begins_s = max(stretch.from_s, window.rise_s, uplink.at_s, self._free_s.get(pair, 0.0))
+            begins_s = max(
+                stretch.from_s,
+                window.rise_s,
+                uplink.at_s,
+                self._free_s.get(pair, 0.0),
+                self._uplinked_s.get(window.vehicle, 0.0),
+            )
             if begins_s >= ends_s:
                 return
             message = Transmission(
@@ -260,6 +279,7 @@ class GroundSegment:
             if event is None:
                 return
             self._free_s[pair] = begins_s + duration_s
+            self._uplinked_s[window.vehicle] = begins_s
             queue.popleft()
             self._uplinks_waiting -= 1
             self._uplink_events.append(event)
@@ -270,7 +290,7 @@ class GroundSegment:
         """Return what becomes of an uplink; None: the pass, or what is known of it, ends before it does."""
         begins_s = attempt.message.sent_s
         state = self._truth.state(window.vehicle, begins_s)
-        if state is None or not self._is_in_view(
+        if state is None or not self._stays_in_view(
             window.station, np.array((state,)), begins_s, ends_s
         ):
             return None
@@ -278,7 +298,7 @@ class GroundSegment:
         distance_m, _ = signal_way(site, state)
         agent = self._agents[window.vehicle]
         drawn = self._chance.draw(attempt.sender, attempt.message.number, window.vehicle)
-        if drawn < self._loss(window.station):
+        if drawn < self._stations[window.station].loss:
             return attempt.failed("lost", agent, distance_m)
         arrives_s = ends_s + distance_m / LIGHT_SPEED_M_S
         delivery = Delivery(
