@@ -26,9 +26,15 @@ if TYPE_CHECKING:
 VERBS = ("ping", "exec", "up")
 """Commands that connect to every machine at once, and leave nothing to be done here."""
 WAYS_MAX = 64
-SILENT = ("--help",)
-INVENTORY = ("-i", "--inventory", "COSMOS_INVENTORY")
-LIMIT = ("-l", "--limit", "COSMOS_LIMIT")
+SHORT = {"-i": "--inventory", "-l": "--limit", "-q": "--quiet"}
+VARIABLES = {
+    "--inventory": "COSMOS_INVENTORY",
+    "--limit": "COSMOS_LIMIT",
+    "--forks": "COSMOS_FORKS",
+}
+VALUED = (*VARIABLES, "--timeout", "--host")
+FLAGS = ("--accept-new-host-keys", "--check", "--diff", "--json", "--quiet", "--sudo")
+"""All options of these commands but --help: at another word nothing is begun, for it may mean anything."""
 
 SWITCH_S = 0.02
 """How long a thread runs before others may: with two for each machine, Python's own 5 ms cost more than they
@@ -55,20 +61,22 @@ def begin(arguments: Sequence[str]) -> None:
     Args:
         arguments: What stands behind `cosmos`.
     """
-    if not is_quick(arguments) or any(word in arguments for word in SILENT):
-        return
-    inventory = option(arguments, INVENTORY)
-    if not inventory:
+    said = options(arguments) if is_quick(arguments) else None
+    if said is None or "--inventory" not in said:
         return
     # Imported here: commands that work on no fleet need none of it.
     from pathlib import Path
 
     from cosmos_cli.errors import CosmosError
+    from cosmos_cli.fleet.pool import FORKS_DEFAULT
     from cosmos_cli.fleet.remembered import key_of, recall
     from cosmos_cli.fleet.ssh_settings import settings_of
 
-    targets = recall(key_of(Path(inventory), option(arguments, LIMIT))) or ()
-    for target in targets[:WAYS_MAX]:
+    forks = said.get("--forks", str(FORKS_DEFAULT))
+    # No machine waits for its turn with a connection that it would close some day.
+    ways_max = min(int(forks), WAYS_MAX) if forks.isdecimal() else 0
+    targets = recall(key_of(Path(said["--inventory"]), said.get("--limit"))) or ()
+    for target in targets[:ways_max]:
         try:
             settings = settings_of(target) if target.connection == "ssh" else None
         except (CosmosError, OSError):
@@ -85,17 +93,29 @@ def is_quick(arguments: Sequence[str]) -> bool:
     return bool(arguments) and arguments[0] in VERBS
 
 
-def option(arguments: Sequence[str], names: tuple[str, str, str]) -> str | None:
-    """Return an option's value: behind its short or long name, or of its variable; None if it has none."""
-    short, long, variable = names
-    for word, following in zip(arguments, [*arguments[1:], ""], strict=True):
-        if word == "--":
+def options(arguments: Sequence[str]) -> dict[str, str] | None:
+    """
+    Return the options of a command line by their long names, those of the environment included.
+
+    As the command itself will read them: the last one counts, and what follows the first word of a
+    command for the machines belongs to that. None for a line with any option that is not known here.
+    """
+    found = {name: os.environ[key] for name, key in VARIABLES.items() if os.environ.get(key)}
+    words = iter(arguments[1:])
+    for word in words:
+        if word == "--" or (arguments[0] == "exec" and not word.startswith("-")):
             break
-        if word in (short, long):
-            return following
-        if word.startswith(f"{long}="):
-            return word.partition("=")[2]
-    return os.environ.get(variable) or None
+        if not word.startswith("-"):
+            continue
+        is_long = word.startswith("--")
+        name, equals, value = word.partition("=") if is_long else (word[:2], "", word[2:])
+        name = SHORT.get(name, name)
+        if name in FLAGS and not (equals or value):
+            continue
+        found[name] = value if equals or value else next(words, "")
+        if name not in VALUED or not found[name]:
+            return None
+    return found
 
 
 def take(host: str, port: int, *, timeout_s: float) -> Way | None:
@@ -106,8 +126,14 @@ def take(host: str, port: int, *, timeout_s: float) -> Way | None:
         OSError: As connecting would.
     """
     way = _ways.pop((host, port), None)
-    if way is None or way.transport is not None:
-        return way
+    if way is None:
+        return None
+    if way.transport is not None:
+        if way.transport.is_active():
+            return way
+        way.transport.close()
+        way.sock.close()
+        return None  # what ended it is told by the next attempt, if it is still so
     try:
         poll = select.poll()
         poll.register(way.sock, select.POLLOUT)
