@@ -114,10 +114,10 @@ def refused(settings: SshSettings, tried: list[str], notes: list[str]) -> Machin
 def _keys(settings: SshSettings, notes: list[str]) -> Iterator[tuple[str, PKey]]:
     seen: set[bytes] = set()
     sources = [_of_files(settings, notes), _of_agent(settings)]
-    if not settings.are_keys_named:
-        sources.reverse()
-    elif settings.identities_only:
+    if settings.identities_only:
         sources.pop()
+    elif not settings.are_keys_named:
+        sources.reverse()
     for source in sources:
         for label, key in source:
             if key.asbytes() not in seen:
@@ -129,19 +129,20 @@ def _of_files(settings: SshSettings, notes: list[str]) -> Iterator[tuple[str, PK
     for file in settings.key_files:
         try:
             yield str(file), load_key(str(file))
+            continue
         except FileNotFoundError:
-            if settings.are_keys_named:
-                notes.append(f"{file}: no such key")
+            note = f"{file}: no such key" if settings.are_keys_named else ""
         except OSError as error:
-            notes.append(f"{file}: {error.strerror or error}")
+            note = f"{file}: {error.strerror or error}"
         except PasswordRequiredException:
-            held = _held_by_agent(settings, file)
-            if held is not None:
-                yield f"{file} (ssh agent)", held
-            else:
-                notes.append(f"{file} needs its passphrase: ssh-add it")
+            note = f"{file} needs its passphrase: ssh-add it"
         except (SSHException, UnknownKeyType, ValueError) as error:
-            notes.append(f"{file}: not a private key that is understood ({error})")
+            note = f"{file}: not a private key that is understood ({error})"
+        held = _held_by_agent(settings, file)
+        if held is not None:
+            yield f"{file} (ssh agent)", held
+        elif note:
+            notes.append(note)
 
 
 def _of_agent(settings: SshSettings) -> Iterator[tuple[str, PKey]]:
@@ -182,9 +183,16 @@ def _load_key(file: str) -> PKey:
 
 
 def public_part(file: Path) -> bytes | None:
-    """Return the public key that belongs to a private key file, without its passphrase; None if unknown."""
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        return base64.b64decode(Path(f"{file}.pub").read_text(encoding="utf-8").split()[1])
+    """
+    Return the public key that a file's name stands for, without a passphrase; None if unknown.
+
+    As with ssh, the file may hold the public key itself, or its neighbour may: the ssh agent has the other half.
+    """
+    for path in (Path(f"{file}.pub"), file):
+        with contextlib.suppress(OSError, ValueError):
+            kind, blob = path.read_text(encoding="utf-8").split()[:2]
+            if not kind.startswith("-"):  # as a private key's first line does
+                return base64.b64decode(blob, validate=True)
     with contextlib.suppress(OSError, ValueError, struct.error, binascii.Error):
         lines = file.read_text(encoding="ascii").strip().splitlines()
         data = base64.b64decode("".join(lines[1:-1]))

@@ -259,6 +259,25 @@ def test_key_with_a_passphrase_is_used_through_the_agent(known, agent, tmp_path,
     assert says(target_of(known, key_file=str(key))) == b"hello\n"
 
 
+def test_public_key_as_identity_names_one_that_the_agent_holds(known, agent, tmp_path):
+    agent(make_key(tmp_path / "other", "ed25519"))
+    agent(known.user_key)
+    (tmp_path / "mine.pub").write_text(public(known.user_key))
+
+    for name in ("mine.pub", "mine"):
+        assert says(target_of(known, key_file=str(tmp_path / name))) == b"hello\n"
+
+
+def test_identities_only_keeps_the_agents_other_keys_back(known, agent, home):
+    agent(known.user_key)
+    write_configuration(home / ".ssh" / "config", "IdentitiesOnly yes")
+
+    with failing(FailureKind.AUTHENTICATION) as caught:
+        connect(target_of(known, key_file=None))
+
+    assert "no key to log in with" in caught.value.text
+
+
 # Not reached.
 
 
