@@ -17,11 +17,10 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from cosmos_cli.cache import cache_folder
 from cosmos_cli.fleet.target import Target
 from madns_runtime import __version__
 
-CACHE_VARIABLE = "COSMOS_CACHE"
-CACHE_DEFAULT = "~/.cache/cosmos"
 FOLDER = "targets"
 FILES_MAX = 500
 BYTES_MAX = 8 * 1024 * 1024
@@ -36,7 +35,7 @@ def recall(key: str | None) -> tuple[Target, ...] | None:
     if key is None:
         return None
     try:
-        kept = json.loads((_folder() / key).read_bytes())
+        kept = json.loads((cache_folder() / FOLDER / key).read_bytes())
         return tuple(Target.from_mapping(mapping) for mapping in kept)
     except (OSError, ValueError, TypeError):
         return None
@@ -47,7 +46,7 @@ def remember(key: str | None, targets: Sequence[Target]) -> None:
     if key is None:
         return
     with contextlib.suppress(OSError):
-        folder = _folder()
+        folder = cache_folder() / FOLDER
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         text = json.dumps([target.to_mapping() for target in targets])
         with tempfile.NamedTemporaryFile("w", dir=folder, delete=False, encoding="utf-8") as file:
@@ -95,7 +94,3 @@ def _below(folder: Path) -> Iterator[Path]:
     for root, folders, names in os.walk(folder, followlinks=True):
         folders.sort()
         yield from (Path(root, name) for name in sorted(names))
-
-
-def _folder() -> Path:
-    return Path(os.environ.get(CACHE_VARIABLE) or CACHE_DEFAULT).expanduser() / FOLDER

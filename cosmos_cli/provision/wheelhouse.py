@@ -4,7 +4,8 @@ Environments for machines without internet: resolved and downloaded here, rememb
     <cache>/locks/<hash of what was asked>.json    what an environment is made of
     <cache>/wheels/<sha256>/<wheel>                 shared by all runs and all machines
 
-When nothing changed no process is started and no network is needed. Safe for threads and processes.
+When nothing changed no process is started and no network is needed. Safe for threads and processes. What was
+not used for a long time goes when something new comes (`cosmos_cli.provision.wheels.remove_unused`).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from cosmos_cli.cache import cache_folder
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.provision import resolver
 from cosmos_cli.provision.lock import (
@@ -35,10 +37,15 @@ from cosmos_cli.provision.lock import (
 )
 from cosmos_cli.provision.platform import Platform
 from cosmos_cli.provision.trees import DISTRIBUTION, Progress, no_progress
-from cosmos_cli.provision.wheels import fetch, lacking, requirements_of, wheel_path
+from cosmos_cli.provision.wheels import (
+    fetch,
+    lacking,
+    remove_unused,
+    requirements_of,
+    wheel_path,
+)
 from cosmos_cli.rundir import write_atomically
 
-CACHE_VARIABLE = "COSMOS_CACHE"
 SCHEMA = 1
 """Of what is remembered; what another one wrote is resolved anew."""
 TRUTH_EXTRA = "truth"
@@ -87,14 +94,6 @@ class Environment:
     def wheel(self, locked: Locked) -> Path:
         """Return where one of its wheels is here."""
         return wheel_path(self.wheels, locked)
-
-
-def cache_folder() -> Path:
-    """Return the folder of what was downloaded: COSMOS_CACHE, else cosmos among the user's caches."""
-    given = os.environ.get(CACHE_VARIABLE)
-    if given:
-        return Path(given).absolute()
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cosmos"
 
 
 def sees_system_packages(packages: Iterable[str]) -> bool:
@@ -215,6 +214,7 @@ def _make_lock(path: Path, need: _Need, cache: Path, progress: Progress) -> Lock
         _failures[str(path)] = (time.monotonic(), error)
         raise
     write_atomically(path, json.dumps(content.to_mapping(), indent=1).encode())
+    remove_unused(cache, now_s=time.clock_gettime(time.CLOCK_REALTIME))
     return content
 
 
@@ -295,11 +295,14 @@ def _refuse_ancient(need: _Need, missing: set[str]) -> None:
 
 
 def _read_lock(path: Path) -> Lock | None:
-    """Return what is remembered; None if nothing is."""
+    """Return what is remembered, which then counts as used now; None if nothing is."""
     try:
-        return Lock.from_mapping(json.loads(path.read_bytes()))
+        content = Lock.from_mapping(json.loads(path.read_bytes()))
     except (OSError, ValueError, KeyError, TypeError):
         return None
+    with contextlib.suppress(OSError):
+        os.utime(path)
+    return content
 
 
 @contextlib.contextmanager

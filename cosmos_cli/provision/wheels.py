@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
+import json
 import os
+import shutil
 import tempfile
 import zipfile
 from collections.abc import Sequence
@@ -17,6 +20,11 @@ from cosmos_cli.provision import resolver
 from cosmos_cli.provision.lock import Chosen, Locked
 from cosmos_cli.provision.platform import Platform
 from cosmos_cli.provision.trees import Progress
+
+UNUSED_S_MAX = 90 * 86_400.0
+"""What nobody has asked for in so long is not kept."""
+MAKING_S_MAX = 86_400.0
+"""What belongs to nothing may be younger: somebody is just downloading it."""
 
 
 def wheel_path(folder: Path, locked: Locked) -> Path:
@@ -86,6 +94,28 @@ def requirements_of(path: Path) -> list[str]:
                 metadata = HeaderParser().parsestr(wheel.read(name).decode())
                 return [str(text) for text in metadata.get_all("Requires-Dist", [])]
     return []
+
+
+def remove_unused(cache: Path, *, now_s: float) -> None:
+    """
+    Remove what was not used for UNUSED_S_MAX, the wheels that nothing else needs, and what was left half made.
+
+    Args:
+        cache: With the folders "locks" and "wheels".
+        now_s: By the wall clock.
+    """
+    needed: set[str] = set()
+    for path in (cache / "locks").glob("*.json"):
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+            if now_s - path.stat().st_mtime > UNUSED_S_MAX:
+                path.unlink()
+                path.with_suffix(".lock").unlink(missing_ok=True)
+            else:
+                needed |= {wheel["sha256"] for wheel in json.loads(path.read_bytes())["wheels"]}
+    for path in (cache / "wheels").glob("*"):
+        with contextlib.suppress(OSError):
+            if path.name not in needed and now_s - path.stat().st_mtime > MAKING_S_MAX:
+                shutil.rmtree(path)
 
 
 def _keep(downloaded: Path, locked: Locked, folder: Path) -> None:

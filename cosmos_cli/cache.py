@@ -1,0 +1,16 @@
+"""Where this computer keeps what can be had again: wheels, and how machines are reached."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+CACHE_VARIABLE = "COSMOS_CACHE"
+
+
+def cache_folder() -> Path:
+    """Return that folder: COSMOS_CACHE, else cosmos among the user's caches."""
+    given = os.environ.get(CACHE_VARIABLE)
+    if given:
+        return Path(given).expanduser().absolute()
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cosmos"
