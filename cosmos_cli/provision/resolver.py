@@ -39,6 +39,7 @@ NO_NETWORK = re.compile(
     re.IGNORECASE,
 )
 SECRET = re.compile(r"://[^/@\s]+@")
+EXTRA_INDEXES = ("UV_INDEX", "UV_EXTRA_INDEX_URL")
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-input")
 
 
@@ -64,7 +65,7 @@ def resolve(requirements: Sequence[str], platform: Platform) -> tuple[Candidate,
     done = _run(
         command,
         timeout_s=RESOLVE_TIMEOUT_S,
-        stdin="\n".join(requirements),
+        stdin="\n".join([*index_lines(settings, os.environ), *requirements]),
         environment=uv_environment(settings, os.environ),
     )
     if done.returncode:
@@ -137,27 +138,41 @@ def pip_settings() -> dict[str, str]:
     return merged
 
 
+def index_lines(settings: Mapping[str, str], environment: Mapping[str, str]) -> list[str]:
+    """
+    Return the indexes that pip sees, as lines of requirements for uv; what is said to uv itself wins.
+
+    An address may hold a password, which has no business in arguments or in the environment.
+    """
+    lines = []
+    for setting, names in {
+        "index-url": ("UV_DEFAULT_INDEX", "UV_INDEX_URL"),
+        "extra-index-url": EXTRA_INDEXES,
+        "find-links": ("UV_FIND_LINKS",),
+    }.items():
+        if not any(name in environment for name in names):
+            lines += [f"--{setting} {value}" for value in settings.get(setting, "").split()]
+    return lines
+
+
 def uv_environment(settings: Mapping[str, str], environment: Mapping[str, str]) -> dict[str, str]:
     """
-    Return an environment in which uv sees the indexes that pip sees; what is said to uv itself wins.
+    Return an environment in which uv reaches indexes as pip does; what is said to uv itself wins.
 
     pip takes the best version that any of its indexes has; uv would stop at the first index that knows
     the name, which finds other versions than pip.
     """
     told = dict(environment)
     passed = {
-        "UV_DEFAULT_INDEX": ("UV_INDEX_URL", settings.get("index-url")),
-        "UV_INDEX": ("UV_EXTRA_INDEX_URL", _joined(settings.get("extra-index-url"), " ")),
-        "UV_FIND_LINKS": ("", _joined(settings.get("find-links"), ",")),
-        "UV_INSECURE_HOST": ("", _joined(settings.get("trusted-host"), " ")),
+        "UV_INSECURE_HOST": ("", " ".join(settings.get("trusted-host", "").split())),
         "SSL_CERT_FILE": ("", settings.get("cert")),
         "ALL_PROXY": ("HTTPS_PROXY", settings.get("proxy")),
     }
     for name, (older_name, value) in passed.items():
         if value and name not in told and older_name not in told:
             told[name] = value
-            if name == "UV_INDEX":
-                told.setdefault("UV_INDEX_STRATEGY", "unsafe-best-match")
+    if settings.get("extra-index-url") and not any(name in told for name in EXTRA_INDEXES):
+        told.setdefault("UV_INDEX_STRATEGY", "unsafe-best-match")
     return told
 
 
@@ -236,10 +251,6 @@ def _pin(chosen: Chosen) -> str:
 def _name_of(requirement: str) -> str:
     match = re.match(r"\s*([A-Za-z0-9][\w.-]*)", requirement)
     return match[1] if match else requirement
-
-
-def _joined(value: str | None, separator: str) -> str | None:
-    return separator.join(value.split()) if value else None
 
 
 def _pip_platform(platform: Platform) -> list[str]:

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 from made_wheels import make_runtime_wheels, make_source, make_wheel, only_index
@@ -13,7 +14,7 @@ from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.provision import resolver, wheelhouse
 from cosmos_cli.provision.lock import Distributed
 from cosmos_cli.provision.platform import Platform
-from cosmos_cli.provision.resolver import pip_environment, uv_environment
+from cosmos_cli.provision.resolver import index_lines, pip_environment, uv_environment
 from cosmos_cli.provision.wheelhouse import environment_key, prepare, sees_system_packages
 
 PI = Platform(python=(3, 11), machine="aarch64", libc_version=(2, 36))
@@ -122,6 +123,32 @@ def test_lost_wheels_are_fetched_as_they_were_locked_though_newer_ones_exist(ind
 
     assert again == first
     assert all(again.wheel(wheel).exists() for wheel in again.lock)
+
+
+def age(environment_or_path, days):
+    """Let a path look as if nobody had used it for so long."""
+    then_s = time.clock_gettime(time.CLOCK_REALTIME) - days * 86_400
+    os.utime(environment_or_path, (then_s, then_s))
+
+
+def test_cache_forgets_what_was_not_used_for_long_when_something_new_comes(index, tmp_path):
+    locks, wheels = tmp_path / "cache/locks", tmp_path / "cache/wheels"
+    make_wheel(index, "pyproj")
+    old = prepare(PI, ["pyproj"])
+    used = prepare(LAPTOP, [])
+    for path in (*locks.iterdir(), *wheels.iterdir()):
+        age(path, 91)
+    (wheels / ".new-cut-off").mkdir()
+    age(wheels / ".new-cut-off", 2)
+    (wheels / ".new-of-somebody").mkdir()
+    assert environment_key(LAPTOP, []) == used.key
+
+    new = prepare(PI, [])
+
+    needed = {wheel.sha256 for environment in (used, new) for wheel in environment.lock}
+    assert {path.name for path in wheels.iterdir()} == {*needed, ".new-of-somebody"}
+    assert len(list(locks.glob("*.json"))) == 2
+    assert prepare(PI, ["pyproj"]).key == old.key
 
 
 def test_key_needs_no_wheels(index, no_process):
@@ -324,21 +351,25 @@ def test_nothing_of_an_index_password_is_kept(index, tmp_path):
     assert "file:" not in kept and str(index) not in kept
 
 
-def test_uv_is_told_the_indexes_that_pip_knows():
+def test_uv_is_told_the_indexes_that_pip_knows_but_in_no_environment():
     settings = {
-        "index-url": "https://one.example/simple",
+        "index-url": "https://me:secret@one.example/simple",
         "extra-index-url": "\nhttps://two.example/simple\nfile:///three",
         "find-links": "/a /b",
         "cert": "/etc/own.pem",
         "trusted-host": "one.example two.example",
     }
 
+    assert index_lines(settings, {}) == [
+        "--index-url https://me:secret@one.example/simple",
+        "--extra-index-url https://two.example/simple",
+        "--extra-index-url file:///three",
+        "--find-links /a",
+        "--find-links /b",
+    ]
     assert uv_environment(settings, {"HOME": "/home/me"}) == {
         "HOME": "/home/me",
-        "UV_DEFAULT_INDEX": "https://one.example/simple",
-        "UV_INDEX": "https://two.example/simple file:///three",
         "UV_INDEX_STRATEGY": "unsafe-best-match",
-        "UV_FIND_LINKS": "/a,/b",
         "SSL_CERT_FILE": "/etc/own.pem",
         "UV_INSECURE_HOST": "one.example two.example",
     }
@@ -353,6 +384,7 @@ def test_what_is_said_to_uv_itself_wins():
     settings = {"index-url": "https://one.example", "extra-index-url": "https://two", "cert": "/c"}
 
     assert said == uv_environment(settings, said)
+    assert index_lines(settings, said) == []
 
 
 def test_pip_is_told_the_index_that_only_uv_knows():
