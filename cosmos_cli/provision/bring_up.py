@@ -29,8 +29,6 @@ from cosmos_cli.provision.step import Kind, Step
 from cosmos_cli.provision.steps import check_possible, plan_steps
 from cosmos_cli.provision.wanted import Content, Paths, Wanted, wanted_of
 
-LOCK_PATIENCE_S = 60.0
-"""Without a question for so long the machine's lock is given up: the operator is gone."""
 LOCK_WAIT_S = 10.0
 """For another command to end there: one that was cut off gives the lock up within moments."""
 LOCK_RETRY_S = 0.5
@@ -197,11 +195,7 @@ class _Work:
 
     def _lock(self, wanted: Wanted) -> None:
         holder = f"cosmos up on {socket.gethostname()}, pid {os.getpid()}"
-        arguments = {
-            "path": wanted.layout.lock,
-            "holder": holder,
-            "patience_s": LOCK_PATIENCE_S,
-        }
+        arguments = {"path": wanted.layout.lock, "holder": holder}
         until_s = time.monotonic() + LOCK_WAIT_S
         while True:
             try:

@@ -29,6 +29,8 @@ HEADER_BYTES_MAX = 64 * 1024 * 1024
 BODY_BYTES_MAX = 1024 * 1024 * 1024
 LAST_WORDS_BYTES = 4000
 SUDO_TIMEOUT_S = 20.0
+LOCK_PATIENCE_S = 60.0
+"""Without a question for so long the machine's lock is given up: the operator is gone."""
 
 
 class Refusal(Exception):
@@ -330,7 +332,7 @@ def lock(request: Request) -> None:
     """
     Take the machine's lock until this loop ends, so that two commands do not work there at once.
 
-    With "patience_s" the loop ends, and with it the lock, when nothing was asked for so long.
+    The loop ends, and with it the lock, when nothing was asked for "patience_s", by default LOCK_PATIENCE_S.
     """
     path = os.path.expanduser(request.arguments["path"])
     os.makedirs(os.path.dirname(path), exist_ok=True)
@@ -346,4 +348,4 @@ def lock(request: Request) -> None:
         ) from None
     os.ftruncate(descriptor, 0)
     os.write(descriptor, str(request.arguments.get("holder", "")).encode()[:200])
-    PatientInput.patience_s = request.arguments.get("patience_s")
+    PatientInput.patience_s = float(request.arguments.get("patience_s", LOCK_PATIENCE_S))
