@@ -18,6 +18,7 @@ from cosmos_cli.console import Console, JsonOption, QuietOption
 from cosmos_cli.counted import counted
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.fleet.connection import Connection
+from cosmos_cli.fleet.ordered import InOrder
 from cosmos_cli.fleet.outcome import Outcome, failed
 
 COMMAND_TIMEOUT_S = 10.0
@@ -41,8 +42,14 @@ def ping(
     """
     console = Console(json=json, quiet=quiet)
     fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
-    lines = _Lines(console, fleet)
-    outcomes = fleet.each_target(_ask, lines.take)
+    addresses = {target.name: target.address for target in fleet.targets}
+    widths = max(map(len, addresses)), max(map(len, addresses.values()))
+
+    def tell(outcome: Outcome[Times]) -> None:
+        head = f"{outcome.machine:<{widths[0]}}  {addresses[outcome.machine]:<{widths[1]}}"
+        console.data(f"{head}  {_words(outcome)}")
+
+    outcomes = fleet.each_target(_ask, InOrder(fleet.targets, tell))
     bad = failed(outcomes)
     exit_code = ExitCode.MACHINES if bad else ExitCode.OK
     console.data(_verdict(len(outcomes), len(bad)))
@@ -64,34 +71,11 @@ def _ask(connection: Connection) -> Times:
     return connection.opening_s * 1e3, (time.monotonic() - start_s) * 1e3
 
 
-class _Lines:
-    """Prints a line a machine in the inventory's order, each as soon as those above it stand."""
-
-    def __init__(self, console: Console, fleet: Fleet) -> None:
-        self._console = console
-        self._names = [target.name for target in fleet.targets]
-        self._width = max(map(len, self._names))
-        self._address_width = max(len(target.address) for target in fleet.targets)
-        self._addresses = {target.name: target.address for target in fleet.targets}
-        self._done: dict[str, Outcome[Times]] = {}
-        self._printed = 0
-
-    def take(self, outcome: Outcome[Times]) -> None:
-        self._done[outcome.machine] = outcome
-        while self._printed < len(self._names):
-            name = self._names[self._printed]
-            if name not in self._done:
-                return
-            self._console.data(self._line(self._done[name]))
-            self._printed += 1
-
-    def _line(self, outcome: Outcome[Times]) -> str:
-        address = self._addresses[outcome.machine]
-        head = f"{outcome.machine:<{self._width}}  {address:<{self._address_width}}"
-        if outcome.value is None:
-            return f"{head}  failed  {outcome.failure}"
-        ssh_ms, exec_ms = outcome.value
-        return f"{head}  ok      ssh {ssh_ms:6.1f} ms  exec {exec_ms:6.1f} ms"
+def _words(outcome: Outcome[Times]) -> str:
+    if outcome.value is None:
+        return f"failed  {outcome.failure}"
+    ssh_ms, exec_ms = outcome.value
+    return f"ok      ssh {ssh_ms:6.1f} ms  exec {exec_ms:6.1f} ms"
 
 
 def _mapping(fleet: Fleet, index: int, times: Times | None) -> dict[str, Any]:

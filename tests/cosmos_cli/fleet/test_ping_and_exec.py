@@ -187,7 +187,7 @@ def test_interrupted_exec_leaves_nothing_running_there(inventory, tmp_path, how)
     """Also when it is killed: whatever happens here, the machine sees its connection end."""
     with cosmos("exec", "-i", inventory(), f"echo $$ > {tmp_path}/$N; sleep 300; true") as process:
         until_s = time.monotonic() + WAIT_S
-        while len(list(tmp_path.glob("[123]"))) < 3 and time.monotonic() < until_s:
+        while sum(map(is_written, tmp_path.glob("[123]"))) < 3 and time.monotonic() < until_s:
             time.sleep(0.02)
         process.send_signal(how)
         status = process.wait(WAIT_S)
@@ -256,6 +256,11 @@ def cosmos(*arguments):
         process.wait()
         process.stdout.close()
         process.stderr.close()
+
+
+def is_written(file: Path) -> bool:
+    """Whether a command there has written its number: the file is there a moment before."""
+    return bool(file.read_text())
 
 
 def is_gone(file: Path) -> bool:
