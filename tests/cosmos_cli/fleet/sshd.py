@@ -1,21 +1,30 @@
-"""Real sshd processes of the tests' own user, on addresses of loopback; nothing of the machine's own is touched."""
+"""
+Real sshd processes of the tests' own user, on addresses of loopback; nothing of the machine's own is touched.
+
+Each server has a keeper: this module, run as a program. Whatever comes of a server's sessions becomes the
+keeper's child when its parent ends, and none of it outlives the test process, however that ends.
+"""
 
 from __future__ import annotations
 
 import base64
 import contextlib
+import ctypes
 import getpass
 import os
 import shutil
 import signal
 import socket
 import subprocess
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 SSHD = shutil.which("sshd", path=os.environ.get("PATH", "") + ":/usr/sbin:/sbin")
 START_TIMEOUT_S = 10.0
+END_TIMEOUT_S = 10.0
+PR_SET_CHILD_SUBREAPER = 36
 KINDS = ("ed25519", "ecdsa", "rsa")
 
 CONFIGURATION = """
@@ -73,7 +82,8 @@ class Sshd:
             ),
             encoding="utf-8",
         )
-        self.process: subprocess.Popen[bytes] | None = None
+        self.pid = 0
+        self._keeper: subprocess.Popen[bytes] | None = None
         self.log = directory / "sshd.log"
 
     @property
@@ -94,31 +104,33 @@ class Sshd:
         if os.geteuid() == 0:  # root's sshd insists on its empty directory
             Path("/run/sshd").mkdir(mode=0o755, exist_ok=True)
         with self.log.open("wb") as log:
-            self.process = subprocess.Popen(
-                [SSHD, "-D", "-e", "-f", str(self._configuration)],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
+            self._keeper = subprocess.Popen(
+                [sys.executable, "-S", "-E", __file__, SSHD, str(self._configuration)],
+                stdin=subprocess.PIPE,  # its end is the keeper's, and so the server's
+                stdout=subprocess.PIPE,
                 stderr=log,
                 start_new_session=True,
             )
+        assert self._keeper.stdout is not None
+        self.pid = int(self._keeper.stdout.readline())
         until_s = time.monotonic() + START_TIMEOUT_S
         while not self._listens():
-            if self.process.poll() is not None or time.monotonic() > until_s:
+            if self._keeper.poll() is not None or time.monotonic() > until_s:
+                self._end()
                 raise RuntimeError(f"sshd did not start: {self.log.read_text(encoding='utf-8')}")
             time.sleep(0.02)
         return self
 
     def __exit__(self, *exc: object) -> None:
-        assert self.process is not None
-        os.kill(self.process.pid, signal.SIGSTOP)
-        self.cut()
-        self.process.kill()
-        self.process.wait()
+        self._end()
+
+    def _end(self) -> None:
+        assert self._keeper is not None
+        self._keeper.communicate(timeout=END_TIMEOUT_S)
 
     def sessions(self) -> list[int]:
         """Pids of the server's children, and theirs: one tree a connection."""
-        assert self.process is not None
-        return descendants(self.process.pid)
+        return descendants(self.pid)
 
     def cut(self) -> None:
         """Kill what serves the open connections; the server itself goes on."""
@@ -130,15 +142,13 @@ class Sshd:
 
     def freeze(self) -> None:
         """Stop the server and its sessions, as a hung machine would be."""
-        assert self.process is not None
-        os.kill(self.process.pid, signal.SIGSTOP)
+        os.kill(self.pid, signal.SIGSTOP)
         self._signal(signal.SIGSTOP)
 
     def thaw(self) -> None:
         """Let them go on."""
-        assert self.process is not None
         self._signal(signal.SIGCONT)
-        os.kill(self.process.pid, signal.SIGCONT)
+        os.kill(self.pid, signal.SIGCONT)
 
     def _signal(self, number: int) -> set[int]:
         """Send a signal to all sessions, also to a process that one of them is just starting."""
@@ -209,3 +219,38 @@ def silent_server(address: str = "127.0.0.1") -> Iterator[int]:
         sock.bind((address, 0))
         sock.listen(8)
         yield int(sock.getsockname()[1])
+
+
+def keep(server: str, configuration: str) -> None:
+    """Run a server until standard input or the server ends; then kill all that is left of it."""
+    ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    pid = os.posix_spawn(
+        server,
+        [server, "-D", "-e", "-f", configuration],
+        os.environ,
+        file_actions=[(os.POSIX_SPAWN_OPEN, n, os.devnull, os.O_RDWR, 0) for n in (0, 1)],
+    )
+
+    def reap(*_: object) -> None:
+        with contextlib.suppress(ChildProcessError):
+            while (ended := os.waitpid(-1, os.WNOHANG)[0]) != 0:
+                if ended == pid:
+                    raise SystemExit
+
+    signal.signal(signal.SIGCHLD, reap)
+    try:
+        reap()  # it may have ended before
+        os.write(1, b"%d\n" % pid)
+        os.read(0, 1)
+    finally:
+        signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel reaps
+        until_s = time.monotonic() + END_TIMEOUT_S
+        while (left := descendants(os.getpid())) and time.monotonic() < until_s:
+            for each in left:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(each, signal.SIGKILL)
+            time.sleep(0.01)
+
+
+if __name__ == "__main__":
+    keep(*sys.argv[1:])
