@@ -236,6 +236,16 @@ def test_passes_survive_a_host_that_fell_behind_and_forgot():
     assert contacts[1].set_s == pytest.approx(SET_S, abs=1e-3)
 
 
+def test_a_pass_is_counted_when_it_begins_and_not_when_it_is_foreseen():
+    segment, counts = ground(), []
+    for t_s in (RISE_S - 0.5, RISE_S + 0.5, SET_S - 0.5, SET_S + 0.5):
+        fly(segment, t_s, from_s=t_s)
+        summary = segment.summary()
+        counts.append((summary["passes"], summary["passes_open"]))
+
+    assert counts == [(0, 0), (1, 1), (1, 1), (1, 0)]
+
+
 def test_looks_are_few():
     asked = []
     truth = equatorial(1)

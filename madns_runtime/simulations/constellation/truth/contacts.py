@@ -85,12 +85,9 @@ class PassWatch:
         """Known, not told yet: those of the last SCAN_STEP_S."""
         self._next_look_s = -math.inf
         self.passes = 0
-        """Found so far, open ones included."""
-
-    @property
-    def open(self) -> int:
-        """How many passes go on."""
-        return len(self._open)
+        """That have begun, as far as it was told."""
+        self.passes_open = 0
+        """Of these, those that go on."""
 
     def look_ahead(self, t_s: float) -> list[Stretch]:
         """Look until LOOK_AHEAD_S after *t_s*, as far as truth is known, and return what is new, in order."""
@@ -109,6 +106,9 @@ class PassWatch:
         self._contacts.sort(key=lambda contact: contact.t_s)
         count = sum(contact.t_s <= t_s for contact in self._contacts)
         result, self._contacts = self._contacts[:count], self._contacts[count:]
+        begun = sum(contact.event == "rise" for contact in result)
+        self.passes += begun
+        self.passes_open += 2 * begun - count
         return result
 
     def next_s(self) -> float:
@@ -137,7 +137,6 @@ class PassWatch:
             pair = window.station, window.vehicle
             if pair not in self._open:
                 self._open.add(pair)
-                self.passes += 1
                 self._contacts.append(self._contact("rise", window))
             if window.set_s is not None:
                 self._open.remove(pair)

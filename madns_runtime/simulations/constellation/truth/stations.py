@@ -178,7 +178,7 @@ class GroundSegment:
         counts = self._account.to_summary(self._in_flight)
         counts["uplinks_waiting"] = self._uplinks_waiting
         counts["passes"] = self._watch.passes
-        counts["passes_open"] = self._watch.open
+        counts["passes_open"] = self._watch.passes_open
         return counts
 
     # Vehicles to stations.
