@@ -289,7 +289,7 @@ def test_initial_data_name_satellite_frame_and_epoch():
     assert initial["frame"] == "TEME"
     assert initial["epoch_utc"] == "2017-03-07T13:32:57Z"
     assert initial["segment"]["states"].dtype == np.float64
-    assert len(initial["segment"]["states"]) == 21 * 6
+    assert initial["segment"]["states"].shape == (21, 6)
 
 
 def test_a_run_shorter_than_one_window_needs_no_refill():

@@ -15,10 +15,6 @@ from madns_runtime.errors import PluginError
 from madns_runtime.plugin.api import AgentContext, AgentSimulation, Tick
 from madns_runtime.recording.records import Field
 from madns_runtime.simulations.constellation.messages import (
-    DELIVERY,
-    REFUSAL,
-    RESULT,
-    SEGMENT,
     CommandResult,
     Delivery,
     Initial,
@@ -146,15 +142,15 @@ class ConstellationAgent(AgentSimulation):
             PluginError: The host sent something else.
         """
         kind = message.get("kind") if isinstance(message, Mapping) else None
-        if kind == SEGMENT:
+        if kind == Segment.KIND:
             self._take_segment(message)
-        elif kind == DELIVERY and self._cockpit is not None:
+        elif kind == Delivery.KIND and self._cockpit is not None:
             self._cockpit.deliver(Delivery.from_message(message))
-        elif kind == RESULT and self._cockpit is not None:
+        elif kind == CommandResult.KIND and self._cockpit is not None:
             self._cockpit.tell(CommandResult.from_message(message))
-        elif kind == REFUSAL and self._cockpit is not None:
+        elif kind == Refusal.KIND and self._cockpit is not None:
             self._cockpit.refuse(Refusal.from_message(message))
-        elif kind in (DELIVERY, RESULT):
+        elif kind in (Delivery.KIND, CommandResult.KIND, Refusal.KIND):
             self._unheard += 1  # a broadcast also reaches those who fly nothing
         else:
             raise PluginError(f"constellation: expected a segment, got {message!r:.200}")

@@ -1,8 +1,7 @@
 """
 What the two halves of the constellation say to each other, as dataclasses that become mappings.
 
-Pure. Segments carry their knots as one flat float64 array: six numbers a knot, m and m/s, and for a rigid
-body a second one of seven: quaternion (scalar last, inertial to body) and body rates, rad/s.
+Pure. A mapping has the fields and "kind", the kind of message; a command's own kind is under "command".
 
     agent -> host    Command (SYNC, deadline: its time), Transmission
     host -> agent    Initial, Segment, CommandResult, Delivery, Refusal
@@ -10,24 +9,18 @@ body a second one of seven: quaternion (scalar last, inertial to body) and body 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, Literal, get_args
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Literal, NamedTuple, Self, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from madns_runtime.config import from_mapping
 from madns_runtime.errors import PluginError
 from madns_runtime.simulations.constellation.parameters import KNOTS_MAX
-from madns_runtime.simulations.constellation.thrust import Thrust
+from madns_runtime.simulations.constellation.thrust import Thrust, Vector
 
-SEGMENT = "segment"
-COMMAND = "command"
-RESULT = "command_result"
-TRANSMISSION = "transmission"
-DELIVERY = "delivery"
-REFUSAL = "refusal"
 EVERYBODY = "*"
 """Receiver of a broadcast."""
 GROUND = "ground"
@@ -38,9 +31,44 @@ CommandFrame = Literal["inertial", "rtn", "body"]
 CommandStatus = Literal["accepted", "executed", "postponed", "refused"]
 
 
+class Message:
+    """What travels between the halves: a dataclass that becomes a mapping and is read back by its fields' types."""
+
+    __slots__ = ()
+    KIND: ClassVar[str]
+
+    def to_message(self) -> dict[str, Any]:
+        """Return the mapping that travels."""
+        message: dict[str, Any] = {"kind": self.KIND}
+        for field in _fields(type(self)):
+            message[field.key] = field.write(getattr(self, field.name))
+        return message
+
+    @classmethod
+    def from_message(cls, message: Mapping[str, Any]) -> Self:
+        """
+        Read a message back.
+
+        Raises:
+            PluginError: It is not as `to_message` writes it; says which field is not.
+        """
+        values = {}
+        for field in _fields(cls):
+            try:
+                values[field.name] = field.read(message[field.key])
+            except (KeyError, TypeError, ValueError) as error:
+                raise PluginError(
+                    f"constellation: {cls.KIND}: expected {field.name}: {field.type}, "
+                    f"got {message.get(field.key)!r:.200}"
+                ) from error
+        return cls(**values)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Segment:
+class Segment(Message):
     """A stretch of one vehicle's future truth."""
+
+    KIND = "segment"
 
     revision: int
     """Grows with every maneuver; a newer one replaces the future from its first knot on."""
@@ -58,68 +86,30 @@ class Segment:
     """Ballistic coefficient that drag acts on all through the segment, m^2/kg, for an accelerometer; None for
     no drag, or nobody who feels it."""
 
+    def __post_init__(self) -> None:
+        """Refuse what nobody could fly along."""
+        rows = len(self.states)
+        finite = math.isfinite(self.t0_s + self.knot_s) and bool(np.isfinite(self.states).all())
+        if self.attitude is not None:
+            finite &= self.attitude.shape == (rows, 7) and bool(np.isfinite(self.attitude).all())
+        fits = self.states.shape == (rows, 6) and 2 <= rows <= KNOTS_MAX and self.knot_s > 0.0
+        if not (finite and fits):
+            raise PluginError(
+                f"constellation: expected a segment of 2 to {KNOTS_MAX} finite knots, got "
+                f"{rows} every {self.knot_s} s"
+            )
+
     @property
     def end_s(self) -> float:
         """Simulated time of the last knot."""
         return self.t0_s + (len(self.states) - 1) * self.knot_s
 
-    def to_message(self) -> dict[str, Any]:
-        """Return the mapping that travels."""
-        message: dict[str, Any] = {
-            "kind": SEGMENT,
-            "revision": self.revision,
-            "t0_s": self.t0_s,
-            "knot_s": self.knot_s,
-            "states": np.ascontiguousarray(self.states, dtype=np.float64).ravel(),
-        }
-        if self.attitude is not None:
-            message["attitude"] = np.ascontiguousarray(self.attitude, dtype=np.float64).ravel()
-        if self.thrust is not None:
-            message["thrust"] = asdict(self.thrust)
-        if self.ballistic_m2_kg is not None:
-            message["ballistic_m2_kg"] = self.ballistic_m2_kg
-        return message
-
-    @classmethod
-    def from_message(cls, message: Mapping[str, Any]) -> Segment:
-        """
-        Read a segment back.
-
-        Raises:
-            PluginError: It is not a segment as `to_message` writes it.
-        """
-        try:
-            flat = np.asarray(message["states"], dtype=np.float64).ravel()
-            attitude, thrust = message.get("attitude"), message.get("thrust")
-            ballistic = message.get("ballistic_m2_kg")
-            if attitude is not None:
-                attitude = np.asarray(attitude, dtype=np.float64).reshape(-1, 7)
-            segment = cls(
-                revision=int(message["revision"]),
-                t0_s=float(message["t0_s"]),
-                knot_s=float(message["knot_s"]),
-                states=flat.reshape(-1, 6),
-                attitude=attitude,
-                thrust=None if thrust is None else from_mapping(Thrust, thrust),
-                ballistic_m2_kg=None if ballistic is None else float(ballistic),
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise PluginError(f"constellation: expected a segment, got {message!r:.200}") from error
-        finite = np.isfinite(flat).all() and np.isfinite((segment.t0_s, segment.knot_s)).all()
-        if segment.attitude is not None:
-            finite &= len(segment.attitude) == len(segment.states)
-            finite &= bool(np.isfinite(segment.attitude).all())
-        if not finite or segment.knot_s <= 0.0 or not 2 <= len(segment.states) <= KNOTS_MAX:
-            raise PluginError(
-                f"constellation: expected a segment of 2 to {KNOTS_MAX} finite knots, got "
-                f"{len(segment.states)} every {segment.knot_s} s"
-            )
-        return segment
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Initial:
+class Initial(Message):
     """What an agent sets itself up from, at the start or when it rejoins."""
+
+    KIND = "initial_data"
 
     satellite: str
     frame: str
@@ -130,42 +120,12 @@ class Initial:
     more: tuple[Segment, ...] = ()
     """What follows it, where maneuvers have cut truth into pieces."""
 
-    def to_message(self) -> dict[str, Any]:
-        """Return the mapping that travels."""
-        return {
-            "satellite": self.satellite,
-            "frame": self.frame,
-            "epoch_utc": self.epoch_utc,
-            "segment": None if self.segment is None else self.segment.to_message(),
-            "more": [segment.to_message() for segment in self.more],
-        }
-
-    @classmethod
-    def from_message(cls, message: Mapping[str, Any]) -> Initial:
-        """
-        Read initial data back.
-
-        Raises:
-            PluginError: They are not as `to_message` writes them.
-        """
-        try:
-            segment = message["segment"]
-            return cls(
-                satellite=str(message["satellite"]),
-                frame=str(message["frame"]),
-                epoch_utc=str(message["epoch_utc"]),
-                segment=None if segment is None else Segment.from_message(segment),
-                more=tuple(Segment.from_message(part) for part in message.get("more", ())),
-            )
-        except (KeyError, TypeError) as error:
-            raise PluginError(
-                f"constellation: expected initial data, got {message!r:.200}"
-            ) from error
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Command:
+class Command(Message):
     """What flight software wants done to its own vehicle."""
+
+    KIND = "command"
 
     number: int
     """The agent's own, from 0 on."""
@@ -177,58 +137,18 @@ class Command:
     """T_m: simulated time of execution; the middle of a finite burn."""
     frame: CommandFrame
     """rtn: radial, along-track, normal at the time of execution."""
-    vector: tuple[float, float, float]
+    vector: Vector
     duration_s: float = 0.0
     """Of a torque, s."""
     phase_s: float = 0.0
     """By how much this agent's ticks lie behind their nominal time, s: its T_m comes that much later, too."""
 
-    def to_message(self) -> dict[str, Any]:
-        """Return the mapping that travels."""
-        return {
-            "kind": COMMAND,
-            "number": self.number,
-            "command": self.kind,
-            "commanded_s": self.commanded_s,
-            "at_s": self.at_s,
-            "frame": self.frame,
-            "vector": list(self.vector),
-            "duration_s": self.duration_s,
-            "phase_s": self.phase_s,
-        }
-
-    @classmethod
-    def from_message(cls, message: Mapping[str, Any]) -> Command:
-        """
-        Read a command back; its numbers need not be finite: what is not is refused, and said so.
-
-        Raises:
-            PluginError: It is not a command as `to_message` writes it.
-        """
-        try:
-            x, y, z = (float(value) for value in message["vector"])
-            command = cls(
-                number=int(message["number"]),
-                kind=message["command"],
-                commanded_s=float(message["commanded_s"]),
-                at_s=float(message["at_s"]),
-                frame=message["frame"],
-                vector=(x, y, z),
-                duration_s=float(message["duration_s"]),
-                phase_s=float(message.get("phase_s", 0.0)),
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise PluginError(f"constellation: expected a command, got {message!r:.200}") from error
-        if command.kind not in get_args(CommandKind):
-            raise PluginError(f"constellation: expected a command, got {message!r:.200}")
-        if command.frame not in get_args(CommandFrame):
-            raise PluginError(f"constellation: no frame {command.frame!r}")
-        return command
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CommandResult:
+class CommandResult(Message):
     """What became of a command."""
+
+    KIND = "command_result"
 
     number: int
     status: CommandStatus
@@ -244,37 +164,12 @@ class CommandResult:
     propellant_kg: float = 0.0
     """Left afterwards."""
 
-    def to_message(self) -> dict[str, Any]:
-        """Return the mapping that travels."""
-        return {"kind": RESULT, **asdict(self)}
-
-    @classmethod
-    def from_message(cls, message: Mapping[str, Any]) -> CommandResult:
-        """
-        Read a result back.
-
-        Raises:
-            PluginError: It is not a result as `to_message` writes it.
-        """
-        try:
-            return cls(
-                number=int(message["number"]),
-                status=message["status"],
-                at_s=float(message["at_s"]),
-                revision=int(message["revision"]),
-                reason=str(message["reason"]),
-                delta_v_m_s=float(message["delta_v_m_s"]),
-                propellant_kg=float(message["propellant_kg"]),
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise PluginError(
-                f"constellation: expected a command's result, got {message!r:.200}"
-            ) from error
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Transmission:
+class Transmission(Message):
     """A message that a vehicle hands to its radio."""
+
+    KIND = "transmission"
 
     to: str
     """An agent's or satellite's name, * for all in view, ground or ground:NAME."""
@@ -285,40 +180,12 @@ class Transmission:
     payload: Any
     """As any message between the halves."""
 
-    def to_message(self) -> dict[str, Any]:
-        """Return the mapping that travels."""
-        return {
-            "kind": TRANSMISSION,
-            "to": self.to,
-            "sent_s": self.sent_s,
-            "number": self.number,
-            "payload": self.payload,
-        }
-
-    @classmethod
-    def from_message(cls, message: Mapping[str, Any]) -> Transmission:
-        """
-        Read a transmission back.
-
-        Raises:
-            PluginError: It is not one as `to_message` writes it.
-        """
-        try:
-            return cls(
-                to=str(message["to"]),
-                sent_s=float(message["sent_s"]),
-                number=int(message["number"]),
-                payload=message["payload"],
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise PluginError(
-                f"constellation: expected a transmission, got {message!r:.200}"
-            ) from error
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Delivery:
+class Delivery(Message):
     """A message that a vehicle's radio hears."""
+
+    KIND = "delivery"
 
     sender: str
     """An agent's name, or ground:NAME."""
@@ -327,40 +194,12 @@ class Delivery:
     """Simulated time at which it is heard: flight software gets it in the first tick at or after it."""
     payload: Any
 
-    def to_message(self) -> dict[str, Any]:
-        """Return the mapping that travels."""
-        return {
-            "kind": DELIVERY,
-            "sender": self.sender,
-            "sent_s": self.sent_s,
-            "arrives_s": self.arrives_s,
-            "payload": self.payload,
-        }
-
-    @classmethod
-    def from_message(cls, message: Mapping[str, Any]) -> Delivery:
-        """
-        Read a delivery back.
-
-        Raises:
-            PluginError: It is not one as `to_message` writes it.
-        """
-        try:
-            return cls(
-                sender=str(message["sender"]),
-                sent_s=float(message["sent_s"]),
-                arrives_s=float(message["arrives_s"]),
-                payload=message["payload"],
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise PluginError(
-                f"constellation: expected a delivery, got {message!r:.200}"
-            ) from error
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Refusal:
+class Refusal(Message):
     """A message that a vehicle handed to its radio and that never left it, or met nobody."""
+
+    KIND = "refusal"
 
     number: int
     """The message's."""
@@ -370,37 +209,102 @@ class Refusal:
     reason: str
     """no_radio or too_long, found on board; or what the host found, see `truth.medium.REFUSED`."""
 
-    def to_message(self) -> dict[str, Any]:
-        """Return the mapping that travels."""
-        return {"kind": REFUSAL, **asdict(self)}
-
-    @classmethod
-    def from_message(cls, message: Mapping[str, Any]) -> Refusal:
-        """
-        Read a refusal back.
-
-        Raises:
-            PluginError: It is not one as `to_message` writes it.
-        """
-        try:
-            return cls(
-                number=int(message["number"]),
-                to=str(message["to"]),
-                sent_s=float(message["sent_s"]),
-                reason=str(message["reason"]),
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise PluginError(f"constellation: expected a refusal, got {message!r:.200}") from error
-
 
 def is_for_ground(to: str) -> bool:
     """Return whether a message's receiver is any station, or one of them."""
     return to == GROUND or to.startswith(f"{GROUND}:")
 
 
-def _vector(values: Any) -> tuple[float, float, float]:
-    """Return three finite numbers, or raise ValueError."""
-    x, y, z = (float(value) for value in values)
-    if not np.isfinite((x, y, z)).all():
-        raise ValueError("expected finite numbers")
+class _Field(NamedTuple):
+    name: str
+    key: str
+    """In the mapping."""
+    type: str
+    read: Callable[[Any], Any]
+    write: Callable[[Any], Any]
+
+
+_FIELDS: dict[type[Message], tuple[_Field, ...]] = {}
+"""Of the classes that were asked for."""
+
+
+def _fields(cls: type[Message]) -> tuple[_Field, ...]:
+    """Return how each field of a message travels."""
+    if cls not in _FIELDS:
+        found = []
+        for field in fields(cast("Any", cls)):
+            key = cls.KIND if field.name == "kind" else field.name
+            found.append(_Field(field.name, key, str(field.type), *_WAYS[str(field.type)]))
+        _FIELDS[cls] = tuple(found)
+    return _FIELDS[cls]
+
+
+def _as_it_is(value: Any) -> Any:
+    return value
+
+
+def _exactly(kind: type) -> Callable[[Any], Any]:
+    def read(value: Any) -> Any:
+        if type(value) is not kind:
+            raise TypeError(kind)
+        return value
+
+    return read
+
+
+def _number(value: Any) -> float:
+    if type(value) not in (float, int):
+        raise TypeError(value)
+    return float(value)
+
+
+def _vector(values: Any) -> Vector:
+    x, y, z = map(_number, values)
     return x, y, z
+
+
+def _one_of(literal: Any) -> Callable[[Any], Any]:
+    words = get_args(literal)
+
+    def read(value: Any) -> Any:
+        if value not in words:
+            raise ValueError(value)
+        return value
+
+    return read
+
+
+def _or_none(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    return lambda value: None if value is None else function(value)
+
+
+def _thrust(values: Any) -> Thrust:
+    start_s, x, y, z, burnt_1_s = map(_number, values)
+    return Thrust(start_s=start_s, acceleration_m_s2=(x, y, z), burnt_1_s=burnt_1_s)
+
+
+def _thrust_numbers(thrust: Thrust) -> list[float]:
+    return [thrust.start_s, *thrust.acceleration_m_s2, thrust.burnt_1_s]
+
+
+_array = _exactly(np.ndarray)
+_WAYS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
+    "Any": (_as_it_is, _as_it_is),
+    "int": (_exactly(int), _as_it_is),
+    "float": (_number, _as_it_is),
+    "float | None": (_or_none(_number), _as_it_is),
+    "str": (_exactly(str), _as_it_is),
+    "Vector": (_vector, list),
+    "CommandKind": (_one_of(CommandKind), _as_it_is),
+    "CommandFrame": (_one_of(CommandFrame), _as_it_is),
+    "CommandStatus": (_one_of(CommandStatus), _as_it_is),
+    "NDArray[np.float64]": (_array, _as_it_is),
+    "NDArray[np.float64] | None": (_or_none(_array), _as_it_is),
+    "Thrust | None": (_or_none(_thrust), _or_none(_thrust_numbers)),
+    "Segment | None": (_or_none(Segment.from_message), _or_none(Segment.to_message)),
+    "tuple[Segment, ...]": (
+        lambda parts: tuple(map(Segment.from_message, parts)),
+        lambda parts: [part.to_message() for part in parts],
+    ),
+}
+"""By a field's type as it is written: how it is read, which raises TypeError or ValueError, and how written."""
