@@ -70,7 +70,7 @@ def test_one_ticks_lead_is_feasible_and_less_than_the_margins_is_not():
     assert desk().decide(0, command(10.1), 10.049).status == "accepted"
     late = desk().decide(0, command(10.1), 10.06)
     assert (late.status, late.at_s) == ("postponed", 10.2)
-    assert late.reason == "0.010 s too late"
+    assert late.reason == "0.01 s too late"
 
 
 def test_an_agent_that_lives_behind_has_its_time_later_too():
@@ -84,7 +84,7 @@ def test_late_commands_are_refused_where_the_scenario_says_so():
 
     taken = strict.decide(0, command(9.0), 10.0)
 
-    assert (taken.status, taken.effect, taken.reason) == ("refused", None, "1.050 s too late")
+    assert (taken.status, taken.effect, taken.reason) == ("refused", None, "1.05 s too late")
     assert strict.account.refused == 1
 
 

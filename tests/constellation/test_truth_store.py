@@ -40,7 +40,7 @@ def impulse(at_s, vector=(0.0, 10.0, 0.0), *, number=0, frame="rtn"):
     )
 
 
-def burn(start_s, end_s, vector=(0.0, 10.0, 0.0), *, number=0, frame="inertial"):
+def burn(start_s, end_s, vector=(0.0, 10.0, 0.0), *, number=0, frame="inertial", burnt=0.0):
     return Effect(
         number=number,
         kind="thrust",
@@ -49,6 +49,7 @@ def burn(start_s, end_s, vector=(0.0, 10.0, 0.0), *, number=0, frame="inertial")
         end_s=end_s,
         vector=vector,
         frame=frame,
+        burnt=burnt,
     )
 
 
@@ -79,11 +80,11 @@ class Truth:
                 end_knot=self.store.end * 10,
                 knot_s=1.0,
                 effects=self.timeline.from_time(start_s),
-                directions=self.timeline.directions,
+                thrusts=self.timeline.thrusts,
             ),
             PROPAGATION,
         )
-        self.timeline.directions |= truth.directions
+        self.timeline.thrusts |= truth.thrusts
         self.store.replace(vehicle, truth)
         return truth
 
@@ -186,22 +187,23 @@ def test_a_burn_is_an_arc_with_its_thrust_and_no_interval_spans_its_ends(start_s
     for t_s in np.arange(start_s - 1.0, end_s + 2.0, 0.04).tolist():
         error = np.array(truth.store.state(1, t_s)) - flown([effect], t_s)
         assert np.abs(error[:3]).max() < HERMITE_M
-    arcs = [s for s in truth.store.segments(1, 0, 2) if s.thrust_m_s2 is not None]
+    arcs = [s for s in truth.store.segments(1, 0, 2) if s.thrust is not None]
     assert [(s.t0_s, s.end_s) for s in arcs] == [(start_s, pytest.approx(end_s))]
-    assert np.array(arcs[0].thrust_m_s2) * (end_s - start_s) == pytest.approx(effect.vector)
+    felt = np.array(arcs[0].thrust.at(start_s + 0.1))
+    assert felt * (end_s - start_s) == pytest.approx(effect.vector)
 
 
 def test_a_burn_goes_on_in_the_same_direction_when_an_impulse_comes_in_its_middle():
     truth = Truth()
     arc = burn(12.3, 16.3, frame="rtn")
     first = truth.command(arc)
-    direction = truth.timeline.directions[0]
+    thrust = truth.timeline.thrusts[0]
 
     second = truth.command(impulse(14.1, (50.0, 0.0, 0.0), number=1))
 
-    assert first.directions == {0: direction}
-    assert second.directions == {0: direction}
-    assert second.pieces[0].thrust_m_s2 == direction
+    assert first.thrusts == {0: thrust}
+    assert second.thrusts == {0: thrust}
+    assert second.pieces[0].thrust == thrust
 
 
 def test_a_burn_beyond_what_is_known_goes_on_in_the_next_stretch():
@@ -220,7 +222,7 @@ def test_a_burn_beyond_what_is_known_goes_on_in_the_next_stretch():
             end_knot=40,
             knot_s=1.0,
             effects=truth.timeline.between(start_s, 40.0),
-            directions=truth.timeline.directions,
+            thrusts=truth.timeline.thrusts,
         ),
         PROPAGATION,
     )

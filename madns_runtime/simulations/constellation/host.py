@@ -22,8 +22,6 @@ from madns_runtime.simulations.constellation.hosting.refills import Refills
 from madns_runtime.simulations.constellation.hosting.supply import TruthSupply
 from madns_runtime.simulations.constellation.hosting.traffic import Traffic
 from madns_runtime.simulations.constellation.messages import (
-    COMMAND,
-    TRANSMISSION,
     Command,
     Initial,
     Transmission,
@@ -119,9 +117,9 @@ class ConstellationHost(HostSimulation):
             PluginError: It is neither, or the scenario has no flight software.
         """
         kind = message.get("kind") if isinstance(message, Mapping) else None
-        if kind == COMMAND and self._maneuvering is not None:
+        if kind == Command.KIND and self._maneuvering is not None:
             self._maneuvering.receive(self._index[agent], Command.from_message(message))
-        elif kind == TRANSMISSION and self._traffic is not None:
+        elif kind == Transmission.KIND and self._traffic is not None:
             self._traffic.receive(self._index[agent], Transmission.from_message(message))
         else:
             raise PluginError(
@@ -179,7 +177,7 @@ class ConstellationHost(HostSimulation):
             "epoch_utc": self._epoch_text(),
             "satellites": dict(zip(self._index, self._fleet.names, strict=True)),
             "segments_sent": self._refills.segments_sent,
-            "propagations": self._supply.jobs,
+            "propagations": self._supply.propagations,
             "truth_late": self._late.count,
             "truth_late_s_max": self._late.s_max,
             "energy_drift_max": conservation.energy_drift,

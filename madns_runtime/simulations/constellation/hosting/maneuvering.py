@@ -78,7 +78,8 @@ class Maneuvering:
         now_s = self._context.now_s()
         taken = self._desk.decide(vehicle, command, now_s)
         if taken.effect is None:
-            self._record(taken, None)
+            # Of those that are refused only the late ones have to do with the inequality.
+            self._record(taken, self._desk.measure(taken, None) if taken.is_late else None)
             self._tell(vehicle, taken.result(self._supply.store.revisions[vehicle]))
             return
         if self._context.is_lockstep:
@@ -125,6 +126,7 @@ class Maneuvering:
             "executed": account.executed,
             "postponed": account.postponed,
             "refused": account.refused,
+            "waiting": self._desk.waiting,
             "inequality_broken": account.inequality_broken,
             "propagated_anew": self._supply.propagated_anew,
             "delta_v_m_s": account.delta_v_m_s,

@@ -7,6 +7,7 @@ Few segments are sent a call, so that no call takes long and no instant sees a b
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from madns_runtime.plugin.api import HostContext
 from madns_runtime.protocol.messages import Service
@@ -61,7 +62,7 @@ class Refills:
         last = max(now + 1, self._turns_passed(vehicle) - 1)
         self._sent_until[vehicle] = min(last + 1, self._store.end)
         self._revisions_given[vehicle] = self._store.revisions[vehicle]
-        return self._store.segments(vehicle, now, last)
+        return self._supply.with_drag(vehicle, self._store.segments(vehicle, now, last))
 
     def timer(self, t_s: float) -> float | None:
         """Send what is due, have computed what will be, and return when to come back."""
@@ -100,6 +101,7 @@ class Refills:
         if not self._active[vehicle]:
             return
         segments = self._store.segments_from(vehicle, change_s, self._sent_until[vehicle])
+        segments = self._supply.with_drag(vehicle, segments)
         left = URGENT_KNOTS_MAX
         agent = self._context.agents[vehicle]
         for whole in segments:
@@ -148,7 +150,7 @@ class Refills:
             return
         self._sent_until[vehicle] = min(window + 1, self._store.end)
         agent = self._context.agents[vehicle]
-        for segment in segments:
+        for segment in self._supply.with_drag(vehicle, segments):
             self._context.send(agent, segment.to_message(), Service.RELIABLE)
         self.segments_sent += len(segments)
 
@@ -160,19 +162,14 @@ def _cut(segment: Segment, knots: int) -> tuple[Segment | None, Segment | None]:
         return segment, None
     if knots < 2:
         return None, segment
-    parts = []
-    for rows, t0_s in (
-        (slice(0, knots), segment.t0_s),
-        (slice(knots - 1, count), segment.t0_s + (knots - 1) * segment.knot_s),
-    ):
-        parts.append(
-            Segment(
-                revision=segment.revision,
-                t0_s=t0_s,
-                knot_s=segment.knot_s,
-                states=segment.states[rows],
-                attitude=None if segment.attitude is None else segment.attitude[rows],
-                thrust_m_s2=segment.thrust_m_s2,
-            )
+    edges = (slice(0, knots), slice(knots - 1, count))
+    urgent, later = (
+        replace(
+            segment,
+            t0_s=segment.t0_s + rows.start * segment.knot_s,
+            states=segment.states[rows],
+            attitude=None if segment.attitude is None else segment.attitude[rows],
         )
-    return parts[0], parts[1]
+        for rows in edges
+    )
+    return urgent, later

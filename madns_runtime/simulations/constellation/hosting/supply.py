@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from madns_runtime.errors import PluginError
 from madns_runtime.plugin.api import HostContext
 from madns_runtime.simulations.constellation.equipment import Vehicle
+from madns_runtime.simulations.constellation.messages import Segment
 from madns_runtime.simulations.constellation.truth.batches import merge, propagate_part, split
 from madns_runtime.simulations.constellation.truth.effects import Timeline
 from madns_runtime.simulations.constellation.truth.jobs import (
@@ -88,8 +89,8 @@ class TruthSupply:
         self.store = store
         self.timelines = [Timeline(vehicle.ballistic_m2_kg) for vehicle in vehicles]
         """What was and will be done to each vehicle."""
-        self.jobs = 0
-        """Jobs submitted."""
+        self.propagations = 0
+        """Stretches asked for, each of all vehicles, however many workers share it."""
         self.propagated_anew = 0
         """Vehicles propagated anew because they were commanded."""
         self._context = context
@@ -132,6 +133,7 @@ class TruthSupply:
             states: At the last knot known, or the epoch's: shape (N, 6).
             attitude: Of the rigid bodies, shape (M, 7).
         """
+        self.propagations += 1
         per_window = self.store.knots_per_window
         first_knot = self.store.end * per_window
         batch = self._batch = _Batch(first_knot=first_knot, knots=windows * per_window + 1)
@@ -232,7 +234,7 @@ class TruthSupply:
             end_knot=store.end * store.knots_per_window,
             knot_s=store.knot_s,
             effects=timeline.from_time(start_s),
-            directions=timeline.directions,
+            thrusts=timeline.thrusts,
             ballistic_m2_kg=timeline.ballistic_at(start_s),
             body=self._body(vehicle, start_s),
         )
@@ -240,9 +242,16 @@ class TruthSupply:
     def _replace(self, vehicle: int, truth: VehicleTruth) -> None:
         if self._batch is not None:
             self._batch.changed.add(vehicle)
-        self.timelines[vehicle].directions |= truth.directions
+        self.timelines[vehicle].thrusts |= truth.thrusts
         self.store.replace(vehicle, truth)
         self.propagated_anew += 1
+
+    def with_drag(self, vehicle: int, segments: list[Segment]) -> list[Segment]:
+        """Return segments as a vehicle with an accelerometer needs them: they say what drag acts on."""
+        if not self.has_drag or self._vehicles[vehicle].sensors.accelerometer is None:
+            return segments
+        timeline = self.timelines[vehicle]
+        return [replace(one, ballistic_m2_kg=timeline.ballistic_at(one.t0_s)) for one in segments]
 
     def drop_before(self, window: int) -> None:
         """Forget truth, and what was done to vehicles, before a window."""
@@ -263,7 +272,7 @@ class TruthSupply:
         turned = [batch.attitude[place] for place in sorted(batch.attitude)]
         self.store.add(stretch, np.concatenate(turned) if turned else None)
         for vehicle, truth in sorted(batch.commanded.items()):
-            self.timelines[vehicle].directions |= truth.directions
+            self.timelines[vehicle].thrusts |= truth.thrusts
             self.store.put(vehicle, truth)
         self._batch = None
 
@@ -291,7 +300,6 @@ class TruthSupply:
     def _start(self, batch: _Batch, what: tuple[str, int], function: Any, *arguments: Any) -> int:
         job = self._context.submit(function, *arguments)
         batch.waiting[job] = what
-        self.jobs += 1
         return job
 
     def _request(
@@ -310,7 +318,7 @@ class TruthSupply:
             end_knot=end_knot,
             knot_s=store.knot_s,
             effects=timeline.between(start_s, end_knot * store.knot_s),
-            directions=timeline.directions,
+            thrusts=timeline.thrusts,
             ballistic_m2_kg=timeline.ballistic_at(start_s),
             body=self._body(vehicle, start_s),
         )

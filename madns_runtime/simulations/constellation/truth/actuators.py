@@ -14,11 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from madns_runtime.simulations.constellation.equipment import ReactionWheels, Thruster, Vehicle
-from madns_runtime.simulations.constellation.truth.effects import Vector, scaled
+from madns_runtime.simulations.constellation.thrust import Vector
+from madns_runtime.simulations.constellation.truth.effects import scaled
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 """By definition; specific impulse in seconds is exhaust velocity over it."""
-TORQUE_MIN_N_M = 1e-15
+DELTA_V_M_S_MIN = 1e-12
+"""Less does not show in the last digit of an orbit's velocity."""
+TORQUE_N_M_MIN = 1e-15
 """Less than wheels can give is nothing."""
 
 
@@ -37,6 +40,8 @@ class Burn:
     """Change of velocity in the command's frame, m/s, errors included."""
     propellant_kg: float
     """Used for it."""
+    burnt: float
+    """The same as a share of the vehicle's mass before it."""
     duration_s: float
     """0 for an impulse."""
 
@@ -81,14 +86,12 @@ def fire(
         delta_v_m_s: As commanded, in any frame, m/s.
         random: Three numbers are drawn.
 
-    The thrust of a finite burn has one acceleration all through it, dv / duration: mass that falls
-    during the burn makes it uneven, which is left out; its duration and propellant are exact.
     Source: Tsiolkovsky's equation, dm = m (1 - exp(-dv / (g0 Isp))).
     """
     magnitude, along, across = random.standard_normal(3).tolist()
     commanded = math.hypot(*delta_v_m_s)
-    if commanded == 0.0:
-        return Refusal(reason="a change of velocity of 0 m/s")
+    if commanded < DELTA_V_M_S_MIN:
+        return Refusal(reason=f"a change of velocity of {commanded:.4g} m/s")
     impulse_n_s = tank.mass_kg * commanded
     if impulse_n_s < thruster.minimum_impulse_n_s:
         return Refusal(
@@ -111,7 +114,8 @@ def fire(
     duration_s = 0.0
     if thruster.thrust_n is not None:
         duration_s = used_kg * exhaust_m_s(thruster) / thruster.thrust_n
-    return Burn(vector=vector, propellant_kg=used_kg, duration_s=duration_s)
+    burnt = used_kg / tank.mass_kg
+    return Burn(vector=vector, propellant_kg=used_kg, burnt=burnt, duration_s=duration_s)
 
 
 def propellant_of(thruster: Thruster, mass_kg: float, delta_v_m_s: float) -> float:
@@ -171,7 +175,7 @@ def turn(
         if possible != torque:
             limits.append(f"{'xyz'[axis]}: wheels saturate")
         given[axis] = possible
-    if max(map(abs, given)) < TORQUE_MIN_N_M:
+    if max(map(abs, given)) < TORQUE_N_M_MIN:
         return Refusal(reason="the wheels are saturated")
     x, y, z = given
     return Turn(torque_n_m=(x, y, z), limits=tuple(limits))

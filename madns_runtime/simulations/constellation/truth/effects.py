@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from madns_runtime.simulations.constellation.messages import CommandFrame
+from madns_runtime.simulations.constellation.thrust import Thrust, Vector
 
-Vector = tuple[float, float, float]
 EffectKind = Literal["impulse", "thrust", "torque", "ballistic"]
 
 
@@ -33,6 +33,8 @@ class Effect:
     vector: Vector
     """impulse and thrust: change of velocity, m/s; torque: N m, body; ballistic: m^2/kg and two zeros."""
     frame: CommandFrame = "inertial"
+    burnt: float = 0.0
+    """Share of the vehicle's mass that a thrust arc burns."""
 
     @property
     def is_arc(self) -> bool:
@@ -54,8 +56,8 @@ class Timeline:
         self.wheels_n_m_s: Vector = (0.0, 0.0, 0.0)
         """Momentum that wheels had taken up before the first effect held, body axes, N m s."""
         self.effects: tuple[Effect, ...] = ()
-        self.directions: dict[int, Vector] = {}
-        """Accelerations, m/s^2, inertial, of thrust arcs that truth already holds, by the effect's number."""
+        self.thrusts: dict[int, Thrust] = {}
+        """Of the thrust arcs that truth already holds, by the effect's number."""
 
     def add(self, effect: Effect) -> None:
         """Put an effect where its time belongs."""
@@ -95,7 +97,7 @@ class Timeline:
         self.ballistic_m2_kg, self.wheels_n_m_s = self.ballistic_at(t_s), self.wheels_at(t_s)
         self.effects = kept
         held = {e.number for e in self.effects}
-        self.directions = {n: v for n, v in self.directions.items() if n in held}
+        self.thrusts = {n: thrust for n, thrust in self.thrusts.items() if n in held}
 
 
 def total(vectors: Iterable[Vector]) -> Vector:

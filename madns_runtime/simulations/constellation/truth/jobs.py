@@ -8,8 +8,10 @@ its knots are those of the grid and of the pieces that the interval needs beside
 from __future__ import annotations
 
 import importlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from types import ModuleType
 from typing import TYPE_CHECKING
 
@@ -17,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from madns_runtime.simulations.constellation.orbit.frames import vector_to_inertial
-from madns_runtime.simulations.constellation.truth.effects import Effect, Vector, scaled, total
+from madns_runtime.simulations.constellation.thrust import Thrust, Vector
+from madns_runtime.simulations.constellation.truth.effects import Effect, scaled, total
 from madns_runtime.simulations.constellation.truth.pieces import (
     Piece,
     Span,
@@ -38,6 +41,10 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 ROUNDING_S = 1e-9
 """Knots nearer to each other than this are the same, computed on two ways."""
+COASTING: Vector = (0.0, 0.0, 0.0)
+THRUST_STEP_S = 10.0
+"""Most of a thrust arc that is propagated at one acceleration, its mean; the rest is added, and gravity does
+not feel it: 1e-4 m in an hour of 1 m/s^2."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,8 +61,8 @@ class VehicleRequest:
     knot_s: float
     effects: tuple[Effect, ...] = ()
     """In order: what acts at start_s or begins after it."""
-    directions: dict[int, Vector] = field(default_factory=dict)
-    """Accelerations of those thrust arcs that began by start_s, m/s^2, inertial, by the effect's number."""
+    thrusts: dict[int, Thrust] = field(default_factory=dict)
+    """Of those thrust arcs that began by start_s, by the effect's number."""
     ballistic_m2_kg: float = 0.0
     """At start_s."""
     body: RigidBody | None = None
@@ -96,10 +103,11 @@ def propagate_bodies(
     bodies: Sequence[RigidBody], states: Array, knots_s: Array, parameters: PropagationParameters
 ) -> Array:
     """Return attitude and rates of rigid bodies that nobody turns, shape (M, K, 7), from (M, 13) at the first knot."""
-    torques = np.zeros((len(bodies), 3))
-    start_s = float(knots_s[0])
     propagate_attitude = _attitude_module().propagate_attitude
-    rows = propagate_attitude(bodies, states, start_s, knots_s, parameters, torques)
+    start_s = float(knots_s[0])
+    rows = propagate_attitude(
+        bodies, states, t0_s=start_s, knots_s=knots_s, parameters=parameters
+    )
     return np.asarray(rows[..., 6:], dtype=np.float64)
 
 
@@ -113,9 +121,10 @@ class _Flight:
         self._state = np.asarray(request.state, dtype=np.float64)
         self._body = request.body
         self._ballistic = request.ballistic_m2_kg
-        self._thrusts: dict[int, Vector] = {}
-        self._torques: dict[int, Vector] = {}
-        self._directions: dict[int, Vector] = {}
+        # An actuator does one thing at a time.
+        self._thrust: Thrust | None = None
+        self._torque = COASTING
+        self._thrusts: dict[int, Thrust] = {}
         self._pieces: list[Piece] = []
         self._first_knot = knot_at_or_after(request.change_s, request.knot_s)
         count = max(0, request.end_knot - self._first_knot + 1)
@@ -131,31 +140,31 @@ class _Flight:
         knots = self._grid_knots(t0_s, stop_s)
         spans: list[Span] = []
         if t0_s >= request.change_s:
-            is_arc = bool(self._thrusts or self._torques)
-            jumps = any(e.kind == "impulse" and e.start_s == stop_s for e in request.effects)
+            is_arc = self._thrust is not None or self._torque != COASTING
+            # Impulses change the velocity there; what drag acts on is one number in a segment.
+            kinds = {e.kind for e in request.effects if e.start_s == stop_s}
+            jumps = not kinds.isdisjoint(("impulse", "ballistic"))
             spans = lay_out(t0_s, stop_s, request.knot_s, jumps=jumps, is_arc=is_arc)
         else:
             knots = []
         wanted = {stop_s, *(knot * request.knot_s for knot in knots)}
         for span in spans:
             wanted.update(span.times_s())
-        torque = total(self._torques.values())
-        at, last = self._states_at(wanted, torque)
+        at, last = self._states_at(wanted)
         for span in spans:
             self._add_piece(span, np.stack([at[t] for t in span.times_s()]))
         for knot in knots:
             self._grid[knot - self._first_knot] = at[knot * request.knot_s]
         self._state, self._t_s = last, stop_s
         if self._body is not None and self._body.wheels_n_m_s is not None:
-            taken = total((self._body.wheels_n_m_s, scaled(torque, t0_s - stop_s)))
+            taken = total((self._body.wheels_n_m_s, scaled(self._torque, t0_s - stop_s)))
             self._body = replace(self._body, wheels_n_m_s=taken)
 
     def apply(self, t_s: float) -> None:
         """Let begin and end what does so at *t_s*."""
         for effect in self._request.effects:
             if effect.is_arc and effect.end_s == t_s:
-                self._thrusts.pop(effect.number, None)
-                self._torques.pop(effect.number, None)
+                self._end(effect)
             if effect.start_s != t_s or effect.start_s <= self._request.start_s:
                 continue
             if effect.is_arc:
@@ -177,7 +186,7 @@ class _Flight:
             states=self._grid[:, :6].copy(),
             attitude=self._grid[:, 6:].copy() if is_rigid else None,
             invariants=conserved_by(self._grid[:, :6], self._parameters),
-            directions=self._directions,
+            thrusts=self._thrusts,
         )
 
     def _grid_knots(self, t0_s: float, stop_s: float) -> list[int]:
@@ -196,19 +205,26 @@ class _Flight:
 
     def _begin(self, effect: Effect) -> None:
         if effect.kind == "torque":
-            self._torques[effect.number] = effect.vector
+            self._torque = effect.vector
             return
-        known = self._request.directions.get(effect.number)
-        if known is None or effect.start_s > self._request.start_s:
-            known = scaled(self._direction(effect), 1.0 / (effect.end_s - effect.start_s))
-        self._directions[effect.number] = self._thrusts[effect.number] = known
+        thrust = self._request.thrusts.get(effect.number)
+        if thrust is None or effect.start_s > self._request.start_s:
+            change = self._change_of_velocity(effect)
+            thrust = Thrust.of(change, effect.start_s, effect.end_s, effect.burnt)
+        self._thrust = self._thrusts[effect.number] = thrust
 
-    def _direction(self, effect: Effect) -> Vector:
+    def _end(self, effect: Effect) -> None:
+        if effect.kind == "torque":
+            self._torque = COASTING
+        else:
+            self._thrust = None
+
+    def _change_of_velocity(self, effect: Effect) -> Vector:
         """Return an arc's change of velocity, inertial, m/s: its frame is that of its middle."""
         if effect.frame == "inertial" or effect.at_s <= self._t_s:
             return self._inertial(effect, self._state)
         # Without the arc's own thrust: the frame that guidance, too, could foresee.
-        row = self._propagate([effect.at_s], total(self._torques.values()))[-1]
+        row = self._leg(self._state, self._t_s, [effect.at_s], None)[-1]
         return self._inertial(effect, row)
 
     @staticmethod
@@ -217,7 +233,7 @@ class _Flight:
         r, v = state[:3].tolist(), state[3:6].tolist()
         return vector_to_inertial(effect.vector, effect.frame, r, v, attitude)
 
-    def _states_at(self, wanted: set[float], torque: Vector) -> tuple[dict[float, Array], Array]:
+    def _states_at(self, wanted: set[float]) -> tuple[dict[float, Array], Array]:
         """Return states at the wanted times, and at the last of them; times may differ by rounding only."""
         times_s: list[float] = []
         places: dict[float, int] = {}
@@ -225,26 +241,55 @@ class _Flight:
             if t_s > self._t_s and (not times_s or t_s - times_s[-1] > ROUNDING_S):
                 times_s.append(t_s)
             places[t_s] = len(times_s)
-        rows = self._propagate(times_s, torque)
+        rows = self._flown(times_s)
         known = (self._state, *rows)
         return {t_s: known[place] for t_s, place in places.items()}, rows[-1]
 
-    def _propagate(self, times_s: Sequence[float], torque: Vector) -> Array:
-        """Return states at times after the present one, shape (K, 6 or 13)."""
-        thrust = np.array([total(self._thrusts.values())]) if self._thrusts else None
+    def _flown(self, times_s: Sequence[float]) -> Array:
+        """
+        Return states at times after the present one, shape (K, 6 or 13).
+
+        A propagator knows one acceleration a call: an arc is flown in legs at their mean acceleration, and
+        what the rocket equation gives besides is added to the states.
+        """
+        thrust = self._thrust
+        if thrust is None:
+            return self._leg(self._state, self._t_s, times_s, None)
+        legs = math.ceil((times_s[-1] - self._t_s) / THRUST_STEP_S)
+        edges_s = np.linspace(self._t_s, times_s[-1], legs + 1).tolist()
+        state, flown = self._state, []
+        for from_s, until_s in pairwise(edges_s):
+            inside = [t_s for t_s in times_s if from_s < t_s <= until_s]
+            stops_s = inside if until_s in inside else [*inside, until_s]
+            mean = thrust.gains(from_s, until_s)[0] / (until_s - from_s)
+            rows = self._leg(state, from_s, stops_s, scaled(thrust.acceleration_m_s2, mean))
+            for row, t_s in zip(rows, stops_s, strict=True):
+                velocity_s, way_s2 = thrust.gains(from_s, t_s)
+                tau_s = t_s - from_s
+                row[:3] += scaled(thrust.acceleration_m_s2, way_s2 - mean * tau_s * tau_s / 2.0)
+                row[3:6] += scaled(thrust.acceleration_m_s2, velocity_s - mean * tau_s)
+            flown += list(rows[: len(inside)])
+            state = rows[-1]
+        return np.stack(flown)
+
+    def _leg(
+        self, state: Array, from_s: float, times_s: Sequence[float], thrust_m_s2: Vector | None
+    ) -> Array:
+        """Return states at times after *from_s* under one thrust and the present torque, shape (K, 6 or 13)."""
         parameters = replace(
             self._parameters,
             ballistic_m2_kg=np.array([self._ballistic]),
-            thrust_m_s2=thrust,
+            thrust_m_s2=None if thrust_m_s2 is None else np.array([thrust_m_s2]),
         )
-        knots = np.array(times_s)
+        knots, states = np.array(times_s), state[None]
         if self._body is not None:
-            torques = np.array([torque])
-            states = self._state[None]
+            turned = replace(self._body, torque_n_m=self._torque)
             propagate_attitude = _attitude_module().propagate_attitude
-            rows = propagate_attitude([self._body], states, self._t_s, knots, parameters, torques)
+            rows = propagate_attitude(
+                [turned], states, t0_s=from_s, knots_s=knots, parameters=parameters
+            )
         else:
-            rows = propagate(self._state[None], self._t_s, knots, parameters)
+            rows = propagate(states, from_s, knots, parameters)
         vehicle: Array = rows[0]
         return vehicle
 
@@ -256,7 +301,7 @@ class _Flight:
                 states=np.ascontiguousarray(rows[:, :6]),
                 end_s=span.end_s,
                 attitude=np.ascontiguousarray(rows[:, 6:]) if self._body is not None else None,
-                thrust_m_s2=total(self._thrusts.values()) if self._thrusts else None,
+                thrust=self._thrust,
             )
         )
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.messages import Command, CommandResult, CommandStatus
 from madns_runtime.simulations.constellation.parameters import Maneuvers
+from madns_runtime.simulations.constellation.thrust import Vector
 from madns_runtime.simulations.constellation.truth.actuators import (
     Burn,
     Refusal,
@@ -29,7 +30,6 @@ from madns_runtime.simulations.constellation.truth.effects import (
     Effect,
     EffectKind,
     Timeline,
-    Vector,
 )
 from madns_runtime.simulations.constellation.truth.pieces import snap
 
@@ -39,6 +39,8 @@ ARC_S_MIN = 0.01
 """A burn that is over sooner is an impulse; a torque is not given for less, s."""
 COMMANDS_MAX = 2**31
 """Numbers of commands are below it."""
+ACTUATORS = {"impulse": "thruster", "thrust": "thruster", "torque": "wheels"}
+"""Who makes an effect, and does one thing at a time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,12 +58,16 @@ class Taken:
     """None if it is refused."""
     delta_v_m_s: float = 0.0
     """Magnitude that is really given."""
+    used_kg: float = 0.0
+    """Propellant that is really burnt."""
     propellant_kg: float = 0.0
     """Left afterwards."""
     expected_m_s: float = 0.0
     """Magnitude without error."""
     expected_kg: float = 0.0
     """Left afterwards without error."""
+    is_late: bool = False
+    """Whether it could not be in truth by its time."""
 
     def result(self, revision: int) -> CommandResult:
         """Return what the vehicle is told now: what is expected, since errors show when they happen."""
@@ -101,20 +107,21 @@ class Account:
     propagation_s_max: float = 0.0
     network_s_max: float = 0.0
     delta_v_m_s: float = 0.0
-    """Sum of the magnitudes given."""
+    """Sum of the magnitudes given by burns that are over."""
     propellant_kg: float = 0.0
+    """Burnt by them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Times:
     """The synchronous inequality of one command, T_p + 2 T_n <= T_m - T_s."""
 
-    propagation_s: float
-    """T_p, measured: from hearing the command to handing out the truth that holds it."""
+    propagation_s: float | None
+    """T_p, measured: from hearing the command to handing out the truth that holds it; None if there is none."""
     network_s: float
     """T_n, measured: from the tick that commanded to hearing of it."""
     slack_s: float
-    """(T_m - T_s) - (T_p + 2 T_n); T_m as commanded."""
+    """(T_m - T_s) - (T_p + 2 T_n); T_m as commanded, T_p as allowed if none was measured."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,6 +164,11 @@ class ManeuverDesk:
         self._taken = [0] * len(agents)
         self._waiting = [0] * len(agents)
 
+    @property
+    def waiting(self) -> int:
+        """Commands that truth holds, or will, and whose time is not over."""
+        return sum(self._waiting)
+
     def decide(self, vehicle: int, command: Command, heard_s: float) -> Taken:
         """Return what becomes of a command that is heard of now; an effect is in its vehicle's timeline then."""
         self.account.commanded += 1
@@ -170,17 +182,18 @@ class ManeuverDesk:
         self.account.postponed += taken.status == "postponed"
         return taken
 
-    def measure(self, taken: Taken, sent_s: float) -> Times:
-        """Enter the synchronous inequality of a command whose truth was handed out at *sent_s*."""
-        command = taken.command
+    def measure(self, taken: Taken, sent_s: float | None) -> Times:
+        """Enter the synchronous inequality of a command whose truth was handed out at *sent_s*; None for a refused one."""
+        command, account = taken.command, self.account
         network_s = max(0.0, taken.heard_s - (command.commanded_s + command.phase_s))
-        propagation_s = sent_s - taken.heard_s
-        slack_s = (command.at_s - command.commanded_s) - (propagation_s + 2.0 * network_s)
-        account = self.account
+        propagation_s = None if sent_s is None else sent_s - taken.heard_s
+        account.network_s_max = max(account.network_s_max, network_s)
+        account.propagation_s_max = max(account.propagation_s_max, propagation_s or 0.0)
+        allowed_s = self._rules.settings.propagation_s
+        needed_s = (allowed_s if propagation_s is None else propagation_s) + 2.0 * network_s
+        slack_s = command.at_s - command.commanded_s - needed_s
         account.inequality_broken += slack_s < 0.0
         account.slack_s_min = min(account.slack_s_min, slack_s)
-        account.propagation_s_max = max(account.propagation_s_max, propagation_s)
-        account.network_s_max = max(account.network_s_max, network_s)
         return Times(propagation_s=propagation_s, network_s=network_s, slack_s=slack_s)
 
     def execute(self, taken: Taken) -> None:
@@ -188,6 +201,7 @@ class ManeuverDesk:
         self._waiting[taken.vehicle] -= 1
         self.account.executed += 1
         self.account.delta_v_m_s += taken.delta_v_m_s
+        self.account.propellant_kg += taken.used_kg
 
     def _judge(self, vehicle: int, command: Command, heard_s: float) -> Taken:
         refused = Taken(
@@ -259,13 +273,12 @@ class ManeuverDesk:
         start_s = snap(command.at_s - burn_s / 2.0, rules.knot_s)
         ready_s = refused.heard_s + rules.settings.propagation_s + rules.settings.network_s
         status: CommandStatus = "accepted"
+        is_late = start_s + command.phase_s < ready_s
         reason = "; ".join(given.limits) if isinstance(given, Turn) else ""
-        if start_s + command.phase_s < ready_s:
-            late_s = ready_s - command.phase_s - start_s
-            reason = f"{late_s:.3f} s too late"
+        if is_late:
+            reason = f"{ready_s - command.phase_s - start_s:.4g} s too late"
             if rules.settings.late == "refuse":
-                self._enter_refused(refused)
-                return replace(refused, reason=reason)
+                return replace(refused, reason=reason, is_late=True)
             # A whole tick: the first time that flight software could have named itself.
             tick = math.ceil((ready_s - command.phase_s) * rules.tick_hz - 1e-9)
             start_s, status = snap(tick / rules.tick_hz, rules.knot_s), "postponed"
@@ -282,27 +295,22 @@ class ManeuverDesk:
             end_s=end_s,
             vector=_vector(command, given),
             frame="body" if isinstance(given, Turn) else command.frame,
+            burnt=given.burnt if isinstance(given, Burn) else 0.0,
         )
         if busy := self._busy(refused.vehicle, effect):
             return replace(refused, at_s=at_s, reason=busy)
-        taken = replace(refused, status=status, at_s=at_s, reason=reason, effect=effect)
+        taken = replace(
+            refused, status=status, at_s=at_s, reason=reason, effect=effect, is_late=is_late
+        )
         return self._booked(taken, given)
 
-    def _enter_refused(self, refused: Taken) -> None:
-        """Enter the inequality of a command that is refused for being late, with the T_p allowed."""
-        command = refused.command
-        network_s = max(0.0, refused.heard_s - (command.commanded_s + command.phase_s))
-        needed_s = self._rules.settings.propagation_s + 2.0 * network_s
-        slack_s = command.at_s - command.commanded_s - needed_s
-        self.account.inequality_broken += slack_s < 0.0
-        self.account.slack_s_min = min(self.account.slack_s_min, slack_s)
-
     def _busy(self, vehicle: int, effect: Effect) -> str:
-        """Return why an arc cannot be flown: its actuator is at work; empty if it can."""
-        for other in self._timelines[vehicle].effects if effect.is_arc else ():
+        """Return why an effect cannot be made: its actuator is at work; empty if it can."""
+        actuator = ACTUATORS.get(effect.kind, "")
+        for other in self._timelines[vehicle].effects:
             overlaps = other.start_s < effect.end_s and effect.start_s < other.end_s
-            if other.kind == effect.kind and overlaps:
-                return f"the actuator is busy from {other.start_s:.3f} s to {other.end_s:.3f} s"
+            if overlaps and ACTUATORS.get(other.kind) == actuator:
+                return f"{actuator} busy from {other.start_s:.3f} s to {other.end_s:.3f} s"
         return ""
 
     def _booked(self, taken: Taken, given: Burn | Turn | None) -> Taken:
@@ -312,10 +320,10 @@ class ManeuverDesk:
         tank, commanded_m_s = self._tanks[taken.vehicle], math.hypot(*taken.command.vector)
         expected_kg = tank.propellant_kg - propellant_of(thruster, tank.mass_kg, commanded_m_s)
         tank.book(given)
-        self.account.propellant_kg += given.propellant_kg
         return replace(
             taken,
             delta_v_m_s=given.magnitude_m_s,
+            used_kg=given.propellant_kg,
             propellant_kg=tank.propellant_kg,
             expected_m_s=commanded_m_s,
             expected_kg=expected_kg,

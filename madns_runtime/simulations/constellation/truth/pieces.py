@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from madns_runtime.simulations.constellation.messages import Segment
-from madns_runtime.simulations.constellation.truth.effects import Vector
+from madns_runtime.simulations.constellation.thrust import Thrust
 
 SNAP_S = 1e-7
 """A time this near to a knot is the knot's: 0.2 mm at 2 km/s."""
@@ -38,7 +38,7 @@ class Piece:
     """Until when it holds: the last knot's time, or sooner if a maneuver has cut it short."""
     attitude: NDArray[np.float64] | None = None
     """Shape (K, 7) for a rigid body."""
-    thrust_m_s2: Vector | None = None
+    thrust: Thrust | None = None
 
     def cut_at(self, t_s: float) -> Piece:
         """Return it with truth up to *t_s* only."""
@@ -56,7 +56,7 @@ class Piece:
             knot_s=self.knot_s,
             states=self.states,
             attitude=self.attitude,
-            thrust_m_s2=self.thrust_m_s2,
+            thrust=self.thrust,
         )
 
 
@@ -76,8 +76,8 @@ class VehicleTruth:
     """The same, shape (G, 7)."""
     invariants: NDArray[np.float64]
     """The same, shape (G, 3), see `orbit.invariants`."""
-    directions: dict[int, Vector]
-    """Accelerations of the thrust arcs that begin within it, m/s^2, inertial, by the effect's number."""
+    thrusts: dict[int, Thrust]
+    """Of the thrust arcs that began by its end, by the effect's number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +119,8 @@ def lay_out(
         start_s: Its beginning, snapped.
         end_s: Its end, snapped, after start_s.
         knot_s: Time between knots of the grid.
-        jumps: Whether the velocity changes at end_s, which the grid knot there will not show.
+        jumps: Whether the velocity changes at end_s, which the grid knot there will not show, or what
+            drag acts on does.
         is_arc: Whether all of it is one piece, with dense knots.
     """
     if is_arc:
