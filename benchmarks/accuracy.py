@@ -280,24 +280,22 @@ def verified_states(lines: tuple[str, str], times_s: Array) -> Array:
 
 def rigid_rows() -> Iterator[Row]:
     """Yield the largest difference from Basilisk's rigid bodies, if it is installed."""
+    settings = BasiliskPropagator(kind="basilisk", step_s=0.05)
     try:
-        from madns_runtime.simulations.constellation.truth.basilisk_attitude import (
-            propagate_rigid_bodies,
-        )
+        load_propagator(settings.kind)
     except MissingExtraError:
         return
     inertia = (10.0, 24.0, 17.0)
     attitude = Attitude(inertia_kg_m2=inertia, rates_deg_s=(1.0, -2.0, 0.5))
     states = np.array([(*s, *initial_attitude(attitude, s[:3], s[3:])) for s in orbits()[:3]])
-    bodies = [RigidBody(inertia_kg_m2=inertia)] * 3
-    torques = np.array([[1e-3, 0.0, -5e-4], [0.0, 2e-4, 0.0], [0.0, 0.0, 0.0]])
+    torques = ((1e-3, 0.0, -5e-4), (0.0, 2e-4, 0.0), (0.0, 0.0, 0.0))
+    bodies = [RigidBody(inertia_kg_m2=inertia, torque_n_m=torque) for torque in torques]
     knots_s = np.arange(1, 61) * 60.0
-    ours = propagate_attitude(
-        bodies, states, 0.0, knots_s, problem(ScipyPropagator(kind="scipy"), 3), torques
-    )
-    settings = BasiliskPropagator(kind="basilisk", step_s=0.05)
-    theirs = propagate_rigid_bodies(
-        bodies, states, knots_s=knots_s, parameters=problem(settings, 3), torques=torques
+    ours, theirs = (
+        propagate_attitude(
+            bodies, states, t0_s=0.0, knots_s=knots_s, parameters=problem(each, len(states))
+        )
+        for each in (ScipyPropagator(kind="scipy"), settings)
     )
     q, p = ours[..., 6:10], theirs[..., 6:10]
     same = np.sign(np.sum(q * p, axis=-1, keepdims=True))

@@ -148,6 +148,7 @@ def rigid_batch(count: int, knots_s: Array) -> Callable[[], object]:
     """Return what computes a batch with Basilisk's spacecraft as it comes."""
     from madns_runtime.simulations.constellation.truth.basilisk_simulation import (
         Design,
+        Pushes,
         Simulation,
     )
 
@@ -161,8 +162,8 @@ def rigid_batch(count: int, knots_s: Array) -> Callable[[], object]:
         has_thrust=False,
         rotates_points=True,
     )
-    simulation, states = Simulation(design), orbits(count)
-    return lambda: simulation.run(states, len(knots_s))
+    simulation, states, pushes = Simulation(design), orbits(count), Pushes()
+    return lambda: simulation.run(states, len(knots_s), pushes)
 
 
 def problem(settings: AnyPropagator, count: int) -> PropagationParameters:

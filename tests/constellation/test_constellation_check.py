@@ -95,6 +95,28 @@ def test_what_fits_together_has_no_faults(folder, rest):
             {"propagator": {"kind": "numba", "forces": ["j2"]}},
             "propagator.forces: expected two_body among them",
         ),
+        (
+            {
+                "propagator": {"kind": "basilisk"},
+                "vehicles": [
+                    {"agents": ["agent-01"], "attitude": {"inertia_kg_m2": [1, 1, 1]}},
+                    {
+                        "attitude": {
+                            "inertia_kg_m2": [1, 1, 1],
+                            "wheels": {"torque_n_m_max": 0.1, "momentum_n_m_s_max": 1},
+                        }
+                    },
+                ],
+            },
+            r"vehicles\[1\].attitude.wheels: basilisk does rigid bodies without wheels only",
+        ),
+        (
+            {
+                "segments": {"knot_s": 2},
+                "vehicles": [{"attitude": {"inertia_kg_m2": [1, 1, 1], "rates_deg_s": [0, 90, 1]}}],
+            },
+            r"vehicles\[0\].attitude.rates_deg_s: expected less than half a turn .* got 180.0\d* deg",
+        ),
         ({"vehicles": [{}, {"agents": ["X*"]}]}, r"vehicles\[1\].agents: 'X\*' fits no agent"),
         (
             {"vehicles": [{"sensors": {"gyro": {}}}]},

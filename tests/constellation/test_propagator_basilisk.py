@@ -1,6 +1,8 @@
 """Truth, for points and for rigid bodies, against Basilisk."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -17,9 +19,6 @@ from madns_runtime.simulations.constellation.truth.attitude import (
     RigidBody,
     initial_attitude,
     propagate_attitude,
-)
-from madns_runtime.simulations.constellation.truth.basilisk_attitude import (
-    propagate_rigid_bodies,
 )
 from madns_runtime.simulations.constellation.truth.basilisk_propagator import (
     SETS_MAX,
@@ -92,12 +91,12 @@ def test_simulations_are_kept_and_bounded():
     basilisk = Basilisk()
     for step_s in (0.1, 0.2, 0.25, 0.5, 1.0, 1.25):
         basilisk.propagate(orbits(), 0.0, np.array([5.0]), make(step_s=step_s))
-    kept = dict(basilisk._sets)
+    kept = dict(basilisk._kept.sets)
 
     basilisk.propagate(orbits(), 5.0, np.array([10.0]), make(step_s=1.25))
 
-    assert len(basilisk._sets) == SETS_MAX
-    assert all(basilisk._sets[key] is kept[key] for key in kept)
+    assert len(basilisk._kept.sets) == SETS_MAX
+    assert all(basilisk._kept.sets[key] is kept[key] for key in kept)
 
 
 def test_a_coarse_step_costs_accuracy():
@@ -165,62 +164,111 @@ def bodies_in_orbit():
         (*row, *initial_attitude(which, row[:3], row[3:]))
         for row, which in zip(orbits().tolist(), (attitude, attitude, still), strict=True)
     ]
+    torques = ((1e-3, 0.0, -5e-4), (0.0, 2e-4, 0.0), (0.0, 0.0, 0.0))
     bodies = [
-        RigidBody(inertia_kg_m2=inertia, has_gravity_gradient=has_gradient)
-        for has_gradient in (True, False, True)
+        RigidBody(inertia_kg_m2=inertia, has_gravity_gradient=has_gradient, torque_n_m=torque)
+        for has_gradient, torque in zip((True, False, True), torques, strict=True)
     ]
     return bodies, np.array(states)
 
 
+def turned(bodies, states, knots_s, parameters, t0_s=0.0):
+    return propagate_attitude(bodies, states, t0_s=t0_s, knots_s=knots_s, parameters=parameters)
+
+
 def turned_rad(a, b):
-    """Angle between attitudes, shape (M, K); good for small ones."""
-    same = np.sign(np.einsum("mki,mki->mk", a, b))[..., None]
-    return 2.0 * np.linalg.norm(a * same - b, axis=-1)
+    """Angle between attitudes, shape (M, K); good for small ones, of one sign."""
+    return 2.0 * np.linalg.norm(a[..., 6:10] - b[..., 6:10], axis=-1)
 
 
 def test_our_rigid_bodies_turn_as_basilisks():
     bodies, states = bodies_in_orbit()
-    torques = np.array([[1e-3, 0.0, -5e-4], [0.0, 2e-4, 0.0], [0.0, 0.0, 0.0]])
-    knots_s = np.arange(1, 61) * 10.0
+    knots_s = np.append(np.arange(1, 60) * 10.0, (595.5, 600.0))
 
-    ours = propagate_attitude(bodies, states, 0.0, knots_s, make("scipy"), torques)
+    ours = turned(bodies, states, knots_s, make("scipy"))
 
-    basilisks = propagate_rigid_bodies(
-        bodies, states, knots_s=knots_s, parameters=make(step_s=0.05), torques=torques
-    )
-    assert turned_rad(ours[..., 6:10], basilisks[..., 6:10]).max() < 1e-9
+    basilisks = turned(bodies, states, knots_s, make(step_s=0.05))
+    assert turned_rad(ours, basilisks).max() < 1e-9
     assert np.abs(ours[..., 10:] - basilisks[..., 10:]).max() < 1e-12
     assert np.abs(ours[..., :3] - basilisks[..., :3]).max() < 1e-6
 
 
+def test_bodies_fly_the_orbits_of_points_to_the_last_digit_also_with_thrust():
+    bodies, states = bodies_in_orbit()
+    knots_s = np.arange(4.0, 9.0)
+    parameters = make(rest={"thrust_m_s2": np.full((3, 3), 1e-3)})
+
+    found = turned(bodies, states, knots_s, parameters, t0_s=3.25)
+    itself = Basilisk().propagate_bodies(
+        bodies, states, offsets_s=knots_s - 3.25, parameters=parameters
+    )
+
+    assert np.array_equal(found[..., :6], propagate(states[:, :6], 3.25, knots_s, parameters))
+    assert np.array_equal(found[..., :6], itself[..., :6])
+
+
+def test_bodies_in_one_simulation_turn_as_in_their_own():
+    bodies, states = bodies_in_orbit()
+    bodies[1] = replace(bodies[1], inertia_kg_m2=(3.0, 2.0, 4.0))
+    knots_s = np.arange(0.0, 11.0)
+
+    together = turned(bodies, states, knots_s, make())
+
+    assert np.array_equal(
+        together, turned(bodies, states, knots_s, make(simulations="per_vehicle"))
+    )
+
+
+def test_a_torque_that_is_over_acts_no_more():
+    bodies, states = bodies_in_orbit()
+    at_rest = [replace(body, torque_n_m=(0.0, 0.0, 0.0)) for body in bodies]
+    knots_s = np.array([10.0])
+    expected = turned(at_rest, states, knots_s, make())
+
+    pushed = turned(bodies, states, knots_s, make(rest={"thrust_m_s2": np.ones((3, 3))}))
+
+    assert not np.array_equal(pushed, expected)
+    assert np.array_equal(turned(at_rest, states, knots_s, make()), expected)
+
+
 def test_the_comparison_sees_a_missing_gravity_gradient():
     bodies, states = bodies_in_orbit()
-    blind = [RigidBody(inertia_kg_m2=b.inertia_kg_m2, has_gravity_gradient=False) for b in bodies]
-    knots_s, torques = np.array([300.0]), np.zeros((3, 3))
+    blind = [replace(body, has_gravity_gradient=False) for body in bodies]
+    knots_s = np.array([300.0])
 
-    ours = propagate_attitude(blind, states, 0.0, knots_s, make("scipy"), torques)
+    ours = turned(blind, states, knots_s, make("scipy"))
 
-    basilisks = propagate_rigid_bodies(
-        bodies, states, knots_s=knots_s, parameters=make(), torques=torques
-    )
-    turned = turned_rad(ours[..., 6:10], basilisks[..., 6:10])[:, 0]
-    assert turned[0] > 1e-4
-    assert turned[1] < 1e-9
+    angles = turned_rad(ours, turned(bodies, states, knots_s, make()))[:, 0]
+    assert angles[0] > 1e-4
+    assert angles[1] < 1e-9
 
 
-def test_bodies_that_basilisk_does_not_do_here_are_refused():
+def test_what_whole_nanoseconds_leave_is_turned_too():
     bodies, states = bodies_in_orbit()
-    wheeled = [RigidBody(inertia_kg_m2=(1.0, 1.0, 1.0), wheels_n_m_s=(0.0, 0.0, 1.0))] * 3
+    # A prime number of nanoseconds: none of the steps tried divides it.
+    knots_s = np.array([0.999999937, 2 * 0.999999937])
 
-    with pytest.raises(ConfigurationError, match="without wheels"):
-        propagate_rigid_bodies(
-            wheeled, states, knots_s=np.array([1.0]), parameters=make(), torques=np.zeros((3, 3))
-        )
-    with pytest.raises(ConfigurationError, match="multiples of the first knot"):
-        propagate_rigid_bodies(
-            bodies,
-            states,
-            knots_s=np.array([1.0, 3.0]),
-            parameters=make(),
-            torques=np.zeros((3, 3)),
-        )
+    found = turned(bodies, states, knots_s, make(step_s=0.09))
+
+    ours = turned(bodies, states, knots_s, make("scipy"))
+    assert turned_rad(ours, found).max() < 1e-12
+    assert np.abs(ours[..., :3] - found[..., :3]).max() < 1e-7
+
+
+def test_wheels_are_refused_by_name():
+    bodies, states = bodies_in_orbit()
+    bodies[1] = replace(bodies[1], wheels_n_m_s=(0.0, 0.0, 1.0))
+
+    with pytest.raises(ConfigurationError, match="^B: basilisk does rigid bodies without wheels"):
+        turned(bodies, states, np.array([1.0]), make(rest={"names": ("A", "B", "C")}))
+
+
+def test_threads_do_not_step_the_same_simulations():
+    basilisk, knots_s = Basilisk(), np.arange(1.0, 41.0)
+    fleets = [orbits(radius_m=radius_m) for radius_m in (6.9e6, 7.0e6, 7.1e6, 7.2e6)] * 3
+    expected = [basilisk.propagate(fleet, 0.0, knots_s, make()) for fleet in fleets]
+
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda f: basilisk.propagate(f, 0.0, knots_s, make()), fleets))
+
+    assert np.array_equal(found, expected)

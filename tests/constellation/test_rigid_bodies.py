@@ -47,10 +47,10 @@ def two_body(*forces):
     )
 
 
-def turned(bodies, attitudes, knots_s, *, t0_s=0.0, torques=None, parameters=None):
+def turned(bodies, attitudes, knots_s, *, t0_s=0.0, parameters=None):
     states = np.array([(*CIRCULAR, *attitude) for attitude in attitudes])
-    torques = np.zeros((len(bodies), 3)) if torques is None else np.array(torques)
-    return propagate_attitude(bodies, states, t0_s, knots_s, parameters or two_body(), torques)
+    parameters = parameters or two_body()
+    return propagate_attitude(bodies, states, t0_s=t0_s, knots_s=knots_s, parameters=parameters)
 
 
 def momentum_inertial(row, inertia):
@@ -90,11 +90,9 @@ def test_a_symmetric_top_precesses_as_its_closed_solution():
 
 
 def test_a_constant_torque_about_a_principal_axis_spins_up_as_it_should():
-    body = RigidBody(inertia_kg_m2=INERTIA, **FREE)
+    body = RigidBody(inertia_kg_m2=INERTIA, torque_n_m=(0.0, 0.0, 0.018), **FREE)
     knots_s = np.array((100.0, 107.5, 130.0))
-    result = turned(
-        [body], [(*IDENTITY, 0.0, 0.0, 0.0)], knots_s, t0_s=90.0, torques=[(0, 0, 0.018)]
-    )
+    result = turned([body], [(*IDENTITY, 0.0, 0.0, 0.0)], knots_s, t0_s=90.0)
 
     for t_s, row in zip((knots_s - 90.0).tolist(), result[0], strict=True):
         assert row[10:] == pytest.approx((0.0, 0.0, 0.002 * t_s), abs=1e-13)
@@ -105,8 +103,8 @@ def test_a_constant_torque_about_a_principal_axis_spins_up_as_it_should():
 
 def test_wheels_take_up_what_the_body_is_given():
     wheels, torque = (0.2, -0.1, 0.3), (0.002, 0.001, -0.003)
-    body = RigidBody(inertia_kg_m2=INERTIA, wheels_n_m_s=wheels, **FREE)
-    result = turned([body], [(*IDENTITY, 0.01, 0.02, -0.01)], HOUR[:11], torques=[torque])[0]
+    body = RigidBody(inertia_kg_m2=INERTIA, wheels_n_m_s=wheels, torque_n_m=torque, **FREE)
+    result = turned([body], [(*IDENTITY, 0.01, 0.02, -0.01)], HOUR[:11])[0]
 
     total = [
         rotate_back(row[6:10], np.multiply(INERTIA, row[10:]) + wheels - np.multiply(torque, t_s))

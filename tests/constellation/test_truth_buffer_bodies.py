@@ -49,7 +49,7 @@ def revision_at(buffer, t_s):
 def truth(attitude, knots_s, inertia=(12.0, 14.0, 9.0)):
     body = RigidBody(inertia_kg_m2=inertia)
     states = np.array([(*START, *attitude)])
-    return propagate_attitude([body], states, 0.0, knots_s, PARAMETERS, np.zeros((1, 3)))[0]
+    return propagate_attitude([body], states, t0_s=0.0, knots_s=knots_s, parameters=PARAMETERS)[0]
 
 
 def worst_between_knots(attitude):

@@ -7,6 +7,7 @@ Imports neither scipy nor sgp4: `cosmos validate` answers at once.
 from __future__ import annotations
 
 import importlib.util
+import math
 from pathlib import Path
 
 from madns_runtime.errors import ConfigurationError
@@ -14,6 +15,7 @@ from madns_runtime.simulations.constellation.check_board import board_faults
 from madns_runtime.simulations.constellation.check_code import code_faults
 from madns_runtime.simulations.constellation.parameters import (
     KNOTS_MAX,
+    BasiliskPropagator,
     ConstellationParameters,
     CustomPropagator,
     ElementSetSatellites,
@@ -55,6 +57,7 @@ def find_faults(
         faults += str(error).splitlines()
     faults += _propagator_faults(parameters, folder)
     faults += _segment_faults(parameters)
+    faults += _attitude_faults(parameters)
     faults += _missing_libraries(parameters)
     faults += board_faults(parameters, pairs, folder)
     return faults
@@ -91,6 +94,28 @@ def _segment_faults(parameters: ConstellationParameters) -> list[str]:
     if 2 * intervals + 1 > KNOTS_MAX:
         return [f"parameters.segments.buffer_s: expected at most {KNOTS_MAX} knots in a buffer"]
     return []
+
+
+def _attitude_faults(parameters: ConstellationParameters) -> list[str]:
+    """Return rigid bodies that the propagator cannot do, or that turn too fast for the knots."""
+    faults = []
+    by_basilisk = isinstance(parameters.propagator, BasiliskPropagator)
+    for number, vehicle in enumerate(parameters.vehicles):
+        attitude, field = vehicle.attitude, f"parameters.vehicles[{number}].attitude"
+        if attitude is None:
+            continue
+        if by_basilisk and attitude.wheels is not None:
+            faults.append(
+                f"{field}.wheels: basilisk does rigid bodies without wheels only; drop them, which "
+                "makes torques exact and without limit, or take kind: scipy or numba"
+            )
+        turn_deg = math.hypot(*attitude.rates_deg_s) * parameters.segments.knot_s
+        if turn_deg >= 180.0:
+            faults.append(
+                f"{field}.rates_deg_s: expected less than half a turn between knots, got "
+                f"{turn_deg:g} deg; a shorter segments.knot_s follows faster ones"
+            )
+    return faults
 
 
 def _missing_libraries(parameters: ConstellationParameters) -> list[str]:

@@ -3,6 +3,7 @@ Truth of rigid bodies: attitude and body rates along the orbit.
 
 No force of the model depends on attitude, so the scenario's own propagator computes the orbit, to the
 last digit as for a point mass, and attitude is integrated along it: with every propagator, also SGP4.
+Basilisk integrates attitude itself.
 """
 
 from __future__ import annotations
@@ -23,8 +24,10 @@ from madns_runtime.simulations.constellation.orbit.quaternions import (
     Vector,
     from_matrix,
 )
+from madns_runtime.simulations.constellation.parameters import BasiliskPropagator
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
+    load_propagator,
     propagate,
 )
 
@@ -62,6 +65,8 @@ class RigidBody:
     wheels_n_m_s: Vector | None = None
     """Momentum of its wheels at t0, body axes, N m s: they give the torque and take up its opposite.
     None: the torque is external."""
+    torque_n_m: Vector = (0.0, 0.0, 0.0)
+    """What it is commanded, body axes, N m; constant all through a call."""
 
     @classmethod
     def of(cls, attitude: Attitude, wheels_n_m_s: Vector | None = None) -> RigidBody:
@@ -97,13 +102,13 @@ def initial_attitude(attitude: Attitude, r: Numbers, v: Numbers) -> tuple[float,
     return (*quaternion, added[0], added[1] - turn_rad_s, added[2])
 
 
-def propagate_attitude(  # noqa: PLR0913 - beside `Propagator.propagate`, whose arguments these are
+def propagate_attitude(
     bodies: Sequence[RigidBody],
     states: Array,
+    *,
     t0_s: float,
     knots_s: Array,
     parameters: PropagationParameters,
-    torques: Array,
 ) -> Array:
     """
     Return the states of all rigid bodies at all knots.
@@ -115,7 +120,6 @@ def propagate_attitude(  # noqa: PLR0913 - beside `Propagator.propagate`, whose 
         t0_s: Simulated time of *states*, s.
         knots_s: Times, shape (K,), s, ascending, none before t0_s.
         parameters: Of the orbit; what is one a vehicle is in the order of *bodies*.
-        torques: Shape (M, 3), N m, body axes, constant all through the call.
 
     Returns:
         Shape (M, K, 13); quaternions of unit length, their signs continuous from *states* on.
@@ -123,24 +127,47 @@ def propagate_attitude(  # noqa: PLR0913 - beside `Propagator.propagate`, whose 
     Raises:
         ConfigurationError: The integration failed, or a state is not finite.
 
-    The gravity gradient is a point mass's. The step is one for all bodies, so that who is in a call
-    shows in the last digits. Accuracy: tests/constellation/test_rigid_bodies.py.
+    The gravity gradient is a point mass's. But for Basilisk's the step is one for all bodies, so that who
+    is in a call shows in the last digits. Accuracy: tests/constellation/test_rigid_bodies.py.
     Source: Markley and Crassidis, 3.3; gravity gradient 3.3.6.1.
     """
-    span_s = float(knots_s[-1]) - t0_s
-    times_s = _support(t0_s, knots_s)
+    by_basilisk = isinstance(parameters.settings, BasiliskPropagator)
+    times_s = knots_s if by_basilisk else _support(t0_s, knots_s)
     orbit = propagate(states[:, STATE], t0_s, times_s, parameters)
     result = np.empty((len(bodies), len(knots_s), 13))
     result[:, :, STATE] = orbit[:, np.searchsorted(times_s, knots_s)]
-    if span_s == 0.0:
+    if knots_s[-1] == t0_s:
         result[:, :, ATTITUDE] = states[:, None, ATTITUDE]
+        return result
+    if by_basilisk:
+        result[:, :, ATTITUDE] = _by_basilisk(bodies, states, knots_s - t0_s, parameters)
         return result
     position = CubicHermiteSpline(
         times_s - t0_s, orbit[..., :3].transpose(1, 2, 0), orbit[..., 3:].transpose(1, 2, 0)
     )
-    derivative = _equations(bodies, torques, position, parameters.gravity.mu_m3_s2)
+    derivative = _equations(bodies, position, parameters.gravity.mu_m3_s2)
     result[:, :, ATTITUDE] = _integrate(derivative, states[:, ATTITUDE], t0_s, knots_s)
     return result
+
+
+def _by_basilisk(
+    bodies: Sequence[RigidBody],
+    states: Array,
+    offsets_s: Array,
+    parameters: PropagationParameters,
+) -> Array:
+    """Return quaternions, their signs continuous from *states* on, and rates, shape (M, K, 7)."""
+    # Imported here: few have it.
+    from madns_runtime.simulations.constellation.truth.basilisk_propagator import Basilisk
+
+    engine = load_propagator("basilisk")
+    assert isinstance(engine, Basilisk)
+    rows = engine.propagate_bodies(bodies, states, offsets_s=offsets_s, parameters=parameters)
+    turned = np.array(rows[:, :, ATTITUDE])
+    before = np.concatenate((states[:, None, ATTITUDE], turned[:, :-1]), axis=1)
+    cosines = np.einsum("mki,mki->mk", turned[..., :4], before[..., :4])
+    turned[..., :4] *= np.cumprod(np.where(cosines < 0.0, -1.0, 1.0), axis=1)[..., None]
+    return turned
 
 
 def _support(t0_s: float, knots_s: Array) -> Array:
@@ -181,12 +208,12 @@ def _integrate(
 
 
 def _equations(
-    bodies: Sequence[RigidBody], torques: Array, position: Callable[[float], Array], mu: float
+    bodies: Sequence[RigidBody], position: Callable[[float], Array], mu: float
 ) -> Callable[[float, Array], Array]:
     """Return the derivative of (7 M) quaternions and rates at a time after t0."""
     count = len(bodies)
     inertia = np.array([body.inertia_kg_m2 for body in bodies]).T
-    torque = np.asarray(torques, dtype=np.float64).reshape(count, 3).T
+    torque = np.array([body.torque_n_m for body in bodies]).T
     gradient = np.array([3.0 * mu if body.has_gravity_gradient else 0.0 for body in bodies])
     has_gradient = bool(gradient.any())
     wheels = np.array([body.wheels_n_m_s or (0.0, 0.0, 0.0) for body in bodies]).T

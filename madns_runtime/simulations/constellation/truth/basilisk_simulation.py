@@ -8,7 +8,7 @@ serves any number of calls. Gravity is set here: Basilisk's own files are fetche
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,7 @@ Array = NDArray[np.float64]
 _TASK = "dynamics"
 _EARTH = "earth_planet_data"
 _POINT_INERTIA_KG_M2 = (1.0, 1.0, 1.0)
+_NOTHING = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,6 +56,33 @@ class Design:
     """Whether rotation is integrated for point masses as well, as Basilisk does unless told otherwise."""
     have_gravity_gradient: tuple[bool, ...] = ()
     """Whether gravity turns each rigid body."""
+
+    def part(self, which: slice) -> Design:
+        """Return the design for some of the spacecraft."""
+        return replace(
+            self,
+            count=len(range(self.count)[which]),
+            inertias_kg_m2=None if self.inertias_kg_m2 is None else self.inertias_kg_m2[which],
+            have_gravity_gradient=self.have_gravity_gradient[which],
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pushes:
+    """Forces and torques, constant all through a call; None for none."""
+
+    thrust_m_s2: Array | None = None
+    """Accelerations, shape (N, 3), inertial."""
+    torques_n_m: Array | None = None
+    """Shape (N, 3), body axes."""
+
+    def part(self, which: slice) -> Pushes:
+        """Return those of some of the spacecraft."""
+        thrust, torques = self.thrust_m_s2, self.torques_n_m
+        return Pushes(
+            thrust_m_s2=None if thrust is None else thrust[which],
+            torques_n_m=None if torques is None else torques[which],
+        )
 
 
 class Simulation:
@@ -87,14 +115,12 @@ class Simulation:
         self._run_until(0)
         self._clear()
 
-    def run(
-        self,
-        states: Array,
-        knots: int,
-        *,
-        thrust_m_s2: Array | None = None,
-        torques_n_m: Array | None = None,
-    ) -> Array:
+    @property
+    def count(self) -> int:
+        """Spacecraft."""
+        return self._design.count
+
+    def run(self, states: Array, knots: int, pushes: Pushes) -> Array:
         """
         Return the states at the next knots.
 
@@ -102,19 +128,18 @@ class Simulation:
             states: Shape (N, 6), m and m/s, inertial; for rigid bodies (N, 13) with the quaternion,
                 scalar last, inertial to body, and body rates, rad/s.
             knots: Number of knots.
-            thrust_m_s2: Constant acceleration, shape (N, 3), inertial.
-            torques_n_m: Constant torque, shape (N, 3), body axes.
+            pushes: What acts on them, if the design has thrust.
 
         Returns:
             Shape (N, knots, 6 or 13), the last not before `knots` times the design's knot_ns.
         """
         for craft, state in zip(self._spacecraft, states.tolist(), strict=True):
             self._set(craft, state)
+        thrust, torques = pushes.thrust_m_s2, pushes.torques_n_m
+        # What the call before gave would go on acting.
         for number, push in enumerate(self._pushes):
-            if thrust_m_s2 is not None:
-                push.extForce_N = _column(thrust_m_s2[number].tolist())
-            if torques_n_m is not None:
-                push.extTorquePntB_B = _column(torques_n_m[number].tolist())
+            push.extForce_N = _column(_NOTHING if thrust is None else thrust[number])
+            push.extTorquePntB_B = _column(_NOTHING if torques is None else torques[number])
         self._run_until(self._now_ns + knots * self._design.knot_ns)
         rows = np.stack([self._read(recorder) for recorder in self._recorders])
         self._clear()
