@@ -41,6 +41,9 @@ LINKS = StreamSchema(
         Field("distance_m", "m"),
     ),
 )
+REFUSALS = StreamSchema(
+    "refusals", (Field("tick", "", "int"), Field("number", "", "int"), Field("reason", "", "str"))
+)
 CONTACTS = StreamSchema(
     "contacts",
     (
@@ -62,7 +65,7 @@ def record(made):
     host.record("contacts", ("set", "agent-01", "Kiruna", 1.0, 9.0, 42.0))
     host.record("contacts", ("rise", "agent-02", "Kiruna", 5.0, None, None))
     for number, name in enumerate(made.names):
-        agent = made.recorder(f"agents/{name}", name, GNSS, ESTIMATES, COMMANDS)
+        agent = made.recorder(f"agents/{name}", name, GNSS, ESTIMATES, COMMANDS, REFUSALS)
         truth = np.loadtxt(
             [line.strip("[]") for line in lines_of(made, name, "state")], delimiter=","
         )
@@ -72,6 +75,8 @@ def record(made):
                 x, y, z = truth[tick - 1, 1:4].tolist()
                 agent.record("gnss", (tick, (tick - 1) / TICK_HZ, x + ERROR_M, y, z))
         agent.record("commands", (1, 0.5))
+        for reason in ("no_radio", "too_long", "no_radio")[: 3 - number]:
+            agent.record("refusals", (2, 0, reason))
         agent.close()
         host.record("maneuvers", (1.0, name, "accepted", 4.0, 0.5, 0.49, 2.9))
         host.record("maneuvers", (5.0, name, "postponed", 5.5, 0.25, 0.26, -0.01))
@@ -148,6 +153,13 @@ def test_messages_are_counted_by_outcome(blocks):
     assert (delivered["name"], int(sum(delivered["y"]))) == ("delivered", 6)
     assert (lost["name"], int(sum(lost["y"]))) == ("lost", 2)
     assert rows[-1] == {"sender": "all", "messages": 8, "delivered": 6, "lost": 2}
+
+
+def test_refused_messages_are_told_by_sender_and_reason(blocks):
+    first, second = cells(blocks["Links"]["Refused messages, as told to their senders"])
+
+    assert first == {"sender": "agent-01", "refused": 3, "no radio": 2, "too long": 1}
+    assert second == {"sender": "agent-02", "refused": 2, "no radio": 1, "too long": 1}
 
 
 def test_passes_are_told_by_station(blocks):

@@ -13,7 +13,12 @@ from dataclasses import dataclass
 from cosmos_cli.report.figures.constellation import elements_blocks, invariants_blocks, state_blocks
 from cosmos_cli.report.figures.generic import generic_blocks
 from cosmos_cli.report.figures.health import health_blocks, process_blocks
-from cosmos_cli.report.figures.links import contact_blocks, link_blocks, message_blocks
+from cosmos_cli.report.figures.links import (
+    contact_blocks,
+    link_blocks,
+    message_blocks,
+    refusal_blocks,
+)
 from cosmos_cli.report.figures.maneuvers import (
     command_blocks,
     estimate_blocks,
@@ -48,6 +53,7 @@ FIGURES: dict[str, Chapter] = {
     "command_results": Chapter("Control", command_blocks),
     "host_links": Chapter("Links", link_blocks),
     "messages": Chapter("Links", message_blocks),
+    "refusals": Chapter("Links", refusal_blocks),
     "host_contacts": Chapter("Links", contact_blocks),
     **{
         name: Chapter("Sensors", sensor_blocks)

@@ -69,6 +69,29 @@ def message_blocks(table: TableReader, source: Source) -> list[Block]:
     return [] if "host_links" in source.tables else generic_blocks(table, source)
 
 
+def refusal_blocks(table: TableReader, source: Source) -> list[Block]:
+    """Return how many messages each vehicle was refused, and why."""
+    if not table.has("reason"):
+        return generic_blocks(table, source)
+    counts = {
+        agent: Counter(columns["reason"].astype(str).tolist())
+        for agent, columns in table.each(("reason",))
+    }
+    reasons = sorted({reason for found in counts.values() for reason in found})
+    rows: list[list[object]] = [
+        [agent, sum(found.values()), *(found[reason] for reason in reasons)]
+        for agent, found in counts.items()
+    ]
+    names = (reason.replace("_", " ") for reason in reasons)
+    return [
+        TableBlock(
+            title="Refused messages, as told to their senders",
+            headings=headings("sender", "refused", *names),
+            rows=rows,
+        )
+    ]
+
+
 def contact_blocks(table: TableReader, source: Source) -> list[Block]:
     """Return the passes over each ground station; nothing for a run without stations."""
     if not table.has(*CONTACT_FIELDS):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from cosmos_cli.counted import counted
 from cosmos_cli.report.figures.grouped import grouped_lines
 from cosmos_cli.report.model import Block, Choice, Figure, Remark, TableBlock, Trace, headings
 from cosmos_cli.report.sampling import Floats, Histogram, TimeEnvelope
@@ -125,7 +126,7 @@ def _missed(source: Source) -> Block:
     missed = [agent.missed for agent in agents.values()]
     if not any(missed):
         return Remark(
-            text=f"No tick was skipped between the recorded ones of {len(agents)} agent(s)."
+            text=f"No tick was skipped between the recorded ones of {counted(len(agents), 'agent')}."
         )
     figure_layout = layout("", "ticks")
     figure_layout["xaxis"] |= {"type": "category", "tickangle": -90}
