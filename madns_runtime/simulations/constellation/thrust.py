@@ -63,6 +63,23 @@ class Thrust:
         way_s2 = way_gain_s2(after_s, self.burnt_1_s) - way_gain_s2(before_s, self.burnt_1_s)
         return gained_s, way_s2 - had_s * (after_s - before_s)
 
+    def parabola(self, from_s: float, until_s: float) -> tuple[float, float]:
+        """
+        Return the parabola nearest to the way between two times, for whoever can fly at one acceleration only.
+
+        The difference has no mean and no first moment, so that gravity does not feel it: it may be added
+        afterwards. With an acceleration of slope b over a leg L the way is mean tau^2 / 2 - b L tau^2 / 4 +
+        b tau^3 / 6, and nearest to tau^3 in that sense is -0.3 L^2 tau + 1.2 L tau^2.
+
+        Returns:
+            Velocity at the beginning, s, and acceleration, as multiples of `acceleration_m_s2`.
+        """
+        leg_s = until_s - from_s
+        velocity_s, way_s2 = self.gains(from_s, until_s)
+        mean = velocity_s / leg_s
+        slope_1_s = 12.0 * (mean / 2.0 - way_s2 / leg_s**2) / leg_s
+        return -0.05 * slope_1_s * leg_s**2, mean - 0.1 * slope_1_s * leg_s
+
 
 def velocity_gain_s(tau_s: float, burnt_1_s: float) -> float:
     """Return the change of velocity after *tau_s*, over the acceleration at the beginning."""

@@ -42,9 +42,8 @@ Array = NDArray[np.float64]
 ROUNDING_S = 1e-9
 """Knots nearer to each other than this are the same, computed on two ways."""
 COASTING: Vector = (0.0, 0.0, 0.0)
-THRUST_STEP_S = 10.0
-"""Most of a thrust arc that is propagated at one acceleration, its mean; the rest is added, and gravity does
-not feel it: 1e-4 m in an hour of 1 m/s^2."""
+THRUST_LEG_S = 10.0
+"""Most of a thrust arc that is propagated in one call."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,9 +104,7 @@ def propagate_bodies(
     """Return attitude and rates of rigid bodies that nobody turns, shape (M, K, 7), from (M, 13) at the first knot."""
     propagate_attitude = _attitude_module().propagate_attitude
     start_s = float(knots_s[0])
-    rows = propagate_attitude(
-        bodies, states, t0_s=start_s, knots_s=knots_s, parameters=parameters
-    )
+    rows = propagate_attitude(bodies, states, t0_s=start_s, knots_s=knots_s, parameters=parameters)
     return np.asarray(rows[..., 6:], dtype=np.float64)
 
 
@@ -249,27 +246,29 @@ class _Flight:
         """
         Return states at times after the present one, shape (K, 6 or 13).
 
-        A propagator knows one acceleration a call: an arc is flown in legs at their mean acceleration, and
-        what the rocket equation gives besides is added to the states.
+        A propagator knows one acceleration a call: an arc is flown in legs, each along a parabola near its
+        way, and what the rocket equation gives besides is added to the states.
         """
         thrust = self._thrust
         if thrust is None:
             return self._leg(self._state, self._t_s, times_s, None)
-        legs = math.ceil((times_s[-1] - self._t_s) / THRUST_STEP_S)
+        legs = math.ceil((times_s[-1] - self._t_s) / THRUST_LEG_S)
         edges_s = np.linspace(self._t_s, times_s[-1], legs + 1).tolist()
-        state, flown = self._state, []
+        state, flown = self._state.copy(), []
+        unit = np.array(thrust.acceleration_m_s2)
         for from_s, until_s in pairwise(edges_s):
             inside = [t_s for t_s in times_s if from_s < t_s <= until_s]
             stops_s = inside if until_s in inside else [*inside, until_s]
-            mean = thrust.gains(from_s, until_s)[0] / (until_s - from_s)
-            rows = self._leg(state, from_s, stops_s, scaled(thrust.acceleration_m_s2, mean))
+            lead_s, push = thrust.parabola(from_s, until_s)
+            state[3:6] += lead_s * unit
+            rows = self._leg(state, from_s, stops_s, scaled(thrust.acceleration_m_s2, push))
             for row, t_s in zip(rows, stops_s, strict=True):
                 velocity_s, way_s2 = thrust.gains(from_s, t_s)
                 tau_s = t_s - from_s
-                row[:3] += scaled(thrust.acceleration_m_s2, way_s2 - mean * tau_s * tau_s / 2.0)
-                row[3:6] += scaled(thrust.acceleration_m_s2, velocity_s - mean * tau_s)
+                row[:3] += (way_s2 - (lead_s + push * tau_s / 2.0) * tau_s) * unit
+                row[3:6] += (velocity_s - lead_s - push * tau_s) * unit
             flown += list(rows[: len(inside)])
-            state = rows[-1]
+            state = rows[-1].copy()
         return np.stack(flown)
 
     def _leg(
