@@ -13,6 +13,8 @@ from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.known_hosts import HostKey, Standing, Verdict
 
 UNREACHABLE = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOWN)
+ENDS = (EOFError, ConnectionResetError, BrokenPipeError)
+"""How the other side's end shows, depending on what was under way."""
 BANNER_ERROR = "Error reading SSH protocol banner"
 NO_SESSION = "No existing session"
 NOT_ALLOWED = 1
@@ -33,7 +35,7 @@ def opening_failure(
     """
     if isinstance(error, MachineFailure):
         return error
-    if not has_spoken and isinstance(error, EOFError):  # while paramiko greeted
+    if not has_spoken and isinstance(error, ENDS):  # while paramiko greeted
         return _silent(where)
     if isinstance(error, socket.gaierror):
         return MachineFailure(

@@ -102,8 +102,12 @@ def test_silence_before_a_word_was_heard_is_a_frozen_machine():
     assert "nothing was said in 10 s" in failure.text
 
 
-def test_end_before_a_word_was_heard_is_no_broken_connection():
-    failure = opening_failure(EOFError(), WHERE, 10.0, has_spoken=False)
+@pytest.mark.parametrize(
+    "error", [EOFError(), ConnectionResetError(104, "reset"), BrokenPipeError()]
+)
+def test_end_before_a_word_was_heard_is_no_broken_connection(error):
+    """As of a machine that goes down or just starts: opening is tried again."""
+    failure = opening_failure(error, WHERE, 10.0, has_spoken=False)
 
     assert FailureKind.REFUSED is failure.kind
 
