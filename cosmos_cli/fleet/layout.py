@@ -5,7 +5,8 @@ Where things are below COSMoS's folder on a machine: the one place that knows. P
     <root>/environments/<key>/      virtual environments, by the hash of their lock; whole when `.complete` is there
     <root>/wheels/<sha256>/         wheels that environments were made from
     <root>/runs/<run>-<session>/    what a run records there, until it is collected
-    <root>/state/                   the register of processes, the lock, what was set and what it was before
+    <root>/state/                   the register of processes, the lock, what was set and what it was before,
+                                    what Python compiled of trees and environments
 """
 
 from __future__ import annotations
@@ -47,6 +48,11 @@ class Layout:
     def state(self) -> str:
         """COSMOS_STATE_DIR of everything that runs there."""
         return self._below("state")
+
+    @property
+    def compiled(self) -> str:
+        """Where Python keeps what it compiles, by the path of the source: trees never change."""
+        return self._below("state", "pycache")
 
     @property
     def lock(self) -> str:

@@ -19,6 +19,7 @@ import orjson
 
 from cosmos_cli.fleet.connection import Stream
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.layout import Layout
 from cosmos_cli.fleet.onboard.processes import MARK
 from cosmos_cli.launch.children import ENVIRONMENT, STDERR_BYTES, STDERR_LINES
 from cosmos_cli.launch.events import ProcessKnown, parse_event
@@ -54,8 +55,7 @@ def start_command(program: RemoteProgram, paths: Paths) -> str:
         **paths.variables,
         MARK: program.run_directory,
         "COSMOS_STATE_DIR": paths.state,
-        # Trees never change: what Python compiles goes elsewhere.
-        "PYTHONPYCACHEPREFIX": str(PurePosixPath(paths.root, "state/pycache")),
+        "PYTHONPYCACHEPREFIX": Layout(paths.root).compiled,
     }
     assignments = " ".join(f"{name}={shlex.quote(value)}" for name, value in environment.items())
     script = (

@@ -101,6 +101,7 @@ def installed_request(
             "environments": layout.environments,
             "wheels": layout.wheels,
         },
+        "compiled": layout.compiled,
         "trees": list(trees),
         "environments": list(environments),
         "touch": touch,

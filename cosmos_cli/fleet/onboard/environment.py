@@ -286,7 +286,7 @@ def versions(request: Request) -> dict[str, str | None]:
 
 @verb("prune_installed")
 def prune_installed(request: Request) -> dict[str, Any]:
-    """Remove the trees, environments and wheels that nobody needs."""
+    """Remove the trees, environments and wheels that nobody needs, and what Python compiled of them."""
     asked = request.arguments
     folders = {kind: store.expand(path) for kind, path in asked["folders"].items()}
     wanted = {"trees": asked["trees"], "environments": asked["environments"]}
@@ -296,4 +296,9 @@ def prune_installed(request: Request) -> dict[str, Any]:
             keep.remove(os.path.join(folders[kind], name))
     for folder in folders.values():
         keep.remove_left_overs(folder)
+    for kind in wanted:
+        # Python puts what it compiles below that folder under the whole path of the source.
+        compiled = store.expand(asked["compiled"]) + folders[kind]
+        for name in set(store.names_in(compiled)) - set(store.names_in(folders[kind])):
+            keep.remove(os.path.join(compiled, name))
     return removed

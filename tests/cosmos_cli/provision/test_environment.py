@@ -440,6 +440,9 @@ def test_prune_spares_the_wanted_the_newest_and_the_used(machine, house, tmp_pat
         install(machine, environments[-1])
         mark = top_of(machine, environments[-1]) / ".complete"
         os.utime(mark, (1000 + index, 1000 + index))
+        compiled = Path(f"{machine.layout.compiled}{top_of(machine, environments[-1])}/lib/a.pyc")
+        compiled.parent.mkdir(parents=True)
+        compiled.touch()
     wanted, used = environments[0], environments[1]
     request = installed_request(machine.layout, trees=[], environments=[wanted.key])
     command = [machine.layout.python(used.key), "-c", "input()"]
@@ -456,6 +459,8 @@ def test_prune_spares_the_wanted_the_newest_and_the_used(machine, house, tmp_pat
     assert {path.name for path in Path(machine.layout.environments).iterdir()} == {
         environment.key for environment in environments
     } - gone
+    compiled = Path(f"{machine.layout.compiled}{machine.layout.environments}")
+    assert {path.name for path in compiled.iterdir()} == {e.key for e in environments} - gone
     kept = {path.name for path in Path(machine.layout.wheels).iterdir()}
     assert {e.lock[0].sha256 for e in environments if e.key not in gone} == kept
 
