@@ -158,22 +158,19 @@ def host_key_failure(
             "compare it with `ssh-keygen -lf /etc/ssh/ssh_host_*_key.pub` there, then record it with"
             " --accept-new-host-keys, or log in once with ssh",
         )
-    place = f" ({verdict.against.file}:{verdict.against.line})" if verdict.against else ""
+    old = verdict.against
+    assert old is not None  # who says more than "unknown" says by which line
+    place = f"({old.file}:{old.line})"
     if verdict.standing is Standing.REVOKED:
         return MachineFailure(
             FailureKind.HOST_KEY_CHANGED,
-            f"{where}: its host key is revoked{place}: {shown}",
+            f"{where}: its host key is revoked {place}: {shown}",
             "do not use that machine before you know who has its key",
         )
-    expected = f", expected {_words(verdict)}" if verdict.against else ""
     return MachineFailure(
         FailureKind.HOST_KEY_CHANGED,
-        f"{where}: its host key has changed: got {shown}{expected}{place}",
+        f"{where}: its host key has changed: got {shown},"
+        f" expected {old.key.kind} {old.key.fingerprint} {place}",
         "somebody else may answer there; if the machine was installed anew, forget the old key with"
-        f" `ssh-keygen -R '{names[0]}'` and accept the new one",
+        f" `ssh-keygen -R '{names[0]}' -f {old.file}` and accept the new one",
     )
-
-
-def _words(verdict: Verdict) -> str:
-    assert verdict.against is not None
-    return f"{verdict.against.key.kind} {verdict.against.key.fingerprint}"

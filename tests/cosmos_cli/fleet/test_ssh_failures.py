@@ -137,7 +137,7 @@ def test_changed_host_key_names_both_keys_the_line_and_the_danger():
     assert KEY.fingerprint in failure.text
     assert LINE.key.fingerprint in failure.text
     assert "known_hosts:7" in failure.text
-    assert "ssh-keygen -R '[pi]:2222'" in failure.advice
+    assert f"ssh-keygen -R '[pi]:2222' -f {LINE.file}" in failure.advice
     assert "--accept-new-host-keys" not in failure.advice
 
 
