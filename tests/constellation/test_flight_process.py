@@ -16,7 +16,8 @@ from madns_runtime.errors import BlamedError
 from madns_runtime.plugin.api import Tick
 from madns_runtime.simulations.constellation.agent import ConstellationAgent
 from madns_runtime.simulations.constellation.flight import line_process
-from madns_runtime.simulations.constellation.flight.process import LOG_LINES_MAX, UNANSWERED_MAX
+from madns_runtime.simulations.constellation.flight.line_process import TALK_LINES_MAX
+from madns_runtime.simulations.constellation.flight.process import LATE_CHECK, UNANSWERED_MAX
 from madns_runtime.simulations.constellation.messages import (
     Command,
     CommandResult,
@@ -72,7 +73,7 @@ class Ship:
         self.agent = ConstellationAgent()
         self.agent.setup(self.context, initial.to_message())
         self._next = 0
-        self.summary = None
+        self.summary = self.late = None
 
     @property
     def process(self):
@@ -97,7 +98,9 @@ class Ship:
         return self
 
     def __exit__(self, *_error):
-        self.summary = self.agent.finish()["flight"]
+        summary = self.agent.finish()
+        self.summary = summary["flight"]
+        self.late = {check["name"]: check for check in summary["checks"]}.get(LATE_CHECK)
         assert not Path(f"/proc/{self.process.pid}").exists()
 
     def commands(self):
@@ -194,9 +197,12 @@ print(json.dumps({"send": [{"to": "*", "payload": [1, "x"]}],
         ('\'{"commands": [{"at_s": 1}]}\'', "one of delta_v_m_s, torque_n_m, ballistic_m2_kg"),
         ('\'{"commands": [{"delta_v_m_s": [0, 0, 0]}]}\'', "with at_s, delta_v_m_s"),
         ('\'{"commands": [{"delta_v_m_s": [0, 0], "at_s": 1}]}\'', "three numbers in m/s"),
-        ('\'{"send": [{"to": "x"}]}\'', "expected a key 'payload'"),
+        ('\'{"send": [{"to": "x"}]}\'', "a message with payload, to, got to;"),
+        ('\'{"send": [{"to": "x", "payload": 1, "when": 2}]}\'', "got to, payload, when"),
+        ('\'{"log": [{"text": "x"}]}\'', "words to log with level, text, got text"),
+        ("'{\"estimate\": []}'", "a mapping of 1 to 64"),
         ("'{\"estimate\": 3}'", "a mapping of 1 to 64"),
-        ("'{}\\n{}'", "one line for each tick"),
+        ("'{}\\n{}'", "one line for each tick and none for the setup"),
         ("'{\"t_s\": 7.5}'", "the answer to the tick at 0 s, got 7.5"),
         ('\'{"t_s": "x"}\'', "it wrote"),
         ("'x' * 300_000", "lines of at most|a JSON object"),
@@ -252,6 +258,8 @@ print(json.dumps({{"estimate": {{"of_t": tick["t_s"]}}}}), flush=True)
     assert [of_t for _, of_t in rows[:5]] == [0.0, 0.1, 0.2, 0.3, 0.4]
     assert all(tick >= 5 for tick, _ in rows)
     assert ship.summary["answers_late"] == ship.summary["answers"] >= 5
+    assert ship.late["got"] >= 5
+    assert not ship.late["passed"]
 
 
 def test_a_program_that_falls_behind_is_sent_no_more_than_it_can_hold(tmp_path):
@@ -263,11 +271,29 @@ def test_a_program_that_falls_behind_is_sent_no_more_than_it_can_hold(tmp_path):
     assert ship.summary["ticks_sent"] == UNANSWERED_MAX
     assert ship.summary["ticks_skipped"] == 30
     assert ship.summary["unanswered"] == UNANSWERED_MAX
+    # Patience has not run out for those that were sent.
+    assert ship.late == {"name": LATE_CHECK, "limit": 0, "got": 30, "passed": False}
+
+
+def test_a_program_that_never_answers_breaks_a_check(tmp_path):
+    command = program(tmp_path, "pass")
+    with Ship(tmp_path, command, is_lockstep=False, flight={"answer_s": 1e-6}) as ship:
+        ship.run(5)
+
+    assert ship.late == {"name": LATE_CHECK, "limit": 0, "got": 5, "passed": False}
+
+
+def test_one_that_answers_in_time_breaks_none(tmp_path):
+    command = program(tmp_path, "print('{}', flush=True)")
+    with Ship(tmp_path, command, is_lockstep=False) as ship:
+        ship.run_until(lambda: ship.agent._cockpit._pilot._software._counts["answers"] >= 3)
+
+    assert ship.late == {"name": LATE_CHECK, "limit": 0, "got": 0, "passed": True}
 
 
 def test_what_it_says_on_standard_error_is_logged_within_bounds(tmp_path):
     body = f"""
-for n in range({LOG_LINES_MAX + 10}):
+for n in range({TALK_LINES_MAX + 10}):
     print("word", n, file=sys.stderr)
 sys.stderr.flush()
 print("{{}}", flush=True)
@@ -276,8 +302,26 @@ print("{{}}", flush=True)
         ship.run(1)
 
     words = [text for _, text in ship.context.logs if ": word " in text]
-    assert len(words) == LOG_LINES_MAX
-    assert ship.summary["log_lines"] == LOG_LINES_MAX + 10
+    assert len(words) == TALK_LINES_MAX
+    assert ship.summary["log_lines"] == TALK_LINES_MAX + 10
+    assert [level for level, text in ship.context.logs if "no more of its words" in text] == [
+        "warning"
+    ]
+
+
+def test_a_word_on_standard_error_without_end_holds_nobody_up(tmp_path):
+    body = """
+sys.stderr.write("x" * 60_000)
+sys.stderr.flush()
+print("{}", flush=True)
+"""
+    with Ship(tmp_path, program(tmp_path, body)) as ship:
+        ship.run(20)
+
+    assert ship.summary["answers"] == 20
+    assert ship.summary["log_lines"] == 1
+    logged = [text for _, text in ship.context.logs if text.endswith("x")]
+    assert [text.count("x") for text in logged] == [500 + sys.executable.count("x")]
 
 
 def test_a_program_that_does_not_end_with_its_input_is_stopped(tmp_path, monkeypatch):
@@ -285,6 +329,8 @@ def test_a_program_that_does_not_end_with_its_input_is_stopped(tmp_path, monkeyp
     text = """
 import signal, sys, time
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
+sys.stdin.readline()
+sys.stdin.readline()
 print("{}", flush=True)
 while True:
     time.sleep(1)
@@ -295,6 +341,15 @@ while True:
 
     assert ship.summary["exit_code"] == -9
     assert [level for level, text in ship.context.logs if "exit code -9" in text] == ["warning"]
+
+
+def test_what_a_program_starts_itself_ends_with_it(tmp_path):
+    script = "sleep 600 & echo $! > pid; read setup; while read tick; do echo '{}'; done"
+    with Ship(tmp_path, ["sh", "-c", script]) as ship:
+        ship.run(2)
+
+    assert ship.summary["exit_code"] == 0
+    _wait_until_gone(int((tmp_path / "pid").read_text()))
 
 
 def test_a_missing_program_is_named_at_set_up(tmp_path):
@@ -315,6 +370,10 @@ def test_a_program_dies_with_its_agents_process(tmp_path):
     os.close(reader)
     os.waitpid(child, 0)
 
+    _wait_until_gone(pid)
+
+
+def _wait_until_gone(pid):
     deadline_s = time.monotonic() + PATIENCE_S
     while _lives(pid):
         assert time.monotonic() < deadline_s

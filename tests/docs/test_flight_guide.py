@@ -11,7 +11,7 @@ import pytest
 from guides import ROOT, blocks, row_keys, spans
 
 from madns_runtime.simulations.constellation.equipment import SensorNoise, Sensors
-from madns_runtime.simulations.constellation.flight import process
+from madns_runtime.simulations.constellation.flight import line_process, process
 from madns_runtime.simulations.constellation.flight.answers import KEYS
 from madns_runtime.simulations.constellation.flight.api import FlightContext, FlightSoftware
 from madns_runtime.simulations.constellation.flight.loading import METHODS
@@ -102,4 +102,5 @@ def test_its_bounds_are_those_of_the_code():
     assert f"{board.MESSAGES_PER_TICK_MAX} messages a tick" in GUIDE
     assert f"{board.PAYLOAD_BYTES_MAX:,} bytes a message" in GUIDE
     assert f"{process.UNANSWERED_MAX} ticks unanswered" in GUIDE
-    assert f"log, {process.LOG_LINES_MAX} lines at most" in " ".join(GUIDE.split())
+    assert f"log, {line_process.TALK_LINES_MAX} lines at most" in " ".join(GUIDE.split())
+    assert f"`{process.LATE_CHECK}`" in GUIDE

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from typing import Any
 
 import orjson
@@ -13,6 +13,8 @@ from madns_runtime.simulations.constellation.flight.api import FlightContext
 TIME_TOLERANCE_S = 1e-5
 """Of the time that an answer names, which may have been printed with six decimals."""
 KEYS = frozenset({"t_s", "commands", "send", "estimate", "log"})
+SENDING = {"to", "payload"}
+LOGGING = {"level", "text"}
 COMMANDS = {
     "delta_v_m_s": ({"delta_v_m_s", "at_s"}, {"frame"}),
     "torque_n_m": ({"torque_n_m", "at_s", "duration_s"}, set()),
@@ -40,16 +42,17 @@ def carry_out(line: bytes, context: FlightContext, program: str, *, t_s: float) 
         for command in answer.get("commands", ()):
             _command(command, context)
         for message in answer.get("send", ()):
+            _check_keys("a message", message, SENDING)
             context.send(message["to"], message["payload"])
-        if estimate := answer.get("estimate"):
-            context.estimate(estimate)
+        if answer.get("estimate") not in (None, {}):
+            context.estimate(answer["estimate"])
         for words in answer.get("log", ()):
+            _check_keys("words to log", words, LOGGING)
             context.log(words["level"], words["text"])
     except orjson.JSONDecodeError as error:
         raise BlamedError(f"{program}: expected a JSON object, got {_shown(line)}") from error
-    except (PluginError, KeyError, TypeError) as error:
-        told = f"expected a key {error}" if isinstance(error, KeyError) else str(error)
-        raise BlamedError(f"{program}: {told}; it wrote {_shown(line)}") from error
+    except (PluginError, TypeError) as error:
+        raise BlamedError(f"{program}: {error}; it wrote {_shown(line)}") from error
 
 
 def _check(answer: Any, t_s: float) -> None:
@@ -72,11 +75,7 @@ def _command(command: Mapping[str, Any], context: FlightContext) -> None:
     told = [key for key in COMMANDS if key in command]
     if len(told) != 1:
         raise PluginError(f"expected a command with one of {', '.join(COMMANDS)}")
-    must, may = COMMANDS[told[0]]
-    if not must <= set(command) <= must | may:
-        raise PluginError(
-            f"expected a command with {', '.join(sorted(must))}, got {', '.join(command)}"
-        )
+    _check_keys("a command", command, *COMMANDS[told[0]])
     at_s = command["at_s"]
     if told[0] == "delta_v_m_s":
         context.delta_v(command["delta_v_m_s"], at_s=at_s, frame=command.get("frame", "rtn"))
@@ -84,6 +83,15 @@ def _command(command: Mapping[str, Any], context: FlightContext) -> None:
         context.torque(command["torque_n_m"], at_s=at_s, duration_s=command["duration_s"])
     else:
         context.ballistic(command["ballistic_m2_kg"], at_s=at_s)
+
+
+def _check_keys(
+    what: str, item: Mapping[str, Any], must: set[str], may: Set[str] = frozenset()
+) -> None:
+    if not must <= set(item) <= must | may:
+        raise PluginError(
+            f"expected {what} with {', '.join(sorted(must))}, got {', '.join(item) or 'nothing'}"
+        )
 
 
 def _shown(line: bytes) -> str:

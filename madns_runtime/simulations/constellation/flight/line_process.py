@@ -2,7 +2,7 @@
 A program that speaks lines: started, written to and read from without ever blocking.
 
 The pipes end when either side does, so that neither outlives the other for long; the kernel kills the
-program when the agent's own process dies.
+program when the agent's own process dies. What it starts itself ends with it.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import signal
 import subprocess
 from collections import deque
 from collections.abc import Sequence
@@ -23,6 +24,10 @@ from madns_runtime.simulations.constellation.flight.programs import find_program
 
 LINE_BYTES_MAX = 262_144
 """Of one line; a longer one is no answer."""
+TALK_LINES_MAX = 1000
+"""Lines of its standard error that are kept; further ones are counted."""
+TALK_LINE_BYTES_MAX = 500
+"""Of one of them; the rest of it is dropped."""
 WAITING_BYTES_MAX = 1_048_576
 """Written, but not taken by the program yet."""
 READ_BYTES = 65_536
@@ -68,7 +73,7 @@ class LineProcess:
         assert self._process.stdin and self._process.stdout and self._process.stderr
         self._in = self._process.stdin.fileno()
         self._out = _Lines(self._process.stdout.fileno())
-        self._err = _Lines(self._process.stderr.fileno())
+        self._err = _Talk(self._process.stderr.fileno())
         os.set_blocking(self._in, False)
         self._waiting = bytearray()
 
@@ -100,16 +105,21 @@ class LineProcess:
         return self._out.take()
 
     def talk(self) -> list[bytes]:
-        """Return the lines of its standard error by now; never waits."""
+        """Return what is new of the first TALK_LINES_MAX lines of its standard error; never waits."""
         self._err.read()
         return self._err.take()
+
+    @property
+    def talk_lines(self) -> int:
+        """Lines of its standard error, also of those that nobody kept."""
+        return self._err.lines
 
     def wait(self, timeout_s: float) -> None:
         """Wait until it writes, ends, or talks; or until the time is over."""
         poller = select.poll()
-        for lines in (self._out, self._err):
-            if not lines.is_closed:
-                poller.register(lines.fd, select.POLLIN)
+        for stream in (self._out, self._err):
+            if not stream.is_closed:
+                poller.register(stream.fd, select.POLLIN)
         if self._waiting:
             poller.register(self._in, select.POLLOUT)
         poller.poll(max(0.0, timeout_s) * 1e3)
@@ -128,18 +138,22 @@ class LineProcess:
             return "closed its standard output"
         return f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
 
-    def end(self) -> int | None:
+    def end(self, *, is_patient: bool = True) -> int | None:
         """
         End it: its input ends, then it is asked by SIGTERM, then killed; returns its exit code.
 
         Waits for at most three times END_S; what it still writes meanwhile is read and kept.
+
+        Args:
+            is_patient: False kills it at once.
         """
         process = self._process
-        for stop in (self._close_input, process.terminate, process.kill):
-            with contextlib.suppress(ProcessLookupError):
-                stop()
+        gentle = (self._close_input, process.terminate) if is_patient else ()
+        for stop in (*gentle, self._kill_all):
+            stop()
             if self._has_gone_by(monotonic() + END_S):
                 break
+        self._kill_all()  # what it started and left behind
         for stream in (process.stdout, process.stderr):
             if stream is not None:
                 stream.close()
@@ -162,6 +176,11 @@ class LineProcess:
         if self._process.stdin is not None:
             with contextlib.suppress(OSError):
                 self._process.stdin.close()
+
+    def _kill_all(self) -> None:
+        """Kill it and what it started: they are a group of their own."""
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, signal.SIGKILL)
 
     def _push(self) -> None:
         while self._waiting:
@@ -217,4 +236,44 @@ class _Lines:
             return []
         lines = list(self._found)
         self._found.clear()
+        return lines
+
+
+class _Talk:
+    """Lines of a standard error: the first ones are kept, all are counted, and reading never stops."""
+
+    def __init__(self, fd: int) -> None:
+        os.set_blocking(fd, False)
+        self.fd = fd
+        self.is_closed = False
+        self.lines = 0
+        self._kept = 0
+        self._is_in_line = False
+        self._rest = b""
+        self._found: list[bytes] = []
+
+    def read(self) -> None:
+        """Read what is there, a bounded amount of it."""
+        if self.is_closed:
+            return
+        try:
+            data = os.read(self.fd, READ_BYTES)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self.is_closed = True
+            data = b"\n" if self._is_in_line else b""
+        self._is_in_line = not data.endswith(b"\n")
+        self.lines += data.count(b"\n")
+        if self._kept < TALK_LINES_MAX:
+            *lines, rest = (self._rest + data).split(b"\n", TALK_LINES_MAX - self._kept)
+            self._rest = rest[:TALK_LINE_BYTES_MAX]
+            self._kept += len(lines)
+            self._found += [line[:TALK_LINE_BYTES_MAX] for line in lines]
+
+    def take(self) -> list[bytes]:
+        """Return the lines kept since the last call."""
+        lines, self._found = self._found, []
         return lines

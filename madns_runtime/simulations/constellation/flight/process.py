@@ -25,17 +25,19 @@ from madns_runtime.context import clean_text
 from madns_runtime.errors import BlamedError
 from madns_runtime.simulations.constellation.flight.answers import carry_out
 from madns_runtime.simulations.constellation.flight.api import FlightContext, Readings
-from madns_runtime.simulations.constellation.flight.line_process import LineProcess
+from madns_runtime.simulations.constellation.flight.line_process import (
+    TALK_LINES_MAX,
+    LineProcess,
+)
 from madns_runtime.simulations.constellation.messages import CommandResult, Delivery, Refusal
 from madns_runtime.simulations.constellation.parameters import FlightProcess
 
+LATE_CHECK = "constellation.flight_answers_late"
+"""Ticks that were answered later than answer_s, or never, or not sent to a program that was behind."""
 UNANSWERED_MAX = 64
 """Ticks under way to the program in real time; further ones are not sent and counted."""
 MAIL_MAX = 1024
 """Messages, results, and refusals, that wait for the next tick that is sent; older ones are dropped and counted."""
-LOG_LINES_MAX = 1000
-"""Lines of the program's standard error in the log of one run."""
-LOG_CHARACTERS_MAX = 500
 
 
 class ExternalFlight:
@@ -64,8 +66,8 @@ class ExternalFlight:
             "answers": 0,
             "answers_late": 0,
             "mail_dropped": 0,
-            "log_lines": 0,
         }
+        self._has_told_all = False
 
     def setup(self, context: FlightContext) -> None:
         """
@@ -121,22 +123,31 @@ class ExternalFlight:
             if self._is_lockstep:
                 self._await_answer(t_s)
         except BlamedError:
-            self._process.end()
+            # At once: other agents may tick in this process.
+            self._process.end(is_patient=False)
+            self._log_talk()
             raise
 
     def finish(self) -> Mapping[str, Any]:
-        """End the program, and return what came of it."""
+        """End the program, and return what came of it; in real time what was late is judged."""
+        late_s = monotonic() - self._settings.answer_s
+        overdue = sum(sent_s < late_s for sent_s, _ in self._asked)
         code = self._process.end()
         self._log_talk()
         if code != 0:
             self._context.log("warning", f"{self._process.name} ended with exit code {code}")
+        counts = self._counts
         summary: dict[str, Any] = {
-            **self._counts,
+            **counts,
+            "log_lines": self._process.talk_lines,
             "unanswered": len(self._asked),
             "exit_code": code,
         }
         if not self._is_lockstep:  # where no summary depends on a clock
             summary["answer_s_max"] = round(self._answer_s_max, 6)
+            late = counts["answers_late"] + counts["ticks_skipped"] + overdue
+            check = {"name": LATE_CHECK, "limit": 0, "got": late, "passed": late == 0}
+            summary["checks"] = [check]
         return summary
 
     def _send(self, t_s: float, readings: Readings) -> None:
@@ -175,8 +186,8 @@ class ExternalFlight:
         process, counts = self._process, self._counts
         if not self._asked:
             raise BlamedError(
-                f"{process.name}: expected one line for each tick, got another one before {t_s:g} s: "
-                f"{clean_text(repr(line[:200]))}"
+                f"{process.name}: expected one line for each tick and none for the setup, got another "
+                f"one before {t_s:g} s: {clean_text(repr(line[:200]))}"
             )
         sent_s, asked_s = self._asked.popleft()
         took_s = monotonic() - sent_s
@@ -200,16 +211,12 @@ class ExternalFlight:
 
     def _log_talk(self) -> None:
         """Log what the program says on its standard error, as far as that is bounded."""
-        counts = self._counts
-        for line in self._process.talk():
-            counts["log_lines"] += 1
-            if counts["log_lines"] <= LOG_LINES_MAX:
-                text = line[:LOG_CHARACTERS_MAX].decode("utf-8", "replace")
-                self._context.log("info", f"{self._process.name}: {text}")
-            elif counts["log_lines"] == LOG_LINES_MAX + 1:
-                self._context.log(
-                    "warning", f"{self._process.name}: no more of its words are logged"
-                )
+        process = self._process
+        for line in process.talk():
+            self._context.log("info", f"{process.name}: {line.decode('utf-8', 'replace')}")
+        if process.talk_lines > TALK_LINES_MAX and not self._has_told_all:
+            self._has_told_all = True
+            self._context.log("warning", f"{process.name}: no more of its words are logged")
 
 
 def _to_plain(value: Any) -> Any:
