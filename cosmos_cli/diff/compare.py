@@ -8,7 +8,7 @@ from fnmatch import fnmatchcase
 from typing import Any
 
 from cosmos_cli.diff.constellation import Constellation, ConstellationDifference
-from cosmos_cli.diff.recorded import Key, Lines, Recorded
+from cosmos_cli.diff.recorded import Key, Recorded
 from cosmos_cli.diff.settings import OF_THE_RUN, KeyDifference, differing_keys
 from cosmos_cli.diff.side import Side, check_comparable
 from cosmos_cli.diff.stream import (
@@ -171,7 +171,7 @@ def _compare_streams(
     for key, size in zip(common, sizes, strict=True):
         progress(f"comparing {key[1]}/{key[0]}", done / total)
         pairing = choose_pairing(of_a[key].fields, of_b[key].fields, (a.tick_hz, b.tick_hz))
-        found = _compare_one(result, (of_a[key], of_b[key]), pairing, selection, constellation)
+        found = _compare_one(of_a[key], of_b[key], pairing, selection, constellation)
         result.streams.append(found)
         done += size
     if constellation is not None:
@@ -179,32 +179,20 @@ def _compare_streams(
 
 
 def _compare_one(
-    result: Comparison,
-    pair: tuple[Recorded, Recorded],
+    recorded: Recorded,
+    other: Recorded,
     pairing: Pairing,
     selection: Selection,
     constellation: Constellation | None,
 ) -> StreamDifference:
-    recorded, other = pair
-    lines = recorded.lines(), other.lines()
-    for side, told in zip((result.a, result.b), lines, strict=True):
-        _note_cut(result, side, told)
-    if lines[0] is not None and lines[1] is not None and lines[0].sha256 == lines[1].sha256:
-        same = identical_stream(recorded, pairing.by, lines[0].records)
+    lines = recorded.lines()
+    if lines is not None and lines == other.lines():
+        same = identical_stream(recorded, pairing.by, lines.records)
         if constellation is not None:
             constellation.take_identical(recorded, same)
         return same
     observe = None if constellation is None else constellation.observer(recorded, pairing)
     return diff_stream(recorded, other, pairing, agents=selection.agents, observe=observe)
-
-
-def _note_cut(result: Comparison, side: Side, lines: Lines | None) -> None:
-    """Name streams that were cut, unless the verdict has named them."""
-    for label in lines.cut if lines is not None else ():
-        source = label.split("/", 1)[0]
-        told = any(line.startswith(f"{source}:") for line in side.missing)
-        if not told:
-            result.missing.append(f"{side.run.name}: {label} was cut: it has no end line")
 
 
 def _remarks(a: Side, b: Side) -> list[str]:

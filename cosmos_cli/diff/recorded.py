@@ -18,7 +18,7 @@ from madns_runtime.recording.records import Field
 ROWS_READ_MAX = 16_384
 """Records of one stream that are read at a time."""
 BLOCK_BYTES = 1 << 20
-END_LINE = b'{"end":'
+CONTROL_KEYS = (b'{"t0_utc":', b'{"end":')
 CONTROL_LINE = re.compile(rb'^\{"(?:t0_utc|end)":[^\n]*\n?', re.MULTILINE)
 """Lines that are no records: they tell when a run was, not what was recorded."""
 Key = tuple[str, str]
@@ -32,8 +32,6 @@ class Lines:
     sha256: str
     """Of all records, without the lines that name the run and its time."""
     records: int
-    cut: tuple[str, ...]
-    """Files without an end line: the recorder was cut off."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,19 +85,14 @@ class Recorded:
         """
         if not self.files:
             return None
-        digest, records, cut = hashlib.sha256(), 0, []
+        digest, records = hashlib.sha256(), 0
         for file in self.files:
-            has_end = False
             for block in _record_blocks(file.path):
-                if END_LINE in block or b'{"t0_utc":' in block:
-                    has_end = has_end or block.rpartition(b"\n{")[2].startswith(b'"end":')
-                    has_end = has_end or block.startswith(END_LINE)
+                if any(key in block for key in CONTROL_KEYS):
                     block = CONTROL_LINE.sub(b"", block)  # noqa: PLW2901 - the same block without them
                 digest.update(block)
                 records += block.count(b"\n")
-            if not has_end:
-                cut.append(file.label)
-        return Lines(sha256=digest.hexdigest(), records=records, cut=tuple(cut))
+        return Lines(sha256=digest.hexdigest(), records=records)
 
 
 def recorded_streams(run: RunDirectory) -> dict[Key, Recorded]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from cosmos_cli.diff.recorded import Key, Recorded, recorded_streams
+from cosmos_cli.earlier import Earlier
 from cosmos_cli.errors import InputError
 from cosmos_cli.expectation import mapping_at
 from cosmos_cli.rundir import RunDirectory
+from cosmos_cli.streams import SUFFIX
 from cosmos_cli.verdict import is_number
 
 
@@ -23,6 +25,8 @@ class Side:
     settings: Mapping[str, Any]
     """What every process of the run was told: the scenario with its defaults."""
     streams: Mapping[Key, Recorded]
+    missing: tuple[str, ...]
+    """What of its data is missing or cut, as its verdict names it, or since it was collected."""
 
     @property
     def simulation(self) -> str:
@@ -40,12 +44,6 @@ class Side:
         """Simulated time that the run was to have, s."""
         value = mapping_at(self.settings, "time").get("duration_s")
         return float(value) if is_number(value) else 0.0
-
-    @property
-    def missing(self) -> tuple[str, ...]:
-        """What of its data is missing or cut, as its verdict names it."""
-        lines = mapping_at(self.document, "data").get("missing", ())
-        return tuple(str(line) for line in lines)
 
 
 def open_side(run: RunDirectory, given: str) -> Side:
@@ -68,7 +66,26 @@ def open_side(run: RunDirectory, given: str) -> Side:
             f"{run.plan_json}: expected the run's settings under config, found none;"
             f" without them {run.name} cannot be compared"
         )
-    return Side(run=run, document=document, settings=settings, streams=recorded_streams(run))
+    told = mapping_at(document, "data").get("missing", ())
+    return Side(
+        run=run,
+        document=document,
+        settings=settings,
+        streams=recorded_streams(run),
+        missing=(*map(str, told), *_changed_since(run)),
+    )
+
+
+def _changed_since(run: RunDirectory) -> Iterator[str]:
+    """Tell of streams that are gone, or have another length than the manifest says."""
+    for name, entry in Earlier.read(run).entries.items():
+        if not name.endswith(SUFFIX):
+            continue
+        path, was = run.path / name, entry.get("bytes")
+        if not path.is_file():
+            yield f"{name}: missing; it was there when the run was collected"
+        elif (now := path.stat().st_size) != was:
+            yield f"{name}: changed since the run was collected ({now} bytes, were {was})"
 
 
 def check_comparable(a: Side, b: Side) -> None:

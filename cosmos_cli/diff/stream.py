@@ -185,7 +185,7 @@ def diff_stream(
         _take(found, piece)
         if observe is not None:
             observe(a.source, piece)
-    found.is_identical = found.has_same_values and not (a.files and b.files)
+    found.is_identical = found.has_same_values and not (a.files or b.files)
     return found
 
 

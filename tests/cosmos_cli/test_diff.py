@@ -161,6 +161,32 @@ def test_cut_data_are_named_and_never_the_same(make, capsys):
     assert alone["last"] == {"key": TICKS - 1.0, "who": "agent-03"}
 
 
+@pytest.mark.parametrize("has_tables", [True, False])
+@pytest.mark.parametrize(
+    ("harm", "words"),
+    [
+        (lambda path: path.unlink(), "missing; it was there"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-200]), "changed since"),
+        (lambda path: path.write_bytes(b""), "changed since"),
+    ],
+)
+def test_data_that_went_after_the_collection_are_named_and_never_the_same(
+    make, capsys, harm, words, has_tables
+):
+    make()
+    harmed = make()
+    harm(harmed.stream("agent-03", "state"))
+    if not has_tables:
+        shutil.rmtree(harmed.run.tables)
+
+    code, document = diff(capsys, "1", "2", "--expect-same")
+
+    assert (code, document["same"]) == (1, False)
+    (line,) = document["missing"]
+    assert line.startswith("0002-synthetic: agents/agent-03/state.jsonl: ")
+    assert words in line
+
+
 def test_what_the_framework_recorded_is_compared_when_it_is_named(make, capsys):
     make(), make(lambda made: change_record(made, stream="ticks", field=1))
 
