@@ -135,12 +135,19 @@ def _common_choice(members: Sequence[Sequence[Located]]) -> Located | None:
     return Located(first.path, (), {**first.error, "ctx": context})
 
 
-def _distance(errors: Sequence[Located]) -> tuple[int, int]:
+def _distance(errors: Sequence[Located]) -> tuple[int, int, int]:
     decisive = sum(
         item.error["type"] in ("literal_error", *_UNKNOWN) or item.path == item.branch[:-1]
         for item in errors
     )
-    return decisive, len(errors)
+    return sum(map(_is_tag, errors)), decisive, len(errors)
+
+
+def _is_tag(item: Located) -> bool:
+    """Tell whether a key has another value than the one by which this member is told from others."""
+    if item.error["type"] != "literal_error" or len(item.path) != len(item.branch):
+        return False
+    return " or " not in str(item.error["ctx"]["expected"])
 
 
 def _fault(document: Document, item: Located, model: Any, below: Path) -> Fault:

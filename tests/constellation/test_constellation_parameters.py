@@ -5,6 +5,7 @@ import pytest
 from constellation_fakes import IRIDIUM, SCENARIOS, WALKER, parameters
 from pydantic import TypeAdapter, ValidationError
 
+from cosmos_cli.errors import InputError
 from cosmos_cli.models.loading import load_scenario
 from madns_runtime.config import from_mapping, to_mapping
 from madns_runtime.errors import ConfigurationError
@@ -338,3 +339,17 @@ def test_the_shipped_scenarios_load_without_faults(name):
     scenario = load_scenario(SCENARIOS / f"{name}.yaml")
 
     assert scenario is not None
+
+
+def test_a_force_that_a_propagator_lacks_is_told_at_the_force(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text(
+        "name: a\nsimulation: constellation\nagents: {count: 1}\nparameters:\n"
+        "  satellites: {walker: '86.4:66/6/2', altitude_km: 780}\n"
+        "  propagator: {kind: basilisk, forces: [two_body, drag]}\n"
+    )
+
+    with pytest.raises(InputError) as error:
+        load_scenario(path)
+
+    assert ":6:51: parameters.propagator.forces[1]: expected two_body or j2" in str(error.value)
