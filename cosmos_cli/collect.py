@@ -22,6 +22,7 @@ from cosmos_cli.bundle import pack_run
 from cosmos_cli.earlier import Earlier
 from cosmos_cli.errors import ExitCode, RunFailedError
 from cosmos_cli.expectation import HOST, Expected, find_missing, mapping_at
+from cosmos_cli.fleet.onboard.living import words_of
 from cosmos_cli.gather import Gathered, Progress, gather
 from cosmos_cli.manifest import build_manifest
 from cosmos_cli.problem import Problem, problems_of_run
@@ -174,7 +175,7 @@ def refuse_living(run: RunDirectory, processes: Sequence[ProcessEntry]) -> None:
         InputError: It does; the message names who.
     """
     living = [
-        f"{entry.role} {entry.name} (pid {entry.pid})"
+        words_of(entry)
         for entry in processes
         if Path(entry.run_directory).resolve().is_relative_to(run.path)
     ]
@@ -239,7 +240,6 @@ def _conclude(
     packed = _attempt(evidence, run.bundle, lambda: pack_run(run, _start_s(document)))
     if packed is not evidence:
         summary = _write_summary(run, gathered, packed)
-    progress("packing", 1.0)
     return summary
 
 

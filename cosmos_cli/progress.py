@@ -51,6 +51,7 @@ def _plain_lines(console: Console, title: str) -> Callable[[str, float], None]:
         step = what.split(" ", 1)[0]
         if step not in told or share - told[step] >= STEP:
             told[step] = share
-            console.say(f"{title}: {what} ({share:.0%})")
+            how_far = f" ({share:.0%})" if share else ""  # of some steps nobody knows
+            console.say(f"{title}: {what}{how_far}")
 
     return tell

@@ -247,6 +247,11 @@ def _conclude(
     if status == "interrupted":
         if facts.host_status in ("failed", "aborted"):  # it was ending already, and had a cause
             return ExitCode.INTERRUPTED, f"INTERRUPTED by the operator, after {blame}"
+        if facts.who not in (
+            None,
+            "operator",
+        ):  # as by `cosmos down`, when there was no operator to ask
+            return ExitCode.INTERRUPTED, f"INTERRUPTED: {blame}"
         return ExitCode.INTERRUPTED, f"INTERRUPTED by {facts.who or 'the operator'}"
     if status != "complete":
         return ExitCode.RUN_FAILED, f"{status.upper()}: {blame}"

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
 from typing import Self, TypeVar
 
+from cosmos_cli.counted import counted
 from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.connection import Connection, ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
@@ -97,9 +98,9 @@ class Retrieval:
         self._run = run
         self._options = options
         self._forks = forks
-        self._tally = _Tally(progress)
         self._given = dict(connections or {})
         self._sources = Sources.read(run)
+        self._tally = _Tally(progress, len(self.due))
         self._claims = Claims(run, self._sources)
         self._visits: dict[str, _Visit] = {}
         self._failures: dict[str, MachineFailure] = {}
@@ -226,9 +227,10 @@ class _Visit:
 class _Tally:
     """Adds up what all machines' accounts tell, and passes it on at a rate that eyes can follow."""
 
-    def __init__(self, progress: Progress) -> None:
+    def __init__(self, progress: Progress, machines: int) -> None:
         self.is_over = False
         self._progress = progress
+        self._what = f"retrieving from {counted(machines, 'machine')}"
         self._lock = threading.Lock()
         self._bytes: dict[str, tuple[int, int]] = {}
         self._told_s = 0.0
@@ -247,7 +249,7 @@ class _Tally:
                     here, total = (
                         sum(values) for values in zip(*self._bytes.values(), strict=True)
                     )
-                    self._progress(f"retrieving {machine}", here / max(total, 1))
+                    self._progress(self._what, here / max(total, 1))
 
         return tell
 

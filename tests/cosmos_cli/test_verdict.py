@@ -30,6 +30,20 @@ def test_nothing_wrong_is_green():
 
 
 @pytest.mark.parametrize(
+    ("who", "reason", "text"),
+    [
+        ("operator", "interrupted by the operator", "INTERRUPTED by operator"),
+        (None, None, "INTERRUPTED by the operator"),
+        ("host", "ended by SIGTERM", "INTERRUPTED: host: ended by SIGTERM"),
+    ],
+)
+def test_interrupted_run_says_by_whom_or_how(who, reason, text):
+    verdict = judged(host_status="interrupted", who=who, reason=reason)
+
+    assert verdict.text == text
+
+
+@pytest.mark.parametrize(
     ("changes", "code", "status"),
     [
         ({"interrupted": True}, 130, "interrupted"),

@@ -68,7 +68,8 @@ def read_register(state: str) -> list[ProcessEntry]:
 
 def words_of(entry: ProcessEntry) -> str:
     """Return a process as a person is told of it."""
-    return f"{entry.role} {entry.name} (pid {entry.pid})"
+    name = entry.name if entry.name == entry.role else f"{entry.role} {entry.name}"
+    return f"{name} (pid {entry.pid})"
 
 
 def is_within(path: str, directory: str) -> bool:
