@@ -23,7 +23,7 @@ from madns_runtime.recording.records import StreamSchema
 LINES_PER_WRITE_MAX = 1024
 LINE_OVERHEAD_BYTES = 56
 """What a waiting line costs beside its text: the bytes object and its place in the list."""
-SUFFIX_MAX = 10_000
+FILES_MAX = 10_000
 NAME_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 CONTROL_KEYS = ("end", "t0_utc")
 
@@ -46,14 +46,14 @@ def check_schema(schema: StreamSchema) -> None:
         raise PluginError(f"stream {schema.name}: a single field may not be named {names[0]}")
 
 
-def create_file(directory: Path, name: str, suffix: str) -> tuple[Path, int, int]:
+def create_file(directory: Path, name: str, first: int) -> tuple[Path, int, int]:
     """
     Create the stream's file under the first name that is still free.
 
     Args:
         directory: Where to.
         name: The stream's.
-        suffix: A number to begin with, or a word; empty for <name>.jsonl.
+        first: The number to begin with; 1 is <name>.jsonl, 2 is <name>.2.jsonl.
 
     Returns:
         The file's path, its descriptor, and the number that it got.
@@ -61,7 +61,7 @@ def create_file(directory: Path, name: str, suffix: str) -> tuple[Path, int, int
     Raises:
         MachineError: The directory takes no new file.
     """
-    for number, path in _candidates(directory, name, suffix):
+    for number, path in _candidates(directory, name, first):
         try:
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
             return path, os.open(path, flags, 0o644), number
@@ -69,15 +69,12 @@ def create_file(directory: Path, name: str, suffix: str) -> tuple[Path, int, int
             continue
         except OSError as error:
             raise MachineError(f"{path}: cannot record there: {error.strerror}") from error
-    raise MachineError(f"{directory}: holds {SUFFIX_MAX} files of stream {name}; clear it out")
+    raise MachineError(f"{directory}: holds {FILES_MAX} files of stream {name}; clear it out")
 
 
-def _candidates(directory: Path, name: str, suffix: str) -> Iterator[tuple[int, Path]]:
-    stem, first = (name, int(suffix)) if suffix.isdecimal() else (name, 1)
-    if suffix and not suffix.isdecimal():
-        stem = f"{name}.{suffix}"
-    for number in range(first, first + SUFFIX_MAX):
-        yield number, directory / (f"{stem}.jsonl" if number == 1 else f"{stem}.{number}.jsonl")
+def _candidates(directory: Path, name: str, first: int) -> Iterator[tuple[int, Path]]:
+    for number in range(first, first + FILES_MAX):
+        yield number, directory / (f"{name}.jsonl" if number == 1 else f"{name}.{number}.jsonl")
 
 
 class StreamFile:

@@ -12,7 +12,7 @@ import logging
 import math
 import os
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from time import monotonic
@@ -31,6 +31,7 @@ from madns_runtime.recording.stream_file import (
     check_schema,
     create_file,
 )
+from madns_runtime.timing.clock import utc_now_iso
 
 WAKE_BYTES = 65_536
 """The writer is woken early when this much waits."""
@@ -45,9 +46,6 @@ LEVELS = {
 VERBOSITY_LEVELS = (logging.CRITICAL + 1, 50, 40, 30, 20, 10)
 """The least level that recording.verbosity 0 to 5 lets through, as logging numbers them."""
 
-LogEcho = Callable[[str, str], None]
-"""Takes level and text of each sentence that was loud enough to be logged."""
-
 
 class Recorder:
     """
@@ -58,22 +56,14 @@ class Recorder:
         run: Name of the run.
         source: Who records: host, an agent's or a machine's name.
         settings: Bounds, interval and verbosity.
-        log_echo: Called with level and text of what is logged.
         life: Which life of its process this is; files are numbered from it.
 
     Raises:
         MachineError: The directory cannot be made.
     """
 
-    def __init__(  # noqa: PLR0913 - who records, and how; two are optional
-        self,
-        directory: Path,
-        *,
-        run: str,
-        source: str,
-        settings: Recording,
-        log_echo: LogEcho | None = None,
-        life: int = 1,
+    def __init__(
+        self, directory: Path, *, run: str, source: str, settings: Recording, life: int = 1
     ) -> None:
         try:
             directory.mkdir(parents=True, exist_ok=True)
@@ -83,7 +73,6 @@ class Recorder:
         self._run = run
         self._source = source
         self._settings = settings
-        self._log_echo = log_echo
         self._level = VERBOSITY_LEVELS[settings.verbosity]
         self._limit_bytes = settings.buffer_bytes
         self._files: dict[str, StreamFile] = {}
@@ -97,9 +86,9 @@ class Recorder:
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
-    def open_stream(self, schema: StreamSchema, *, suffix: str = "") -> None:
+    def open_stream(self, schema: StreamSchema) -> None:
         """
-        Create the file of a stream: <name>.jsonl, or <name>.<suffix>.jsonl.
+        Create the file of a stream: <name>.jsonl, or <name>.<life>.jsonl of a later life.
 
         An existing file is left alone: the next free of .2, .3, ... is taken. The number that the
         first stream got is where all others begin: it tells which life of the process they are of, also
@@ -112,9 +101,8 @@ class Recorder:
         check_schema(schema)
         if schema.name in self._files:
             raise PluginError(f"stream {schema.name}: declared twice")
-        begin = suffix or str(self._life)
-        path, descriptor, number = create_file(self._directory, schema.name, begin)
-        if not self._files and not suffix:
+        path, descriptor, number = create_file(self._directory, schema.name, self._life)
+        if not self._files:
             self._life = number
         # A new dictionary, so that the writer thread never walks one that changes.
         self._files = {**self._files, schema.name: StreamFile(schema, path, descriptor)}
@@ -190,8 +178,6 @@ class Recorder:
         text = text.encode("utf-8", "backslashreplace").decode("utf-8")
         if LOG.name in self._files:
             self.record(LOG.name, (t_s, self._utc(), level, text))
-        if self._log_echo is not None:
-            self._log_echo(level, text)
 
     def counts(self) -> RecordCounts:
         """Return what was written and dropped until now."""
@@ -237,8 +223,8 @@ class Recorder:
         self._wake.set()
 
     def _utc(self) -> str:
-        """Return the time that a logged sentence carries."""
-        return datetime.now(UTC).isoformat(timespec="milliseconds")
+        """Return the time that events and logged sentences carry."""
+        return utc_now_iso()
 
     def _write_on(self) -> None:
         _schedule_normally()
