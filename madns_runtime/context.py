@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import traceback
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -46,7 +47,6 @@ class RunContext:
         recorder: Where its streams go.
         now_s: Returns the simulated time.
         send: Takes messages.
-        is_lockstep: Whether simulated time waits for everybody.
     """
 
     def __init__(  # noqa: PLR0913 - the collaborators of a seam, all keyword-only
@@ -58,10 +58,9 @@ class RunContext:
         recorder: Recorder,
         now_s: Callable[[], float],
         send: Sender,
-        is_lockstep: bool = False,
     ) -> None:
         self.name = name
-        self.is_lockstep = is_lockstep
+        self.is_lockstep = config.time.is_lockstep
         self.agents = config.agents.resolved_names()
         self.workers = config.executor.workers
         self.parameters = parameters
@@ -93,26 +92,39 @@ class JobContext(RunContext):
     wake: Callable[[float], None]
 
 
-def check_service(service: Service) -> None:
+def check_sending(
+    to: str,
+    receivers: Container[str],
+    service: Service,
+    deadline_s: float | None,
+    *,
+    is_running: bool,
+) -> None:
     """
-    Refuse what is no class of service.
+    Refuse what cannot be sent, or what nobody could keep account of.
+
+    Args:
+        to: The receiver.
+        receivers: Who there is.
+        service: The class of service.
+        deadline_s: Simulated time by which it must be there, s.
+        is_running: Whether simulated time has begun.
 
     Raises:
-        PluginError: It is something else, such as its name.
+        PluginError: There is no such receiver or class of service, or the deadline is none.
     """
+    if to not in receivers:
+        raise PluginError(
+            f"expected a receiver (an agent sends to 'host', the host to an agent's name), got {to!r}"
+        )
     if not isinstance(service, Service):
         raise PluginError(f"expected a Service, such as Service.RELIABLE, got {service!r}")
-
-
-def check_deadline(service: Service, *, is_running: bool) -> None:
-    """
-    Refuse a deadline that nobody could keep account of.
-
-    Raises:
-        PluginError: The class of service has none, or simulated time has not begun.
-    """
+    if deadline_s is None:
+        return
     if service is not Service.SYNC:
         raise PluginError(f"deadline_s goes with Service.SYNC, not with {service!r}")
+    if isinstance(deadline_s, bool) or not math.isfinite(deadline_s):
+        raise PluginError(f"deadline_s: expected a simulated time in seconds, got {deadline_s!r}")
     if not is_running:
         raise PluginError("deadline_s is simulated time, which has not begun")
 

@@ -26,11 +26,11 @@ class HostReport:
     scheduling: Mapping[str, Any] = field(default_factory=dict)
     ending_status: str | None = None
     """What an order of the operator makes of the run."""
-    problems_told: set[str] = field(default_factory=set)
-    """Whose trouble with its records has been told."""
     _who: str | None = None
     _reason: str | None = None
     _completed_s: float | None = None
+    _told: set[str] = field(default_factory=set)
+    """Whose trouble with its records has been told."""
 
     def fail(self, who: str, reason: str) -> None:
         """Keep the first cause."""
@@ -40,6 +40,12 @@ class HostReport:
     def completed(self, t_s: float) -> None:
         """Every agent has run its simulated time, at simulated time *t_s* of the host."""
         self._completed_s = t_s
+
+    def untold(self, problems: Mapping[str, str | None]) -> list[tuple[str, str]]:
+        """Return who has trouble with its records, and which, the first time that it has any."""
+        new = [(who, text) for who, text in problems.items() if text and who not in self._told]
+        self._told.update(who for who, _ in new)
+        return new
 
     def result(self, session: HostSession, *, network: Mapping[str, Any]) -> dict[str, Any]:
         """Return the result as the operator's side expects it; *network* counts the host's socket."""
@@ -77,18 +83,21 @@ def _agent_result(peer: Peer, loss_reason: str | None) -> dict[str, Any]:
         "reason": loss_reason,
         "incarnations": len(peer.incarnations_seen),
         **summary,
-        "messages": _messages(peer, records.pop("messages", None)),
+        "messages": _messages(peer, records.pop("messages", None), records.get("held_dropped", 0)),
         "records": records,
         "simulation": simulation,
     }
 
 
-def _messages(peer: Peer, agent_side: Mapping[str, Any] | None) -> dict[str, Any]:
+def _messages(
+    peer: Peer, agent_side: Mapping[str, Any] | None, held_dropped: int
+) -> dict[str, Any]:
     """
     Join both ends' counters of an agent's link.
 
     The agent counts before its last word, the host after it. Without the agent's own count nobody
-    knows what was lost: None, and a check on it does not hold.
+    knows what was lost: None, and a check on it does not hold. What came while the agent's half was
+    being set up, and was too much to hold (*held_dropped*), never reached it: lost, of whichever class.
     """
     host_side: Mapping[str, Any] = peer.link.counters.to_mapping() if peer.link else {}
     joined: dict[str, Any] = {
@@ -97,6 +106,8 @@ def _messages(peer: Peer, agent_side: Mapping[str, Any] | None) -> dict[str, Any
     joined["sync"]["deadlines_broken"] = host_side.get("deadlines_broken", 0) + (
         agent_side or {}
     ).get("deadlines_broken", 0)
+    if joined["reliable"]["lost"] is not None:
+        joined["reliable"]["lost"] += held_dropped
     joined["not_sent"] = peer.not_sent
     joined["agent"] = dict(agent_side or {})
     joined["host"] = dict(host_side)

@@ -11,19 +11,19 @@ import os
 import signal
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import orjson
 
-from madns_runtime.agent_runner import AgentRunner, Outcome, Program
+from madns_runtime.agent_runner import AgentRunner, Outcome
 from madns_runtime.config import AgentLaunch
 from madns_runtime.context import clean_text
-from madns_runtime.errors import MadnsError
+from madns_runtime.errors import MachineError, MadnsError
+from madns_runtime.half import Program
 from madns_runtime.health.sampler import SAMPLER_TIMEOUT_S, start_sampler, stop_sampler
 from madns_runtime.health.stress import start_stress, stop_stress
-from madns_runtime.plugin.registry import load_half, parse_parameters, resolve
 from madns_runtime.processes import register
 from madns_runtime.reactor.forking import leave_parent
 from madns_runtime.reactor.lines import OPERATOR_SIDE_GONE, OperatorLink
@@ -68,11 +68,8 @@ class Supervisor:
     def __init__(self, launch: AgentLaunch, fds: tuple[int, int], pending: bytes) -> None:
         config = launch.config
         self._launch = launch
-        base = Path(config.base_directory)
-        descriptor = resolve(config.simulation, base)
         # Loaded before the forks: the children share the parent's pages.
-        self._simulation = load_half(descriptor, "agent", base)
-        self._parameters = parse_parameters(descriptor, config.parameters)
+        self._program = Program.load(config, "agent")
         machine_directory = Path(launch.directory) / "machines" / launch.machine
         self._sampler = start_sampler(
             machine_directory,
@@ -126,7 +123,11 @@ class Supervisor:
     def _fork(self, agents: tuple[str, ...], *, incarnation: int) -> Child:
         sys.stdout.flush()
         sys.stderr.flush()
-        pid = os.fork()
+        try:
+            pid = os.fork()
+        except OSError as error:
+            told = f"cannot start the process of {', '.join(agents)}: {error.strerror}"
+            raise MachineError(told) from error
         if pid == 0:
             self._run_child(agents, incarnation)
         child = Child(agents, pid, incarnation)
@@ -141,11 +142,7 @@ class Supervisor:
             process = AgentProcess(
                 self._launch,
                 agents,
-                Program(
-                    simulation=self._simulation,
-                    parameters=self._parameters,
-                    incarnation=incarnation,
-                ),
+                replace(self._program, life=incarnation),
                 life_fd=self._life_read_fd,
             )
             with register(

@@ -138,24 +138,6 @@ class ProcessUsage:
         )
 
 
-_own_usage = ProcessUsage()
-
-
-def _start_anew() -> None:
-    global _own_usage  # noqa: PLW0603  one a process, so a forked one has its own
-    _own_usage = ProcessUsage()
-
-
-os.register_at_fork(after_in_child=_start_anew)
-
-
-def process_usage(
-    t_s: float | None = None,
-) -> tuple[float | None, float, int | None, int, int, int]:
-    """Return one record of the PROCESS stream, CPU since the last call in this process; see `ProcessUsage`."""
-    return _own_usage.read(t_s)
-
-
 def pss_bytes(pid: int) -> int | None:
     """Return a process's proportional share of memory; None if it is gone or may not be looked at."""
     text = _read_text(Path(f"/proc/{pid}/smaps_rollup"))

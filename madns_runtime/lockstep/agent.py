@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from madns_runtime.config import RunConfig
-from madns_runtime.context import RunContext, check_deadline, check_service
-from madns_runtime.errors import PluginError
+from madns_runtime.context import RunContext, check_sending
+from madns_runtime.half import Half, Program
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.frames import POSITIONS, STEPPING, Sent
 from madns_runtime.lockstep.post import Allowance, encode
 from madns_runtime.lockstep.recorder import LockstepRecorder
-from madns_runtime.plugin.api import HOST, AgentSimulation
+from madns_runtime.plugin.api import HOST
 from madns_runtime.protocol.messages import Service
 
 
@@ -25,8 +24,7 @@ class Crewmates:
     config: RunConfig
     directory: Path
     """The run directory."""
-    simulation: Callable[[], AgentSimulation]
-    parameters: Any
+    program: Program
     clock: SimulatedClock
     outbox: list[Sent] = field(default_factory=list)
     """What was sent since the last answer to the host, in order."""
@@ -42,6 +40,7 @@ class LockstepAgent:
 
     Raises:
         MachineError: It cannot record.
+        HalfFailed: Its half cannot be made.
     """
 
     def __init__(self, index: int, mates: Crewmates) -> None:
@@ -55,9 +54,8 @@ class LockstepAgent:
             source=self.name,
             clock=mates.clock,
         )
-        self.simulation = mates.simulation()
-        self.step = self.simulation.step
-        self.receive = self.simulation.receive
+        self.half = Half(mates.program.make, self.recorder.say)
+        self.step = self.half.simulation.step
         self.stepping = index * POSITIONS + STEPPING
         self.is_running = False
         self.deadlines_broken = 0
@@ -65,11 +63,10 @@ class LockstepAgent:
         self.context = RunContext(
             name=self.name,
             config=mates.config,
-            parameters=mates.parameters,
+            parameters=mates.program.parameters,
             recorder=self.recorder,
             now_s=mates.clock.now_s,
             send=self.send,
-            is_lockstep=True,
         )
 
     def send(
@@ -81,12 +78,8 @@ class LockstepAgent:
         deadline_s: float | None = None,
     ) -> None:
         """Send to the host's half; see `plugin.api.Context.send`."""
-        if to != HOST:
-            raise PluginError(f"an agent sends to {HOST!r}, not to {to!r}")
-        check_service(service)
+        check_sending(to, (HOST,), service, deadline_s, is_running=self.is_running)
         t_s = self._clock.t_s
-        if deadline_s is not None:
-            check_deadline(service, is_running=self.is_running)
         body = encode(message, service)
         self._allowance.take(len(body), t_s)
         if deadline_s is not None and deadline_s < t_s:  # it arrives when it is sent

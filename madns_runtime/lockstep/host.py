@@ -12,44 +12,34 @@ import contextlib
 import signal
 from pathlib import Path
 from time import monotonic
-from typing import Any
-
-import orjson
 
 from madns_runtime.config import HostLaunch
-from madns_runtime.context import JobContext, check_deadline, check_service
-from madns_runtime.errors import PluginError
+from madns_runtime.context import JobContext
 from madns_runtime.executor import make_executor
+from madns_runtime.half import HostHalf, Program
 from madns_runtime.lockstep import frames
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.crew import Crew
-from madns_runtime.lockstep.half import HostHalf
+from madns_runtime.lockstep.half import LockstepHalf
 from madns_runtime.lockstep.meeting import Meeting, RunEnds
-from madns_runtime.lockstep.post import Allowance, decode, encode
+from madns_runtime.lockstep.outbox import Outbox
+from madns_runtime.lockstep.post import decode
 from madns_runtime.lockstep.recorder import LockstepRecorder
 from madns_runtime.lockstep.result import Ending, RunAccount
 from madns_runtime.lockstep.shares import processors_here, share_out
-from madns_runtime.plugin import returned
 from madns_runtime.plugin.api import HOST
-from madns_runtime.plugin.registry import load_half, parse_parameters, resolve
 from madns_runtime.protocol.codec import pack
-from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.states import HostEvent, host_machine
 from madns_runtime.reactor.scheduling import freeze_garbage, outlive_parent
 from madns_runtime.reactor.watchdog import end_after_hang_up
+from madns_runtime.result_file import hand_over, leave
 from madns_runtime.timing.clock import utc_now_iso
 from madns_runtime.timing.rate import Pacer
 
-FLUSH_TIMEOUT_S = 5.0
 HANG_GRACE_S = 2.0
 """Beyond twice the time for shutdown: a host that hangs, without an operator, ends by force."""
-TIMER_REPEATS_MAX = 100_000
-"""Calls of the half's timer at one simulated time; more means that it never lets time go on."""
 DRAIN_ROUNDS_MAX = 16
 """Answers to answers that are handed out after the last tick."""
-RESULT_BYTES_MAX = 1024 * 1024
-"""A longer result is not sent to the operator, only named."""
-RESULT_FILE = "result.json"
 
 
 class LockstepHost:
@@ -63,67 +53,54 @@ class LockstepHost:
     """
 
     def __init__(self, launch: HostLaunch, fds: tuple[int, int], pending: bytes) -> None:
-        config = launch.config
-        self._config, self._launch, self._fds = config, launch, fds
-        self._names = names = config.agents.resolved_names()
-        self._index = {name: number for number, name in enumerate(names)}
+        self._config = config = launch.config
+        self._launch, self._line_fd = launch, fds[0]
+        self._names = config.agents.resolved_names()
         self._directory = Path(launch.directory)
         _allow_many_files()
         shares = share_out(config.agents, processors_here())
         # Everything that forks comes before every thread; workers load their half at the same time.
         self._crew = Crew(config, self._directory.parent, shares)
-        base = Path(config.base_directory)
-        descriptor = resolve(config.simulation, base)
-        parameters = parse_parameters(descriptor, config.parameters)
-        simulation = load_half(descriptor, "host", base)()
+        program = Program.load(config, "host")
         executor = make_executor(config.executor)
-        self._clock = SimulatedClock(-config.timeouts.start_lead_s)
-        self._account = RunAccount(names=names, duration_s=config.time.duration_s)
-        self._account.workers = len(shares)
-        self._recorder = LockstepRecorder(self._directory, config, source=HOST, clock=self._clock)
+        self._clock = clock = SimulatedClock(-config.timeouts.start_lead_s)
+        self._account = account = RunAccount(self._names, config.time.duration_s, len(shares))
+        self._recorder = LockstepRecorder(self._directory, config, source=HOST, clock=clock)
+        self._outbox = Outbox(shares, account=account, clock=clock, recorder=self._recorder)
         self._meeting = Meeting(
-            launch, self._crew, account=self._account, clock=self._clock, fds=fds, pending=pending
+            launch, self._crew, account=account, clock=clock, fds=fds, pending=pending
         )
         self._operator = self._meeting.operator
-        self._half = HostHalf(
-            simulation,
-            config=config,
+        self._half = LockstepHalf(
+            HostHalf(program.make, self._recorder.say),
+            config.timeouts,
             meeting=self._meeting,
             executor=executor,
-            recorder=self._recorder,
             on_hang=self._leave_hanging,
         )
         self._context = JobContext(
             name=HOST,
             config=config,
-            parameters=parameters,
+            parameters=program.parameters,
             recorder=self._recorder,
-            now_s=self._clock.now_s,
-            send=self._send,
-            is_lockstep=True,
+            now_s=clock.now_s,
+            send=self._outbox.send,
         )
-        self._context.submit = self._half.submit
-        self._context.wake = self._wake
+        self._context.submit, self._context.wake = self._half.submit, self._half.wake
         self._machine = host_machine()
-        self._boxes: list[list[tuple[int, bytes]]] = [[] for _ in shares]
-        self._box_of = [self._boxes[number] for number, share in enumerate(shares) for _ in share]
-        self._allowances = [Allowance() for _ in names]
-        self._timer_s: float | None = None
-        self._timer_repeats = 0
 
     def run(self) -> int:
         """Run to the end and return the process's exit code."""
         if self._launch.is_detached:
             signal.signal(signal.SIGHUP, signal.SIG_IGN)
         else:
-            end_after_hang_up(self._fds[0], 2 * self._config.timeouts.shutdown_s + HANG_GRACE_S)
+            end_after_hang_up(self._line_fd, 2 * self._config.timeouts.shutdown_s + HANG_GRACE_S)
         outlive_parent()
         meeting = self._meeting
         end_by_term = lambda: meeting.end(HOST, "ended by SIGTERM", status="interrupted")  # noqa: E731
         meeting.reactor.on_signal(signal.SIGTERM, end_by_term)
-        meeting.reactor.on_signal(
-            signal.SIGINT, lambda: None
-        )  # a terminal's Ctrl-C is the operator's
+        # A terminal's Ctrl-C is the operator's.
+        meeting.reactor.on_signal(signal.SIGINT, lambda: None)
         self._operator.emit({"event": "state", "state": self._machine.state.value})
         try:
             with contextlib.suppress(RunEnds):
@@ -140,7 +117,7 @@ class LockstepHost:
         self._start()
         for number in range(self._tick_count()):
             self._advance(number / self._config.agents.tick_hz)
-            self._meeting.exchange((frames.TICK, number), self._boxes)
+            self._meeting.exchange((frames.TICK, number), self._outbox.boxes)
             self._account.ticks = number + 1
             self._take_messages()
         self._advance(self._config.time.duration_s)
@@ -156,9 +133,7 @@ class LockstepHost:
         self._half.call("setup", self._context, limit_s=limit_s)
         initial = []
         for number, name in enumerate(self._names):
-            data = self._half.call(
-                "initial_data", name, check=returned.initial_data, limit_s=limit_s
-            )
+            data = self._half.call("initial_data", name, limit_s=limit_s)
             initial.append((number, pack(data)))
         self._fire(HostEvent.SETUP_FINISHED)
         for worker in self._crew.workers:
@@ -173,7 +148,7 @@ class LockstepHost:
         self._account.t0_utc = utc_now_iso()
         self._account.began_s = monotonic()
         self._half.call("start", self._clock.t_s)
-        self._call_timer()
+        self._half.call_timer(self._clock.t_s)
 
     def _tick_count(self) -> int:
         time, tick_hz = self._config.time, self._config.agents.tick_hz
@@ -182,36 +157,20 @@ class LockstepHost:
 
     def _advance(self, t_s: float) -> None:
         """Let simulated time go on to *t_s*, and do all that the half wants done until then."""
-        while self._timer_s is not None and self._timer_s <= t_s:
-            self._clock.t_s = max(self._clock.t_s, self._timer_s)
-            self._call_timer()
+        while (next_s := self._half.next_s) is not None and next_s <= t_s:
+            self._clock.t_s = max(self._clock.t_s, next_s)
+            self._half.call_timer(self._clock.t_s)
             self._meeting.serve()
         self._clock.t_s = t_s
-
-    def _wake(self, t_s: float) -> None:
-        if self._timer_s is None or t_s < self._timer_s:
-            self._timer_s = t_s
-
-    def _call_timer(self) -> None:
-        now_s = self._clock.t_s
-        self._timer_s = self._half.call("timer", now_s, check=returned.next_time)
-        is_again = self._timer_s is not None and self._timer_s <= now_s
-        self._timer_repeats = self._timer_repeats + 1 if is_again else 0
-        if self._timer_repeats > TIMER_REPEATS_MAX:
-            times = f"{TIMER_REPEATS_MAX} times in a row"
-            self._half.refuse(f"timer asked {times} for t = {now_s:g} s: simulated time stands")
 
     def _drain(self) -> None:
         """Hand out what was answered to the last tick, and the answers to that."""
         for _ in range(DRAIN_ROUNDS_MAX):
-            if not any(self._boxes):
+            if not any(self._outbox.boxes):
                 break
-            self._meeting.exchange((frames.DRAIN,), self._boxes)
+            self._meeting.exchange((frames.DRAIN,), self._outbox.boxes)
             self._take_messages()
-        for box in self._boxes:
-            for number, _ in box:
-                self._account.agents[number].too_late += 1
-            box.clear()
+        self._outbox.give_up()
 
     def _finish(self) -> None:
         timeouts, account = self._config.timeouts, self._account
@@ -226,7 +185,7 @@ class LockstepHost:
                 account.agents[number].summary = summary
                 account.agents[number].deadlines_broken += deadlines_broken
         account.set_states("complete")
-        account.simulation = self._half.call("finish", check=returned.summary)
+        account.simulation = self._half.call("finish")
 
     # Messages -------------------------------------------------------------------------------------
 
@@ -236,30 +195,6 @@ class LockstepHost:
         for number, service, body in self._meeting.messages():
             accounts[number].up[service] += 1
             half.call("receive", names[number], decode(body))
-
-    def _send(
-        self,
-        to: str,
-        message: Any,
-        service: Service = Service.RELIABLE,
-        *,
-        deadline_s: float | None = None,
-    ) -> None:
-        number = self._index.get(to)
-        if number is None:
-            raise PluginError(f"no agent is called {to!r}")
-        check_service(service)
-        t_s = self._clock.t_s
-        if deadline_s is not None:
-            check_deadline(service, is_running=self._account.began_s is not None)
-        body = encode(message, service)
-        self._allowances[number].take(len(body), t_s)
-        account = self._account.agents[number]
-        if deadline_s is not None and deadline_s < t_s:  # it arrives when it is sent
-            account.deadlines_broken += 1
-            self._recorder.event("sync_deadline_broken", agent=to, late_s=t_s - deadline_s)
-        account.down[int(service)] += 1
-        self._box_of[number].append((number, body))
 
     # The end --------------------------------------------------------------------------------------
 
@@ -286,33 +221,14 @@ class LockstepHost:
         self._log("critical", f"emergency shutdown: {ending.who}: {ending.reason}")
 
     def _close(self) -> int:
-        result = self._account.result()
-        result["events_dropped"] = self._operator.dropped_count
-        text = orjson.dumps(result, option=orjson.OPT_SERIALIZE_NUMPY)
-        if self._leave(text) and len(text) > RESULT_BYTES_MAX:
-            self._operator.emit({"event": "finished", "result": None, "file": RESULT_FILE})
-        else:
-            self._operator.emit({"event": "finished", "result": result})
-        self._operator.flush(FLUSH_TIMEOUT_S)
-        self._operator.close()
+        code = hand_over(self._account.result(), self._directory, self._operator)
         self._meeting.reactor.close()
-        return 0 if result["status"] == "complete" else 1
-
-    def _leave(self, text: bytes) -> bool:
-        """Write the result beside the records: no operator who is gone, or slow, costs it."""
-        path = self._directory / RESULT_FILE
-        try:
-            path.with_suffix(".tmp").write_bytes(text)
-            path.with_suffix(".tmp").replace(path)
-        except OSError:  # a full disk, say: then the line to the operator is all there is
-            path.with_suffix(".tmp").unlink(missing_ok=True)
-            return False
-        return True
+        return code
 
     def _leave_hanging(self, reason: str) -> None:
         """Leave a result although the half hangs; called in another thread, before the process ends."""
         self._account.ending = Ending(who=HOST, reason=reason)
-        self._leave(orjson.dumps(self._account.result(), option=orjson.OPT_SERIALIZE_NUMPY))
+        leave(self._account.result(), self._directory)
 
     # Telling --------------------------------------------------------------------------------------
 
@@ -322,7 +238,7 @@ class LockstepHost:
         self._operator.emit({"event": "state", "state": state})
 
     def _log(self, level: str, text: str) -> None:
-        self._recorder.log(level, text, self._recorder.t_s)
+        self._recorder.say(level, text)
         self._operator.emit({"event": "log", "level": level, "source": HOST, "text": text})
 
 

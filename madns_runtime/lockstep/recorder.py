@@ -6,6 +6,8 @@ No thread, and no byte that depends on the wall clock: a run recorded twice is r
 
 from __future__ import annotations
 
+import contextlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +15,11 @@ from madns_runtime.config import RunConfig
 from madns_runtime.errors import MachineError
 from madns_runtime.lockstep.clock import T0_UTC, SimulatedClock
 from madns_runtime.recording.counts import RecordCounts
-from madns_runtime.recording.records import EVENTS, LOG
-from madns_runtime.recording.writer import CLOSE_TIMEOUT_S, Recorder
-
-T_S_DIGITS = 6
+from madns_runtime.recording.run_recorder import RunRecorder
+from madns_runtime.recording.writer import CLOSE_TIMEOUT_S
 
 
-class LockstepRecorder(Recorder):
+class LockstepRecorder(RunRecorder):
     """
     The record streams of the host or of one agent, written by whoever records.
 
@@ -39,27 +39,23 @@ class LockstepRecorder(Recorder):
     def __init__(
         self, directory: Path, config: RunConfig, *, source: str, clock: SimulatedClock
     ) -> None:
-        super().__init__(directory, run=config.scenario, source=source, settings=config.recording)
         self._clock = clock
-        self._is_closed = False
-        # A line that is longer than the bound is dropped and counted, in every run alike.
+        named = replace(config, run=config.scenario)
+        super().__init__(directory, named, source=source, t_s=clock.now_s)
         self.set_t0(T0_UTC)
-        self.open_stream(EVENTS)
-        self.open_stream(LOG)
-
-    @property
-    def t_s(self) -> float:
-        """The simulated time, as events carry it, s."""
-        return round(self._clock.t_s, T_S_DIGITS)
 
     def start(self) -> None:
         """Do nothing: there is no thread."""
 
     def event(self, event: str, **values: Any) -> None:
-        """Record that something happened; nothing once the records are closed."""
-        if not self._is_closed:
-            fields = {"t_s": self.t_s, "utc": self._clock.utc(), "event": event, **values}
-            self.record(EVENTS.name, fields)
+        """Record that something happened, as a run's end, which no full disk may hold up."""
+        with contextlib.suppress(MachineError):  # what is recorded next, or flushed, says it
+            super().event(event, **values)
+
+    def log(self, level: str, text: str, t_s: float | None = None) -> None:
+        """Log a sentence, as of a run's end, which no full disk may hold up."""
+        with contextlib.suppress(MachineError):
+            super().log(level, text, t_s)
 
     def flush(self) -> None:
         """
@@ -74,9 +70,9 @@ class LockstepRecorder(Recorder):
     def close(self, timeout_s: float = CLOSE_TIMEOUT_S) -> RecordCounts:
         """Write what waits and the end lines, make it durable, and return the last counts."""
         del timeout_s  # the host waits, not this process
-        if not self._is_closed:
+        if not self._is_ended:
             self.event("end")
-            self._is_closed = self._is_closing = True
+            self._is_ended = self._is_closing = True
             self._flush()
             self._finish_files()
         return self.counts()

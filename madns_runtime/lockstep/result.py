@@ -68,14 +68,14 @@ class AgentAccount:
         return messages
 
 
-@dataclass(slots=True, kw_only=True)
+@dataclass(slots=True)
 class RunAccount:
     """What a run has come to."""
 
     names: tuple[str, ...]
     duration_s: float
+    workers: int
     agents: list[AgentAccount] = field(init=False)
-    workers: int = 0
     ticks: int = 0
     """Run by every agent."""
     lost: dict[str, str] = field(default_factory=dict)

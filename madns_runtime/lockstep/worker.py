@@ -21,16 +21,15 @@ from time import monotonic
 from typing import Any, NoReturn
 
 from madns_runtime.config import RunConfig
-from madns_runtime.context import clean_text, describe_exception
-from madns_runtime.errors import MachineError, MadnsError, PluginError
+from madns_runtime.context import clean_text
+from madns_runtime.errors import MadnsError
+from madns_runtime.half import HalfFailed, Program
 from madns_runtime.lockstep import frames
 from madns_runtime.lockstep.agent import Crewmates, LockstepAgent
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.frames import POSITIONS, FrameReader, encode_frame
 from madns_runtime.lockstep.post import decode
-from madns_runtime.plugin import returned
 from madns_runtime.plugin.api import Tick
-from madns_runtime.plugin.registry import load_half, parse_parameters, resolve
 from madns_runtime.processes import register
 from madns_runtime.protocol.codec import unpack
 from madns_runtime.reactor.forking import leave_parent
@@ -178,33 +177,26 @@ class Worker:
     # Orders -----------------------------------------------------------------------------------------
 
     def _load(self) -> bytes:
-        config, first = self._assignment.config, self._assignment.agents[0]
-        self._position[0] = first * POSITIONS + frames.LOADING
-        base = Path(config.base_directory)
+        config, index = self._assignment.config, self._assignment.agents[0]
+        self._position[0] = index * POSITIONS + frames.LOADING
         try:
-            descriptor = resolve(config.simulation, base)
             self._mates = Crewmates(
                 config=config,
                 directory=self._assignment.directory,
-                simulation=load_half(descriptor, "agent", base),
-                parameters=parse_parameters(descriptor, config.parameters),
+                program=Program.load(config, "agent"),
                 clock=self._clock,
             )
-        except MadnsError as error:
-            raise AgentFailed(first, str(error)) from error
-        for index in self._assignment.agents:
-            try:
+            for index in self._assignment.agents:
                 self._agents.append(LockstepAgent(index, self._mates))
-            except (Exception, SystemExit) as error:  # noqa: BLE001 - a plug-in may raise anything
-                kind = getattr(self._mates.simulation, "__name__", "the agent's half")
-                raise AgentFailed(index, _told(error, f"{kind}.__init__")) from error
+        except MadnsError as error:
+            raise AgentFailed(index, str(error)) from error
         return encode_frame(frames.READY)
 
     def _set_up(self, initial: list[tuple[int, bytes]]) -> bytes:
         for agent, (index, packed) in zip(self._agents, initial, strict=True):
             self._position[0] = index * POSITIONS + frames.SETTING_UP
             agent.recorder.event("start")
-            self._guard(agent, "setup", agent.simulation.setup, agent.context, unpack(packed))
+            self._call(agent, "setup", agent.context, unpack(packed))
         freeze_garbage()  # what set-up made stays: no collection walks it in mid-run
         return self._done()
 
@@ -222,8 +214,8 @@ class Worker:
             for agent in self._agents:
                 position[0] = agent.stepping
                 agent.step(tick)
-        except (Exception, SystemExit) as error:  # noqa: BLE001 - a plug-in may raise anything
-            raise self._failure(agent, "step", error) from error
+        except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
+            raise AgentFailed(agent.index, str(agent.half.failure("step", error))) from error
         if monotonic() - self._flushed_s > self._flush_interval_s:
             self._flush()
         return self._done()
@@ -238,13 +230,7 @@ class Worker:
         summaries = []
         for agent in self._agents:
             self._position[0] = agent.index * POSITIONS + frames.FINISHING
-            value = self._guard(agent, "finish", agent.simulation.finish)
-            try:
-                summary = returned.summary(value)
-            except PluginError as error:
-                kind = type(agent.simulation).__name__
-                reason = f"{kind}.finish returned {clean_text(str(error))}"
-                raise AgentFailed(agent.index, reason) from error
+            summary = self._call(agent, "finish")
             summaries.append((agent.index, summary, agent.deadlines_broken))
         return encode_frame(frames.SUMMARIES, summaries)
 
@@ -258,30 +244,21 @@ class Worker:
         first = self._assignment.agents[0]
         for index, body in messages:
             self._position[0] = index * POSITIONS + frames.RECEIVING
-            agent = self._agents[index - first]
-            self._guard(agent, "receive", agent.receive, decode(body))
+            self._call(self._agents[index - first], "receive", decode(body))
 
     # Faults and records ------------------------------------------------------------------------------
 
-    def _guard(
-        self, agent: LockstepAgent, name: str, method: Callable[..., Any], *arguments: Any
-    ) -> Any:
+    def _call(self, agent: LockstepAgent, name: str, *arguments: Any) -> Any:
         try:
-            return method(*arguments)
-        except (Exception, SystemExit) as error:  # noqa: BLE001 - a plug-in may raise anything
-            raise self._failure(agent, name, error) from error
-
-    def _failure(self, agent: LockstepAgent, name: str, error: BaseException) -> AgentFailed:
-        if not isinstance(error, MachineError):
-            text = "".join(traceback.format_exception(error))
-            agent.recorder.log("critical", text, agent.recorder.t_s)
-        return AgentFailed(agent.index, _told(error, f"{type(agent.simulation).__name__}.{name}"))
+            return agent.half.call(name, *arguments)
+        except HalfFailed as failure:
+            raise AgentFailed(agent.index, str(failure)) from failure
 
     def _flush(self) -> None:
         for agent in self._agents:
             try:
                 agent.recorder.flush()
-            except MachineError as error:
+            except MadnsError as error:
                 raise AgentFailed(agent.index, str(error)) from error
         self._flushed_s = monotonic()
 
@@ -290,15 +267,9 @@ class Worker:
             self._position[0] = agent.index * POSITIONS + frames.CLOSING
             if reason is not None:
                 agent.recorder.event("emergency", reason=reason)
-                text = f"emergency shutdown: {reason}"
-                agent.recorder.log("critical", text, agent.recorder.t_s)
+                agent.recorder.say("critical", f"emergency shutdown: {reason}")
             counts = agent.recorder.close().to_mapping()
             if is_told:
                 self._line.sendall(encode_frame(frames.CLOSED, agent.index, counts))
         for index in self._assignment.agents[len(self._agents) :] if is_told else ():
             self._line.sendall(encode_frame(frames.CLOSED, index, {}))  # it never opened any
-
-
-def _told(error: BaseException, doing: str) -> str:
-    """Return why an agent cannot go on: the disk's own words, or which call of the plug-in raised what."""
-    return str(error) if isinstance(error, MachineError) else describe_exception(error, doing)

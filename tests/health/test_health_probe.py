@@ -4,7 +4,8 @@ import sys
 
 import pytest
 
-from madns_runtime.health.probe import Probe, ProcessUsage, process_usage, pss_bytes
+from madns_runtime.health import probe
+from madns_runtime.health.probe import Probe, ProcessUsage, pss_bytes
 
 
 def put(path, text):
@@ -85,13 +86,14 @@ def test_vanished_directory_has_no_space(tmp_path):
 
 
 def test_usage_is_a_record_of_the_process_stream():
-    t_s, cpu_percent, rss_bytes, major_faults, voluntary, involuntary = process_usage(1.5)
+    usage = ProcessUsage()
+    t_s, cpu_percent, rss_bytes, major_faults, voluntary, involuntary = usage.read(1.5)
 
     assert t_s == 1.5
     assert cpu_percent >= 0
     assert rss_bytes > 1_000_000
     assert min(major_faults, voluntary, involuntary) >= 0
-    assert process_usage()[0] is None
+    assert usage.read()[0] is None
 
 
 def test_usage_is_since_the_last_call():
@@ -101,6 +103,19 @@ def test_usage_is_since_the_last_call():
         total += sum(range(1000))
 
     assert usage.read()[1] <= 100.0 * 1.5
+
+
+def test_each_agent_of_a_process_counts_since_its_own_last_record(monkeypatch):
+    now = {"wall": 0.0, "cpu": 0.0}
+    monkeypatch.setattr(probe.time, "monotonic", lambda: now["wall"])
+    monkeypatch.setattr(probe.time, "process_time", lambda: now["cpu"])
+    first, second = ProcessUsage(), ProcessUsage()
+    now |= {"wall": 5.0, "cpu": 1.0}
+    shares = [first.read()[1]]
+    now |= {"wall": 5.001}
+    shares.append(second.read()[1])
+
+    assert shares == [20.0, pytest.approx(20.0, abs=0.1)]
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/smaps_rollup"), reason="the kernel has none")

@@ -130,7 +130,7 @@ def test_a_full_disk_ends_it_instead_of_costing_records(tmp_path, monkeypatch):
 
 
 def test_the_account_tells_speed_and_result():
-    account = RunAccount(names=("a", "b"), duration_s=100.0)
+    account = RunAccount(("a", "b"), duration_s=100.0, workers=1)
     assert account.progress(-0.5, 7.0)["t_s"] is None
     account.began_s = 10.0
     account.ticks = 50
