@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import importlib
+import math
 import os
 import sys
 import tempfile
@@ -91,7 +92,17 @@ def load_command(verb: str) -> Any:
     single = typer.Typer(add_completion=False, rich_markup_mode=None)
     settings = getattr(module, "CONTEXT_SETTINGS", None)
     single.command(name=verb, context_settings=settings)(getattr(module, verb))
-    return typer.main.get_command(single)
+    command = typer.main.get_command(single)
+    for parameter in command.params:
+        parameter.callback = parameter.callback or _refuse_not_finite
+    return command
+
+
+def _refuse_not_finite(context: Any, parameter: Any, value: Any) -> Any:
+    """Return an option's value; every range lets nan pass, and nobody means it or infinity."""
+    if isinstance(value, float) and not math.isfinite(value):
+        raise typer.BadParameter(f"expected a finite number, got {value}", context, parameter)
+    return value
 
 
 def make_app() -> typer.Typer:

@@ -10,6 +10,7 @@ import typer
 
 from cosmos_cli.commands.fleet_options import (
     FORKS_DEFAULT,
+    TIMEOUT_S_MAX,
     AcceptHostKeysOption,
     ForksOption,
     InventoryOption,
@@ -41,7 +42,10 @@ def exec(  # noqa: A001 - the verb's name is the function's
     limit: LimitOption = None,
     sudo: Annotated[bool, typer.Option("--sudo", help="As root, through sudo -n.")] = False,
     timeout_s: Annotated[
-        float, typer.Option("--timeout", metavar="S", min=0.1, help="Time for the command, s.")
+        float,
+        typer.Option(
+            "--timeout", metavar="S", min=0.1, max=TIMEOUT_S_MAX, help="Time for the command, s."
+        ),
     ] = TIMEOUT_S,
     forks: ForksOption = FORKS_DEFAULT,
     accept_new_host_keys: AcceptHostKeysOption = False,

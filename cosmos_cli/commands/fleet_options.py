@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FORKS_DEFAULT",
+    "TIMEOUT_S_MAX",
     "AcceptHostKeysOption",
     "Fleet",
     "ForksOption",
@@ -26,6 +27,9 @@ __all__ = [
     "fleet_of",
     "some_machines",
 ]
+
+TIMEOUT_S_MAX = 1e6
+"""Of any --timeout, eleven days: the kernel's waits end at twenty-four."""
 
 InventoryOption = Annotated[
     Path,

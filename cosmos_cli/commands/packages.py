@@ -13,6 +13,7 @@ import typer
 
 from cosmos_cli.commands.fleet_options import (
     FORKS_DEFAULT,
+    TIMEOUT_S_MAX,
     AcceptHostKeysOption,
     ForksOption,
     InventoryOption,
@@ -63,7 +64,10 @@ def packages(
         bool, typer.Option("--check", help="Show what would change, and change nothing.")
     ] = False,
     timeout_s: Annotated[
-        float, typer.Option("--timeout", metavar="S", min=1.0, help="Time for each machine, s.")
+        float,
+        typer.Option(
+            "--timeout", metavar="S", min=1.0, max=TIMEOUT_S_MAX, help="Time for each machine, s."
+        ),
     ] = TIMEOUT_S,
     forks: ForksOption = FORKS_DEFAULT,
     accept_new_host_keys: AcceptHostKeysOption = False,

@@ -283,6 +283,9 @@ def test_init_refuses_names_that_no_scenario_can_have(cosmos, name):
             "error: scenarios/scenario.schema.json: no such file here; name the file to check",
         ),
         (["plan", "a.yaml", "--workers", "0"], "see `cosmos plan --help`\n"),
+        (["plan", "a.yaml", "--bandwidth-mbit", "nan"], "expected a finite number, got nan"),
+        (["plan", "a.yaml", "--latency-ms", "inf"], "'--latency-ms': expected a finite number"),
+        (["exec", "-i", "x", "--timeout", "1e9", "true"], "range 0.1<=x<=1000000.0"),
     ],
 )
 def test_wrong_usage_ends_with_2_and_says_what_is_right(cosmos, arguments, text):
