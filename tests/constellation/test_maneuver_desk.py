@@ -95,6 +95,11 @@ def test_late_commands_are_refused_where_the_scenario_says_so():
         ({"at_s": math.nan}, "finite"),
         ({"vector": (math.inf, 0.0, 0.0)}, "finite"),
         ({"vector": (0.0, 0.0, 0.0)}, "0 m/s"),
+        ({"vector": (0.0, 1e-200, 0.0)}, "a change of velocity of 1e-200 m/s"),
+        ({"vector": (1e300, 0.0, 0.0)}, "propellant"),
+        ({"at_s": 1e300}, "beyond the run"),
+        ({"at_s": math.inf}, "finite"),
+        ({"vector": (math.nan, 0.0, 0.0)}, "finite"),
         ({"vector": (900.0, 0.0, 0.0)}, "propellant"),
         ({"frame": "body"}, "without attitude"),
         ({"kind": "torque", "frame": "body", "duration_s": 1.0}, "without attitude"),
@@ -163,8 +168,60 @@ def test_a_thruster_does_one_burn_at_a_time():
 
     busy = at.decide(0, command(22.0, number=2), 10.0)
 
-    assert "busy from 17.501 s to 22.499 s" in busy.reason
+    assert busy.reason == "thruster busy from 17.501 s to 22.499 s"
     assert busy.propellant_kg == left_kg
+    # What is over at once, too.
+    short = at.decide(0, command(20.1, number=3, vector=(0.001, 0.0, 0.0)), 10.0)
+    before = at.decide(0, command(13.0, number=4), 10.0)
+    assert (short.reason, before.reason) == (busy.reason, "")
+    at = desk(at._vehicles[0])
+    at.decide(0, command(20.1, number=3, vector=(0.001, 0.0, 0.0)), 10.0)
+    assert "busy from 20.100 s to 20.100 s" in at.decide(0, command(20.0), 10.0).reason
+
+
+def test_impulses_of_one_moment_add_up():
+    at = desk()
+
+    both = [at.decide(0, command(20.0, number=n), 10.0) for n in range(2)]
+
+    assert [taken.status for taken in both] == ["accepted"] * 2
+    assert both[1].propellant_kg < both[0].propellant_kg
+
+
+def test_what_was_burnt_counts_when_it_is_burnt_and_what_waits_is_told():
+    at = desk()
+    first, second = (at.decide(0, command(20.0 + n, number=n), 10.0) for n in range(2))
+    assert (at.waiting, at.account.propellant_kg, at.account.delta_v_m_s) == (2, 0.0, 0.0)
+
+    at.execute(first)
+
+    assert (at.waiting, at.account.executed) == (1, 1)
+    assert at.account.propellant_kg == pytest.approx(20.0 - first.propellant_kg)
+    assert at.account.delta_v_m_s == 1.0
+    assert second.used_kg > 0.0
+
+
+def test_a_burn_tells_truth_how_much_lighter_it_makes_the_vehicle():
+    slow = Vehicle(thruster=Thruster(isp_s=220.0, propellant_kg=20.0, thrust_n=20.0))
+
+    effect = desk(slow).decide(0, command(40.0, vector=(5.0, 0.0, 0.0)), 5.0).effect
+
+    assert effect.burnt == pytest.approx(1.0 - math.exp(-5.0 / (220.0 * 9.80665)))
+
+
+def test_a_torque_that_no_knot_could_tell_is_refused():
+    free = Vehicle(attitude=Attitude(inertia_kg_m2=(10.0, 10.0, 2.0)))
+    torque = {"kind": "torque", "frame": "body"}
+
+    def given(vector, duration_s):
+        return desk(free).decide(0, command(vector=vector, duration_s=duration_s, **torque), 10.0)
+
+    assert given((3.0, 0.0, 0.0), 10.0).status == "accepted"
+    assert "6 rad/s; less than 3.142 rad/s" in given((6.0, 0.0, 0.0), 10.0).reason
+    assert "5 rad/s; less than 3.142 rad/s" in given((0.0, 0.0, 1.0), 10.0).reason
+    # Of a longer one than the run only the run's part acts.
+    assert given((0.0, 0.1, 0.0), 1e9).status == "accepted"
+    assert "rad/s" in given((0.0, 1e300, 0.0), 1e9).reason
 
 
 def test_a_torque_fills_wheels_that_later_ones_find_full():
@@ -193,6 +250,19 @@ def test_the_inequality_is_measured_in_the_agents_own_time():
     assert at.account.inequality_broken == 0
     at.measure(at.decide(0, command(10.1, number=1), 10.09), 10.095)
     assert at.account.inequality_broken == 1
+
+
+def test_a_command_too_late_for_what_is_allowed_counts_although_it_was_quick():
+    # As in lockstep, where nothing takes time.
+    at, strict = desk(), desk(late="refuse")
+
+    postponed, refused = (d.decide(0, command(10.0), 10.0) for d in (at, strict))
+
+    assert at.measure(postponed, 10.0).slack_s == 0.0
+    assert at.account.inequality_broken == 1
+    times = strict.measure(refused, None)
+    assert (times.propagation_s, times.slack_s) == (None, pytest.approx(-0.02))
+    assert (strict.account.inequality_broken, strict.account.propagation_s_max) == (1, 0.0)
 
 
 def test_the_same_command_gets_the_same_error_whatever_came_before():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from constellation_fakes import SCENARIOS, Star, parameters, state_rows
 
-from madns_runtime.errors import PluginError
+from madns_runtime.errors import ConfigurationError, PluginError
 from madns_runtime.protocol.messages import Service
 from madns_runtime.simulations.constellation.messages import Command
 
@@ -123,6 +123,48 @@ def test_new_truth_travels_ahead_of_all_else_with_its_deadline(fly):
     assert first["t0_s"] == pytest.approx(10.1)
 
 
+def test_every_change_of_truth_is_with_its_vehicle_before_its_time_and_said_so(fly):
+    star = fly(["* 100 rtn 0.1 0 1 0", "agent-02 105 inertial 3 0 0 1"])
+    thruster = fly(["agent-01 100 rtn 5 0 2 0"], vehicle={"thruster": {**THRUSTER, "thrust_n": 50}})
+
+    star.run(20.0)
+    thruster.run(20.0)
+
+    changes = star.contexts["agent-02"].records["truth_changes"]
+    assert [(row[0], row[1]) for row in changes] == [(1, pytest.approx(10.1)), (2, 13.5)]
+    assert [row[3] for row in changes] == [pytest.approx(row[1] - row[2]) for row in changes]
+    assert 0.0 < changes[0][3] < 0.1
+    assert star.summaries()["agent-02"]["left_at_change_s_min"] == changes[0][3]
+    # Of an arc from its beginning on: 100 kg and 2 m/s at 50 N last 4 s.
+    (change,) = thruster.contexts["agent-01"].records["truth_changes"]
+    assert change[1] == pytest.approx(13.0, abs=0.01)
+
+
+def test_a_vehicle_may_leave_the_earth_and_has_no_elements_then(fly):
+    star = fly(
+        ["agent-02 100 rtn 5 0 5000 0"],
+        vehicle={"thruster": {**THRUSTER, "isp_s": 3000, "propellant_kg": 90}},
+    )
+
+    star.run(30.0)
+
+    assert len(star.contexts["agent-02"].records["elements"]) == 15
+    assert len(star.contexts["agent-01"].records["elements"]) == 30
+    assert len(state_rows(star, "agent-02")) == 300
+    assert star.underruns() == 0
+
+
+def test_a_body_spun_up_beyond_what_knots_can_tell_ends_the_run_by_name(fly):
+    star = fly(
+        ["agent-02 10 torque 1 0 0 20 1", "agent-02 20 torque 2 0 0 20 1"],
+        vehicle={"attitude": {"inertia_kg_m2": [10.0, 10.0, 10.0]}},
+        count=2,
+    )
+
+    with pytest.raises(ConfigurationError, match=r"agent-02: .*3.142 rad/s, got 4 rad/s"):
+        star.run(10.0)
+
+
 def test_a_late_command_is_postponed_or_refused_and_its_broken_inequality_counted(fly):
     lines = ["agent-01 100 rtn 0.0 0 1 0"]
     postponing, refusing = fly(lines), fly(lines, maneuvers={"late": "refuse"})
@@ -133,6 +175,8 @@ def test_a_late_command_is_postponed_or_refused_and_its_broken_inequality_counte
     assert told(postponing, "agent-01") == ["0 postponed 1", "0 executed 1"]
     assert record(postponing)["executed_s"] == pytest.approx(10.1)
     assert told(refusing, "agent-01") == ["0 refused 0"]
+    assert (record(refusing)["propagation_s"], record(refusing)["executed_s"]) == (None, None)
+    assert record(refusing)["slack_s"] == pytest.approx(-0.02 - 2 * 0.01)
     for star in (postponing, refusing):
         summary = star.host.finish()
         assert summary["maneuvers"]["inequality_broken"] == 1

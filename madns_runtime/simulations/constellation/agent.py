@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from madns_runtime.errors import PluginError
+from madns_runtime.errors import BlamedError, PluginError
 from madns_runtime.plugin.api import AgentContext, AgentSimulation, Tick
 from madns_runtime.recording.records import Field
 from madns_runtime.simulations.constellation.messages import (
@@ -21,7 +21,10 @@ from madns_runtime.simulations.constellation.messages import (
     Refusal,
     Segment,
 )
-from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
+from madns_runtime.simulations.constellation.orbit.constants import (
+    EARTH_POLAR_RADIUS_M,
+    GRAVITY_MODELS,
+)
 from madns_runtime.simulations.constellation.orbit.elements import elements_from_state
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
 from madns_runtime.simulations.constellation.vehicle.fitting import fit_out
@@ -49,7 +52,16 @@ ELEMENTS = (
     Field("argp_deg", "deg"),
     Field("mean_anomaly_deg", "deg"),
 )
-"""Osculating elements of the state, in the scenario's gravity constants."""
+"""Osculating elements of the state, in the scenario's gravity constants; none of a vehicle on an escape orbit."""
+
+TRUTH_CHANGES = (
+    Field("revision", "", "int"),
+    Field("from_s", "s"),
+    Field("heard_s", "s"),
+    Field("left_s", "s"),
+)
+"""Truth that a maneuver changed, when its first segment was here: left_s until this agent's own from_s, T_m or
+the beginning of a burn."""
 
 
 class ConstellationAgent(AgentSimulation):
@@ -81,6 +93,8 @@ class ConstellationAgent(AgentSimulation):
         self._served = 0
         self._unheard = 0
         self._left_s_min = math.inf
+        self._revision = 0 if first.segment is None else first.segment.revision
+        self._change_left_s_min = math.inf
         self._buffer = TruthBuffer()
         if first.segment is not None:
             self._buffer.add(first.segment)
@@ -92,11 +106,21 @@ class ConstellationAgent(AgentSimulation):
         if vehicle.attitude is not None:
             context.open_stream("attitude", ATTITUDE)
         self._sensors, self._cockpit = fit_out(context, first, vehicle=vehicle, buffer=self._buffer)
+        if self._cockpit is not None:
+            context.open_stream("truth_changes", TRUTH_CHANGES)
 
     def step(self, tick: Tick) -> None:
-        """Record the truth of this tick; a tick without truth is counted and nothing is made up."""
+        """
+        Record the truth of this tick; a tick without truth is counted and nothing is made up.
+
+        Raises:
+            BlamedError: The vehicle has met the Earth.
+        """
         state = self._buffer.lookup(tick.t_s)
         if state is not None:
+            x, y, z = state[:3]
+            if x * x + y * y + z * z < EARTH_POLAR_RADIUS_M**2:
+                raise BlamedError(f"{self._satellite} has met the Earth at {tick.t_s:g} s")
             self._record_truth(tick, state)
         readings = None
         if self._sensors is not None:
@@ -143,7 +167,7 @@ class ConstellationAgent(AgentSimulation):
         """
         kind = message.get("kind") if isinstance(message, Mapping) else None
         if kind == Segment.KIND:
-            self._take_segment(message)
+            self._take_segment(Segment.from_message(message))
         elif kind == Delivery.KIND and self._cockpit is not None:
             self._cockpit.deliver(Delivery.from_message(message))
         elif kind == CommandResult.KIND and self._cockpit is not None:
@@ -155,14 +179,24 @@ class ConstellationAgent(AgentSimulation):
         else:
             raise PluginError(f"constellation: expected a segment, got {message!r:.200}")
 
-    def _take_segment(self, message: Mapping[str, Any]) -> None:
-        left_s = self._buffer.end_s - self._context.now_s()
-        if self._buffer.add(Segment.from_message(message)):
+    def _take_segment(self, segment: Segment) -> None:
+        now_s = self._context.now_s()
+        left_s = self._buffer.end_s - now_s
+        if self._buffer.add(segment):
             self._left_s_min = min(self._left_s_min, left_s)
+        if segment.revision > self._revision and self._cockpit is not None:
+            self._revision = segment.revision
+            left_s = segment.t0_s + self._cockpit.phase_s - now_s
+            self._change_left_s_min = min(self._change_left_s_min, left_s)
+            row = (segment.revision, segment.t0_s, now_s, left_s)
+            self._context.record("truth_changes", row)
 
     def finish(self) -> Mapping[str, Any]:
         """Return how well this vehicle was served; any underrun breaks the run's verdict."""
         buffer = self._buffer
+        flown = {} if self._cockpit is None else self._cockpit.finish()
+        # What flight software wants judged is judged with the vehicle's own.
+        checks = flown["flight"].pop("checks", []) if flown else []
         underruns = {
             "name": "constellation.underruns",
             "limit": 0,
@@ -177,17 +211,23 @@ class ConstellationAgent(AgentSimulation):
             "segments_refused": buffer.refused,
             "segments_superseded": buffer.superseded,
             "left_at_refill_s_min": self._left_s_min if math.isfinite(self._left_s_min) else None,
+            "left_at_change_s_min": self._change_left_s_min
+            if math.isfinite(self._change_left_s_min)
+            else None,
             "joint_gap_m_max": buffer.joint_gap_m_max,
             **({} if self._sensors is None else {"sensors": self._sensors.summary()}),
-            **({} if self._cockpit is None else self._cockpit.finish()),
+            **flown,
             "messages_unheard": self._unheard,
-            "checks": [underruns],
+            "checks": [underruns, *(checks if isinstance(checks, list) else [checks])],
         }
 
     def _record_elements(
         self, tick: int, r_m: tuple[float, float, float], v_m_s: tuple[float, float, float]
     ) -> None:
-        elements = elements_from_state(r_m, v_m_s, self._mu_m3_s2)
+        try:
+            elements = elements_from_state(r_m, v_m_s, self._mu_m3_s2)
+        except ValueError:
+            return  # an escape orbit has none of these
         self._context.record(
             "elements",
             (

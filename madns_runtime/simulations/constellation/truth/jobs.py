@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from madns_runtime.errors import ConfigurationError
 from madns_runtime.simulations.constellation.orbit.frames import vector_to_inertial
 from madns_runtime.simulations.constellation.thrust import Thrust, Vector
 from madns_runtime.simulations.constellation.truth.effects import Effect, scaled, total
@@ -27,6 +28,7 @@ from madns_runtime.simulations.constellation.truth.pieces import (
     VehicleTruth,
     knot_at_or_after,
     lay_out,
+    spin_rad_s_max,
 )
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
@@ -290,7 +292,19 @@ class _Flight:
         else:
             rows = propagate(states, from_s, knots, parameters)
         vehicle: Array = rows[0]
+        self._check_spin(vehicle)
         return vehicle
+
+    def _check_spin(self, rows: Array) -> None:
+        if self._body is None:
+            return
+        spin_rad_s = float(np.linalg.norm(rows[:, 10:], axis=1).max())
+        limit_rad_s = spin_rad_s_max(self._request.knot_s)
+        if not spin_rad_s < limit_rad_s:
+            raise ConfigurationError(
+                f"{self._parameters.name_of(0)}: expected a body that turns less than half a turn in "
+                f"parameters.segments.knot_s, {limit_rad_s:.4g} rad/s, got {spin_rad_s:.4g} rad/s"
+            )
 
     def _add_piece(self, span: Span, rows: Array) -> None:
         self._pieces.append(

@@ -31,7 +31,7 @@ from madns_runtime.simulations.constellation.truth.effects import (
     EffectKind,
     Timeline,
 )
-from madns_runtime.simulations.constellation.truth.pieces import snap
+from madns_runtime.simulations.constellation.truth.pieces import snap, spin_rad_s_max
 
 WAITING_MAX = 64
 """Commands of one vehicle whose time is not over."""
@@ -103,6 +103,7 @@ class Account:
     postponed: int = 0
     refused: int = 0
     inequality_broken: int = 0
+    """Commands for which it does not hold, and those that came too late by what the scenario allows."""
     slack_s_min: float = math.inf
     propagation_s_max: float = 0.0
     network_s_max: float = 0.0
@@ -192,7 +193,7 @@ class ManeuverDesk:
         allowed_s = self._rules.settings.propagation_s
         needed_s = (allowed_s if propagation_s is None else propagation_s) + 2.0 * network_s
         slack_s = command.at_s - command.commanded_s - needed_s
-        account.inequality_broken += slack_s < 0.0
+        account.inequality_broken += slack_s < 0.0 or taken.is_late
         account.slack_s_min = min(account.slack_s_min, slack_s)
         return Times(propagation_s=propagation_s, network_s=network_s, slack_s=slack_s)
 
@@ -217,6 +218,8 @@ class ManeuverDesk:
         if fault:
             return replace(refused, reason=fault)
         given = self._given(vehicle, command)
+        if isinstance(given, Turn):
+            given = self._bearable(vehicle, command, given)
         if isinstance(given, Refusal):
             return replace(refused, reason=given.reason)
         return self._in_time(refused, given)
@@ -263,6 +266,21 @@ class ManeuverDesk:
             wheels = described.attitude.wheels
             return turn(wheels, momentum, command.vector, command.duration_s, random)
         return None
+
+    def _bearable(self, vehicle: int, command: Command, given: Turn) -> Turn | Refusal:
+        """Return a turn, or a refusal if it alone would spin the body faster than knots can tell."""
+        described = self._vehicles[vehicle].attitude
+        assert described is not None
+        acting_s = min(command.duration_s, self._rules.duration_s)
+        pairs = zip(given.torque_n_m, described.inertia_kg_m2, strict=True)
+        gained_rad_s = max(abs(torque) / inertia for torque, inertia in pairs) * acting_s
+        limit_rad_s = spin_rad_s_max(self._rules.knot_s)
+        if gained_rad_s < limit_rad_s:
+            return given
+        return Refusal(
+            reason=f"it would spin the body up by {gained_rad_s:.4g} rad/s; "
+            f"less than {limit_rad_s:.4g} rad/s, half a turn a knot, can be told"
+        )
 
     def _in_time(self, refused: Taken, given: Burn | Turn | None) -> Taken:
         """Return the command at its time, or at the first feasible one, or refused."""

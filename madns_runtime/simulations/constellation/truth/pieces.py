@@ -98,6 +98,11 @@ class Span:
         return [*(self.start_s + i * self.knot_s for i in range(self.count - 1)), self.end_s]
 
 
+def spin_rad_s_max(knot_s: float) -> float:
+    """Return the rate at which a body turns half a turn a knot: attitude between knots has no meaning then."""
+    return math.pi / knot_s
+
+
 def snap(t_s: float, knot_s: float) -> float:
     """Return *t_s*, or the grid knot that it means."""
     knot = round(t_s / knot_s) * knot_s
