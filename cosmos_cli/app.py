@@ -73,6 +73,13 @@ class LazyGroup(typer.core.TyperGroup):
             self.commands[cmd_name] = load_command(cmd_name)
         return self.commands[cmd_name]
 
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command; typer would make a silent exit code of Ctrl-C."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            raise typer.Abort from None
+
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the command that is meant; typer looks for similar names among loaded ones only."""
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
@@ -175,7 +182,8 @@ def run(arguments: list[str]) -> int:
     except CLICK_ERROR as error:
         return _report_usage(error, wants_json)
     except (KeyboardInterrupt, typer.Abort):
-        return _report(_plain("interrupted", "interrupted", 130), "interrupted", wants_json)
+        told = _plain("interrupted", "interrupted", int(ExitCode.INTERRUPTED))
+        return _report(told, "interrupted", wants_json, bare=True)
     except BrokenPipeError:
         return _leave_quietly()
     except OSError as error:
@@ -191,7 +199,7 @@ def _plain(kind: str, message: str, exit_code: int) -> dict[str, Any]:
 
 
 def _report(description: dict[str, Any], text: str, wants_json: bool, *, bare: bool = False) -> int:
-    """Print an error; *bare* without the word, so that file:line:col starts the line, as editors expect."""
+    """Print an error; *bare* without the word: where file:line:col starts the line, and where nothing is wrong."""
     from cosmos_cli.console import print_error, print_json
 
     try:

@@ -9,13 +9,14 @@ from __future__ import annotations
 import gc
 import sys
 
-from cosmos_cli.fleet import headstart
-
 
 def main() -> None:
     """Run the command line and end the process with its exit code."""
     gc.disable()  # imports make many objects and no garbage; the command itself is collected again
     try:
+        # Here, where Ctrl-C is heard: whoever starts the wrong command stops it in its first moment.
+        from cosmos_cli.fleet import headstart
+
         headstart.begin(sys.argv[1:])
         from cosmos_cli import app
     except KeyboardInterrupt:

@@ -67,7 +67,7 @@ def exec(  # noqa: A001 - the verb's name is the function's
             lambda outcome: _print(console, outcome, width),
         )
     except KeyboardInterrupt:
-        console.say("interrupted: what still ran there is ended")
+        console.say("what still ran there is ended")
         raise
     exit_code = _exit_code(outcomes)
     console.say(_verdict(outcomes))

@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -209,6 +210,24 @@ def test_interrupt_while_a_machine_does_not_answer_is_heard_at_once(inventory):
             process.send_signal(signal.SIGINT)
             assert process.wait(WAIT_S) == 130
             assert time.monotonic() - start_s < 5.0
+
+
+@pytest.mark.parametrize("arguments", [["ping"], ["up"], ["packages", "upgrade"]])
+def test_interrupted_command_says_so_to_people_and_to_scripts(inventory, arguments):
+    with silent_server() as port, socket.create_server(("127.0.0.1", 0)) as noticing:
+        file = inventory(
+            frozen={"ansible_host": "127.0.0.1", "ansible_port": port},
+            asked={"ansible_host": "127.0.0.1", "ansible_port": noticing.getsockname()[1]},
+        )
+        with cosmos(*arguments, "-i", file, "-l", "frozen,asked", "--json") as process:
+            noticing.settimeout(WAIT_S)
+            noticing.accept()[0].close()  # the command is under way
+            process.send_signal(signal.SIGINT)
+            said, talk = process.communicate(timeout=WAIT_S)
+
+    assert process.returncode == 130
+    assert json.loads(said)["error"]["kind"] == "interrupted"
+    assert talk == b"interrupted\n"
 
 
 def test_exec_as_root_where_the_inventory_forbids_it_is_refused(inventory, capsys, servers):
