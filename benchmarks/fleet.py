@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
 import statistics
 import subprocess
@@ -36,6 +35,8 @@ import uv  # noqa: E402
 from rivals import Ansible, Job, Pyinfra, install_rivals, run  # noqa: E402
 from tower import Tower  # noqa: E402
 
+from cosmos_cli.cache import cache_folder  # noqa: E402
+
 JOBS = ("first up", "second up", "exec", "fetch")
 COLLECT = "collect"
 """Ours alone: fetch, verify, judge, report, package, clear up."""
@@ -54,7 +55,7 @@ def main() -> None:
     parser.add_argument("--rivals", default="pyinfra,ansible", help="whom to compare with")
     parser.add_argument("--json", action="store_true", help="print all times as JSON")
     arguments = parser.parse_args()
-    cache = Path(os.environ.get("COSMOS_CACHE") or Path.home() / ".cache/cosmos")
+    cache = cache_folder()
     rivals = [name for name in arguments.rivals.split(",") if name]
     programs = install_rivals(cache) if rivals else cache
     times: dict[int, dict[str, dict[str, list[float]]]] = {}
