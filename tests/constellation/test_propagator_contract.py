@@ -11,6 +11,7 @@ from propagator_kinds import EXTRAS, OWN, distance_m, make_kind, orbits
 
 from madns_runtime.errors import ConfigurationError, MissingExtraError
 from madns_runtime.simulations.constellation import truth
+from madns_runtime.simulations.constellation.orbit.constants import EARTH_POLAR_RADIUS_M
 from madns_runtime.simulations.constellation.orbit.invariants import ENERGY
 from madns_runtime.simulations.constellation.parameters import (
     CustomPropagator,
@@ -226,8 +227,6 @@ def test_a_thrust_is_refused_by_who_cannot_maneuver(folder):
     [
         (lambda s: s.__setitem__((2, 4), math.nan), "C: expected a finite state, got .*nan"),
         (lambda s: s.__setitem__((2, 0), math.inf), "C: expected a finite state, got .*inf"),
-        (lambda s: s.__setitem__((2, slice(0, 3)), 3e6), "C: is inside the Earth, 5196.2 km"),
-        (lambda s: s.__setitem__((2, slice(0, 3)), 0.0), "C: is inside the Earth, 0.0 km"),
     ],
 )
 def test_bad_states_are_named(kind, change, what):
@@ -238,12 +237,41 @@ def test_bad_states_are_named(kind, change, what):
         propagate(states, 5.0, np.array([6.0]), kind.parameters(names=("A", "B", "C", "D")))
 
 
-def test_a_vehicle_that_meets_the_earth_is_named_with_the_time(numerical):
-    states = orbits()
+def test_a_vehicle_that_meets_the_earth_stands_still_there_and_the_others_fly_on(numerical):
+    states, knots_s = orbits(), np.arange(0.0, 700.0, 20.0)
     states[1, 3:] *= 0.5
 
-    with pytest.raises(ConfigurationError, match=r"^vehicle 1: is inside the Earth, .* at 600 s$"):
-        propagate(states, 0.0, np.array([10.0, 600.0]), numerical.parameters())
+    found = propagate(states, 0.0, knots_s, numerical.parameters())
+
+    expected = propagate(orbits(), 0.0, knots_s, numerical.parameters())
+    assert distance_m(found[[0, 2, 3]], expected[[0, 2, 3]]) < 1e-7
+    heights_m = np.linalg.norm(found[1, :, :3], axis=1) - EARTH_POLAR_RADIUS_M
+    met = int(np.argmax(heights_m < 0.0))
+    assert 10 < met < 30
+    assert np.linalg.norm(found[1, met, 3:]) > 4e3
+    assert (found[1, met:, :3] == found[1, met, :3]).all()
+    assert not found[1, met + 1 :, 3:].any()
+
+
+def test_a_call_that_begins_inside_the_earth_stays_where_it_began(kind):
+    states = orbits()
+    states[2, :3] = 3e6, 3e6, 3e6
+    knots_s = np.array([5.0, 6.0, 2000.0])
+
+    found = propagate(states, 5.0, knots_s, kind.parameters())
+
+    assert (found[2, :, :3] == 3e6).all()
+    assert found[2, :, 3:].any(axis=1).tolist() == [True, False, False]
+    others = propagate(orbits(), 5.0, knots_s, kind.parameters())
+    assert distance_m(found[[0, 1, 3]], others[[0, 1, 3]]) < 1e-6
+
+
+def test_a_fleet_of_wrecks_stays_where_it_is(kind):
+    states = np.zeros((4, 6))
+
+    found = propagate(states, 5.0, np.array([6.0]), kind.parameters())
+
+    assert not found.any()
 
 
 @pytest.mark.parametrize("name", ["scipy", "numba"])

@@ -18,7 +18,11 @@ def folder(tmp_path):
 @pytest.mark.parametrize(
     ("implementation", "error", "what"),
     [
-        ("own.py:Flat", ConfigurationError, r"expected states of shape \(4, 1, 6\), got \(4, 6\)"),
+        (
+            "own.py:Flat",
+            ConfigurationError,
+            r"of shape \(4, 1, 6\) of float64, got \(4, 6\) of float64",
+        ),
         ("own.py:Idle", PluginError, "expected a class with the method propagate"),
         ("own.py:Demanding", PluginError, "own.py:Demanding: TypeError: .*orbit"),
         ("own.py:Missing", PluginError, "Missing"),

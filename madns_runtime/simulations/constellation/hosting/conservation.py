@@ -84,8 +84,14 @@ class Conservation:
             self._reference[vehicle] = store.invariants(vehicle, window)[first].copy()
         return first
 
-    def _judge(self, vehicle: int, values: NDArray[np.float64]) -> tuple[float, float]:
+    def _judge(
+        self, vehicle: int, values: NDArray[np.float64]
+    ) -> tuple[float, float] | tuple[None, None]:
         """Return the drifts of energy and momentum at the last knot, relative to the reference."""
+        # Who has met the Earth stands still and keeps nothing.
+        values = values[values[:, MOMENTUM] > 0.0]
+        if not len(values):
+            return None, None
         reference = self._reference[vehicle]
         assert reference is not None
         deviation = values - reference

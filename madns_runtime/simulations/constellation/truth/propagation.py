@@ -42,6 +42,8 @@ PROPAGATORS = {
 """The kind in a scenario -> module:class."""
 FAULTS_MAX = 5
 """Vehicles that one message names."""
+_ANY_ORBIT = (7.0e6, 0.0, 0.0, 0.0, 7.5e3, 0.0)
+"""Position and velocity, m and m/s."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,25 +167,56 @@ def propagate(
     """
     Return the states of all vehicles at all knots by the propagator of the settings.
 
-    Arguments and result are those of `Propagator.propagate`, and are judged here for all kinds.
+    Arguments and result are those of `Propagator.propagate`, and are judged here for all kinds. A vehicle
+    that has met the Earth stands still: from the knot after the first one inside it, or all through a call
+    that begins there, so that the others' truth goes on.
 
     Raises:
-        ConfigurationError: Arguments do not fit each other, a vehicle cannot be propagated, or one
-            is inside the Earth; the message names it and says when and why.
+        ConfigurationError: Arguments do not fit each other, or a vehicle cannot be propagated; the
+            message names it and says when and why.
         MissingExtraError: The library behind the propagator is not installed.
     """
     _check_arguments(states, t0_s, knots_s, parameters)
     shape = (len(states), len(knots_s), 6)
     if 0 in shape:
         return np.empty(shape)
-    found = load_propagator(parameters.settings.kind).propagate(states, t0_s, knots_s, parameters)
-    if getattr(found, "shape", None) != shape:
-        got = getattr(found, "shape", type(found).__name__)
-        raise ConfigurationError(
-            f"parameters.propagator: expected states of shape {shape}, got {got}"
-        )
-    _check_states(found, knots_s, parameters)
-    return found
+    is_down = is_inside_earth(states)
+    flown = states
+    if is_down.any():
+        # Something flies in the place of a wreck, whose own way would lead to the Earth's centre.
+        flown = states.copy()
+        flown[is_down] = states[~is_down][0] if not is_down.all() else _ANY_ORBIT
+    found = load_propagator(parameters.settings.kind).propagate(flown, t0_s, knots_s, parameters)
+    _check_result(found, shape, knots_s, parameters)
+    inside = is_inside_earth(found)
+    if not (inside.any() or is_down.any()):
+        return found
+    return _held(states, found, inside, knots_s > t0_s)
+
+
+def is_inside_earth(states: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell of states (..., 6) whether they are nearer to the Earth's centre than its poles."""
+    r2 = np.einsum("...i,...i->...", states[..., :3], states[..., :3])
+    return np.asarray(r2 < EARTH_POLAR_RADIUS_M**2)
+
+
+def _held(
+    states: NDArray[np.float64],
+    found: NDArray[np.float64],
+    inside: NDArray[np.bool_],
+    is_later: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """Return the states found with vehicles standing still once they are inside the Earth."""
+    held = np.array(found)
+    for vehicle in np.flatnonzero(is_inside_earth(states)):
+        held[vehicle] = states[vehicle]
+        held[vehicle, is_later, 3:] = 0.0
+        inside[vehicle] = False
+    for vehicle in np.flatnonzero(inside.any(axis=1)):
+        first = int(np.argmax(inside[vehicle]))
+        held[vehicle, first + 1 :, :3] = held[vehicle, first, :3]
+        held[vehicle, first + 1 :, 3:] = 0.0
+    return held
 
 
 def propagate_stretch(request: StretchRequest, parameters: PropagationParameters) -> Stretch:
@@ -234,29 +267,40 @@ def _check_arguments(
         faults.append(f"propagation: expected knots that ascend from {t0_s:g} s on, got {knots_s}")
     if faults:
         raise ConfigurationError("\n".join(faults))
-    _check_states(states[:, None], np.array([t0_s]), parameters)
+    _check_finite(states[:, None], np.array([t0_s]), parameters)
 
 
-def _check_states(
+def _check_result(
+    found: NDArray[np.float64],
+    shape: tuple[int, ...],
+    knots_s: NDArray[np.float64],
+    parameters: PropagationParameters,
+) -> None:
+    """Raise ConfigurationError for anything but finite float64 states of that shape."""
+    if not isinstance(found, np.ndarray) or found.shape != shape or found.dtype != np.float64:
+        is_array = isinstance(found, np.ndarray)
+        got = f"{found.shape} of {found.dtype}" if is_array else type(found).__name__
+        raise ConfigurationError(
+            f"parameters.propagator: expected states of shape {shape} of float64, got {got}"
+        )
+    _check_finite(found, knots_s, parameters)
+
+
+def _check_finite(
     states: NDArray[np.float64], times_s: NDArray[np.float64], parameters: PropagationParameters
 ) -> None:
-    """Raise ConfigurationError for states (N, K, 6) that are not finite or lie inside the Earth."""
-    r2 = np.einsum("nki,nki->nk", states[..., :3], states[..., :3])
+    """Raise ConfigurationError for states (N, K, 6) that are not finite."""
     # A sum is finite only if all of its numbers are: one quick look at what is nearly always sound.
-    if not r2.size or (r2.min() >= EARTH_POLAR_RADIUS_M**2 and np.isfinite(states.sum())):
+    if np.isfinite(states.sum()):
         return
-    sound = (r2 >= EARTH_POLAR_RADIUS_M**2) & np.isfinite(states).all(axis=2)
+    sound = np.isfinite(states).all(axis=2)
     vehicles = np.flatnonzero(~sound.all(axis=1))
     faults = []
     for vehicle in vehicles[:FAULTS_MAX].tolist():
         knot = int(np.argmin(sound[vehicle]))
-        distance_km = float(np.sqrt(r2[vehicle, knot])) / 1000.0
-        what = (
-            f"is inside the Earth, {distance_km:.1f} km from its centre"
-            if np.isfinite(states[vehicle, knot]).all()
-            else f"expected a finite state, got {states[vehicle, knot].tolist()}"
-        )
+        what = f"expected a finite state, got {states[vehicle, knot].tolist()}"
         faults.append(f"{parameters.name_of(vehicle)}: {what}, at {times_s[knot]:g} s")
     if len(vehicles) > FAULTS_MAX:
         faults.append(f"and {len(vehicles) - FAULTS_MAX} more")
-    raise ConfigurationError("\n".join(faults))
+    if faults:  # else their sum alone is too large
+        raise ConfigurationError("\n".join(faults))

@@ -1,0 +1,56 @@
+"""A vehicle that meets the Earth is lost by name and time; the truth of the others goes on."""
+
+import pytest
+from constellation_fakes import Star, parameters, state_rows
+
+from madns_runtime.errors import BlamedError
+from madns_runtime.simulations.constellation.orbit.constants import EARTH_POLAR_RADIUS_M
+
+TWO = {
+    "keplerian": [
+        {"name": "HIGH", "altitude_km": 780, "i_deg": 86},
+        {"name": "FALLER", "a_km": 6420, "e": 0.006, "i_deg": 60, "mean_anomaly_deg": 90},
+    ]
+}
+DIVE = """
+class Dive:
+    def setup(self, context):
+        self.context = context
+
+    def step(self, t_s, readings):
+        if t_s == 1.0:
+            self.context.delta_v((-5000.0, 0.0, 0.0), at_s=4.0)
+"""
+THRUSTER = {"thruster": {"isp_s": 1e6, "propellant_kg": 50}}
+
+
+@pytest.fixture
+def star(tmp_path):
+    (tmp_path / "dive.py").write_text(DIVE)
+    flight = {"software": "dive.py:Dive", "input": "truth", "agents": ["FALLER"]}
+    settings = parameters(TWO, flight=flight, vehicles=[THRUSTER])
+    return Star(settings, count=2, duration_s=60.0, base_directory=tmp_path)
+
+
+def test_who_meets_the_earth_ends_with_that_as_its_reason(star):
+    with pytest.raises(BlamedError, match=r"^FALLER has met the Earth at 16\.9 s$"):
+        star.run(60.0)
+
+    x, y, z = state_rows(star, "agent-02")[-1, 1:4]
+    assert 0.0 < (x * x + y * y + z * z) ** 0.5 - EARTH_POLAR_RADIUS_M < 1000.0
+
+
+def test_the_others_go_on_and_what_fell_is_not_judged(star):
+    with pytest.raises(BlamedError):
+        star.run(60.0)
+    at_s = star.context.clock_s
+
+    del star.agents["agent-02"]
+    star.host.agent_lost("agent-02", "it fell")
+    star.run(60.0, from_s=at_s + 0.1)
+
+    assert state_rows(star, "agent-01")[-1, 0] == 599
+    assert star.agents["agent-01"].finish()["underruns"] == 0
+    summary = star.host.finish()
+    assert summary["energy_drift_max"] < 1e-12
+    assert all(check["passed"] for check in summary["checks"])
