@@ -20,12 +20,12 @@ class Thruster:
 
     __pydantic_config__ = FORBID_EXTRA
 
-    isp_s: Annotated[float, Gt(0)]
+    isp_s: Annotated[float, Gt(0), Le(100_000)]
     """Specific impulse, s."""
     propellant_kg: Annotated[float, Ge(0)]
     """Propellant at the epoch, kg; part of the vehicle's mass."""
     thrust_n: Annotated[float, Gt(0)] | None = None
-    """Thrust, N: delta-v is a finite burn centred on its time; none for an impulse."""
+    """Thrust, N: delta-v is a finite burn around its time; none for an impulse."""
     magnitude_error: Annotated[float, Ge(0), Lt(1)] = 0.0
     """Standard deviation of the delta-v's magnitude, as a share of it."""
     direction_error_deg: Annotated[float, Ge(0), Le(45)] = 0.0
@@ -114,11 +114,13 @@ class Sensors:
     __pydantic_config__ = FORBID_EXTRA
 
     gnss: Gnss | None = None
+    """Position and velocity."""
     gyro: SensorNoise | None = None
     """Body rates, rad/s."""
     accelerometer: SensorNoise | None = None
     """Specific force, mean since the measurement before, in body axes, m/s^2."""
     magnetometer: Magnetometer | None = None
+    """Magnetic field."""
     star_tracker: SensorNoise | None = None
     """Quaternion, scalar last, inertial to body; noise in rad about each body axis."""
     sun_sensor: SensorNoise | None = None

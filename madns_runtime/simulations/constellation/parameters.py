@@ -99,7 +99,7 @@ class ScipyPropagator:
     """Relative tolerance of a step, held for every vehicle by itself however many there are."""
     atol_m: Annotated[float, Ge(1e-9), Le(1)] = 1e-6
     """Absolute tolerance of a step in position, m; in velocity a thousandth of it a second."""
-    step_s_max: Annotated[float, Gt(0)] = 30.0
+    step_s_max: Annotated[float, Ge(0.01)] = 30.0
     """Longest step, s: values between steps are interpolated, and long steps would spoil them."""
 
 
@@ -117,7 +117,7 @@ class NumbaPropagator:
     """Relative tolerance of a step."""
     atol_m: Annotated[float, Ge(1e-9), Le(1)] = 1e-6
     """Absolute tolerance of a step in position, m; in velocity a thousandth of it a second."""
-    step_s_max: Annotated[float, Gt(0)] = 30.0
+    step_s_max: Annotated[float, Ge(0.01)] = 30.0
     """Longest step, s."""
     threads: Annotated[int, Ge(1), Le(256)] = 1
     """Threads that share the vehicles."""
@@ -179,9 +179,9 @@ class Maneuvers:
     late: Literal["postpone", "refuse"] = "postpone"
     """What becomes of a command that cannot be in truth by its time: executed at the first feasible time,
     or not at all."""
-    propagation_s: Annotated[float, Gt(0)] = 0.02
+    propagation_s: Annotated[float, Gt(0), Le(60)] = 0.02
     """T_p: time allowed for propagating one vehicle anew; more is counted against the inequality."""
-    network_s: Annotated[float, Ge(0)] = 0.02
+    network_s: Annotated[float, Ge(0), Le(60)] = 0.02
     """T_n: time allowed for one way of a message."""
 
 
@@ -195,7 +195,7 @@ class Crosslinks:
     """Longest link, km."""
     atmosphere_km: Annotated[float, Ge(0)] = 100.0
     """Height below which the Earth's atmosphere blocks a link, km."""
-    rate_bit_s: Annotated[float, Gt(0)] = 1e6
+    rate_bit_s: Annotated[float, Ge(1)] = 1e6
     """Rate of every transmitter; its messages wait for each other, bit/s."""
     processing_s: Annotated[float, Ge(0)] = 0.0
     """Added to light time and transmission, s."""
@@ -221,7 +221,7 @@ class GroundStation:
     """Height above the ellipsoid, m."""
     elevation_deg_min: Annotated[float, Ge(0), Lt(90)] = 10.0
     """Elevation mask, deg."""
-    rate_bit_s: Annotated[float, Gt(0)] = 1e6
+    rate_bit_s: Annotated[float, Ge(1)] = 1e6
     """Rate of each way of a contact, bit/s."""
     loss: Annotated[float, Ge(0), Le(1)] = 0.0
     """Share of messages of either way that are lost."""
