@@ -47,6 +47,8 @@ class RunSummary:
     verdict: Verdict
     document: Mapping[str, Any]
     """run.json."""
+    is_packed: bool = True
+    """Whether the package holds all of this."""
 
     @property
     def exit_code(self) -> ExitCode:
@@ -240,6 +242,7 @@ def _conclude(
     packed = _attempt(evidence, run.bundle, lambda: pack_run(run, _start_s(document)))
     if packed is not evidence:
         summary = _write_summary(run, gathered, packed)
+        return dataclasses.replace(summary, is_packed=False)
     return summary
 
 

@@ -65,7 +65,8 @@ def collect(
         console.print_json(summary.document)
         # The verdict where `run` puts it: on stdout, or beside JSON as talk.
         (console.say if as_json else console.data)(summary.last_line)
-        console.say(f"packed: {found.bundle}")
+        if summary.is_packed:
+            console.say(f"packed: {found.bundle}")
     return int(ExitCode.DATA_INCOMPLETE if summary.missing else ExitCode.OK)
 
 

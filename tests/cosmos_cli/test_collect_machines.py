@@ -69,6 +69,20 @@ def test_records_of_all_machines_come_and_the_run_is_judged(split, capsys):
     files = json.loads(split.run.manifest_json.read_bytes())["files"]
     assert {"machines/pi01/manifest.json", "machines/pi02/health.jsonl"} <= set(files)
     assert split.run.bundle.exists()
+    assert f"packed: {split.run.bundle}" in err
+
+
+def test_package_that_was_not_written_is_not_said_to_be_there(split, monkeypatch, capsys):
+    def refuse(*_arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(collect, "pack_run", refuse)
+
+    assert app.run(["collect"]) == 5
+
+    err = capsys.readouterr().err
+    assert f"{split.run.bundle.name}: not written: No space left on device" in err
+    assert "packed:" not in err
 
 
 def test_second_time_is_the_same_and_asks_nobody(split, network):
