@@ -271,19 +271,20 @@ def _check_arguments(
 
 
 def _check_result(
-    found: NDArray[np.float64],
+    found: object,
     shape: tuple[int, ...],
     knots_s: NDArray[np.float64],
     parameters: PropagationParameters,
 ) -> None:
     """Raise ConfigurationError for anything but finite float64 states of that shape."""
-    if not isinstance(found, np.ndarray) or found.shape != shape or found.dtype != np.float64:
-        is_array = isinstance(found, np.ndarray)
-        got = f"{found.shape} of {found.dtype}" if is_array else type(found).__name__
-        raise ConfigurationError(
-            f"parameters.propagator: expected states of shape {shape} of float64, got {got}"
-        )
-    _check_finite(found, knots_s, parameters)
+    got = type(found).__name__
+    if isinstance(found, np.ndarray):
+        if found.shape == shape and found.dtype == np.float64:
+            return _check_finite(found, knots_s, parameters)
+        got = f"{found.shape} of {found.dtype}"
+    raise ConfigurationError(
+        f"parameters.propagator: expected states of shape {shape} of float64, got {got}"
+    )
 
 
 def _check_finite(
@@ -293,7 +294,8 @@ def _check_finite(
     # A sum is finite only if all of its numbers are: one quick look at what is nearly always sound.
     if np.isfinite(states.sum()):
         return
-    sound = np.isfinite(states).all(axis=2)
+    finite: NDArray[np.bool_] = np.isfinite(states)
+    sound = finite.all(axis=2)
     vehicles = np.flatnonzero(~sound.all(axis=1))
     faults = []
     for vehicle in vehicles[:FAULTS_MAX].tolist():
