@@ -26,6 +26,7 @@ from cosmos_cli.errors import InputError
 from cosmos_cli.runindex import remember_run, remembered_runs
 from madns_runtime.config import RunConfig, from_mapping, to_mapping
 from madns_runtime.errors import ConfigurationError
+from madns_runtime.processes import list_processes
 
 RESERVE_NAME = ".reserve"
 RESERVE_BYTES = 1024 * 1024
@@ -161,7 +162,7 @@ def create_run(root: Path, scenario_name: str) -> RunDirectory:
         root.mkdir(parents=True, exist_ok=True)
         with (root / LOCK_NAME).open("wb") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            number = max((run.number or 0 for run in list_runs(root)), default=0) + 1
+            number = max((0, *_numbers(root))) + 1
             run = RunDirectory((root / f"{number:04d}-{slug}").resolve())
             run.path.mkdir()
         remember_run(run.name, run.path)
@@ -176,6 +177,16 @@ def create_run(root: Path, scenario_name: str) -> RunDirectory:
             f"choose another folder with --runs or {RUNS_VARIABLE}"
         ) from error
     return run
+
+
+def _numbers(root: Path) -> Iterator[int]:
+    """Yield the numbers that are taken: of what lies there, and of runs whose folder was deleted while they live."""
+    top = root.resolve()
+    yield from (run.number or 0 for run in list_runs(root))
+    for entry in list_processes():
+        match = RUN_NAME.match(entry.run)
+        if match and Path(entry.run_directory).is_relative_to(top):
+            yield int(match[1])
 
 
 def discard_run(run: RunDirectory) -> None:

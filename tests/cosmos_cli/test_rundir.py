@@ -1,9 +1,12 @@
+import os
+import shutil
 import subprocess
 import sys
 import threading
 
 import orjson
 import pytest
+from registered import registered
 from synthetic_run import make_config
 
 from cosmos_cli.errors import InputError
@@ -159,3 +162,16 @@ def test_run_that_could_not_be_made_is_not_there_to_be_collected(tmp_path, monke
         create_run(tmp_path, "b")
 
     assert [run.name for run in list_runs(tmp_path)] == ["0001-a"]
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("folder", ["", "host"])
+def test_number_of_a_living_run_is_not_given_again_when_its_folder_is_deleted(tmp_path, folder):
+    first = create_run(tmp_path / "runs", "a")
+    places = {"directory": first.path / folder, "state": os.environ["COSMOS_STATE_DIR"]}
+    with registered(first.name, "host", "host", **places):
+        shutil.rmtree(tmp_path / "runs")
+
+        assert create_run(tmp_path / "runs", "a").name == "0002-a"
+        assert create_run(tmp_path / "elsewhere", "a").name == "0001-a"
+    assert create_run(tmp_path / "third", "a").name == "0001-a"
