@@ -113,7 +113,7 @@ class Facts:
     disk: Disk
     network: NetworkFacts = field(default_factory=NetworkFacts)
     clock_offset_s: float = 0.0
-    """Its clock less the operator's; as exact as the question's way there and back."""
+    """Its clock less the operator's: what is certain of it, however long the answer took."""
     uptime_s: float | None = None
     boot_id: str | None = None
     memory_total_bytes: int | None = None
@@ -179,7 +179,9 @@ class Facts:
                     "wireless_up": tuple(told["network"].get("wireless_up") or ()),
                 }
             ),
-            clock_offset_s=clock["utc_s"] - (asked_utc_s + answered_utc_s) / 2,
+            clock_offset_s=_nearest_to_zero(
+                clock["utc_s"] - answered_utc_s, clock["utc_s"] - asked_utc_s
+            ),
             uptime_s=clock.get("uptime_s"),
             boot_id=clock.get("boot_id"),
             memory_total_bytes=memory.get("total_bytes"),
@@ -245,6 +247,10 @@ def files_of(told: Mapping[str, Any]) -> dict[str, FileFact]:
 def condition_key(condition: Mapping[str, Any]) -> str:
     """Return the key by which a condition is asked and answered."""
     return json.dumps(condition, sort_keys=True)
+
+
+def _nearest_to_zero(low: float, high: float) -> float:
+    return min(max(low, 0.0), high)
 
 
 def _radio_words(radio: Radio) -> str:

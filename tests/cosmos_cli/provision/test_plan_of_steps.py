@@ -5,9 +5,10 @@ import json
 from dataclasses import dataclass
 
 import pytest
-from provision_machines import CASES, HOME, facts_of, wanted
+from provision_machines import CASES, HOME, facts_of, told, wanted
 
 from cosmos_cli.fleet.failure import MachineFailure
+from cosmos_cli.provision.facts import Facts
 from cosmos_cli.provision.notes import notes_of
 from cosmos_cli.provision.steps import RESERVE_BYTES, check_possible, plan_steps
 
@@ -138,11 +139,20 @@ def test_facts_tell_the_clock_and_leave_out_what_only_the_plan_needed():
 
     mapping = facts.to_mapping()
 
-    assert mapping["clock_offset_s"] == 10.0
+    assert mapping["clock_offset_s"] == 9.5  # at least: it was read within a second
     assert mapping["model"] == "Raspberry Pi 4 Model B Rev 1.4"
     assert mapping["radios"] == {"rfkill0": "bluetooth: on", "rfkill1": "wlan: on"}
     assert "files" not in mapping
     assert json.loads(json.dumps(mapping)) == mapping
+
+
+def test_slow_answer_makes_no_clock_wrong():
+    """Conditions of commands may take a minute, and the clock is read before them."""
+    answer = told(clock={"utc_s": 1000.1})
+    facts = Facts.from_mapping(answer, asked_utc_s=1000.0, answered_utc_s=1060.0)
+
+    assert facts.clock_offset_s == 0.0
+    assert notes_of(facts, wanted()) == ()
 
 
 @pytest.mark.parametrize(
@@ -150,7 +160,8 @@ def test_facts_tell_the_clock_and_leave_out_what_only_the_plan_needed():
     [
         ({}, {}, ()),
         ({"clock": {"utc_s": 1004.0}}, {}, ()),
-        ({"clock": {"utc_s": 1000.5 - 7200}}, {}, ("2 h behind this computer's",)),
+        ({"clock": {"utc_s": 1001.0 + 5.1}}, {}, ("5 s ahead",)),
+        ({"clock": {"utc_s": 1000.0 - 7200}}, {}, ("2 h behind this computer's",)),
         ({"clock": {"utc_s": 1000.5 + 30}}, {}, ("30 s ahead of this computer's",)),
         ({"throttled": 0x50005}, {}, ("its supply voltage is too low and it is throttled",)),
         ({"throttled": 0x50000}, {}, ()),
