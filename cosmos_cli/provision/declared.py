@@ -44,6 +44,8 @@ class Sketch:
     files: dict[str, FileFact]
     packages: set[str]
     """Those that will have been installed."""
+    may_bring_files: bool = False
+    """Whether packages or commands of the plan may make files that are not there yet."""
 
 
 def declared_steps(
@@ -60,7 +62,8 @@ def declared_steps(
     Raises:
         MachineFailure: One cannot be done, such as a line in a file that is not there.
     """
-    sketch = Sketch(files=dict(facts.files), packages=set(packages))
+    is_any_new = any(facts.packages.get(name) is None for name in packages)
+    sketch = Sketch(files=dict(facts.files), packages=set(packages), may_bring_files=is_any_new)
     for each in declared:
         for step in _PLANNERS[each.step.kind](each, facts, sketch):
             name = each.step.name
@@ -68,7 +71,9 @@ def declared_steps(
 
 
 def _packages(declared: Declared, facts: Facts, sketch: Sketch) -> Iterator[Step]:
-    yield from package_step(facts, declared.step.packages or (), sketch.packages)
+    for step in package_step(facts, declared.step.packages or (), sketch.packages):
+        sketch.may_bring_files = True
+        yield step
 
 
 def _file(declared: Declared, facts: Facts, sketch: Sketch) -> Iterator[Step]:
@@ -149,7 +154,7 @@ def _line(declared: Declared, facts: Facts, sketch: Sketch) -> Iterator[Step]:
     is_present = action.state == "present"
     if before.kind == "missing" and not is_present:
         return
-    if before.kind == "missing" and not action.create:
+    if before.kind == "missing" and not (action.create or sketch.may_bring_files):
         text = f"line in {path}: there is no such file on this machine"
         raise MachineFailure(
             FailureKind.STEP, text, "correct the path, or say create: true in cosmos_provision"
@@ -223,6 +228,7 @@ def _command(declared: Declared, facts: Facts, sketch: Sketch) -> Iterator[Step]
     assert condition is not None
     if facts.conditions.get(condition_key(condition)):
         return
+    sketch.may_bring_files = True
     asked = {**condition, "run": action.run, "timeout_s": COMMAND_TIMEOUT_S}
     first = action.run.strip().splitlines()[0]
     more = " ..." if "\n" in action.run.strip() else ""
