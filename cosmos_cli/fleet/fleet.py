@@ -126,7 +126,8 @@ def fleet_of(
         machines = load()
         load = functools.partial(tuple, machines)
         targets = tuple(target_of(machine) for machine in machines)
-        remember(key, targets)
+        if key == key_of(inventory, limit):  # nobody edited it meanwhile
+            remember(key, targets)
     return Fleet(
         targets=targets,
         forks=forks,

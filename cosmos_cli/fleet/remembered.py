@@ -60,21 +60,23 @@ def remember(key: str | None, targets: Sequence[Target]) -> None:
 def key_of(inventory: Path, limit: str | None) -> str | None:
     """Return a hash of all that the targets of an inventory depend on; None when that is too much."""
     told = hashlib.sha256()
-    where = (__version__, str(Path(inventory).absolute()), str(Path.cwd()), str(Path.home()))
-    told.update(json.dumps([*where, limit]).encode())
     size_bytes = 0
     try:
+        where = (__version__, str(Path(inventory).absolute()), str(Path.cwd()), str(Path.home()))
+        told.update(json.dumps([*where, limit]).encode())
         for path in READERS.rglob("*.py"):
             status = path.stat()
             told.update(f"{path} {status.st_mtime_ns} {status.st_size}\n".encode())
         for count, path in enumerate(_files(inventory)):
+            if not path.is_file():  # a pipe would be empty for who reads it next
+                return None
             data = path.read_bytes()
             size_bytes += len(data)
             if count >= FILES_MAX or size_bytes > BYTES_MAX:
                 return None
             told.update(f"{path} {len(data)}\n".encode())
             told.update(data)
-    except OSError:
+    except (OSError, RuntimeError):  # also: a folder that is gone, nobody's home
         return None
     return told.hexdigest()
 

@@ -2,11 +2,12 @@
 
 import os
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 from cosmos_cli.errors import InputError
-from cosmos_cli.fleet import remembered
+from cosmos_cli.fleet import fleet, remembered
 from cosmos_cli.fleet.fleet import fleet_of
 from cosmos_cli.fleet.remembered import key_of, recall, remember
 from cosmos_cli.fleet.target import Target
@@ -26,8 +27,6 @@ def inventory(tmp_path):
 @pytest.fixture
 def reads(monkeypatch):
     """How often an inventory was read."""
-    from cosmos_cli.fleet import fleet
-
     counted = []
     read = fleet._machines
     monkeypatch.setattr(
@@ -49,11 +48,11 @@ def test_second_reading_of_an_unchanged_inventory_is_spared(inventory, reads):
 
 def test_machines_are_read_when_somebody_asks_for_them(inventory, reads):
     addresses(inventory)
-    fleet = fleet_of(inventory)
+    machines = fleet_of(inventory)
 
     assert len(reads) == 1
-    assert [machine.name for machine in fleet.machines] == ["pi1", "pi2"]
-    assert fleet.machines is fleet.machines
+    assert [machine.name for machine in machines.machines] == ["pi1", "pi2"]
+    assert machines.machines is machines.machines
     assert len(reads) == 2
 
 
@@ -89,6 +88,45 @@ def test_missing_inventory_is_told(tmp_path):
     assert key_of(tmp_path / "none.yaml", None) is None
     with pytest.raises(InputError):
         fleet_of(tmp_path / "none.yaml")
+
+
+def test_inventory_that_comes_through_a_pipe_is_left_to_who_reads_it(inventory, tmp_path):
+    """As of `-i <(command)`: what is read of a pipe is gone."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(pipe.write_text, inventory.read_text())
+
+        assert key_of(pipe, None) is None
+        assert addresses(pipe) == ["10.0.0.1", "pi2"]
+
+
+def test_nothing_is_remembered_of_an_inventory_that_changes_while_it_is_read(
+    inventory, monkeypatch
+):
+    text = inventory.read_text()
+    load = fleet._machines
+
+    def edit_and_load(*arguments):
+        inventory.write_text(text.replace("10.0.0.1", "10.0.0.9"))
+        return load(*arguments)
+
+    monkeypatch.setattr(fleet, "_machines", edit_and_load)
+    assert addresses(inventory) == ["10.0.0.9", "pi2"]
+    monkeypatch.setattr(fleet, "_machines", load)
+    inventory.write_text(text)
+
+    assert addresses(inventory) == ["10.0.0.1", "pi2"]
+
+
+def test_folder_that_is_gone_is_no_failure(inventory, tmp_path, monkeypatch):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+
+    assert key_of(inventory, None) is None
+    assert addresses(inventory) == ["10.0.0.1", "pi2"]
 
 
 def test_where_one_stands_counts_since_key_files_may_be_relative(inventory, tmp_path, monkeypatch):
