@@ -18,6 +18,7 @@ from cosmos_cli.tables import TableReader, open_tables
 SENTENCES_MAX = 60
 CONTROL = "Control"
 LEVELS_TOLD = ("critical", "error", "warning")
+NOT_MEASURED = "not measured"
 OF_MACHINES = ("machine_health", "host_health", "process", "clock")
 
 
@@ -105,7 +106,7 @@ def figures_of(document: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     lost = agents.get("lost") or ()
     return [
         ("agents", _number(agents.get("count")), f"{len(lost)} lost"),
-        ("real-time factor", _number(document.get("rtf"), ".6f"), "simulated per wall second"),
+        ("real-time factor", _number(document.get("rtf"), ".7g"), "simulated per wall second"),
         (
             "ticks missed",
             _number(timing.get("missed")),
@@ -113,13 +114,13 @@ def figures_of(document: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         ),
         (
             "lateness p99",
-            f"{_number(lateness.get('p99'), '.3g')} ms",
-            f"max {_number(lateness.get('max'), '.3g')} ms",
+            _milliseconds(lateness.get("p99")),
+            f"max {_milliseconds(lateness.get('max'))}" if lateness else NOT_MEASURED,
         ),
         (
             "round trip p50",
-            f"{_number(round_trip.get('p50'), '.3g')} ms",
-            _round_trip_remark(round_trip),
+            _milliseconds(round_trip.get("p50")),
+            _round_trip_remark(round_trip) if "p50" in round_trip else NOT_MEASURED,
         ),
         (
             "messages lost",
@@ -138,7 +139,11 @@ def figures_of(document: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 def _round_trip_remark(round_trip: Mapping[str, Any]) -> str:
     """Tell the tail; of the clock's exchanges, of which only the quickest are recorded, there is none."""
     name = "p99" if "p99" in round_trip else "max"
-    return f"{name} {_number(round_trip.get(name), '.3g')} ms ({round_trip.get('stream', 'none')})"
+    return f"{name} {_milliseconds(round_trip.get(name))} ({round_trip.get('stream', 'none')})"
+
+
+def _milliseconds(value: object) -> str:
+    return "–" if value is None else f"{_number(value, '.3g')} ms"
 
 
 def _number(value: object, form: str = "") -> str:

@@ -102,9 +102,12 @@ class _Page:
         )
         select = _select(figure, number) if len(figure.choices) > 1 else ""
         note = f'<p class="note">{html.escape(figure.note)}</p>' if figure.note else ""
+        height = f"{figure.height_px}px"
+        if figure.is_square:
+            height = f"min({height}, 90vw)"
         return (
             f"<figure><figcaption><h3>{html.escape(figure.title)}</h3>{select}{note}</figcaption>"
-            f'<div class="plot" id="plot{number}" style="height:{figure.height_px}px"></div></figure>'
+            f'<div class="plot" id="plot{number}" style="height:{height}"></div></figure>'
         )
 
     def _encode(self, value: Any) -> Any:
@@ -214,7 +217,7 @@ def _checks(document: Mapping[str, Any]) -> str:
         passed = check.get("passed") is True
         mark = '<td class="mark good">holds</td>' if passed else '<td class="mark bad">broken</td>'
         rows.append(
-            f"<tr><td>{html.escape(str(check.get('name')))}</td>"
+            f"<tr><td>{_breakable(str(check.get('name')))}</td>"
             f'<td class="n">{html.escape(_measured(check.get("got")))}</td>'
             f'<td class="n">{html.escape(format_cell(check.get("limit")))}</td>{mark}</tr>'
         )
@@ -224,6 +227,11 @@ def _checks(document: Mapping[str, Any]) -> str:
         '<th class="n">measured</th><th class="n">limit</th><th></th></tr></thead>'
         f"<tbody>{''.join(rows)}</tbody></table></div>{remarks}</section>"
     )
+
+
+def _breakable(name: str) -> str:
+    """Return a name that may go on in the next line behind each of its parts."""
+    return html.escape(name).replace("_", "_<wbr>").replace(".", ".<wbr>")
 
 
 def _measured(value: object) -> str:

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from madns_runtime.recording.records import Field
+
 Trace = dict[str, Any]
 """One trace as plotly.js takes it; numbers are numpy arrays until the page is written."""
 
@@ -27,6 +29,8 @@ class Figure:
     choices: Sequence[Choice]
     layout: Mapping[str, Any] = field(default_factory=dict)
     height_px: int = 300
+    is_square: bool = False
+    """Whether it is never higher than the page is wide, as a scene that would else be cut off."""
     group: str = ""
     """Figures of one group, such as satellite, change their choice together."""
 
@@ -71,6 +75,12 @@ class Section:
 def headings(first: str, *numbers: str) -> tuple[Heading, ...]:
     """Return the heads of a table whose first column names things and whose others are numbers."""
     return (Heading(text=first, is_number=False), *(Heading(text=text) for text in numbers))
+
+
+def title_of(field: Field) -> str:
+    """Return a field's name in words, without the unit that ends it: that stands at the axis."""
+    unit = field.unit.lower().replace("^", "").translate(str.maketrans("/ ", "__"))
+    return field.name.removesuffix(f"_{unit}").replace("_", " ")
 
 
 def format_cell(value: object) -> str:

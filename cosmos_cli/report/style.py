@@ -29,7 +29,8 @@ def axis(title: str = "", **more: Any) -> dict[str, Any]:
         "linecolor": "#cbd2d9",
         "zeroline": False,
         "exponentformat": "power",
-        "minexponent": 5,
+        "minexponent": 7,
+        "separatethousands": True,
         "tickfont": {"size": 11, "color": MUTED},
         "automargin": True,
         **more,
@@ -45,7 +46,8 @@ def base_layout(**more: Any) -> dict[str, Any]:
     """Return what all figures share."""
     return {
         "font": {"family": FONT, "size": 12, "color": INK},
-        "margin": {"l": 60, "r": 16, "t": 30, "b": 44},
+        # Above the plot: the mode bar, and below it the legend or the titles of a grid.
+        "margin": {"l": 60, "r": 16, "t": 48, "b": 44},
         "paper_bgcolor": "rgba(0,0,0,0)",
         "plot_bgcolor": "rgba(0,0,0,0)",
         "hovermode": "closest",
@@ -158,7 +160,7 @@ def grid_layout(
         )
         result[f"yaxis{number}"] = axis(domain=[max(y1 - height, 0), y1], anchor=f"x{number}")
         result["annotations"].append(_plot_title(title, x0, y1))
-    return result, 60 + rows * row_px
+    return result, 78 + rows * row_px
 
 
 def groups_of_agents(names: Sequence[str]) -> list[tuple[str, list[str]]]:

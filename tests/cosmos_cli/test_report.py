@@ -132,6 +132,22 @@ def test_drawn_orbit_passes_through_the_flown_one(tmp_path):
     np.testing.assert_allclose(radius_km[np.isfinite(radius_km)], 7158.0, atol=1e-3)
 
 
+@pytest.mark.parametrize(("ticks", "is_cut"), [(400, False), (1700, False), (3000, True)])
+def test_orbits_of_a_long_run_are_drawn_as_orbits_and_what_is_left_out_is_told(
+    tmp_path, ticks, is_cut
+):
+    # A record every 50 s, 6026 s an orbit.
+    config = make_config(1, ticks=ticks, tick_hz=0.02)
+    _, sections = build(SyntheticRun(tmp_path, config).write(with_states=True))
+
+    figure = next(b for b in sections["Orbits"] if b.title == "Position and velocity")
+    trace = figure.choices[0].traces[0]
+    assert len(trace["x"]) <= 400
+    assert np.diff(trace["x"]).max() <= 6026.0 / 24.0
+    assert trace["x"][-1] == (ticks - 1) * 50.0
+    assert ("From" in figure.note) == (trace["x"][0] > 0.0) == is_cut
+
+
 def test_machine_without_a_sensor_is_told_plainly(tmp_path):
     _, sections = build(SyntheticRun(tmp_path).write())
 
@@ -161,7 +177,7 @@ def test_stream_of_ones_own_plug_in_gets_a_figure_for_each_number(tmp_path):
     _, sections = build(made)
 
     (figure,) = sections["Stream thrust"]
-    assert figure.title == "force n"
+    assert figure.title == "force"
     assert figure.layout["yaxis"]["title"]["text"] == "N"
     assert figure.choices[0].traces[0]["y"].tolist() == [i * 0.5 for i in range(20)]
 

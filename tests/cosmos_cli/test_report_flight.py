@@ -143,7 +143,7 @@ def test_slot_error_is_drawn_of_all_and_by_agent(blocks):
     assert largest["y"] == pytest.approx(0.2)
     assert rms["y"] == pytest.approx(np.sqrt((0.1**2 + 0.2**2) / 2))
     assert "Slot error believed, by agent" in blocks["Control"]
-    assert "Estimate: sma m" in blocks["Control"]
+    assert "Estimate: sma" in blocks["Control"]
 
 
 def test_messages_are_counted_by_outcome(blocks):

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosmos_cli.report.figures.generic import generic_blocks
-from cosmos_cli.report.figures.orbit_scene import ellipse, orbit_figure
+from cosmos_cli.report.figures.orbit_scene import MU_KM3_S2, ellipse, orbit_figure
 from cosmos_cli.report.model import Block, Choice, Figure, Remark, TableBlock, Trace, headings
-from cosmos_cli.report.sampling import Floats, evenly
+from cosmos_cli.report.sampling import Floats, evenly, thin
 from cosmos_cli.report.source import Source
 from cosmos_cli.report.style import (
     PALETTE,
@@ -23,8 +24,11 @@ from cosmos_cli.report.style import (
 from cosmos_cli.tables import TableReader
 
 POINTS_MAX, POINTS_MIN, POINTS_ALL = 400, 100, 14_000
+POINTS_PER_ORBIT_MIN = 24
+"""With fewer an orbit looks like a polygon, and a day of orbits like anything."""
 POSITION = tuple(re.compile(rf"^{axis}(_[a-z0-9]+)??_(k?m)$") for axis in "xyz")
 VELOCITY = tuple(re.compile(rf"^v{axis}(_[a-z0-9]+)??_(k?m)_s$") for axis in "xyz")
+NODE = "raan_deg"
 GROUP = "satellite"
 
 
@@ -38,7 +42,7 @@ def state_blocks(table: TableReader, source: Source) -> list[Block]:
     if not states:
         return [Remark(text="No state was recorded.")]
     frame = _frame(names[0][0])
-    return [
+    figures = [
         orbit_figure(
             {label: r_km for _, r_km, _, label in states.values()},
             [ellipse(r_km[-1], v_km_s[-1]) for _, r_km, v_km_s, _ in states.values()],
@@ -57,6 +61,11 @@ def state_blocks(table: TableReader, source: Source) -> list[Block]:
             ("h, km²/s",),
         ),
     ]
+    from_s = min(t_s[0] for t_s, *_ in states.values())
+    if from_s <= min(source.time_of(table, agent)[0][0] for agent in states):
+        return [*figures]
+    cut = f" From {from_s:g} s on: more points would not fit."
+    return [replace(figure, note=f"{figure.note}{cut}".strip()) for figure in figures]
 
 
 def elements_blocks(table: TableReader, source: Source) -> list[Block]:
@@ -72,12 +81,14 @@ def elements_blocks(table: TableReader, source: Source) -> list[Block]:
     choices, rows = [], []
     for agent in table.sources:
         t_s, _ = source.time_of(table, agent)
-        chosen = evenly(len(t_s), points)
-        shared, traces = t_s[chosen], []
+        traces = []
         columns = [source.values(table, agent, f.name) * _scale(f.unit) for f in fields]
-        for number, values in enumerate(columns, start=1):
+        for number, (field, values) in enumerate(zip(fields, columns, strict=True), start=1):
             axes: Trace = {"xaxis": f"x{number}", "yaxis": f"y{number}"}
-            traces.append(line(shared, values[chosen], titles[number - 1], **axes))
+            shown = values
+            if field.name == NODE and np.isfinite(values).all():
+                shown = np.unwrap(values, period=360.0)  # it moves slowly, over 360 deg as well
+            traces.append(line(*thin(t_s, shown, points), titles[number - 1], **axes))
         choices.append(Choice(name=_satellite(source, agent), traces=traces))
         rows.append([_satellite(source, agent), *(_last(values) for values in columns)])
     return [
@@ -131,7 +142,8 @@ def _drift(
     figure_layout["yaxis"] |= {"exponentformat": "power"}
     return Figure(
         title=title,
-        note="Against its value at simulated time zero; one point a vehicle and window of truth.",
+        note="Against its value at simulated time zero, or after the vehicle's last maneuver;"
+        " one point a vehicle and window of truth.",
         choices=choices,
         layout=figure_layout,
         group="agents",
@@ -203,13 +215,26 @@ def _read_state(
     table: TableReader, source: Source, agent: str, names: tuple[list[str], list[str]]
 ) -> State:
     t_s, _ = source.time_of(table, agent)
-    chosen = evenly(len(t_s), _points(len(table.sources)))
     km = [1.0 if "_km" in names[part][0] else 1e-3 for part in (0, 1)]
     r_km, v_km_s = (
-        np.column_stack([source.values(table, agent, n)[chosen] for n in names[part]]) * km[part]
+        np.column_stack([source.values(table, agent, n) for n in names[part]]) * km[part]
         for part in (0, 1)
     )
-    return t_s[chosen], r_km, v_km_s, _satellite(source, agent)
+    chosen = _drawn(t_s, r_km, v_km_s, _points(len(table.sources)))
+    return t_s[chosen], r_km[chosen], v_km_s[chosen], _satellite(source, agent)
+
+
+def _drawn(t_s: Floats, r_km: Floats, v_km_s: Floats, points: int) -> NDArray[np.int64]:
+    """Return which states to draw: evenly spread ones if they still show orbits, else the last that do."""
+    count = len(t_s)
+    if count <= points:
+        return np.arange(count)
+    alpha = 2.0 / np.linalg.norm(r_km[-1]) - v_km_s[-1] @ v_km_s[-1] / MU_KM3_S2
+    turn_s = 2.0 * np.pi / np.sqrt(MU_KM3_S2 * max(float(alpha), 1e-12) ** 3)
+    records = turn_s / POINTS_PER_ORBIT_MIN / (t_s[-1] - t_s[0]) * (count - 1)
+    if not records < count / points:
+        return evenly(count, points)
+    return np.arange(count - 1, -1, -max(int(records), 1))[:points][::-1]
 
 
 def _frame(field_name: str) -> str:
@@ -235,14 +260,9 @@ def _vectors(
     for number in range(1, len(titles) + 1):
         figure_layout[f"yaxis{number}"] |= {"exponentformat": "none", "separatethousands": True}
     figure_layout["showlegend"] = True
-    figure_layout["margin"] = {"l": 64, "r": 16, "t": 52, "b": 44}
-    figure_layout["legend"] = {
-        "orientation": "h",
-        "y": 1,
-        "yanchor": "bottom",
-        "x": 1,
-        "xanchor": "right",
-    }
+    figure_layout["margin"] = {"l": 64, "r": 16, "t": 70, "b": 44}
+    # Between the mode bar and the titles.
+    figure_layout["legend"] |= {"yref": "container", "y": 1 - 28 / height_px, "yanchor": "top"}
     choices = [
         Choice(name=label, traces=build(t_s, r_km, v_km_s))
         for t_s, r_km, v_km_s, label in states.values()

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from cosmos_cli.report.figures.generic import TIME_FIELDS, generic_blocks
+from cosmos_cli.report.figures.generic import generic_blocks
 from cosmos_cli.report.figures.grouped import grouped_lines, points_per_trace
 from cosmos_cli.report.model import Block, Choice, Figure, Remark, TableBlock, headings
 from cosmos_cli.report.sampling import Floats, evenly
@@ -60,9 +60,10 @@ def command_blocks(table: TableReader, source: Source) -> list[Block]:
 
 def estimate_blocks(table: TableReader, source: Source) -> list[Block]:
     """Return the slot error of all agents over time and by agent, and every other estimate."""
+    others = generic_blocks(table, source, prefix="Estimate: ", without=(SLOT_ERROR,))
     if not table.rows or not table.has(SLOT_ERROR):
-        return generic_blocks(table, source)
-    blocks: list[Block] = [
+        return others
+    return [
         _slot_errors(table, source),
         *grouped_lines(
             table,
@@ -72,13 +73,8 @@ def estimate_blocks(table: TableReader, source: Source) -> list[Block]:
             unit="deg",
             note="As flight software believed it.",
         ),
+        *others,
     ]
-    for field in table.fields:
-        is_drawn = field.kind in ("float", "int") and field.name not in (*TIME_FIELDS, SLOT_ERROR)
-        if is_drawn:
-            title = f"Estimate: {field.name.replace('_', ' ')}"
-            blocks += grouped_lines(table, source, field.name, title=title, unit=field.unit)
-    return blocks
 
 
 def _delta_v(numbers: Mapping[str, Floats], by_agent: Mapping[str, Rows], source: Source) -> Figure:

@@ -42,21 +42,32 @@ def orbit_figure(
     points = _scatter3d(ends, WARM, 1, "satellites at the end")
     points |= {"mode": "markers", "marker": {"size": 3.5, "color": WARM}, "text": labels}
     points["hovertemplate"] = "%{text}<extra></extra>"
+    traces = [*_earth(), whole, *flown, points]
     hidden = {"visible": False, "showspikes": False}
     scene = {
         "xaxis": hidden,
         "yaxis": hidden,
         "zaxis": hidden,
-        "aspectmode": "data",
+        "aspectmode": "manual",
+        "aspectratio": _proportions([*ellipses_km, *flown_km.values()]),
         "camera": {"eye": {"x": 0.92, "y": 0.92, "z": 0.5}},
     }
     return Figure(
         title=title,
         note="What was flown in colour, the orbit that it belongs to in grey, the Earth to scale. Drag to turn.",
-        choices=[Choice(name="", traces=[*_earth(), whole, *flown, points])],
+        choices=[Choice(name="", traces=traces)],
         layout=base_layout(scene=scene, showlegend=False, margin={"l": 0, "r": 0, "t": 0, "b": 0}),
         height_px=560,
+        is_square=True,
     )
+
+
+def _proportions(paths_km: Sequence[Floats]) -> dict[str, float]:
+    """Return the sides of the box of all that is drawn, the longest 1: so it fits whatever its shape."""
+    corners = np.array([[-EARTH_RADIUS_KM] * 3, [EARTH_RADIUS_KM] * 3])
+    every = np.concatenate([corners, *paths_km])
+    sides = np.nanmax(every, axis=0) - np.nanmin(every, axis=0)
+    return dict(zip("xyz", (sides / sides.max()).tolist(), strict=True))
 
 
 def _scatter3d(points_km: Floats, colour: str, width: float, name: str) -> Trace:

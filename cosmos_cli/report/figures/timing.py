@@ -15,6 +15,8 @@ from cosmos_cli.tables import TableReader
 LATENESS_US_MIN = 1.0
 HISTOGRAM_BINS = 90
 BINS_PER_DECADE = 30
+TICKS_TOLD_MAX = 6
+"""Whole numbers up to this one each have a line: there is no half a tick."""
 
 
 def tick_blocks(table: TableReader, source: Source) -> list[Block]:
@@ -130,6 +132,8 @@ def _missed(source: Source) -> Block:
         )
     figure_layout = layout("", "ticks")
     figure_layout["xaxis"] |= {"type": "category", "tickangle": -90}
+    if max(missed) <= TICKS_TOLD_MAX:
+        figure_layout["yaxis"] |= {"dtick": 1}
     return Figure(
         title="Missed ticks by agent",
         choices=[Choice(name="", traces=[bars(list(agents), missed)])],
