@@ -12,7 +12,9 @@ import errno
 import io
 import json
 import os
+import shutil
 import sys
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, TextIO
@@ -72,13 +74,19 @@ class Console:
             print_json(value)
 
     def table(self, columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
-        """Print a table on stdout: framed on a terminal, aligned plain lines elsewhere."""
+        """Print a table on stdout: framed on a terminal that is wide enough, aligned plain lines elsewhere."""
         if self.json:
             return
-        if is_terminal(sys.stdout):
+        lines = aligned(columns, rows)
+        if not is_terminal(sys.stdout):
+            _write(sys.stdout, "\n".join(lines))
+            return
+        width = shutil.get_terminal_size().columns
+        frame = len(columns) + 3  # beside the two spaces between columns
+        if max(map(len, lines)) + frame <= width:
             _rich_table(columns, rows)
         else:
-            _write(sys.stdout, "\n".join(aligned(columns, rows)))
+            _write(sys.stdout, "\n".join(stacked(columns, rows, width)))
 
 
 def print_json(value: Any) -> None:
@@ -176,6 +184,36 @@ def aligned(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> list[st
         ]
         lines.append("  ".join(padded).rstrip())
     return lines
+
+
+def stacked(columns: Sequence[Column], rows: Sequence[Sequence[str]], width: int) -> list[str]:
+    """
+    Return the columns that fit on a line, aligned, and below each row the others, one a line.
+
+    No word is cut: what stands there may be a command that is to be copied.
+    """
+    count = len(columns)
+    while count > 1 and max(map(len, aligned(columns[:count], [r[:count] for r in rows]))) > width:
+        count -= 1
+    head, *lines = aligned(columns[:count], [row[:count] for row in rows])
+    told = [head]
+    for line, row in zip(lines, rows, strict=True):
+        told.append(line)
+        for column, cell in zip(columns[count:], row[count:], strict=True):
+            text = f"{column.heading}: {cell}" if column.heading else cell
+            told += _wrapped(text, width) if cell else []
+    return told
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    return textwrap.wrap(
+        text,
+        width,
+        initial_indent="  ",
+        subsequent_indent="    ",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 def is_terminal(stream: TextIO) -> bool:

@@ -105,5 +105,8 @@ def tell_outcomes(console: Console, outcomes: Sequence[Outcome[Retrieved]]) -> N
     """Say of each machine what has come, or why it has not."""
     width = max((len(outcome.machine) for outcome in outcomes), default=0)
     for outcome in outcomes:
-        words = outcome.value.words if outcome.value else f"failed: {outcome.failure}"
-        console.say(f"{outcome.machine:{width}}  {words}  ({outcome.duration_s:.1f} s)")
+        if outcome.value is not None:
+            words = f"{outcome.value.words}  ({outcome.duration_s:.1f} s)"
+        else:
+            words = f"failed: {outcome.failure}"
+        console.say(f"{outcome.machine:{width}}  {words}")
