@@ -20,10 +20,18 @@ raise SystemExit("validating runs nothing")
 """
 
 
+PEEPING = """
+from madns_runtime.simulations.constellation.flight.api import FlightSoftware
+class G(FlightSoftware):
+    from madns_runtime.simulations.constellation.vehicle import truth_buffer
+"""
+
+
 @pytest.fixture
 def folder(tmp_path):
     (tmp_path / "guidance.py").write_text(GUIDANCE)
     (tmp_path / "broken.py").write_text("x = 1\nclass G(:\n")
+    (tmp_path / "peeping.py").write_text(PEEPING)
     (tmp_path / "program").write_text("#!/bin/sh\n")
     (tmp_path / "run.sh").write_text("#!/bin/sh\n")
     (tmp_path / "run.sh").chmod(0o755)
@@ -79,6 +87,10 @@ def test_what_fits_together_has_no_faults(folder, rest):
             "flight: .*guidance.py has no class 'guidance'; it has Guidance, Other",
         ),
         ({"flight": {"software": "broken.py:G"}}, "flight.software: .*broken.py:2: "),
+        (
+            {"flight": "peeping.py:G"},
+            r"flight: .*peeping.py:4: expected no import of madns_runtime\..*\.vehicle.truth_buffer:",
+        ),
         ({"flight": {"software": "no_such_module:G"}}, r"flight.software: no module .*\.py:G"),
         (
             {"flight": {"software": "guidance.py:Guidance", "agents": ["agent-03"]}},

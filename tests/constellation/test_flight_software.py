@@ -1,6 +1,8 @@
 """Flight software on its board: what it is given, what leaves it, and who is blamed."""
 
+import inspect
 import re
+import types
 
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ from madns_runtime.simulations.constellation.messages import (
     Segment,
     Transmission,
 )
+from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBuffer
 
 HZ = 10.0
 RESULT = {
@@ -66,8 +69,9 @@ class Ship:
         initial = Initial(
             satellite="SAT-1", frame="TEME", epoch_utc="2026-01-01T00:00:00Z", segment=segment()
         )
+        self.initial = initial.to_message()
         self.agent = ConstellationAgent()
-        self.agent.setup(self.context, initial.to_message())
+        self.agent.setup(self.context, self.initial)
 
     def run(self, until_s, from_s=0.0):
         for index in range(round(from_s * HZ), round(until_s * HZ)):
@@ -126,6 +130,67 @@ def test_it_is_given_no_truth_otherwise(tmp_path):
     text = "class G:\n    def step(self, t_s, readings):\n        assert 'truth' not in readings"
 
     Ship(tmp_path, text).run(1.0)
+
+
+def test_no_public_name_that_it_is_given_leads_to_truth(tmp_path):
+    text = """
+class G:
+    def setup(self, context):
+        G.given = context
+    def step(self, t_s, readings):
+        pass
+    def finish(self):
+        return {}
+"""
+    ship = Ship(tmp_path, text, crosslinks={}, flight={"settings": {"a": [1.0]}}).run(1.0)
+    given = ship.agent._cockpit._pilot._software.given
+
+    def leaks():
+        holders = (TruthBuffer, Segment, Initial, FakeContext, ConstellationAgent)
+        return [thing for thing in public_things(given) if isinstance(thing, holders)]
+
+    assert leaks() == []
+    given.leak = {"deep": [ship.context]}
+    assert ship.context in leaks()  # what there is, is found
+
+
+def public_things(root):
+    """Return all that public names, items and bound methods lead to; code, text, numbers and numpy's left out."""
+    ends = (type, types.ModuleType, types.FunctionType, types.BuiltinMethodType, str, float, int)
+    found, waiting = {}, [root]
+    while waiting:
+        thing = waiting.pop()
+        if id(thing) in found or isinstance(thing, ends) or "numpy" in type(thing).__module__:
+            continue
+        found[id(thing)] = thing
+        waiting += [getattr(thing, name) for name in dir(thing) if not name.startswith("_")]
+        if isinstance(thing, dict):
+            waiting += thing.values()
+        elif isinstance(thing, list | tuple | set | frozenset):
+            waiting += thing
+        elif inspect.ismethod(thing):
+            waiting.append(thing.__self__)
+    return list(found.values())
+
+
+def test_settings_are_each_vehicles_own(tmp_path):
+    text = """
+class G:
+    def setup(self, context):
+        context.settings["seen"] = [*context.settings["seen"], context.name]
+        self.seen = context.settings["seen"]
+        context.settings["a"].append(1.0)
+    def finish(self):
+        return {"seen": self.seen}
+"""
+    flight = {"settings": {"seen": ["x"], "a": [0.0]}}
+
+    first = Ship(tmp_path, text, flight=flight)
+    again = ConstellationAgent()
+    again.setup(BoardContext(first.context.parameters, base_directory=tmp_path), first.initial)
+
+    assert again.finish()["flight"] == first.flight == {"seen": ["x", "agent-01"]}
+    assert first.context.parameters.flight.settings == {"seen": ["x"], "a": [0.0]}
 
 
 def test_a_command_leaves_at_once_with_its_time_as_deadline(tmp_path):
@@ -400,6 +465,15 @@ def test_an_error_names_class_method_file_and_line_once(tmp_path):
 
     told = describe_exception(caught.value, "ConstellationAgent.step")
     assert told == "G.step raised ZeroDivisionError: division by zero (guidance.py:7)"
+
+
+def test_what_making_it_raises_is_blamed_on_its_own_line(tmp_path):
+    text = (
+        "class G:\n    def __init__(self):\n        1 / 0\n    def step(self, t_s, readings): pass"
+    )
+
+    with pytest.raises(BlamedError, match=r"^G.__init__ raised ZeroDiv.*\(guidance.py:3\)$"):
+        Ship(tmp_path, text)
 
 
 def test_commands_before_the_first_tick_are_refused(tmp_path):

@@ -15,6 +15,9 @@ from madns_runtime.simulations.constellation.parameters import (
 )
 from madns_runtime.simulations.constellation.vehicles import fits
 
+_HERE = "madns_runtime.simulations.constellation"
+WALL = tuple(f"{_HERE}.{part}" for part in ("truth", "vehicle", "hosting", "host", "agent"))
+"""What flight software does not import: all that knows truth."""
 PENDING_MAX = 10_000
 """Measurements that a sensor may have under way: see vehicle.sensors.sensor."""
 
@@ -106,11 +109,12 @@ def _flight_faults(
     if flight is None:
         return []
     if isinstance(flight, str):
-        return code_faults("parameters.flight", flight, base_directory)
+        return code_faults("parameters.flight", flight, base_directory, forbidden=WALL)
     faults = glob_faults("parameters.flight.agents", flight.agents, names)
     if isinstance(flight, FlightProcess):
         return faults + _program_faults(flight.command[0], base_directory)
-    return faults + code_faults("parameters.flight.software", flight.software, base_directory)
+    field, software = "parameters.flight.software", flight.software
+    return faults + code_faults(field, software, base_directory, forbidden=WALL)
 
 
 def _program_faults(program: str, base_directory: Path) -> list[str]:

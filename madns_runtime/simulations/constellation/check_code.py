@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import ast
 import importlib.util
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from madns_runtime.plugin.registry import is_file
 
 
-def code_faults(field: str, spec: str, base_directory: Path) -> list[str]:
+def code_faults(
+    field: str, spec: str, base_directory: Path, *, forbidden: Sequence[str] = ()
+) -> list[str]:
     """
     Return what is wrong with a class that a scenario names.
 
@@ -22,6 +24,7 @@ def code_faults(field: str, spec: str, base_directory: Path) -> list[str]:
         field: Dotted name of the parameter.
         spec: file.py:Class beside the scenario, or module:Class.
         base_directory: Folder of the scenario.
+        forbidden: Modules that its file must not import, nor what is below them.
     """
     place, _, name = spec.rpartition(":")
     if not place or not name.isidentifier():
@@ -40,12 +43,27 @@ def code_faults(field: str, spec: str, base_directory: Path) -> list[str]:
         return [f"{field}: {path}:{error.lineno}: {error.msg}"]
     except (OSError, ValueError) as error:
         return [f"{field}: {path} cannot be read: {error}"]
+    faults = [
+        f"{field}: {path}:{line}: expected no import of {module}: flight software sees what its "
+        "context gives it"
+        for line, module in _imports(tree)
+        if any(f"{module}.".startswith(f"{one}.") for one in forbidden)
+    ]
     names = set(_names(tree))
-    if name in names or "*" in names:
-        return []
-    classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
-    told = f"; it has {', '.join(classes)}" if classes else ""
-    return [f"{field}: {path} has no class {name!r}{told}"]
+    if name not in names and "*" not in names:
+        classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
+        told = f"; it has {', '.join(classes)}" if classes else ""
+        faults.append(f"{field}: {path} has no class {name!r}{told}")
+    return faults
+
+
+def _imports(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield line and module of every import, wherever it stands; what is taken from a package may be a module."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield from ((node.lineno, f"{node.module}.{alias.name}") for alias in node.names)
 
 
 def _names(tree: ast.Module) -> Iterator[str]:

@@ -18,13 +18,18 @@ class Pilot:
     One vehicle's flight software behind its contract.
 
     Args:
-        software: An object that has some of the contract's methods.
+        make: Returns an object that has some of the contract's methods: a class.
+
+    Raises:
+        BlamedError: It raised.
     """
 
-    def __init__(self, software: Any) -> None:
-        self._name = type(software).__name__
-        self._software = software
-        self._step: Callable[[float, Readings], object] = getattr(software, "step", _do_nothing)
+    def __init__(self, make: Callable[[], Any]) -> None:
+        self._name = getattr(make, "__name__", "flight software")
+        self._software = self._call("__init__", make)
+        self._step: Callable[[float, Readings], object] = getattr(
+            self._software, "step", _do_nothing
+        )
 
     def setup(self, context: FlightContext) -> None:
         """

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from madns_runtime.plugin.api import AgentContext
@@ -51,7 +54,7 @@ def fit_out(
             context,
             initial,
             vehicle=vehicle,
-            settings=flight.settings,
+            settings=copy.deepcopy(flight.settings),  # its own: vehicles may share a process
             random=generator_of(chance, "flight"),
         )
         pilot = Pilot(_software(flight, context))
@@ -60,7 +63,8 @@ def fit_out(
     return suite, cockpit
 
 
-def _software(flight: FlightSoftware | FlightProcess, context: AgentContext) -> Any:
+def _software(flight: FlightSoftware | FlightProcess, context: AgentContext) -> Callable[[], Any]:
+    folder = context.base_directory
     if isinstance(flight, FlightProcess):
-        return ExternalFlight(flight, context.base_directory, is_lockstep=context.is_lockstep)
-    return load_flight_class(flight.software, context.base_directory)()
+        return partial(ExternalFlight, flight, folder, is_lockstep=context.is_lockstep)
+    return load_flight_class(flight.software, folder)
