@@ -22,7 +22,8 @@ from cosmos_cli.diff.recorded import Key, Recorded
 from cosmos_cli.diff.side import Side
 from cosmos_cli.diff.stream import Observer, Pairing, StreamDifference
 from cosmos_cli.expectation import mapping_at
-from cosmos_cli.report.control import ControlRow, read_control
+from cosmos_cli.report.control import TIMES_MAX, ControlRow, read_control, recorded_times_s
+from cosmos_cli.report.sampling import evenly
 from cosmos_cli.report.style import as_array
 from cosmos_cli.spread import Spread, Stretch
 from cosmos_cli.tables import open_tables
@@ -32,6 +33,8 @@ POSITION = tuple(re.compile(rf"^{axis}(_[a-z0-9]+)??_m$") for axis in "xyz")
 VELOCITY = tuple(re.compile(rf"^v{axis}(_[a-z0-9]+)??_m_s$") for axis in "xyz")
 Slots = tuple[ControlRow, ...]
 Measured = dict[tuple[str, str], MeasurementError]
+TIME_DECIMALS = 6
+"""Times nearer each other are one."""
 AXES = ("radial", "along", "normal")
 
 
@@ -141,7 +144,7 @@ class Constellation:
         result = self._result
         result.over_time = self._spread.rows()
         first, second = self._sides
-        result.slots = (_slots_of(first), _slots_of(second))
+        result.slots = _slots_of(first, second)
         result.measurements = (
             measurement_errors(of_a, first.tick_hz),
             measurement_errors(of_b, second.tick_hz),
@@ -177,8 +180,19 @@ class Constellation:
         self._spread.add(t_s[is_there], distance_m)
 
 
-def _slots_of(side: Side) -> Slots:
-    return read_control(open_tables(side.run.tables), side.run.read_config())
+def _slots_of(a: Side, b: Side) -> tuple[Slots, Slots]:
+    """Return both runs' slots over time, at times that both have, and that the longer one has alone."""
+    tables = open_tables(a.run.tables), open_tables(b.run.tables)
+    of_a, of_b = (np.round(recorded_times_s(one), TIME_DECIMALS) for one in tables)
+    both_s = np.intersect1d(of_a, of_b)
+    later_s = max(of_a, of_b, key=lambda times_s: times_s[-1:].tolist())
+    times_s = np.concatenate((both_s, later_s[later_s > both_s.max(initial=-np.inf)]))
+    times_s = times_s[evenly(len(times_s), TIMES_MAX)]
+    slots_a, slots_b = (
+        read_control(one, side.run.read_config(), times_s[times_s <= own_s.max(initial=-np.inf)])
+        for one, side, own_s in zip(tables, (a, b), (of_a, of_b), strict=True)
+    )
+    return slots_a, slots_b
 
 
 def state_names(recorded: Recorded) -> tuple[list[str], list[str]] | None:

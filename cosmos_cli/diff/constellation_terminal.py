@@ -28,7 +28,7 @@ def print_constellation(console: Console, found: ConstellationDifference) -> Non
         _print_positions(console, found, total)
         _print_over_time(console, found.over_time, "m")
     if any(found.slots):
-        _title(console, "Slots: error by truth, deg, over all that have one")
+        _title(console, "Slots over time: error by truth, deg; delta-v given, m/s; messages sent")
         _print_slots(console, found)
     if any(found.measurements):
         _title(console, "Measurements: error against each run's own truth")
@@ -72,11 +72,17 @@ def _print_over_time(console: Console, rows: Sequence[Stretch], unit: str) -> No
 
 def _print_slots(console: Console, found: ConstellationDifference) -> None:
     columns = [Column("t, s", True)]
-    for name in ("rms", "max", "rms believed"):
+    for name in ("rms", "max", "rms believed", "delta-v mean", "messages"):
         columns += [Column(f"{name} A", True), Column(f"{name} B", True)]
     a, b = ({row.t_s: row for row in rows} for rows in found.slots)
     times_s = sorted({*a, *b})
-    names = ("slot_error_deg_rms", "slot_error_deg_max", "slot_error_estimated_deg_rms")
+    names = (
+        "slot_error_deg_rms",
+        "slot_error_deg_max",
+        "slot_error_estimated_deg_rms",
+        "delta_v_m_s_mean",
+        "messages",
+    )
     rows = [
         [f"{t_s:g}"]
         + [format_cell(getattr(one.get(t_s), name, None)) for name in names for one in (a, b)]

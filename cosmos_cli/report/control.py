@@ -61,9 +61,16 @@ class ControlRow:
 
 
 def read_control(
-    tables: Mapping[str, TableReader], config: RunConfig | None
+    tables: Mapping[str, TableReader], config: RunConfig | None, times_s: Floats | None = None
 ) -> tuple[ControlRow, ...]:
-    """Return the constellation over time; nothing for a run without slots or without truth on record."""
+    """
+    Return the constellation over time; nothing for a run without slots or without truth on record.
+
+    Args:
+        tables: The run's.
+        config: Its settings.
+        times_s: Recorded times to judge at, from the start on; by default some, evenly spread.
+    """
     state, estimates = tables.get("state"), tables.get("estimates")
     if state is None or config is None or not state.has("t_s", *STATE) or not state.rows:
         return ()
@@ -72,7 +79,12 @@ def read_control(
     if slots not in ("even", "kept"):
         return ()
     # By the run's agents, not by the table's: one that died early still has its place in the ring.
-    agents, times_s = config.agents.resolved_names(), _times(state)
+    agents = config.agents.resolved_names()
+    if times_s is None:
+        recorded_s = recorded_times_s(tables)
+        times_s = recorded_s[evenly(len(recorded_s), TIMES_MAX)]
+    if not len(times_s):
+        return ()
     mean = _mean_elements(state, agents, times_s, str(config.parameters.get("gravity")))
     if slots == "even":
         errors = even_errors_deg(mean)
@@ -97,6 +109,14 @@ def read_control(
             )
         )
     return tuple(rows)
+
+
+def recorded_times_s(tables: Mapping[str, TableReader]) -> Floats:
+    """Return the times at which the first agent recorded its truth; none without truth on record."""
+    state = tables.get("state")
+    if state is None or not state.has("t_s") or not state.rows:
+        return np.empty(0)
+    return as_array(state.read(state.sources[0], ("t_s",))["t_s"])
 
 
 def as_document(rows: Sequence[ControlRow], config: RunConfig | None) -> dict[str, Any] | None:
@@ -187,12 +207,6 @@ def _who_hears_whom(
     near = np.linalg.norm(r_m[:, None] - r_m, axis=2) <= 1e3 * range_km
     sight = have_line_of_sight(r_m[:, None], r_m[None], 1e3 * height_km)
     return np.asarray(near & sight)
-
-
-def _times(state: TableReader) -> Floats:
-    """Return the times to judge at: recorded ones of the first agent, evenly spread."""
-    times_s = as_array(state.read(state.sources[0], ("t_s",))["t_s"])
-    return np.asarray(times_s[evenly(len(times_s), TIMES_MAX)])
 
 
 def _mean_elements(

@@ -1,12 +1,15 @@
 """Slots judged by recorded truth: against what was put in, against what was believed, and with holes."""
 
 import math
+import sys
 
 import numpy as np
 import pytest
 from synthetic_run import SyntheticRun, make_config
 
 from cosmos_cli.collect import finish_run
+from cosmos_cli.diff.constellation import Constellation
+from cosmos_cli.diff.side import open_side
 from cosmos_cli.report.build import build_sections, open_source, with_control
 from cosmos_cli.report.control import read_control
 from cosmos_cli.report.model import Figure, TableBlock
@@ -109,6 +112,24 @@ def test_delta_v_counts_once_executed_and_messages_once_sent(tmp_path):
     assert [row.delta_v_m_s_mean for row in rows] == pytest.approx([0, 0, 0.5, 0.5, 0.5])
     assert rows[-1].delta_v_m_s_max == 0.75
     assert [row.messages for row in rows] == [3, 6, 9, 12, 15]
+
+
+def test_two_runs_are_judged_at_times_of_both_and_then_of_the_longer(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "TICKS", 200)
+    places = [lambda _t, n=n: 120.0 * n for n in range(3)]
+    short, _ = written(tmp_path, places)
+    monkeypatch.setattr(sys.modules[__name__], "TICKS", 450)
+    long, _ = written(tmp_path, places)
+    sides = [open_side(made.run, made.run.name) for made in (short, long)]
+
+    found = Constellation(*sides).finish(sides[0].streams, sides[1].streams)
+
+    of_short, of_long = ([row.t_s for row in rows] for rows in found.slots)
+    assert of_long[: len(of_short)] == of_short
+    assert (of_short[0], of_long[-1]) == (0.0, 449 * 600.0)
+    assert max(of_short) > 190 * 600.0
+    assert all(row.slot_error_deg_rms < 1e-3 for row in found.slots[1])
+    assert found.slots[1][-1].messages == 3 * 450
 
 
 def test_agent_that_recorded_nothing_leaves_its_slot_empty_and_the_others_where_they_are(tmp_path):
