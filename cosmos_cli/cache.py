@@ -12,5 +12,5 @@ def cache_folder() -> Path:
     """Return that folder: COSMOS_CACHE, else cosmos among the user's caches."""
     given = os.environ.get(CACHE_VARIABLE)
     if given:
-        return Path(given).expanduser().absolute()
+        return Path(os.path.expanduser(given)).absolute()
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cosmos"

@@ -90,7 +90,7 @@ def settings_of(target: Target) -> SshSettings:
         port=port,
         user=target.user or value("user") or getpass.getuser(),
         names=names_of(host, port, value("hostkeyalias")),
-        key_files=tuple(Path(name).expanduser() for name in named or DEFAULT_KEYS),
+        key_files=tuple(map(_path, named or DEFAULT_KEYS)),
         are_keys_named=bool(named),
         identities_only=bool(target.key_file) or value("identitiesonly").lower() == "yes",
         agent_socket=_agent_socket(value("identityagent", "SSH_AUTH_SOCK")),
@@ -120,7 +120,7 @@ def _lookup(target: Target) -> Values:
 
 def _configuration() -> SshConfig:
     named = os.environ.get(CONFIG_VARIABLE)
-    files = [Path(name).expanduser() for name in ([named] if named else CONFIG_FILES)]
+    files = [_path(name) for name in ([named] if named else CONFIG_FILES)]
     if named and not files[0].is_file():
         raise InputError(f"{CONFIG_VARIABLE}: {named}: no such file")
     with _READING:
@@ -151,7 +151,12 @@ def _jumps(name: str, value: str) -> tuple[Target, ...]:
 
 def _files(*lists: str) -> tuple[Path, ...]:
     names = [name for text in lists for name in shlex.split(text)]
-    return tuple(Path(name).expanduser() for name in names if name.lower() != "none")
+    return tuple(_path(name) for name in names if name.lower() != "none")
+
+
+def _path(name: str) -> Path:
+    """Return a path; ~ of somebody whom nobody knows stays as it is, and leads nowhere."""
+    return Path(os.path.expanduser(name))
 
 
 def _agent_socket(wanted: str) -> str | None:

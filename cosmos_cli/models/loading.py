@@ -167,6 +167,8 @@ def _simulation(document: Document, base_directory: Path) -> tuple[Simulation | 
         simulation = resolve(spec, base_directory)
     except MadnsError as error:
         return None, [document.fault(("simulation",), str(error))]
+    except OSError as error:  # such as a name that is too long for a file
+        return None, [document.fault(("simulation",), f"not to be found: {error.strerror}")]
     # Whoever writes a file wants to hear of all its slips; an installed simulation's halves stay unloaded.
     texts = part_faults(simulation, base_directory) if is_file(spec) else []
     return simulation, [document.fault(("simulation",), text) for text in texts]

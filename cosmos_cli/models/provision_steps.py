@@ -6,6 +6,7 @@ A step says what should be, never how to get there; the plan of `cosmos up` comp
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -156,7 +157,7 @@ class ProvisionStep(BaseModel):
 
 def source_path(src: str, folder: Path) -> Path:
     """Return the absolute path of a file here that a step names."""
-    return (folder / Path(src).expanduser()).absolute()
+    return (folder / os.path.expanduser(src)).absolute()
 
 
 def step_faults(steps: Any, folder: Path) -> list[StepFault]:

@@ -134,6 +134,12 @@ def test_several_known_hosts_files_are_read_in_their_order(home):
     assert settings().known_hosts == (home / "a", Path("/with space/b"))
 
 
+def test_home_of_nobody_leads_nowhere(configure):
+    configure("IdentityFile ~no-such-user/key")
+
+    assert settings().key_files == (Path("~no-such-user/key"),)
+
+
 def test_connect_timeout_is_a_number(configure):
     configure("ConnectTimeout 3")
     assert settings().connect_timeout_s == 3

@@ -315,6 +315,12 @@ def test_fault_of_the_simulation_without_a_name_stands_at_parameters(see):
     assert shown.startswith("a.yaml:4:1: parameters: spare and mass_kg do not fit together\n")
 
 
+def test_simulation_that_can_be_no_file_is_a_fault_of_its_place(see):
+    shown = see(f"name: a\nsimulation: {'a' * 300}\nagents: {{count: 3}}\n")
+
+    assert shown.startswith("a.yaml:2:13: simulation: not to be found: File name too long\n")
+
+
 def test_fault_in_the_plugin_file_is_shown_with_both_places(see):
     Path("broken.py").write_text("x = 1\nx.nothing\n")
 

@@ -141,6 +141,12 @@ def test_missing_source_and_folder_are_refused_with_where_they_were_looked_for(r
     ]
 
 
+def test_source_at_nobodys_home_is_missing_as_any_other(read):
+    ((*_, told),) = faults_of(read, "file: {src: ~no-such-user/a, dest: /x}")
+
+    assert told.startswith("no such file: ")
+
+
 def test_faults_of_all_steps_are_told_at_once(read):
     faults = faults_of(read, "packages: [A]", "name: x", "command: {run: x}")
 
