@@ -164,7 +164,7 @@ def choose(known: Sequence[Doomed], wanted: Sequence[str], *, is_all: bool) -> l
         raise InputError(f"name the runs to end, or give --all; living runs: {names}")
     chosen: list[Doomed] = []
     for which in wanted:
-        found = [run for run in known if run.is_called(which)] or _ended_before(which)
+        found = [run for run in known if run.is_called(which)] or _otherwise_called(which, known)
         if not found:
             raise InputError(f"{which}: no such run lives on this machine; living runs: {names}")
         if len(found) > 1:
@@ -174,12 +174,15 @@ def choose(known: Sequence[Doomed], wanted: Sequence[str], *, is_all: bool) -> l
     return chosen
 
 
-def _ended_before(which: str) -> list[Doomed]:
-    """Return a run that is known, though nothing says that it lives: its machines are asked all the same."""
+def _otherwise_called(which: str, known: Sequence[Doomed]) -> list[Doomed]:
+    """Return the run that `last` means; or one of which nothing says that it lives: its machines are asked."""
     try:
         run = find_run(runs_root(), which)
     except InputError:
         return []
+    living = [each for each in known if each.directory == str(run.path)]
+    if living:
+        return living
     doomed = Doomed(run=run.name, directory=str(run.path))
     _add_machines(doomed, run)
     return [doomed]

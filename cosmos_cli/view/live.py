@@ -87,7 +87,8 @@ class LiveView:
 
     def work(self, what: str, share: float) -> None:
         """Show what is done with the records, and how far it is."""
-        self._state = f"{words.work_words(what)} {share:.0%}"
+        how_far = f" {share:.0%}" if share else ""  # of some steps nobody knows
+        self._state = f"{words.work_words(what)}{how_far}"
         if self._is_due():
             self._draw()
 

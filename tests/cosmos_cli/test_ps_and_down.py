@@ -233,6 +233,19 @@ def test_down_without_a_name_ends_nothing(start: Start, capsys: pytest.CaptureFi
     assert is_alive(host.pid)
 
 
+def test_down_of_the_last_run_ends_it_here_as_well(
+    start: Start, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
+    earlier, last = start("0001-a", "host", "host"), start("0002-a", "host", "host")
+    for name in ("0001-a", "0002-a"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+
+    assert cosmos(["down", "last"]) == 0
+
+    assert [is_alive(earlier.pid), is_alive(last.pid)] == [True, False]
+
+
 def test_name_that_fits_runs_in_two_folders_asks_for_the_directory(
     start: Start, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
