@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from pathlib import PurePosixPath
 from typing import Any
 
 from cosmos_cli.expectation import mapping_at
@@ -32,7 +33,15 @@ def open_source(run: RunDirectory, document: Mapping[str, Any]) -> Source:
         tick_hz=config.agents.tick_hz if config else None,
         ticks=tick_statistics(tables.get("ticks")),
         control=read_control(tables, config),
+        unread=_unread(run, tables),
     )
+
+
+def _unread(run: RunDirectory, tables: Mapping[str, TableReader]) -> tuple[str, ...]:
+    listed = mapping_at(run.read_json(run.manifest_json) or {}, "files")
+    paths = [PurePosixPath(name) for name in listed]
+    folder = run.tables.name
+    return tuple(str(path) for path in paths if path.parts[0] == folder and path.stem not in tables)
 
 
 def with_control(run: RunDirectory, document: Mapping[str, Any]) -> dict[str, Any]:
@@ -51,7 +60,17 @@ def build_sections(source: Source) -> list[Section]:
         first = slots if chapter.title == CONTROL else []
         sections.setdefault(chapter.title, [*first]).extend(_build(table, chapter, source))
     built = [Section(title=title, blocks=blocks) for title, blocks in sections.items() if blocks]
-    return [*built, *_words(source)]
+    return [*_gaps(source), *built, *_words(source)]
+
+
+def _gaps(source: Source) -> list[Section]:
+    if not source.unread:
+        return []
+    text = (
+        f"{', '.join(source.unread)} cannot be read: what they hold is not shown;"
+        f" cosmos collect {source.document.get('run')} makes them anew."
+    )
+    return [Section(title="Tables that are missing", blocks=[Remark(text=text)])]
 
 
 def _chapters(tables: Mapping[str, TableReader]) -> Iterator[tuple[TableReader, Chapter]]:

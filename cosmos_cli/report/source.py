@@ -27,6 +27,8 @@ class Source:
     ticks: TickStatistics
     control: tuple[ControlRow, ...] = ()
     """A constellation's slots over time; empty for a run without."""
+    unread: tuple[str, ...] = ()
+    """Tables that the manifest lists and that are gone or cannot be read."""
 
     def agent_summary(self, name: str) -> Mapping[str, Any]:
         """Return what the agent's half of the simulation summed up; empty for one that died."""

@@ -148,6 +148,21 @@ def test_orbits_of_a_long_run_are_drawn_as_orbits_and_what_is_left_out_is_told(
     assert ("From" in figure.note) == (trace["x"][0] > 0.0) == is_cut
 
 
+def test_tables_that_cannot_be_read_are_named_and_the_others_shown(tmp_path):
+    made = SyntheticRun(tmp_path).write(with_states=True)
+    build(made)
+    (made.run.tables / "state.parquet").write_bytes(b"PAR1")
+    (made.run.tables / "clock.parquet").unlink()
+
+    document = made.run.read_json(made.run.run_json)
+    first, *others = build_sections(open_source(made.run, document))
+
+    assert first.title == "Tables that are missing"
+    assert first.blocks[0].text.startswith("tables/clock.parquet, tables/state.parquet cannot be")
+    assert "Orbits" not in [section.title for section in others]
+    assert "Real time" in [section.title for section in others]
+
+
 def test_machine_without_a_sensor_is_told_plainly(tmp_path):
     _, sections = build(SyntheticRun(tmp_path).write())
 

@@ -23,6 +23,7 @@ from cosmos_cli.report.figures.maneuvers import (
     command_blocks,
     estimate_blocks,
     maneuver_blocks,
+    truth_change_blocks,
 )
 from cosmos_cli.report.figures.round_trips import round_trip_blocks
 from cosmos_cli.report.figures.sensors import sensor_blocks
@@ -51,6 +52,7 @@ FIGURES: dict[str, Chapter] = {
     "host_maneuvers": Chapter("Control", maneuver_blocks),
     "commands": Chapter("Control", command_blocks),
     "command_results": Chapter("Control", command_blocks),
+    "truth_changes": Chapter("Control", truth_change_blocks),
     "host_links": Chapter("Links", link_blocks),
     "messages": Chapter("Links", message_blocks),
     "refusals": Chapter("Links", refusal_blocks),

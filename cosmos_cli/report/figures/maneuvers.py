@@ -58,6 +58,11 @@ def command_blocks(table: TableReader, source: Source) -> list[Block]:
     return [] if "host_maneuvers" in source.tables else generic_blocks(table, source)
 
 
+def truth_change_blocks(table: TableReader, source: Source) -> list[Block]:
+    """Return how each vehicle was told of changes of its truth; nothing where there were none."""
+    return generic_blocks(table, source, prefix="Change of truth: ") if table.rows else []
+
+
 def estimate_blocks(table: TableReader, source: Source) -> list[Block]:
     """Return the slot error of all agents over time and by agent, and every other estimate."""
     others = generic_blocks(table, source, prefix="Estimate: ", without=(SLOT_ERROR,))
