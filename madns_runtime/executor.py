@@ -99,7 +99,7 @@ def run_job(function: Callable[..., Any], *arguments: Any) -> Any:
     """
     try:
         return function(*arguments)
-    except (Exception, SystemExit) as error:  # a plug-in may raise anything
+    except BaseException as error:  # a plug-in may raise anything
         name = getattr(function, "__qualname__", repr(function))
         raise JobFailed(describe_exception(error, name)) from error
 

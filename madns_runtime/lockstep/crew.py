@@ -157,13 +157,13 @@ class Crew:
         if self._reactor is not None:
             self._reactor.remove_reader(worker.line.fileno())
         worker.line.close()
-        until_s = time.monotonic() + EXIT_WAIT_S
-        while time.monotonic() < until_s:
-            pid, status = os.waitpid(worker.pid, os.WNOHANG)
-            if pid:
-                return _how(os.waitstatus_to_exitcode(status))
-            time.sleep(EXIT_CHECK_S)
-        return "has closed its line to the host"
+        code = _await_exit(worker.pid)
+        if code is not None:
+            return _how(code)
+        # Nobody speaks to it any more: it must not live on.
+        os.kill(worker.pid, signal.SIGKILL)
+        _await_exit(worker.pid)
+        return "has closed its line to the host and not ended"
 
 
 class _Reader:
@@ -212,6 +212,18 @@ def _fork(config: RunConfig, directory: Path, share: range) -> WorkerProcess:
         run_worker(assignment, there)
     there.close()
     return WorkerProcess(agents=share, pid=pid, line=here, position=position)
+
+
+def _await_exit(pid: int) -> int | None:
+    """Wait for a child's end and return its exit code; None if it lives on after EXIT_WAIT_S."""
+    until_s = time.monotonic() + EXIT_WAIT_S
+    while True:
+        ended, status = os.waitpid(pid, os.WNOHANG)
+        if ended:
+            return os.waitstatus_to_exitcode(status)
+        if time.monotonic() > until_s:
+            return None
+        time.sleep(EXIT_CHECK_S)
 
 
 def _how(code: int) -> str:

@@ -68,6 +68,10 @@ class _Terminated(BaseException):
     """SIGTERM came while nothing was under way."""
 
 
+class _HostGone(Exception):
+    """The other end of the line is closed."""
+
+
 def run_worker(assignment: Assignment, line: socket.socket) -> NoReturn:
     """Run as a forked child; never returns."""
     code = 1
@@ -122,17 +126,15 @@ class Worker:
     def run(self) -> int:
         """Carry out orders until the last, and return the exit code."""
         signal.signal(signal.SIGTERM, self._on_sigterm)
-        self._answer(self._load)
-        while True:
-            order = self._next_order()
-            if order is None:
-                self._close_all("its host is gone", is_told=False)
-                return 1
-            if order[0] == frames.STOP:
-                self._close_all(order[1], is_told=True)
-                return 0 if order[1] is None else 1
-            carry_out = self._orders[order[0]]
-            self._answer(partial(carry_out, *order[1:]))
+        try:
+            self._answer(self._load)
+            while (order := self._next_order())[0] != frames.STOP:
+                self._answer(partial(self._orders[order[0]], *order[1:]))
+            self._close_all(order[1], is_told=True)
+        except _HostGone:
+            self._close_all("its host is gone", is_told=False)
+            return 1
+        return 0 if order[1] is None else 1
 
     def _answer(self, carry_out: Callable[[], bytes]) -> None:
         try:
@@ -141,26 +143,31 @@ class Worker:
         except AgentFailed as failure:
             answer = self._failed(failure)
         self._position[0] = frames.IDLE
-        self._line.sendall(answer)
+        self._say(answer)
+
+    def _say(self, frame: bytes) -> None:
+        try:
+            self._line.sendall(frame)
+        except OSError as error:
+            raise _HostGone from error
 
     def _failed(self, failure: AgentFailed) -> bytes:
         return encode_frame(frames.FAILED, failure.index, clean_text(failure.reason))
 
-    def _next_order(self) -> list[Any] | None:
+    def _next_order(self) -> list[Any]:
+        data = b""
         try:
             self._is_waiting = True
             while True:
-                for order in self._reader.feed(b""):
+                for order in self._reader.feed(data):
                     return order
                 data = self._line.recv(READ_BYTES)
                 if not data:
-                    return None
-                for order in self._reader.feed(data):
-                    return order
+                    raise _HostGone
         except _Terminated:
             return [frames.DRAIN, []]  # whose answer tells it
-        except OSError:
-            return None
+        except OSError as error:
+            raise _HostGone from error
         finally:
             self._is_waiting = False
 
@@ -270,6 +277,6 @@ class Worker:
                 agent.recorder.say("critical", f"emergency shutdown: {reason}")
             counts = agent.recorder.close().to_mapping()
             if is_told:
-                self._line.sendall(encode_frame(frames.CLOSED, agent.index, counts))
+                self._say(encode_frame(frames.CLOSED, agent.index, counts))
         for index in self._assignment.agents[len(self._agents) :] if is_told else ():
-            self._line.sendall(encode_frame(frames.CLOSED, index, {}))  # it never opened any
+            self._say(encode_frame(frames.CLOSED, index, {}))  # it never opened any

@@ -110,3 +110,24 @@ def test_disk_without_room_for_the_summary_is_bad_input(laboratory):
 
     assert run.finish() == 2
     assert "cannot make a run directory: No space left on device" in run.stderr
+
+
+@pytest.mark.root
+@pytest.mark.parametrize(
+    ("source", "faults"),
+    [("agent-02", {"waste_bytes": 100_000}), ("host", {"host_waste_bytes": 40_000})],
+    ids=["agent", "host"],
+)
+def test_full_disk_ends_a_lockstep_run_in_good_order_and_is_named(laboratory, source, faults):
+    run, directory = run_on_small_disk(laboratory, "--set", "time.mode=lockstep", **faults)
+
+    assert run.finish() == 1, run.describe()
+    document = json.loads((directory / "run.json").read_text())
+    assert (document["status"], document["who"]) == ("failed", source), run.describe()
+    assert "No space left on device" in document["reason"]
+    # Nobody was killed: everybody has said what became of the records.
+    result = json.loads((directory / "result.json").read_text())
+    assert result["not_stopped"] == []
+    assert {agent["state"] for agent in result["agents"].values()} == {"stopped"}
+    whose = result["records"] if source == "host" else result["agents"][source]["records"]
+    assert whose["dropped"] > 0

@@ -2,13 +2,17 @@
 
 import errno
 import json
+import os
+import socket
+import subprocess
 
 import pytest
 
 from madns_runtime.config import Agents, RunConfig, TimeSettings
 from madns_runtime.errors import MachineError, MessageTooLarge, PeerError
-from madns_runtime.lockstep import frames
+from madns_runtime.lockstep import crew, frames
 from madns_runtime.lockstep.clock import SimulatedClock
+from madns_runtime.lockstep.crew import Crew, WorkerProcess
 from madns_runtime.lockstep.frames import FRAME_BYTES_MAX, HEAD, FrameReader, encode_frame
 from madns_runtime.lockstep.post import QUEUE_BYTES_MAX, Allowance, decode, encode
 from madns_runtime.lockstep.recorder import LockstepRecorder
@@ -142,3 +146,34 @@ def test_the_account_tells_speed_and_result():
     assert (account.result()["status"], account.result()["rtf"]) == ("complete", 200.0)
     account.ending = Ending(who="a", reason="told to")
     assert (account.result()["status"], account.result()["rtf"]) == ("failed", None)
+
+
+@pytest.mark.process
+def test_a_worker_that_only_closes_its_line_does_not_live_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(crew, "EXIT_WAIT_S", 0.05)
+    here, _ = socket.socketpair()
+    with subprocess.Popen(["sleep", "60"]) as process:
+        worker = WorkerProcess(range(1), process.pid, here, memoryview(bytes(8)).cast("q"))
+        how = Crew(config(), tmp_path, ()).let_go(worker)
+
+    assert how == "has closed its line to the host and not ended"
+    assert not os.path.exists(f"/proc/{process.pid}")
+
+
+def test_a_run_on_a_full_disk_still_comes_to_its_end(tmp_path, monkeypatch):
+    recorder = LockstepRecorder(tmp_path, config(), source="host", clock=SimulatedClock(0.0))
+    recorder.open_stream(OWN)
+
+    def refuse(fd, data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(stream_file.os, "write", refuse)
+    with pytest.raises(MachineError):
+        for number in range(1000):
+            recorder.record("own", (number, "x" * 1000))
+    recorder.event("emergency", who="host", reason="x")
+    recorder.say("critical", "emergency shutdown: host: x")
+    counts = recorder.close()
+
+    assert counts.dropped > 60
+    assert "No space left on device" in counts.errors[0]
