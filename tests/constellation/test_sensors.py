@@ -2,6 +2,7 @@
 
 import math
 from datetime import datetime
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -33,6 +34,9 @@ HZ = 10.0
 LEO = (7.158e6, 0.0, 0.0, 0.0, 1000.0, 7390.0)
 TURNED = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
 """Body x on inertial y."""
+SUN_M = np.array(sun_m(days_since_j2000(datetime.fromisoformat(EPOCH))))
+SUN = SUN_M / np.linalg.norm(SUN_M)
+LIT = (*(7.158e6 * SUN), 0.0, 0.0, 0.0)
 UNTOUCHED = SimpleNamespace(ballistic_m2_kg=None, given_m_s=lambda t_s: (0.0, 0.0, 0.0))
 """Neither thrust nor drag; what an accelerometer feels of them is in test_accelerometer.py."""
 RIGID = (*LEO, *TURNED, 0.001, -0.002, 0.003)
@@ -41,8 +45,8 @@ RIGID = (*LEO, *TURNED, 0.001, -0.002, 0.003)
 class Bench:
     """A suite of sensors on a still vehicle."""
 
-    def __init__(self, *, chance=CHANCE, epoch=EPOCH, **sensors):
-        self.context = FakeContext("agent-01", ("agent-01",), parameters())
+    def __init__(self, *, chance=CHANCE, epoch=EPOCH, hz=HZ, **sensors):
+        self.context = FakeContext("agent-01", ("agent-01",), parameters(), tick_hz=hz)
         settings = from_mapping(Sensors, sensors)
         scene = Scene(epoch, UNTOUCHED, EGM_96.radius_m)
         self.suite = SensorSuite(settings, scene, context=self.context, chance=chance)
@@ -110,25 +114,20 @@ def test_a_star_trackers_errors_are_about_the_body_axes():
 
 
 def test_a_sun_sensor_points_at_the_sun_and_sees_nothing_in_the_shadow():
-    sun = np.array(sun_m(days_since_j2000(datetime.fromisoformat(EPOCH))))
-    sun /= np.linalg.norm(sun)
-    lit = (*(7.158e6 * sun), 0.0, 0.0, 0.0)
-    dark = (*(-7.158e6 * sun), 0.0, 0.0, 0.0)
+    dark = (*(-7.158e6 * SUN), 0.0, 0.0, 0.0)
     bench = Bench(sun_sensor={})
 
-    assert bench.values("sun_sensor", [0], lit)[0] == pytest.approx(sun, abs=1e-6)
+    assert bench.values("sun_sensor", [0], LIT)[0] == pytest.approx(SUN, abs=1e-6)
     assert bench.run([10], dark) == [{}]
     assert bench.suite.summary()["sun_sensor"] == {"samples": 1, "dropped": 0, "blind": 1}
 
 
 def test_a_sun_sensor_errs_by_an_angle():
-    sun = np.array(sun_m(days_since_j2000(datetime.fromisoformat(EPOCH))))
-    lit = (*(7.158e6 * sun / np.linalg.norm(sun)), 0.0, 0.0, 0.0)
     bench = Bench(sun_sensor={"rate_hz": HZ, "noise": 0.01})
 
-    found = bench.values("sun_sensor", range(2000), lit)
+    found = bench.values("sun_sensor", range(2000), LIT)
 
-    angles = np.arccos(found @ (sun / np.linalg.norm(sun)))
+    angles = np.arccos(found @ SUN)
     assert np.sqrt((angles**2).mean() / 2) == pytest.approx(0.01, rel=0.05)
 
 
@@ -153,11 +152,20 @@ def test_a_sensor_measures_at_its_rate():
     assert [tick for tick, reading in enumerate(readings) if reading] == [0, 4, 8, 12, 16]
 
 
-def test_a_rate_above_the_ticks_measures_once_a_tick():
-    bench = Bench(clock={"rate_hz": 1000.0})
+@pytest.mark.parametrize("rate_hz", [11.0, 1000.0, 1e300])
+def test_a_rate_above_the_ticks_measures_once_a_tick(rate_hz):
+    bench = Bench(clock={"rate_hz": rate_hz, "bias_walk": 1.0})
 
     assert all("clock" in reading for reading in bench.run(range(20)))
     assert bench.suite.summary()["clock"]["samples"] == 20
+
+
+def test_days_of_fast_ticks_lose_no_sample():
+    hz = 700.0
+    bench = Bench(hz=hz, clock={"rate_hz": hz})
+    first = round(3 * 86_400 * hz)
+
+    assert all("clock" in reading for reading in bench.run(range(first, first + 500), hz=hz))
 
 
 def test_latency_delays_a_measurement_and_keeps_its_time():
@@ -191,6 +199,59 @@ def test_dropouts_are_counted_and_have_the_share_asked_for():
     assert counts["samples"] == sum(1 for reading in readings if reading)
     assert counts["samples"] + counts["dropped"] == 4000
     assert counts["dropped"] / 4000 == pytest.approx(0.25, abs=0.03)
+
+
+# The size of errors --------------------------------------------------------------------------------
+
+FREE = {
+    "gnss": 3,
+    "gyro": 3,
+    "accelerometer": 3,
+    "magnetometer": 3,
+    "star_tracker": 3,
+    "sun_sensor": 2,
+    "clock": 1,
+}
+"""By sensor: in how many directions a measurement can err."""
+SIGMA = 1e-4
+IN_THE_SUN = (*LIT, *TURNED, 0.001, -0.002, 0.003)
+
+
+@cache
+def measured(name, ticks, chance=CHANCE, **settings):
+    bench = Bench(chance=chance, **{name: {"rate_hz": HZ, **settings}})
+    return bench.values(name, ticks, IN_THE_SUN)
+
+
+def errors_of(name, ticks, *, chance=CHANCE, **settings):
+    """Return the errors of a sensor's measurements, shape (N, 3 or 1): against one that has none."""
+    noisy, exact = measured(name, ticks, chance, **settings), measured(name, ticks)
+    if name == "star_tracker":
+        return np.array([rotation_between(*pair) for pair in zip(exact, noisy, strict=True)])
+    return (noisy - exact)[:, :3]
+
+
+@pytest.mark.parametrize(("name", "free"), FREE.items())
+def test_white_noise_has_the_size_asked_for_and_no_memory(name, free):
+    errors = errors_of(name, range(1, 3001), noise=SIGMA)
+
+    assert np.sqrt((errors**2).sum(axis=1).mean() / free) == pytest.approx(SIGMA, rel=0.06)
+    assert errors.mean(axis=0) == pytest.approx(0.0, abs=0.1 * SIGMA)
+    correlation = (errors[1:] * errors[:-1]).sum() / (errors**2).sum()
+    assert abs(correlation) < 0.07
+
+
+@pytest.mark.parametrize(("name", "free"), FREE.items())
+@pytest.mark.parametrize(("what", "size"), [("bias", SIGMA), ("bias_walk", SIGMA * 5.0)])
+def test_biases_have_the_size_asked_for_over_many_agents(name, free, what, size):
+    # A walk of 25 s has five times the size that it has after one second.
+    squares = []
+    for agent in range(150):
+        chance = agent.to_bytes(32, "little")
+        error = errors_of(name, (0, 250), chance=chance, **{what: SIGMA})[-1]
+        squares.append((error**2).sum())
+
+    assert np.sqrt(np.mean(squares) / free) == pytest.approx(size, rel=0.2)
 
 
 NOISY = {"rate_hz": HZ, "noise": 1.0, "bias": 2.0, "bias_walk": 0.5, "dropout": 0.1}

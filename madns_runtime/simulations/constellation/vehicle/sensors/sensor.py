@@ -24,7 +24,9 @@ from madns_runtime.simulations.constellation.vehicle.sensors.errors import (
 from madns_runtime.simulations.constellation.vehicle.sensors.scene import Scene
 
 TIME_EPSILON_S = 1e-9
-"""Rounding of tick and sample times."""
+"""Rounding of times."""
+SAMPLE_EPSILON = 1e-6
+"""Rounding of a sample's number: of a tick's time times a rate, also after days."""
 PENDING_MAX = 10_000
 """Measurements under way to flight software; further ones are dropped and counted."""
 
@@ -89,7 +91,8 @@ class Sensor:
         self.blind = 0
         """Measurements with nothing to measure."""
         self._measure: Callable[[Scene, Row], tuple[float, ...] | None] = instrument.measure
-        self._rate_hz = settings.rate_hz
+        # Faster than the ticks, its samples would be numbers that nobody measures.
+        self._rate_hz = min(settings.rate_hz, context.tick_hz)
         self._latency_s = settings.latency_s
         self._digits = instrument.digits
         self._record = context.record
@@ -101,7 +104,7 @@ class Sensor:
             bias=tuple(settings.bias if has else 0.0 for has in has_bias),
             walk=tuple(settings.bias_walk if has else 0.0 for has in has_bias),
             dropout=settings.dropout,
-            period_s=1.0 / settings.rate_hz,
+            period_s=1.0 / self._rate_hz,
         )
         self._errors = Errors(model, key_of(chance, f"sensor {self.name}"))
         fields = (Field("tick", "", "int"), Field("t_s", "s"), *instrument.fields)
@@ -109,7 +112,7 @@ class Sensor:
 
     def sample(self, scene: Scene) -> None:
         """Measure if it is time to: once a tick at most."""
-        number = math.floor(scene.t_s * self._rate_hz + TIME_EPSILON_S)
+        number = math.floor(scene.t_s * self._rate_hz + SAMPLE_EPSILON)
         if number <= self._number:
             return
         self._number = number
