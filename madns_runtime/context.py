@@ -12,7 +12,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from madns_runtime.config import RunConfig
-from madns_runtime.errors import BlamedError, PluginError
+from madns_runtime.errors import (
+    BlamedError,
+    ConfigurationError,
+    MissingExtraError,
+    PluginError,
+)
 from madns_runtime.protocol.messages import Service
 from madns_runtime.recording.records import Field, StreamSchema
 from madns_runtime.recording.writer import Recorder
@@ -133,13 +138,14 @@ def describe_exception(error: BaseException, doing: str) -> str:
     """
     Return one line: which call of a plug-in raised what, and in which file and line.
 
-    The place is the innermost line of the plug-in's own folder, not that of a library which it called.
+    The place is the innermost line of the plug-in's own folder, not that of a library which it called. Errors
+    that blame the user's file say all by themselves.
 
     Args:
         error: What was caught, one call above the plug-in.
         doing: The call, such as FleetHost.setup.
     """
-    if isinstance(error, BlamedError):
+    if isinstance(error, BlamedError | ConfigurationError | MissingExtraError):
         return clean_text(str(error))
     frames = traceback.extract_tb(error.__traceback__)
     place = ""

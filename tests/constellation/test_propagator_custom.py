@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from propagator_kinds import OWN, make_kind, orbits
 
-from madns_runtime.errors import ConfigurationError, PluginError
+from madns_runtime.errors import BlamedError, ConfigurationError, PluginError
 from madns_runtime.simulations.constellation.parameters import CustomPropagator
 from madns_runtime.simulations.constellation.truth.propagation import propagate
 
@@ -24,7 +24,11 @@ def folder(tmp_path):
             r"of shape \(4, 1, 6\) of float64, got \(4, 6\) of float64",
         ),
         ("own.py:Idle", PluginError, "expected a class with the method propagate"),
-        ("own.py:Demanding", PluginError, "own.py:Demanding: TypeError: .*orbit"),
+        (
+            "own.py:Demanding",
+            PluginError,
+            r"^own.py:Demanding raised TypeError: .*orbit.* \(custom_propagator.py:\d+\)$",
+        ),
         ("own.py:Missing", PluginError, "Missing"),
         ("absent.py:Mine", PluginError, "no file .*absent.py"),
     ],
@@ -45,3 +49,42 @@ def test_a_propagator_of_ones_own_may_be_an_installed_module(folder):
     found = propagate(orbits(), 0.0, np.array([1.0]), sgp4._replace(settings=settings).parameters())
 
     assert np.array_equal(found, propagate(orbits(), 0.0, np.array([1.0]), sgp4.parameters()))
+
+
+def test_what_a_propagator_of_ones_own_raises_is_told_with_its_line(folder):
+    (folder / "own.py").write_text(
+        "class Mine:\n"
+        "    def propagate(self, states, t0_s, knots_s, parameters):\n"
+        "        states[:] = 0.0\n"
+        "        raise SystemExit('no thrust')\n"
+    )
+    states = orbits()
+
+    with pytest.raises(
+        BlamedError,
+        match=r"^own.py:Mine.propagate at 7 s raised SystemExit: no thrust \(own.py:4\)$",
+    ):
+        propagate(states, 7.0, np.array([8.0]), make_kind("custom", folder).parameters())
+
+    assert np.array_equal(states, orbits())
+
+
+@pytest.mark.parametrize(
+    ("made", "got"),
+    [
+        ("found.tolist()", "list"),
+        ("found.astype('f4')", r"\(4, 1, 6\) of float32"),
+        ("found[:, :0]", r"\(4, 0, 6\) of float64"),
+        ("None", "NoneType"),
+    ],
+)
+def test_what_is_no_array_of_states_is_refused(folder, made, got):
+    (folder / "own.py").write_text(
+        "class Mine:\n"
+        "    def propagate(self, states, t0_s, knots_s, parameters):\n"
+        "        found = states[:, None]\n"
+        f"        return {made}\n"
+    )
+
+    with pytest.raises(ConfigurationError, match=rf"shape \(4, 1, 6\) of float64, got {got}$"):
+        propagate(orbits(), 0.0, np.array([1.0]), make_kind("custom", folder).parameters())

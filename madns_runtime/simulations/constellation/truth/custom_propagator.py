@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from madns_runtime.errors import PluginError
+from madns_runtime.context import describe_exception
+from madns_runtime.errors import BlamedError
 from madns_runtime.plugin.registry import load_function
 from madns_runtime.simulations.constellation.parameters import CustomPropagator
 from madns_runtime.simulations.constellation.truth.propagation import (
@@ -30,13 +31,20 @@ class Custom:
         """
         Return what the named class returns, see `Propagator.propagate`.
 
+        It may do with the arrays what it wants.
+
         Raises:
-            PluginError: The class cannot be found, made without arguments, or has no propagate.
+            PluginError: The class cannot be found, made without arguments, or has no propagate; or that
+                raised.
         """
         settings = parameters.settings
         assert isinstance(settings, CustomPropagator)
         propagator = load_custom(settings.implementation, parameters.base_directory)
-        return propagator.propagate(states, t0_s, knots_s, parameters)
+        try:
+            return propagator.propagate(states.copy(), t0_s, knots_s.copy(), parameters)
+        except (Exception, SystemExit) as error:  # a class of one's own may raise anything
+            doing = f"{settings.implementation}.propagate at {t0_s:g} s"
+            raise BlamedError(describe_exception(error, doing)) from error
 
 
 @lru_cache(maxsize=4)
@@ -55,9 +63,9 @@ def load_custom(implementation: str, base_directory: str) -> Propagator:
     try:
         propagator: Propagator = made()
     except Exception as error:  # noqa: BLE001 - a class of one's own may raise anything
-        raise PluginError(f"{implementation}: {type(error).__name__}: {error}") from error
+        raise BlamedError(describe_exception(error, implementation)) from error
     if not callable(getattr(propagator, "propagate", None)):
-        raise PluginError(
+        raise BlamedError(
             f"{implementation}: expected a class with the method "
             "propagate(states, t0_s, knots_s, parameters), it has none"
         )

@@ -294,7 +294,7 @@ def _check_finite(
     # A sum is finite only if all of its numbers are: one quick look at what is nearly always sound.
     if np.isfinite(states.sum()):
         return
-    sound: NDArray[np.bool_] = np.isfinite(states).all(axis=2)
+    sound = np.asarray(np.isfinite(states).all(axis=2))
     vehicles = np.flatnonzero(~sound.all(axis=1))
     faults = []
     for vehicle in vehicles[:FAULTS_MAX].tolist():
