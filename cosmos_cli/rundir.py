@@ -33,6 +33,8 @@ RESERVE_BYTES = 1024 * 1024
 RESULT_BYTES_MAX = 256 * 1024 * 1024
 """A host's result is some kilobytes an agent; a file beyond this is none."""
 LOCK_NAME = ".lock"
+FOLDERS = ("host", "agents", "machines")
+"""In every run directory from its beginning."""
 BUNDLE_SUFFIX = ".tar.zst"
 SCHEMA = 1
 """Version of run.json and manifest.json; a change that breaks a reader raises it."""
@@ -166,8 +168,8 @@ def create_run(root: Path, scenario_name: str) -> RunDirectory:
             run = RunDirectory((root / f"{number:04d}-{slug}").resolve())
             run.path.mkdir()
         remember_run(run.name, run.path)
-        for folder in (run.path / "host", run.path / "agents", run.path / "machines"):
-            folder.mkdir()
+        for folder in FOLDERS:
+            (run.path / folder).mkdir()
         _allocate(run.reserve, RESERVE_BYTES)
     except OSError as error:
         if run is not None:
@@ -216,9 +218,13 @@ def find_run(root: Path, which: str) -> RunDirectory:
     """
     if os.sep in which or which in (".", ".."):
         path = Path(which)
-        if path.is_dir():
-            return RunDirectory(path.resolve())
-        raise InputError(f"{which}: no such run directory")
+        if not path.is_dir():
+            raise InputError(f"{which}: no such run directory")
+        if not (path / "plan.json").is_file() and not all((path / f).is_dir() for f in FOLDERS):
+            raise InputError(
+                f"{which}: no run directory: expected plan.json, or the folders {', '.join(FOLDERS)}"
+            )
+        return RunDirectory(path.resolve())
     runs = [run for run in list_runs(root) if run.path.is_dir()]
     if which == "last":
         found = runs[-1:]

@@ -99,6 +99,19 @@ def test_run_that_is_not_there_is_bad_input_and_the_message_lists_the_last(tmp_p
         find_run(tmp_path, which)
 
 
+@pytest.mark.parametrize("name", ["plan.json", "agents"])
+def test_folder_that_is_no_run_is_refused_and_one_that_lost_something_is_not(tmp_path, name):
+    (tmp_path / "photos" / "host").mkdir(parents=True)
+    run = create_run(tmp_path, "x")
+    begin_run(run, make_config(1), {})
+    path = run.path / name
+    path.rmdir() if path.is_dir() else path.unlink()
+
+    assert find_run(tmp_path, str(run.path)) == run
+    with pytest.raises(InputError, match="no run directory"):
+        find_run(tmp_path, str(tmp_path / "photos"))
+
+
 def test_unwritable_root_says_which_option_helps(tmp_path):
     (tmp_path / "file").touch()
 
