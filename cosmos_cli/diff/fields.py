@@ -104,7 +104,7 @@ class FieldDifference:
             worst = int(np.abs(difference).argmax())
             size = abs(float(difference[worst]))
             if size > self.max:
-                self.max, self.at = size, _place(a, worst)
+                self.max, self.at = size, place_of(a, worst)
                 self.values = (float(left[worst]), float(right[worst]))
 
     def _add_texts(self, a: Rows, left: NDArray[Any], right: NDArray[Any]) -> None:
@@ -114,14 +114,15 @@ class FieldDifference:
         self._note_first(a, is_different)
         if self.values is None and is_different.any():
             index = int(is_different.argmax())
-            self.at, self.values = _place(a, index), (_told(left[index]), _told(right[index]))
+            self.at, self.values = place_of(a, index), (_told(left[index]), _told(right[index]))
 
     def _note_first(self, a: Rows, is_different: NDArray[np.bool_]) -> None:
         if self.first is None and is_different.any():
-            self.first = _place(a, int(is_different.argmax()))
+            self.first = place_of(a, int(is_different.argmax()))
 
 
-def _place(rows: Rows, index: int) -> Place:
+def place_of(rows: Rows, index: int) -> Place:
+    """Return where a record is."""
     who = rows.who[index]
     return Place(float(rows.keys[index]), who if isinstance(who, str) else "")
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from cosmos_cli.diff.fields import FieldDifference, Place
+from cosmos_cli.diff.fields import FieldDifference, Place, place_of
 from cosmos_cli.diff.matching import Floats, Matched, Rows, joined, match
 from cosmos_cli.diff.recorded import ROWS_READ_MAX, Recorded
 from cosmos_cli.report.style import as_array
@@ -57,7 +57,7 @@ class Alone:
             return
         self.count += len(rows)
         low, high = int(np.nanargmin(_finite(rows.keys))), int(np.nanargmax(_finite(rows.keys)))
-        first, last = _place(rows, low), _place(rows, high)
+        first, last = place_of(rows, low), place_of(rows, high)
         if self.first is None or first.key < self.first.key:
             self.first = first
         if self.last is None or last.key > self.last.key:
@@ -268,11 +268,6 @@ def _who(columns: Mapping[str, Any], identity: tuple[str, ...], count: int) -> A
 
 def _finite(keys: Floats) -> Floats:
     return np.where(np.isfinite(keys), keys, 0.0)
-
-
-def _place(rows: Rows, index: int) -> Place:
-    who = rows.who[index]
-    return Place(float(rows.keys[index]), who if isinstance(who, str) else "")
 
 
 def _union(first: tuple[str, ...], second: tuple[str, ...]) -> tuple[str, ...]:

@@ -12,8 +12,8 @@ from madns_runtime.protocol.codec import pack
 from madns_runtime.simulations.constellation.messages import Transmission
 from madns_runtime.simulations.constellation.orbit.visibility import LIGHT_SPEED_M_S
 from madns_runtime.simulations.constellation.parameters import Crosslinks as Settings
-from madns_runtime.simulations.constellation.truth.links import LINK_FIELDS, Crosslinks
-from madns_runtime.simulations.constellation.truth.medium import LEAD_S, OUTCOMES
+from madns_runtime.simulations.constellation.truth.links import Crosslinks
+from madns_runtime.simulations.constellation.truth.medium import LEAD_S, LINK_FIELDS, OUTCOMES
 
 RADIUS_M = 7_158_137.0
 RATE_RAD_S = math.sqrt(3.986004415e14 / RADIUS_M**3)

@@ -23,8 +23,9 @@ from madns_runtime.simulations.constellation.orbit.earth import (
 )
 from madns_runtime.simulations.constellation.orbit.visibility import LIGHT_SPEED_M_S
 from madns_runtime.simulations.constellation.parameters import GroundStation, Uplink
+from madns_runtime.simulations.constellation.truth.contacts import CONTACT_FIELDS
 from madns_runtime.simulations.constellation.truth.medium import LEAD_S, OUTCOMES
-from madns_runtime.simulations.constellation.truth.stations import CONTACT_FIELDS, GroundSegment
+from madns_runtime.simulations.constellation.truth.stations import GroundSegment
 
 ROOT = Path(__file__).parents[2]
 AUTHORITY = json.loads((ROOT / "tests/authorities/passes.json").read_text())

@@ -16,10 +16,11 @@ from madns_runtime.simulations.constellation.messages import (
     is_for_ground,
 )
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
-from madns_runtime.simulations.constellation.truth.links import LINK_FIELDS, Crosslinks, LinkEvent
-from madns_runtime.simulations.constellation.truth.medium import REFUSED
+from madns_runtime.simulations.constellation.truth.contacts import CONTACT_FIELDS
+from madns_runtime.simulations.constellation.truth.links import Crosslinks
+from madns_runtime.simulations.constellation.truth.medium import LINK_FIELDS, REFUSED, LinkEvent
 from madns_runtime.simulations.constellation.truth.segments import TruthStore
-from madns_runtime.simulations.constellation.truth.stations import CONTACT_FIELDS, GroundSegment
+from madns_runtime.simulations.constellation.truth.stations import GroundSegment
 
 STEP_S = 0.001
 """Least time between two calls of the timer."""

@@ -26,7 +26,6 @@ from madns_runtime.simulations.constellation.orbit.visibility import (
 from madns_runtime.simulations.constellation.parameters import Crosslinks as CrosslinkSettings
 from madns_runtime.simulations.constellation.truth.medium import (
     LEAD_S,
-    LINK_FIELDS,
     Account,
     Attempt,
     Chance,
@@ -38,8 +37,6 @@ from madns_runtime.simulations.constellation.truth.medium import (
     checked_sent_s,
     index_of_names,
 )
-
-__all__ = ["LINK_FIELDS", "Crosslinks", "LinkEvent", "Truth"]
 
 _ALL = -1
 """Stands for every receiver."""

@@ -25,19 +25,14 @@ from madns_runtime.simulations.constellation.orbit.visibility import (
     signal_way,
 )
 from madns_runtime.simulations.constellation.parameters import GroundStation, Uplink
-from madns_runtime.simulations.constellation.truth.contacts import (
-    CONTACT_FIELDS,
-    Contact,
-    PassWatch,
-    Stretch,
-)
-from madns_runtime.simulations.constellation.truth.links import LinkEvent
+from madns_runtime.simulations.constellation.truth.contacts import Contact, PassWatch, Stretch
 from madns_runtime.simulations.constellation.truth.medium import (
     LEAD_S,
     Account,
     Attempt,
     Chance,
     InFlight,
+    LinkEvent,
     Transmitter,
     Truth,
     checked_sent_s,
@@ -49,8 +44,6 @@ from madns_runtime.simulations.constellation.truth.passes import (
     Sites,
     Window,
 )
-
-__all__ = ["CONTACT_FIELDS", "Contact", "GroundSegment"]
 
 DOWNLINK_QUEUE_MAX = 256
 """Messages that may wait at one vehicle's transmitter to the ground; further ones are refused."""
