@@ -75,6 +75,7 @@ def sleep_long(number: int) -> None:
 class FaultyHost(HostSimulation):
     def setup(self, context: Any) -> None:
         self.context = context
+        self.lost: list[str] = []
         self.fault = Fault(context.parameters, "host", HOST)
         context.open_stream("echoes", (Field("agent", "", "str"), Field("waste", "", "str")))
         self.fault.strike("setup")
@@ -102,9 +103,12 @@ class FaultyHost(HostSimulation):
     def result(self, job: int, value: Any) -> None:
         self.fault.strike("result")
 
+    def agent_lost(self, agent: str, reason: str) -> None:
+        self.lost.append(agent)
+
     def finish(self) -> Mapping[str, Any]:
         self.fault.strike("finish")
-        return {}
+        return {"lost": self.lost}
 
 
 class FaultyAgent(AgentSimulation):

@@ -86,6 +86,8 @@ def test_others_complete_without_the_killed_agent_if_the_policy_is_to_continue(
     assert document["agents"]["lost"] == ["agent-02"]
     assert [line.split(":")[0] for line in document["data"]["missing"]] == ["agent-02"]
     result = run.result
+    # The half was told of it, however early: not before its set-up.
+    assert result["simulation"] == {"lost": ["agent-02"]}
     assert {name: agent["state"] for name, agent in result["agents"].items()} == {
         "agent-01": "stopped",
         "agent-02": "lost",
