@@ -101,6 +101,18 @@ def test_messages_over_links_and_passes_repeat_to_the_bit(cosmos):
     assert results[0][1]["records_sha256"] == results[1][1]["records_sha256"]
 
 
+def test_neither_records_nor_summaries_tell_how_many_computed_the_truth(cosmos):
+    many = ("agents.count=501", "parameters.satellites.walker=56:501/3/1", "agents.tick_hz=1")
+    results = [
+        cosmos.run("walker24.yaml", *many, "time.duration_s=3", f"executor.workers={workers}")
+        for workers in (1, 2)
+    ]
+
+    assert [code for code, _ in results] == [0, 0]
+    assert results[0][1]["records_sha256"] == results[1][1]["records_sha256"]
+    assert results[0][1]["simulation"] == results[1][1]["simulation"]
+
+
 def test_a_run_that_is_collected_again_says_the_same(cosmos):
     _, result = cosmos.run("counter24.yaml", "agents.count=3", "time.duration_s=1")
     again = json.loads(cosmos("collect", result["run"], "--json").stdout)
