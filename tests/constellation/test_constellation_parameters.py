@@ -227,6 +227,12 @@ def test_a_walker_pattern_has_its_spacing():
     assert len(set(fleet.names)) == 66
 
 
+def test_of_a_pattern_of_millions_those_are_made_that_fly():
+    fleet = load_fleet(parameters({**WALKER, "walker": "53:900000000/9/1"}), 2, SCENARIOS)
+
+    assert fleet.names == ("P1S000000001", "P1S000000002")
+
+
 def test_a_star_pattern_spreads_its_nodes_over_half_the_equator():
     fleet = load_fleet(parameters({**WALKER, "raan_spread_deg": 180}), 66, SCENARIOS)
     last = fleet.states[-1].tolist()

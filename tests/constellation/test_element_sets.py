@@ -178,6 +178,33 @@ def test_a_folder_or_a_binary_file_is_refused(tmp_path):
         read_element_sets(tmp_path / "a.tle")
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "fault"),
+    [
+        ("a.json", "[" * 100_000, " maximum recursion"),
+        ("a.json", '[{"EPOCH": ' + "1" * 5000 + "}]", " Exceeds the limit"),
+        ("a.csv", "x" * 200_000, "0: field larger"),
+        ("a.csv", CSV.splitlines()[0] + "\n" + "x" * 200_000, "1: field larger"),
+        ("a.json", JSON.replace("2017-", "9999-", 1), "2: EPOCH: expected such as"),
+        ("a.json", JSON.replace("2017-", "1956-", 1), "2: EPOCH: expected such as"),
+    ],
+    ids=["brackets", "digits", "wide head", "wide field", "last year", "before Sputnik"],
+)
+def test_what_no_element_set_looks_like_is_refused(tmp_path, name, text, fault):
+    found = faults_of(tmp_path / name, text)
+
+    assert found[0].startswith(fault), found[0]
+
+
+def test_a_day_beyond_its_year_is_refused(tmp_path):
+    line = TLE.splitlines()[1][:20] + "367.00000000" + TLE.splitlines()[1][32:68]
+    text = "\n".join((line + str(tle_checksum(line)), TLE.splitlines()[2]))
+
+    assert faults_of(tmp_path / "a.tle", text) == [
+        "1: expected a day of the year, got 367.00000000"
+    ]
+
+
 def test_a_long_list_of_faults_is_cut(tmp_path):
     faults = faults_of(tmp_path / "a.tle", "x" * 30 + "\n" + ("y" * 30 + "\n") * 100)
 
@@ -192,7 +219,7 @@ def test_a_set_that_sgp4_cannot_propagate_is_named():
         name="WRECK", epoch_utc=sets[3].epoch_utc, omm=tuple(sorted(fields.items()))
     )
 
-    with pytest.raises(ConfigurationError, match="WRECK: SGP4: "):
+    with pytest.raises(ConfigurationError, match="^WRECK: SGP4: .*, at [012] s$"):
         sgp4_states((*sets[:3], broken), EPOCH, np.arange(3.0))
 
 

@@ -7,8 +7,10 @@ Needs neither numpy nor sgp4, so that `cosmos validate` finds every fault that a
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
+from itertools import islice
 from pathlib import Path
 
 from madns_runtime.errors import ConfigurationError
@@ -96,7 +98,9 @@ def _choose_satellites(
     if isinstance(satellites, ElementSetSatellites):
         return _choose_sets(satellites, count, base_directory)
     if isinstance(satellites, WalkerSatellites):
-        orbits, field = _walker_orbits(satellites, parameters), "walker"
+        # No more than fly: a pattern may have millions.
+        orbits = tuple(islice(_walker_orbits(satellites, parameters), count))
+        field = "walker"
     else:
         orbits, field = _keplerian_orbits(satellites, parameters), "keplerian"
     if len(orbits) < count:
@@ -158,7 +162,7 @@ def _whole_second(moment: datetime) -> datetime:
 
 def _walker_orbits(
     satellites: WalkerSatellites, parameters: ConstellationParameters
-) -> tuple[tuple[str, Elements], ...]:
+) -> Iterator[tuple[str, Elements]]:
     try:
         pattern = parse_walker(satellites.walker)
     except ConfigurationError as error:

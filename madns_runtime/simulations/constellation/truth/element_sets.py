@@ -23,6 +23,8 @@ from madns_runtime.errors import ConfigurationError
 FILE_BYTES_MAX = 64 * 1024 * 1024
 """The whole public catalogue as XML takes half of this."""
 TLE_NAME_COLUMNS = 24
+FIRST_YEAR = 1957
+"""Of the first satellite: no epoch lies before it, and two-digit years turn over there."""
 FAULTS_MAX = 20
 """Faults that one message lists; a file of another kind would give one a line."""
 
@@ -166,8 +168,10 @@ def _tle_set(
     if len(faults) > before:
         return None
     year, day = int(line1[18:20]), float(line1[20:32])
-    # Two-digit years turn over at 1957, the year of the first satellite.
-    start = datetime(year + (2000 if year < 57 else 1900), 1, 1, tzinfo=UTC)
+    if not 1.0 <= day < 367.0:
+        faults.append(f"{where}:{first[0]}: expected a day of the year, got {line1[20:32]}")
+        return None
+    start = datetime(year + (2000 if year < FIRST_YEAR - 1900 else 1900), 1, 1, tzinfo=UTC)
     return ElementSet(
         name=name or line1[2:7].strip(),
         epoch_utc=start + timedelta(days=day - 1.0),
@@ -199,13 +203,17 @@ def tle_checksum(line: str) -> int:
 
 def _read_csv(text: str, where: str, faults: list[str]) -> Iterator[ElementSet]:
     reader = csv.DictReader(io.StringIO(text))
-    missing = sorted({"EPOCH", *NUMBERS} - set(reader.fieldnames or ()))
-    if missing:
-        faults.append(f"{where}:1: expected the columns of an OMM, missing {', '.join(missing)}")
-        return
-    for row in reader:
-        fields = {key: value for key, value in row.items() if key and value is not None}
-        yield from _omm_set(fields, f"{where}:{reader.line_num}", faults)
+    try:
+        missing = sorted({"EPOCH", *NUMBERS} - set(reader.fieldnames or ()))
+        if missing:
+            columns = ", ".join(missing)
+            faults.append(f"{where}:1: expected the columns of an OMM, missing {columns}")
+            return
+        for row in reader:
+            fields = {key: value for key, value in row.items() if key and value is not None}
+            yield from _omm_set(fields, f"{where}:{reader.line_num}", faults)
+    except csv.Error as error:
+        faults.append(f"{where}:{reader.line_num}: {error}")
 
 
 def _read_json(text: str, where: str, faults: list[str]) -> Iterator[ElementSet]:
@@ -213,6 +221,12 @@ def _read_json(text: str, where: str, faults: list[str]) -> Iterator[ElementSet]
         document = json.loads(text)
     except json.JSONDecodeError as error:
         faults.append(f"{where}:{error.lineno}:{error.colno}: {error.msg}")
+        return
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # a number of thousands of digits, brackets without end
+        faults.append(f"{where}: {error}")
         return
     entries = document if isinstance(document, list) else [document]
     lines = _lines_of('"EPOCH"', text)
@@ -283,4 +297,6 @@ def _omm_epoch(text: str) -> datetime | None:
         epoch = datetime.fromisoformat(text.strip().removesuffix("Z"))
     except ValueError:
         return None
-    return epoch.replace(tzinfo=UTC) if epoch.tzinfo is None else None
+    if epoch.tzinfo is not None or not FIRST_YEAR <= epoch.year < datetime.max.year:
+        return None
+    return epoch.replace(tzinfo=UTC)

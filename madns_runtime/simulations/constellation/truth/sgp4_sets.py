@@ -69,7 +69,7 @@ def sgp4_states(
         States, shape (N, K, 6), m and m/s, TEME.
 
     Raises:
-        ConfigurationError: A set cannot be propagated to a time; names the satellites and why.
+        ConfigurationError: A set cannot be propagated to a time; names the satellites, when first, and why.
 
     Accuracy: within 1.2e-7 km of the verification vectors that the sgp4 package ships.
     """
@@ -79,10 +79,11 @@ def sgp4_states(
     errors, r_km, v_km_s = _fleet_records(element_sets).sgp4(
         whole + days, part + rest_s / SECONDS_PER_DAY
     )
-    if errors.any():
-        bad = {
-            element_sets[int(n)].name: SGP4_ERRORS.get(int(errors[n, k]), str(errors[n, k]))
-            for n, k in np.argwhere(errors)
-        }
-        raise ConfigurationError("\n".join(f"{name}: SGP4: {why}" for name, why in bad.items()))
+    faults = []
+    for n in np.flatnonzero(errors.any(axis=1)).tolist():
+        k = int(np.argmax(errors[n] > 0))
+        why = SGP4_ERRORS.get(int(errors[n, k]), str(errors[n, k]))
+        faults.append(f"{element_sets[n].name}: SGP4: {why}, at {t_s[k]:g} s")
+    if faults:
+        raise ConfigurationError("\n".join(faults))
     return np.concatenate((r_km, v_km_s), axis=2) * 1000.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from madns_runtime.errors import ConfigurationError
@@ -46,9 +47,9 @@ def parse_walker(text: str) -> WalkerPattern:
 
 def walker_orbits(
     pattern: WalkerPattern, *, a_m: float, raan_spread_deg: float
-) -> tuple[tuple[str, Elements], ...]:
+) -> Iterator[tuple[str, Elements]]:
     """
-    Return a name such as P2S05 and the elements of every satellite, plane by plane.
+    Yield a name such as P2S05 and the elements of every satellite, plane by plane.
 
     Args:
         pattern: The pattern.
@@ -60,7 +61,6 @@ def walker_orbits(
     """
     per_plane = pattern.satellites // pattern.planes
     width = len(str(per_plane))
-    orbits = []
     for plane in range(pattern.planes):
         raan = math.radians(raan_spread_deg * plane / pattern.planes)
         for slot in range(per_plane):
@@ -73,5 +73,4 @@ def walker_orbits(
                 argp_rad=0.0,
                 mean_anomaly_rad=math.tau * (turns % 1.0),
             )
-            orbits.append((f"P{plane + 1}S{slot + 1:0{width}d}", elements))
-    return tuple(orbits)
+            yield f"P{plane + 1}S{slot + 1:0{width}d}", elements
