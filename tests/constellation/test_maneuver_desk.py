@@ -77,6 +77,14 @@ def test_an_agent_that_lives_behind_has_its_time_later_too():
     taken = desk().decide(0, command(10.1, phase_s=0.09), 10.092)
 
     assert (taken.status, taken.at_s) == ("accepted", 10.1)
+    late = desk().decide(0, command(10.1, phase_s=0.09), 10.192)
+    # Feasible from 10.242 s on, which in its own time is 10.152 s.
+    assert (late.status, late.at_s) == ("postponed", 10.2)
+
+
+def test_a_time_that_means_a_knot_is_the_knots():
+    assert desk().decide(0, command(20.00000005), 10.0).effect.start_s == 20.0
+    assert desk().decide(0, command(20.3), 10.0).effect.start_s == 20.3
 
 
 def test_late_commands_are_refused_where_the_scenario_says_so():
@@ -99,6 +107,7 @@ def test_late_commands_are_refused_where_the_scenario_says_so():
         ({"vector": (1e300, 0.0, 0.0)}, "propellant"),
         ({"at_s": 1e300}, "beyond the run"),
         ({"at_s": math.inf}, "finite"),
+        ({"phase_s": math.nan}, "finite"),
         ({"vector": (math.nan, 0.0, 0.0)}, "finite"),
         ({"vector": (900.0, 0.0, 0.0)}, "propellant"),
         ({"frame": "body"}, "without attitude"),

@@ -28,7 +28,7 @@ class Thruster:
     """Thrust, N: delta-v is a finite burn around its time; none for an impulse."""
     magnitude_error: Annotated[float, Ge(0), Lt(1)] = 0.0
     """Standard deviation of the delta-v's magnitude, as a share of it."""
-    direction_error_deg: Annotated[float, Ge(0), Le(45)] = 0.0
+    direction_error_deg: Annotated[float, Ge(0), Le(20)] = 0.0
     """Standard deviation of the delta-v's direction about each of two axes, deg."""
     minimum_impulse_n_s: Annotated[float, Ge(0)] = 0.0
     """A smaller impulse is not executed, N s."""

@@ -7,12 +7,14 @@ from typing import Annotated, Literal
 
 from annotated_types import Ge, Le
 
+from madns_runtime.config import FORBID_EXTRA
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CounterParameters:
     """How the counting packets travel."""
 
-    __pydantic_config__ = {"extra": "forbid"}
+    __pydantic_config__ = FORBID_EXTRA
 
     service: Literal["best", "reliable", "sync"] = "best"
     """Class of service: best as a bare datagram, reliable and sync with delivery guaranteed."""

@@ -226,7 +226,8 @@ class ManeuverDesk:
 
     def _fault(self, vehicle: int, command: Command) -> str:
         """Return why a command cannot be carried out at any time; empty if it can."""
-        numbers = (command.at_s, command.commanded_s, command.duration_s, *command.vector)
+        times_s = (command.commanded_s, command.phase_s, command.at_s, command.duration_s)
+        numbers = (*times_s, *command.vector)
         described = self._vehicles[vehicle]
         if not all(map(math.isfinite, numbers)):
             return f"expected finite numbers, got {numbers}"
