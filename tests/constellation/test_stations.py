@@ -15,8 +15,8 @@ from sgp4.api import Satrec, SatrecArray, jday
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.protocol.codec import pack
 from madns_runtime.simulations.constellation.messages import Transmission
+from madns_runtime.simulations.constellation.orbit.constants import EARTH_RADIUS_M
 from madns_runtime.simulations.constellation.orbit.earth import (
-    WGS_84_RADIUS_M,
     days_since_j2000,
     gmst_rad,
     gmst_rate_rad_s,
@@ -32,14 +32,14 @@ AUTHORITY = json.loads((ROOT / "tests/authorities/passes.json").read_text())
 EPOCH = datetime(2017, 3, 7, 12, tzinfo=UTC)
 
 # One satellite on an equatorial circle, over stations on the equator: passes by hand.
-RADIUS_M = WGS_84_RADIUS_M + 780e3
+RADIUS_M = EARTH_RADIUS_M + 780e3
 ORBIT_RAD_S = math.sqrt(3.986004415e14 / RADIUS_M**3)
 TURN_RAD_S = gmst_rate_rad_s(days_since_j2000(EPOCH))
 ZERO_DEG = math.degrees(gmst_rad(days_since_j2000(EPOCH)))
 BEHIND_RAD = math.radians(40.0)
 """The first vehicle starts so far west of the first station, each further one as far west of the one before."""
 MASK_RAD = math.radians(10.0)
-REACH_RAD = math.acos(WGS_84_RADIUS_M / RADIUS_M * math.cos(MASK_RAD)) - MASK_RAD
+REACH_RAD = math.acos(EARTH_RADIUS_M / RADIUS_M * math.cos(MASK_RAD)) - MASK_RAD
 """Angle at the Earth's centre between station and vehicle on the mask."""
 RISE_S = (BEHIND_RAD - REACH_RAD) / (ORBIT_RAD_S - TURN_RAD_S)
 SET_S = (BEHIND_RAD + REACH_RAD) / (ORBIT_RAD_S - TURN_RAD_S)
@@ -187,7 +187,7 @@ def test_pass_over_the_equator_is_that_computed_by_hand():
 def test_pass_shorter_than_the_step_is_not_missed(short_s, phase_s):
     # A mask so high that the pass lasts short_s, at any phase of the looks.
     reach = 0.5 * short_s * (ORBIT_RAD_S - TURN_RAD_S)
-    across, up = RADIUS_M * math.sin(reach), RADIUS_M * math.cos(reach) - WGS_84_RADIUS_M
+    across, up = RADIUS_M * math.sin(reach), RADIUS_M * math.cos(reach) - EARTH_RADIUS_M
     mask_deg = math.degrees(math.atan2(up, across))
     shift_deg = math.degrees(phase_s * (ORBIT_RAD_S - TURN_RAD_S))
     middle_s = BEHIND_RAD / (ORBIT_RAD_S - TURN_RAD_S) + phase_s

@@ -89,6 +89,15 @@ def test_harmonics_of_degree_one_are_the_dipole():
         assert harmonics.field_t(place) == pytest.approx(dipole_field_t(dipole, place), rel=1e-9)
 
 
+def test_near_the_pole_the_field_is_that_of_the_pole():
+    harmonics = Harmonics(dipole_at(2026.0))
+
+    for place in ((0.0, 0.0, 7e6), (1e-4, 0.0, 7e6), (0.0, -1e-5, 7e6), (0.0, 2e-3, 7e6)):
+        assert harmonics.field_t(place) == pytest.approx(
+            dipole_field_t(dipole_at(2026.0), place), rel=1e-6
+        )
+
+
 def test_the_igrf_agrees_with_its_authors_own_program():
     ppigrf = pytest.importorskip("ppigrf", reason="the extra igrf is not installed")
     harmonics = Harmonics(igrf_coefficients(2025.0))

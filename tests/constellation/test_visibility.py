@@ -10,10 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sgp4.propagation import gstime
 
-from madns_runtime.simulations.constellation.orbit.constants import EGM_96
+from madns_runtime.simulations.constellation.orbit.constants import (
+    EARTH_POLAR_RADIUS_M,
+    EARTH_RADIUS_M,
+    EGM_96,
+)
 from madns_runtime.simulations.constellation.orbit.earth import (
-    WGS_84_POLAR_RADIUS_M,
-    WGS_84_RADIUS_M,
     days_since_j2000,
     fixed_to_teme,
     geodetic_to_fixed,
@@ -32,7 +34,7 @@ from madns_runtime.simulations.constellation.orbit.visibility import (
 )
 
 HEIGHT_M = 100e3
-RADIUS_M = WGS_84_RADIUS_M + 780e3
+RADIUS_M = EARTH_RADIUS_M + 780e3
 COORDINATES = st.floats(-2e7, 2e7)
 POSITIONS = st.tuples(COORDINATES, COORDINATES, COORDINATES)
 
@@ -59,13 +61,13 @@ def test_line_of_sight_reaches_further_without_atmosphere():
 
 @pytest.mark.parametrize(("above_m", "is_clear"), [(1.0, True), (-1.0, False)])
 def test_earth_is_flat_at_its_poles(above_m, is_clear):
-    z = WGS_84_POLAR_RADIUS_M + HEIGHT_M + above_m
+    z = EARTH_POLAR_RADIUS_M + HEIGHT_M + above_m
 
     assert has_line_of_sight((-3e6, 0.0, z), (3e6, 0.0, z), HEIGHT_M) is is_clear
 
 
 def test_who_is_inside_the_atmosphere_sees_nobody():
-    inside = on_equator(0.0, WGS_84_RADIUS_M + 99e3)
+    inside = on_equator(0.0, EARTH_RADIUS_M + 99e3)
 
     assert not has_line_of_sight(inside, on_equator(1.0), HEIGHT_M)
     assert not has_line_of_sight(on_equator(1.0), inside, HEIGHT_M)
@@ -76,7 +78,7 @@ def test_line_of_sight_is_the_same_both_ways_and_for_many(first, second):
     one_way = has_line_of_sight(first, second, HEIGHT_M)
     many = have_line_of_sight(np.array(first), np.array([second, second]), HEIGHT_M)
 
-    nearest_m = abs(nearest_scaled(first, second) - 1.0) * WGS_84_RADIUS_M
+    nearest_m = abs(nearest_scaled(first, second) - 1.0) * EARTH_RADIUS_M
     if nearest_m > 1e-3:  # closer than that, rounding may decide
         assert has_line_of_sight(second, first, HEIGHT_M) == one_way
         assert many.tolist() == [one_way, one_way]
@@ -84,7 +86,7 @@ def test_line_of_sight_is_the_same_both_ways_and_for_many(first, second):
 
 def nearest_scaled(first, second):
     """Return the least distance from the centre, of 1001 points and the ends, by trial."""
-    equator, pole = WGS_84_RADIUS_M + HEIGHT_M, WGS_84_POLAR_RADIUS_M + HEIGHT_M
+    equator, pole = EARTH_RADIUS_M + HEIGHT_M, EARTH_POLAR_RADIUS_M + HEIGHT_M
     scale = np.array((equator, equator, pole))
     start, end = np.array(first) / scale, np.array(second) / scale
     way = end - start
@@ -162,7 +164,7 @@ def test_places_stand_on_the_ellipsoid_and_look_along_its_normal(latitude, longi
     ground, up = geodetic_to_fixed(*arrays, np.zeros(1))
     raised, _ = geodetic_to_fixed(*arrays, np.array([altitude_m]))
 
-    radii = np.array((WGS_84_RADIUS_M, WGS_84_RADIUS_M, WGS_84_POLAR_RADIUS_M))
+    radii = np.array((EARTH_RADIUS_M, EARTH_RADIUS_M, EARTH_POLAR_RADIUS_M))
     normal = ground[0] / radii**2
     assert np.sum((ground[0] / radii) ** 2) == pytest.approx(1.0, abs=1e-14)
     assert up[0] == pytest.approx(normal / np.linalg.norm(normal), abs=1e-14)

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 SECONDS_PER_DAY = 86_400.0
 EARTH_RATE_RAD_S = 7.292115e-5
 """Rotation of the Earth about TEME's z axis, rad/s. Source: WGS-84, NIMA TR8350.2, 3rd ed."""
+EARTH_RADIUS_M = 6_378_137.0
+"""Equatorial radius of the Earth's ellipsoid, m. Source: WGS-84, NIMA TR8350.2, 3rd ed., table 3.1."""
 EARTH_FLATTENING = 1.0 / 298.257223563
-"""Flattening of the Earth's ellipsoid. Source: WGS-84, NIMA TR8350.2, 3rd ed."""
-EARTH_POLAR_RADIUS_M = 6_356_752.3142
-"""Smallest distance from the Earth's centre to its surface, m. Source: WGS-84, NIMA TR8350.2, 3rd ed."""
+"""Of the same ellipsoid; same source."""
+EARTH_POLAR_RADIUS_M = EARTH_RADIUS_M * (1.0 - EARTH_FLATTENING)
+"""Smallest distance from the Earth's centre to its surface, m."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

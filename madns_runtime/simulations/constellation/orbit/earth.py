@@ -14,13 +14,11 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from madns_runtime.simulations.constellation.orbit.constants import SECONDS_PER_DAY
-
-WGS_84_RADIUS_M = 6_378_137.0
-"""Equatorial radius of the WGS-84 ellipsoid, m. Source: NIMA TR8350.2, 3rd ed., table 3.1."""
-WGS_84_FLATTENING = 1.0 / 298.257223563
-"""Source: the same."""
-WGS_84_POLAR_RADIUS_M = WGS_84_RADIUS_M * (1.0 - WGS_84_FLATTENING)
+from madns_runtime.simulations.constellation.orbit.constants import (
+    EARTH_FLATTENING,
+    EARTH_RADIUS_M,
+    SECONDS_PER_DAY,
+)
 
 J2000 = datetime(2000, 1, 1, 12, tzinfo=UTC)
 _DAYS_PER_CENTURY = 36_525.0
@@ -80,8 +78,8 @@ def geodetic_to_fixed(
     Source: Vallado, Fundamentals of Astrodynamics and Applications, 4th ed., section 3.2.
     """
     sine, cosine = np.sin(latitude_rad), np.cos(latitude_rad)
-    e2 = WGS_84_FLATTENING * (2.0 - WGS_84_FLATTENING)
-    curvature = WGS_84_RADIUS_M / np.sqrt(1.0 - e2 * sine * sine)
+    e2 = EARTH_FLATTENING * (2.0 - EARTH_FLATTENING)
+    curvature = EARTH_RADIUS_M / np.sqrt(1.0 - e2 * sine * sine)
     east = np.cos(longitude_rad), np.sin(longitude_rad)
     up = np.stack((cosine * east[0], cosine * east[1], sine), axis=-1)
     radius = (curvature + altitude_m) * cosine

@@ -32,6 +32,8 @@ IGRF_14_DIPOLE_NT = {
 """g10, g11 and h11 by year, nT. Source: IGRF-14, doi:10.5281/zenodo.14012302; 2030 from its secular
 variation."""
 NT = 1e-9
+POLE_M = 1e-3
+"""Nearer to the axis there is no longitude, m."""
 
 
 def decimal_year(days: float) -> float:
@@ -99,10 +101,12 @@ class Harmonics:
     def field_t(self, r_m: Vector) -> Vector:
         """Return the field, T."""
         x, y, z = r_m
-        flat = max(math.hypot(x, y), 1e-3)  # at a pole every longitude will do
+        if math.hypot(x, y) < POLE_M:
+            x, y = POLE_M, 0.0  # at a pole every longitude will do
+        flat = math.hypot(x, y)
         r = math.hypot(flat, z)
         sine, cosine = flat / r, z / r
-        cos_1, sin_1 = (x / flat, y / flat) if x or y else (1.0, 0.0)
+        cos_1, sin_1 = x / flat, y / flat
         up, south, east = self._spherical(r, sine, cosine, cos_1, sin_1)
         outward = up * sine + south * cosine
         return (

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 
+from madns_runtime.simulations.constellation.orbit.constants import EARTH_RADIUS_M
+
 Vector = tuple[float, float, float]
 
 ASTRONOMICAL_UNIT_M = 149_597_870_700.0
 """Source: IAU 2012 resolution B2."""
 SUN_RADIUS_M = 695_700e3
 """Source: IAU 2015 resolution B3, nominal."""
-EARTH_RADIUS_M = 6_378_137.0
-"""Of the sphere that casts the shadow. Source: WGS-84, equatorial."""
 
 
 def sun_m(days: float) -> Vector:

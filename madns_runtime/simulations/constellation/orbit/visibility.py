@@ -17,10 +17,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from madns_runtime.simulations.constellation.orbit.constants import EGM_96
-from madns_runtime.simulations.constellation.orbit.earth import (
-    WGS_84_POLAR_RADIUS_M,
-    WGS_84_RADIUS_M,
+from madns_runtime.simulations.constellation.orbit.constants import (
+    EARTH_POLAR_RADIUS_M,
+    EARTH_RADIUS_M,
+    EGM_96,
 )
 from madns_runtime.simulations.constellation.orbit.elements import (
     elements_from_state,
@@ -44,7 +44,7 @@ def has_line_of_sight(first: Sequence[float], second: Sequence[float], height_m:
         second: The same.
         height_m: Height that both radii of the ellipsoid are raised by, m; an end below it sees nothing.
     """
-    equator, pole = WGS_84_RADIUS_M + height_m, WGS_84_POLAR_RADIUS_M + height_m
+    equator, pole = EARTH_RADIUS_M + height_m, EARTH_POLAR_RADIUS_M + height_m
     x, y, z = first[0] / equator, first[1] / equator, first[2] / pole
     dx, dy, dz = second[0] / equator - x, second[1] / equator - y, second[2] / pole - z
     square = dx * dx + dy * dy + dz * dz
@@ -69,7 +69,7 @@ def have_line_of_sight(
     Returns:
         Shape (...).
     """
-    equator, pole = WGS_84_RADIUS_M + height_m, WGS_84_POLAR_RADIUS_M + height_m
+    equator, pole = EARTH_RADIUS_M + height_m, EARTH_POLAR_RADIUS_M + height_m
     scale = np.array((equator, equator, pole))
     start = first / scale
     way = second / scale - start

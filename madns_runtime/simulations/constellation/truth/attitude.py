@@ -30,6 +30,7 @@ from madns_runtime.simulations.constellation.truth.propagation import (
     load_propagator,
     propagate,
 )
+from madns_runtime.simulations.constellation.truth.scipy_propagator import RTOL_MIN
 
 try:
     from scipy.integrate import solve_ivp
@@ -40,8 +41,6 @@ except ImportError as error:
 Array = NDArray[np.float64]
 
 RTOL = 1e-12
-RTOL_MIN = 2.3e-14
-"""scipy refuses less."""
 ATOL = 1e-13
 """Of a quaternion's number; of a rate a hundredth of it a second."""
 RATE_SHARE_PER_S = 1e-2
