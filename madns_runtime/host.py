@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import sys
 import traceback
 from pathlib import Path
@@ -22,6 +23,7 @@ from madns_runtime.plugin.api import HOST
 from madns_runtime.processes import register
 from madns_runtime.reactor.lines import read_launch
 from madns_runtime.reactor.scheduling import die_with_parent
+from madns_runtime.reactor.watchdog import tell_stack_on
 
 
 def main() -> None:
@@ -29,6 +31,7 @@ def main() -> None:
     out_fd = os.dup(1)
     os.dup2(2, 1)  # what a plug-in prints must not mix with the events
     die_with_parent()  # until the loop runs: loading a plug-in may take for ever
+    tell_stack_on(signal.SIGTERM)
     try:
         document, pending = read_launch(0)
         launch = from_mapping(HostLaunch, document)

@@ -29,7 +29,7 @@ from madns_runtime.reactor.lines import OPERATOR_SIDE_GONE, OperatorLink
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import apply as apply_scheduling
 from madns_runtime.reactor.scheduling import freeze_garbage, outlive_parent
-from madns_runtime.reactor.watchdog import end_after_hang_up, extend
+from madns_runtime.reactor.watchdog import end_after_hang_up, extend, tell_stack_on
 from madns_runtime.recording.run_recorder import RunRecorder
 from madns_runtime.result_file import hand_over
 from madns_runtime.timing.clock import utc_at_iso
@@ -116,9 +116,9 @@ class HostRuntime:
         else:
             end_after_hang_up(self._line_fd, config.timeouts.shutdown_s + HANG_GRACE_S)
         outlive_parent()
-        self._reactor.on_signal(signal.SIGTERM, self._terminated)
-        # A terminal's Ctrl-C is the operator's.
-        self._reactor.on_signal(signal.SIGINT, lambda: None)
+        on_signal = self._reactor.on_signal
+        tell_stack_on(signal.SIGTERM, lambda: on_signal(signal.SIGTERM, self._terminated))
+        on_signal(signal.SIGINT, lambda: None)  # a terminal's Ctrl-C is the operator's
         self._recorder.start()
         self._report.scheduling = apply_scheduling(config.scheduling, is_host=True).to_mapping()
         socket = self._port.socket

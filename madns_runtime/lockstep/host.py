@@ -31,7 +31,7 @@ from madns_runtime.plugin.api import HOST
 from madns_runtime.protocol.codec import pack
 from madns_runtime.protocol.states import HostEvent, host_machine
 from madns_runtime.reactor.scheduling import freeze_garbage, outlive_parent
-from madns_runtime.reactor.watchdog import end_after_hang_up
+from madns_runtime.reactor.watchdog import end_after_hang_up, tell_stack_on
 from madns_runtime.result_file import hand_over, leave
 from madns_runtime.timing.clock import utc_now_iso
 from madns_runtime.timing.rate import Pacer
@@ -96,11 +96,9 @@ class LockstepHost:
         else:
             end_after_hang_up(self._line_fd, 2 * self._config.timeouts.shutdown_s + HANG_GRACE_S)
         outlive_parent()
-        meeting = self._meeting
-        end_by_term = lambda: meeting.end(HOST, "ended by SIGTERM", status="interrupted")  # noqa: E731
-        meeting.reactor.on_signal(signal.SIGTERM, end_by_term)
-        # A terminal's Ctrl-C is the operator's.
-        meeting.reactor.on_signal(signal.SIGINT, lambda: None)
+        on_signal = self._meeting.reactor.on_signal
+        tell_stack_on(signal.SIGTERM, lambda: on_signal(signal.SIGTERM, self._terminated))
+        on_signal(signal.SIGINT, lambda: None)  # a terminal's Ctrl-C is the operator's
         self._operator.emit({"event": "state", "state": self._machine.state.value})
         try:
             with contextlib.suppress(RunEnds):
@@ -197,6 +195,10 @@ class LockstepHost:
             half.call("receive", names[number], decode(body))
 
     # The end --------------------------------------------------------------------------------------
+
+    def _terminated(self) -> None:
+        """End on SIGTERM, which does not come from the operator: it has a line of its own."""
+        self._meeting.end(HOST, "ended by SIGTERM", status="interrupted")
 
     def _shut_down(self) -> None:
         ending = self._account.ending = self._meeting.ending

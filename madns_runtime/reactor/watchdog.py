@@ -10,6 +10,7 @@ import faulthandler
 import select
 import sys
 import threading
+from collections.abc import Callable
 
 _lock = threading.Lock()
 _has_noticed = False
@@ -21,6 +22,20 @@ def extend(grace_s: float) -> None:
     with _lock:
         _has_noticed = True
         faulthandler.dump_traceback_later(grace_s, exit=True, file=sys.__stderr__ or 2)
+
+
+def tell_stack_on(number: int, listen: Callable[[], None] | None = None) -> None:
+    """
+    Have a signal first write to standard error where the main thread is: it may hang and never take note.
+
+    Args:
+        number: The signal's.
+        listen: Sets what handles the signal besides; without it that stays.
+    """
+    faulthandler.unregister(number)  # before: it puts back what handled the signal when it came
+    if listen is not None:
+        listen()
+    faulthandler.register(number, file=sys.__stderr__ or 2, all_threads=False, chain=True)
 
 
 def end_after_hang_up(fd: int, grace_s: float) -> None:

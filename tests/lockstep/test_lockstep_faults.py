@@ -147,6 +147,16 @@ def test_sigterm_ends_it_in_good_order(start_host):
     assert not any(map(is_alive, workers))
 
 
+def test_sigterm_shows_where_a_host_hangs(start_host):
+    run = start_host(fault="hostsetup_hang")
+    wait_until(lambda: any(e.get("state") == "SIMULATION_SETUP" for e in run.events), "no setup")
+    wait_until(lambda: run.process.send_signal(signal.SIGTERM) or stuck(run), "no stack")
+
+
+def stuck(run):
+    return "in go_wrong" in (run.folder / "stderr.txt").read_text()
+
+
 def test_it_ends_with_its_operator(start_host):
     run, workers = slow_host(start_host)
     run.process.stdin.close()
