@@ -20,7 +20,6 @@ from madns_runtime.simulations.constellation.equipment import Vehicle
 Force = Literal["two_body", "j2", "j3", "j4", "drag"]
 Setting = bool | int | float | str | list[float] | list[str]
 """A value of one's own that a scenario hands to code of one's own."""
-SATELLITES_MAX = 5000
 KNOTS_MAX = 100_000
 """Knots in one segment: more is a mistake, not a plan."""
 
