@@ -165,6 +165,45 @@ def test_broadcast_is_one_transmission_heard_by_all_in_view():
     assert medium.summary()["sent"] == 3
 
 
+@pytest.mark.parametrize("waits", [0, 1])
+def test_broadcast_reaches_whom_a_message_to_each_alone_would_reach(waits):
+    # At 50.36 deg the atmosphere gets in between; 300 s of waiting move those of another height by degrees.
+    degrees = (0.0, 10.0, 49.0, 50.2, 50.5, 53.0, 60.0, 180.0)
+    circle, _ = ring(*degrees)
+    lower = np.linspace(1.0, 1.02, len(degrees))[:, None]
+    scale = np.hstack((np.repeat(1.0 / lower, 3, axis=1), np.repeat(lower**0.5, 3, axis=1)))
+
+    def states(t_s):
+        return circle(t_s) * scale
+
+    def sent(to):
+        medium = links(*degrees, states=states, rate_bit_s=BITS / 300.0)
+        for number in range(waits):
+            medium.send(0, message("v1", number=number), 0.0)
+        return medium.send(0, message(to, number=waits), 0.0)
+
+    alone = [event for n in range(1, len(degrees)) for event in sent(f"v{n}")]
+    reached = [event for event in alone if event.outcome == "delivered"]
+    together = sent("*")
+    assert [event.to for event in together] == [event.to for event in reached]
+    for one, other in zip(together, reached, strict=True):
+        assert one.distance_m == pytest.approx(other.distance_m, rel=1e-12)
+        assert one.arrives_s == pytest.approx(other.arrives_s, abs=1e-9)
+
+
+def test_receivers_of_a_broadcast_lose_it_each_by_itself():
+    medium = links(*range(0, 40, 2), loss=0.5)
+
+    counts = [
+        outcomes(medium.send(0, message("*", number=number), 0.0)).count("lost")
+        for number in range(20)
+    ]
+
+    # 190 of 380, by five standard deviations; and never all or nobody of 19.
+    assert abs(sum(counts) - 190) < 49
+    assert 0 < min(counts) <= max(counts) < 19
+
+
 @pytest.mark.parametrize(
     ("degrees", "outcome"), [((0.0, 180.0), "no_line_of_sight"), ((0.0, 30.0), "out_of_range")]
 )

@@ -435,6 +435,30 @@ def test_message_for_any_station_reaches_the_one_it_stands_highest_over():
     assert outcome("ground:none") == ("ground:none", "unknown_receiver")
 
 
+def test_standing_highest_is_not_standing_furthest_above_the_mask():
+    strict, lenient = station(east_deg=-38.0, mask_deg=60.0), station("far", east_deg=-33.0)
+
+    (event,) = ground(lenient, strict).send(0, message(sent_s=0.0), 0.0)
+
+    assert (event.to, event.outcome) == ("ground:here", "delivered")
+
+
+def test_station_moves_on_while_the_signal_comes_down():
+    east_deg = -30.0
+    (event,) = ground(station(east_deg=east_deg)).send(0, message(sent_s=0.0), 0.0)
+
+    def distance_m(light_s):
+        # A vehicle 40 deg west of the first meridian, a station that turns with the Earth.
+        apart = BEHIND_RAD + math.radians(east_deg) + TURN_RAD_S * light_s
+        square = RADIUS_M**2 + WGS_84_RADIUS_M**2
+        return math.sqrt(square - 2.0 * RADIUS_M * WGS_84_RADIUS_M * math.cos(apart))
+
+    still_m = distance_m(0.0)
+    moved_m = distance_m(still_m / LIGHT_SPEED_M_S)
+    assert moved_m - still_m > 1.0
+    assert event.distance_m == pytest.approx(moved_m, abs=0.01)
+
+
 def test_downlinks_wait_for_each_other_and_are_bounded():
     segment = ground(station(east_deg=-40.0, rate_bit_s=BITS * 10.0))
 
