@@ -1,6 +1,7 @@
 """Both halves with flight software that follows a script: from command to the truth that the vehicle flies."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -138,6 +139,42 @@ def test_every_change_of_truth_is_with_its_vehicle_before_its_time_and_said_so(f
     # Of an arc from its beginning on: 100 kg and 2 m/s at 50 N last 4 s.
     (change,) = thruster.contexts["agent-01"].records["truth_changes"]
     assert change[1] == pytest.approx(13.0, abs=0.01)
+
+
+def test_an_agent_that_lives_behind_its_nominal_times_has_its_truth_by_its_own(fly):
+    star = fly([])
+    star.run(10.19)
+    last = Command(
+        number=0,
+        kind="delta_v",
+        commanded_s=10.1,
+        at_s=10.2,
+        frame="rtn",
+        vector=(0.0, 1.0, 0.0),
+        phase_s=0.09,
+    )
+    jobs = len(star.context.jobs)
+
+    star.host.receive("agent-02", last.to_message())
+    star.host.receive("agent-02", replace(last, number=1, at_s=10.62).to_message())
+
+    assert star.context.deadlines == [(Service.SYNC, pytest.approx(10.29))] * 2
+    # By its own time the second one is 0.53 s away: time for the executor.
+    functions = [function.__name__ for function, _ in star.context.jobs[jobs:]]
+    assert functions == ["propagate_vehicles"]
+
+
+def test_a_burn_over_several_windows_keeps_the_direction_of_its_middle(fly):
+    star = fly(["agent-02 50 rtn 27 0 5 0"], vehicle={"thruster": {**THRUSTER, "thrust_n": 20}})
+
+    star.run(60.0)
+
+    arcs = [m for _, to, m in star.context.sent if to == "agent-02" and m.get("thrust")]
+    assert len(arcs) > 3
+    assert len({tuple(arc["thrust"]) for arc in arcs}) == 1
+    start_s = arcs[0]["thrust"][0]
+    assert start_s == pytest.approx(32.0 - 12.486, abs=0.01)
+    assert star.underruns() == 0
 
 
 def test_a_vehicle_may_leave_the_earth_and_has_no_elements_then(fly):
