@@ -16,7 +16,7 @@ from madns_runtime.config import AgentLaunch
 from madns_runtime.context import RunContext
 from madns_runtime.half import Half, HalfFailed, Program
 from madns_runtime.plugin.api import Tick
-from madns_runtime.protocol import agent_session as told
+from madns_runtime.protocol import agent_events as told
 from madns_runtime.protocol.codec import NO_DATA
 from madns_runtime.protocol.states import AgentState
 from madns_runtime.reactor.reactor import Reactor

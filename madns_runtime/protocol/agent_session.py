@@ -13,6 +13,18 @@ from dataclasses import dataclass
 from typing import Any
 
 from madns_runtime.config import Timeouts
+from madns_runtime.protocol.agent_events import (
+    AgentSessionEvent,
+    ClockEstimated,
+    DataReceived,
+    EmergencyDeclared,
+    ExpelledFromRun,
+    SessionEnded,
+    SetupReceived,
+    StartReceived,
+    StateEntered,
+    StopReceived,
+)
 from madns_runtime.protocol.codec import (
     NO_DATA,
     MalformedMessage,
@@ -39,8 +51,9 @@ from madns_runtime.protocol.messages import (
     SimulationStart,
     SystemStop,
 )
+from madns_runtime.protocol.silence import Wakefulness, host_silence_limit_s
 from madns_runtime.protocol.states import AGENT_LIVE, AgentEvent, AgentState, agent_machine
-from madns_runtime.protocol.wire import Wire
+from madns_runtime.protocol.wire import PLUGIN_CHANNEL, Wire
 from madns_runtime.timing.clocksync import ClockEstimate
 
 PING_INTERVAL_S = 0.25
@@ -50,84 +63,12 @@ PINGS_FIRST = 12
 CLOCK_ERROR_S_MAX = 0.02
 CLOCK_WAIT_S = 2.0
 """An agent is ready once it knows the host's clock this well, or has tried for this long."""
-STALL_S = 1.0
-"""A session that was not called for this long was itself frozen, and blames nobody for silence."""
 LINGER_S = 1.0
 """How long an agent waits at the end for its last words to be acknowledged."""
 HELD_MAX = 1024
 """Messages that may wait for the agent's half to be set up."""
-PLUGIN_CHANNEL = 1
 
-
-@dataclass(frozen=True, slots=True)
-class StateEntered:
-    """The agent is in another state now."""
-
-    state: AgentState
-
-
-@dataclass(frozen=True, slots=True)
-class SetupReceived:
-    """Initial data came: set up the simulation, then call `setup_finished`."""
-
-    initial: Any
-
-
-@dataclass(frozen=True, slots=True)
-class StartReceived:
-    """Simulated time zero is *t0_host_s* on the host's clock."""
-
-    t0_host_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class DataReceived:
-    """The host's half sent this."""
-
-    payload: Any
-
-
-@dataclass(frozen=True, slots=True)
-class StopReceived:
-    """Close the records, then call `records_closed`."""
-
-
-@dataclass(frozen=True, slots=True)
-class EmergencyDeclared:
-    """End now: close the records, then call `records_closed`."""
-
-    who: str
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class ExpelledFromRun:
-    """The host had declared this agent lost; this conversation is over, a new incarnation may join."""
-
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class ClockEstimated:
-    """A clock exchange came in; `AgentSession.clock` has changed."""
-
-
-@dataclass(frozen=True, slots=True)
-class SessionEnded:
-    """Nothing more is to be sent or awaited."""
-
-
-AgentSessionEvent = (
-    StateEntered
-    | SetupReceived
-    | StartReceived
-    | DataReceived
-    | StopReceived
-    | EmergencyDeclared
-    | ExpelledFromRun
-    | ClockEstimated
-    | SessionEnded
-)
+_RUNNING = AgentState.RUN_SIMULATION
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -176,7 +117,7 @@ class AgentSession:
         self._machine = agent_machine()
         self._events: deque[AgentSessionEvent] = deque()
         self._heard_s: float | None = None
-        self._handled_s = now_s
+        self._wakefulness = Wakefulness(timeouts.silence_s, now_s)
         self._ping_due_s = now_s
         self._ping_count = 0
         self._state_deadline_s: float | None = (
@@ -196,8 +137,6 @@ class AgentSession:
     def state(self) -> AgentState:
         """Where this agent stands."""
         return self._machine.state
-
-    # What the composition root reports ------------------------------------------------------
 
     def setup_finished(self, now_s: float) -> None:
         """Take note that the agent's half is set up; the host is told once its clock is known here."""
@@ -227,7 +166,7 @@ class AgentSession:
         """Declare an emergency and tell the host; no effect when already ending."""
         if self._machine.allows(AgentEvent.EMERGENCY):
             self._send(EmergencyShutdown(self.identity.name, reason), Service.SYNC, now_s)
-            self._enter_emergency(self.identity.name, reason)
+            self._end(EmergencyDeclared(self.identity.name, reason))
 
     def send(
         self, payload: Any, service: Service, now_s: float, *, deadline_s: float | None = None
@@ -241,8 +180,6 @@ class AgentSession:
         """
         body = encode_data(payload)
         self.link.send(body, service, now_s, channel=PLUGIN_CHANNEL, deadline_s=deadline_s)
-
-    # The quick way of a tick's messages ---------------------------------------------------------
 
     def seal_data(self, payload: Any, now_s: float) -> bytes | None:
         """
@@ -262,7 +199,7 @@ class AgentSession:
             and events say what it brought.
         """
         body = None
-        if self._machine.state is AgentState.RUN_SIMULATION and not self._events:
+        if self._machine.state is _RUNNING and not self._events:
             body = self.link.open_best(data, now_s)
         if body is None:
             self.receive_datagram(data, now_s)
@@ -272,8 +209,6 @@ class AgentSession:
         if payload is NO_DATA:
             self._take(body, now_s)
         return payload
-
-    # Datagrams and time ------------------------------------------------------------------------
 
     def receive_datagram(self, data: bytes, now_s: float) -> None:
         """Take one datagram; whatever is wrong with it is counted."""
@@ -304,9 +239,7 @@ class AgentSession:
         """Do what is due. Received datagrams must have been handed in before."""
         if self.state is AgentState.EXIT:
             return
-        if now_s - self._handled_s > STALL_S and self._heard_s is not None:
-            self._heard_s = max(self._heard_s, now_s - self._timeouts.silence_s / 2)
-        self._handled_s = now_s
+        self._wakefulness.called(now_s)
         self.link.handle_timer(now_s)
         if now_s >= self._ping_due_s:
             self._ping(now_s)
@@ -321,8 +254,6 @@ class AgentSession:
     def next_broken_deadline(self) -> BrokenDeadline | None:
         """Return a SYNC message of this side that broke its deadline, once each."""
         return self.link.next_broken_deadline()
-
-    # Inside --------------------------------------------------------------------------------------
 
     def _fire(self, event: AgentEvent) -> None:
         self._events.append(StateEntered(self._machine.fire(event)))
@@ -350,18 +281,16 @@ class AgentSession:
                 self._say_ready(now_s)
         elif isinstance(message, SimulationSetup):
             self._move(AgentEvent.SETUP_RECEIVED, SetupReceived(message.initial))
-            self._state_deadline_s = None  # the agent's own work now; the host times it
         elif isinstance(message, SimulationStart):
             if self._machine.allows(AgentEvent.START_RECEIVED):
                 self.clock.settle(now_s)
             self._move(AgentEvent.START_RECEIVED, StartReceived(message.t0_host_s))
-            self._state_deadline_s = None  # from here on, the host's silence is the limit
         elif isinstance(message, SystemStop):
             self._move(AgentEvent.STOP_RECEIVED, StopReceived())
         elif isinstance(message, EmergencyShutdown):
-            self._enter_emergency(message.who, message.reason)
+            self._end(EmergencyDeclared(message.who, message.reason))
         elif isinstance(message, Expelled):
-            self._expelled(message.reason)
+            self._end(ExpelledFromRun(message.reason))
         else:
             self.malformed_count += 1  # a message that only agents send
 
@@ -376,21 +305,15 @@ class AgentSession:
     def _move(self, event: AgentEvent, outcome: AgentSessionEvent) -> None:
         if self._machine.allows(event):
             self._fire(event)
+            self._state_deadline_s = None  # the agent's own work now; the host times it
             self._events.append(outcome)
         else:
             self.malformed_count += 1
 
-    def _enter_emergency(self, who: str, reason: str) -> None:
+    def _end(self, outcome: EmergencyDeclared | ExpelledFromRun) -> None:
         if self._machine.allows(AgentEvent.EMERGENCY):
-            self._fire(AgentEvent.EMERGENCY)
-            self._state_deadline_s = self._ready_due_s = None
-            self._events.append(EmergencyDeclared(who, reason))
-
-    def _expelled(self, reason: str) -> None:
-        if self._machine.allows(AgentEvent.EMERGENCY):
-            self._fire(AgentEvent.EMERGENCY)
-            self._state_deadline_s = self._ready_due_s = None
-            self._events.append(ExpelledFromRun(reason))
+            self._ready_due_s = None
+            self._move(AgentEvent.EMERGENCY, outcome)
 
     def _is_clock_known(self, now_s: float) -> bool:
         return self.clock.is_valid and self.clock.error_s(now_s) <= CLOCK_ERROR_S_MAX
@@ -429,14 +352,9 @@ class AgentSession:
             )
         elif self._state_deadline_s is not None and now_s >= self._state_deadline_s:
             self.emergency(f"host: no order to go on from {state.value} before its deadline", now_s)
-        elif self._heard_s is not None and now_s - self._heard_s > self._silence_limit_s(state):
-            # It is told as well: it may only have been stuck.
-            self.emergency(f"host: silent for {self._silence_limit_s(state):g} s", now_s)
-
-    def _silence_limit_s(self, state: AgentState) -> float:
-        # While it sets up its own half the host may be busy; afterwards it answers pings at once.
-        if state is AgentState.AGENT_READY:
-            return self._timeouts.silence_s + self._timeouts.host_setup_s
-        if state is AgentState.SIMULATION_COMPLETE:
-            return self._timeouts.silence_s + self._timeouts.shutdown_s  # it makes its summary
-        return self._timeouts.silence_s
+        elif self._heard_s is not None:
+            silent_s = now_s - max(self._heard_s, self._wakefulness.blameless_until_s)
+            limit_s = host_silence_limit_s(state, self._timeouts)
+            if silent_s > limit_s:
+                # It is told as well: it may only have been stuck.
+                self.emergency(f"host: silent for {limit_s:g} s", now_s)

@@ -24,7 +24,7 @@ class BestSender:
     def __init__(self, queue_max: int, counters: ClassCounters) -> None:
         self._counters = counters
         self.numbers: dict[int, int] = {}
-        """Number of the next message by channel."""
+        """Number of the next message by channel, which is how many there were."""
         self.queue: deque[bytes] = deque(maxlen=queue_max)
 
     def push(self, body: bytes, channel: int) -> None:
@@ -44,7 +44,6 @@ class BestSender:
         number = self.numbers.get(channel, 0)
         self.numbers[channel] = number + 1
         self.queue.append(FRAME.pack(_BEST, channel, len(body), number) + body)
-        self._counters.sent += 1
 
 
 class BestReceiver:

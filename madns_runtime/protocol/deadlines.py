@@ -12,6 +12,8 @@ from madns_runtime.protocol.counters import LinkCounters
 BROKEN_UNREAD_MAX: Final = 1024
 """Reports kept for an owner that does not read them; the counter counts all."""
 
+_NEVER: Final = float("inf")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BrokenDeadline:
@@ -65,7 +67,7 @@ class DeadlineWatch:
         heap = self._heap
         while heap and heap[0][1] not in self._open:
             heapq.heappop(heap)
-        return heap[0][0] if heap else float("inf")
+        return heap[0][0] if heap else _NEVER
 
     def _break(self, index: int, late_s: float | None) -> None:
         deadline_s, sent_s, channel, body = self._open.pop(index)

@@ -140,14 +140,14 @@ class Peer:
     phase: Phase = Phase.ABSENT
     link: Link | None = None
     address: Address | None = None
-    incarnation: int | None = None
     pid: int | None = None
+    """Of the process that said hello; None until it did."""
     incarnations_seen: set[int] = field(default_factory=set)
+    """Of all processes that spoke for it; the link's is the present one."""
     heard_s: float = 0.0
     pings: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=PINGS_MAX))
     """Pings not answered yet: the agent's time, and when it came."""
     timer_s: float = float("inf")
-    rejoining: bool = False
     loss_reason: str | None = None
     report: Mapping[str, Any] = field(default_factory=dict)
     summary: Mapping[str, Any] = field(default_factory=dict)

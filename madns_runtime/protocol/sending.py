@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import deque
 from typing import Final, NamedTuple
 
-from madns_runtime.protocol.acks import ACK_BITS
 from madns_runtime.protocol.counters import ClassCounters
 from madns_runtime.protocol.delivery import (
     FRAME,
@@ -18,6 +17,7 @@ from madns_runtime.protocol.delivery import (
     WINDOW_FRAGMENTS_MIN,
 )
 from madns_runtime.protocol.messages import Service
+from madns_runtime.protocol.packets import ACK_BITS
 from madns_runtime.protocol.recovery import REORDER_PACKETS, RoundTrip
 
 FRAGMENT_BYTES_MIN: Final = 256
@@ -116,7 +116,7 @@ class SendStream:
     @property
     def is_flushed(self) -> bool:
         """Whether the peer has everything."""
-        return not self._pending and not self._unacknowledged
+        return not self.queued_bytes
 
     @property
     def has_output(self) -> bool:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from madns_runtime.protocol.link import LinkLimits
+from madns_runtime.protocol.limits import LinkLimits
+
+PLUGIN_CHANNEL = 1
+"""Of BEST messages: the framework's own go by channel 0, so that neither pushes the other out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -90,7 +90,6 @@ def test_new_link_has_nothing_to_do():
     assert agent.next_message() is None
     assert agent.next_broken_deadline() is None
     assert agent.srtt_s is None
-    assert agent.last_received_s is None
     assert agent.is_flushed
     assert agent.queued_bytes == 0
 
@@ -103,17 +102,6 @@ def test_datagrams_of_a_peer_start_with_its_prefix():
     assert datagram.startswith(host.peer_prefix)
     assert peek(datagram).agent_index == 1
     assert peek(datagram).incarnation == 2
-
-
-def test_silence_is_measured_from_accepted_datagrams():
-    agent, host = make_pair()
-    agent.send(b"x", BEST, 1.0)
-    (datagram,) = agent.datagrams_to_send(1.0)
-
-    host.receive_datagram(datagram, 2.0)
-    host.receive_datagram(datagram, 3.0)
-
-    assert host.last_received_s == 2.0
 
 
 def test_best_must_fit_one_datagram():
@@ -736,7 +724,7 @@ def test_lost_packets_remembered_are_bounded():
         agent.handle_timer(now_s)
         agent.datagrams_to_send(now_s)
 
-    assert len(agent._out[0]._lost) == sending.LOST_PACKETS_MAX
+    assert len(agent._outgoing.reliable._lost) == sending.LOST_PACKETS_MAX
 
 
 def test_round_trip_is_smoothed():

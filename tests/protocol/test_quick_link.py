@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lossy_wire import RUN_KEY, SESSION
 
-from madns_runtime.protocol.acks import ACK_BITS, REPLAY_WINDOW_PACKETS, ReceivedPackets
 from madns_runtime.protocol.codec import (
     ITEMS_MAX,
     NO_DATA,
@@ -21,6 +20,7 @@ from madns_runtime.protocol.codec import (
 )
 from madns_runtime.protocol.link import BEST_BYTES_MAX, Link
 from madns_runtime.protocol.messages import Ping, Service, SimulationData
+from madns_runtime.protocol.packets import ACK_BITS, REPLAY_WINDOW_PACKETS, Packets
 from madns_runtime.protocol.recovery import MEASURE_INTERVAL_S
 from madns_runtime.protocol.seal import DATAGRAM_BYTES_MAX, MAC_BYTES, OVERHEAD_BYTES
 
@@ -50,7 +50,7 @@ def general(link, body, now_s, channel=1):
 
 
 def state(link):
-    return (link.counters.to_mapping(), link.last_received_s, link.srtt_s, link.get_timer())
+    return (link.counters.to_mapping(), link.srtt_s, link.get_timer())
 
 
 # Sending.
@@ -281,7 +281,7 @@ def all_bits(packets):
 
 @given(st.lists(st.integers(1, 60), max_size=80), st.integers(0, 200))
 def test_received_packets_are_known_one_by_one_whatever_their_order(numbers, in_order):
-    packets = ReceivedPackets()
+    packets = Packets()
     seen = set()
     for number in [*numbers, *range(100, 100 + in_order)]:
         assert packets.is_new(number) == (number not in seen)
@@ -290,11 +290,11 @@ def test_received_packets_are_known_one_by_one_whatever_their_order(numbers, in_
             seen.add(number)
         largest = max(seen)
         bits = sum(1 << i for i in range(ACK_BITS) if largest - 1 - i in seen)
-        assert packets.acknowledge(0.0)[:2] == (largest, packets.ack_bits) == (largest, bits)
+        assert packets.depart(0.0)[1:3] == (largest, packets.ack_bits) == (largest, bits)
 
 
 def test_long_run_in_order_forgets_what_is_older_than_the_window():
-    packets = ReceivedPackets()
+    packets = Packets()
     packets.add(2, 0.0)  # 1 is missing
     for number in range(3, 2 * REPLAY_WINDOW_PACKETS):
         packets.add(number, 0.0)
@@ -305,10 +305,10 @@ def test_long_run_in_order_forgets_what_is_older_than_the_window():
 
 @pytest.mark.parametrize(("later_s", "delay"), [(-1.0, 0), (0.0, 0), (0.01, 1000), (5.0, 65_535)])
 def test_delay_of_an_acknowledgement_is_bounded(later_s, delay):
-    packets = ReceivedPackets()
+    packets = Packets()
     packets.add(1, 10.0)
 
-    assert packets.acknowledge(10.0 + later_s)[2] == pytest.approx(delay, abs=1)
+    assert packets.depart(10.0 + later_s)[3] == pytest.approx(delay, abs=1)
 
 
 # Messages.

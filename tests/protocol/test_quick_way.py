@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_sessions import World
 
-from madns_runtime.protocol import agent_session as a
+from madns_runtime.protocol import agent_events as a
 from madns_runtime.protocol import host_events as h
 from madns_runtime.protocol.codec import NO_DATA, UnencodableValue
 from madns_runtime.protocol.host_events import Phase

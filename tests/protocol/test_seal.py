@@ -6,8 +6,8 @@ import itertools
 
 import pytest
 
-from madns_runtime.protocol.acks import REPLAY_WINDOW_PACKETS, ReceivedPackets
 from madns_runtime.protocol.messages import VERSION
+from madns_runtime.protocol.packets import REPLAY_WINDOW_PACKETS, Packets
 from madns_runtime.protocol.seal import (
     DATAGRAM_BYTES_MAX,
     OVERHEAD_BYTES,
@@ -165,7 +165,7 @@ def test_cut_datagram_is_a_fault():
 
 
 def test_packet_is_new_once():
-    packets = ReceivedPackets()
+    packets = Packets()
 
     for number in (5, 3, 9, 4, 1, 2000, 1999):
         assert packets.is_new(number)
@@ -174,7 +174,7 @@ def test_packet_is_new_once():
 
 
 def test_packet_older_than_the_window_is_refused():
-    packets = ReceivedPackets()
+    packets = Packets()
     packets.add(5000, 0.0)
 
     assert packets.is_new(5000 - REPLAY_WINDOW_PACKETS + 1)
@@ -183,11 +183,11 @@ def test_packet_older_than_the_window_is_refused():
 
 
 def test_packet_number_zero_is_never_new():
-    assert not ReceivedPackets().is_new(0)
+    assert not Packets().is_new(0)
 
 
 def test_far_jump_keeps_the_bitmap_small():
-    packets = ReceivedPackets()
+    packets = Packets()
     packets.add(1, 0.0)
 
     assert not packets.add(2**64 - 1, 0.0)
@@ -198,7 +198,7 @@ def test_far_jump_keeps_the_bitmap_small():
 
 
 def test_bitmap_names_the_packets_before_the_largest():
-    packets = ReceivedPackets()
+    packets = Packets()
 
     in_order = [packets.add(number, 0.0) for number in (1, 2, 4, 3, 70)]
 

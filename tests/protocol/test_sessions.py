@@ -7,9 +7,14 @@ import pytest
 
 from madns_runtime import __version__
 from madns_runtime.config import Timeouts
-from madns_runtime.protocol import agent_session as a
+from madns_runtime.protocol import agent_events as a
 from madns_runtime.protocol import host_events as h
-from madns_runtime.protocol.agent_session import AgentIdentity, AgentSession
+from madns_runtime.protocol.agent_session import (
+    CLOCK_ERROR_S_MAX,
+    CLOCK_WAIT_S,
+    AgentIdentity,
+    AgentSession,
+)
 from madns_runtime.protocol.host_events import Phase
 from madns_runtime.protocol.host_session import HostSession
 from madns_runtime.protocol.messages import Service
@@ -208,7 +213,7 @@ def test_agents_are_ready_only_when_their_clocks_stand():
         assert session.state is AgentState.RUN_SIMULATION
         assert name in w.was_busy
         assert abs(session.clock.offset_s(w.now_s)) < 0.005  # both clocks are one here
-        assert session.clock.uncertainty_s(w.now_s) < a.CLOCK_ERROR_S_MAX
+        assert session.clock.uncertainty_s(w.now_s) < CLOCK_ERROR_S_MAX
 
 
 def test_agent_whose_clock_never_stands_is_ready_all_the_same_and_says_so():
@@ -219,7 +224,7 @@ def test_agent_whose_clock_never_stands_is_ready_all_the_same_and_says_so():
     while w.t0_s is None:
         w.run_for(0.05)
 
-    assert w.now_s > 100.0 + a.CLOCK_WAIT_S
+    assert w.now_s > 100.0 + CLOCK_WAIT_S
     assert not session.clock.is_valid
 
 

@@ -4,7 +4,7 @@ import pytest
 from test_sessions import TIMEOUTS, WIRE, World, world
 
 from madns_runtime import __version__
-from madns_runtime.protocol import agent_session as a
+from madns_runtime.protocol import agent_events as a
 from madns_runtime.protocol import host_events as h
 from madns_runtime.protocol.agent_session import HELD_MAX, AgentIdentity, AgentSession
 from madns_runtime.protocol.codec import encode_message
@@ -29,7 +29,7 @@ def say(w, name, message):
 def order(w, name, message):
     """Let the host's link say something out of turn."""
     w.host.peers[name].link.send_urgent(encode_message(message), Service.SYNC, w.now_s)
-    w.host._dirty.add(w.host.peers[name].index)
+    w.host._links.mark(w.host.peers[name])
     w.run_for(0.3)
 
 
@@ -42,7 +42,7 @@ def test_messages_of_the_wrong_side_or_without_sense_are_counted():
     order(w, "agent-1", Hello("agent-1", __version__, 1))
     order(w, "agent-1", SimulationStart(1.0))  # it runs already
     w.host.peers["agent-1"].link.send_urgent(b"\xff\x00", Service.SYNC, w.now_s)
-    w.host._dirty.add(1)
+    w.host._links.mark(w.host.peers["agent-1"])
     w.run_for(0.3)
 
     assert w.host.malformed_count == 2
