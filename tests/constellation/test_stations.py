@@ -332,6 +332,21 @@ def test_uplink_is_handed_over_before_it_arrives():
     assert len(segment.due(RISE_S - LEAD_S + 0.1)) == 1
 
 
+def test_uplink_is_handed_over_before_it_arrives_where_truth_is_known_for_seconds_only():
+    clock = [0.0]
+    truth = equatorial(1)
+
+    def known(t_s):
+        return truth(t_s) if clock[0] - 1.0 <= t_s <= clock[0] + 3.0 else None
+
+    segment, handed_s = ground(states=known, uplinks=[(0.0, "v0", TEXT)]), []
+    for tick in range(int(RISE_S * 10) + 20):
+        clock[0] = tick / 10.0
+        handed_s += [clock[0] for _ in segment.due(clock[0])]
+
+    assert handed_s == pytest.approx([RISE_S - LEAD_S], abs=0.2)
+
+
 def test_uplink_that_does_not_end_within_the_pass_waits_for_the_next():
     segment = ground(station(rate_bit_s=BITS / 2.0), uplinks=[(SET_S - 1.0, "v0", TEXT)])
 
@@ -450,8 +465,8 @@ def test_station_moves_on_while_the_signal_comes_down():
     def distance_m(light_s):
         # A vehicle 40 deg west of the first meridian, a station that turns with the Earth.
         apart = BEHIND_RAD + math.radians(east_deg) + TURN_RAD_S * light_s
-        square = RADIUS_M**2 + WGS_84_RADIUS_M**2
-        return math.sqrt(square - 2.0 * RADIUS_M * WGS_84_RADIUS_M * math.cos(apart))
+        square = RADIUS_M**2 + EARTH_RADIUS_M**2
+        return math.sqrt(square - 2.0 * RADIUS_M * EARTH_RADIUS_M * math.cos(apart))
 
     still_m = distance_m(0.0)
     moved_m = distance_m(still_m / LIGHT_SPEED_M_S)
