@@ -128,9 +128,15 @@ def _status(arguments: argparse.Namespace) -> None:
             say(f"tower {places.index}: starting or ending")
             continue
         for name, board in state["boards"].items():
-            link = "" if board["is_link_up"] else " unplugged"
-            boots = f"boot {board['boots']}"
-            show(f"{places.index} {name:10} {board['address']:12} {board['power']:8} {boots}{link}")
+            ills = {
+                "unplugged": not board["is_link_up"],
+                "frozen": board["is_frozen"],
+                "disk failed": board["has_disk_failed"],
+            }
+            told = ", ".join(
+                [f"boot {board['boots']}", *(ill for ill, is_so in ills.items() if is_so)]
+            )
+            show(f"{places.index} {name:10} {board['address']:12} {board['power']:8} {told}")
 
 
 def _shell(arguments: argparse.Namespace) -> None:
@@ -144,6 +150,8 @@ def _fault(arguments: argparse.Namespace) -> None:
         for name, fault in FAULTS.items():
             show(f"{name} {fault.takes}".ljust(22) + fault.text)
         return
+    if arguments.fault is None:
+        raise TowerError(f"which fault? there are {', '.join(FAULTS)}")
     request = {
         "verb": "fault",
         "board": arguments.board,

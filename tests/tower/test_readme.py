@@ -68,6 +68,8 @@ def test_commands_work(tmp_path):
     assert run.returncode == 0, run.stderr
     assert len(re.findall(r"^\d+ pi\d\d +10\.", run.stdout, re.MULTILINE)) == 2 * 24
     assert "pi01\nroot\n" in run.stdout
+    assert re.search(r"^\d+ pi03 .*, frozen$", run.stdout, re.MULTILINE)
+    assert re.search(r"^\d+ pi04 .*, unplugged$", run.stdout, re.MULTILINE)
     assert "load average" in run.stdout
     assert tower.returncode == 0
     assert "pi24" in (tmp_path / "tower.yaml").read_text()
