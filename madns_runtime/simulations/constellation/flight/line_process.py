@@ -13,7 +13,7 @@ import select
 import signal
 import subprocess
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from time import monotonic
 
@@ -33,6 +33,9 @@ WAITING_BYTES_MAX = 1_048_576
 READ_BYTES = 65_536
 END_S = 1.0
 """For a program to end by itself after its input has; and again after it was asked to by a signal."""
+PATIENCE_S = 6.0
+"""For all programs of this process together, whose agents end one after the other; then PATIENCE_S_MIN for each."""
+PATIENCE_S_MIN = 0.1
 
 
 class LineProcess:
@@ -46,6 +49,9 @@ class LineProcess:
     Raises:
         BlamedError: It cannot be started.
     """
+
+    patience_s = PATIENCE_S
+    """What is left of it."""
 
     def __init__(self, command: Sequence[str], base_directory: Path) -> None:
         self.name = command[0]
@@ -142,22 +148,30 @@ class LineProcess:
         """
         End it: its input ends, then it is asked by SIGTERM, then killed; returns its exit code.
 
-        Waits for at most three times END_S; what it still writes meanwhile is read and kept.
+        Waits for at most three times END_S, and less if others have used up this process's patience; what it
+        still writes meanwhile is read and kept.
 
         Args:
             is_patient: False kills it at once.
         """
         process = self._process
         gentle = (self._close_input, process.terminate) if is_patient else ()
-        for stop in (*gentle, self._kill_all):
-            stop()
-            if self._has_gone_by(monotonic() + END_S):
-                break
+        if not any(self._goes_by_itself(stop) for stop in gentle):
+            self._kill_all()
+            self._has_gone_by(monotonic() + END_S)
         self._kill_all()  # what it started and left behind
         for stream in (process.stdout, process.stderr):
             if stream is not None:
                 stream.close()
         return process.returncode
+
+    def _goes_by_itself(self, stop: Callable[[], object]) -> bool:
+        stop()
+        began_s = monotonic()
+        limit_s = max(PATIENCE_S_MIN, min(END_S, LineProcess.patience_s))
+        has_gone = self._has_gone_by(began_s + limit_s)
+        LineProcess.patience_s -= monotonic() - began_s
+        return has_gone
 
     def _has_gone_by(self, deadline_s: float) -> bool:
         while self._process.poll() is None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import math
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
@@ -60,6 +61,8 @@ class ExternalFlight:
         self._results: deque[dict[str, Any]] = deque(maxlen=MAIL_MAX)
         self._refusals: deque[dict[str, Any]] = deque(maxlen=MAIL_MAX)
         self._answer_s_max = 0.0
+        self._begun_s = -math.inf
+        """When its first answer came: what it had to do before that is no lateness of the ticks asked meanwhile."""
         self._counts = {
             "ticks_sent": 0,
             "ticks_skipped": 0,
@@ -130,8 +133,8 @@ class ExternalFlight:
 
     def finish(self) -> Mapping[str, Any]:
         """End the program, and return what came of it; in real time what was late is judged."""
-        late_s = monotonic() - self._settings.answer_s
-        overdue = sum(sent_s < late_s for sent_s, _ in self._asked)
+        now_s = monotonic()
+        overdue = sum(self._is_late(sent_s, now_s) for sent_s, _ in self._asked)
         code = self._process.end()
         self._log_talk()
         if code != 0:
@@ -190,12 +193,16 @@ class ExternalFlight:
                 f"one before {t_s:g} s: {clean_text(repr(line[:200]))}"
             )
         sent_s, asked_s = self._asked.popleft()
-        took_s = monotonic() - sent_s
-        self._answer_s_max = max(self._answer_s_max, took_s)
+        now_s = monotonic()
+        self._answer_s_max = max(self._answer_s_max, now_s - sent_s)
+        if not counts["answers"]:
+            self._begun_s = now_s
         counts["answers"] += 1
-        if took_s > self._settings.answer_s:
-            counts["answers_late"] += 1
+        counts["answers_late"] += self._is_late(sent_s, now_s)
         carry_out(line, self._context, process.name, t_s=asked_s)
+
+    def _is_late(self, sent_s: float, now_s: float) -> bool:
+        return now_s - max(sent_s, self._begun_s) > self._settings.answer_s
 
     def _await_answer(self, t_s: float) -> None:
         deadline_s = monotonic() + self._settings.answer_s
