@@ -3,12 +3,16 @@
 import math
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from control_harness import SCENARIOS, Fleet, flight_class
 
-from madns_runtime.simulations.constellation.flight.ring import RingSettings
+from madns_runtime.simulations.constellation.flight.api import Reading
+from madns_runtime.simulations.constellation.flight.ring import RingMember, RingSettings
+from madns_runtime.simulations.constellation.messages import Delivery
+from madns_runtime.simulations.constellation.orbit.atmosphere import density_kg_m3, height_m
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.orbit.mean_elements import (
     CircularElements,
@@ -16,7 +20,6 @@ from madns_runtime.simulations.constellation.orbit.mean_elements import (
     osculating_from_mean,
     state_from_circular,
 )
-from madns_runtime.simulations.constellation.orbit.atmosphere import density_kg_m3, height_m
 
 RING = 12
 SLOTS = {"slots": "even", "altitude_km": 780.0, "inclination_deg": 86.4, "exchange_s": 300.0}
@@ -207,6 +210,27 @@ def test_satellite_that_is_nobodys_nearest_is_adopted_and_agrees_with_the_others
     assert [one.finish()["neighbours"] for one in kept.software] == [2, 1, 1]
     assert np.ptp(agreed_km) < 0.1
     assert np.mean(agreed_km) == pytest.approx(EGM_96.radius_m / 1e3 + 780.0, abs=1.0)
+
+
+def test_what_a_neighbour_said_counts_once_and_not_again_when_it_falls_silent():
+    context = SimpleNamespace(
+        settings=SLOTS, index=0, agents=("a", "b", "c"), send=lambda to, payload: None
+    )
+    member = RingMember(context, follows_sma=False)
+    beliefs_deg = []
+    for number in range(6):
+        t_s = number * SLOTS["exchange_s"]
+        at = state(mean_orbit(780.0, member.rate_rad_s * t_s))
+        member.exchange(Reading(t_s, at))
+        beliefs_deg.append(math.degrees(member.slot_error_rad))
+        if number == 0:
+            said = {"round": 0, "t_s": 0.0, "lam": 0.0, "a": 7e6, "phase": 0.03, "sma": 7e6}
+            message = Delivery(sender="b", sent_s=0.0, arrives_s=0.0, payload=said | {"degree": 2})
+            member.hear(message)
+
+    # A ring of three agrees at once, without momentum: a third of what is heard, and that is all.
+    expected = [0.0] + [-math.degrees(0.03 / 3.0)] * 5
+    assert beliefs_deg == pytest.approx(expected, abs=2e-3)
 
 
 @pytest.mark.parametrize(
