@@ -11,6 +11,7 @@ import typer
 
 from cosmos_cli.commands.fleet_options import (
     FORKS_DEFAULT,
+    TIMEOUT_S_MAX,
     AcceptHostKeysOption,
     ForksOption,
     LimitOption,
@@ -78,7 +79,14 @@ def down(
     inventory: SomeInventoryOption = None,
     limit: LimitOption = None,
     timeout_s: Annotated[
-        float, typer.Option("--timeout", metavar="S", min=0.0, help="Time for a clean shutdown, s.")
+        float,
+        typer.Option(
+            "--timeout",
+            metavar="S",
+            min=0.0,
+            max=TIMEOUT_S_MAX,
+            help="Time for a clean shutdown, s.",
+        ),
     ] = CLEAN_TIMEOUT_S,
     forks: ForksOption = FORKS_DEFAULT,
     accept_new_host_keys: AcceptHostKeysOption = False,

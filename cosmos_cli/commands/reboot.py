@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from cosmos_cli.commands.fleet_options import (
+    TIMEOUT_S_MAX,
     AcceptHostKeysOption,
     ForksOption,
     InventoryOption,
@@ -41,7 +42,13 @@ def reboot(
     ] = False,
     timeout_s: Annotated[
         float,
-        typer.Option("--timeout", metavar="S", min=1.0, help="Until a machine must be back, s."),
+        typer.Option(
+            "--timeout",
+            metavar="S",
+            min=1.0,
+            max=TIMEOUT_S_MAX,
+            help="Until a machine must be back, s.",
+        ),
     ] = TIMEOUT_S,
     forks: ForksOption = FORKS_DEFAULT,
     accept_new_host_keys: AcceptHostKeysOption = False,

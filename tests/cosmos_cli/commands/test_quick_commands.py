@@ -286,6 +286,8 @@ def test_init_refuses_names_that_no_scenario_can_have(cosmos, name):
         (["plan", "a.yaml", "--bandwidth-mbit", "nan"], "expected a finite number, got nan"),
         (["plan", "a.yaml", "--latency-ms", "inf"], "'--latency-ms': expected a finite number"),
         (["exec", "-i", "x", "--timeout", "1e9", "true"], "range 0.1<=x<=1000000.0"),
+        (["down", "7", "--timeout", "1e9"], "range 0.0<=x<=1000000.0"),
+        (["reboot", "-i", "x", "--timeout", "1e9"], "range 1.0<=x<=1000000.0"),
     ],
 )
 def test_wrong_usage_ends_with_2_and_says_what_is_right(cosmos, arguments, text):
