@@ -115,7 +115,6 @@ class SshConfig:
         self._pass(query)
         if query.wants_final:
             query.is_final = True
-            query.verdicts.clear()
             self._pass(query)
         tokens = _tokens(query)
         return {

@@ -100,6 +100,15 @@ def test_rest_goes_where_the_load_is_least():
     }
 
 
+def test_rest_makes_up_for_what_rules_have_dealt_unevenly():
+    rule = {"count": 4, "machines": "pi00"}
+
+    assert placed(10, rule, boards=machines(2)) == {
+        "pi00": [1, 2, 3, 4, 5],
+        "pi01": [6, 7, 8, 9, 10],
+    }
+
+
 def test_rules_take_agents_by_name_by_glob_by_count_and_the_rest_in_turn():
     rules = [
         {"agents": ["agent-04", "agent-0[12]"], "machines": "pi01"},

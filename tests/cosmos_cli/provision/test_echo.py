@@ -50,7 +50,8 @@ def test_many_machines_share_one_echo(echo):
 
 def test_strangers_get_no_answer(echo, link):
     question = echo.question("127.0.0.1")
-    for packet in (b"", b"x" * 16, b"y" * 1000, bytes.fromhex(question["nonce_hex"])[:15]):
+    nonce = bytes.fromhex(question["nonce_hex"])
+    for packet in (b"", b"x" * 16, b"y" * 1000, nonce[:15], nonce + b"z" * 1000):
         link.sendto(packet, ("127.0.0.1", echo.port))
 
     with pytest.raises(TimeoutError):

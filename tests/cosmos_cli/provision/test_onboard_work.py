@@ -11,8 +11,8 @@ from fake_system import connection_to
 
 from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
-from cosmos_cli.fleet.onboard import files, system
-from cosmos_cli.fleet.onboard.core import Refusal
+from cosmos_cli.fleet.onboard import core, files, system
+from cosmos_cli.fleet.onboard.core import Refusal, Request
 from cosmos_cli.fleet.onboard.files import replace_file
 from cosmos_cli.provision.parts import HELPER_PARTS
 
@@ -24,6 +24,14 @@ def wait_until(condition):
     while not condition():
         assert time.monotonic() < until_s, "waited in vain"
         time.sleep(0.02)
+
+
+def test_lock_is_given_up_within_a_minute_unless_something_else_is_said(tmp_path, monkeypatch):
+    monkeypatch.setattr(core.PatientInput, "patience_s", None)
+
+    core.lock(Request(arguments={"path": str(tmp_path / "lock")}, body=b""))
+
+    assert core.PatientInput.patience_s == 60.0
 
 
 def test_new_file_has_the_usual_mode_and_folders_above(tmp_path):

@@ -351,6 +351,12 @@ def test_nothing_of_an_index_password_is_kept(index, tmp_path):
     assert "file:" not in kept and str(index) not in kept
 
 
+def test_no_password_of_what_uv_and_pip_say_is_repeated():
+    said = "error: cannot fetch https://me:secret@one.example/simple/x\n"
+
+    assert resolver.last_lines(said) == "error: cannot fetch https://***@one.example/simple/x"
+
+
 def test_uv_is_told_the_indexes_that_pip_knows_but_in_no_environment():
     settings = {
         "index-url": "https://me:secret@one.example/simple",
