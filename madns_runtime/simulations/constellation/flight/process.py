@@ -61,6 +61,8 @@ class ExternalFlight:
         self._results: deque[dict[str, Any]] = deque(maxlen=MAIL_MAX)
         self._refusals: deque[dict[str, Any]] = deque(maxlen=MAIL_MAX)
         self._answer_s_max = 0.0
+        self._listened_s = 0.0
+        """When answers were taken last: those to the last tick come when nobody listens any more."""
         self._begun_s = -math.inf
         """When its first answer came: what it had to do before that is no lateness of the ticks asked meanwhile."""
         self._counts = {
@@ -133,8 +135,7 @@ class ExternalFlight:
 
     def finish(self) -> Mapping[str, Any]:
         """End the program, and return what came of it; in real time what was late is judged."""
-        now_s = monotonic()
-        overdue = sum(self._is_late(sent_s, now_s) for sent_s, _ in self._asked)
+        overdue = sum(self._is_late(sent_s, self._listened_s) for sent_s, _ in self._asked)
         code = self._process.end()
         self._log_talk()
         if code != 0:
@@ -177,6 +178,7 @@ class ExternalFlight:
 
     def _take_answers(self, t_s: float) -> None:
         process = self._process
+        self._listened_s = monotonic()
         for line in process.lines():
             self._take(line, t_s)
         self._log_talk()
