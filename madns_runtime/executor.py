@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
-import importlib
 import multiprocessing
 import os
 import signal
 from collections.abc import Callable
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import (
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+)
+from pathlib import Path
 from typing import Any, cast
 
 from madns_runtime.config import ExecutorSettings
 from madns_runtime.context import describe_exception
-from madns_runtime.errors import ConfigurationError, PluginError
+from madns_runtime.errors import ConfigurationError, MachineError, PluginError
+from madns_runtime.plugin.guard import call_plugin
+from madns_runtime.plugin.registry import load_function
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import die_with_parent
 
 JOBS_MAX = 10_000
 """Jobs submitted and not yet taken back."""
+START_TIMEOUT_S = 30.0
+"""For the workers of a pool of our own to be there."""
 
 
 def make_executor(settings: ExecutorSettings) -> Executor:
@@ -38,19 +48,18 @@ def make_executor(settings: ExecutorSettings) -> Executor:
         from madns_runtime.dask_executor import connect  # a second of imports that few need
 
         return connect(settings)
-    module_name, _, attribute = settings.kind.partition(":")
-    if not attribute:
-        raise ConfigurationError(
-            f"executor.kind: expected process, thread, dask or module:callable, got {settings.kind!r}"
-        )
+    return _made_elsewhere(settings.kind)
+
+
+def _made_elsewhere(kind: str) -> Executor:
+    """Return what the callable makes that *kind* names as module:callable."""
     try:
-        factory = getattr(importlib.import_module(module_name), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ConfigurationError(f"executor.kind: cannot load {settings.kind}: {error}") from error
-    executor = factory()
+        executor = call_plugin(kind.partition(":")[2], load_function(kind, Path()))
+    except PluginError as error:
+        raise ConfigurationError(f"executor.kind: {error}") from error
     if not (hasattr(executor, "submit") and hasattr(executor, "shutdown")):
         raise ConfigurationError(
-            f"executor.kind: {settings.kind} returned {type(executor).__name__}, which is no"
+            f"executor.kind: {kind} returned {type(executor).__name__}, which is no"
             " concurrent.futures.Executor"
         )
     return cast("Executor", executor)
@@ -63,7 +72,13 @@ def _process_pool(workers: int) -> ProcessPoolExecutor:
         initializer=_start_worker,
         initargs=(os.getpid(),),
     )
-    pool.submit(_nothing).result(timeout=30.0)  # forks every worker now, while no thread runs
+    try:
+        # Forks every worker now, while no thread runs.
+        pool.submit(_nothing).result(timeout=START_TIMEOUT_S)
+    except (OSError, BrokenExecutor) as error:  # a timeout is an OSError
+        raise MachineError(
+            f"executor: {workers} worker(s) cannot be started: {str(error) or type(error).__name__}"
+        ) from error
     return pool
 
 

@@ -236,6 +236,48 @@ def test_workers_of_our_own_cluster_die_with_a_killed_host(tmp_path):
         worker.wait(PATIENCE_S)
 
 
+FACTORIES = """\
+from concurrent.futures import ThreadPoolExecutor
+def good(): return ThreadPoolExecutor(1)
+def bad():
+    raise ValueError("no cluster here")
+def none(): return None
+def needs(a): return a
+thing = 3
+"""
+
+
+@pytest.fixture
+def factories(tmp_path, monkeypatch):
+    (tmp_path / "factories.py").write_text(FACTORIES)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield
+    sys.modules.pop("factories", None)
+
+
+def test_an_executor_of_ones_own_is_used(factories):
+    executor = make_executor(ExecutorSettings(kind="factories:good"))
+
+    assert executor.submit(math.sqrt, 4.0).result(PATIENCE_S) == 2.0
+    executor.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [
+        ("factories:bad", r"factories.py:4: bad\(\): ValueError: no cluster here"),
+        ("factories:none", "factories:none returned NoneType, which is no"),
+        ("factories:needs", r"factories.py:6: needs\(\): TypeError: needs\(\) missing 1"),
+        ("factories:thing", "factories:thing: expected a function, got int"),
+        ("factories:god", "has no 'god', did you mean good?"),
+        ("nowhere:x", "nowhere:x: No module named 'nowhere'"),
+    ],
+)
+def test_what_is_wrong_with_an_executor_of_ones_own_is_named(factories, kind, expected):
+    with pytest.raises(ConfigurationError, match=f"executor.kind: .*{expected}"):
+        make_executor(ExecutorSettings(kind=kind))
+
+
 def test_without_dask_one_line_says_what_to_install(monkeypatch):
     monkeypatch.delitem(sys.modules, "madns_runtime.dask_executor", raising=False)
     monkeypatch.setitem(sys.modules, "distributed", None)
