@@ -135,12 +135,16 @@ def _common_choice(members: Sequence[Sequence[Located]]) -> Located | None:
     return Located(first.path, (), {**first.error, "ctx": context})
 
 
-def _distance(errors: Sequence[Located]) -> tuple[int, int, int]:
+def _distance(errors: Sequence[Located]) -> tuple[bool, int, int, int]:
+    """Return how far a member is from what was written: of another type, then by its tag, then by all errors."""
+    is_misfit = any(
+        item.path == item.branch[:-1] and item.error["type"].endswith("_type") for item in errors
+    )
     decisive = sum(
         item.error["type"] in ("literal_error", *_UNKNOWN) or item.path == item.branch[:-1]
         for item in errors
     )
-    return sum(map(_is_tag, errors)), decisive, len(errors)
+    return is_misfit, sum(map(_is_tag, errors)), decisive, len(errors)
 
 
 def _is_tag(item: Located) -> bool:

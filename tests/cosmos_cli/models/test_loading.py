@@ -406,6 +406,16 @@ def test_thousand_agents_with_names_are_read(tmp_path):
     assert found.scenario.agents.names[999] == "sat-999"
 
 
+def test_of_a_union_no_member_of_another_type_speaks_for_a_mapping(see):
+    flight = "parameters: {flight: {command: [x], input: foo}}\n"
+    shown = see("name: a\nsimulation: constellation\nagents: {count: 1}\n" + flight)
+
+    assert (
+        "a.yaml:4:44: parameters.flight.input: expected measurements or truth, got 'foo'" in shown
+    )
+    assert "expected a text" not in shown
+
+
 def test_choice_that_no_member_of_a_union_knows_lists_those_of_all(see):
     shown = see(PLUGGED + "parameters: {mass_kg: 1, method: {kind: quik, steps: 2, x: 1}}\n")
 
