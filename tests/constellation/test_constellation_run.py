@@ -212,6 +212,11 @@ def test_never_more_than_one_propagation_is_under_way():
     star.run(30.0)
 
     assert len(star.context.jobs) == 2
+    summary = star.host.finish()
+    assert summary["truth_late"] == 1
+    assert summary["truth_late_s_max"] == pytest.approx(30.0 - 17.5, abs=0.02)
+    (text,) = (text for level, text in star.context.logs if level == "warning")
+    assert text.startswith("truth from 30 s on has not come, by now 12.490 s too late; ")
 
 
 def test_late_truth_is_sent_as_soon_as_it_is_there():

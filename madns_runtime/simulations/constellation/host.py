@@ -142,15 +142,7 @@ class ConstellationHost(HostSimulation):
         window, now_s = self._store.end, self._context.now_s()
         if not self._supply.result(job, value):
             return
-        late_s = self._refills.lateness_s(window, now_s)
-        if window >= WINDOWS_FIRST and late_s > 0.0:
-            self._late.count += 1
-            self._late.s_max = max(self._late.s_max, late_s)
-            self._context.log(
-                "warning",
-                f"truth from {window * self._store.window_s:g} s on came {late_s:.3f} s too late; "
-                "a longer segments.buffer_s helps, and more executor workers do with many vehicles",
-            )
+        self._enter_late(window, now_s, "came")
         self._refills.submit_if_due(now_s)
 
     def agent_lost(self, agent: str, reason: str) -> None:
@@ -164,6 +156,8 @@ class ConstellationHost(HostSimulation):
     def finish(self) -> Mapping[str, Any]:
         """Return how well truth was computed and sent, and what was done to it."""
         conservation = self._conservation
+        if self._supply.is_busy:
+            self._enter_late(self._store.end, self._context.now_s(), "has not come, by now")
         limit = self._parameters.record.energy_drift_max
         checks = []
         # SGP4 averages and drags: its energy moves by design and is recorded, not judged.
@@ -192,6 +186,19 @@ class ConstellationHost(HostSimulation):
         if self._traffic is not None:
             summary |= self._traffic.finish()
         return summary | {"checks": checks}
+
+    def _enter_late(self, window: int, now_s: float, what: str) -> None:
+        """Count and tell truth whose first sending was due before now."""
+        late_s = self._refills.lateness_s(window, now_s)
+        if window < WINDOWS_FIRST or late_s <= 0.0:
+            return
+        self._late.count += 1
+        self._late.s_max = max(self._late.s_max, late_s)
+        self._context.log(
+            "warning",
+            f"truth from {window * self._store.window_s:g} s on {what} {late_s:.3f} s too late; "
+            "a longer segments.buffer_s helps, and more executor workers do with many vehicles",
+        )
 
     def _make_maneuvering(self, vehicles: list[Vehicle]) -> Maneuvering | None:
         """Return who carries commands out; nobody without flight software."""
