@@ -10,6 +10,7 @@ from constellation_fakes import SCENARIOS, Star, parameters, state_rows
 
 from madns_runtime.errors import ConfigurationError, PluginError
 from madns_runtime.protocol.messages import Service
+from madns_runtime.simulations.constellation.hosting.refills import URGENT_KNOTS_MAX
 from madns_runtime.simulations.constellation.messages import Command
 
 SCRIPT = '''
@@ -119,9 +120,14 @@ def test_new_truth_travels_ahead_of_all_else_with_its_deadline(fly):
     star.run(20.0)
 
     assert star.context.deadlines == [(Service.SYNC, pytest.approx(10.1))] * 2
-    first = next(m for _, to, m in star.context.sent if m.get("revision") == 1)
+    changed = [m for _, to, m in star.context.sent if m.get("revision") == 1]
+    first, second, rest = changed[:3]
     assert (first["kind"], first["states"].shape) == ("segment", (2, 6))
     assert first["t0_s"] == pytest.approx(10.1)
+    # One datagram's worth is urgent; the rest follows, from the last urgent knot on.
+    assert len(first["states"]) + len(second["states"]) == URGENT_KNOTS_MAX
+    assert rest["states"][0].tolist() == second["states"][-1].tolist()
+    assert rest["t0_s"] == second["t0_s"] + (len(second["states"]) - 1) * second["knot_s"]
 
 
 def test_every_change_of_truth_is_with_its_vehicle_before_its_time_and_said_so(fly):

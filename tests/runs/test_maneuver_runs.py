@@ -84,6 +84,11 @@ def speeds(evidence, agent):
     return {row[0]: math.hypot(*row[4:]) for row in rows(path)}
 
 
+def phase_s(evidence, agent):
+    lines = (evidence / "agents" / agent / "events.jsonl").read_bytes().splitlines()
+    return next(e["phase_s"] for e in map(orjson.loads, lines) if e.get("event") == "phase")
+
+
 def test_every_vehicle_burns_when_it_was_told_to(tmp_path):
     result, evidence = run(tmp_path, "realtime")
 
@@ -98,6 +103,13 @@ def test_every_vehicle_burns_when_it_was_told_to(tmp_path):
     for agent, summary in result["simulation"]["agents"].items():
         assert summary["underruns"] == 0
         assert summary["flight"]["told"] == ["accepted 6.3 1", "executed 6.3 1"]
+        # By its own time, which lies a phase behind.
+        (change,) = rows(evidence / "agents" / agent / "truth_changes.jsonl")
+        assert change[:2] == [1, pytest.approx(5.3 if agent == "agent-02" else 6.3, abs=0.01)]
+        assert change[3] == pytest.approx(
+            change[1] + phase_s(evidence, agent) - change[2], abs=1e-6
+        )
+        assert change[3] > 0.0
         before_and_after = speeds(evidence, agent)
         # agent-02 burns for 2 s around it, the others at once; its tick at 6.3 s may be a missed one.
         after = next(v for k, v in sorted(before_and_after.items()) if k >= 75)
