@@ -23,6 +23,7 @@ from madns_runtime.simulations.constellation.messages import (
     CommandResult,
     Delivery,
     Initial,
+    Refusal,
     Segment,
 )
 
@@ -158,6 +159,8 @@ print("{}", flush=True)
         result = CommandResult(number=4, status="refused", at_s=1.0, revision=0, reason="no fuel")
         ship.agent.receive(message.to_message())
         ship.agent.receive(result.to_message())
+        refusal = Refusal(number=1, to="*", sent_s=0.0, reason="no_line_of_sight")
+        ship.agent.receive(refusal.to_message())
         ship.run(1)
 
     setup, tick = map(json.loads, (tmp_path / "told.json").read_text().splitlines())
@@ -186,6 +189,9 @@ print("{}", flush=True)
         }
     ]
     assert tick["results"][0]["reason"] == "no fuel"
+    assert tick["refusals"] == [
+        {"number": 1, "to": "*", "sent_s": 0.0, "reason": "no_line_of_sight"}
+    ]
 
 
 def test_it_sends_by_radio_and_logs(tmp_path):
