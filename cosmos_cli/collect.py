@@ -202,6 +202,7 @@ def _evidence(run: RunDirectory, gathered: Gathered, end: _RunEnd, expected: Exp
         config=run.read_config(),
         expected=expected,
         result=end.result,
+        host_machine=Sources.read(run).host_machine,
         interrupted=end.interrupted,
         problems=end.problems,
         scans=gathered.scans,

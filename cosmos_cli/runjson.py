@@ -37,6 +37,8 @@ class Evidence:
     ticks: TickStatistics
     round_trip_ms: Mapping[str, Any] = field(default_factory=dict)
     clock: Mapping[str, float] = field(default_factory=dict)
+    host_machine: str | None = None
+    """Where the host was; None when it was this computer."""
     interrupted: bool = False
     problems: tuple[Problem, ...] = ()
     missing: tuple[str, ...] = ()
@@ -83,6 +85,7 @@ class Evidence:
             host_status=_text(result.get("status")),
             who=_text(result.get("who")),
             reason=_text(result.get("reason")),
+            host_lost=self._host_lost(),
             interrupted=self.interrupted,
             lost_agents=self._lost(),
             machine_problems=tuple(f"{p.machine}: {p.text}" for p in self.problems if p.machine),
@@ -101,6 +104,10 @@ class Evidence:
             plugin_checks=tuple(self._plugin_checks()),
             remarks=affinity_remarks(mapping_at(result, "agents")),
         )
+
+    def _host_lost(self) -> str | None:
+        met = (p for p in self.problems if p.machine == self.host_machine and p.step == "run")
+        return next((p.text for p in met), None) if self.host_machine else None
 
     def _plugin_checks(self) -> list[Any]:
         agents = mapping_at(self.result, "agents")

@@ -57,6 +57,8 @@ class Facts:
     """What the host said of itself; None when it ended without saying anything."""
     who: str | None = None
     reason: str | None = None
+    host_lost: str | None = None
+    """What became of the machine that ran the host, if it was lost."""
     interrupted: bool = False
     lost_agents: tuple[str, ...] = ()
     machine_problems: tuple[str, ...] = ()
@@ -111,7 +113,8 @@ def judge(facts: Facts, limits: Limits) -> Verdict:
         if status == "interrupted":
             who, reason = who or "operator", reason or "ended at once, without waiting for the host"
         else:
-            who, reason = who or "host", reason or _why_no_result(facts.problems)
+            reason = reason or facts.host_lost or _why_no_result(facts.problems)
+            who = who or "host"
     code, text = _conclude(facts, status, checks, _blame(who, reason))
     return Verdict(
         status=status,

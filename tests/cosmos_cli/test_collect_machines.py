@@ -241,6 +241,22 @@ def test_result_that_did_not_come_from_the_hosts_machine_is_explained(split, net
     assert lines[0].startswith("host: not retrieved from pi02: no result")
 
 
+@pytest.mark.parametrize(
+    ("machine", "blame"),
+    [("pi02", "machine pi02 is lost: no sign of life"), ("pi01", "it ended without a result")],
+)
+def test_host_that_went_with_its_machine_is_not_said_to_have_been_killed(split, machine, blame):
+    plan = json.loads(split.run.plan_json.read_bytes())
+    plan["host"] = {"name": "pi02", "target": plan["machines"]["pi02"]["target"]}
+    split.run.plan_json.write_text(json.dumps(plan))
+    split.run.left_result_json.unlink()
+    problem = Problem(machine=machine, text=f"machine {machine} is lost: no sign of life")
+
+    summary = collect_run(split.run, problems=(problem,))
+
+    assert summary.verdict.text.startswith(f"FAILED: host: {blame}")
+
+
 def test_file_that_is_damaged_here_after_it_came_is_named_every_time(split):
     split.retrieve()
     path = split.run.path / "agents/agent-01/ticks.jsonl"
