@@ -11,7 +11,7 @@
 #include <string.h>
 
 #define MU_M3_S2 398600441500000.0 /* EGM-96 */
-#define LINE_BYTES 65536
+#define LINE_BYTES 1048576 /* more than a vehicle ever sends */
 
 /* Return the text behind a key, or NULL. */
 static const char *find(const char *text, const char *key)

@@ -285,6 +285,11 @@ class Board:
                 f"estimate: expected a mapping of 1 to {ESTIMATES_MAX} names, got {values!r:.200}"
             )
         names = tuple(values)
+        for name in names:
+            if not isinstance(name, str) or not name.isprintable() or not name:
+                raise PluginError(
+                    f"estimate: expected names such as slot_error_deg, got {name!r:.80}"
+                )
         fields = [Field(name, streams.unit_of(name)) for name in names]
         self._context.open_stream("estimates", (Field("tick", "", "int"), *fields))
         self._estimate_names = names

@@ -116,7 +116,7 @@ class CommandDesk:
 
 
 def _vector(kind: str, values: Any, unit: str) -> tuple[float, float, float]:
-    is_vector = isinstance(values, Sequence) or hasattr(values, "__array__")
+    is_vector = isinstance(values, Sequence) or getattr(values, "ndim", 0) == 1
     if not is_vector or isinstance(values, str) or len(values) != 3:
         raise PluginError(f"{kind}: expected three numbers in {unit}, got {values!r:.80}")
     x, y, z = (_number(kind, "component", value) for value in values)
