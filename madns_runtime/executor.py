@@ -26,6 +26,7 @@ from madns_runtime.reactor.scheduling import die_with_parent
 
 JOBS_MAX = 10_000
 """Jobs submitted and not yet taken back."""
+WORKER_DIED = "a worker of the executor has died: was it killed, or is memory short?"
 START_TIMEOUT_S = 30.0
 """For the workers of a pool of our own to be there."""
 
@@ -152,12 +153,16 @@ class JobRunner:
 
         Raises:
             ConfigurationError: More than JOBS_MAX are waiting.
+            MachineError: A worker has died, and the executor with it.
         """
         if len(self._pending) >= JOBS_MAX:
             raise ConfigurationError(f"more than {JOBS_MAX} jobs are waiting in the executor")
         self._submitted_count += 1
         job = self._submitted_count
-        future = self._executor.submit(run_job, function, *arguments)
+        try:
+            future = self._executor.submit(run_job, function, *arguments)
+        except BrokenExecutor as error:
+            raise MachineError(WORKER_DIED) from error
         self._pending[job] = future
         future.add_done_callback(
             lambda _: self._reactor.call_soon_threadsafe(lambda: self._done(job))

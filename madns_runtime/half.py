@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
+from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -17,7 +17,7 @@ from typing import Any, Final
 from madns_runtime.config import RunConfig
 from madns_runtime.context import clean_text, describe_exception
 from madns_runtime.errors import MachineError, PluginError
-from madns_runtime.executor import JobFailed
+from madns_runtime.executor import WORKER_DIED, JobFailed
 from madns_runtime.plugin import returned
 from madns_runtime.plugin.registry import Role, load_half, parse_parameters, resolve
 
@@ -150,6 +150,8 @@ class HostHalf(Half):
             self.call("result", job, future.result())
             return
         doing = f"{self.name}: job {job}"
+        if isinstance(error, BrokenExecutor):
+            raise HalfFailed(f"{doing}: {WORKER_DIED}")
         self._log("critical", "".join(traceback.format_exception(error)))
         is_told = isinstance(error, JobFailed)
         raise HalfFailed(f"{doing}: {error}" if is_told else describe_exception(error, doing))

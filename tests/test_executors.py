@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 import signal
 import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import BrokenExecutor
 from datetime import UTC, datetime
 
 import numpy as np
@@ -276,6 +278,16 @@ def test_an_executor_of_ones_own_is_used(factories):
 def test_what_is_wrong_with_an_executor_of_ones_own_is_named(factories, kind, expected):
     with pytest.raises(ConfigurationError, match=f"executor.kind: .*{expected}"):
         make_executor(ExecutorSettings(kind=kind))
+
+
+def test_a_job_for_workers_that_have_died_is_no_fault_of_who_submits_it():
+    executor = make_executor(ExecutorSettings(kind="process", workers=1))
+    runner = JobRunner(Reactor(), executor, lambda job, future: None)
+    with pytest.raises(BrokenExecutor):
+        executor.submit(os.kill, next(iter(executor._processes)), signal.SIGKILL).result(PATIENCE_S)
+
+    with pytest.raises(MachineError, match="a worker of the executor has died"):
+        runner.submit(math.sqrt, 4.0)
 
 
 def test_without_dask_one_line_says_what_to_install(monkeypatch):

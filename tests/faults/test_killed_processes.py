@@ -253,6 +253,6 @@ def test_killed_worker_ends_the_run_and_is_named(laboratory):
         os.kill(int(worker), signal.SIGKILL)
 
     document = check_ending(
-        run, 1, "failed", "FAILED: host: FaultyHost: job 1 raised BrokenProcessPool"
+        run, 1, "failed", "FAILED: host: FaultyHost: job 1: a worker of the executor has died"
     )
     assert document["who"] == "host"

@@ -55,7 +55,7 @@ def wait_until(is_so, what):
         ("hostreceive_raise", "host", "Host.receive raised ValueError: told to"),
         ("timer_raise", "host", "Host.timer raised ValueError: told to"),
         ("timer_stands", "host", "Host.timer asked 100000 times in a row for t = -0.5 s"),
-        ("job_kill", "host", "Host: job 13 raised BrokenProcessPool: A process in the"),
+        ("job_kill", "host", "Host: job 13: a worker of the executor has died: was it"),
         ("job_raise", "host", "Host: job 13: square raised ValueError: no such job"),
         (
             "send_set",
