@@ -104,6 +104,15 @@ class LockstepHalf:
         if self._timer_repeats > REPEATS_MAX:
             self._refuse(f"timer asked {REPEATS_MAX} times in a row for t = {t_s:g} s")
 
+    def finish(self) -> Any:
+        """
+        Return the half's summary; what it submits meanwhile comes too late.
+
+        Raises:
+            RunEnds: As `call`.
+        """
+        return self._guard("finish", partial(self._half.call, "finish"))
+
     def close(self) -> None:
         """End the executor, whatever it is doing."""
         self._jobs.close()

@@ -183,7 +183,7 @@ class LockstepHost:
                 account.agents[number].summary = summary
                 account.agents[number].deadlines_broken += deadlines_broken
         account.set_states("complete")
-        account.simulation = self._half.call("finish")
+        account.simulation = self._half.finish()
 
     # Messages -------------------------------------------------------------------------------------
 

@@ -81,6 +81,9 @@ class Context(Protocol):
 
         Raises:
             MessageTooLarge: It does not fit its class of service.
+            SendQueueFull: The receiver has not taken what was sent before.
+            PluginError: It holds what messages do not carry, or there is no such receiver, class of
+                service or deadline.
         """
 
     def open_stream(self, name: str, fields: Sequence[Field]) -> None:
@@ -107,7 +110,7 @@ class HostContext(Context, Protocol):
         """
 
     def wake(self, t_s: float) -> None:
-        """Have `HostSimulation.timer` called at simulated time *t_s* if it wanted a later one, or none."""
+        """Have `HostSimulation.timer` called at simulated time *t_s* if it wants a later one, or none."""
 
 
 class AgentContext(Context, Protocol):
@@ -138,7 +141,7 @@ class HostSimulation(Protocol):
         """Take the value of a submitted job."""
 
     def agent_lost(self, agent: str, reason: str) -> None:
-        """*agent* is gone; the policy lets the run go on."""
+        """*agent* is gone; the policy lets the run go on. Told after `setup` if it was lost before."""
 
     def agent_rejoined(self, agent: str) -> None:
         """*agent* runs again, from initial data given just before."""

@@ -91,6 +91,7 @@ class Host(HostSimulation):
         self.note("job", [job, value])
 
     def finish(self):
+        self.context.submit(square, 12)  # too late: nothing is called any more
         return {"draws": self.context.random.random()}
 
 

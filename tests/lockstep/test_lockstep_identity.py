@@ -65,6 +65,7 @@ def test_everything_happens_at_its_simulated_time(start_host):
     assert timers == sorted(timers) and timers[-1] <= 1.0
     assert all(b == a + 0.037 for a, b in zip(timers, timers[1:], strict=False))
     assert result["messages"]["best"]["sent"] == 4 * 6 * 2
+    # The last word is theirs: after `finish` no job's value is handed in.
     assert heard[-6:] == [[1.0, f"agent-0{n}", ["last word", n - 1]] for n in range(1, 7)]
 
 
