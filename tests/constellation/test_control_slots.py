@@ -212,6 +212,42 @@ def test_satellite_that_is_nobodys_nearest_is_adopted_and_agrees_with_the_others
     assert np.mean(agreed_km) == pytest.approx(EGM_96.radius_m / 1e3 + 780.0, abs=1.0)
 
 
+@pytest.mark.parametrize("loss", [0.0, 0.02, 0.3])
+def test_lost_messages_delay_a_ring_and_do_not_move_what_it_agrees_upon(loss):
+    chance, names = np.random.default_rng(3), tuple(f"v{number}" for number in range(RING))
+    errors_deg = np.random.default_rng(7).normal(scale=0.2, size=RING)
+    air = []
+
+    def radio(index):
+        return lambda to, payload: air.append((names[index], names.index(to), payload))
+
+    members = [
+        RingMember(
+            SimpleNamespace(settings=SLOTS, index=index, agents=names, send=radio(index)),
+            follows_sma=False,
+        )
+        for index in range(RING)
+    ]
+    for number in range(120):
+        t_s = number * SLOTS["exchange_s"]
+        for index, member in enumerate(members):
+            place = math.radians(errors_deg[index]) + math.tau * index / RING
+            at = state(mean_orbit(780.0, place + member.rate_rad_s * t_s, sma_m=10.0 * index))
+            member.exchange(Reading(t_s, at))
+        if number == 0:
+            measured_m = [member.mean.a_m for member in members]
+        for sender, receiver, payload in air:
+            if chance.random() >= loss:
+                delivery = Delivery(sender=sender, sent_s=t_s, arrives_s=t_s, payload=payload)
+                members[receiver].hear(delivery)
+        air.clear()
+
+    believed_deg = [math.degrees(member.slot_error_rad) for member in members]
+    assert believed_deg == pytest.approx((errors_deg - errors_deg.mean()).tolist(), abs=3e-3)
+    agreed_m = [member.sma_ring_m for member in members]
+    assert agreed_m == pytest.approx([float(np.mean(measured_m))] * RING, abs=0.01)
+
+
 def test_what_a_neighbour_said_counts_once_and_not_again_when_it_falls_silent():
     context = SimpleNamespace(
         settings=SLOTS, index=0, agents=("a", "b", "c"), send=lambda to, payload: None
@@ -225,8 +261,8 @@ def test_what_a_neighbour_said_counts_once_and_not_again_when_it_falls_silent():
         beliefs_deg.append(math.degrees(member.slot_error_rad))
         if number == 0:
             said = {"round": 0, "t_s": 0.0, "lam": 0.0, "a": 7e6, "phase": 0.03, "sma": 7e6}
-            message = Delivery(sender="b", sent_s=0.0, arrives_s=0.0, payload=said | {"degree": 2})
-            member.hear(message)
+            said |= {"degree": 2, "phase_flow": (0.0, 0.0), "sma_flow": (0.0, 0.0)}
+            member.hear(Delivery(sender="b", sent_s=0.0, arrives_s=0.0, payload=said))
 
     # A ring of three agrees at once, without momentum: a third of what is heard, and that is all.
     expected = [0.0] + [-math.degrees(0.03 / 3.0)] * 5
