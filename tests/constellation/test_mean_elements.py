@@ -84,10 +84,10 @@ def test_mean_argument_of_latitude_and_node_turn_at_the_rates_of_theory(i_deg):
     slope, residual_deg = straight(times_s, lam)
     node_slope, node_residual_deg = straight(times_s, raan)
 
-    # First order leaves some J2^2 = 1.2e-6 of the rate; residuals are of the order J2 e.
+    # First order leaves some J2^2 = 1.2e-6 of the rate, some J2 of the node's; residuals are of the order J2 e.
     assert slope == pytest.approx(rates.lam_rad_s, rel=1e-5)
     assert residual_deg < 1e-3
-    assert node_slope == pytest.approx(rates.raan_rad_s, rel=2e-3)
+    assert node_slope == pytest.approx(rates.raan_rad_s, rel=3e-3)
     assert node_residual_deg < 3e-4
 
 
