@@ -334,6 +334,22 @@ def test_a_job_that_is_not_back_in_time_is_overtaken(fly):
     assert star.underruns() == 0
 
 
+def test_a_host_that_stood_still_over_a_maneuver_carries_it_out_and_counts_it(fly):
+    star = fly(["agent-02 90 inertial 0.9 0 0 3"])
+    star.run(9.0)
+    star.job_s = 100.0
+    star.run(9.6, from_s=9.0)
+
+    # The window of the maneuver is to be forgotten when the host looks up again.
+    star.run(12.0, from_s=11.2)
+
+    maneuvers = star.host.finish()["maneuvers"]
+    assert (maneuvers["executed"], maneuvers["inequality_broken"]) == (1, 1)
+    assert record(star)["propagation_s"] == pytest.approx(11.2 - 9.01)
+    rows, still = state_rows(star, "agent-02"), state_rows(coasting(), "agent-02")
+    assert rows[-1, 6] - still[119, 6] == pytest.approx(3.0, abs=0.1)
+
+
 def test_a_rejoining_agent_gets_truth_with_its_maneuvers_in_it(fly):
     lines = ["agent-02 120 rtn 3.05 0 5 0", "agent-02 121 rtn 8.1 0 5 0"]
     whole, broken = fly(lines), fly(lines)

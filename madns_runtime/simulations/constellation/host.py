@@ -128,9 +128,11 @@ class ConstellationHost(HostSimulation):
 
     def timer(self, t_s: float) -> float | None:
         """Do what is due and return when to come back."""
-        times_s = [self._refills.timer(t_s)]
+        times_s = []
         if self._maneuvering is not None:
+            # Before truth is forgotten that a maneuver, late by however much, begins from.
             times_s.append(self._maneuvering.timer(t_s))
+        times_s.append(self._refills.timer(t_s))
         if self._traffic is not None:
             times_s.append(self._traffic.timer(t_s))
         return min((time_s for time_s in times_s if time_s is not None), default=None)

@@ -103,18 +103,18 @@ class Maneuvering:
         return True
 
     def timer(self, t_s: float) -> float | None:
-        """Report what is over, overtake jobs that are late, and return when to come back."""
-        while self._pending and self._pending[0][0] <= t_s:
-            taken = heapq.heappop(self._pending)[2]
-            self._desk.execute(taken)
-            revision = self._supply.store.revisions[taken.vehicle]
-            self._tell(taken.vehicle, taken.executed(revision))
+        """Overtake jobs that are late, report what is over, and return when to come back."""
         while self._waiting and self._waiting[0][0] <= t_s:
             _, job = heapq.heappop(self._waiting)
             if (late := self._jobs.pop(job, None)) is not None:
                 self._overtaken.add(job)
                 self._supply.forget_job(job)
                 self._carry_out(late)
+        while self._pending and self._pending[0][0] <= t_s:
+            taken = heapq.heappop(self._pending)[2]
+            self._desk.execute(taken)
+            revision = self._supply.store.revisions[taken.vehicle]
+            self._tell(taken.vehicle, taken.executed(revision))
         times_s = [heap[0][0] for heap in (self._waiting, self._pending) if heap]
         return min(times_s, default=None)
 
