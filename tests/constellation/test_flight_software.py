@@ -247,10 +247,21 @@ class G:
 """
     thruster = {"isp_s": 220.0, "propellant_kg": 5.0}
     ship = Ship(tmp_path, text, vehicles=[{"mass_kg": 50.0, "thruster": thruster}]).run(0.1)
-    ship.tell(CommandResult(number=0, **RESULT)).run(0.3, 0.1)
+    ship.tell(CommandResult(number=0, **RESULT | {"status": "accepted"})).run(0.2, 0.1)
+    ship.tell(CommandResult(number=0, **RESULT)).run(0.4, 0.2)
 
-    assert ship.flight["calls"] == [[0.0, None], "executed", [0.1, [49.0, 4.0]], [0.2, None]]
-    assert ship.context.records["command_results"] == [(1, 0, "executed", 3.0, 1, 0.1, 4.0, "")]
+    assert ship.flight["calls"] == [
+        [0.0, None],
+        "accepted",
+        [0.1, None],
+        "executed",
+        [0.2, [49.0, 4.0]],
+        [0.3, None],
+    ]
+    assert ship.context.records["command_results"] == [
+        (1, 0, "accepted", 3.0, 1, 0.1, 4.0, ""),
+        (2, 0, "executed", 3.0, 1, 0.1, 4.0, ""),
+    ]
 
 
 LISTENER = """

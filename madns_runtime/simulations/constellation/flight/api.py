@@ -30,7 +30,7 @@ TRUTH = "truth"
 """Name of the reading that is the truth itself, when the scenario says input: truth. Its values are x, y, z, m,
 vx, vy, vz, m/s; for a rigid body also the quaternion, scalar last, and the body rates, rad/s."""
 MASS = "mass"
-"""Name of the reading that a tank gauge gives with each command's result: mass, kg, and propellant, kg."""
+"""Name of the reading that a tank gauge gives when a command was executed: mass, kg, and propellant, kg."""
 
 
 class Reading(NamedTuple):

@@ -116,9 +116,9 @@ class Cockpit:
         }
 
     def _read_gauge(self, t_s: float, result: CommandResult, readings: dict[str, Reading]) -> None:
-        """Give mass and propellant with what changed them."""
+        """Give mass and propellant with what changed them, and not before it has."""
         thruster = self._vehicle.thruster
-        if thruster is None or result.status == "refused":
+        if thruster is None or result.status != "executed":
             return
         left_kg = result.propellant_kg
         mass_kg = self._vehicle.mass_kg - (thruster.propellant_kg - left_kg)
