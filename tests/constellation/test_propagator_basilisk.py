@@ -10,6 +10,8 @@ import pytest
 
 pytest.importorskip("Basilisk", reason="the extra `basilisk` is not installed")
 
+from constellation_fakes import Star, parameters
+
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.simulations.constellation.equipment import Attitude
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
@@ -272,3 +274,23 @@ def test_threads_do_not_step_the_same_simulations():
         found = list(pool.map(lambda f: basilisk.propagate(f, 0.0, knots_s, make()), fleets))
 
     assert np.array_equal(found, expected)
+
+
+def test_a_run_with_basilisk_has_its_rigid_bodies_turned_by_it(monkeypatch):
+    turned_by_it = []
+    propagate_bodies = Basilisk.propagate_bodies
+
+    def count(self, bodies, states, **rest):
+        turned_by_it.append(len(bodies))
+        return propagate_bodies(self, bodies, states, **rest)
+
+    monkeypatch.setattr(Basilisk, "propagate_bodies", count)
+    body = {"attitude": {"inertia_kg_m2": [10, 24, 17], "rates_deg_s": [1, -2, 0.5]}}
+    last = []
+    for kind in ("basilisk", "scipy"):
+        star = Star(parameters(propagator={"kind": kind}, vehicles=[body]), 2, duration_s=12.0)
+        star.run(12.0)
+        last.append([star.contexts[name].records["attitude"][-1] for name in star.agents])
+
+    assert turned_by_it == [2]
+    assert np.array(last[0]) == pytest.approx(np.array(last[1]), abs=1e-10)
