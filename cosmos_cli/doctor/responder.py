@@ -6,16 +6,15 @@ import dataclasses
 import secrets
 import socket
 import time
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from cosmos_cli.fleet.datagrams import DatagramServer, bound_socket
 from cosmos_cli.fleet.onboard.round_trips import ANSWER, ASK, NONCE_BYTES, UNASKED, Datagram
 
 
-class Responder:
+class Responder(DatagramServer):
     """
-    Answers machines that know its nonce, from its making on; use it as a context manager.
+    Answers machines that know its nonce; use it as a context manager.
 
     Args:
         port: UDP port to listen at, as the host of a run would; one that is free when it is 0 or taken.
@@ -25,32 +24,15 @@ class Responder:
         self.nonce = secrets.token_bytes(NONCE_BYTES)
         self.ignored = 0
         """Datagrams of somebody else."""
-        self._server = DatagramServer(self._answer, port=port)
-        self._other = bound_socket(family=self._server.family)
+        super().__init__(self._reply, port=port)
+        self._other = bound_socket(family=self.family)
 
-    @property
-    def port(self) -> int:
-        """Where it listens."""
-        return self._server.port
-
-    @property
-    def is_port_taken(self) -> bool:
-        """Whether the wanted port was somebody else's."""
-        return self._server.is_port_taken
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._server.close()
+    def close(self) -> None:
+        """Hear no more; harmless when repeated."""
+        super().close()
         self._other.close()
 
-    def _answer(self, own: socket.socket, data: bytes, where: Any) -> None:
+    def _reply(self, own: socket.socket, data: bytes, where: Any) -> None:
         received_s = time.clock_gettime(time.CLOCK_REALTIME)
         asked = Datagram.decode(data)
         if asked is None or asked.kind != ASK or asked.nonce != self.nonce:
