@@ -21,7 +21,7 @@ class Dive:
         if t_s == 1.0:
             self.context.delta_v((-2000.0, 0.0, 0.0), at_s=4.0)
 """
-THRUSTER = {"thruster": {"isp_s": 1e6, "propellant_kg": 50}}
+THRUSTER = {"thruster": {"isp_s": 1e5, "propellant_kg": 50}}
 
 
 @pytest.fixture
