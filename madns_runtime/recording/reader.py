@@ -23,6 +23,7 @@ BLOCK_BYTES = 1 << 17
 """Small enough that its text and values stay in the processor's cache: eight times as much took twice the time."""
 LINE_BYTES_MAX = 64 << 20
 """A longer line is none of ours; it is skipped and counted as damaged."""
+END_COUNTS = ("records", "dropped", "not_finite")
 _COMMA = ord(",")
 _NEWLINE = ord("\n")
 
@@ -241,14 +242,12 @@ class _Decoder:
             self.state = replace(self.state, t0_utc=value["t0_utc"])
             return True
         end = value["end"]
-        if not isinstance(end, dict):
+        counts: list[Any] = [end.get(name) for name in END_COUNTS] if isinstance(end, dict) else []
+        if not counts or not all(type(count) is int for count in counts):
             return False
+        recorded, dropped, not_finite = counts
         self.state = replace(
-            self.state,
-            is_cut=False,
-            dropped=int(end.get("dropped", 0)),
-            not_finite=int(end.get("not_finite", 0)),
-            recorded=end.get("records"),
+            self.state, is_cut=False, recorded=recorded, dropped=dropped, not_finite=not_finite
         )
         return True
 
@@ -291,7 +290,12 @@ def _decode(line: bytes) -> Any:
 
 
 def _is_header(value: Any) -> bool:
-    return isinstance(value, dict) and {"schema", "stream", "shape", "fields"} <= value.keys()
+    if not isinstance(value, dict) or not {"schema", "stream", "shape", "fields"} <= value.keys():
+        return False
+    fields = value["fields"]
+    return isinstance(fields, list) and all(
+        isinstance(field, dict) and {"name", "kind"} <= field.keys() for field in fields
+    )
 
 
 def _is_control(value: Any) -> bool:

@@ -321,3 +321,32 @@ def test_damaged_columns_are_what_a_plain_reader_reads(tmp_path_factory, count, 
     got = [list(row) for row in zip(*(column.tolist() for column in columns.values()), strict=True)]
     assert got == expected or any(not isinstance(v, int) for row in expected for v in row)
     assert len(got) == len(expected)
+
+
+HEADER = '{"schema":1,"stream":"own","shape":"array","fields":%s}'
+GOOD = HEADER % '[{"name":"a","kind":"float"}]'
+
+
+@pytest.mark.parametrize(
+    "line",
+    [HEADER % "3", HEADER % '["a"]', HEADER % '[{"name":"a"}]', HEADER % "null", "7", "[]"],
+)
+def test_a_damaged_header_makes_a_file_without_schema_not_an_error(tmp_path, line):
+    path = tmp_path / "own.jsonl"
+    path.write_text(line + "\n[1.5]\n")
+    reading = read_stream(path)
+
+    assert (dict(reading.schema), list(reading.records())) == ({}, [])
+    assert read_columns(path) == {}
+
+
+@pytest.mark.parametrize(
+    "end", ["3", "{}", '{"records":1,"dropped":"x","not_finite":0}', '{"records":1}', "null"]
+)
+def test_a_damaged_end_line_ends_nothing(tmp_path, end):
+    path = tmp_path / "own.jsonl"
+    path.write_text(f'{GOOD}\n[1.5]\n{{"end":{end}}}\n')
+    reading = read_stream(path)
+
+    assert list(reading.records()) == [[1.5]]
+    assert (reading.state.is_cut, reading.state.truncated_lines) == (True, 1)
