@@ -9,6 +9,7 @@ Agents read them back with `from_mapping` and never need pydantic.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import types
 import typing
 from collections.abc import Iterable, Mapping
@@ -50,10 +51,14 @@ class Agents:
 
     def resolved_names(self) -> tuple[str, ...]:
         """Return one name an agent, in order."""
-        if self.names:
-            return self.names
-        width = max(2, len(str(self.count)))
-        return tuple(f"agent-{index:0{width}d}" for index in range(1, self.count + 1))
+        return self.names or _numbered_names(self.count)
+
+
+@functools.lru_cache(maxsize=4)
+def _numbered_names(count: int) -> tuple[str, ...]:
+    # Every agent holds the names of all: of thousands, a tuple of its own would be gigabytes.
+    width = max(2, len(str(count)))
+    return tuple(f"agent-{index:0{width}d}" for index in range(1, count + 1))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

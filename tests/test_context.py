@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from madns_runtime.config import Agents
 from madns_runtime.context import describe_exception
 from madns_runtime.executor import JobFailed, run_job
 
@@ -89,3 +90,10 @@ def test_job_that_leaves_has_failed(plugin):
 
 def test_job_that_succeeds_returns_its_value():
     assert run_job(max, 1, 2) == 2
+
+
+def test_thousands_of_agents_share_one_list_of_all_names():
+    first, second = (Agents(count=5000, tick_hz=hz).resolved_names() for hz in (1.0, 2.0))
+
+    assert first is second
+    assert (first[0], first[-1]) == ("agent-0001", "agent-5000")
