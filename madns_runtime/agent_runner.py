@@ -12,7 +12,7 @@ from typing import Any
 
 from madns_runtime.agent_port import AgentPort
 from madns_runtime.agent_recorder import AgentRecorder
-from madns_runtime.config import AgentLaunch
+from madns_runtime.config import AgentLaunch, RunConfig
 from madns_runtime.context import RunContext
 from madns_runtime.half import Half, HalfFailed, Program
 from madns_runtime.plugin.api import Tick
@@ -84,7 +84,7 @@ class AgentRunner:
         # Called every tick: without a layer between.
         self._step, self._receive = half.simulation.step, half.simulation.receive
         self._record = self._recorder.record
-        self._pacer: Pacer | None = None
+        self._phase_s, self._pacer = _make_pacer(config, name)
         self._factor = RealTimeFactor()
         self._period_s = 1.0 / config.agents.tick_hz
         # Infinite is never: each timer is made once and moved.
@@ -190,27 +190,18 @@ class AgentRunner:
 
     def _start_run(self, t0_host_s: float) -> None:
         self._port.t0_host_s = t0_host_s
-        agents = self._config.agents
-        index = agents.resolved_names().index(self.name)
-        phase_s = stagger(index, agents.count, agents.tick_hz, phase=agents.phase)
-        self._pacer = Pacer(
-            tick_hz=agents.tick_hz,
-            phase_s=phase_s,
-            duration_s=self._config.time.duration_s,
-            tolerance_s=self._config.deadline.tolerance_ms * 1e-3,
-        )
         now_s = self._port.now_s()
         self._recorder.set_t0(utc_at_iso(-now_s))
-        self._recorder.event("phase", phase_s=phase_s)
+        self._recorder.event("phase", phase_s=self._phase_s)
         if now_s > 0:
             self._pacer.skip_to(now_s)
         freeze_garbage()  # what set-up made stays: no collection walks it in mid-run
-        self._arm_tick(self._pacer)
+        self._arm_tick()
         self._recorder.begin_usage()
         self._usage_timer.reschedule(monotonic() + self._config.health.period_s)
 
-    def _arm_tick(self, pacer: Pacer) -> None:
-        deadline_s = pacer.next_deadline_s()
+    def _arm_tick(self) -> None:
+        deadline_s = self._pacer.next_deadline_s()
         if deadline_s is None:
             end_s = self._config.time.duration_s + DRAIN_S
             self._end_timer.reschedule(self._port.local_s(end_s))
@@ -219,7 +210,7 @@ class AgentRunner:
 
     def _tick(self) -> None:
         pacer, port = self._pacer, self._port
-        if pacer is None or self._session.state is not AgentState.RUN_SIMULATION:
+        if self._session.state is not AgentState.RUN_SIMULATION:
             return
         began_s = port.now_s()
         timing = pacer.begin(began_s)
@@ -238,10 +229,10 @@ class AgentRunner:
             margin_s = pacer.end(port.now_s())
             values = (index, int(lateness_s * 1e6), int(margin_s * 1e6), missed)
             self._record("ticks", values)
-        self._arm_tick(pacer)
+        self._arm_tick()
 
     def _finish_run(self) -> None:
-        if self._pacer is None or self._session.state is not AgentState.RUN_SIMULATION:
+        if self._session.state is not AgentState.RUN_SIMULATION:
             return
         self._pacer.finish(self._port.now_s())
         self._takes_data = False  # what comes from now on is too late for the summary
@@ -266,6 +257,7 @@ class AgentRunner:
             "messages": messages,
             "network": self._port.socket.counters(),
             "held_dropped": self._session.held_dropped_count,
+            "malformed": self._session.malformed_count,
         }
         self._session.records_closed(records, monotonic())
 
@@ -292,7 +284,7 @@ class AgentRunner:
 
     def _report(self) -> Mapping[str, Any]:
         report = self._recorder.report()
-        if self._pacer is not None:
+        if self._port.t0_host_s is not None:
             summary = self._pacer.summary()
             report.update(
                 ticks=summary["run"],
@@ -307,12 +299,14 @@ class AgentRunner:
     def _summary(self, simulation: Any) -> dict[str, Any]:
         clock, now_s = self._session.clock, monotonic()
         return {
-            "ticks": dict(self._pacer.summary()) if self._pacer else {},
+            "ticks": dict(self._pacer.summary()),
             "rtf": self._real_time_factor(),
             "clock": {
                 "offset_us": clock.offset_s(now_s) * 1e6,
                 "drift_ppm": clock.drift_ppm,
                 "uncertainty_us": clock.uncertainty_s(now_s) * 1e6,
+                "steps": clock.steps,
+                "rejected": clock.rejected,
             }
             if clock.is_valid
             else None,
@@ -337,3 +331,16 @@ class AgentRunner:
     def _fail(self, failure: HalfFailed) -> None:
         self._session.emergency(str(failure), monotonic())
         self._port.must_flush = True
+
+
+def _make_pacer(config: RunConfig, name: str) -> tuple[float, Pacer]:
+    """Return the agent's share of the period by which its ticks are put off, s, and its pace."""
+    agents = config.agents
+    index = agents.resolved_names().index(name)
+    phase_s = stagger(index, agents.count, agents.tick_hz, phase=agents.phase)
+    return phase_s, Pacer(
+        tick_hz=agents.tick_hz,
+        phase_s=phase_s,
+        duration_s=config.time.duration_s,
+        tolerance_s=config.deadline.tolerance_ms * 1e-3,
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import traceback
 from collections.abc import Callable
 from concurrent.futures import (
     BrokenExecutor,
@@ -173,7 +174,10 @@ class JobRunner:
         """Let go of every job and end the workers, also one that is deep in its work."""
         self._pending.clear()
         workers = list((getattr(self._executor, "_processes", None) or {}).values())
-        self._executor.shutdown(wait=False, cancel_futures=True)
+        try:
+            self._executor.shutdown(wait=False, cancel_futures=True)
+        except Exception:  # noqa: BLE001 - somebody's executor; the run is over, and its result counts
+            traceback.print_exc()
         for worker in workers:
             worker.kill()
 

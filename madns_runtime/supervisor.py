@@ -37,6 +37,7 @@ HANG_GRACE_S = 2.0
 """Beyond the time for shutdown: an agent that hangs in its plug-in ends itself, and leaves its stack."""
 KILL_GRACE_S = 3.0
 """Beyond the time for shutdown: one that cannot even do that is killed."""
+KILL_WAIT_S = 2.0
 FLUSH_TIMEOUT_S = 2.0
 REASON_BYTES_MAX = 2048
 """A reason is written in one piece, so that those of two children never mix."""
@@ -278,6 +279,8 @@ class Supervisor:
         for child in self._children.values():
             os.kill(child.pid, signal.SIGKILL)
             self._tell_killed(child)
+        # One that not even this ends hangs in the kernel; it is left to whoever reaps this process.
+        self._reactor.call_at(self._reactor.now_s() + KILL_WAIT_S, self._reactor.stop)
 
     def _tell_killed(self, child: Child, hint: str = "") -> None:
         text = f"{', '.join(child.agents)} did not end in time and was killed{hint}"

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import BrokenExecutor
+from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from datetime import UTC, datetime
 
 import numpy as np
@@ -288,6 +288,21 @@ def test_a_job_for_workers_that_have_died_is_no_fault_of_who_submits_it():
 
     with pytest.raises(MachineError, match="a worker of the executor has died"):
         runner.submit(math.sqrt, 4.0)
+
+
+class Stubborn(ThreadPoolExecutor):
+    """Somebody's executor that cannot be closed in the usual way."""
+
+    def shutdown(self, wait=True):  # no cancel_futures
+        super().shutdown(wait)
+
+
+def test_an_executor_that_cannot_be_closed_costs_no_result(capsys):
+    executor = Stubborn(1)
+    JobRunner(Reactor(), executor, lambda job, future: None).close()
+
+    assert "TypeError" in capsys.readouterr().err
+    executor.shutdown()
 
 
 def test_without_dask_one_line_says_what_to_install(monkeypatch):
