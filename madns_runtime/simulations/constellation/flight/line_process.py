@@ -229,12 +229,9 @@ class _Lines:
         """Read what is there, a bounded amount of it."""
         if self.is_closed or self.is_overlong or len(self._found) > self.LINES_MAX:
             return
-        try:
-            data = os.read(self.fd, READ_BYTES)
-        except BlockingIOError:
+        data = _read(self.fd)
+        if data is None:
             return
-        except OSError:
-            data = b""
         if not data:
             self.is_closed = True
             if self._rest:
@@ -270,12 +267,9 @@ class _Talk:
         """Read what is there, a bounded amount of it."""
         if self.is_closed:
             return
-        try:
-            data = os.read(self.fd, READ_BYTES)
-        except BlockingIOError:
+        data = _read(self.fd)
+        if data is None:
             return
-        except OSError:
-            data = b""
         if not data:
             self.is_closed = True
             data = b"\n" if self._is_in_line else b""
@@ -291,3 +285,13 @@ class _Talk:
         """Return the lines kept since the last call."""
         lines, self._found = self._found, []
         return lines
+
+
+def _read(fd: int) -> bytes | None:
+    """Return what is there; None for nothing yet, nothing for no more."""
+    try:
+        return os.read(fd, READ_BYTES)
+    except BlockingIOError:
+        return None
+    except OSError:
+        return b""
