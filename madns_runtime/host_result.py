@@ -103,9 +103,8 @@ def _messages(
     joined: dict[str, Any] = {
         service: _joined(service, host_side, agent_side) for service in SERVICES
     }
-    joined["sync"]["deadlines_broken"] = host_side.get("deadlines_broken", 0) + (
-        agent_side or {}
-    ).get("deadlines_broken", 0)
+    sides = (host_side, agent_side or {}, *peer.retired_counters)
+    joined["sync"]["deadlines_broken"] = sum(side.get("deadlines_broken", 0) for side in sides)
     if joined["reliable"]["lost"] is not None:
         joined["reliable"]["lost"] += held_dropped
     joined["not_sent"] = peer.not_sent

@@ -27,7 +27,7 @@ class BrokenDeadline:
     deadline_s: float
     """As `sent_s`, on this side's monotonic clock."""
     late_s: float | None
-    """Acknowledgement minus deadline; None if there was none yet when the deadline's timer came."""
+    """Acknowledgement minus deadline; None if there was none when the deadline's timer came, or will be none."""
 
 
 class DeadlineWatch:
@@ -61,6 +61,11 @@ class DeadlineWatch:
         """Report what is not acknowledged and past its deadline."""
         while self.get_timer() <= now_s:
             self._break(heapq.heappop(self._heap)[1], None)
+
+    def give_up(self) -> None:
+        """Report all that are open: their messages will not be acknowledged any more."""
+        for index in list(self._open):
+            self._break(index, None)
 
     def get_timer(self) -> float:
         """Return the next deadline, infinity if there is none."""

@@ -257,10 +257,13 @@ class Link:
         """
         Give streams up, all without an argument: what is not acknowledged is counted as lost and forgotten.
 
-        Nothing can be sent in such a stream again: its receiver waits for what is gone.
+        Nothing can be sent in such a stream again: its receiver waits for what is gone. Deadlines that are
+        still open are broken.
         """
         for service in services or (Service.RELIABLE, Service.SYNC):
             self._outgoing.streams[service - 1].abandon()
+            if service == _SYNC:
+                self._outgoing.watch.give_up()
 
 
 def _seal(run_key: bytes, session: bytes, agent_index: int, incarnation: int, role: Role) -> Seal:

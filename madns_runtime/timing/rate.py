@@ -246,7 +246,9 @@ class Pacer:
             self._deadline_s = self._closing_s = math.inf
 
     def _newest_due(self, now_s: float) -> int:
-        """Return the last index, of however long a run, whose deadline is not after *now_s*; -1 before all."""
+        """Return the last index whose deadline is not after *now_s*: -1 before all, `tick_count` after the end."""
+        if now_s >= self._deadline_of(self.tick_count):
+            return self.tick_count
         index = max(math.floor((now_s - self._phase_s) * self._tick_hz), -1)
         # The product may be rounded across a whole number; the deadlines themselves decide.
         while self._deadline_of(index + 1) <= now_s:

@@ -133,7 +133,8 @@ class World:
             session.handle_timer(self.now_s)
         while (event := session.next_event()) is not None:
             self.agent_events[name].append(event)
-            if isinstance(event, a.SetupReceived) and name not in self.mute:
+            is_in_setup = session.state is AgentState.SIMULATION_SETUP
+            if isinstance(event, a.SetupReceived) and name not in self.mute and is_in_setup:
                 session.setup_finished(self.now_s)
             elif isinstance(event, a.StopReceived | a.EmergencyDeclared | a.ExpelledFromRun):
                 session.records_closed({"written": 7}, self.now_s)

@@ -1,7 +1,7 @@
 """Sessions where things happen out of turn: each is counted or refused, and nothing moves wrongly."""
 
 import pytest
-from test_sessions import TIMEOUTS, WIRE, World, world
+from test_sessions import STEP_S, TIMEOUTS, WIRE, World, world
 
 from madns_runtime import __version__
 from madns_runtime.protocol import agent_events as a
@@ -14,6 +14,8 @@ from madns_runtime.protocol.messages import (
     Hello,
     Pong,
     Service,
+    SimulationComplete,
+    SimulationReady,
     SimulationStart,
     SystemStop,
 )
@@ -26,8 +28,9 @@ def say(w, name, message):
     w.run_for(0.3)
 
 
-def order(w, name, message):
+def order(w, name, message, *, step_agent=None):
     """Let the host's link say something out of turn."""
+    w.step_agent = step_agent or w.step_agent
     w.host.peers[name].link.send_urgent(encode_message(message), Service.SYNC, w.now_s)
     w.host._links.mark(w.host.peers[name])
     w.run_for(0.3)
@@ -224,3 +227,107 @@ def test_agent_that_gives_another_name_than_its_place_is_refused(name):
     w.run_for(1)
 
     assert w.host.peers["agent-1"].phase is Phase.LOST
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        Hello("agent-1", __version__, 1),
+        SimulationReady(),
+        SimulationComplete({"never": "ran"}),
+    ],
+    ids=lambda word: type(word).__name__,
+)
+def test_word_out_of_turn_moves_no_agent_and_holds_up_no_wait(word):
+    w = World(("agent-1", "agent-2"))
+    w.join("agent-1")
+    w.run_for(0.5)
+
+    say(w, "agent-1", word)
+
+    assert w.host.malformed_count == 1
+    assert w.host.peers["agent-1"].phase is Phase.READY
+    assert w.host.peers["agent-1"].summary == {}
+    w.run_for(8)
+    assert w.host_event(h.EmergencyDeclared).who == "agent-2"
+    assert w.host.state is HostState.EXIT
+
+
+def test_agents_silent_at_once_are_all_lost_and_named():
+    w = world(count=3)
+    w.run_for(1.5)
+    w.host.peers["agent-2"].heard_s = w.host.peers["agent-3"].heard_s = w.now_s - 2.6
+    w.frozen.update(("agent-2", "agent-3"))
+
+    w.run_for(0.15)
+
+    reason = "silent for 2.5 s while running"
+    lost = [e for e in w.host_events if isinstance(e, h.AgentLost)]
+    assert lost == [h.AgentLost("agent-2", reason), h.AgentLost("agent-3", reason)]
+    declared = [e for e in w.host_events if isinstance(e, h.EmergencyDeclared)]
+    assert declared == [h.EmergencyDeclared("agent-2, agent-3", reason)]
+
+
+def test_what_an_agent_missed_of_a_deadline_is_counted_as_lost_with_it():
+    for sent in (["never read"], []):
+        w = world(count=1)
+        w.host_sets_up = False
+        w.join("agent-1")
+        w.agents["agent-1"].datagrams_to_send(w.now_s)
+        w.run_for(0.5)
+        for payload in sent:
+            w.host.send("agent-1", payload, Service.RELIABLE, w.now_s)
+        w.frozen.add("agent-1")
+        w.run_for(16)
+
+        peer = w.host.peers["agent-1"]
+        assert peer.phase is Phase.LOST
+        assert peer.link.counters.reliable.lost == len(sent)
+
+
+def test_orders_to_a_process_that_another_replaced_are_lost_and_their_deadlines_broken():
+    w = world(count=2, policy="continue")
+    w.run_for(1.5)
+    w.frozen.add("agent-1")
+    w.host.send("agent-1", "burn", Service.SYNC, w.now_s, deadline_s=w.now_s + 60.0)
+    w.run_for(0.2)
+    w.frozen.clear()
+
+    w.join("agent-1")
+    w.run_for(1.0)
+
+    broken = w.host_event(h.SyncDeadlineBroken)
+    assert (broken.agent, broken.broken.late_s) == ("agent-1", None)
+    (earlier,) = w.host.peers["agent-1"].retired_counters
+    assert earlier["deadlines_broken"] == earlier["sync"]["lost"] == 1
+
+
+def test_nothing_waits_for_a_process_that_has_not_said_hello():
+    w = world(count=2, policy="continue")
+    w.run_for(1.5)
+    w.host.agent_exited("agent-2", "killed by SIGKILL", w.now_s)
+    w.join("agent-2")
+    w.agents["agent-2"].datagrams_to_send(w.now_s)  # the hello, lost
+    while w.host.peers["agent-2"].phase is Phase.LOST:
+        w.run_for(STEP_S)
+    assert w.host.peers["agent-2"].phase is Phase.JOINING
+
+    assert w.host.send("agent-2", "too early", Service.RELIABLE, w.now_s) is False
+
+    assert w.host.peers["agent-2"].not_sent == 1
+    assert w.host.peers["agent-2"].link.is_flushed
+
+
+def test_timer_of_an_agent_that_takes_long_to_close_its_records_does_not_stand_still():
+    w = world(count=1)
+    w.run_for(1.5)
+    session = w.agents["agent-1"]
+    session.run_finished({}, w.now_s)
+    order(w, "agent-1", SystemStop(), step_agent=lambda name, session: None)
+    assert session.state is AgentState.AGENT_SHUTDOWN  # its owner closes the records
+
+    for _ in range(100):
+        w.now_s = max(w.now_s + STEP_S, session.get_timer())
+        session.handle_timer(w.now_s)
+        session.datagrams_to_send(w.now_s)
+        assert session.get_timer() > w.now_s

@@ -1,25 +1,7 @@
 import re
 from datetime import datetime, timedelta
 
-import pytest
-
-from madns_runtime.timing.clock import ManualClock, utc_at_iso, utc_now_iso
-
-
-def test_manual_clock_moves_only_when_told():
-    clock = ManualClock(5.0)
-
-    assert clock.now_s() == clock.now_s() == 5.0
-    assert clock.advance(0.25) == 5.25
-    assert clock.now_s() == 5.25
-
-
-def test_manual_clock_refuses_to_go_back():
-    clock = ManualClock(1.0)
-
-    with pytest.raises(ValueError, match=r"go back by 0\.5 s"):
-        clock.advance(-0.5)
-    assert clock.now_s() == 1.0
+from madns_runtime.timing.clock import utc_at_iso, utc_now_iso
 
 
 def test_wall_time_is_utc_with_microseconds():
