@@ -74,6 +74,21 @@ def test_the_first_step_is_not_refused_at_any_height(solvers):
         assert step_s > 50.0
 
 
+def test_tolerances_hold_for_a_vehicle_among_many_as_for_it_alone():
+    high = np.array([[4.2e7, 0.0, 0.0, 0.0, (EGM_96.mu_m3_s2 / 4.2e7) ** 0.5, 0.0]])
+    fleet, end_s = np.concatenate((ORBIT, np.repeat(high, 999, axis=0))), np.array([6000.0])
+    expected = propagate(ORBIT, end_s, rtol=1e-13)[0, 0, :3]
+
+    errors_m = [
+        np.linalg.norm(propagate(states, end_s, rtol=1e-8, step_s_max=1e4)[0, 0, :3] - expected)
+        for states in (ORBIT, fleet)
+    ]
+
+    # A root mean square over all would let it err thirty times as much.
+    assert errors_m[0] > 1e-3
+    assert errors_m[1] < 2.0 * errors_m[0]
+
+
 def test_many_states_in_a_step_are_those_of_few():
     many_s = np.arange(1, 301) * 0.1
 
