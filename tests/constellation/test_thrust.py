@@ -7,10 +7,17 @@ import pytest
 from constellation_fakes import parameters
 from scipy.integrate import quad, solve_ivp
 
-from madns_runtime.simulations.constellation.equipment import Thruster, Vehicle
+from madns_runtime.simulations.constellation.equipment import (
+    Attitude,
+    ReactionWheels,
+    Thruster,
+    Vehicle,
+)
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
 from madns_runtime.simulations.constellation.thrust import Thrust, velocity_gain_s, way_gain_s2
+from madns_runtime.simulations.constellation.truth import jobs
 from madns_runtime.simulations.constellation.truth.actuators import Tank, chance_of, fire
+from madns_runtime.simulations.constellation.truth.attitude import RigidBody, initial_attitude
 from madns_runtime.simulations.constellation.truth.effects import Effect
 from madns_runtime.simulations.constellation.truth.fleet import load_fleet
 from madns_runtime.simulations.constellation.truth.forces import acceleration_of
@@ -108,3 +115,33 @@ def test_truth_in_a_burn_is_that_of_an_integration_with_mass(delta_v_m_s):
     # Measured: 2e-5 m and 1e-7 m/s. One acceleration all through would be off by dv T q / 12 and more: 50 km.
     assert np.abs(truth.states[-1][:3] - expected[:3]).max() < 1e-4
     assert np.abs(truth.states[-1][3:] - expected[3:6]).max() < 5e-7
+
+
+def test_wheels_take_up_their_torque_through_all_legs_of_a_burn(monkeypatch):
+    attitude = Attitude(
+        inertia_kg_m2=(10.0, 12.0, 14.0),
+        rates_deg_s=(2.0, 1.0, 0.0),
+        wheels=ReactionWheels(torque_n_m_max=1.0, momentum_n_m_s_max=100.0),
+    )
+    turned = initial_attitude(attitude, STATE[:3].tolist(), STATE[3:].tolist())
+    kinds = {"thrust": (0.0, 40.0, 0.0), "torque": (0.0, 0.0, 0.1)}
+    effects = tuple(
+        Effect(number=n, kind=kind, at_s=25.0, start_s=5.0, end_s=45.0, vector=vector, burnt=0.1)
+        for n, (kind, vector) in enumerate(kinds.items())
+    )
+    request = VehicleRequest(
+        start_s=0.0,
+        state=np.concatenate((STATE, turned)),
+        change_s=5.0,
+        end_knot=50,
+        knot_s=1.0,
+        effects=effects,
+        body=RigidBody.of(attitude, (0.0, 0.0, 0.0)),
+    )
+
+    in_legs = propagate_vehicle(request, PROPAGATION)
+    monkeypatch.setattr(jobs, "THRUST_LEG_S", 100.0)
+    at_once = propagate_vehicle(request, PROPAGATION)
+
+    assert np.abs(in_legs.attitude - at_once.attitude).max() < 1e-9
+    assert np.abs(in_legs.attitude[-1, 4:] - turned[4:]).max() > 0.1

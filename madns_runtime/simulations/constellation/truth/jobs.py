@@ -154,10 +154,8 @@ class _Flight:
             self._add_piece(span, np.stack([at[t] for t in span.times_s()]))
         for knot in knots:
             self._grid[knot - self._first_knot] = at[knot * request.knot_s]
+        self._body = self._body_at(stop_s)
         self._state, self._t_s = last, stop_s
-        if self._body is not None and self._body.wheels_n_m_s is not None:
-            taken = total((self._body.wheels_n_m_s, scaled(self._torque, t0_s - stop_s)))
-            self._body = replace(self._body, wheels_n_m_s=taken)
 
     def apply(self, t_s: float) -> None:
         """Let begin and end what does so at *t_s*."""
@@ -283,17 +281,27 @@ class _Flight:
             thrust_m_s2=None if thrust_m_s2 is None else np.array([thrust_m_s2]),
         )
         knots, states = np.array(times_s), state[None]
-        if self._body is not None:
-            turned = replace(self._body, torque_n_m=self._torque)
+        body = self._body_at(from_s)
+        if body is not None:
             propagate_attitude = _attitude_module().propagate_attitude
             rows = propagate_attitude(
-                [turned], states, t0_s=from_s, knots_s=knots, parameters=parameters
+                [body], states, t0_s=from_s, knots_s=knots, parameters=parameters
             )
         else:
             rows = propagate(states, from_s, knots, parameters)
         vehicle: Array = rows[0]
         self._check_spin(vehicle)
         return vehicle
+
+    def _body_at(self, t_s: float) -> RigidBody | None:
+        """Return the body under the present torque, and what its wheels hold at *t_s*."""
+        body = self._body
+        if body is None:
+            return None
+        wheels = body.wheels_n_m_s
+        if wheels is not None:
+            wheels = total((wheels, scaled(self._torque, self._t_s - t_s)))
+        return replace(body, torque_n_m=self._torque, wheels_n_m_s=wheels)
 
     def _check_spin(self, rows: Array) -> None:
         if self._body is None:
