@@ -45,8 +45,10 @@ RIGID = (*LEO, *TURNED, 0.001, -0.002, 0.003)
 class Bench:
     """A suite of sensors on a still vehicle."""
 
-    def __init__(self, *, chance=CHANCE, epoch=EPOCH, hz=HZ, **sensors):
-        self.context = FakeContext("agent-01", ("agent-01",), parameters(), tick_hz=hz)
+    def __init__(self, *, chance=CHANCE, epoch=EPOCH, hz=HZ, joined_s=-1.0, **sensors):
+        self.context = FakeContext(
+            "agent-01", ("agent-01",), parameters(), tick_hz=hz, clock_s=joined_s
+        )
         settings = from_mapping(Sensors, sensors)
         scene = Scene(epoch, UNTOUCHED, EGM_96.radius_m)
         self.suite = SensorSuite(settings, scene, context=self.context, chance=chance)
@@ -265,6 +267,19 @@ def test_missed_ticks_change_nothing_of_later_measurements():
     some.run([0, 5, BLOCK + 3])
 
     assert every.run(later) == some.run(later)
+
+
+def test_who_rejoins_measures_as_if_it_had_been_there_and_has_walked_before_its_first_tick(
+    monkeypatch,
+):
+    first = round(1000.0 * HZ)
+    always, again = Bench(gnss=NOISY), Bench(gnss=NOISY, joined_s=1000.0)
+    expected = always.run(range(first, first + 40))
+    draws = []
+    monkeypatch.setattr(Errors, "_draws", lambda self, block: draws.append(block))
+
+    assert again.run(range(first, first + 40)) == expected
+    assert draws == []
 
 
 def test_another_sensor_changes_nothing_of_the_first():

@@ -27,6 +27,8 @@ TIME_EPSILON_S = 1e-9
 """Rounding of times."""
 SAMPLE_EPSILON = 1e-6
 """Rounding of a sample's number: of a tick's time times a rate, also after days."""
+REJOIN_S = 1.0
+"""What a clock may be ahead of the first tick."""
 PENDING_MAX = 10_000
 """Measurements under way to flight software; further ones are dropped and counted."""
 
@@ -107,6 +109,8 @@ class Sensor:
             period_s=1.0 / self._rate_hz,
         )
         self._errors = Errors(model, key_of(chance, f"sensor {self.name}"))
+        # In a vehicle that rejoins, biases walk here to where they are by now: a tick has no time for that.
+        self._errors.at(max(0, math.floor((context.now_s() - REJOIN_S) * self._rate_hz)))
         fields = (Field("tick", "", "int"), Field("t_s", "s"), *instrument.fields)
         context.open_stream(self._stream, fields)
 
