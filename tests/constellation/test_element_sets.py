@@ -1,5 +1,6 @@
 """Element sets: the four syntaxes agree, and a bad file is named with its line."""
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -8,9 +9,15 @@ import pytest
 from constellation_fakes import SCENARIOS
 
 from madns_runtime.errors import ConfigurationError
+from madns_runtime.simulations.constellation.orbit.constants import EARTH_POLAR_RADIUS_M, EGM_96
+from madns_runtime.simulations.constellation.parameters import Sgp4Propagator
 from madns_runtime.simulations.constellation.truth.element_sets import (
     read_element_sets,
     tle_checksum,
+)
+from madns_runtime.simulations.constellation.truth.propagation import (
+    PropagationParameters,
+    propagate,
 )
 from madns_runtime.simulations.constellation.truth.sgp4_sets import julian_date, sgp4_states
 
@@ -221,6 +228,30 @@ def test_a_set_that_sgp4_cannot_propagate_is_named():
 
     with pytest.raises(ConfigurationError, match="^WRECK: SGP4: .*, at [012] s$"):
         sgp4_states((*sets[:3], broken), EPOCH, np.arange(3.0))
+
+
+def test_a_set_that_falls_is_followed_down_to_the_earth_and_stands_still_there():
+    high, low = read_element_sets(DATA / "iridium10.csv")[:2]
+    fields = dict(low.omm) | {"MEAN_MOTION": "16.45", "BSTAR": "0.05", "ECCENTRICITY": "0.0005"}
+    falling = replace(low, omm=tuple(sorted(fields.items())))
+    knots_s = np.arange(0.0, 3000.0, 10.0)
+    parameters = PropagationParameters(
+        settings=Sgp4Propagator(kind="sgp4"),
+        gravity=EGM_96,
+        epoch_utc=low.epoch_utc,
+        element_sets=(high, falling),
+    )
+
+    found = propagate(np.full((2, 6), 7e6), 0.0, knots_s, parameters)
+
+    radii_m = np.linalg.norm(found[..., :3], axis=2)
+    met = int(np.argmax(radii_m[1] < EARTH_POLAR_RADIUS_M))
+    assert 0 < met < 299
+    assert radii_m[1, met] > EARTH_POLAR_RADIUS_M - 10e3
+    assert not found[1, met + 1 :, 3:].any()
+    assert np.abs(radii_m[0] - 7.15e6).max() < 3e4
+    with pytest.raises(ConfigurationError, match=f"^{falling.name}: SGP4: .*, at .* s$"):
+        sgp4_states((high, falling), low.epoch_utc, knots_s)
 
 
 def test_julian_dates_are_those_of_the_almanac():

@@ -42,7 +42,8 @@ class Sgp4:
         steps = np.array((0.0, *WEIGHTS)) * DIFFERENCE_S
         # Knots and differences often fall on the same times; each is computed once.
         times_s, place = np.unique(np.round(knots_s + steps[:, None], 9), return_inverse=True)
-        found = sgp4_states(parameters.element_sets, parameters.epoch_utc, times_s)[..., :3]
+        sets, epoch_utc = parameters.element_sets, parameters.epoch_utc
+        found = sgp4_states(sets, epoch_utc, times_s, may_fall=True)[..., :3]
         r, *around = (found[:, row] for row in place.reshape(len(steps), -1))
         v = sum(weight * near for weight, near in zip(WEIGHTS.values(), around, strict=True))
         return np.concatenate((r, np.asarray(v) / DIFFERENCE_S), axis=2)

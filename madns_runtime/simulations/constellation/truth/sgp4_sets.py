@@ -23,6 +23,8 @@ try:
 except ImportError as error:
     raise MissingExtraError("sgp4", "host") from error
 
+DECAYED = 6
+"""Error of a satellite below the equatorial radius; its state is computed all the same."""
 _J2000_UTC = datetime(2000, 1, 1, 12, tzinfo=UTC)
 _J2000_JD = 2_451_545.0
 
@@ -55,7 +57,11 @@ def _fleet_records(element_sets: tuple[ElementSet, ...]) -> SatrecArray:
 
 
 def sgp4_states(
-    element_sets: tuple[ElementSet, ...], epoch_utc: datetime, t_s: NDArray[np.float64]
+    element_sets: tuple[ElementSet, ...],
+    epoch_utc: datetime,
+    t_s: NDArray[np.float64],
+    *,
+    may_fall: bool = False,
 ) -> NDArray[np.float64]:
     """
     Return the states of a fleet by SGP4.
@@ -64,6 +70,7 @@ def sgp4_states(
         element_sets: N sets.
         epoch_utc: UTC of t_s = 0.
         t_s: Times, shape (K,), s.
+        may_fall: Whether satellites may be lower than the Earth's equator is.
 
     Returns:
         States, shape (N, K, 6), m and m/s, TEME.
@@ -79,6 +86,8 @@ def sgp4_states(
     errors, r_km, v_km_s = _fleet_records(element_sets).sgp4(
         whole + days, part + rest_s / SECONDS_PER_DAY
     )
+    if may_fall:
+        errors = np.where(errors == DECAYED, 0, errors)
     faults = []
     for n in np.flatnonzero(errors.any(axis=1)).tolist():
         k = int(np.argmax(errors[n] > 0))
