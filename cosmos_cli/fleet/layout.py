@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import PurePosixPath
 
 SESSION_CHARACTERS = 8
-COMPLETE_MARK = ".complete"
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,11 +34,6 @@ class PlacementRule:
     per_machine: Annotated[int, Ge(1)] | None = None
     """Most agents of this rule on one machine."""
 
-    @property
-    def takes_rest(self) -> bool:
-        """Whether it takes every agent that is left."""
-        return not self.agents and self.count is None
-
 
 @dataclass(frozen=True, slots=True)
 class Claims:

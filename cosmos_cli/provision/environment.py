@@ -53,11 +53,6 @@ class Installed:
             folders=mapping["folders"],
         )
 
-    @property
-    def prunable_count(self) -> int:
-        """Return how many things nobody needs any more."""
-        return sum(len(names) for names in self.prunable.values())
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RuntimeCheck:
@@ -120,19 +115,6 @@ def ask_installed(board: Board, request: Mapping[str, Any]) -> Installed:
         MachineFailure: The connection is lost.
     """
     return Installed.from_mapping(board.call("installed", request, timeout_s=LOOK_TIMEOUT_S).value)
-
-
-def prune(board: Board, request: Mapping[str, Any]) -> Mapping[str, Sequence[str]]:
-    """
-    Remove what no living run uses, *request* does not name, and is not among the newest.
-
-    Returns:
-        What was removed, as `Installed.prunable`.
-    """
-    removed: Mapping[str, Sequence[str]] = board.call(
-        "prune_installed", request, timeout_s=BUILD_TIMEOUT_S
-    ).value
-    return removed
 
 
 def install_environment(
@@ -216,22 +198,6 @@ def check_distribution(board: Board, environment: Environment) -> None:
             + "; ".join(faults),
             advice,
         )
-
-
-def check_runtime(board: Board, layout: Layout, check: RuntimeCheck) -> dict[str, Any]:
-    """
-    See that the runtime starts on a machine, and that datagrams reach this computer and come back.
-
-    Returns:
-        {"runtime": its version, "start_ms": ..., "round_trip_ms": ... or None}.
-
-    Raises:
-        MachineFailure: It does not start, or no datagram came back; the text has the last words.
-    """
-    told: dict[str, Any] = board.call(
-        "check_runtime", check_request(layout, check), timeout_s=START_TIMEOUT_S + LOOK_TIMEOUT_S
-    ).value
-    return told
 
 
 def check_request(layout: Layout, check: RuntimeCheck) -> dict[str, Any]:

@@ -324,14 +324,3 @@ def test_machine_without_apt_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyP
         list(board.parts("packages", {"action": "install", "names": ["foo"]}))
 
     assert failure.value.kind is FailureKind.UNSUPPORTED
-
-
-@pytest.mark.process
-def test_installed_versions_are_told_by_name(apt: PlayedApt) -> None:
-    apt.holds(foo="1.0")
-    target = Target(name="pi01", address="127.0.0.1", connection="local")
-
-    with Board.start(LocalConnection(target), PARTS) as board:
-        answer = board.call("installed_packages", {"names": ["foo", "bar"]}).value
-
-    assert answer == {"foo": "1.0", "bar": None}

@@ -10,7 +10,7 @@ from cosmos_cli.errors import ExitCode
 from cosmos_cli.fleet.failure import FailureKind
 from cosmos_cli.fleet.layout import Layout
 from cosmos_cli.fleet.ssh_config import KEYWORDS
-from cosmos_cli.models.inventory import load_inventory
+from cosmos_cli.models.inventory import load_machines
 from cosmos_cli.models.inventory.variables import Variables
 from cosmos_cli.models.limit import select_machines
 from cosmos_cli.models.loading import load_scenario
@@ -31,7 +31,7 @@ def names_of(prefix):
 def machines_of(folder, text):
     path = folder / "inventory.yaml"
     path.write_text(text, "utf-8")
-    return load_inventory(path)
+    return load_machines(path)
 
 
 def test_every_variable_of_cosmos_is_documented_and_no_other():

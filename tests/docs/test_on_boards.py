@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from guides import GUIDES, ROOT
 
-from cosmos_cli.models.inventory import load_inventory
+from cosmos_cli.models.inventory import load_machines
 
 README = GUIDES[0].read_text("utf-8")
 BOX = "```yaml\n# box.yaml\n(.*?)```"
@@ -29,7 +29,7 @@ def write_box(folder):
 
 
 def test_readme_shows_an_inventory_of_24_boards(tmp_path):
-    machines = load_inventory(write_box(tmp_path))
+    machines = load_machines(write_box(tmp_path))
 
     assert [machine.name for machine in machines] == [f"pi{n:02d}" for n in range(1, 25)]
     assert machines[0].user == "pi"

@@ -24,7 +24,7 @@ from cosmos_cli.provision.environment import (
     PARTS,
     RuntimeCheck,
     ask_installed,
-    check_runtime,
+    check_request,
     install_environment,
     installed_request,
     modules_of,
@@ -152,7 +152,7 @@ def checked(name, environment, runtime):
             simulation="constellation",
             udp=echo.question(connection.own_address),
         )
-        return check_runtime(board, LAYOUT, check)
+        return board.call("check_runtime", check_request(LAYOUT, check), timeout_s=240.0).value
 
 
 def test_board_without_internet_gets_all_that_it_runs(tower):
@@ -263,7 +263,7 @@ def test_closed_udp_is_told_with_the_address(tower):
         )
         started_s = time.monotonic()
         with pytest.raises(MachineFailure) as caught:
-            check_runtime(board, LAYOUT, check)
+            board.call("check_runtime", check_request(LAYOUT, check), timeout_s=240.0)
 
     assert caught.value.text == f"no UDP from here to {tower.address}:9"
     assert "is a firewall closing it?" in caught.value.advice

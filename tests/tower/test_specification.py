@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cosmos_cli.models.inventory import load_inventory
+from cosmos_cli.models.inventory import load_machines
 
 from . import roots
 from .inventory import format_inventory
@@ -76,7 +76,7 @@ def test_inventory_means_the_boards_to_cosmos(tmp_path):
     path = tmp_path / "tower.yaml"
     path.write_text(text)
 
-    machines = {machine.name: machine for machine in load_inventory(path)}
+    machines = {machine.name: machine for machine in load_machines(path)}
 
     assert set(machines) == {"pi01", "pi02", "here"}
     assert machines["pi02"].address == "10.77.1.2"

@@ -69,12 +69,6 @@ class Deadlines:
     lock_s: float
 
 
-@verb("installed_packages")
-def installed_packages(request: Request) -> dict[str, str | None]:
-    """Tell the installed version of each of the packages in "names"; null for one that is not there."""
-    return installed(request.arguments["names"])
-
-
 @verb("packages")
 def packages(request: Request) -> Iterator[Part]:
     """

@@ -7,7 +7,6 @@ that YAML 1.1 reads otherwise) is a fault and never skipped; variables of others
 
 from cosmos_cli.models.inventory.load import (
     Inventory,
-    load_inventory,
     load_machines,
     read_inventory,
 )
@@ -21,7 +20,6 @@ __all__ = [
     "Machine",
     "Variables",
     "expand",
-    "load_inventory",
     "load_machines",
     "read_inventory",
 ]

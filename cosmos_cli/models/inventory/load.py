@@ -42,16 +42,6 @@ class Inventory:
         return select_machines(self.machines, pattern, groups=self.groups)
 
 
-def load_inventory(path: Path) -> tuple[Machine, ...]:
-    """
-    Read an inventory and return its machines in the order of the file.
-
-    Raises:
-        InputError: With every fault found, in the order of the file.
-    """
-    return read_inventory(path).machines
-
-
 def load_machines(path: Path, limit: str | None = None) -> tuple[Machine, ...]:
     """
     Read an inventory and return the machines that --limit leaves of it.

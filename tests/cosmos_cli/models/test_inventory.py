@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from cosmos_cli.errors import InputError
-from cosmos_cli.models.inventory import expand, load_inventory, load_machines
+from cosmos_cli.models.inventory import expand, load_machines
 from cosmos_cli.models.inventory.names import split_port
 
 ROOT = Path(__file__).parents[3]
@@ -16,7 +16,7 @@ def read(tmp_path):
 
     def read_text(text):
         path.write_text(text)
-        return load_inventory(path)
+        return load_machines(path)
 
     read_text.path = path
     return read_text
@@ -29,7 +29,7 @@ def faults_of(read, text):
 
 
 def test_shipped_tower_has_24_boards_one_with_a_sense_hat_and_this_computer():
-    machines = load_inventory(ROOT / "inventory/tower.yaml")
+    machines = load_machines(ROOT / "inventory/tower.yaml")
 
     *boards, here = machines
     assert [machine.name for machine in boards] == [f"pi{i:02d}" for i in range(1, 25)]
@@ -48,7 +48,7 @@ def test_shipped_tower_has_24_boards_one_with_a_sense_hat_and_this_computer():
 
 
 def test_shipped_loopback_is_this_computer():
-    (machine,) = load_inventory(ROOT / "inventory/loopback.yaml")
+    (machine,) = load_machines(ROOT / "inventory/loopback.yaml")
 
     assert (machine.name, machine.address, machine.connection) == ("loopback", "127.0.0.1", "local")
 
@@ -489,7 +489,7 @@ def test_other_kinds_of_inventories_are_refused(tmp_path, name, text, told):
     (tmp_path / name).write_text(text)
 
     with pytest.raises(InputError) as caught:
-        load_inventory(tmp_path / name)
+        load_machines(tmp_path / name)
 
     assert told in str(caught.value)
 
@@ -504,7 +504,7 @@ def test_faults_of_variable_files_are_named_with_their_place(tmp_path):
     (tmp_path / "host_vars/m2").write_text("$ANSIBLE_VAULT;1.1;AES256\n")
 
     with pytest.raises(InputError) as caught:
-        load_inventory(tmp_path / "i.yaml")
+        load_machines(tmp_path / "i.yaml")
 
     told = [
         (Path(f.file).relative_to(tmp_path), f.line, f.text.split(":")[0])
@@ -523,7 +523,7 @@ def test_folder_without_an_inventory_is_refused(tmp_path):
     (tmp_path / "README.md").write_text("nothing")
 
     with pytest.raises(InputError, match="expected an inventory file in this folder"):
-        load_inventory(tmp_path)
+        load_machines(tmp_path)
 
 
 def test_machines_are_bounded_over_all_groups_and_counted_once(read):

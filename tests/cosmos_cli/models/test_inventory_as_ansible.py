@@ -11,7 +11,7 @@ import yaml
 
 from cosmos_cli import app
 from cosmos_cli.errors import InputError
-from cosmos_cli.models.inventory import load_inventory, read_inventory
+from cosmos_cli.models.inventory import load_machines, read_inventory
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("ansible") is None,
@@ -90,7 +90,7 @@ def test_random_webs_of_groups_resolve_as_in_ansible(tmp_path):
     answers = ansible_reading.resolve_many(requests, tmp_path)
 
     for request, answer in zip(requests, answers, strict=True):
-        machines = load_inventory(Path(request["file"]))
+        machines = load_machines(Path(request["file"]))
 
         assert {
             machine.name: [sorted(machine.groups), dict(machine.variables)] for machine in machines

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from cosmos_cli.errors import InputError
-from cosmos_cli.models.inventory import load_inventory
+from cosmos_cli.models.inventory import load_machines
 from cosmos_cli.models.provision_steps import Command, FileContent, LineInFile, Service
 
 HEAD = "all:\n  hosts: {m: }\n  vars:\n    cosmos_provision:\n"
@@ -14,7 +14,7 @@ def read(tmp_path):
     def read_steps(*steps):
         path = tmp_path / "i.yaml"
         path.write_text(HEAD + "".join(f"      - {step}\n" for step in steps))
-        return load_inventory(path)[0].provision
+        return load_machines(path)[0].provision
 
     return read_steps
 

@@ -24,11 +24,10 @@ from cosmos_cli.provision.environment import (
     RuntimeCheck,
     ask_installed,
     check_distribution,
-    check_runtime,
+    check_request,
     install_environment,
     installed_request,
     modules_of,
-    prune,
 )
 from cosmos_cli.provision.lock import Distributed, Lock, Locked
 from cosmos_cli.provision.platform import greeted_platform
@@ -111,6 +110,10 @@ def python(machine, environment, program):
         check=True,
     )
     return done.stdout.strip()
+
+
+def started(board, layout, check):
+    return board.call("check_runtime", check_request(layout, check), timeout_s=240.0).value
 
 
 def is_whole(machine, environment):
@@ -449,13 +452,13 @@ def test_prune_spares_the_wanted_the_newest_and_the_used(machine, house, tmp_pat
     with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
         with machine.board() as board:
             foretold = ask_installed(board, request).prunable
-            removed = prune(board, request)
+            removed = board.call("prune_installed", request).value
             left = ask_installed(board, request)
         process.communicate(b"\n", timeout=20)
 
     gone = {environments[2].key, environments[3].key}
     assert set(removed["environments"]) == set(foretold["environments"]) == gone
-    assert left.prunable_count == 0
+    assert not any(left.prunable.values())
     assert {path.name for path in Path(machine.layout.environments).iterdir()} == {
         environment.key for environment in environments
     } - gone
@@ -477,7 +480,7 @@ def test_what_a_run_asked_for_is_among_the_newest(machine, house, tmp_path):
         ask_installed(board, asked)
         nothing = installed_request(machine.layout, trees=[], environments=[])
 
-        assert first not in prune(board, nothing)["environments"]
+        assert first not in board.call("prune_installed", nothing).value["environments"]
 
 
 def test_full_disk_leaves_no_half_built_environment(machine, house, navlib, tmp_path, monkeypatch):
@@ -511,8 +514,8 @@ def test_runtime_runs_from_its_environment_and_tree_alone(machine, tmp_path, mon
             modules=modules_of(environment),
             simulation="constellation",
         )
-        told = check_runtime(board, machine.layout, check)
-        light = check_runtime(board, machine.layout, dataclasses.replace(check, is_full=False))
+        told = started(board, machine.layout, check)
+        light = started(board, machine.layout, dataclasses.replace(check, is_full=False))
     program = (
         "import madns_runtime.agent, numpy, sys\n"
         "print(sorted({m.__file__.split('/lib/')[0] for m in sys.modules.values()\n"
@@ -542,7 +545,7 @@ def test_runtime_that_does_not_start_is_told_with_its_last_words(machine, house,
     check = RuntimeCheck(key=environment.key, trees=["0" * 64], is_full=False)
 
     with machine.board() as board, pytest.raises(MachineFailure) as caught:
-        check_runtime(board, machine.layout, check)
+        started(board, machine.layout, check)
 
     assert "the runtime does not start there" in caught.value.text
     assert "No module named 'madns_runtime'" in caught.value.text
@@ -557,7 +560,7 @@ def test_missing_module_is_named_by_the_light_check(machine, house, navlib):
 
     with machine.board() as board, pytest.raises(MachineFailure, match="no module named numpy$"):
         send_tree(board, machine.layout, runtime)
-        check_runtime(board, machine.layout, check)
+        started(board, machine.layout, check)
 
 
 def test_prepared_environment_installs(machine, tmp_path, monkeypatch):
