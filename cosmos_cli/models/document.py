@@ -17,11 +17,11 @@ from cosmos_cli.models.yaml_source import Node, Source, compose
 
 VALUES_MAX = 200_000
 """Bound of the values that a document may unfold to: aliases of aliases grow without end."""
-INDEX_MAX = 10_000
 
 Path = tuple[str | int, ...]
-_STEP = re.compile(r"([^.\[\]]+)|\[([0-9]+)\]")
-_KEY = re.compile(r"[^.\[\]]+(?:\.[^.\[\]]+|\[[0-9]+\])*")
+_STEP = re.compile(r"([^.\[\]]+)|\[([0-9]{1,9})\]")
+_INDEX = re.compile(r"[0-9]{1,9}")
+_KEY = re.compile(r"[^.\[\]]+(?:\.[^.\[\]]+|\[[0-9]{1,9}\])*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,7 +243,7 @@ def parse_override(override: str) -> tuple[str, Path, Any]:
     if not _KEY.fullmatch(key):
         raise _override_error(key or override, "expected a dotted path, such as agents.names[0]")
     path = tuple(
-        int(index) if index else int(name) if name.isdigit() else name
+        int(index) if index else int(name) if _INDEX.fullmatch(name) else name
         for name, index in _STEP.findall(key)
     )
     source = Source.of("", text)
