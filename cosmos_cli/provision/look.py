@@ -16,7 +16,7 @@ from cosmos_cli.provision.steps import installed_question
 from cosmos_cli.provision.wanted import Wanted, questions
 
 LOOK_TIMEOUT_S = 150.0
-"""For all facts, conditions of commands included."""
+"""For one question: all facts, conditions of commands included, or a first start of the runtime."""
 
 Answer = Mapping[str, Any]
 """Of one of several requests: "ok" and "value", or "error"."""
@@ -77,9 +77,8 @@ def look(
 
 def several(board: Board, calls: Sequence[Mapping[str, Any]]) -> list[Answer]:
     """Ask several things in one frame."""
-    answers: list[Answer] = board.call(
-        "several", {"calls": list(calls)}, timeout_s=LOOK_TIMEOUT_S
-    ).value
+    timeout_s = LOOK_TIMEOUT_S * len(calls)
+    answers: list[Answer] = board.call("several", {"calls": list(calls)}, timeout_s=timeout_s).value
     return answers
 
 
