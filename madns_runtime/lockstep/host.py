@@ -133,6 +133,7 @@ class LockstepHost:
         for number, name in enumerate(self._names):
             data = self._half.call("initial_data", name, limit_s=limit_s)
             initial.append((number, pack(data)))
+            meeting.serve()
         self._fire(HostEvent.SETUP_FINISHED)
         for worker in self._crew.workers:
             meeting.order(worker, frames.SETUP, [initial[number] for number in worker.agents])
@@ -193,6 +194,7 @@ class LockstepHost:
         for number, service, body in self._meeting.messages():
             accounts[number].up[service] += 1
             half.call("receive", names[number], decode(body))
+            self._meeting.serve()
 
     # The end --------------------------------------------------------------------------------------
 

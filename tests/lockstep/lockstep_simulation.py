@@ -31,6 +31,8 @@ def go_wrong(fault):
         raise ValueError("told to")
     if what == "hang":
         time.sleep(60)
+    if what == "idle":
+        time.sleep(1.0)
     if what == "exit":
         os._exit(0)
     if what == "kill":

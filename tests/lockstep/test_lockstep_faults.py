@@ -138,6 +138,17 @@ def test_the_operators_word_ends_it_in_good_order(start_host):
     assert not any(map(is_alive, workers))
 
 
+def test_the_operator_is_heard_between_two_calls_of_a_slow_half(start_host):
+    run = start_host(fault="hostreceive_idle")  # 6 s for the messages of the first tick
+    wait_until(lambda: any(e.get("state") == "SIMULATION_START" for e in run.events), "no start")
+    run.say({"command": "stop", "reason": "enough", "status": "interrupted"})
+    result = run.result()
+
+    assert (result["status"], result["reason"]) == ("interrupted", "enough")
+    heard = [who for _, who, what in run.records("host/heard.jsonl") if "tick" in str(what)]
+    assert len(heard) < 6
+
+
 def test_sigterm_ends_it_in_good_order(start_host):
     run, workers = slow_host(start_host)
     run.process.terminate()
