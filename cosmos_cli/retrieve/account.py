@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from cosmos_cli.counted import counted
 from cosmos_cli.retrieve.disk import size_words
 
 
@@ -40,9 +41,9 @@ class Retrieved:
             resumed = (
                 f", resumed after {size_words(self.resumed_bytes)}" if self.resumed_bytes else ""
             )
-            told = f"{self.fetched_files} of {self.files} files, {wire}{resumed}"
+            told = f"{self.fetched_files} of {counted(self.files, 'file')}, {wire}{resumed}"
         else:
-            told = f"{self.files} files, {size_words(self.bytes)}, here already"
+            told = f"{counted(self.files, 'file')}, {size_words(self.bytes)}, here already"
         return told + (f"; {self.remark}" if self.remark else "")
 
 

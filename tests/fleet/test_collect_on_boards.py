@@ -78,6 +78,27 @@ def test_link_that_comes_back_soon_is_not_even_an_error(tower8, tmp_path):
     assert run.is_here()
 
 
+@pytest.mark.parametrize("fault", ["reboot", "crash"])
+def test_board_that_starts_anew_in_the_midst_of_a_large_file_is_collected_whole(
+    tower8, tmp_path, fault
+):
+    run = BoardRun(tmp_path, tower8, boards=2, noise_bytes=LARGE_BYTES)
+    tower8.run("pi01", "sync")
+    process = run.start("collect")
+    wait_for_part(run, 2_000_000)
+    restart(tower8, "pi01", fault)
+
+    _, talk = process.communicate(timeout=PATIENCE_S)
+
+    # Within that time it may have been reached again, or given up.
+    assert process.returncode == (0 if run.is_here("pi01") else 5), talk
+    assert run.is_here("pi02")
+    done = run.cosmos("collect")
+    assert done.returncode == 0, done.stderr
+    assert run.is_here()
+    assert not run.lies_on("pi01")
+
+
 def test_frozen_board_is_named_and_collected_once_it_thaws(tower8, tmp_path):
     run = BoardRun(tmp_path, tower8, boards=2, noise_bytes=LARGE_BYTES)
     process = run.start("collect")

@@ -112,6 +112,25 @@ def test_board_whose_disk_fills_during_a_run_is_named_and_its_records_are_cut_wh
     assert operator.cosmos("collect").returncode == 5
 
 
+def test_board_whose_card_fails_during_a_run_is_named_and_keeps_what_it_has(operator):
+    process = operator.start("worn", 6)
+    boots = operator.tower.state()["boards"]["pi01"]["boots"]
+    try:
+        operator.tower.fault("pi01", "ro")
+        _, talk = process.communicate(timeout=PATIENCE_S)
+
+        assert process.returncode == 5, talk
+        assert {"agent-01", "agent-02"} <= operator.named() <= {"agent-01", "agent-02", "pi01"}
+        assert "Read-only file system" in " ".join(operator.document()["data"]["missing"])
+        assert operator.tower.run("pi01", "ls cosmos/runs").stdout != ""
+        assert operator.tower.run("pi02", "ls cosmos/runs").stdout == ""
+    finally:
+        operator.tower.fault("pi01", "reboot")
+        operator.tower.wait_until_on("pi01", boots + 1)
+    assert operator.cosmos("collect").returncode == 5
+    assert operator.tower.run("pi01", "ls cosmos/runs").stdout == ""
+
+
 def test_run_that_lost_the_power_of_everything_is_collected_afterwards(operator):
     process = operator.start("power", 60)
     time.sleep(3.0)
