@@ -162,7 +162,11 @@ def _applies(line: Line, query: _Query) -> bool:
             # As in ssh: a command is not run when the line cannot match any more.
             holds = is_match and _CRITERIA[criterion](argument, query)
         else:
-            raise InputError(f"{line.place}: criterion of Match is not understood: {criterion}")
+            known = ", ".join(("all", "final", *_CRITERIA))
+            raise InputError(
+                f"{line.place}: criterion of Match is not understood: expected {known}, got {criterion};"
+                " a file without it can be named in COSMOS_SSH_CONFIG"
+            )
         is_match = is_match and holds == is_wanted
     return is_match
 

@@ -84,7 +84,7 @@ def settings_of(target: Target) -> SshSettings:
     named = [name for name in named if name.lower() != "none"]
     jump, command = value("proxyjump", "none"), value("proxycommand", "none")
     is_direct = jump.lower() == "none"
-    timeout = value("connecttimeout")
+    timeout = value("connecttimeout", "none")
     return SshSettings(
         host=host,
         port=port,
@@ -102,7 +102,7 @@ def settings_of(target: Target) -> SshSettings:
         hashes_known_hosts=value("hashknownhosts").lower() == "yes",
         jumps=() if is_direct else _jumps(target.name, jump),
         proxy_command=command if is_direct and command.lower() != "none" else None,
-        connect_timeout_s=_number(timeout, "ConnectTimeout") if timeout else None,
+        connect_timeout_s=None if timeout == "none" else _number(timeout, "ConnectTimeout"),
     )
 
 

@@ -144,6 +144,9 @@ def test_connect_timeout_is_a_number(configure):
     configure("ConnectTimeout 3")
     assert settings().connect_timeout_s == 3
 
+    configure("ConnectTimeout none")
+    assert settings_again().connect_timeout_s is None
+
     configure("ConnectTimeout soon")
     with pytest.raises(InputError, match="ConnectTimeout: expected a number, got 'soon'"):
         settings_again()
