@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import time
 from dataclasses import dataclass
 
@@ -32,6 +33,7 @@ def go_wrong(fault):
     if what == "hang":
         time.sleep(60)
     if what == "idle":
+        print("idle", file=sys.stderr, flush=True)
         time.sleep(1.0)
     if what == "exit":
         os._exit(0)
