@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from madns_runtime.host_result import HostReport
+from madns_runtime.protocol.counters import LinkCounters
 from madns_runtime.protocol.host_events import Peer, Phase
 
 
@@ -38,3 +39,13 @@ def test_trouble_with_records_is_told_once(again):
 
     assert report.untold({"host": None, "agent-01": "disk full"}) == [("agent-01", "disk full")]
     assert report.untold({"host": None, "agent-01": again}) == []
+
+
+def test_deadlines_that_were_broken_before_an_agent_came_again_stay_counted():
+    earlier = LinkCounters(deadlines_broken=2).to_mapping()
+    peer = Peer(name="agent-01", index=1, phase=Phase.STOPPED, retired_counters=[earlier])
+    session: Any = SimpleNamespace(peers={"agent-01": peer}, refused={}, malformed_count=0)
+
+    result = HostReport(10.0).result(session, network={})
+
+    assert result["messages"]["sync"]["deadlines_broken"] == 2
