@@ -261,6 +261,17 @@ def test_the_inequality_is_measured_in_the_agents_own_time():
     assert at.account.inequality_broken == 1
 
 
+def test_a_burn_is_to_be_in_truth_when_it_begins():
+    slow = Vehicle(thruster=Thruster(isp_s=220.0, propellant_kg=20.0, thrust_n=20.0))
+    at, strict = desk(slow), desk(slow, late="refuse")
+
+    # 5 s long: it begins at 17.5 s, or would have begun at 9.5 s.
+    taken, late = at.decide(0, command(20.0), 10.0), strict.decide(0, command(12.0), 10.0)
+
+    assert at.measure(taken, 10.1).slack_s == pytest.approx(7.5 - 0.1, abs=1e-3)
+    assert strict.measure(late, None).slack_s == pytest.approx(-0.5 - 0.02, abs=1e-3)
+
+
 def test_a_command_too_late_for_what_is_allowed_counts_although_it_was_quick():
     # As in lockstep, where nothing takes time.
     at, strict = desk(), desk(late="refuse")

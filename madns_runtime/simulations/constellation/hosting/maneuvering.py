@@ -44,7 +44,7 @@ MANEUVERS = (
     Field("reason", "", "str"),
 )
 """One record a command: at_s is T_m as commanded, executed_s as it became (none if refused); propagation_s
-is T_p, network_s T_n, slack_s (T_m - T_s) - (T_p + 2 T_n)."""
+is T_p, network_s T_n, slack_s (T_m - T_s) - (T_p + 2 T_n), for a finite burn with its beginning for T_m."""
 
 
 class Maneuvering:

@@ -66,6 +66,8 @@ class Taken:
     """Magnitude without error."""
     expected_kg: float = 0.0
     """Left afterwards without error."""
+    begins_s: float = 0.0
+    """When it begins as commanded: T_m, of a finite burn half its length before."""
     is_late: bool = False
     """Whether it could not be in truth by its time."""
 
@@ -122,7 +124,7 @@ class Times:
     network_s: float
     """T_n, measured: from the tick that commanded to hearing of it."""
     slack_s: float
-    """(T_m - T_s) - (T_p + 2 T_n); T_m as commanded, T_p as allowed if none was measured."""
+    """(T_m - T_s) - (T_p + 2 T_n); T_m as commanded, of a burn its beginning; T_p as allowed if none was measured."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -192,7 +194,7 @@ class ManeuverDesk:
         account.propagation_s_max = max(account.propagation_s_max, propagation_s or 0.0)
         allowed_s = self._rules.settings.propagation_s
         needed_s = (allowed_s if propagation_s is None else propagation_s) + 2.0 * network_s
-        slack_s = command.at_s - command.commanded_s - needed_s
+        slack_s = taken.begins_s - command.commanded_s - needed_s
         account.inequality_broken += slack_s < 0.0 or taken.is_late
         account.slack_s_min = min(account.slack_s_min, slack_s)
         return Times(propagation_s=propagation_s, network_s=network_s, slack_s=slack_s)
@@ -289,7 +291,7 @@ class ManeuverDesk:
         burn_s = given.duration_s if isinstance(given, Burn) else 0.0
         burn_s = burn_s if burn_s >= ARC_S_MIN else 0.0
         arc_s = command.duration_s if isinstance(given, Turn) else burn_s
-        start_s = snap(command.at_s - burn_s / 2.0, rules.knot_s)
+        start_s = begins_s = snap(command.at_s - burn_s / 2.0, rules.knot_s)
         ready_s = refused.heard_s + rules.settings.propagation_s + rules.settings.network_s
         status: CommandStatus = "accepted"
         is_late = start_s + command.phase_s < ready_s
@@ -297,7 +299,7 @@ class ManeuverDesk:
         if is_late:
             reason = f"{ready_s - command.phase_s - start_s:.4g} s too late"
             if rules.settings.late == "refuse":
-                return replace(refused, reason=reason, is_late=True)
+                return replace(refused, reason=reason, begins_s=begins_s, is_late=True)
             # A whole tick: the first time that flight software could have named itself.
             tick = math.ceil((ready_s - command.phase_s) * rules.tick_hz - 1e-9)
             start_s, status = snap(tick / rules.tick_hz, rules.knot_s), "postponed"
@@ -318,9 +320,8 @@ class ManeuverDesk:
         )
         if busy := self._busy(refused.vehicle, effect):
             return replace(refused, at_s=at_s, reason=busy)
-        taken = replace(
-            refused, status=status, at_s=at_s, reason=reason, effect=effect, is_late=is_late
-        )
+        taken = replace(refused, status=status, at_s=at_s, reason=reason, effect=effect)
+        taken = replace(taken, begins_s=begins_s, is_late=is_late)
         return self._booked(taken, given)
 
     def _busy(self, vehicle: int, effect: Effect) -> str:
