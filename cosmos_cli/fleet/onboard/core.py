@@ -173,7 +173,8 @@ class Rooted:
         """Have root do it, and pass its answer on."""
         process = self._process or self._start()
         assert process.stdin is not None and process.stdout is not None
-        FrameWriter(process.stdin).write(header, body)  # type: ignore[arg-type]
+        with contextlib.suppress(BrokenPipeError):  # nor will there be an answer
+            FrameWriter(process.stdin).write(header, body)  # type: ignore[arg-type]
         reader = FrameReader(process.stdout)  # type: ignore[arg-type]
         while (frame := reader.read()) is not None:
             out.write(*frame)
@@ -209,8 +210,9 @@ class Rooted:
             start_new_session=True,
         )
         assert process.stdin is not None
-        process.stdin.write(self._package)
-        process.stdin.flush()
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.write(self._package)
+            process.stdin.flush()
         assert process.stdout is not None
         if FrameReader(process.stdout).read() is None:  # type: ignore[arg-type]
             raise Refusal("lost", "what runs there as root ended before it began")

@@ -1,6 +1,7 @@
 """What works on a machine changes files whole or not at all, and sees its commands through."""
 
 import errno
+import io
 import os
 import stat
 import time
@@ -32,6 +33,25 @@ def test_lock_is_given_up_within_a_minute_unless_something_else_is_said(tmp_path
     core.lock(Request(arguments={"path": str(tmp_path / "lock")}, body=b""))
 
     assert core.PatientInput.patience_s == 60.0
+
+
+def test_what_worked_as_root_and_was_killed_is_lost_and_not_the_operator(tmp_path, monkeypatch):
+    """A broken pipe to it must not look as if nobody listened any more."""
+    sudo = tmp_path / "sudo"
+    sudo.write_text('#!/bin/sh\nshift\nexec "$@"\n')
+    sudo.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    greets_and_dies = 'echo \'{"ok": true, "body": 0}\''
+    rooted = core.Rooted(["/bin/sh", "-c", greets_and_dies], b"package")
+    out = core.FrameWriter(io.BytesIO())
+
+    for _ in range(2):
+        with pytest.raises(Refusal, match="ended without an answer") as caught:
+            rooted.relay({"verb": "facts"}, b"", out)
+        rooted._process.wait()
+
+    assert caught.value.kind == "lost"
+    rooted.close()
 
 
 def test_new_file_has_the_usual_mode_and_folders_above(tmp_path):
