@@ -261,6 +261,27 @@ def test_the_inequality_is_measured_in_the_agents_own_time():
     assert at.account.inequality_broken == 1
 
 
+def test_a_late_command_that_finds_its_actuator_busy_counts_as_late():
+    at = desk(Vehicle(thruster=Thruster(isp_s=220.0, propellant_kg=20.0, thrust_n=20.0)))
+    at.decide(0, command(13.0), 10.0)
+
+    busy = at.decide(0, command(10.0, number=1), 10.0)
+
+    assert (busy.status, busy.is_late) == ("refused", True)
+    assert "thruster busy" in busy.reason
+    at.measure(busy, None)
+    assert at.account.inequality_broken == 1
+
+
+def test_what_came_late_and_was_limited_says_both():
+    torque = {"kind": "torque", "frame": "body", "duration_s": 1.0}
+
+    taken = desk(RIGID).decide(0, command(10.0, vector=(0.0, 0.2, 0.0), **torque), 10.0)
+
+    assert (taken.status, taken.at_s) == ("postponed", 10.1)
+    assert taken.reason == "0.05 s too late; y: 0.1 N m at most"
+
+
 def test_a_burn_is_to_be_in_truth_when_it_begins():
     slow = Vehicle(thruster=Thruster(isp_s=220.0, propellant_kg=20.0, thrust_n=20.0))
     at, strict = desk(slow), desk(slow, late="refuse")

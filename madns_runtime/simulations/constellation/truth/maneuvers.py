@@ -295,11 +295,13 @@ class ManeuverDesk:
         ready_s = refused.heard_s + rules.settings.propagation_s + rules.settings.network_s
         status: CommandStatus = "accepted"
         is_late = start_s + command.phase_s < ready_s
-        reason = "; ".join(given.limits) if isinstance(given, Turn) else ""
+        refused = replace(refused, begins_s=begins_s, is_late=is_late)
+        reasons = given.limits if isinstance(given, Turn) else ()
         if is_late:
-            reason = f"{ready_s - command.phase_s - start_s:.4g} s too late"
+            late = f"{ready_s - command.phase_s - start_s:.4g} s too late"
             if rules.settings.late == "refuse":
-                return replace(refused, reason=reason, begins_s=begins_s, is_late=True)
+                return replace(refused, reason=late)
+            reasons = (late, *reasons)
             # A whole tick: the first time that flight software could have named itself.
             tick = math.ceil((ready_s - command.phase_s) * rules.tick_hz - 1e-9)
             start_s, status = snap(tick / rules.tick_hz, rules.knot_s), "postponed"
@@ -320,8 +322,8 @@ class ManeuverDesk:
         )
         if busy := self._busy(refused.vehicle, effect):
             return replace(refused, at_s=at_s, reason=busy)
+        reason = "; ".join(reasons)
         taken = replace(refused, status=status, at_s=at_s, reason=reason, effect=effect)
-        taken = replace(taken, begins_s=begins_s, is_late=is_late)
         return self._booked(taken, given)
 
     def _busy(self, vehicle: int, effect: Effect) -> str:
