@@ -14,7 +14,6 @@ import argparse
 import json
 import os
 import resource
-import shutil
 import socket
 import statistics
 import struct
@@ -34,6 +33,11 @@ PACKET = struct.Struct("<Id")
 PACKET_BYTES = 64
 RECEIVE_BUFFER_BYTES = 4 * 1024 * 1024
 FIFO_PRIORITY = 10
+BUDGET_BROKEN = 4
+"""The exit code of a run that missed too many ticks, which is what is measured here."""
+SECONDS_MIN = 4.0
+"""A shorter run is over before its processes were watched."""
+COUNTS = ("due", "missed", "lost")
 ROOT = Path(__file__).parents[1]
 
 
@@ -41,22 +45,32 @@ def main() -> None:
     """Measure every shape and print a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument("--seconds", type=float, default=20.0, help="length of each measurement")
-    parser.add_argument("--shapes", default="24x100,93x100", help="agents x Hz, comma-separated")
+    parser.add_argument(
+        "--shapes", type=shapes, default="24x100,93x100", help="agents x Hz, comma-separated"
+    )
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
     arguments = parser.parse_args()
+    if not arguments.seconds >= SECONDS_MIN:
+        parser.error(f"--seconds: expected at least {SECONDS_MIN:g}, got {arguments.seconds:g}")
     rows = []
-    for shape in arguments.shapes.split(","):
-        agents, hz = (int(part) for part in shape.split("x"))
-        # Bare before and after: the median of the two stands beside ours.
+    for agents, hz in arguments.shapes:
+        # Bare before and after, as long as ours together: the sum of their counts stands beside ours, and
+        # the mean of everything else.
         before = bare_star(agents, hz, arguments.seconds / 2)
         ours = cosmos_star(agents, hz, arguments.seconds)
         after = bare_star(agents, hz, arguments.seconds / 2)
-        bare = {key: statistics.fmean((before[key], after[key])) for key in before}
+        bare = {key: (before[key] + after[key]) / (1 if key in COUNTS else 2) for key in before}
         rows.append({"agents": agents, "hz": hz, "bare": bare, "cosmos": ours})
     if arguments.json:
         print(json.dumps(rows, indent=2))
     else:
         print_table(rows)
+
+
+def shapes(text: str) -> list[tuple[int, int]]:
+    """Return (agents, Hz) of each shape."""
+    pairs = [shape.split("x") for shape in text.split(",")]
+    return [(int(agents), int(hz)) for agents, hz in pairs]
 
 
 def print_table(rows: list[dict]) -> None:
@@ -202,7 +216,12 @@ def cpu_seconds() -> float:
 
 def cosmos_star(agents: int, hz: int, seconds: float) -> dict[str, float]:
     """Run the counter simulation through `cosmos run`; return its figures."""
-    directory = Path(tempfile.mkdtemp(prefix="cosmos-star-"))
+    with tempfile.TemporaryDirectory(prefix="cosmos-star-") as directory:
+        return run_cosmos(Path(directory), agents, hz, seconds)
+
+
+def run_cosmos(directory: Path, agents: int, hz: int, seconds: float) -> dict[str, float]:
+    """Run it in *directory*, and return the figures of what it left there."""
     environment = {**os.environ, "COSMOS_STATE_DIR": str(directory / "state")}
     scenario = directory / "star.yaml"
     scenario.write_text(
@@ -219,6 +238,8 @@ def cosmos_star(agents: int, hz: int, seconds: float) -> dict[str, float]:
     os.environ["COSMOS_STATE_DIR"] = environment["COSMOS_STATE_DIR"]
     cpu, pss = watch(run, seconds)
     output = run.communicate(timeout=120)[0]
+    if run.returncode not in (0, BUDGET_BROKEN):
+        raise SystemExit(f"cosmos run ended with exit code {run.returncode}: no figures")
     result = json.loads(output)
     evidence = directory / "runs" / result["run"]
     ticks = [np.array(read_records(p)) for p in evidence.glob("agents/*/ticks.jsonl")]
@@ -226,7 +247,6 @@ def cosmos_star(agents: int, hz: int, seconds: float) -> dict[str, float]:
     lateness = np.concatenate([t[:, 1] for t in ticks])
     round_trips = np.concatenate([t[:, 2] for t in trips])
     recorded = sum(p.stat().st_size for p in evidence.glob("agents/**/*.jsonl"))
-    shutil.rmtree(directory)
     return {
         "rtt_p50_us": float(np.percentile(round_trips, 50)),
         "rtt_p99_us": float(np.percentile(round_trips, 99)),
@@ -256,10 +276,10 @@ def watch(run: subprocess.Popen, seconds: float) -> tuple[dict[str, float], floa
         if "host" in roles and "agent" in roles:
             break
         time.sleep(0.2)
-    time.sleep(2.0 + 0.1 * seconds)
+    time.sleep(1.0 + 0.1 * seconds)
     processes = list_processes()
     first, began_s = {p.pid: process_cpu_s(p.pid) for p in processes}, time.monotonic()
-    time.sleep(0.6 * seconds)
+    time.sleep(0.5 * seconds)
     spent_s = time.monotonic() - began_s
     cpu = {"host": 0.0, "agent": 0.0}
     for process in processes:
