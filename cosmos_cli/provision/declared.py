@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
-from cosmos_cli.fleet.onboard.files import MODE_DEFAULT, edited
+from cosmos_cli.fleet.onboard.files import MISSING_FILE_ADVICE, MODE_DEFAULT, edited
 from cosmos_cli.models.provision_steps import Command, FileContent, LineInFile, Service
 from cosmos_cli.provision.facts import Facts, FileFact, condition_key
 from cosmos_cli.provision.packages import package_step
@@ -156,9 +156,7 @@ def _line(declared: Declared, facts: Facts, sketch: Sketch) -> Iterator[Step]:
         return
     if before.kind == "missing" and not (action.create or sketch.may_bring_files):
         text = f"line in {path}: there is no such file on this machine"
-        raise MachineFailure(
-            FailureKind.STEP, text, "correct the path, or say create: true in cosmos_provision"
-        )
+        raise MachineFailure(FailureKind.STEP, text, MISSING_FILE_ADVICE)
     if before.kind != "missing" and before.text is None:
         text = f"line in {path}: the file cannot be read, or it is too long to be edited"
         raise MachineFailure(FailureKind.STEP, text)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 MODE_DEFAULT = 0o644
 FOLDER_MODE_DEFAULT = 0o755
+MISSING_FILE_ADVICE = "correct the path, or say create: true in cosmos_provision"
 KINDS = {stat.S_IFREG: "file", stat.S_IFDIR: "directory"}
 
 
@@ -246,7 +247,8 @@ def edit_line(request: Request) -> bool:
             before = file.read().decode(errors="surrogateescape")
     except FileNotFoundError:
         if not arguments.get("create"):
-            raise
+            text = f"{path}: there is no such file on this machine"
+            raise Refusal("step", text, MISSING_FILE_ADVICE) from None
         before = ""
     after = edited(
         before,

@@ -104,6 +104,22 @@ def test_contradicting_steps_are_at_least_carried_out_in_order(place):
     assert (place / "made/a.conf").stat().st_mode & 0o777 == 0o600
 
 
+def test_line_finds_the_file_that_a_command_before_makes_and_says_when_it_does_not(place):
+    made = place / "made"
+    command = {"become": False, "command": {"run": f"echo a > {made}/a", "creates": f"{made}/a"}}
+    lines = [
+        {"become": False, "line": {"path": f"{made}/{name}", "line": "x"}} for name in ("a", "b")
+    ]
+
+    brought = up(connection_to(place / "cosmos"), machine_at(place, provision=(command, *lines)))
+
+    assert (made / "a").read_text() == "a\nx\n"
+    assert brought.failure.text == (
+        f"line in {made}/b: add x: {made}/b: there is no such file on this machine"
+    )
+    assert "create: true" in brought.failure.advice
+
+
 def test_failing_command_ends_the_plan_and_keeps_what_was_done(place):
     made = place / "made"
     provision = (
