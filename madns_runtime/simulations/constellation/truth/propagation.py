@@ -181,11 +181,8 @@ def propagate(
     if 0 in shape:
         return np.empty(shape)
     is_down = is_inside_earth(states)
-    flown = states
-    if is_down.any():
-        # Something flies in the place of a wreck, whose own way would lead to the Earth's centre.
-        flown = states.copy()
-        flown[is_down] = states[~is_down][0] if not is_down.all() else _ANY_ORBIT
+    # Something flies in the place of a wreck, whose own way would lead to the Earth's centre.
+    flown = np.where(is_down[:, None], _ANY_ORBIT, states) if is_down.any() else states
     found = load_propagator(parameters.settings.kind).propagate(flown, t0_s, knots_s, parameters)
     _check_result(found, shape, knots_s, parameters)
     inside = is_inside_earth(found)
