@@ -24,8 +24,8 @@ SLOTS_MAX = 32
 SLOT_S_FIRST = 0.25
 SLOT_S_MAX = 2.0
 """Slots double in length as the window fills, up to a window of 64 s: drift of crystals moves in minutes."""
-DRIFT_MAX = 200e-6
-"""Two free crystals differ by less than 200 ppm."""
+DRIFT_MAX = 700e-6
+"""Two free crystals differ by less than 200 ppm, and a time service slews the monotonic clock too, by up to 500 ppm."""
 DRIFT_PRIOR = 100e-6
 """Standard deviation of the drift before anything is known."""
 DRIFT_WANDER = 1e-6
