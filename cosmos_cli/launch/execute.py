@@ -194,7 +194,7 @@ def _execute(
             return _finish(prepared, outcome, options, view=view)
         except KeyboardInterrupt:
             raise CollectionInterrupted(
-                f"interrupted while collecting; the records are on disk, judge and package them with:"
+                "interrupted while collecting; what was recorded is kept, here or where it was; go on with:"
                 f" cosmos collect {run.path}"
             ) from None
         finally:
