@@ -46,8 +46,9 @@ def read_launch(fd: int) -> tuple[dict[str, Any], bytes]:
         ConfigurationError: It did not come in time, is cut, or is no JSON object.
     """
     deadline_s = time.monotonic() + LAUNCH_TIMEOUT_S
-    data = b""
-    while b"\n" not in data:
+    parts: list[bytes] = []
+    size = 0
+    while not parts or b"\n" not in parts[-1]:
         left_s = deadline_s - time.monotonic()
         if left_s <= 0 or not select.select([fd], [], [], left_s)[0]:
             raise ConfigurationError(
@@ -55,12 +56,13 @@ def read_launch(fd: int) -> tuple[dict[str, Any], bytes]:
                 " `cosmos run`, which writes it to standard input"
             )
         chunk = os.read(fd, READ_BYTES)
-        if not chunk or len(data) > LINE_BYTES_MAX:
+        size += len(chunk)
+        if not chunk or size > LINE_BYTES_MAX:
             raise ConfigurationError(
                 "the launch document on standard input is empty, cut or too long"
             )
-        data += chunk
-    line, rest = data.split(b"\n", 1)
+        parts.append(chunk)
+    line, rest = b"".join(parts).split(b"\n", 1)
     try:
         document = orjson.loads(line)
     except orjson.JSONDecodeError as error:

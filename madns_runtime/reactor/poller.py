@@ -15,6 +15,10 @@ from madns_runtime.reactor import libc
 EVENTS_MAX = 64
 """Descriptors reported by one wait; the others come with the next."""
 NANOSECONDS = 1_000_000_000
+FAR_S = 1e9
+"""A time of the monotonic clock beyond this, thirty years after the start of the machine, is never."""
+WAIT_S_MAX = 86_400.0
+"""The portable poller looks up at least this often: its platform may not take longer timeouts."""
 
 
 class Poller(Protocol):
@@ -59,9 +63,9 @@ class TimerFd:
         self._when = libc.Itimerspec()
 
     def set(self, when_s: float) -> None:
-        """Let the descriptor become readable at *when_s*; infinite for never."""
+        """Let the descriptor become readable at *when_s*; beyond FAR_S for never."""
         # Zero would disarm the timer, so a time before the clock's beginning is its first moment.
-        when_ns = 0 if when_s == math.inf else max(1, math.ceil(when_s * NANOSECONDS))
+        when_ns = 0 if when_s > FAR_S else max(1, math.ceil(when_s * NANOSECONDS))
         if self._settime_ns is not None:
             self._settime_ns(self.fd, flags=libc.TFD_TIMER_ABSTIME, initial=when_ns)
             return
@@ -140,7 +144,7 @@ class SelectorPoller:
 
     def wait(self, until_s: float) -> list[int]:
         """Wait for descriptors until *until_s*; see `Poller`."""
-        timeout_s = None if until_s == math.inf else max(0.0, until_s - time.monotonic())
+        timeout_s = min(max(0.0, until_s - time.monotonic()), WAIT_S_MAX)
         return [key.fd for key, _ in self._selector.select(timeout_s)[:EVENTS_MAX]]
 
     def close(self) -> None:

@@ -71,6 +71,20 @@ def test_timer_of_the_past_runs_at_once(reactor):
     assert ran == ["past"]
 
 
+@pytest.mark.parametrize("portable", [False, True])
+@pytest.mark.parametrize("when_s", [1e10, 1e19, 1e300, float("inf")])
+def test_timer_beyond_what_the_kernel_knows_is_never_and_harms_no_other(portable, when_s):
+    reactor = Reactor(portable=portable)
+    ran = []
+    reactor.call_at(when_s, lambda: ran.append("far"))
+    threading.Timer(0.02, lambda: reactor.call_soon_threadsafe(reactor.stop)).start()
+
+    reactor.run()
+
+    assert ran == []
+    reactor.close()
+
+
 def test_periodic_timer_keeps_its_absolute_deadlines(reactor):
     start_s = reactor.now_s()
     deadlines = []
