@@ -16,6 +16,8 @@ SHORTENED = [
     (["pi8", "pi9", "pi10"], "pi[8:10]"),
     (["pi098", "pi099", "pi100"], "pi[098:100]"),
     (["pi08", "pi09", "pi010", "pi10", "pi11"], "pi08, pi09, pi010, pi10, pi11"),
+    (["pi97", "pi98", "pi099", "pi100"], "pi97, pi98, pi099, pi100"),
+    ([f"pi{n:02d}" for n in range(1, 102)], "pi[01:99], pi100, pi101"),
     (["rack1-pi1.lab", "rack1-pi2.lab", "rack1-pi3.lab"], "rack1-pi[1:3].lab"),
     (["rack2-pi1", "rack1-pi2", "rack1-pi3"], "rack1-pi2, rack1-pi3, rack2-pi1"),
     (["pi01", "pi01", "pi02", "pi03"], "pi[01:03]"),

@@ -230,6 +230,12 @@ def test_interrupted_command_says_so_to_people_and_to_scripts(inventory, argumen
     assert talk == b"interrupted\n"
 
 
+def test_host_that_is_no_machine_of_the_inventory_is_bad_input(inventory, capsys):
+    assert run(["up", "-i", inventory(), "-l", "pi1,pi2", "--host", "pi9"]) == 2
+
+    assert "--host pi9: expected one of the machines pi1, pi2" in capsys.readouterr().err
+
+
 def test_exec_as_root_where_the_inventory_forbids_it_is_refused(inventory, capsys, servers):
     file = inventory(tame=entry(servers[0], ansible_become=False))
 
