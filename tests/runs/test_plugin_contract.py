@@ -37,7 +37,9 @@ class H(HostSimulation):
             return None
         if self.evil == "timer":
             return float("nan")
-        if self.evil == "deadline":
+        if self.evil == "best_deadline" and t_s >= 0:
+            self.context.send("agent-01", 1, Service.BEST, deadline_s=t_s + 1.0)
+        if self.evil in ("deadline", "best_deadline"):
             for agent in self.context.agents:
                 self.context.send(agent, "late", Service.SYNC, deadline_s=t_s - 1.0)
             return t_s + 0.2
@@ -76,25 +78,33 @@ deadline: {max_miss_ratio: 1}
 """
 
 
-@pytest.mark.parametrize(
-    ("evil", "code", "who", "expected"),
-    [
-        ("initial_data", 1, "host", "H.initial_data returned a set: expected a mapping"),
-        ("timer", 1, "host", "H.timer returned nan: expected a simulated time"),
-        ("host_finish", 1, "host", "H.finish returned None: expected a mapping; is a return"),
-        ("agent_finish", 1, "agent-0", "A.finish returned a summary without a JSON form"),
-        ("exit", 1, "agent-01", "its process ended by itself, exit code 0"),
-        ("text", 1, "agent-0", "A.step raised ValueError: \\udcffxxx"),
-        ("service", 1, "agent-0", "expected a Service, such as Service.RELIABLE, got 'SYNC'"),
-    ],
-)
-def test_the_verdict_names_the_call(tmp_path, evil, code, who, expected):
-    result = run(tmp_path, evil)
+FAULTS = [
+    ("initial_data", "host", "H.initial_data returned a set: expected a mapping"),
+    ("timer", "host", "H.timer returned nan: expected a simulated time"),
+    ("host_finish", "host", "H.finish returned None: expected a mapping; is a return"),
+    ("agent_finish", "agent-0", "A.finish returned a summary without a JSON form"),
+    ("text", "agent-0", "A.step raised ValueError: \\udcffxxx"),
+    ("service", "agent-0", "expected a Service, such as Service.RELIABLE, got 'SYNC'"),
+    ("best_deadline", "host", "deadline_s goes with Service.SYNC, not with <Service.BEST"),
+]
 
-    assert result["exit_code"] == code
+
+@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+@pytest.mark.parametrize(("evil", "who", "expected"), FAULTS, ids=[fault[0] for fault in FAULTS])
+def test_the_verdict_names_the_call_in_both_modes(tmp_path, evil, who, expected, mode):
+    result = run(tmp_path, evil, f"time.mode={mode}")
+
+    assert result["exit_code"] == 1
     assert result["who"].startswith(who)
     assert expected in result["reason"]
     assert len(result["reason"]) < 3000
+
+
+def test_an_agent_that_ends_its_process_is_named(tmp_path):
+    result = run(tmp_path, "exit")
+
+    assert (result["exit_code"], result["who"]) == (1, "agent-01")
+    assert "its process ended by itself, exit code 0" in result["reason"]
 
 
 def test_broken_sync_deadline_breaks_its_check(tmp_path):
