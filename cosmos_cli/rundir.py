@@ -22,7 +22,7 @@ from typing import Any
 
 import orjson
 
-from cosmos_cli.errors import InputError
+from cosmos_cli.errors import InputError, RunFailedError
 from cosmos_cli.runindex import remember_run, remembered_runs
 from madns_runtime.config import RunConfig, from_mapping, to_mapping
 from madns_runtime.errors import ConfigurationError
@@ -266,8 +266,12 @@ def alone(run: RunDirectory) -> Iterator[None]:
 
     Raises:
         InputError: Another one is at it.
+        RunFailedError: Somebody deleted the run.
     """
-    descriptor = os.open(run.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        descriptor = os.open(run.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise RunFailedError(f"{run.path}: {error.strerror}; was the run deleted?") from error
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

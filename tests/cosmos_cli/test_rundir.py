@@ -9,9 +9,10 @@ import pytest
 from registered import registered
 from synthetic_run import make_config
 
-from cosmos_cli.errors import InputError
+from cosmos_cli.errors import InputError, RunFailedError
 from cosmos_cli.rundir import (
     RESERVE_BYTES,
+    alone,
     begin_run,
     create_run,
     find_run,
@@ -110,6 +111,14 @@ def test_folder_that_is_no_run_is_refused_and_one_that_lost_something_is_not(tmp
     assert find_run(tmp_path, str(run.path)) == run
     with pytest.raises(InputError, match="no run directory"):
         find_run(tmp_path, str(tmp_path / "photos"))
+
+
+def test_run_that_was_deleted_before_its_end_is_told_in_words(tmp_path):
+    run = create_run(tmp_path, "x")
+    shutil.rmtree(run.path)
+
+    with pytest.raises(RunFailedError, match="was the run deleted"), alone(run):
+        pass
 
 
 def test_unwritable_root_says_which_option_helps(tmp_path):
