@@ -17,7 +17,7 @@ LONGEST_S = 60.0
 
 
 class RoughWorld(World):
-    """A wire that repeats and reorders, with times at which it carries nothing."""
+    """A wire that repeats and reorders, with times at which it carries nothing; in some runs for good."""
 
     def __init__(self, names, seed):
         chance = random.Random(seed)
@@ -75,7 +75,7 @@ class RoughWorld(World):
             session.send(number, service, self.now_s)
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(24))
 def test_every_run_ends_on_both_sides_and_takes_no_message_twice(seed):
     w = RoughWorld(tuple(f"agent-{i}" for i in range(1, 2 + seed % 4)), seed)
     for name in w.names:
@@ -84,12 +84,16 @@ def test_every_run_ends_on_both_sides_and_takes_no_message_twice(seed):
         else:
             w.joins.append((w.now_s + 8 * w.chance.random(), name))
     end_s = w.now_s + LONGEST_S
+    dies_s = w.now_s + (20 * w.chance.random() ** 2 if seed % 2 else LONGEST_S)
 
     number = 0
     while w.host.state is not HostState.EXIT and w.now_s < end_s:
-        w.disturb()
-        number += 1
-        w.talk(number)
+        if w.now_s < dies_s:
+            w.disturb()
+            number += 1
+            w.talk(number)
+        else:
+            w.dead_until_s = end_s + LONGEST_S  # nobody hears of anybody any more
         w.run_for(0.02)
     assert w.host.state is HostState.EXIT
     w.frozen.clear()

@@ -331,3 +331,20 @@ def test_timer_of_an_agent_that_takes_long_to_close_its_records_does_not_stand_s
         session.handle_timer(w.now_s)
         session.datagrams_to_send(w.now_s)
         assert session.get_timer() > w.now_s
+
+
+def test_process_that_another_replaced_does_not_come_back():
+    w = world(count=2, policy="continue")
+    w.run_for(1.5)
+    first = w.agents["agent-1"]
+    w.join("agent-1")
+    w.run_for(1.0)
+    assert w.host.peers["agent-1"].phase is Phase.RUNNING
+
+    first.handle_timer(w.now_s)
+    for data in first.datagrams_to_send(w.now_s):
+        w.host.receive_datagram(data, ("agent-1",), w.now_s)
+
+    assert w.host.refused["old_incarnation"] > 0
+    assert w.host.peers["agent-1"].phase is Phase.RUNNING
+    assert len(w.host.peers["agent-1"].retired_counters) == 1
