@@ -17,7 +17,6 @@ from struct import Struct
 from typing import Final, NamedTuple
 
 from madns_runtime.protocol.counters import ClassCounters
-from madns_runtime.protocol.deadlines import BrokenDeadline as BrokenDeadline
 from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.seal import PAYLOAD_BYTES_MAX
 

@@ -146,7 +146,7 @@ class Peer:
     """Of all processes that spoke for it; the link's is the present one."""
     heard_s: float = 0.0
     pings: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=PINGS_MAX))
-    """Pings not answered yet: the agent's time, and when it came."""
+    """Pings not answered yet: the agent's time, and when it came. Older ones give way: they would tell less of its clock."""
     timer_s: float = float("inf")
     loss_reason: str | None = None
     report: Mapping[str, Any] = field(default_factory=dict)
