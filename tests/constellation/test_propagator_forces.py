@@ -8,6 +8,12 @@ import numpy as np
 import pytest
 from sgp4 import earth_gravity
 
+from madns_runtime.simulations.constellation.orbit.atmosphere import (
+    BASES,
+    SCALE_HEIGHTS_M,
+    density_kg_m3,
+    height_m,
+)
 from madns_runtime.simulations.constellation.orbit.constants import (
     EARTH_FLATTENING,
     EARTH_RATE_RAD_S,
@@ -24,12 +30,6 @@ from madns_runtime.simulations.constellation.orbit.invariants import (
     specific_energy,
 )
 from madns_runtime.simulations.constellation.parameters import NumbaPropagator, ScipyPropagator
-from madns_runtime.simulations.constellation.orbit.atmosphere import (
-    BASES,
-    SCALE_HEIGHTS_M,
-    density_kg_m3,
-    height_m,
-)
 from madns_runtime.simulations.constellation.truth.forces import (
     FORCES,
     acceleration_of,

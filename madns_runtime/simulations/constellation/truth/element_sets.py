@@ -15,7 +15,7 @@ import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import MAXYEAR, UTC, datetime, timedelta
 from pathlib import Path
 
 from madns_runtime.errors import ConfigurationError
@@ -297,6 +297,6 @@ def _omm_epoch(text: str) -> datetime | None:
         epoch = datetime.fromisoformat(text.strip().removesuffix("Z"))
     except ValueError:
         return None
-    if epoch.tzinfo is not None or not FIRST_YEAR <= epoch.year < datetime.max.year:
+    if epoch.tzinfo is not None or not FIRST_YEAR <= epoch.year < MAXYEAR:
         return None
     return epoch.replace(tzinfo=UTC)
