@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
 
 pytest_plugins = ["tower.fixtures"]  # of tests/tower; costs nothing where no test asks for a tower
 
+# A shell's background jobs ignore Ctrl-C, and so would every command that a test interrupts.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SLOW_FIRST = ("runs", "faults", "cosmos_cli", "fleet", "tower", "docs", "lockstep")
 """Folders whose tests start processes: begun first, so that none of them runs on alone at the end."""

@@ -76,7 +76,9 @@ def look(
 
 
 def several(board: Board, calls: Sequence[Mapping[str, Any]]) -> list[Answer]:
-    """Ask several things in one frame."""
+    """Ask several things in one frame; nothing is asked where there is nothing to ask."""
+    if not calls:
+        return []
     timeout_s = LOOK_TIMEOUT_S * len(calls)
     answers: list[Answer] = board.call("several", {"calls": list(calls)}, timeout_s=timeout_s).value
     return answers

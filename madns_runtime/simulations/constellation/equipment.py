@@ -128,6 +128,9 @@ class Sensors:
     clock: SensorNoise | None = None
     """Time since the epoch, s."""
 
+BallisticCoefficient = Annotated[float, Ge(0), Le(100)]
+"""m^2/kg, from nothing to a foil of 20 g/m^2; of more no integrator could follow the end."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vehicle:
@@ -139,9 +142,9 @@ class Vehicle:
     """Globs of agents' or satellites' names; a vehicle is described by the first entry that fits."""
     mass_kg: Annotated[float, Gt(0)] = 100.0
     """Mass at the epoch, propellant included, kg."""
-    ballistic_m2_kg: Annotated[float, Ge(0)] = 0.01
+    ballistic_m2_kg: BallisticCoefficient = 0.01
     """Ballistic coefficient Cd A / m, m^2/kg: what drag acts on."""
-    ballistic_m2_kg_range: tuple[float, float] | None = None
+    ballistic_m2_kg_range: tuple[BallisticCoefficient, BallisticCoefficient] | None = None
     """Smallest and largest one that flight software may command by turning the vehicle; none for neither."""
     thruster: Thruster | None = None
     """None: no delta-v is executed."""
