@@ -128,6 +128,7 @@ class Sensors:
     clock: SensorNoise | None = None
     """Time since the epoch, s."""
 
+
 BallisticCoefficient = Annotated[float, Ge(0), Le(100)]
 """m^2/kg, from nothing to a foil of 20 g/m^2; of more no integrator could follow the end."""
 
