@@ -186,20 +186,25 @@ def test_workers_with_another_version_are_refused(cluster, monkeypatch):
         connected(cluster)
 
 
+CLUSTER = """\
+import sys
+from distributed import LocalCluster
+local = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "protocol": "tcp"}
+with LocalCluster(n_workers=1, processes=False, threads_per_worker=1, **local) as cluster:
+    print(cluster.scheduler_address, flush=True)
+    sys.stdin.read()
+"""
+
+
 def test_jobs_of_a_lost_scheduler_fail_instead_of_never_coming_back(monkeypatch):
     monkeypatch.setattr(dask_executor, "CONNECT_S", 1.0)
-    lost = distributed.LocalCluster(
-        n_workers=1,
-        processes=False,
-        threads_per_worker=1,
-        dashboard_address="127.0.0.1:0",
-        host="127.0.0.1",
-        protocol="tcp",
-    )
-    with lost:
-        executor = connected(lost)
-        job = executor.submit(time.sleep, 2.0)
-        lost.close(timeout=1.0)
+    with subprocess.Popen(
+        [sys.executable, "-c", CLUSTER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as cluster:
+        address = cluster.stdout.readline().strip()
+        executor = make_executor(ExecutorSettings(kind="dask", address=address))
+        job = executor.submit(time.sleep, PATIENCE_S)
+        cluster.kill()
 
         with pytest.raises((MachineError, OSError)):
             job.result(PATIENCE_S)

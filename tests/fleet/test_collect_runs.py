@@ -134,7 +134,7 @@ def test_board_whose_card_fails_during_a_run_is_named_and_keeps_what_it_has(oper
 def test_run_that_lost_the_power_of_everything_is_collected_afterwards(operator):
     process = operator.start("power", 60)
     time.sleep(3.0)
-    boots = operator.tower.state()["boards"]["pi01"]["boots"]
+    boots = {name: board["boots"] for name, board in operator.tower.state()["boards"].items()}
     own = [entry["pid"] for entry in operator.living() if entry["role"] in ("operator", "host")]
     assert process.pid in own
     for name in ("pi01", "pi02"):
@@ -144,7 +144,7 @@ def test_run_that_lost_the_power_of_everything_is_collected_afterwards(operator)
         os.kill(pid, signal.SIGKILL)
     process.communicate(timeout=PATIENCE_S)
     for name in ("pi01", "pi02"):
-        operator.tower.wait_until_on(name, boots=boots + 1)
+        operator.tower.wait_until_on(name, boots=boots[name] + 1)
     assert operator.document()["status"] == "running"
 
     done = operator.cosmos("collect")
