@@ -1,25 +1,60 @@
 # One command from a clone to a judged run, one to a tested checkout.
 PYTHON ?= python3
 VENV ?= .venv
+RUNNABLE = $(VENV)/.runnable
 READY = $(VENV)/.ready
+MEASURED = tests/protocol tests/timing
+QUICK = not process and not root and not browser and not nightly and not slow
+PIP = $(VENV)/bin/python -m pip install --quiet
 
-.PHONY: demo test check clean
+# One setting of Python's in an environment would let every process of a test compile all anew.
+unexport PYTHONDONTWRITEBYTECODE
 
-demo: $(READY)  ## Run ten real Iridium satellites on ten loopback agents.
+.PHONY: demo test lint measured unmeasured check clean
+
+demo: $(RUNNABLE)  ## Run ten real Iridium satellites on ten loopback agents.
 	$(VENV)/bin/cosmos run scenarios/iridium10.yaml
 
-test: $(READY)  ## Lint, types, import contracts and every test.
+test: $(READY)  ## Lint, types, import contracts and every test but those of `.ci/nightly`.
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint measured unmeasured
+	$(VENV)/bin/python -m pytest --numprocesses 4 --dist loadfile --no-loadscope-reorder --durations=25 $(addprefix --ignore=,$(MEASURED))
+
+lint: $(READY)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
-	$(VENV)/bin/python -m pytest --numprocesses 3 --dist loadfile --no-loadscope-reorder --durations=25 --cov=madns_runtime.protocol --cov=madns_runtime.timing --cov-branch --cov-fail-under=95
 
-$(READY): pyproject.toml
+# Coverage quadruples what these tests compute and adds half to all others, which it needs none of.
+measured: $(READY)
+	$(VENV)/bin/python -m pytest --numprocesses 2 --dist worksteal $(MEASURED) -m "not nightly and not slow" --cov=madns_runtime.protocol --cov=madns_runtime.timing --cov-branch --cov-fail-under=95
+
+# Chance of many seeds reaches no line that the others do not: what computes for long is worth its time alone.
+unmeasured: $(READY)
+	$(VENV)/bin/python -m pytest --numprocesses 2 --dist worksteal $(MEASURED) -m "slow and not nightly"
+
+check: $(READY)  ## Lint, types, import contracts and the tests that start nothing and compute little.
+	@$(VENV)/bin/ruff check --quiet .
+	@$(VENV)/bin/ruff format --quiet --check .
+	@$(VENV)/bin/mypy >$(VENV)/types.txt 2>&1 & types=$$!; \
+	$(VENV)/bin/lint-imports >$(VENV)/contracts.txt 2>&1 & contracts=$$!; \
+	$(VENV)/bin/python -m pytest --quiet --numprocesses 2 --dist worksteal -m "$(QUICK)"; failed=$$?; \
+	wait $$types || { failed=1; cat $(VENV)/types.txt; }; \
+	wait $$contracts || { failed=1; cat $(VENV)/contracts.txt; }; \
+	exit $$failed
+
+# What running needs. Compiled Python is left to the first start: four fifths of it would never be read.
+$(RUNNABLE): pyproject.toml
+	@MAKECMDGOALS="$(MAKECMDGOALS)" .ci/prerequisites $(PYTHON)
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/python -m pip install --quiet --upgrade pip
-	$(VENV)/bin/python -m pip install --quiet --editable '.[dev]'
-	touch $(READY)
+	$(PIP) --upgrade pip
+	$(PIP) --no-compile --editable '.[host]'
+	touch $@
+
+# What its development needs, beside it.
+$(READY): $(RUNNABLE)
+	$(PIP) --editable '.[dev]'
+	touch $@
 
 clean:
 	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -4,18 +4,23 @@ A fleet made ready, spoken to and collected from: cosmos beside pyinfra and Ansi
     python benchmarks/fleet.py [--boards 10,24] [--rounds 3] [--rivals pyinfra,ansible] [--json]
 
 Needs root on Linux: the boards are those of tests/tower, with a real OpenSSH server each. Every
-contender starts from bare boards of its own and does the same job: folders, some hundred files of
-code, a virtual environment from wheels without internet, a first start of what is in it. It does that
-again, runs a command on all boards, and fetches what they recorded. See benchmarks/rivals.py for what
-the others are given. cosmos brings along all it needs, checks the content of every file, and has each
-board send a datagram here and back. Its `fetch` verifies and clears up: it is the time of `collect` less
-that of a second one, which judges, reports and packages alike but has nothing to fetch.
+contender starts from bare boards of its own and does the same job: code and wheels to the boards, a virtual
+environment without internet, a first start of what is in it. It does that again with nothing changed, runs a
+command on all boards, and fetches what they recorded. See benchmarks/rivals.py for how the others do it.
+Shown are seconds and, in parentheses, seconds of processor time, of the operator's programs and of the
+boards' together: both stand on the same processors here.
+
+cosmos brings along all it needs, checks the content of every file, and has each board send a datagram here
+and back. Its `fetch` verifies and clears up: it is the time of `collect` less that of a second one, which
+judges, reports and packages alike but has nothing to fetch.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
+import resource
 import shutil
 import statistics
 import subprocess
@@ -47,6 +52,20 @@ RUN_S = 10.0
 RECORDS = "/home/pi/records"
 
 
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Cost:
+    """What one job took: time on the clock and time of processors, s."""
+
+    wall_s: float
+    cpu_s: float
+
+    def less(self, other: Cost) -> Cost:
+        """Return what is left of it without *other*, never below 0."""
+        return Cost(
+            wall_s=max(0.0, self.wall_s - other.wall_s), cpu_s=max(0.0, self.cpu_s - other.cpu_s)
+        )
+
+
 def main() -> None:
     """Measure every fleet and print a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
@@ -58,73 +77,97 @@ def main() -> None:
     cache = cache_folder()
     rivals = [name for name in arguments.rivals.split(",") if name]
     programs = install_rivals(cache) if rivals else cache
-    times: dict[int, dict[str, dict[str, list[float]]]] = {}
+    costs: dict[int, dict[str, dict[str, list[Cost]]]] = {}
     for count in map(int, arguments.boards.split(",")):
-        fleet = times.setdefault(count, {})
+        fleet = costs.setdefault(count, {})
         for number in range(arguments.rounds):
             # Another order each round, so that what else the machine does hits everybody.
             names = [COSMOS, *rivals]
             for name in names[number % len(names) :] + names[: number % len(names)]:
                 figures = fleet.setdefault(name, {})
-                for job, seconds in measure(name, count, programs):
-                    figures.setdefault(job, []).append(seconds)
-                    print(f"{count} boards: {name}: {job}: {seconds:.2f} s", file=sys.stderr)
-    print(json.dumps(times, indent=2) if arguments.json else table(times))
+                for job, cost in measure(name, count, programs):
+                    figures.setdefault(job, []).append(cost)
+                    text = f"{cost.wall_s:.2f} s ({cost.cpu_s:.2f} s of processors)"
+                    print(f"{count} boards: {name}: {job}: {text}", file=sys.stderr)
+    print(
+        json.dumps(costs, indent=2, default=dataclasses.asdict) if arguments.json else table(costs)
+    )
 
 
-def table(times: dict[int, dict[str, dict[str, list[float]]]]) -> str:
-    """Return the medians, and how many times longer the others take."""
+def table(costs: dict[int, dict[str, dict[str, list[Cost]]]]) -> str:
+    """Return the medians, and how many times longer the others take on the clock and of processors."""
     lines = []
-    for count, fleet in times.items():
-        lines.append(f"\n{count} boards, s (times cosmos)")
-        lines.append(f"  {'':12}" + "".join(f"{name:>20}" for name in fleet))
+    for count, fleet in costs.items():
+        lines.append(f"\n{count} boards: s (s of processors), times cosmos")
+        lines.append(f"  {'':12}" + "".join(f"{name:>28}" for name in fleet))
         for job in (*JOBS, COLLECT):
-            own = statistics.median(fleet[COSMOS][job])
+            own = median(fleet[COSMOS][job])
             cells = []
-            for figures in fleet.values():
+            for name, figures in fleet.items():
                 if job not in figures:
                     continue
-                median = statistics.median(figures[job])
-                cells.append(f"{median:.2f} ({median / own:.1f}x)")
-            lines.append(f"  {job:12}" + "".join(f"{cell:>20}" for cell in cells))
+                cost = median(figures[job])
+                cell = f"{cost.wall_s:.2f} ({cost.cpu_s:.2f})"
+                if name != COSMOS:
+                    cell += f" {cost.wall_s / own.wall_s:.2f}x ({cost.cpu_s / own.cpu_s:.2f}x)"
+                cells.append(cell)
+            lines.append(f"  {job:12}" + "".join(f"{cell:>28}" for cell in cells))
     return "\n".join(lines)
 
 
-def measure(name: str, count: int, programs: Path) -> Iterator[tuple[str, float]]:
-    """Yield each job's name and time, s, on a tower of its own."""
+def median(costs: list[Cost]) -> Cost:
+    """Return the medians of both times, each by itself."""
+    return Cost(
+        wall_s=statistics.median(cost.wall_s for cost in costs),
+        cpu_s=statistics.median(cost.cpu_s for cost in costs),
+    )
+
+
+def measure(name: str, count: int, programs: Path) -> Iterator[tuple[str, Cost]]:
+    """Yield each job's name and cost on a tower of its own."""
     with tempfile.TemporaryDirectory(prefix="cosmos-fleet-") as folder, Tower(count=count) as tower:
         cosmos = Cosmos(tower, Path(folder))
         if name == COSMOS:
             cosmos.warm_up()
-            yield JOBS[0], timed(cosmos.up)
-            yield JOBS[1], timed(cosmos.up)
-            yield JOBS[2], timed(cosmos.exec)
+            yield JOBS[0], spent(tower, cosmos.up)
+            yield JOBS[1], spent(tower, cosmos.up)
+            yield JOBS[2], spent(tower, cosmos.exec)
             cosmos.record()
-            whole_s, again_s = timed(cosmos.collect), timed(cosmos.judge_again)
-            yield JOBS[3], max(0.0, whole_s - again_s)
-            yield COLLECT, whole_s
+            whole, again = spent(tower, cosmos.collect), spent(tower, cosmos.judge_again)
+            yield JOBS[3], whole.less(again)
+            yield COLLECT, whole
             return
         contender = RIVALS[name](make_job(cosmos), programs)
         put_uv_on_boards(tower)
-        yield JOBS[0], timed(contender.up)
-        yield JOBS[1], timed(contender.up)
-        yield JOBS[2], timed(contender.exec)
+        yield JOBS[0], spent(tower, contender.up)
+        yield JOBS[1], spent(tower, contender.up)
+        yield JOBS[2], spent(tower, contender.exec)
         # All fetch records of the same run, which only cosmos can make.
         cosmos.up()
         cosmos.record()
         names = cosmos.lay_out_records()
         fetched = cosmos.folder / "fetched"
-        yield JOBS[3], timed(lambda: contender.collect(names, fetched))
+        fetched.mkdir()
+        yield JOBS[3], spent(tower, lambda: contender.collect(fetched))
         found = sum(path.is_file() for path in fetched.rglob("*"))
         if found != count * len(names):
             raise SystemExit(f"{name} fetched {found} files of {count * len(names)}")
 
 
-def timed(act: Callable[[], None]) -> float:
-    """Return how long it took, s."""
-    start_s = time.perf_counter()
+def spent(tower: Tower, act: Callable[[], None]) -> Cost:
+    """Return what an act cost: on the clock, and of processors here and on the boards."""
+    start_s, start_cpu_s = time.perf_counter(), processors_s(tower)
     act()
-    return time.perf_counter() - start_s
+    return Cost(
+        wall_s=time.perf_counter() - start_s, cpu_s=max(0.0, processors_s(tower) - start_cpu_s)
+    )
+
+
+def processors_s(tower: Tower) -> float:
+    """Return the processor time, s, of all programs that ended here and of all that ran on the boards."""
+    here = resource.getrusage(resource.RUSAGE_CHILDREN)
+    boards = tower.state()["boards"].values()
+    return here.ru_utime + here.ru_stime + sum(board["cpu_s"] or 0.0 for board in boards)
 
 
 class Cosmos:

@@ -23,18 +23,20 @@ from datetime import UTC, datetime
 import numpy as np
 
 from madns_runtime.config import ExecutorSettings
-from madns_runtime.executor import make_executor, run_job
+from madns_runtime.plugin.executor import make_executor, run_job
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.parameters import (
     BasiliskPropagator,
     NumbaPropagator,
     ScipyPropagator,
 )
-from madns_runtime.simulations.constellation.truth.batches import merge, propagate_part, split
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
-    Stretch,
     StretchRequest,
+    TruthStretch,
+    merge,
+    propagate_part,
+    split,
 )
 
 EXECUTORS = {
@@ -127,10 +129,10 @@ def fleet(
     return StretchRequest(first_knot=0, knots=window_s + 1, knot_s=1.0, states=states), parameters
 
 
-def nothing(request: StretchRequest, parameters: PropagationParameters) -> Stretch:
+def nothing(request: StretchRequest, parameters: PropagationParameters) -> TruthStretch:
     """Return a result of the size of truth."""
     count = len(request.states)
-    return Stretch(
+    return TruthStretch(
         first_knot=request.first_knot,
         states=np.zeros((count, request.knots, 6)),
         invariants=np.zeros((count, request.knots, 3)),
@@ -139,15 +141,15 @@ def nothing(request: StretchRequest, parameters: PropagationParameters) -> Stret
 
 def window(
     executor: Executor,
-    function: Callable[[StretchRequest, PropagationParameters], Stretch],
+    function: Callable[[StretchRequest, PropagationParameters], TruthStretch],
     parts: list[tuple[StretchRequest, PropagationParameters]],
-) -> Stretch:
+) -> TruthStretch:
     """Return a stretch by the way of the host's: jobs out, results back, merged."""
     futures = [executor.submit(run_job, function, *part) for part in parts]
     return merge([future.result(timeout=JOB_TIMEOUT_S) for future in futures])
 
 
-def timed(function: Callable[[], Stretch]) -> tuple[float, Stretch]:
+def timed(function: Callable[[], TruthStretch]) -> tuple[float, TruthStretch]:
     """Return how long a call takes, s, and its value."""
     started_s = time.perf_counter()
     value = function()

@@ -1,10 +1,10 @@
 """
-Other fleet tools doing the jobs of benchmarks/fleet.py, each as its own documentation would have it done.
+Other fleet tools doing the jobs of benchmarks/fleet.py, each as somebody who knows it well would have it done.
 
-They are installed into a private environment in the cache. pyinfra gets its library's fastest settings
-(parallel connections to every board); Ansible gets pipelining, shared connections and a fork a board.
-Both find uv on the boards. pyinfra syncs the folders of code and wheels; Ansible unpacks the code from one
-archive, since a file at a time takes it minutes.
+They are installed into a private environment in the cache. pyinfra connects to every board at once; Ansible
+gets pipelining, shared connections, no gathering of facts and a fork per board. Both find uv on the boards.
+Code and wheels travel as one archive, which is sent and unpacked only where its hash differs; the environment
+is made, and started for a first time, only then. Records come back as one archive per board.
 """
 
 from __future__ import annotations
@@ -24,46 +24,42 @@ PACKAGES = ("pyinfra>=3.5", "ansible-core>=2.17")
 TIMEOUT_S = 1800.0
 CHECK = "import madns_runtime.agent, numpy"
 
+ARCHIVE = f"{HOME}.tar"
+"""Of code and wheels, on each board."""
+PACKED = "/tmp/records.tar"
+"""The same of the records."""
+
 PYINFRA_DEPLOY = """
 from pyinfra.operations import files, server
 
-for folder in ("", "/wheels", "/runs", "/state"):
-    files.directory(path="{home}" + folder)
-files.sync(src="{code}", dest="{home}/code")
-files.sync(src="{wheels}", dest="{home}/wheels")
-server.shell(
-    "test -e {home}/environment/complete || ({install} && touch {home}/environment/complete)"
-)
-server.shell("cd {home} && PYTHONPATH=code environment/bin/python -c '{check}'")
+archive = files.put(src="{archive}", dest="{remote}")
+server.shell("{unpack} && {install} && {check}", _if=archive.did_change)
 """
 
 PYINFRA_COLLECT = """
 from pyinfra import host
-from pyinfra.operations import files
+from pyinfra.operations import files, server
 
-for name in {names}:
-    files.get(src="{source}/" + name, dest="{target}/" + host.name + "/" + name, create_local_dir=True)
+server.shell("tar -cf {packed} -C {source} .")
+files.get(src="{packed}", dest="{target}/" + host.name + ".tar")
 """
 
 PLAYBOOK = """
 - hosts: all
   gather_facts: false
   tasks:
-    - file: {{path: "{home}{{{{ item }}}}", state: directory}}
-      loop: ["", /code, /wheels, /runs, /state]
-    - unarchive: {{src: "{code_archive}", dest: "{home}/code"}}
-    - copy: {{src: "{wheels}/", dest: "{home}/wheels/"}}
-    - shell: "{install} && touch {home}/environment/complete"
-      args: {{creates: "{home}/environment/complete"}}
-    - shell: "cd {home} && PYTHONPATH=code environment/bin/python -c '{check}'"
+    - copy: {{src: "{archive}", dest: "{remote}"}}
+      register: archive
+    - shell: "{unpack} && {install} && {check}"
+      when: archive.changed
 """
 
 PLAYBOOK_COLLECT = """
 - hosts: all
   gather_facts: false
   tasks:
-    - fetch: {{src: "{source}/{{{{ item }}}}", dest: "{target}/"}}
-      loop: {names}
+    - command: tar -cf {packed} -C {source} .
+    - fetch: {{src: "{packed}", dest: "{target}/{{{{ inventory_hostname }}}}.tar", flat: true}}
 """
 
 
@@ -86,14 +82,23 @@ class Job:
     records: str
     """Folder on each board with the records to collect."""
 
-    @property
-    def install(self) -> str:
-        """Shell command that makes the environment on a board."""
-        return (
-            f"cd {HOME} && rm -rf environment && /usr/local/bin/uv venv -q environment &&"
+    def deployment(self) -> dict[str, str]:
+        """Return what goes into a play: the archive and the shell commands that follow it on a board."""
+        archive = self.folder / "payload.tar"
+        if not archive.exists():
+            with tarfile.open(archive, "w") as packed:
+                packed.add(self.code, "code")
+                packed.add(self.wheels, "wheels")
+        return {
+            "archive": str(archive),
+            "remote": ARCHIVE,
+            "unpack": f"mkdir -p {HOME}/runs {HOME}/state && cd {HOME} && rm -rf code wheels"
+            f" && tar -xf {ARCHIVE}",
+            "install": "/usr/local/bin/uv venv -q --clear environment &&"
             " /usr/local/bin/uv pip install -q --offline --no-index --no-deps"
-            " -p environment/bin/python wheels/*.whl"
-        )
+            " -p environment/bin/python wheels/*.whl",
+            "check": f"PYTHONPATH=code environment/bin/python -c '{CHECK}'",
+        }
 
 
 def install_rivals(cache: Path) -> Path:
@@ -129,23 +134,18 @@ class Pyinfra:
 
     def up(self) -> None:
         """Make every board ready."""
-        text = PYINFRA_DEPLOY.format(
-            home=HOME,
-            code=self._job.code,
-            wheels=self._job.wheels,
-            install=self._job.install,
-            check=CHECK,
-        )
+        text = PYINFRA_DEPLOY.format(**self._job.deployment())
         self._run(str(_write(self._job.folder / "deploy.py", text)))
 
     def exec(self) -> None:
         """Run a command on every board."""
         self._run("exec", "--", "uname", "-n")
 
-    def collect(self, names: tuple[str, ...], target: Path) -> None:
-        """Fetch the records *names* of every board."""
-        text = PYINFRA_COLLECT.format(names=names, source=self._job.records, target=target)
+    def collect(self, target: Path) -> None:
+        """Fetch the records of every board into a folder per board."""
+        text = PYINFRA_COLLECT.format(packed=PACKED, source=self._job.records, target=target)
         self._run(str(_write(self._job.folder / "collect.py", text)))
+        unpack_records(target)
 
     def _run(self, *arguments: str) -> None:
         parallel = str(len(self._job.boards))
@@ -161,9 +161,6 @@ class Ansible:
     def __init__(self, job: Job, programs: Path) -> None:
         self._job = job
         self._programs = programs
-        self._archive = job.folder / "code.tar"
-        with tarfile.open(self._archive, "w") as archive:
-            archive.add(job.code, ".")
         self._variables = {
             "ANSIBLE_PIPELINING": "1",
             "ANSIBLE_FORKS": str(len(job.boards)),
@@ -175,23 +172,18 @@ class Ansible:
 
     def up(self) -> None:
         """Make every board ready."""
-        text = PLAYBOOK.format(
-            home=HOME,
-            code_archive=self._archive,
-            wheels=self._job.wheels,
-            install=self._job.install,
-            check=CHECK,
-        )
+        text = PLAYBOOK.format(**self._job.deployment())
         self._play(_write(self._job.folder / "up.yaml", text))
 
     def exec(self) -> None:
         """Run a command on every board."""
         self._run("ansible", "all", "-m", "command", "-a", "uname -n")
 
-    def collect(self, names: tuple[str, ...], target: Path) -> None:
-        """Fetch the records *names* of every board."""
-        text = PLAYBOOK_COLLECT.format(names=list(names), source=self._job.records, target=target)
+    def collect(self, target: Path) -> None:
+        """Fetch the records of every board into a folder per board."""
+        text = PLAYBOOK_COLLECT.format(packed=PACKED, source=self._job.records, target=target)
         self._play(_write(self._job.folder / "collect.yaml", text))
+        unpack_records(target)
 
     def _play(self, playbook: Path) -> None:
         self._run("ansible-playbook", str(playbook))
@@ -199,6 +191,14 @@ class Ansible:
     def _run(self, program: str, *arguments: str) -> None:
         command = [self._programs / program, "-i", self._job.inventory, *arguments]
         run(command, self._variables, self._job.folder)
+
+
+def unpack_records(folder: Path) -> None:
+    """Unpack what was fetched from each board beside it."""
+    for path in folder.glob("*.tar"):
+        with tarfile.open(path) as archive:
+            archive.extractall(path.with_suffix(""))
+        path.unlink()
 
 
 def run(command: list[Any], variables: Mapping[str, str], folder: Path) -> str:

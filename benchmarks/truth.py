@@ -146,10 +146,10 @@ def batch_of(settings: AnyPropagator, count: int, knots_s: Array) -> Callable[[]
 
 def rigid_batch(count: int, knots_s: Array) -> Callable[[], object]:
     """Return what computes a batch with Basilisk's spacecraft as it comes."""
-    from madns_runtime.simulations.constellation.truth.basilisk_simulation import (
+    from madns_runtime.simulations.constellation.truth.propagators.basilisk_simulation import (
+        BasiliskSimulation,
         Design,
-        Pushes,
-        Simulation,
+        ForcesAndTorques,
     )
 
     step_ns = round(float(knots_s[0]) * 1e9)
@@ -162,7 +162,7 @@ def rigid_batch(count: int, knots_s: Array) -> Callable[[], object]:
         has_thrust=False,
         rotates_points=True,
     )
-    simulation, states, pushes = Simulation(design), orbits(count), Pushes()
+    simulation, states, pushes = BasiliskSimulation(design), orbits(count), ForcesAndTorques()
     return lambda: simulation.run(states, len(knots_s), pushes)
 
 

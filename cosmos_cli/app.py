@@ -7,6 +7,7 @@ A command's module is imported when it is invoked, so that quick commands stay q
 from __future__ import annotations
 
 import contextlib
+import copy
 import gc
 import importlib
 import math
@@ -15,20 +16,26 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Sequence
-from typing import Any, NoReturn
+from typing import Any
+
+import typer
+import typer.core
 
 from cosmos_cli.errors import CosmosError, ExitCode, InputError, describe
-from cosmos_cli.fleet import headstart
+from cosmos_cli.models.inventory_arguments import split_variable
+from cosmos_cli.ui import invocation, step_times
+from cosmos_cli.ui.console import (
+    Console,
+    OutputLost,
+    let_go_of_output,
+    open_standard_streams,
+    print_error,
+    print_json,
+    tell_lost_output,
+)
+from cosmos_cli.ui.out_of_memory import is_out_of_memory, memory_text
+from madns_runtime import __version__
 from madns_runtime.errors import MadnsError
-
-try:
-    import typer
-    import typer.core
-except ModuleNotFoundError:  # an agent's board has the base install only
-    sys.exit(
-        "error: the command line needs the operator's packages; "
-        "install them with: pip install 'cosmos-madns[host]'"
-    )
 
 COMMANDS = (
     "init",
@@ -38,21 +45,34 @@ COMMANDS = (
     "inventory",
     "up",
     "ping",
+    "facts",
     "doctor",
+    "devices",
     "exec",
     "packages",
     "reboot",
     "wipe",
     "run",
+    "inject",
     "ps",
     "down",
+    "logs",
     "runs",
     "collect",
     "report",
     "diff",
+    "tabulate",
 )
+INVENTORY_VARIABLE = "COSMOS_INVENTORY"
 GARBAGE_AFTER = 50_000
 """Objects made between two looks for garbage: what is imported later makes many, too."""
+TIMED = (
+    *("up", "ping", "facts", "doctor", "exec", "packages", "reboot", "wipe"),
+    *("run", "collect", "logs", "ps", "down"),
+)
+"""Commands that take -v: they do one thing after the other, here and on machines."""
+QUICK = ("ping", "exec", "up")
+"""Commands whose every millisecond is told, and which leave nothing to be done here."""
 USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
 CLICK_ERROR: Any = USAGE_ERROR.__mro__[1]
 """Base of all errors of usage. Typer carries its own click since 0.2x, so click's own class would not match."""
@@ -83,7 +103,7 @@ class LazyGroup(typer.core.TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the command that is meant; typer looks for similar names among loaded ones only."""
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
-            import difflib
+            import difflib  # for typing errors alone
 
             close = difflib.get_close_matches(args[0], COMMANDS, n=1)
             hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(COMMANDS)}"
@@ -91,18 +111,90 @@ class LazyGroup(typer.core.TyperGroup):
         return super().resolve_command(ctx, args)
 
 
+class StrictCommand(typer.core.TyperCommand):
+    """A command that refuses an option given twice where one value counts: the first would be dropped in silence."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the command's words."""
+        seen: set[str] = set()
+        for parameter in self.make_parser(ctx).parse_args(args=list(args))[2]:
+            name = str(parameter.name)
+            if name in seen and _counts_once(parameter):
+                words = "/".join([*parameter.opts[:1], *parameter.secondary_opts[:1]])
+                hint = f"; join the patterns: {words} 'A,B'" if name == "limit" else ""
+                raise USAGE_ERROR(f"{words} is given twice, and only one could count{hint}", ctx)
+            seen.add(name)
+        invocation.record(
+            str(self.name),
+            args,
+            frozenset(name for p in self.params if _takes_value(p) for name in p.opts),
+            has_tail=not ctx.allow_interspersed_args,
+        )
+        return super().parse_args(ctx, args)
+
+
+def _takes_value(parameter: Any) -> bool:
+    is_option = parameter.param_type_name == "option"
+    return is_option and not (parameter.is_flag or parameter.count)
+
+
+def _counts_once(parameter: Any) -> bool:
+    """Whether a second value would replace the first; a flag says the same however often it is given."""
+    if parameter.param_type_name != "option" or parameter.multiple or parameter.count:
+        return False
+    return not parameter.is_flag or bool(parameter.secondary_opts)
+
+
 def load_command(verb: str) -> Any:
     """Import `cosmos_cli.commands.<verb>` and return its function as a command."""
     module = importlib.import_module(f"cosmos_cli.commands.{verb}")
     gc.set_threshold(GARBAGE_AFTER)
     gc.enable()
-    single = typer.Typer(add_completion=False, rich_markup_mode=None)
     settings = getattr(module, "CONTEXT_SETTINGS", None)
-    single.command(name=verb, context_settings=settings)(getattr(module, verb))
-    command = typer.main.get_command(single)
+    command = _as_command(
+        getattr(module, verb), name=verb, cls=StrictCommand, context_settings=settings
+    )
+    if verb in TIMED:
+        command.params.append(_verbose_option())
     for parameter in command.params:
         parameter.callback = parameter.callback or _refuse_not_finite
+        if parameter.envvar == INVENTORY_VARIABLE:
+            parameter.type = _with_own_split(parameter.type)
     return command
+
+
+def _verbose_option() -> Any:
+    """Return the option -v, which is the same for every command and no command's affair."""
+
+    def told(
+        verbose: int = typer.Option(
+            0,
+            *("--verbose", "-v"),
+            count=True,
+            max=step_times.VERBOSITY_MAX,
+            clamp=True,
+            expose_value=False,
+            callback=step_times.set_verbosity,
+            show_default=False,
+            help="Say on stderr how long each step of each machine took; -vv: each question, too.",
+        ),
+    ) -> None:
+        """Hold the option."""
+
+    return next(option for option in _as_command(told).params if option.name == "verbose")
+
+
+def _as_command(function: Any, **settings: Any) -> Any:
+    single = typer.Typer(add_completion=False, rich_markup_mode=None)
+    single.command(**settings)(function)
+    return typer.main.get_command(single)
+
+
+def _with_own_split(kind: Any) -> Any:
+    """Return an option's type that reads several inventories from one variable; the original is shared by all texts."""
+    own = copy.copy(kind)
+    own.split_envvar_value = split_variable
+    return own
 
 
 def _refuse_not_finite(context: Any, parameter: Any, value: Any) -> Any:
@@ -128,9 +220,7 @@ def make_app() -> typer.Typer:
 
 def _print_version(is_wanted: bool) -> None:
     if is_wanted:
-        from madns_runtime import __version__
-
-        typer.echo(f"cosmos {__version__}")
+        Console().data(f"cosmos {__version__}")
         raise typer.Exit
 
 
@@ -149,23 +239,17 @@ def cosmos(
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and end the process with the exit code of DESIGN 9."""
-    from cosmos_cli.console import open_standard_streams
-
     open_standard_streams()
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     code = run(arguments)
     # At its end the interpreter would look through all objects for cycles, for 50 ms, and free them one by one.
     gc.freeze()
-    if headstart.is_quick(arguments):
-        _end_at_once(code)
+    if arguments and arguments[0] in QUICK:
+        # What the system frees anyway is not freed here: nothing of a quick command is left to be done.
+        with contextlib.suppress(OSError, ValueError):
+            sys.stderr.flush()
+        os._exit(code)
     sys.exit(code)
-
-
-def _end_at_once(code: int) -> NoReturn:
-    """End without freeing what the system frees anyway: nothing of a quick command is left to be done."""
-    with contextlib.suppress(OSError, ValueError):
-        sys.stderr.flush()
-    os._exit(code)
 
 
 def run(arguments: list[str]) -> int:
@@ -177,21 +261,28 @@ def run(arguments: list[str]) -> int:
         )
         return _flushed(int(code) if isinstance(code, int) else int(ExitCode.OK))
     except (CosmosError, MadnsError) as error:
-        has_places = isinstance(error, InputError) and error.faults
-        return _report(describe(error), str(error), wants_json, bare=bool(has_places))
+        return _report(
+            describe(error),
+            str(error),
+            wants_json,
+            bare=bool(isinstance(error, InputError) and error.faults),
+        )
     except CLICK_ERROR as error:
         return _report_usage(error, wants_json)
     except (KeyboardInterrupt, typer.Abort):
-        told = _plain("interrupted", "interrupted", int(ExitCode.INTERRUPTED))
-        return _report(told, "interrupted", wants_json, bare=True)
+        return _report(
+            _plain("interrupted", "interrupted", int(ExitCode.INTERRUPTED)),
+            "interrupted",
+            wants_json,
+            bare=True,
+        )
     except BrokenPipeError:
         return _leave_quietly()
-    except OSError as error:
-        return _report_lost_output(error, wants_json)
+    except OutputLost as error:
+        tell_lost_output(error)
+        return int(ExitCode.RUN_FAILED)
     except Exception as error:  # noqa: BLE001 - the last seam: a defect of ours still ends in one line
         return _report_unexpected(error, wants_json)
-    finally:
-        headstart.close()
 
 
 def _plain(kind: str, message: str, exit_code: int) -> dict[str, Any]:
@@ -200,8 +291,6 @@ def _plain(kind: str, message: str, exit_code: int) -> dict[str, Any]:
 
 def _report(description: dict[str, Any], text: str, wants_json: bool, *, bare: bool = False) -> int:
     """Print an error; *bare* without the word: where file:line:col starts the line, and where nothing is wrong."""
-    from cosmos_cli.console import print_error, print_json
-
     try:
         if wants_json:
             print_json(description)
@@ -222,17 +311,33 @@ def _report_usage(error: Any, wants_json: bool) -> int:
 
 
 def _report_unexpected(error: Exception, wants_json: bool) -> int:
+    if is_out_of_memory(error):
+        return _report(
+            _plain("memory", memory_text(), int(ExitCode.MACHINES)), memory_text(), wants_json
+        )
+
     head = f"unexpected {type(error).__name__}: {error}"
     if os.environ.get("COSMOS_DEBUG"):
-        traceback.print_exc()
+        print_error(traceback.format_exc().rstrip(), bare=True)
         advice = "this is a defect of COSMoS; please report it with the traceback above"
     else:
-        handle, path = tempfile.mkstemp(prefix="cosmos-error-", suffix=".txt")
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            traceback.print_exc(file=file)
-        advice = f"this is a defect of COSMoS; please report it with the traceback in {path}"
+        advice = f"this is a defect of COSMoS; please report it {_kept_traceback()}"
     text = f"{head}\n{advice}"
     return _report(_plain("unexpected", text, ExitCode.RUN_FAILED), text, wants_json)
+
+
+def _kept_traceback() -> str:
+    """Keep the traceback of the error in a file, and say where; a full disk must not hide the error itself."""
+    try:
+        handle, path = tempfile.mkstemp(prefix="cosmos-error-", suffix=".txt")
+        with os.fdopen(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
+            traceback.print_exc(file=file)
+    except OSError as error:
+        return (
+            f"with the traceback that COSMOS_DEBUG=1 shows; it could not be kept in a file:"
+            f" {error.strerror or error}"
+        )
+    return f"with the traceback in {path}"
 
 
 def _flushed(code: int) -> int:
@@ -242,26 +347,13 @@ def _flushed(code: int) -> int:
     except BrokenPipeError:
         return code or _leave_quietly()
     except OSError as error:
-        from cosmos_cli.console import tell_lost_output
-
         tell_lost_output(error)
         return code or int(ExitCode.RUN_FAILED)
     return code
 
 
-def _report_lost_output(error: OSError, wants_json: bool) -> int:
-    from cosmos_cli.console import OutputLost, tell_lost_output
-
-    if not isinstance(error, OutputLost):
-        return _report_unexpected(error, wants_json)
-    tell_lost_output(error)
-    return int(ExitCode.RUN_FAILED)
-
-
 def _leave_quietly() -> int:
     """Whoever read our output has gone, as `head` does; the interpreter must not complain at exit."""
-    from cosmos_cli.console import let_go_of_output
-
     let_go_of_output()
     return int(ExitCode.RUN_FAILED)
 

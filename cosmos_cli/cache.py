@@ -1,4 +1,4 @@
-"""Where this computer keeps what can be had again: wheels, and how machines are reached."""
+"""Folder of this computer for all that can be had again: wheels, and ways to reach machines."""
 
 from __future__ import annotations
 

@@ -7,9 +7,11 @@ a check broken, 5 data incomplete, 130 interrupted.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
+from pathlib import Path
 from typing import Any
 
 from madns_runtime.errors import (
@@ -22,10 +24,13 @@ from madns_runtime.errors import (
 )
 
 SOURCE_CHARACTERS_MAX = 100
+PART_CHARACTERS_MAX = 2000
+FAULTS_SHOWN_MAX = 100
+"""Of one error; nobody mends more at a time, and a file can hold a hundred thousand."""
 
 
 class ExitCode(IntEnum):
-    """What a script can rely on."""
+    """Exit codes that a script can rely on."""
 
     OK = 0
     RUN_FAILED = 1
@@ -41,7 +46,7 @@ class Fault:
     """One thing wrong with what a person wrote, and where it stands."""
 
     text: str
-    """What was expected and what came."""
+    """The expectation, and the value that came."""
     path: str = ""
     """Dotted path, such as agents.count; empty when the whole file is meant."""
     file: str = ""
@@ -50,17 +55,27 @@ class Fault:
     column: int | None = None
     source: str = ""
     """The line of the file, for the caret."""
+    caret: int | None = None
+    """Position of `column` in `source`, from 0, if that is only a part of the line."""
     override: str = ""
     """KEY when the value came from --set KEY=VALUE."""
 
     def render(self) -> str:
         """Return `file:line:col: path: text`, with the source line and a caret under it where there is one."""
-        parts = [self._where(), self._shown_path(), self.text]
+        path = "" if self.path == self.override else self.path
+        parts = [self._where(), _cut(path), _cut(self.text)]
         head = ": ".join(part for part in parts if part)
         if not self.source or self.column is None:
             return head
+        shown = self.clipped()
+        return f"{head}\n    {shown.source}\n    {' ' * (shown.caret or 0)}^"
+
+    def clipped(self) -> Fault:
+        """Return the fault with no more of its line than is shown."""
+        if not self.source or self.column is None or self.caret is not None:
+            return self
         source, caret = _clip(self.source, self.column - 1)
-        return f"{head}\n    {source}\n    {' ' * caret}^"
+        return replace(self, source=source, caret=caret)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fault for --json."""
@@ -68,9 +83,9 @@ class Fault:
             "file": self.file or None,
             "line": self.line,
             "column": self.column,
-            "path": self.path or None,
+            "path": _cut(self.path) or None,
             "override": self.override or None,
-            "message": self.text,
+            "message": _cut(self.text),
         }
 
     def _where(self) -> str:
@@ -80,18 +95,25 @@ class Fault:
             return self.file
         return f"{self.file}:{self.line}:{self.column}"
 
-    def _shown_path(self) -> str:
-        return "" if self.override and self.path == self.override else self.path
+
+def _cut(text: str) -> str:
+    """Return a text of a length that somebody reads: keys and numbers in a file may be of megabytes."""
+    if len(text) <= PART_CHARACTERS_MAX:
+        return text
+    half = PART_CHARACTERS_MAX // 2
+    return f"{text[:half]} ... ({len(text)} characters) ... {text[-half:]}"
 
 
 def _clip(source: str, index: int) -> tuple[str, int]:
     """Return a window of *source* that fits a terminal, and where *index* stands in it."""
-    text = source.replace("\t", " ").rstrip()
-    if len(text) <= SOURCE_CHARACTERS_MAX:
-        return text, index
-    start = max(0, min(index - SOURCE_CHARACTERS_MAX // 2, len(text) - SOURCE_CHARACTERS_MAX))
-    window = text[start : start + SOURCE_CHARACTERS_MAX]
-    left, right = ("..." if start else ""), ("..." if start + len(window) < len(text) else "")
+    size = len(source)
+    while size and source[size - 1].isspace():
+        size -= 1
+    if size <= SOURCE_CHARACTERS_MAX:
+        return source[:size].replace("\t", " "), index
+    start = max(0, min(index - SOURCE_CHARACTERS_MAX // 2, size - SOURCE_CHARACTERS_MAX))
+    window = source[start : start + SOURCE_CHARACTERS_MAX].replace("\t", " ")
+    left, right = ("..." if start else ""), ("..." if start + len(window) < size else "")
     return f"{left}{window}{right}", index - start + len(left)
 
 
@@ -113,18 +135,42 @@ class RunFailedError(CosmosError):
 
 
 class InputError(CosmosError):
-    """Something a person wrote is wrong: a file, an option. Carries every fault found."""
+    """Something a person wrote is wrong: a file, an option. Carries the first faults found, and how many more there are."""
 
     exit_code = ExitCode.BAD_INPUT
     kind = "input"
 
-    def __init__(self, message: str = "", *, faults: Sequence[Fault] = ()) -> None:
-        self.faults = tuple(faults)
-        super().__init__(message or "\n".join(fault.render() for fault in self.faults))
+    def __init__(
+        self, message: str = "", *, faults: Sequence[Fault] = (), omitted: int = 0
+    ) -> None:
+        self.faults = tuple(faults[:FAULTS_SHOWN_MAX])
+        self.omitted = omitted + max(0, len(faults) - FAULTS_SHOWN_MAX)
+        """Number of further faults."""
+        lines = [fault.render() for fault in self.faults]
+        if self.omitted:
+            lines.append(f"and {self.omitted} more fault{'' if self.omitted == 1 else 's'}")
+        super().__init__(message or "\n".join(lines))
 
     def details(self) -> Mapping[str, Any]:
         """Return the faults."""
-        return {"faults": [fault.to_mapping() for fault in self.faults]}
+        return {
+            "faults": [fault.to_mapping() for fault in self.faults],
+            "faults_omitted": self.omitted,
+        }
+
+
+def check_path_is_text(path: Path) -> None:
+    """
+    Refuse a path that cannot be written into records and sent to machines, all of which are UTF-8.
+
+    Raises:
+        InputError: Its name, or that of a folder above it, is none.
+    """
+    real = os.path.realpath(path)
+    try:
+        real.encode()
+    except UnicodeEncodeError:
+        raise InputError(f"{real}: expected a path in UTF-8; rename the folder or file") from None
 
 
 class MachinesError(CosmosError):
@@ -132,27 +178,6 @@ class MachinesError(CosmosError):
 
     exit_code = ExitCode.MACHINES
     kind = "machines"
-
-
-class BudgetError(CosmosError):
-    """The real-time budget or a check is broken."""
-
-    exit_code = ExitCode.BUDGET_BROKEN
-    kind = "budget"
-
-
-class DataIncompleteError(CosmosError):
-    """A run's data is missing or cut; the message names whose."""
-
-    exit_code = ExitCode.DATA_INCOMPLETE
-    kind = "data_incomplete"
-
-
-class InterruptedRun(CosmosError):
-    """The operator ended the run; what was recorded is kept."""
-
-    exit_code = ExitCode.INTERRUPTED
-    kind = "interrupted"
 
 
 def exit_code_of(error: CosmosError | MadnsError) -> ExitCode:

@@ -1,28 +1,46 @@
-"""
-Where `cosmos` starts: machines are spoken to first, then the rest of the program is imported.
-
-Nothing is imported above that waits for it to be needed: a fleet's servers work meanwhile.
-"""
+"""Start of `cosmos`: Ctrl-C and a memory that is full end it with a word and a code also while it is imported."""
 
 from __future__ import annotations
 
 import gc
+import os
 import sys
+from types import ModuleType
+
+from cosmos_cli.ui.out_of_memory import is_out_of_memory, memory_text
+
+EXIT_CODE_MACHINES = 3
+"""As cosmos_cli.errors says, which may not be there yet."""
 
 
 def main() -> None:
     """Run the command line and end the process with its exit code."""
     gc.disable()  # imports make many objects and no garbage; the command itself is collected again
     try:
-        # Here, where Ctrl-C is heard: whoever starts the wrong command stops it in its first moment.
-        from cosmos_cli.fleet import headstart
-
-        headstart.begin(sys.argv[1:])
-        from cosmos_cli import app
+        _import_app().main()
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
         sys.exit(130)
-    app.main()
+    except Exception as error:
+        if is_out_of_memory(error):  # and not even any to tell by the usual ways
+            os.write(2, f"error: {memory_text()}\n".encode())
+            os._exit(EXIT_CODE_MACHINES)
+        raise
+
+
+def _import_app() -> ModuleType:
+    """Import the program; an agent's board, with the base install only, is told what the command line needs."""
+    try:
+        # Here, where Ctrl-C is heard: whoever starts the wrong command stops it in its first moment.
+        from cosmos_cli import app
+    except ModuleNotFoundError as error:
+        if error.name != "typer":
+            raise
+        sys.exit(
+            "error: the command line needs the operator's packages; "
+            "install them with: pip install 'cosmos-madns[host]'"
+        )
+    return app
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ Write the parts of the documentation that come from the code.
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from madns_runtime.protocol.states import (
     HostState,
     mermaid,
 )
+from madns_runtime.simulations.constellation.flight.json_protocol import message_schema
 
 DOCS = Path(__file__).parent
 STATES = """\
@@ -50,7 +52,12 @@ def states_page() -> str:
     )
 
 
-PAGES = {"states.md": states_page}
+def flight_messages() -> str:
+    """Return docs/flight-messages.schema.json."""
+    return json.dumps(message_schema(), indent=2) + "\n"
+
+
+PAGES = {"states.md": states_page, "flight-messages.schema.json": flight_messages}
 
 
 def stale_pages() -> list[str]:

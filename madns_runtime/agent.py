@@ -18,9 +18,10 @@ import orjson
 from madns_runtime.config import AgentLaunch, from_mapping
 from madns_runtime.errors import ConfigurationError, MachineError, MadnsError
 from madns_runtime.processes import register
-from madns_runtime.reactor.lines import read_launch
+from madns_runtime.reactor.operator_link import read_launch
 from madns_runtime.reactor.scheduling import die_with_parent
-from madns_runtime.supervisor import Supervisor
+from madns_runtime.realtime.supervisor import Supervisor
+from madns_runtime.recording.access import apply_access
 
 USAGE = "usage: madns-agent [--launch SOCKET]"
 
@@ -34,6 +35,7 @@ def main() -> None:
             die_with_parent()  # until the loop runs: loading a plug-in may take for ever
         document, pending = read_launch(fds[0])
         launch = from_mapping(AgentLaunch, document)
+        apply_access(launch.config.recording.access)
         code = _supervise(launch, fds, pending)
     except MadnsError as error:
         sys.stderr.write(f"madns-agent: {error}\n")

@@ -1,28 +1,25 @@
 """
-What a run needs to know, as frozen dataclasses that travel as plain mappings.
+Settings of a run as frozen dataclasses that travel as plain mappings.
 
 The sections are also what a person writes in a scenario: the operator's side validates the same
 classes through pydantic (the bounds are `annotated_types`), so that a new setting has one home.
-Agents read them back with `from_mapping` and never need pydantic.
+Agents read them back with `from_mapping` (madns_runtime.plain_values) and never need pydantic.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-import types
-import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Gt, Le, MinLen
 
-from madns_runtime.errors import ConfigurationError
-
-T = TypeVar("T")
+from madns_runtime.plain_values import from_mapping as from_mapping
+from madns_runtime.plain_values import to_mapping as to_mapping
 
 AGENTS_MAX = 5000
+RATE_HZ_MAX = 10_000.0
 SEED_MAX = 2**63 - 1
 """A seed travels in messages as a signed integer of 64 bits."""
 DURATION_S_MAX = 10 * 365.25 * 86_400.0
@@ -30,24 +27,29 @@ DURATION_S_MAX = 10 * 365.25 * 86_400.0
 FORBID_EXTRA = {"extra": "forbid"}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Agents:
-    """The agents of a run: how many, their names, and how fast their software ticks."""
+class ScenarioSection:
+    """A section of a scenario: validated, it refuses keys that it does not know."""
 
+    __slots__ = ()
     __pydantic_config__ = FORBID_EXTRA
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Agents(ScenarioSection):
+    """The agents of a run: how many, their names, and how fast their software ticks."""
 
     count: Annotated[int, Ge(1), Le(AGENTS_MAX)]
     """Number of agents."""
     tick_hz: Annotated[float, Gt(0), Le(10_000)] = 10.0
     """Rate of every agent's loop, Hz."""
     names: tuple[str, ...] = ()
-    """Names, one an agent; empty for agent-01, agent-02, ..."""
+    """Names, one per agent; empty for agent-01, agent-02, ..."""
     phase: Literal["staggered", "aligned"] = "staggered"
     """Spread the agents' ticks over the period, or let all tick at one instant."""
     per_process: Annotated[int, Ge(1)] = 1
     """Agents in one process."""
     restarts_max: Annotated[int, Ge(0), Le(100)] = 0
-    """How often an agent that died is started again (with on_agent_loss: continue)."""
+    """Number of times an agent that died is started again (with on_agent_loss: continue)."""
 
     def resolved_names(self) -> tuple[str, ...]:
         """Return one name an agent, in order."""
@@ -62,10 +64,8 @@ def _numbered_names(count: int) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TimeSettings:
-    """How simulated time passes."""
-
-    __pydantic_config__ = FORBID_EXTRA
+class TimeSettings(ScenarioSection):
+    """Passing of simulated time."""
 
     mode: Literal["realtime", "lockstep"] = "realtime"
     """realtime: simulated seconds pass as wall seconds do; lockstep: as fast as all agents allow, here, the same under a seed."""
@@ -81,22 +81,22 @@ class TimeSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Deadline:
+class Deadline(ScenarioSection):
     """The real-time budget that a run is judged by."""
 
-    __pydantic_config__ = FORBID_EXTRA
+    __old_keys__ = {"tolerance_ms": "overrun_ms"}
 
-    tolerance_ms: Annotated[float, Ge(0)] = 5.0
+    overrun_ms: Annotated[float, Ge(0)] = 5.0
     """A step that ends later than this after its period is an error, before it a warning (thesis A.2.5)."""
+    lateness_ms: Annotated[float, Ge(0)] | None = None
+    """Latest wake-up of an idle loop that `cosmos doctor` finds good enough for a run. Not given: overrun_ms."""
     max_miss_ratio: Annotated[float, Ge(0), Le(1)] = 1e-3
-    """Largest share of ticks that may be missed, and of ticks whose step overran the tolerance."""
+    """Largest share of ticks that may be missed, and of ticks whose step ended more than overrun_ms too late."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Network:
-    """Where the host listens."""
-
-    __pydantic_config__ = FORBID_EXTRA
+class Network(ScenarioSection):
+    """Address of the host, and what its sockets ask for."""
 
     address: str = "127.0.0.1"
     """Address that the host binds and agents send to."""
@@ -107,11 +107,17 @@ class Network:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Timeouts:
-    """Every wait has an end; when it comes, the message names whom it waited for."""
+class Timeouts(ScenarioSection):
+    """
+    Every wait has an end; when it comes, the message names whom it waited for.
 
-    __pydantic_config__ = FORBID_EXTRA
+    In time.mode lockstep the time that a process waits for a processor does not count.
+    """
 
+    host_start_s: Annotated[float, Gt(0)] = 60.0
+    """From the start of the host's process until it listens: imports, workers of the executor."""
+    loading_s: Annotated[float, Gt(0), Le(3600)] = 60.0
+    """For each import of the simulation's code, and before the run for each question to it (check, demand); in the run at most 0.8 of host_start_s, of agents_ready_s. Waiting for a processor does not count."""
     agents_ready_s: Annotated[float, Gt(0)] = 30.0
     """From the host's start until every agent has said hello."""
     host_setup_s: Annotated[float, Gt(0)] = 120.0
@@ -127,14 +133,12 @@ class Timeouts:
     shutdown_s: Annotated[float, Gt(0)] = 10.0
     """For shutdown: the last reports, and flushing of records."""
     tick_s: Annotated[float, Gt(0)] = 30.0
-    """time.mode lockstep: wall time for one tick of all agents of a process, or one call of the host's half."""
+    """time.mode lockstep: for one tick of all agents of a process, or one call of the host's half."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Scheduling:
-    """What is asked of the kernel for a loop; what it grants is recorded."""
-
-    __pydantic_config__ = FORBID_EXTRA
+class Scheduling(ScenarioSection):
+    """Requests to the kernel for a loop; what it grants is recorded."""
 
     policy: Literal["auto", "fifo", "normal"] = "auto"
     """auto: SCHED_FIFO where permitted, and a note where not; fifo: a refusal is a warning."""
@@ -147,10 +151,8 @@ class Scheduling:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Recording:
-    """How records reach the disk."""
-
-    __pydantic_config__ = FORBID_EXTRA
+class Recording(ScenarioSection):
+    """Settings of the records and of their way to the disk."""
 
     flush_interval_s: Annotated[float, Gt(0), Le(60)] = 0.25
     """The most that a killed process loses, s."""
@@ -158,15 +160,17 @@ class Recording:
     """Time between syncs to the disk, s: what a power cut costs at most; 0 leaves it to the kernel. Not given: 5 on other machines, 0 on this one."""
     buffer_bytes: Annotated[int, Ge(65_536)] = 4 * 1024 * 1024
     """Bound of the buffer between loop and disk; what does not fit is dropped and counted."""
-    verbosity: Annotated[int, Ge(0), Le(5)] = 3
+    access: Literal["private", "group", "all"] | None = None
+    """Who may read the run's folder, its package and what it records on machines: private (its owner), group, or all. Not given: as COSMOS_ACCESS says, else private."""
+    not_finite_max: Annotated[int, Ge(0)] = 0
+    """Values of all records that may be NaN or infinite: more break the check records.not_finite. A value that is not there is null (None), which is no such value."""
+    verbosity: Annotated[int, Ge(0), Le(5)] = 4
     """0 nothing, 1 critical, 2 error, 3 warning, 4 info, 5 debug: the thesis's VERBOSITY (table A.1)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Health:
+class Health(ScenarioSection):
     """State of health, sampled beside the loops."""
-
-    __pydantic_config__ = FORBID_EXTRA
 
     period_s: Annotated[float, Ge(0.1)] = 5.0
     """Time between samples, s."""
@@ -175,10 +179,8 @@ class Health:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ExecutorSettings:
-    """Who does the host's long work."""
-
-    __pydantic_config__ = FORBID_EXTRA
+class ExecutorSettings(ScenarioSection):
+    """The executor of the host's long work."""
 
     kind: str = "process"
     """process, thread, dask, or module:callable that returns a concurrent.futures.Executor."""
@@ -186,6 +188,64 @@ class ExecutorSettings:
     """Workers: N_p of the thesis's inequalities; of a cluster, how many jobs it is given at once."""
     address: str = ""
     """dask: the scheduler, such as tcp://10.0.0.1:8786; empty for a cluster of our own on this machine."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScenarioDevice:
+    """A device that needs no hardware: each of some agents gets one of its own."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    name: Annotated[str, MinLen(1)]
+    """Name by which agents know it, such as gps."""
+    kind: Annotated[str, MinLen(1)]
+    """Registered kind, module:NAME or ./file.py:NAME beside the scenario."""
+    agents: tuple[str, ...] = ("*",)
+    """Names, labels or globs of the agents that get one."""
+    rate_hz: Annotated[float, Gt(0), Le(RATE_HZ_MAX)] | None = None
+    """Rate at which it is read, Hz; the kind's own if not given."""
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    """The kind's own."""
+    hang_s: Annotated[float, Gt(0), Le(3600)] = 15.0
+    """A device that says nothing for so long is given up: its process is killed and started anew."""
+    frozen_s: Mapping[str, float] = field(default_factory=dict)
+    """By input: values unchanged for so many seconds are frozen."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HardwareUse:
+    """Which agents use which devices of the machine that they run on."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    devices: Annotated[tuple[str, ...], MinLen(1)]
+    """Names of devices, as the inventory's cosmos_devices gives them."""
+    agents: tuple[str, ...] = ("*",)
+    """Names, labels or globs of agents; those whose machine has no such device use none."""
+    owner: str = ""
+    """The agent that may move the devices' outputs; needed only where several agents of a machine use one."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HardwareSettings:
+    """Devices in the loop: who uses what, whether outputs may move, and what a loss means."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    use: tuple[HardwareUse, ...] = ()
+    """Devices of the inventory."""
+    devices: tuple[ScenarioDevice, ...] = ()
+    """Devices that need no hardware, one per agent."""
+    armed: bool = False
+    """Outputs move only with this, and where the inventory permits it (outputs: true of the device)."""
+    on_device_loss: Literal["abort", "continue"] = "abort"
+    """abort: the run ends (exit code 3) when a device is lost; continue: the checks below tell."""
+    stale_ratio: Annotated[float, Ge(0), Le(1)] = 1e-2
+    """Largest share of the run in which a device's newest sample may be stale or missing."""
+    lost: Annotated[int, Ge(0)] = 0
+    """Times that devices may be lost."""
+    frozen: Annotated[int, Ge(0)] = 0
+    """Times that inputs may be frozen (unchanged for their frozen_s)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -209,139 +269,100 @@ class RunConfig:
     recording: Recording = field(default_factory=Recording)
     health: Health = field(default_factory=Health)
     executor: ExecutorSettings = field(default_factory=ExecutorSettings)
+    hardware: HardwareSettings = field(default_factory=HardwareSettings)
     on_agent_loss: Literal["abort", "continue"] = "abort"
     seed: Annotated[int, Ge(0), Le(SEED_MAX)] = 0
     parameters: Mapping[str, Any] = field(default_factory=dict)
     """The simulation's own, already validated, defaults filled in."""
 
+    @property
+    def longest_s(self) -> float:
+        """Longest time that a run may take: all its waits, one behind the other, s."""
+        t = self.timeouts
+        setup_s = t.agents_ready_s + t.host_setup_s + t.agent_setup_s + t.start_lead_s
+        return setup_s + self.time.duration_s + t.complete_s + 4 * t.shutdown_s
+
+
+OPERATOR_SOCKET = "operator.{}.sock"
+"""Name, with the incarnation, of the socket at which a process waits for an operator whose connection broke."""
+RELAY_CONNECTED = b'{"event":"relayed"}\n'
+"""First word of `madns_runtime.reactor.relay`."""
+RELAY_NOBODY = 3
+"""Its exit code if no process waits there; 0 if one did and has closed its side."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HostLaunch:
-    """First line of the host's standard input. Holds the run key: never argv, environment or disk."""
+class DeviceLaunch:
+    """One device that a machine drives in a run."""
+
+    name: str
+    """Name by which agents know it."""
+    place: str
+    """The machine's name, or that of the agent whose own it is."""
+    kind: str
+    """Registered kind, module:NAME or ./file.py:NAME."""
+    base_directory: str
+    """Folder here from which files are found."""
+    rate_hz: Annotated[float, Gt(0)]
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    serial: str = ""
+    """Identity that the device must have; empty for any."""
+    users: tuple[str, ...] = ()
+    """Agents that use it, all on this machine."""
+    owner: str = ""
+    """The agent that may move its outputs; empty for nobody."""
+    may_move: bool = False
+    """Whether outputs may move: the scenario is armed and the inventory permits it."""
+    why_not: str = ""
+    """If they may not: what is missing."""
+    hang_s: Annotated[float, Gt(0)] = 15.0
+    frozen_s: Mapping[str, float] = field(default_factory=dict)
+    seed: int = 0
+
+    @property
+    def full_name(self) -> str:
+        """Name of the device among all of the run, such as pi22/imu."""
+        return f"{self.place}/{self.name}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Launch:
+    """First line of a program's standard input. Holds the run key: never argv, environment or disk."""
 
     config: RunConfig
     run_key_hex: Annotated[str, MinLen(64)] = field(repr=False)
     session_hex: str
     directory: str
-    """Where the host records (host/ of the run directory)."""
+    """Folder to record in: of the host, host/ of the run directory; of agents the run directory here, of which
+    they take agents/<name>/, and the machine's health machines/<machine>/."""
     is_detached: bool = False
     """The operator leaves while the run goes on: the end of standard input is no end."""
+    reattach_s: Annotated[float, Ge(0)] = 0.0
+    """Time for an operator on another computer to come back when its line has ended, s; 0: that is its end."""
+    devices: tuple[DeviceLaunch, ...] = ()
+    """Devices that are driven: of agents those of their machine; of the host, in lockstep, those of all agents."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AgentLaunch:
-    """First line of an agent supervisor's standard input: which agents this machine runs, and where the host is."""
+class HostLaunch(Launch):
+    """Launch of the host."""
 
-    config: RunConfig
-    run_key_hex: Annotated[str, MinLen(64)] = field(repr=False)
-    session_hex: str
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AgentLaunch(Launch):
+    """Launch of an agent supervisor: which agents this machine runs, and where the host is."""
+
     machine: str
     """Name of this machine in the inventory."""
     agents: tuple[str, ...]
     """Names of the agents to run here."""
     host_address: str
     host_port: int
-    directory: str
-    """The run directory here; agents record in agents/<name>/, the machine's health in machines/<machine>/."""
-    is_detached: bool = False
-    """The operator leaves while the run goes on: the end of standard input is no end."""
     life: Annotated[int, Ge(1)] = 1
-    """Which supervisor of this machine this is: more than 1 when the machine was lost and has returned."""
+    """Number of this supervisor on its machine: more than 1 when the machine was lost and has returned."""
     first_incarnations: Mapping[str, int] = field(default_factory=dict)
     """The number that an agent's first process here gets; 1 where none is named."""
 
     def first_incarnation(self, agents: Iterable[str]) -> int:
         """Return the number of the first process of *agents*: their others were of an earlier supervisor."""
         return max(self.first_incarnations.get(agent, 1) for agent in agents)
-
-
-def to_mapping(value: Any) -> dict[str, Any]:
-    """Return a dataclass of this module as plain mappings, lists and scalars."""
-    return typing.cast("dict[str, Any]", _plain(value))
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value
-
-
-def from_mapping(cls: type[T], mapping: Mapping[str, Any], where: str = "") -> T:
-    """
-    Build a dataclass from plain mappings, as the peer's `to_mapping` wrote them.
-
-    Checks names, presence and plain types, not bounds: those were checked where the file was read.
-
-    Raises:
-        ConfigurationError: A key is unknown or missing, or a value has another type; the message
-            gives the dotted path.
-    """
-    value = _build(cls, mapping, where or cls.__name__)
-    return typing.cast("T", value)
-
-
-def _build(expected: Any, value: Any, where: str) -> Any:
-    origin = typing.get_origin(expected)
-    if origin is Annotated:
-        return _build(typing.get_args(expected)[0], value, where)
-    if dataclasses.is_dataclass(expected):
-        return _build_dataclass(typing.cast("type", expected), value, where)
-    if origin in (typing.Union, types.UnionType):
-        return _build_union(expected, value, where)
-    if origin is Literal:
-        if value not in typing.get_args(expected):
-            raise ConfigurationError(
-                f"{where}: expected one of {typing.get_args(expected)}, got {value!r}"
-            )
-        return value
-    if origin in (tuple, list):
-        item = typing.get_args(expected)[0]
-        if not isinstance(value, list | tuple):
-            raise ConfigurationError(f"{where}: expected a list, got {value!r}")
-        return origin(_build(item, v, f"{where}[{i}]") for i, v in enumerate(value))
-    if expected is Any:
-        return value
-    plain = origin or expected
-    if expected is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if not isinstance(value, plain) or (isinstance(value, bool) and plain is int):
-        raise ConfigurationError(f"{where}: expected {plain.__name__}, got {value!r}")
-    return value
-
-
-def _build_union(expected: Any, value: Any, where: str) -> Any:
-    failures = []
-    for option in typing.get_args(expected):
-        if option is type(None):
-            if value is None:
-                return None
-            continue
-        try:
-            return _build(option, value, where)
-        except ConfigurationError as error:
-            failures.append(str(error))
-    raise ConfigurationError("; or ".join(failures) or f"{where}: unexpected {value!r}")
-
-
-def _build_dataclass(cls: type, value: Any, where: str) -> Any:
-    if not isinstance(value, Mapping):
-        raise ConfigurationError(f"{where}: expected a mapping, got {value!r}")
-    hints = typing.get_type_hints(cls, include_extras=True)
-    fields = {f.name: f for f in dataclasses.fields(cls)}
-    unknown = sorted(set(value) - set(fields))
-    if unknown:
-        raise ConfigurationError(f"{where}: unknown {', '.join(unknown)}")
-    missing = [
-        name
-        for name, f in fields.items()
-        if name not in value
-        and f.default is dataclasses.MISSING
-        and f.default_factory is dataclasses.MISSING
-    ]
-    if missing:
-        raise ConfigurationError(f"{where}: missing {', '.join(missing)}")
-    return cls(**{k: _build(hints[k], v, f"{where}.{k}") for k, v in value.items()})

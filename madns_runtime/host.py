@@ -17,13 +17,14 @@ from pathlib import Path
 import orjson
 
 from madns_runtime.config import HostLaunch, from_mapping
-from madns_runtime.context import describe_exception
 from madns_runtime.errors import MadnsError
 from madns_runtime.plugin.api import HOST
+from madns_runtime.plugin.context import describe_exception
 from madns_runtime.processes import register
-from madns_runtime.reactor.lines import read_launch
+from madns_runtime.reactor.operator_link import read_launch
 from madns_runtime.reactor.scheduling import die_with_parent
 from madns_runtime.reactor.watchdog import tell_stack_on
+from madns_runtime.recording.access import apply_access
 
 
 def main() -> None:
@@ -35,6 +36,7 @@ def main() -> None:
     try:
         document, pending = read_launch(0)
         launch = from_mapping(HostLaunch, document)
+        apply_access(launch.config.recording.access)
         with register(launch.config.run, "host", HOST, Path(launch.directory).parent):
             code = _run(launch, (0, out_fd), pending)
     except MadnsError as error:
@@ -47,12 +49,13 @@ def main() -> None:
 
 
 def _run(launch: HostLaunch, fds: tuple[int, int], pending: bytes) -> int:
-    # Each mode needs nothing of the other.
     if launch.config.time.is_lockstep:
+        # Each mode needs nothing of the other.
         from madns_runtime.lockstep.host import LockstepHost
 
         return LockstepHost(launch, fds, pending).run()
-    from madns_runtime.host_runtime import HostRuntime
+    # As above.
+    from madns_runtime.realtime.host import HostRuntime
 
     return HostRuntime(launch, fds, pending).run()
 

@@ -1,5 +1,5 @@
 """
-The machine's register of what runs on it: one small file a process, believed only as far as the kernel agrees.
+The machine's register of running processes: one small file each, believed only as far as the kernel agrees.
 
 A pid alone says nothing, for the kernel gives it out again: an entry holds the start time and the boot
 as well, and a process is signalled through a descriptor that cannot come to mean another. Standard
@@ -15,6 +15,8 @@ import os
 import platform
 import re
 import signal
+import stat
+import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
@@ -40,7 +42,7 @@ class ProcessEntry:
     name: str
     pid: int
     start_ticks: int
-    """When it started, in clock ticks since boot (field 22 of /proc/<pid>/stat)."""
+    """Start in clock ticks since boot (field 22 of /proc/<pid>/stat)."""
     boot_id: str
     node: str
     """The machine's own name: a home directory may be shared by many."""
@@ -179,6 +181,14 @@ def read_start_ticks(pid: int) -> int | None:
     return int(values[19])
 
 
+def own_age_s() -> float:
+    """Return how long ago this process started, s; 0 where the kernel does not say."""
+    ticks = read_start_ticks(os.getpid())
+    if ticks is None:
+        return 0.0
+    return max(0.0, time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK"))
+
+
 def read_boot_id() -> str:
     """Return what names this boot of the machine; empty where the kernel does not say."""
     try:
@@ -207,10 +217,14 @@ def _signal(pid: int, number: int) -> bool:
 
 
 def _write_whole(path: Path, text: bytes) -> None:
-    """Write a file that is there in full or not at all."""
+    """Write a file that is there in full or not at all; never through a link that lies in its place."""
     draft = path.with_name(f".{path.name}")
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+    with contextlib.suppress(FileNotFoundError):
+        draft.unlink()
     try:
-        draft.write_bytes(text)
+        with open(os.open(draft, flags, 0o600), "wb") as file:
+            file.write(text)
         draft.replace(path)
     except OSError:
         with contextlib.suppress(OSError):
@@ -246,9 +260,11 @@ def _check(path: Path) -> ProcessEntry | None:
 
 def _read_entry(path: Path) -> ProcessEntry | None:
     try:
-        if path.stat().st_uid != os.geteuid():
-            return None  # What another user wrote must not tell us whom to signal.
-        with path.open("rb") as file:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+        with open(descriptor, "rb") as file:
+            found = os.fstat(file.fileno())
+            if found.st_uid != os.geteuid() or not stat.S_ISREG(found.st_mode):
+                return None  # What another user wrote must not tell us whom to signal.
             values = json.loads(file.read(FILE_BYTES_MAX))
     except (OSError, ValueError, RecursionError):
         return None

@@ -1,12 +1,17 @@
-"""What all tests share: a private register of processes, and no skip that CI would not notice."""
+"""What all tests share: a private register of processes, and no skip and no process that goes unnoticed."""
 
 from __future__ import annotations
 
+import multiprocessing.process
 import os
+import platform
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 pytest_plugins = ["tower.fixtures"]  # of tests/tower; costs nothing where no test asks for a tower
 
@@ -14,21 +19,43 @@ pytest_plugins = ["tower.fixtures"]  # of tests/tower; costs nothing where no te
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-SLOW_FIRST = ("runs", "faults", "cosmos_cli", "fleet", "tower", "docs", "lockstep")
+# Some set this for themselves; each process of a run would compile all of COSMoS and its libraries anew,
+# which is more than half of what the whole suite costs then.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
+# A busy machine takes longer than Hypothesis' 0.2 s for an example now and then, which is no fault of the code.
+settings.register_profile(
+    "any_machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("any_machine")
+
+SLOW_FIRST = ("runs", "cars", "faults", "cosmos_cli", "fleet", "tower", "docs", "lockstep")
 """Folders whose tests start processes: begun first, so that none of them runs on alone at the end."""
 
 
 def pytest_collection_modifyitems(config, items):
-    """Bring the slow folders' tests to the front; the order within each stays."""
+    """Bring what may take longest to the front, then the slow folders' tests; the order within a file stays."""
     here = Path(__file__).parent
     places = {name: place for place, name in enumerate(SLOW_FIRST)}
+    limits_s = {}
+    for item in items:
+        marker = item.get_closest_marker("timeout")
+        limit_s = marker.args[0] if marker and not is_left_out(config, item) else 0
+        limits_s[item.path] = max(limit_s, limits_s.get(item.path, 0))
     items.sort(
         key=lambda item: (
+            -limits_s[item.path],
             places.get(item.path.relative_to(here).parts[0], len(SLOW_FIRST))
             if item.path.is_relative_to(here)
-            else len(SLOW_FIRST)
+            else len(SLOW_FIRST),
         )
     )
+
+
+def is_left_out(config, item):
+    """Whether a test is one of the night's, and this is the day."""
+    return item.get_closest_marker("nightly") and "not nightly" in config.option.markexpr
 
 
 @pytest.hookimpl(hookwrapper=True)
@@ -44,7 +71,52 @@ def pytest_runtest_makereport(item, call):
 @pytest.fixture(autouse=True, scope="session")
 def private_register(tmp_path_factory):
     """Keep the tests' processes out of the register of this machine's user."""
+    platform.platform()  # starts `uname` the first time
     patch = pytest.MonkeyPatch()
     patch.setenv("COSMOS_STATE_DIR", str(tmp_path_factory.mktemp("state")))
     yield
     patch.undo()
+
+
+@pytest.fixture(autouse=True)
+def marker_of_processes(request, monkeypatch):
+    """Blame a test that starts processes and lacks the marker: `make check` leaves out what has it."""
+    if any(request.node.get_closest_marker(name) for name in ("process", "root", "browser")):
+        yield
+        return
+    started = []
+
+    def noted(start, what):
+        def act(*arguments, **more):
+            if not is_importing():
+                started.append(what)
+            return start(*arguments, **more)
+
+        return act
+
+    for owner, name in (
+        (subprocess.Popen, "__init__"),
+        (multiprocessing.process.BaseProcess, "start"),
+        (os, "fork"),
+    ):
+        monkeypatch.setattr(owner, name, noted(getattr(owner, name), f"{owner.__name__}.{name}"))
+    yield
+    assert not started, f"it started a process ({started[0]}): give it the marker `process`"
+
+
+def is_importing():
+    """Whether a module is being imported: matplotlib, which Basilisk brings, looks for fonts the first time."""
+    frame = sys._getframe()
+    while frame and not frame.f_code.co_filename.startswith("<frozen importlib"):
+        frame = frame.f_back
+    return frame is not None
+
+
+@pytest.fixture(autouse=True)
+def umask_kept():
+    """Blame the test that leaves another umask behind, not those after it whose files others cannot read."""
+    before = os.umask(0o022)
+    os.umask(before)
+    yield
+    after = os.umask(before)
+    assert f"{after:03o}" == f"{before:03o}"

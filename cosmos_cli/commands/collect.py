@@ -3,28 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from cosmos_cli.commands.fleet_options import FORKS_DEFAULT, AcceptHostKeysOption, ForksOption
-from cosmos_cli.commands.runs import RunsOption
-from cosmos_cli.console import Console, JsonOption, QuietOption, losing_output
-from cosmos_cli.counted import counted
-from cosmos_cli.errors import ExitCode
+from cosmos_cli.collect.finish import collect_run, refuse_living, still_running
+from cosmos_cli.collect.machine_retrieval import Retrieved
+from cosmos_cli.collect.retrieval_state import NONE, forget, forgotten_problems
+from cosmos_cli.collect.retrieve import Retrieval, problems_of
+from cosmos_cli.collect.size_bound import parse_size
+from cosmos_cli.commands.fleet_command import FORKS_DEFAULT, AcceptHostKeysOption, ForksOption
+from cosmos_cli.commands.runs import RunArgument, RunsOption
+from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.evidence.run_directory import RunDirectory, alone, runs_root
+from cosmos_cli.evidence.run_documents import Problem
+from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.fleet.connection import ConnectOptions
-from cosmos_cli.problem import Problem
-from cosmos_cli.progress import told_progress
-from cosmos_cli.rundir import RunDirectory, alone, find_run, runs_root
-from cosmos_cli.still_running import still_running
+from cosmos_cli.fleet.failure import MachineFailure
+from cosmos_cli.fleet.outcome import Outcome
+from cosmos_cli.ui.console import Console, JsonOption, QuietOption, losing_output
+from cosmos_cli.ui.plural import counted
+from cosmos_cli.ui.progress import told_progress
 from madns_runtime.processes import list_processes
 
-if TYPE_CHECKING:
-    from cosmos_cli.fleet.outcome import Outcome
-    from cosmos_cli.retrieve import Retrieval, Retrieved
-
-RunArgument = Annotated[
-    str, typer.Argument(metavar="RUN", help="Number, name or path of a run, or: last.")
+SizeMaxOption = Annotated[
+    str | None,
+    typer.Option(
+        "--size-max",
+        metavar="SIZE",
+        help="The most that a machine, or this computer in files with holes, may have of the run, such as 20GB; else by the run's plan.",
+    ),
+]
+ForgetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--forget",
+        metavar="MACHINE",
+        help="Ask this machine no more, as it is gone for good; all: every one that is left;"
+        " none: ask all again. Repeatable.",
+    ),
 ]
 NOT_ASKED = "its records were not fetched, as --no-retrieve says"
 
@@ -38,6 +55,8 @@ def collect(
             "--retrieve/--no-retrieve", help="Fetch what still lies on the run's machines first."
         ),
     ] = True,
+    size_max: SizeMaxOption = None,
+    forget: ForgetOption = None,
     forks: ForksOption = FORKS_DEFAULT,
     accept_new_host_keys: AcceptHostKeysOption = False,
     as_json: JsonOption = False,
@@ -47,18 +66,32 @@ def collect(
     Bring the records of a run here, and make of them tables, a report and a package.
 
     What a machine has is fetched, verified, and only then deleted there; a transfer that was cut goes
-    on where it ended. Ends with 5 when data are missing or cut, whatever the run itself ended with.
+    on where it ended. What is forgotten stays missing. Ends with 5 when data are missing or cut, whatever the run itself ended with.
     """
-    from cosmos_cli.collect import collect_run, refuse_living
-
     console = Console(json=as_json, quiet=quiet)
     found = find_run(runs_root(folder), run)
     refuse_living(found, list_processes())
-    options = ConnectOptions(accept_new_host_keys=accept_new_host_keys)
+    bytes_max = _bytes_of(size_max)
     with alone(found):
-        problems = _retrieved(found, console, options, forks if retrieve else None)
+        _forget(found, forget or [], console)
         with told_progress(console, found.name) as progress:
-            summary = collect_run(found, problems=problems, progress=progress)
+            retrieval = Retrieval(
+                found,
+                options=ConnectOptions(accept_new_host_keys=accept_new_host_keys),
+                forks=forks,
+                progress=progress,
+                say=console.warn,
+                bytes_max=bytes_max,
+            )
+            due = [each.machine for each in retrieval.due]
+            outcomes = _fetch(found, retrieval, progress) if due and retrieve else []
+        tell_outcomes(console, [outcome for outcome in outcomes if outcome.machine in due])
+        problems = problems_of(outcomes)
+        if not retrieve:
+            problems = tuple(Problem(machine=name, text=NOT_ASKED, step="collect") for name in due)
+        problems += forgotten_problems(found)
+        with told_progress(console, found.name) as progress:
+            summary = collect_run(found, problems=problems, progress=progress, bytes_max=bytes_max)
     for line in summary.missing:
         console.warn(line)
     with losing_output(f"{summary.verdict.text}; it stands in {found.run_json}"):
@@ -70,24 +103,26 @@ def collect(
     return int(ExitCode.DATA_INCOMPLETE if summary.missing else ExitCode.OK)
 
 
-def _retrieved(
-    run: RunDirectory, console: Console, options: ConnectOptions, forks: int | None
-) -> tuple[Problem, ...]:
-    """Fetch what lies on machines, unless *forks* is None, and return whose records have not come."""
-    from cosmos_cli.retrieve import Retrieval, problems_of
+def _forget(run: RunDirectory, names: Sequence[str], console: Console) -> None:
+    if not names:
+        return
+    try:
+        changed = forget(run, names)
+    except MachineFailure as failure:
+        raise InputError(f"{run.name}: {failure}") from failure
+    for machine in changed:
+        if NONE in names:
+            console.say(f"{machine}: is asked again")
+        else:
+            again = f"cosmos collect {run.name} --forget {NONE}"
+            console.say(f"{machine}: is asked no more; to ask it again: {again}")
 
-    with told_progress(console, run.name) as progress:
-        retrieval = Retrieval(run, options=options, forks=forks or 1, progress=progress)
-        due = retrieval.due
-        if not due:
-            return ()
-        if forks is None:
-            return tuple(
-                Problem(machine=each.machine, text=NOT_ASKED, step="collect") for each in due
-            )
-        outcomes = _fetch(run, retrieval, progress)
-    tell_outcomes(console, [o for o in outcomes if o.machine in {each.machine for each in due}])
-    return problems_of(outcomes)
+
+def _bytes_of(size: str | None) -> int | None:
+    try:
+        return None if size is None else parse_size(size)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--size-max") from None
 
 
 def _fetch(

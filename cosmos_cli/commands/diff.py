@@ -4,18 +4,24 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from cosmos_cli.commands.runs import RunsOption
-from cosmos_cli.console import Console, JsonOption, QuietOption, SetOption
+from cosmos_cli.diff.compare import Selection, compare
+from cosmos_cli.diff.document import to_document
+from cosmos_cli.diff.side import open_side
+from cosmos_cli.diff.terminal import print_comparison
 from cosmos_cli.errors import ExitCode, InputError
-from cosmos_cli.progress import told_progress
-from cosmos_cli.rundir import RunDirectory, find_run, runs_root
-
-if TYPE_CHECKING:
-    from cosmos_cli.models.loading import ScenarioFile
+from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
+from cosmos_cli.evidence.run_search import find_run
+from cosmos_cli.evidence.table_labels import run_labels
+from cosmos_cli.launch.execute import Detached, RunOptions, execute
+from cosmos_cli.models.loading import ScenarioFile, load_scenario
+from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
+from cosmos_cli.ui.progress import told_progress
+from cosmos_cli.view.factory import make_view
 
 
 def diff(
@@ -52,11 +58,6 @@ def diff(
 
     Ends with 0 when they were compared, whatever was found; with --expect-same, 1 when their records differ.
     """
-    from cosmos_cli.diff.compare import Selection, compare
-    from cosmos_cli.diff.document import to_document
-    from cosmos_cli.diff.side import open_side
-    from cosmos_cli.diff.terminal import print_comparison
-
     console = Console(json=as_json, quiet=quiet)
     code = ExitCode.OK
     if run_first:
@@ -69,10 +70,11 @@ def diff(
         root = runs_root(folder)
         found = (find_run(root, a), find_run(root, b))
     sides = open_side(found[0], a), open_side(found[1], b)
+    chosen = tuple(agents or ())
+    labelled = (name for run in found for name in run_labels(run).labelled(chosen))
+    selection = Selection(agents=(*chosen, *labelled), streams=tuple(streams or ()))
     with told_progress(console, "diff") as progress:
-        comparison = compare(
-            *sides, Selection(agents=tuple(agents or ()), streams=tuple(streams or ())), progress
-        )
+        comparison = compare(*sides, selection, progress)
     console.print_json(to_document(comparison))
     print_comparison(console, comparison)
     if code is ExitCode.OK and expect_same and not comparison.is_same:
@@ -91,9 +93,7 @@ def _run_both(
     paths: tuple[str, str], console: Console, folder: Path | None, *, overrides: list[str]
 ) -> tuple[tuple[RunDirectory, RunDirectory], ExitCode]:
     """Run two scenarios one after the other; both are checked before the first starts."""
-    from cosmos_cli.models.loading import load_scenario
-
-    first, second = (load_scenario(Path(path), overrides) for path in paths)
+    first, second = (load_scenario(Path(path), overrides, warn=console.warn) for path in paths)
     if first.scenario.simulation != second.scenario.simulation:
         raise InputError(
             f"expected two scenarios of one simulation, got {paths[0]} of"
@@ -110,11 +110,9 @@ def _run_both(
 def _run_one(
     scenario: ScenarioFile, *, console: Console, root: Path
 ) -> tuple[RunDirectory, ExitCode]:
-    from cosmos_cli.launch.execute import Detached, RunOptions, execute
-    from cosmos_cli.view.factory import make_view
-
-    view = partial(make_view, quiet=console.quiet)
-    summary = execute(scenario, RunOptions(runs=root), view, console.say)
+    summary = execute(
+        scenario, RunOptions(runs=root), partial(make_view, quiet=console.quiet), console.say
+    )
     assert not isinstance(summary, Detached)  # nobody asked for it
     console.say(summary.last_line)
     return summary.run, summary.exit_code

@@ -6,28 +6,46 @@ import dataclasses
 import os
 import sys
 import time
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from cosmos_cli.commands.fleet_options import AcceptHostKeysOption, ForksOption, LimitOption
-from cosmos_cli.console import Column, Console, JsonOption, QuietOption, SetOption
-from cosmos_cli.counted import counted
-from cosmos_cli.doctor.case import Wants
-from cosmos_cli.doctor.finding import HERE, Finding, Level, grouped
+from cosmos_cli.commands.fleet_command import (
+    AcceptHostKeysOption,
+    ForksOption,
+    LimitOption,
+    SomeInventoryOption,
+    failure_teller,
+)
+from cosmos_cli.doctor.case import Case, Wants
+from cosmos_cli.doctor.finding import HERE, Finding, Severity, grouped
+from cosmos_cli.doctor.here import interface_of, look_here
 from cosmos_cli.doctor.judge import judge
-from cosmos_cli.doctor.probe import ask, ask_here, case_of
-from cosmos_cli.doctor.responder import Responder
-from cosmos_cli.errors import ExitCode
+from cosmos_cli.doctor.probe import DoctorNeeds, Responder, ask, ask_here
+from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.evidence.run_directory import runs_root
 from cosmos_cli.fleet.connection import Connection
 from cosmos_cli.fleet.fleet import Fleet, fleet_of
 from cosmos_cli.fleet.local import LocalConnection
 from cosmos_cli.fleet.outcome import Outcome, failed
 from cosmos_cli.fleet.pool import for_each
+from cosmos_cli.fleet.retry_file import offer_retry
 from cosmos_cli.fleet.target import Target
+from cosmos_cli.launch.device_sampling import missing_for
+from cosmos_cli.launch.feasibility import BITS_PER_BYTE, Resources
+from cosmos_cli.launch.plan import make_plan
+from cosmos_cli.launch.plan_view import feasibility_of
 from cosmos_cli.models.inventory import Machine
+from cosmos_cli.models.inventory.devices import driven_devices
+from cosmos_cli.models.inventory.machine import LOOPBACK
+from cosmos_cli.models.inventory_arguments import refuse_stray_limit
+from cosmos_cli.models.loading import ScenarioFile, load_scenario
+from cosmos_cli.ui.console import Column, Console, JsonOption, QuietOption, SetOption
+from cosmos_cli.ui.plural import counted
+from madns_runtime.processes import state_directory
 
 FORKS_DEFAULT = 100
 """All at once: a machine is measured for some seconds, in which there is nothing to do here."""
@@ -49,16 +67,7 @@ def doctor(
         Path | None,
         typer.Argument(metavar="[SCENARIO]", help="Scenario file: its wants are held against."),
     ] = None,
-    inventory: Annotated[
-        Path | None,
-        typer.Option(
-            "--inventory",
-            "-i",
-            metavar="FILE",
-            envvar="COSMOS_INVENTORY",
-            help="Inventory; without one this computer alone is looked at.",
-        ),
-    ] = None,
+    inventory: SomeInventoryOption = None,
     limit: LimitOption = None,
     all_: Annotated[bool, typer.Option("--all", help="Show what is well, too.")] = False,
     strict: Annotated[bool, typer.Option("--strict", help="Warnings fail as errors do.")] = False,
@@ -75,20 +84,44 @@ def doctor(
     """
     console = Console(json=json, quiet=quiet)
     start_s = time.monotonic()
+    if not inventory:
+        refuse_stray_limit(limit)
+    if set_ and scenario is None:
+        raise InputError(
+            f"--set {set_[0]}: there is no scenario whose value it could replace; name one"
+        )
     fleet = fleet_of(inventory, limit, forks, accept_new_host_keys) if inventory else None
     examination = _Examination(console, fleet, scenario, set_ or ())
     console.say(f"measuring {_who(examination.wants.machines)}, some seconds each")
     outcomes = examination.outcomes()
-    findings = {o.machine: examination.judge(o.machine, o.value) for o in outcomes if o.value}
+    wants = examination.wants
+    findings = {o.machine: judge(Case.of(o.machine, o.value, wants)) for o in outcomes if o.value}
     told = [finding for machine in findings.values() for finding in machine]
     _show(console, told, outcomes, is_all=all_)
     exit_code = _exit_code(told, outcomes, is_strict=strict)
+    names = [outcome.machine for outcome in failed(outcomes)]
+    retry = None
+    if fleet:
+        retry = offer_retry(console, fleet.sources, failed=names, count=len(fleet.targets))
     console.data(_verdict(told, outcomes, time.monotonic() - start_s))
     console.print_json(
         {
             "scenario": examination.wants.scenario,
-            "machines": [_mapping(o, findings.get(o.machine, ())) for o in outcomes],
-            "levels": {level.value: _count(told, level) for level in Level},
+            "machines": [
+                outcome.to_mapping(
+                    {
+                        "findings": [
+                            each.to_mapping() for each in findings.get(outcome.machine, ())
+                        ],
+                        "probed": outcome.value,
+                    }
+                )
+                for outcome in outcomes
+            ],
+            "levels": {
+                level.value: sum(finding.level == level for finding in told) for level in Severity
+            },
+            "retry": retry,
             "exit_code": int(exit_code),
         }
     )
@@ -105,29 +138,16 @@ class _Examination:
         scenario: Path | None,
         overrides: Sequence[str],
     ) -> None:
-        self._console = console
-        self._fleet = fleet and _remote_part(fleet)
-        self._scenario_file: Any = None
-        self.wants = Wants(machines=len(self._fleet.targets) if self._fleet else 0)
         machines = fleet.machines if fleet else ()
-        if scenario is not None:
-            self._read_scenario(scenario, overrides, machines)
-        affinity = _affinity(machines, self._scenario_file)
-        self.wants = dataclasses.replace(self.wants, affinity=affinity)
-
-    def _read_scenario(
-        self, path: Path, overrides: Sequence[str], machines: Sequence[Machine]
-    ) -> None:
-        from cosmos_cli.models.loading import load_scenario  # pydantic models take a while
-        from cosmos_cli.plan import LOOPBACK, make_plan
-
-        file = self._scenario_file = load_scenario(path, overrides)
-        plan = make_plan(file.scenario, machines or (LOOPBACK,), fault_at=file.fault)
-        agents: dict[str, int] = {}
-        for planned in plan.machines:
-            name = HERE if planned.connection == "local" else planned.name
-            agents[name] = agents.get(name, 0) + len(planned.agents)
-        self.wants = Wants.of(file.scenario, agents, machines=self.wants.machines)
+        self._console = console
+        self._devices = _devices(machines)
+        self._fleet = fleet and fleet.elsewhere()
+        self._scenario_file = (
+            None if scenario is None else load_scenario(scenario, overrides, warn=console.warn)
+        )
+        self._needs = DoctorNeeds(machines, self._scenario_file)
+        count = len(self._fleet.targets) if self._fleet else 0
+        self.wants = _wants(self._scenario_file, machines, count)
 
     def outcomes(self) -> list[Outcome[Told]]:
         """Return what every machine told, this computer first."""
@@ -143,22 +163,20 @@ class _Examination:
 
                 def task(connection: Connection, machine: Machine) -> Told:
                     own_addresses.add(connection.own_address)
-                    return ask(connection, self.wants, responder, host_address=machine.host_address)
+                    return ask(
+                        connection,
+                        self.wants,
+                        responder,
+                        machine=machine,
+                        needs=self._needs,
+                    )
 
-                outcomes = self._fleet.each(task)
+                outcomes = self._fleet.each(task, failure_teller(self._console))
         return [self._ask_here(own_addresses, outcomes), *outcomes]
-
-    def judge(self, machine: str, told: Told) -> list[Finding]:
-        """Return the findings of one machine."""
-        return judge(case_of(machine, told, self.wants))
 
     def _ask_here(
         self, own_addresses: set[str], outcomes: Sequence[Outcome[Told]]
     ) -> Outcome[Told]:
-        from cosmos_cli.doctor.here import interface_of, look_here
-        from cosmos_cli.rundir import runs_root
-        from madns_runtime.processes import state_directory
-
         target = Target(name=HERE, address=HERE_ADDRESS, connection="local", python=sys.executable)
 
         def task(target: Target) -> Told:
@@ -171,7 +189,10 @@ class _Examination:
                 interface=interface,
             )
             living = [entry["run_directory"] for entry in told["cosmos"]["living"]]
-            told["here"] = look_here(living) | {"feasibility": self._feasibility(outcomes)}
+            told["here"] = look_here(living) | {
+                "feasibility": self._feasibility(outcomes),
+                "devices": self._devices,
+            }
             return told
 
         return for_each([target], task)[0]
@@ -180,13 +201,13 @@ class _Examination:
         """Hold the four inequalities against the network as it was measured; None without a demand."""
         if self._scenario_file is None:
             return None
-        from cosmos_cli.commands.plan import feasibility_of
-        from cosmos_cli.feasibility import BITS_PER_BYTE, Resources
 
         trips_ms = [
             trip["p50_ms"]
             for outcome in outcomes
-            if outcome.value and (trip := outcome.value["round_trips"]) and trip["p50_ms"]
+            if outcome.value
+            and (trip := outcome.value["round_trips"])
+            and trip.get("p50_ms") is not None
         ]
         latency_s = max(trips_ms) / 2e3 if trips_ms else LATENCY_S_UNKNOWN
         resources = Resources(
@@ -198,21 +219,50 @@ class _Examination:
         return None if found is None else found.to_mapping()
 
 
-def _affinity(machines: Sequence[Machine], scenario_file: Any) -> dict[str, tuple[int, ...]]:
+def _devices(machines: Sequence[Machine]) -> list[dict[str, Any]]:
+    """Return what devices of this computer need and is missing."""
+    return [
+        {
+            "device": f"{machine.name}/{device.name}",
+            "missing": [
+                {"found": found, "cure": cure}
+                for found, _, cure in (
+                    text.rpartition(": ") for text in missing_for(machine, device)
+                )
+            ],
+        }
+        for machine in machines
+        if machine.connection == "local"
+        for device in driven_devices(machine.variables.cosmos_devices or ()).values()
+    ]
+
+
+def _wants(file: ScenarioFile | None, machines: Sequence[Machine], count: int) -> Wants:
+    """Return what a scenario asks for of these machines, *count* of which are others than this computer."""
+    affinity = _affinity(machines, file)
+    if file is None:
+        return Wants(machines=count, affinity=affinity)
+    plan = make_plan(
+        file.scenario, machines or (LOOPBACK,), fault_at=file.fault, labels=file.labels
+    )
+    agents: Counter[str] = Counter()
+    for planned in plan.machines:
+        name = HERE if planned.machine.connection == "local" else planned.name
+        agents[name] += len(planned.agents)
+    return dataclasses.replace(Wants.of(file.scenario, agents, machines=count), affinity=affinity)
+
+
+def _affinity(
+    machines: Sequence[Machine], scenario_file: ScenarioFile | None
+) -> dict[str, tuple[int, ...]]:
     """Return the processors that agents are to use on each machine that has agents, where anybody says it."""
     common = scenario_file.scenario.scheduling.cpu_affinity if scenario_file else ()
     found: dict[str, tuple[int, ...]] = {} if machines else {HERE: common}
     for machine in machines:
         name = HERE if machine.connection == "local" else machine.name
-        own = machine.cpu_affinity or common
+        own = machine.variables.cosmos_cpu_affinity or common
         found[name] = tuple(sorted({*found.get(name, ()), *own}))
     return found
-
-
-def _remote_part(fleet: Fleet) -> Fleet:
-    """Return the fleet without this computer, which is looked at anyway."""
-    targets = tuple(target for target in fleet.targets if target.connection != "local")
-    return dataclasses.replace(fleet, targets=targets)
 
 
 def _show(
@@ -230,7 +280,7 @@ def _show(
     rows += [
         (group.level.value, group.check, group.names, group.found, group.cure)
         for group in grouped(findings)
-        if is_all or group.level != Level.OK
+        if is_all or group.level != Severity.OK
     ]
     if rows:
         console.table(COLUMNS, rows)
@@ -241,7 +291,7 @@ def _exit_code(
 ) -> ExitCode:
     if failed(outcomes):
         return ExitCode.MACHINES
-    bad = {Level.ERROR, Level.WARNING} if is_strict else {Level.ERROR}
+    bad = {Severity.ERROR, Severity.WARNING} if is_strict else {Severity.ERROR}
     return ExitCode.RUN_FAILED if any(f.level in bad for f in findings) else ExitCode.OK
 
 
@@ -250,7 +300,7 @@ def _verdict(
 ) -> str:
     parts = [
         counted(number, level.value)
-        for level in (Level.ERROR, Level.WARNING, Level.NOTE)
+        for level in (Severity.ERROR, Severity.WARNING, Severity.NOTE)
         if (number := len([g for g in grouped(findings) if g.level == level]))
     ]
     bad = len(failed(outcomes))
@@ -261,13 +311,3 @@ def _verdict(
 
 def _who(machines: int) -> str:
     return f"{counted(machines, 'machine')} and {HERE}" if machines else HERE
-
-
-def _count(findings: Sequence[Finding], level: Level) -> int:
-    return sum(finding.level == level for finding in findings)
-
-
-def _mapping(outcome: Outcome[Told], findings: Sequence[Finding]) -> dict[str, Any]:
-    return outcome.to_mapping(
-        {"findings": [finding.to_mapping() for finding in findings], "probed": outcome.value}
-    )

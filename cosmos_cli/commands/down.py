@@ -9,25 +9,37 @@ from typing import Annotated, Any
 
 import typer
 
-from cosmos_cli.commands.fleet_options import (
+from cosmos_cli.collect.machine_sources import RecordingMachine, RecordingMachines
+from cosmos_cli.collect.retrieval_state import asked_sources
+from cosmos_cli.commands.fleet_command import (
     FORKS_DEFAULT,
     TIMEOUT_S_MAX,
     AcceptHostKeysOption,
     ForksOption,
     LimitOption,
     SomeInventoryOption,
+    failure_teller,
 )
-from cosmos_cli.console import Console, JsonOption, QuietOption
-from cosmos_cli.counted import counted
 from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
+from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.fleet.connection import ConnectOptions
-from cosmos_cli.fleet.onboard.processes import Ending
 from cosmos_cli.fleet.outcome import Outcome, failed
+from cosmos_cli.fleet.retry_file import offer_retry_of
 from cosmos_cli.fleet.target import Target
-from cosmos_cli.launch.elsewhere import Fleetwide, Seen, targets_of, unfinished_runs
-from cosmos_cli.launch.living import LivingRun, end_run, is_called, living_runs
-from cosmos_cli.retrieve.sources import Source, Sources
-from cosmos_cli.rundir import RunDirectory, find_run, runs_root
+from cosmos_cli.launch.living_processes import (
+    Fleetwide,
+    LivingRun,
+    Seen,
+    is_called,
+    living_runs,
+    targets_of,
+    unfinished_runs,
+)
+from cosmos_cli.onboard.processes import RunEnding, end_entries
+from cosmos_cli.ui.console import Console, JsonOption, QuietOption
+from cosmos_cli.ui.name_ranges import compact
+from cosmos_cli.ui.plural import counted
 from madns_runtime.processes import ProcessEntry
 
 CLEAN_TIMEOUT_S = 30.0
@@ -41,33 +53,24 @@ class Doomed:
     run: str
     directory: str
     here: LivingRun | None = None
-    there: dict[str, Source] = field(default_factory=dict)
+    there: dict[str, RecordingMachine] = field(default_factory=dict)
     """By machine."""
     host: str | None = None
     """The machine of its host; None for this computer."""
 
-    def is_called(self, which: str) -> bool:
-        """Tell whether *which* is this run's name, number or directory."""
-        return is_called(self.run, self.directory, which)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ended:
-    """What came of it."""
+    """Result of ending a run."""
 
     run: str
-    here: Ending
-    there: list[Outcome[Ending]]
+    here: RunEnding
+    there: list[Outcome[RunEnding]]
 
     @property
-    def endings(self) -> list[Ending]:
-        """Of all machines that answered, this computer's first."""
-        return [self.here, *(each.value for each in self.there if each.value is not None)]
-
-    @property
-    def left(self) -> list[ProcessEntry]:
-        """Who lives still."""
-        return [entry for ending in self.endings for entry in ending.left]
+    def is_left(self) -> bool:
+        """Whether a process of it still lives, here or on a machine that answered."""
+        return bool(self.here.left) or any(each.value and each.value.left for each in self.there)
 
 
 def down(
@@ -101,25 +104,29 @@ def down(
     """
     console = Console(json=json, quiet=quiet)
     fleet = Fleetwide(
-        options=ConnectOptions(accept_new_host_keys=accept_new_host_keys), forks=forks
+        options=ConnectOptions(accept_new_host_keys=accept_new_host_keys),
+        forks=forks,
+        tell=failure_teller(console),
     )
     targets = [t for t in targets_of(inventory, limit) if t.connection != "local"]
     outcomes = fleet.look(targets)
     known = known_runs(living_runs(), unfinished_runs())
     known += found_runs(known, targets, outcomes)
-    chosen = choose(known, runs or [], is_all=all_)
+    unasked = [outcome.machine for outcome in failed(outcomes)]
+    chosen = choose(known, runs or [], is_all=all_, unasked=unasked)
     ended = [_end(run, fleet, timeout_s, console.say) for run in chosen]
     bad = [each for one in ended for each in failed(one.there)] + failed(outcomes)
     for one in ended:
         for line in _lines(one):
             console.data(line)
-    for outcome in failed(outcomes):
-        console.say(f"{outcome.machine}: {outcome.failure}")
     if not chosen:
-        console.say("no run lives on this machine")
-    is_left = any(one.left for one in ended)
+        console.say("no run lives on this machine" + _unasked_words(unasked))
+    is_left = any(one.is_left for one in ended)
     exit_code = ExitCode.RUN_FAILED if is_left else ExitCode.MACHINES if bad else ExitCode.OK
-    console.print_json({"runs": [_mapping(one) for one in ended], "exit_code": int(exit_code)})
+    retry = offer_retry_of(console, inventory, targets, [outcome.machine for outcome in bad])
+    console.print_json(
+        {"runs": [_mapping(one) for one in ended], "retry": retry, "exit_code": int(exit_code)}
+    )
     return int(exit_code)
 
 
@@ -146,33 +153,45 @@ def found_runs(
         # One run has a folder of one name on all of its machines.
         folder = Path(seen.directory).name
         doomed = found.setdefault(folder, Doomed(run=seen.entry.run, directory=folder))
-        source = Source(target=by_name[seen.machine], directory=seen.directory)
+        source = RecordingMachine(target=by_name[seen.machine], directory=seen.directory)
         doomed.there[seen.machine] = source
         doomed.host = seen.machine if seen.entry.role == "host" else doomed.host
     return sorted(found.values(), key=lambda each: (each.run, each.directory))
 
 
 def _add_machines(doomed: Doomed, run: RunDirectory) -> None:
-    sources = Sources.read(run)
-    doomed.there = {source.machine: source for source in sources.remote}
+    sources = RecordingMachines.read(run)
+    doomed.there = {source.machine: source for source in asked_sources(run)}
     doomed.host = sources.host_machine
 
 
-def choose(known: Sequence[Doomed], wanted: Sequence[str], *, is_all: bool) -> list[Doomed]:
+def choose(
+    known: Sequence[Doomed],
+    wanted: Sequence[str],
+    *,
+    is_all: bool,
+    unasked: Sequence[str] = (),
+) -> list[Doomed]:
     """
-    Return the runs that are meant.
+    Return the runs that are meant; *unasked* machines may have others.
 
     Raises:
         InputError: Nothing or something unknown was named, or a name that fits several.
     """
+    if is_all and wanted:
+        raise InputError(
+            f"--all ends every living run, not only {', '.join(wanted)}; give one of both"
+        )
     if is_all:
         return list(known)
     names = ", ".join(run.run for run in known) or "none"
+    names += _unasked_words(unasked)
     if not wanted:
         raise InputError(f"name the runs to end, or give --all; living runs: {names}")
     chosen: list[Doomed] = []
     for which in wanted:
-        found = [run for run in known if run.is_called(which)] or _otherwise_called(which, known)
+        found = [run for run in known if is_called(run.run, run.directory, which)]
+        found = found or _otherwise_called(which, known)
         if not found:
             raise InputError(f"{which}: no such run lives on this machine; living runs: {names}")
         if len(found) > 1:
@@ -180,6 +199,10 @@ def choose(known: Sequence[Doomed], wanted: Sequence[str], *, is_all: bool) -> l
             raise InputError(f"{which}: several living runs; give the directory: {directories}")
         chosen += [run for run in found if run not in chosen]
     return chosen
+
+
+def _unasked_words(machines: Sequence[str]) -> str:
+    return f"; {compact(machines)} could not be asked" if machines else ""
 
 
 def _otherwise_called(which: str, known: Sequence[Doomed]) -> list[Doomed]:
@@ -202,29 +225,34 @@ def _end(run: Doomed, fleet: Fleetwide, clean_s: float, say: Callable[[str], Non
         say(f"{run.run}: asking {counted(len(run.there), 'machine')} to end it")
     first = [source for name, source in run.there.items() if name == run.host]
     rest = [source for name, source in run.there.items() if name != run.host]
-    here = Ending(run=run.run)
-    there: list[Outcome[Ending]] = []
+    here = RunEnding(run=run.run)
+    there: list[Outcome[RunEnding]] = []
     is_led_from_there = bool(first) and (run.here is None or not run.here.of_role("operator"))
     if is_led_from_there:
         there += fleet.end(first, clean_s=clean_s, forced_s=FORCED_TIMEOUT_S)
     if run.here is not None:
-        here = end_run(run.here, clean_s=clean_s, forced_s=FORCED_TIMEOUT_S, say=say)
+        here = end_entries(
+            run.here.processes,
+            directory=run.directory,
+            clean_s=clean_s,
+            forced_s=FORCED_TIMEOUT_S,
+            say=say,
+        )
     others = rest if is_led_from_there else first + rest
     there += fleet.end(others, clean_s=clean_s, forced_s=FORCED_TIMEOUT_S)
     return Ended(run=run.run, here=here, there=there)
 
 
 def _lines(ended: Ended) -> list[str]:
-    lines = []
-    if ended.here.ended or ended.here.left:
-        lines.append(f"{ended.run}: {_words(ended.here)}")
-    for outcome in ended.there:
-        words = f"failed: {outcome.failure}" if outcome.value is None else _words(outcome.value)
-        lines.append(f"{ended.run}: {outcome.machine}: {words}")
-    return lines or [f"{ended.run}: nothing of it lives"]
+    lines = [_words(ended.here)] if ended.here.ended or ended.here.left else []
+    lines += [
+        f"{each.machine}: {_words(each.value) if each.value else f'failed: {each.failure}'}"
+        for each in ended.there
+    ]
+    return [f"{ended.run}: {line}" for line in lines or ["nothing of it lives"]]
 
 
-def _words(ending: Ending) -> str:
+def _words(ending: RunEnding) -> str:
     if ending.left:
         pids = ", ".join(str(entry.pid) for entry in ending.left)
         return f"still living: {pids}"
@@ -245,7 +273,7 @@ def _mapping(ended: Ended) -> dict[str, Any]:
     }
 
 
-def _ending(ending: Ending) -> Mapping[str, Any]:
+def _ending(ending: RunEnding) -> Mapping[str, Any]:
     return {
         "ended": [_process(entry) for entry in ending.ended],
         "killed": [_process(entry) for entry in ending.killed],

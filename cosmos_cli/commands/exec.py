@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
 
-from cosmos_cli.commands.fleet_options import (
+from cosmos_cli.commands.fleet_command import (
     FORKS_DEFAULT,
     TIMEOUT_S_MAX,
     AcceptHostKeysOption,
@@ -17,16 +18,18 @@ from cosmos_cli.commands.fleet_options import (
     LimitOption,
     fleet_of,
 )
-from cosmos_cli.console import Console, JsonOption, QuietOption
-from cosmos_cli.counted import counted
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.fleet.connection import Completed, Connection
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.outcome import Outcome, failed
-from cosmos_cli.fleet.watched import NO_SUDO_MARK, as_root, watched
+from cosmos_cli.fleet.retry_file import offer_retry
+from cosmos_cli.fleet.shell import NO_SUDO_MARK, as_root, watched
+from cosmos_cli.ui.console import Console, JsonOption, QuietOption
+from cosmos_cli.ui.foreign_text import clean_text
+from cosmos_cli.ui.plural import counted
 
 CONTEXT_SETTINGS = {"allow_interspersed_args": False}
-"""What follows the command's first word belongs to it, with or without -- before."""
+"""All words after the command's first belong to it, with or without -- before."""
 TIMEOUT_S = 600.0
 
 
@@ -69,12 +72,21 @@ def exec(  # noqa: A001 - the verb's name is the function's
     except KeyboardInterrupt:
         console.say("what still ran there is ended")
         raise
-    exit_code = _exit_code(outcomes)
-    console.say(_verdict(outcomes))
+    bad = len(failed(outcomes))
+    nonzero = sum(bool(outcome.value and outcome.value.exit_status) for outcome in outcomes)
+    exit_code = ExitCode.MACHINES if bad else ExitCode.RUN_FAILED if nonzero else ExitCode.OK
+    retry = offer_retry(
+        console,
+        fleet.sources,
+        failed=[o.machine for o in outcomes if o.value is None or o.value.exit_status],
+        count=len(outcomes),
+    )
+    console.say(_verdict(len(outcomes), bad, nonzero))
     console.print_json(
         {
             "command": line,
             "machines": [outcome.to_mapping(_mapping(outcome.value)) for outcome in outcomes],
+            "retry": retry,
             "exit_code": int(exit_code),
         }
     )
@@ -105,22 +117,25 @@ def _task(line: str, *, is_root: bool, timeout_s: float) -> Callable[[Connection
 
 
 def _print(console: Console, outcome: Outcome[Completed], width: int) -> None:
-    """Print what a machine said, each line under its name: output as data, errors as talk."""
+    """
+    Print what a machine said, each line under its name: output as data, errors as talk.
+
+    Its colours and cursor movements are shown as escapes, on a terminal, too: other than Ansible, which passes
+    them on, for one machine could then write over what the others said. Under --json they stand as they came.
+    """
     head = f"{outcome.machine:<{width}}"
     done = outcome.value
     if done is None:
         console.say(f"{head} ! {outcome.failure}")
         return
-    for text, tell in ((done.stdout, console.data), (done.stderr, console.say)):
-        lines = text.decode(errors="replace").splitlines()
-        if lines:
+    errors = functools.partial(console.say, length_max=None)
+    for text, tell in ((done.stdout, console.data), (done.stderr, errors)):
+        if text:
+            lines = clean_text(text.decode(errors="replace")).removesuffix("\n").split("\n")
             tell("\n".join(f"{head} | {line}" for line in lines))
-    if done.exit_status:
-        console.say(f"{head} ! {_status_words(done.exit_status)}")
-
-
-def _status_words(status: int) -> str:
-    return f"ended by signal {-status}" if status < 0 else f"exit status {status}"
+    if status := done.exit_status:
+        words = f"ended by signal {-status}" if status < 0 else f"exit status {status}"
+        console.say(f"{head} ! {words}")
 
 
 def _mapping(done: Completed | None) -> dict[str, Any]:
@@ -134,17 +149,7 @@ def _mapping(done: Completed | None) -> dict[str, Any]:
     }
 
 
-def _exit_code(outcomes: Sequence[Outcome[Completed]]) -> ExitCode:
-    if failed(outcomes):
-        return ExitCode.MACHINES
-    is_bad = any(outcome.value and outcome.value.exit_status for outcome in outcomes)
-    return ExitCode.RUN_FAILED if is_bad else ExitCode.OK
-
-
-def _verdict(outcomes: Sequence[Outcome[Completed]]) -> str:
-    bad = len(failed(outcomes))
-    nonzero = sum(bool(outcome.value and outcome.value.exit_status) for outcome in outcomes)
-    count = len(outcomes)
+def _verdict(count: int, bad: int, nonzero: int) -> str:
     parts = [f"{count - bad - nonzero} ok"]
     parts += [f"{nonzero} exit status not 0"] if nonzero else []
     parts += [f"{counted(bad, 'machine')} failed"] if bad else []

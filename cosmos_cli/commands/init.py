@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
+import keyword
 import re
+import sys
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from cosmos_cli.console import Console, JsonOption, QuietOption
 from cosmos_cli.errors import InputError
+from cosmos_cli.ui.console import Console, JsonOption, QuietOption
+from madns_runtime.plugin.registry import registered_names
 
 TEMPLATES = Path(__file__).parent.parent / "templates"
 PLACEHOLDER = "@NAME@"
+MODULE_PLACEHOLDER = "@MODULE@"
+"""The name as Python imports it: with underscores."""
 NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 
 
 class Template(StrEnum):
-    """What to start from."""
+    """A scenario to start from."""
 
     benchmark = "benchmark"
     constellation = "constellation"
     plugin = "plugin"
+    package = "package"
+    device = "device"
 
 
 def init(
@@ -31,7 +38,7 @@ def init(
         Template,
         typer.Option(
             help="benchmark: packets to the host and back; constellation: four satellites; "
-            "plugin: a simulation of your own in one Python file."
+            "plugin: a simulation of your own in one Python file; package: a distribution of your own, with a test; device: a driver of your own, with a test."
         ),
     ] = Template.benchmark,
     directory: Annotated[
@@ -46,25 +53,49 @@ def init(
         raise InputError(
             f"NAME: expected lower-case letters, digits and hyphens, at most 64, got {name!r}"
         )
-    files = render(template.value, name)
-    paths = write_new(files, directory)
-    scenario = directory / f"{name}.yaml"
-    following = [f"cosmos validate {scenario}", f"cosmos run {scenario}"]
+    is_package = template is Template.package
+    if is_package:
+        _check_module(name)
+    paths = write_new(render(template.value, name), directory)
+    folder = directory / name if is_package else directory
+    scenario = folder / f"{name}.yaml"
+    following = [f"pip install -e {folder}"] if is_package else []
+    following += [f"cosmos validate {scenario}", f"cosmos run {scenario}"]
     for path in paths:
         console.data(str(path))
     console.say(f"next: {'; then '.join(following)}")
     console.print_json({"files": [str(path) for path in paths], "next": following})
 
 
+def _check_module(name: str) -> None:
+    """
+    See that a package and a simulation can be called so.
+
+    Raises:
+        InputError: They cannot.
+    """
+    module = _module(name)
+    if not module.isidentifier() or keyword.iskeyword(module):
+        raise InputError(f"NAME: expected what Python can import, such as my-cars, got {name!r}")
+    if module in sys.stdlib_module_names or name in registered_names():
+        raise InputError(f"NAME: {name!r} is taken by Python or by an installed simulation")
+
+
+def _module(name: str) -> str:
+    return name.replace("-", "_")
+
+
 def render(template: str, name: str) -> dict[Path, str]:
     """Return the template's files, by their path within the target folder, with the name filled in."""
     root = TEMPLATES / template
+
+    def filled(text: str) -> str:
+        return text.replace(PLACEHOLDER, name).replace(MODULE_PLACEHOLDER, _module(name))
+
     return {
-        Path(str(path.relative_to(root)).replace(PLACEHOLDER, name)): path.read_text(
-            encoding="utf-8"
-        ).replace(PLACEHOLDER, name)
-        for path in sorted(root.rglob(f"*{PLACEHOLDER}*"))
-        if path.suffix != ".pyc"
+        Path(filled(str(path.relative_to(root)))): filled(path.read_text(encoding="utf-8"))
+        for path in sorted(root.rglob("*"))
+        if path.is_file() and path.suffix != ".pyc"
     }
 
 

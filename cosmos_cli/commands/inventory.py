@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from cosmos_cli.commands.fleet_options import InventoryOption, LimitOption
-from cosmos_cli.console import Column, Console, JsonOption
-from cosmos_cli.counted import counted
+from cosmos_cli.commands.fleet_command import InventoryOption, LimitOption
 from cosmos_cli.models.inventory import Machine, load_machines
+from cosmos_cli.models.inventory.devices import device_label
+from cosmos_cli.ui.console import Column, Console, JsonOption
+from cosmos_cli.ui.plural import counted
 
 COLUMNS = (
     Column("machine"),
@@ -27,25 +28,19 @@ def inventory(
     machines = load_machines(inventory, limit)
     console.table(COLUMNS, [_row(machine) for machine in machines])
     console.data(counted(len(machines), "machine"))
-    console.print_json({"machines": [_shown(machine) for machine in machines]})
+    # The variables are those that Ansible sees.
+    shown = [{"name": m.name, "groups": m.groups, "vars": dict(m.raw_variables)} for m in machines]
+    console.print_json({"machines": shown})
 
 
 def _row(machine: Machine) -> tuple[str, ...]:
-    port = f":{machine.port}" if machine.port else ""
+    variables = machine.variables
+    port = f":{variables.port}" if variables.port else ""
     return (
         machine.name,
         f"[{machine.address}]{port}" if port and ":" in machine.address else machine.address + port,
         machine.connection,
-        machine.user or "",
+        variables.user or "",
         ", ".join(machine.groups),
-        ", ".join(machine.devices),
+        ", ".join(map(device_label, variables.cosmos_devices or ())),
     )
-
-
-def _shown(machine: Machine) -> dict[str, object]:
-    """Return what --json promises: the variables are those that Ansible sees."""
-    return {
-        "name": machine.name,
-        "groups": list(machine.groups),
-        "vars": dict(machine.variables),
-    }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 import time
 from collections.abc import Sequence
@@ -11,41 +10,43 @@ from typing import Annotated, Any
 
 import typer
 
-from cosmos_cli.commands.fleet_options import (
+from cosmos_cli.commands.fleet_command import (
     FORKS_DEFAULT,
     TIMEOUT_S_MAX,
     AcceptHostKeysOption,
     ForksOption,
     InventoryOption,
     LimitOption,
+    finish,
     fleet_of,
 )
-from cosmos_cli.console import Console, JsonOption, QuietOption
-from cosmos_cli.counted import counted
-from cosmos_cli.errors import ExitCode, InputError
-from cosmos_cli.fleet.board import Board
+from cosmos_cli.errors import InputError
 from cosmos_cli.fleet.connection import Connection
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.fleet import Fleet
+from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
-from cosmos_cli.fleet.onboard.apt_words import PYTHON_HINT
-from cosmos_cli.fleet.ordered import InOrder
-from cosmos_cli.fleet.outcome import Outcome, failed
+from cosmos_cli.fleet.outcome import InOrder, Outcome, failed
+from cosmos_cli.onboard.apt_words import PYTHON_HINT
+from cosmos_cli.ui.console import Console, JsonOption, QuietOption
+from cosmos_cli.ui.plural import counted
 
-PARTS = ("apt_words", "apt")
+PARTS = ("files", "links", "facts", "system", "apt_words", "apt")
 PIECE_TIMEOUT_S = 60.0
 """A sign of life comes each second; a slow card may hold one up."""
 TIMEOUT_S = 1800.0
+ANSWER_MARGIN_S = 60.0
+"""The machine itself ends its work in time, and says so."""
 NAMES_SHOWN_MAX = 5
 NAME = re.compile(r"[a-z0-9][a-z0-9+.-]*[a-z0-9+.](?::[a-z0-9-]+)?(?:=[A-Za-z0-9.+:~-]+)?")
 """A package's name, perhaps with its architecture and a version; one that ends in - would be removed."""
 
 Changed = dict[str, Any]
-"""What the verb "packages" tells at its end: "changes" and "notes"."""
+"""Changes and notes that the verb "packages" tells at its end."""
 
 
 class Action(StrEnum):
-    """What is done."""
+    """Things that can be done."""
 
     INSTALL = "install"
     REMOVE = "remove"
@@ -85,20 +86,20 @@ def packages(
     fleet = _without_this_computer(console, fleet_of(inventory, limit, forks, accept_new_host_keys))
     start_s = time.monotonic()
     outcomes = _change(console, fleet, action, wanted, timeout_s=timeout_s, is_check=check)
-    exit_code = ExitCode.MACHINES if failed(outcomes) else ExitCode.OK
-    console.data(_verdict(outcomes, time.monotonic() - start_s, is_check=check))
-    console.print_json(
-        {
+    return finish(
+        console,
+        fleet,
+        outcomes=outcomes,
+        verdict=_verdict(outcomes, time.monotonic() - start_s, is_check=check),
+        document={
             "action": action.value,
             "names": wanted,
             "is_check": check,
             "machines": [outcome.to_mapping(_mapping(outcome)) for outcome in outcomes],
             "changed": sum(_is_changed(outcome) for outcome in outcomes),
             "failed": len(failed(outcomes)),
-            "exit_code": int(exit_code),
-        }
+        },
     )
-    return int(exit_code)
 
 
 def check_names(action: Action, names: Sequence[str]) -> list[str]:
@@ -124,8 +125,7 @@ def _without_this_computer(console: Console, fleet: Fleet) -> Fleet:
     for target in fleet.targets:
         if target.connection == "local":
             console.say(f"{target.name}: left alone, it is this computer")
-    targets = tuple(target for target in fleet.targets if target.connection != "local")
-    return dataclasses.replace(fleet, targets=targets)
+    return fleet.elsewhere()
 
 
 def _change(
@@ -145,13 +145,13 @@ def _change(
     }
     width = max((len(target.name) for target in fleet.targets), default=0)
 
-    def task(connection: Connection) -> Changed:
-        return _change_one(connection, arguments)
-
     def tell(outcome: Outcome[Changed]) -> None:
         console.data(f"{outcome.machine:<{width}}  {_words(outcome)}")
 
-    return fleet.each_target(task, InOrder(fleet.targets, tell))
+    in_order = InOrder(fleet.targets, tell)
+    return fleet.each_target(
+        lambda connection: _change_one(connection, arguments), in_order, in_order.wait
+    )
 
 
 def _change_one(connection: Connection, arguments: dict[str, Any]) -> Changed:
@@ -164,12 +164,15 @@ def _change_one(connection: Connection, arguments: dict[str, Any]) -> Changed:
             "leave that machine out with --limit",
         )
     last: Changed = {}
-    with Board.start(connection, PARTS) as board:
+    with Helper.start(connection, PARTS) as board:
         if not is_check:
-            lock = {"path": Layout(target.root).lock, "holder": "cosmos packages"}
-            board.call("lock", lock)
+            board.call("lock", {"path": Layout(target.root).lock, "holder": "cosmos packages"})
         for part in board.parts(
-            "packages", arguments, as_root=not is_check, timeout_s=PIECE_TIMEOUT_S
+            "packages",
+            arguments,
+            as_root=not is_check,
+            timeout_s=PIECE_TIMEOUT_S,
+            whole_s=float(arguments["timeout_s"]) + ANSWER_MARGIN_S,
         ):
             last = dict(part.value)
     if "changes" not in last:
@@ -213,9 +216,8 @@ def _verdict(outcomes: Sequence[Outcome[Changed]], duration_s: float, *, is_chec
 
 def _mapping(outcome: Outcome[Changed]) -> dict[str, Any]:
     done = outcome.value
-    status = "failed" if done is None else "changed" if done["changes"] else "ok"
     return {
-        "status": status,
+        "status": "failed" if done is None else "changed" if done["changes"] else "ok",
         "changes": done["changes"] if done else [],
         "notes": done["notes"] if done else [],
     }

@@ -5,21 +5,19 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from cosmos_cli.commands.fleet_options import (
+from cosmos_cli.commands.fleet_command import (
     FORKS_DEFAULT,
     AcceptHostKeysOption,
-    Fleet,
     ForksOption,
     InventoryOption,
     LimitOption,
+    finish,
     fleet_of,
 )
-from cosmos_cli.console import Console, JsonOption, QuietOption
-from cosmos_cli.counted import counted
-from cosmos_cli.errors import ExitCode
-from cosmos_cli.fleet.connection import Connection
-from cosmos_cli.fleet.ordered import InOrder
-from cosmos_cli.fleet.outcome import Outcome, failed
+from cosmos_cli.fleet.connection import SMALL_BYTES_MAX, Connection
+from cosmos_cli.fleet.outcome import InOrder, Outcome, failed
+from cosmos_cli.ui.console import Console, JsonOption, QuietOption
+from cosmos_cli.ui.plural import counted
 
 COMMAND_TIMEOUT_S = 10.0
 
@@ -49,25 +47,22 @@ def ping(
         head = f"{outcome.machine:<{widths[0]}}  {addresses[outcome.machine]:<{widths[1]}}"
         console.data(f"{head}  {_words(outcome)}")
 
-    outcomes = fleet.each_target(_ask, InOrder(fleet.targets, tell))
-    bad = failed(outcomes)
-    exit_code = ExitCode.MACHINES if bad else ExitCode.OK
-    console.data(_verdict(len(outcomes), len(bad)))
-    console.print_json(
-        {
-            "machines": [
-                outcome.to_mapping(_mapping(fleet, index, outcome.value))
-                for index, outcome in enumerate(outcomes)
-            ],
-            "exit_code": int(exit_code),
-        }
+    in_order = InOrder(fleet.targets, tell)
+    outcomes = fleet.each_target(_ask, in_order, in_order.wait)
+    return finish(
+        console,
+        fleet,
+        outcomes=outcomes,
+        verdict=_verdict(len(outcomes), len(failed(outcomes))),
+        document={
+            "machines": [o.to_mapping(_mapping(addresses[o.machine], o.value)) for o in outcomes]
+        },
     )
-    return int(exit_code)
 
 
 def _ask(connection: Connection) -> Times:
     start_s = time.monotonic()
-    connection.run("true", timeout_s=COMMAND_TIMEOUT_S)
+    connection.run("true", timeout_s=COMMAND_TIMEOUT_S, said_bytes_max=SMALL_BYTES_MAX)
     return connection.opening_s * 1e3, (time.monotonic() - start_s) * 1e3
 
 
@@ -78,17 +73,15 @@ def _words(outcome: Outcome[Times]) -> str:
     return f"ok      ssh {ssh_ms:6.1f} ms  exec {exec_ms:6.1f} ms"
 
 
-def _mapping(fleet: Fleet, index: int, times: Times | None) -> dict[str, Any]:
+def _mapping(address: str, times: Times | None) -> dict[str, Any]:
     ssh_ms, exec_ms = times or (None, None)
     return {
-        "address": fleet.targets[index].address,
+        "address": address,
         "ssh_ms": None if ssh_ms is None else round(ssh_ms, 2),
         "exec_ms": None if exec_ms is None else round(exec_ms, 2),
     }
 
 
 def _verdict(count: int, bad: int) -> str:
-    machines = counted(count, "machine")
-    return (
-        f"{machines}: {count - bad} answered, {bad} failed" if bad else f"{machines}: all answered"
-    )
+    told = f"{count - bad} answered, {bad} failed" if bad else "all answered"
+    return f"{counted(count, 'machine')}: {told}"

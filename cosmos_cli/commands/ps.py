@@ -9,24 +9,37 @@ from typing import Annotated, Any
 
 import typer
 
-from cosmos_cli.commands.fleet_options import (
+from cosmos_cli.collect.machine_sources import RecordingMachines
+from cosmos_cli.collect.retrieval_state import asked_sources
+from cosmos_cli.commands.fleet_command import (
     FORKS_DEFAULT,
     AcceptHostKeysOption,
     ForksOption,
     LimitOption,
     SomeInventoryOption,
+    failure_teller,
 )
-from cosmos_cli.console import Column, Console, JsonOption, QuietOption
-from cosmos_cli.counted import counted
 from cosmos_cli.errors import ExitCode
+from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.fleet.connection import ConnectOptions
-from cosmos_cli.fleet.onboard.processes import age_s
 from cosmos_cli.fleet.outcome import Outcome, failed
+from cosmos_cli.fleet.retry_file import offer_retry_of
 from cosmos_cli.fleet.target import Target
-from cosmos_cli.launch.elsewhere import Fleetwide, Seen, distinct, targets_of, unfinished_runs
-from cosmos_cli.launch.living import LivingRun, in_order, is_called, living_runs
-from cosmos_cli.retrieve.sources import Sources
-from cosmos_cli.rundir import RunDirectory
+from cosmos_cli.launch.living_processes import (
+    Fleetwide,
+    LivingRun,
+    Seen,
+    distinct,
+    in_order,
+    is_called,
+    living_runs,
+    targets_of,
+    unfinished_runs,
+)
+from cosmos_cli.onboard.processes import age_s
+from cosmos_cli.ui.console import Column, Console, JsonOption, QuietOption
+from cosmos_cli.ui.name_ranges import compact
+from cosmos_cli.ui.plural import counted
 from madns_runtime.processes import ProcessEntry
 
 HERE = "(here)"
@@ -42,8 +55,8 @@ COLUMNS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
-    """What lives of one run on one machine."""
+class RunPart:
+    """Living processes of one run on one machine."""
 
     run: str
     machine: str | None
@@ -77,31 +90,48 @@ def ps(
     console = Console(json=json, quiet=quiet)
     here = living_runs()
     directories = _directories(here, run)
-    targets = [source.target for each in directories for source in Sources.read(each).remote]
-    targets += targets_of(inventory, limit)
+    targets = [source.target for each in directories for source in asked_sources(each)]
+    listed = _others(targets_of(inventory, limit))
+    targets += listed
     fleet = Fleetwide(
-        options=ConnectOptions(accept_new_host_keys=accept_new_host_keys), forks=forks
+        options=ConnectOptions(accept_new_host_keys=accept_new_host_keys),
+        forks=forks,
+        tell=failure_teller(console),
     )
     outcomes = fleet.look(_others(targets))
-    parts = [part for part in (*_here(here), *_there(outcomes)) if _is_meant(part, run)]
+    parts = [
+        part
+        for part in (*_here(here), *_there(outcomes))
+        if run is None or is_called(part.run, part.directory, run)
+    ]
     parts.sort(key=lambda part: (part.run, part.machine or ""))
     rows = [row for part in parts for row in _rows(part, is_every_agent=all_)]
     if rows:
         console.table(COLUMNS, rows)
-    else:
-        console.say("no run lives on this machine" if not outcomes else "no run lives")
     bad = failed(outcomes)
-    for outcome in bad:
-        console.say(f"{outcome.machine}: {outcome.failure}")
+    if not rows:
+        console.say(_nothing_words(len(outcomes) - len(bad), bool(outcomes)))
+    if bad:
+        unasked = compact(outcome.machine for outcome in bad)
+        console.say(f"whether a run lives there is not known: {unasked} could not be asked")
     exit_code = ExitCode.MACHINES if bad else ExitCode.OK
+    retry = offer_retry_of(console, inventory, listed, [outcome.machine for outcome in bad])
     console.print_json(
         {
             "runs": _mappings(parts, directories),
             "machines": [outcome.to_mapping() for outcome in outcomes],
+            "retry": retry,
             "exit_code": int(exit_code),
         }
     )
     return int(exit_code)
+
+
+def _nothing_words(answered: int, has_asked: bool) -> str:
+    """Say where no run lives: what nobody could ask about is left out."""
+    if not has_asked or not answered:
+        return "no run lives on this machine"
+    return f"no run lives on this machine and on the {counted(answered, 'machine')} that answered"
 
 
 def _others(targets: Sequence[Target]) -> list[Target]:
@@ -117,24 +147,22 @@ def _directories(here: Sequence[LivingRun], which: str | None) -> list[RunDirect
     ]
 
 
-def _is_meant(part: Part, which: str | None) -> bool:
-    return which is None or is_called(part.run, part.directory, which)
-
-
-def _here(runs: Sequence[LivingRun]) -> list[Part]:
+def _here(runs: Sequence[LivingRun]) -> list[RunPart]:
     return [
-        Part(run.run, None, run.directory, {e.pid: age_s(e) for e in run.processes}, run.processes)
+        RunPart(
+            run.run, None, run.directory, {e.pid: age_s(e) for e in run.processes}, run.processes
+        )
         for run in runs
     ]
 
 
-def _there(outcomes: Sequence[Outcome[list[Seen]]]) -> list[Part]:
+def _there(outcomes: Sequence[Outcome[list[Seen]]]) -> list[RunPart]:
     found: dict[tuple[str, str, str], list[Seen]] = {}
     for outcome in outcomes:
         for seen in outcome.value or ():
             found.setdefault((seen.entry.run, seen.machine, seen.directory), []).append(seen)
     return [
-        Part(
+        RunPart(
             run,
             machine,
             directory,
@@ -145,12 +173,20 @@ def _there(outcomes: Sequence[Outcome[list[Seen]]]) -> list[Part]:
     ]
 
 
-def _rows(part: Part, *, is_every_agent: bool) -> list[list[str]]:
+def _rows(part: RunPart, *, is_every_agent: bool) -> list[list[str]]:
     machine = part.machine or HERE
     agents = [entry for entry in part.processes if entry.role == "agent"]
     shown = [entry for entry in part.processes if is_every_agent or entry.role != "agent"]
     rows = [
-        [part.run, machine, e.role, e.name, str(e.pid), _age(part, e), part.directory]
+        [
+            part.run,
+            machine,
+            e.role,
+            e.name,
+            str(e.pid),
+            age_words(part.ages_s[e.pid]),
+            part.directory,
+        ]
         for e in shown
     ]
     if agents and not is_every_agent:
@@ -163,16 +199,14 @@ def _rows(part: Part, *, is_every_agent: bool) -> list[list[str]]:
     return rows
 
 
-def _age(part: Part, entry: ProcessEntry) -> str:
-    return age_words(part.ages_s[entry.pid])
-
-
-def _mappings(parts: Sequence[Part], directories: Sequence[RunDirectory]) -> list[dict[str, Any]]:
+def _mappings(
+    parts: Sequence[RunPart], directories: Sequence[RunDirectory]
+) -> list[dict[str, Any]]:
     """Return a mapping a run; its directory is the one here, where it has one."""
     here = {
         source.directory: str(run.path)
         for run in directories
-        for source in Sources.read(run).remote
+        for source in RecordingMachines.read(run).remote
     }
     runs: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for part in parts:

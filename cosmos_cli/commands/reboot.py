@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 import time
 from collections.abc import Sequence
@@ -10,22 +9,23 @@ from typing import Annotated, Any
 
 import typer
 
-from cosmos_cli.commands.fleet_options import (
+from cosmos_cli.commands.fleet_command import (
     TIMEOUT_S_MAX,
     AcceptHostKeysOption,
     ForksOption,
     InventoryOption,
     LimitOption,
+    finish,
     fleet_of,
 )
-from cosmos_cli.console import Console, JsonOption, QuietOption
-from cosmos_cli.counted import counted
-from cosmos_cli.errors import ExitCode, InputError
-from cosmos_cli.fleet.connect import connect
+from cosmos_cli.errors import InputError
 from cosmos_cli.fleet.fleet import Fleet
-from cosmos_cli.fleet.names import compact
+from cosmos_cli.fleet.open_connection import connect
 from cosmos_cli.fleet.outcome import Outcome, failed
-from cosmos_cli.reboot import Rebooted, Rebooting
+from cosmos_cli.fleet.reboot import Rebooted, Rebooting
+from cosmos_cli.ui.console import Console, JsonOption, QuietOption, confirm
+from cosmos_cli.ui.name_ranges import compact
+from cosmos_cli.ui.plural import counted
 from madns_runtime.processes import read_boot_id
 
 FORKS_DEFAULT = 100
@@ -65,23 +65,18 @@ def reboot(
     own = [target.name for target in fleet.targets if target.connection == "local"]
     for name in own:
         console.say(f"{name}: left alone, it is this computer")
-    fleet = dataclasses.replace(
-        fleet, targets=tuple(t for t in fleet.targets if t.connection != "local")
-    )
+    fleet = fleet.elsewhere()
     if fleet.targets and not yes:
         _ask(fleet)
     start_s = time.monotonic()
     outcomes = _reboot(console, fleet, timeout_s, is_forced=force)
-    exit_code = ExitCode.MACHINES if failed(outcomes) else ExitCode.OK
-    console.data(_verdict(outcomes, time.monotonic() - start_s))
-    console.print_json(
-        {
-            "machines": [_mapping(outcome) for outcome in outcomes],
-            "left_alone": own,
-            "exit_code": int(exit_code),
-        }
+    return finish(
+        console,
+        fleet,
+        outcomes=outcomes,
+        verdict=_verdict(outcomes, time.monotonic() - start_s),
+        document={"machines": [_mapping(outcome) for outcome in outcomes], "left_alone": own},
     )
-    return int(exit_code)
 
 
 def _ask(fleet: Fleet) -> None:
@@ -96,7 +91,8 @@ def _ask(fleet: Fleet) -> None:
     what = f"reboot {counted(len(fleet.targets), 'machine')} ({names})"
     if not sys.stdin.isatty():
         raise InputError(f"{what}: nobody is there to ask; give --yes")
-    typer.confirm(f"{what}?", abort=True, err=True)
+    if not confirm(f"{what}?", is_sure=False):
+        raise typer.Abort
 
 
 def _reboot(
@@ -131,12 +127,11 @@ def _words(outcome: Outcome[Rebooted]) -> str:
 def _verdict(outcomes: Sequence[Outcome[Rebooted]], duration_s: float) -> str:
     back = sum(bool(o.value and o.value.back_s is not None) for o in outcomes)
     bad = len(failed(outcomes))
-    count = len(outcomes)
+    left_alone = len(outcomes) - back - bad
     parts = [f"{back} back"]
-    parts += [f"{count - back - bad} left alone"] if count > back + bad else []
+    parts += [f"{left_alone} left alone"] if left_alone else []
     parts += [f"{bad} failed"] if bad else []
-    machines = counted(count, "machine")
-    return f"{machines}: {', '.join(parts)} in {duration_s:.1f} s"
+    return f"{counted(len(outcomes), 'machine')}: {', '.join(parts)} in {duration_s:.1f} s"
 
 
 def _mapping(outcome: Outcome[Rebooted]) -> dict[str, Any]:

@@ -7,11 +7,15 @@ from typing import Annotated
 
 import typer
 
-from cosmos_cli.commands.collect import RunArgument
-from cosmos_cli.commands.runs import RunsOption
-from cosmos_cli.console import Console, JsonOption, QuietOption
+from cosmos_cli.commands.runs import RunArgument, RunsOption
 from cosmos_cli.errors import InputError
-from cosmos_cli.rundir import find_run, runs_root
+from cosmos_cli.evidence.run_directory import runs_root
+from cosmos_cli.evidence.run_documents import fault_of_summary
+from cosmos_cli.evidence.run_search import find_run
+from cosmos_cli.report.build import build_sections, with_simulation
+from cosmos_cli.report.html import write_report
+from cosmos_cli.report.terminal import print_report
+from cosmos_cli.ui.console import Console, JsonOption, QuietOption
 
 
 def report(
@@ -25,22 +29,23 @@ def report(
     quiet: QuietOption = False,
 ) -> None:
     """Show what a run recorded: verdict, checks, tables; with figures in report.html of the run."""
-    from cosmos_cli.report.build import build_sections, open_source, with_control
-    from cosmos_cli.report.html import write_report
-    from cosmos_cli.report.terminal import print_report
-
     console = Console(json=as_json, quiet=quiet)
     found = find_run(runs_root(folder), run)
     document = found.read_json(found.run_json)
     if document is None or document.get("status") == "running":
         raise InputError(f"{found.name} is not collected yet; do that with: cosmos collect {run}")
+    fault = fault_of_summary(document)
+    if fault is not None:
+        raise InputError(
+            f"{found.run_json}: {fault}; make it anew with: cosmos collect {found.path}"
+        )
     if as_json:
-        console.print_json(with_control(found, document))
+        console.print_json(with_simulation(found, document, console.warn))
     if html is not None:
         try:
             console.say(f"report written to {write_report(found, document, html)}")
         except OSError as error:
             raise InputError(f"{html}: cannot be written: {error.strerror or error}") from error
     elif not as_json:
-        print_report(console, document, build_sections(open_source(found, document)))
+        print_report(console, document, build_sections(found, document))
         console.say(f"with figures: {found.report_html}")

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from cosmos_cli.commands.fleet_options import (
+from cosmos_cli.commands.fleet_command import (
     FORKS_DEFAULT,
     AcceptHostKeysOption,
     ForksOption,
@@ -17,11 +17,14 @@ from cosmos_cli.commands.fleet_options import (
     SomeInventoryOption,
     some_machines,
 )
-from cosmos_cli.console import Console, JsonOption, QuietOption, SetOption, losing_output
+from cosmos_cli.evidence.run_directory import runs_root
 from cosmos_cli.fleet.connection import ConnectOptions
-from cosmos_cli.launch.execute import Detached, RunOptions, execute
-from cosmos_cli.models.loading import load_scenario
-from cosmos_cli.rundir import runs_root
+from cosmos_cli.launch.access import chosen_access
+from cosmos_cli.launch.execute import Detached, RunOptions, execute, plan_of
+from cosmos_cli.launch.rehearsal import Rehearsal
+from cosmos_cli.launch.rehearsal_view import Asked, check_run
+from cosmos_cli.models.loading import ScenarioFile, load_scenario
+from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption, losing_output
 from cosmos_cli.view.factory import make_view
 
 
@@ -46,9 +49,16 @@ def run(
             metavar="DIR", envvar="COSMOS_RUNS", help="Folder of all runs; default: ./runs."
         ),
     ] = None,
+    check: Annotated[
+        bool,
+        typer.Option("--check", help="Say what the run would meet, and change nothing."),
+    ] = False,
     manual: Annotated[
         list[str] | None,
-        typer.Option(metavar="AGENT", help="Print the command that starts this agent by hand."),
+        typer.Option(
+            metavar="AGENT",
+            help="Print the command that starts this agent (or label, or glob) by hand.",
+        ),
     ] = None,
     report: Annotated[
         bool, typer.Option("--report/--no-report", help="Write report.html at the end.")
@@ -58,11 +68,14 @@ def run(
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Run a scenario, in real time or lockstep, here or on the machines of an inventory, and end with a verdict."""
+    """
+    Run a scenario, in real time or lockstep, here or on the machines of an inventory, and end with a verdict.
+
+    With --check: its plan, whether it can keep real time, and whether every machine has what it needs; ends
+    with 0, 2 or 3.
+    """
     console = Console(json=json, quiet=quiet)
-    overrides = list(set_ or ())
-    if duration_s is not None:
-        overrides.append(f"time.duration_s={duration_s!r}")
+    duration = [] if duration_s is None else [f"time.duration_s={duration_s!r}"]
     options = RunOptions(
         runs=runs_root(runs),
         manual=tuple(dict.fromkeys(manual or ())),
@@ -73,13 +86,38 @@ def run(
         forks=forks,
         connecting=ConnectOptions(accept_new_host_keys=accept_new_host_keys),
     )
-    checked = load_scenario(scenario, overrides)
-    summary = execute(checked, options, partial(make_view, quiet=quiet), console.say)
+    checked = load_scenario(scenario, [*(set_ or ()), *duration], warn=console.warn)
+    if check:
+        asked = Asked(scenario=scenario, inventory=tuple(inventory or ()), limit=limit, host=host)
+        raise typer.Exit(_check(console, checked, options, asked))
+    _run(console, checked, options)
+
+
+def _run(console: Console, checked: ScenarioFile, options: RunOptions) -> None:
+    """Run, and end with the verdict; or without, where the run goes on by itself."""
+    summary = execute(checked, options, partial(make_view, quiet=console.quiet), console.say)
+    say = console.say if console.json else console.data
     if isinstance(summary, Detached):
         console.print_json(summary.to_mapping())
-        (console.say if json else console.data)(summary.words)
-        return
+        return say(summary.words)
     with losing_output(f"{summary.verdict.text}; it stands in {summary.run.run_json}"):
         console.print_json(dict(summary.document))
-        (console.say if json else console.data)(summary.last_line)
+        say(summary.last_line)
     raise typer.Exit(int(summary.exit_code))
+
+
+def _check(
+    console: Console,
+    scenario: ScenarioFile,
+    options: RunOptions,
+    asked: Asked,
+) -> int:
+    chosen_access(scenario.scenario.recording)
+    rehearsal = Rehearsal(
+        plan=plan_of(scenario, options),
+        scenario=scenario,
+        runs=options.runs,
+        options=options.connecting,
+        forks=options.forks,
+    )
+    return check_run(console, rehearsal, asked)

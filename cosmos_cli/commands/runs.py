@@ -7,10 +7,15 @@ from typing import Annotated, Any
 
 import typer
 
-from cosmos_cli.console import Column, Console, JsonOption, QuietOption
-from cosmos_cli.rundir import RunDirectory, list_runs, runs_root
+from cosmos_cli.evidence.run_directory import RunDirectory, list_runs, runs_root
+from cosmos_cli.evidence.run_documents import fault_of
+from cosmos_cli.evidence.verdict import is_number
+from cosmos_cli.ui.console import Column, Console, JsonOption, QuietOption
 from madns_runtime.processes import list_processes
 
+RunArgument = Annotated[
+    str, typer.Argument(metavar="RUN", help="Number, name or path of a run, or: last.")
+]
 RunsOption = Annotated[
     Path | None,
     typer.Option(
@@ -45,21 +50,31 @@ def runs(
 
 
 def _entry(run: RunDirectory, *, is_living: bool) -> dict[str, Any]:
+    is_here = run.path.is_dir()
     document = run.read_json(run.run_json) or {}
+    fault = fault_of(run.run_json) if is_here else None
     agents = document.get("agents")
-    status = document.get("status", "unknown") if run.path.is_dir() else "packed"
+    count, duration_s = agents.get("count") if isinstance(agents, dict) else None, None
+    if is_number(document.get("duration_s")):
+        duration_s = document["duration_s"]
+    status = _text(document.get("status")) or "unknown" if is_here else "packed"
     if status == "running" and not is_living:
         status = "cut off"
+    exit_code = document.get("exit_code")
     return {
         "run": run.name,
-        "path": str(run.path if run.path.is_dir() else run.bundle),
+        "path": str(run.path if is_here else run.bundle),
         "status": status,
-        "exit_code": document.get("exit_code"),
-        "agents": agents.get("count") if isinstance(agents, dict) else None,
-        "duration_s": document.get("duration_s"),
-        "started_utc": document.get("started_utc"),
-        "verdict": document.get("verdict"),
+        "exit_code": exit_code if is_number(exit_code) else None,
+        "agents": count if is_number(count) else None,
+        "duration_s": duration_s,
+        "started_utc": _text(document.get("started_utc")),
+        "verdict": _text(document.get("verdict")) or (f"run.json: {fault}" if fault else None),
     }
+
+
+def _text(value: object) -> str | None:
+    return value if isinstance(value, str) else None
 
 
 def _row(entry: dict[str, Any]) -> list[str]:

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from cosmos_cli.console import Console
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.schema import schema_text
-from madns_runtime.plugin.registry import registered_names, resolve
+from cosmos_cli.models.separate_process import SeparateDefect, SeparateFailure, work_separately
+from cosmos_cli.ui.console import Console
+from madns_runtime.bounded_files import read_regular_file
+from madns_runtime.config import Timeouts
+from madns_runtime.errors import MadnsError, PluginError
+from madns_runtime.plugin.registry import is_shipped, registered_names, resolve
 
+SCHEMA_BYTES_MAX = 64 * 1024 * 1024
 KEPT = Path("scenarios/scenario.schema.json")
-"""Where this repository keeps it, for editors and for `--check`."""
+"""Place of the schema in this repository, for editors and for `--check`."""
 
 
 def schema(
@@ -29,7 +36,7 @@ def schema(
 ) -> None:
     """Print the JSON Schema of scenarios, for completion in editors."""
     console = Console()
-    text = schema_text({name: resolve(name, Path()).parameters for name in registered_names()})
+    text = _current_schema()
     if check and output is None:
         output = KEPT
         if not output.is_file():
@@ -47,6 +54,33 @@ def schema(
     console.say(f"{output}: {'current' if check else 'written'}")
 
 
+def _current_schema() -> str:
+    names = registered_names()
+    if all(map(is_shipped, names)):
+        return str(_schema_of(names, lambda doing: None)["text"])
+    try:
+        found = work_separately(partial(_schema_of, names), limit_s=Timeouts().loading_s)
+    except SeparateFailure as failure:
+        raise PluginError(str(failure)) from None
+    except SeparateDefect as defect:
+        raise RuntimeError(str(defect)) from None
+    if "fault" in found:
+        raise PluginError(found["fault"])
+    return str(found["text"])
+
+
+def _schema_of(names: Sequence[str], tell: Callable[[str], None]) -> Mapping[str, str]:
+    """Return the schema as `text`, or what is wrong with an installed simulation as `fault`."""
+    kinds = {}
+    for name in names:
+        tell(f"importing {name}")
+        try:
+            kinds[name] = resolve(name, Path()).parameters
+        except MadnsError as error:
+            return {"fault": f"{name}: {error}"}
+    return {"text": schema_text(kinds)}
+
+
 def _check(path: Path, text: str) -> None:
-    if path.read_text(encoding="utf-8") != text:
+    if read_regular_file(path, bytes_max=SCHEMA_BYTES_MAX) != text.encode():
         raise InputError(f"{path}: is not current; write it with: cosmos schema --output {path}")

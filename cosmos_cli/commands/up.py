@@ -4,32 +4,34 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cosmos_cli.background import Background
-from cosmos_cli.commands.fleet_options import (
+from cosmos_cli.commands.fleet_command import (
     FORKS_DEFAULT,
     AcceptHostKeysOption,
+    Fleet,
     ForksOption,
     InventoryOption,
     LimitOption,
     fleet_of,
 )
-from cosmos_cli.console import Console, JsonOption, QuietOption
 from cosmos_cli.errors import ExitCode
-from cosmos_cli.fleet.board import Board
-from cosmos_cli.fleet.silence import WatchedConnection
-from cosmos_cli.provision.echo import Echo
-from cosmos_cli.provision.parts import HELPER_PARTS
+from cosmos_cli.fleet.helper import Helper
+from cosmos_cli.fleet.liveness import SilenceWatch
+from cosmos_cli.fleet.pool import BackgroundCall
+from cosmos_cli.fleet.retry_file import offer_retry
+from cosmos_cli.provision import HELPER_PARTS, up_table
+from cosmos_cli.provision.udp_echo import Echo
+from cosmos_cli.provision.up_table import MachineResult, result_of
 from cosmos_cli.provision.up_view import UpView
+from cosmos_cli.ui.console import Console, JsonOption, QuietOption
+from cosmos_cli.ui.step_times import HERE, timed
 
 if TYPE_CHECKING:
     from cosmos_cli.fleet.connection import Connection
-    from cosmos_cli.provision.brought import Brought
-    from cosmos_cli.provision.fleet_up import FleetUp
-    from cosmos_cli.provision.up_table import MachineResult
+    from cosmos_cli.provision.up import FleetUp
 
 
 def up(
@@ -67,36 +69,61 @@ def up(
     names = [target.name for target in fleet.targets]
 
     def gather() -> FleetUp:
-        from cosmos_cli.provision.brought import UpOptions
-        from cosmos_cli.provision.fleet_up import FleetUp
+        # Imported here: while logging in, as what it needs takes as long.
+        from cosmos_cli.provision.up import FleetUp, UpOptions
 
         options = UpOptions(is_check=check, has_texts=diff, host=host)
-        return FleetUp(fleet, scenarios or (), options, echo=echo, view=view)
+        with timed(HERE, "read the inventory and the scenarios"):
+            found = FleetUp(fleet, scenarios or (), options, echo=echo, view=view)
+            _look_at_devices(found, fleet, inventory if limit else None, host=host)
+            return found
 
     with Echo() as echo, UpView(console, names) as view:
         # Logging in takes as long as validating the inventory and reading scenarios: both go on at once.
-        fleet_up = Background(gather)
+        fleet_up = BackgroundCall(gather)
         outcomes = fleet.each_target(
             lambda connection: _bring(connection, fleet_up),
-            lambda outcome: view.done(outcome.machine),
+            lambda outcome: view.done(outcome.machine, result_of(outcome).words(is_check=check)),
+            view.look,
         )
-        results = [fleet_up.result().result(outcome) for outcome in outcomes]
+        fleet_up.result()  # tells faults of what was read here, also where no machine could be asked
+    results = [result_of(outcome) for outcome in outcomes]
     _show(console, results, is_check=check, has_diffs=diff)
-    return _end(console, results, is_check=check, duration_s=time.monotonic() - start_s)
+    retry = offer_retry(
+        console,
+        fleet.sources,
+        failed=[result.machine for result in results if result.status == "failed"],
+        count=len(results),
+        needed=host,
+    )
+    return _end(console, results, retry, is_check=check, duration_s=time.monotonic() - start_s)
 
 
-def _bring(connection: Connection, fleet_up: Background[FleetUp]) -> Brought | None:
+def _look_at_devices(
+    fleet_up: FleetUp, fleet: Fleet, whole: list[str] | None, *, host: str | None
+) -> None:
+    """Tell what is wrong with the scenarios' devices; *whole* names the inventory of which the fleet is a part."""
+    if not fleet_up.scenarios:
+        return
+    # Imported here, as above: not needed for the runtime alone.
+    from cosmos_cli.launch.device_plan import look_at_devices
+    from cosmos_cli.models.inventory import load_machines
+
+    machines = fleet.machines if whole is None else load_machines(whole)
+    for scenario in fleet_up.scenarios:
+        look_at_devices(scenario, machines, host=host, warn=fleet_up.warn)
+
+
+def _bring(connection: Connection, fleet_up: BackgroundCall[FleetUp]) -> MachineResult | None:
     if connection.target.connection == "local":
         return None
-    with Board.start(WatchedConnection(connection), HELPER_PARTS) as board:
+    with Helper.start(connection, HELPER_PARTS, watch=SilenceWatch(connection)) as board:
         return fleet_up.result().bring(connection, board)
 
 
 def _show(
     console: Console, results: list[MachineResult], *, is_check: bool, has_diffs: bool
 ) -> None:
-    from cosmos_cli.provision import up_table
-
     if is_check or has_diffs:
         for line in up_table.plan_lines(results, has_diffs=has_diffs):
             console.data(line)
@@ -106,12 +133,17 @@ def _show(
 
 
 def _end(
-    console: Console, results: list[MachineResult], *, is_check: bool, duration_s: float
+    console: Console,
+    results: list[MachineResult],
+    retry: dict[str, Any] | None,
+    *,
+    is_check: bool,
+    duration_s: float,
 ) -> int:
-    from cosmos_cli.provision import up_table
-
     console.data(up_table.verdict(results, is_check=is_check, duration_s=duration_s))
     is_failed = any(result.status == "failed" for result in results)
     exit_code = int(ExitCode.MACHINES if is_failed else ExitCode.OK)
-    console.print_json({**up_table.document(results, is_check=is_check), "exit_code": exit_code})
+    console.print_json(
+        {**up_table.document(results, is_check=is_check), "retry": retry, "exit_code": exit_code}
+    )
     return exit_code

@@ -7,9 +7,16 @@ from typing import Annotated
 
 import typer
 
-from cosmos_cli.console import Console, JsonOption, QuietOption, SetOption
 from cosmos_cli.errors import Fault, InputError
+from cosmos_cli.launch.access import chosen_access
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
+from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
+
+READERS = {
+    "private": "",
+    "group": "; its records readable by the group",
+    "all": "; its records readable by all",
+}
 
 
 def validate(
@@ -21,17 +28,19 @@ def validate(
     """Check scenario files and show every fault with its line and column."""
     console = Console(json=json, quiet=quiet)
     faults: list[Fault] = []
+    omitted = 0
     found: list[ScenarioFile] = []
     for path in files:
         try:
-            scenario_file = load_scenario(path, set_ or ())
+            scenario_file = load_scenario(path, set_ or (), warn=console.warn)
         except InputError as error:
             faults += error.faults
+            omitted += error.omitted
         else:
             found.append(scenario_file)
             console.data(f"{path}: ok: {_summary(scenario_file)}")
     if faults:
-        raise InputError(faults=faults)
+        raise InputError(faults=faults, omitted=omitted)
     console.print_json({"valid": True, "scenarios": [_result(item) for item in found]})
 
 
@@ -39,8 +48,13 @@ def _summary(item: ScenarioFile) -> str:
     scenario = item.scenario
     agents = f"{scenario.agents.count} agent{'s' if scenario.agents.count > 1 else ''}"
     rate = f"at {scenario.agents.tick_hz:g} Hz for {scenario.time.duration_s:g} s"
-    return f"{scenario.name}, {agents} of {scenario.simulation} {rate}"
+    readers = READERS[chosen_access(scenario.recording)]
+    return f"{scenario.name}, {agents} of {scenario.simulation} {rate}{readers}"
 
 
 def _result(item: ScenarioFile) -> dict[str, object]:
-    return {"file": str(item.path), "scenario": item.to_mapping()}
+    return {
+        "file": str(item.path),
+        "access": chosen_access(item.scenario.recording),
+        "scenario": item.to_mapping(),
+    }

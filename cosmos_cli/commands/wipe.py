@@ -9,26 +9,27 @@ from typing import Annotated, Any
 
 import typer
 
-from cosmos_cli.commands.fleet_options import (
+from cosmos_cli.collect.disk import size_words
+from cosmos_cli.collect.wipe import Order, RunThere, Wiped, carry_out, look, make_order, runs_here
+from cosmos_cli.commands.fleet_command import (
     FORKS_DEFAULT,
     AcceptHostKeysOption,
     Fleet,
     ForksOption,
     InventoryOption,
     LimitOption,
+    failure_teller,
     fleet_of,
 )
 from cosmos_cli.commands.runs import RunsOption
-from cosmos_cli.confirm import confirm
-from cosmos_cli.console import Column, Console, JsonOption, QuietOption
-from cosmos_cli.counted import counted
 from cosmos_cli.errors import ExitCode
+from cosmos_cli.evidence.run_directory import runs_root
 from cosmos_cli.fleet.connection import Connection
 from cosmos_cli.fleet.failure import MachineFailure
 from cosmos_cli.fleet.outcome import Outcome
-from cosmos_cli.retrieve.disk import size_words
-from cosmos_cli.rundir import runs_root
-from cosmos_cli.wipe import Order, RunThere, Wiped, carry_out, look, make_order, runs_here
+from cosmos_cli.fleet.retry_file import offer_retry
+from cosmos_cli.ui.console import Column, Console, JsonOption, QuietOption, confirm
+from cosmos_cli.ui.plural import counted
 
 COLUMNS = (
     Column("machine"),
@@ -78,7 +79,7 @@ def wipe(
         findings = look(connection, known, is_all=all_)
         return make_order(findings, is_all=all_, with_uncollected=uncollected)
 
-    found = fleet.each_target(find)
+    found = fleet.each_target(find, failure_teller(console))
     rows = [row for outcome in found for row in _rows(outcome)]
     if rows:
         console.table(COLUMNS, rows)
@@ -86,15 +87,18 @@ def wipe(
     if orders and not confirm(_question(list(orders.values())), is_sure=yes):
         console.say("nothing was deleted")
         orders = {}
-    wiped = _carry_out(fleet, orders)
-    return _tell(console, found, wiped)
+    return _tell(console, fleet, found, _carry_out(console, fleet, orders))
 
 
-def _carry_out(fleet: Fleet, orders: dict[str, Order]) -> dict[str, Outcome[Wiped]]:
-    targets = tuple(target for target in fleet.targets if target.name in orders)
-    chosen = dataclasses.replace(fleet, targets=targets)
+def _carry_out(
+    console: Console, fleet: Fleet, orders: dict[str, Order]
+) -> dict[str, Outcome[Wiped]]:
+    chosen = dataclasses.replace(
+        fleet, targets=tuple(target for target in fleet.targets if target.name in orders)
+    )
     outcomes = chosen.each_target(
-        lambda connection: carry_out(connection, orders[connection.target.name], HOLDER)
+        lambda connection: carry_out(connection, orders[connection.target.name], HOLDER),
+        failure_teller(console),
     )
     return {outcome.machine: outcome for outcome in outcomes}
 
@@ -106,8 +110,9 @@ def _rows(outcome: Outcome[Order]) -> list[list[str]]:
     rows = [_row(outcome.machine, run, "deleted") for run in order.runs]
     rows += [_row(outcome.machine, run, "kept") for run in order.kept]
     if order.is_root:
-        size = size_words(order.installed_bytes)
-        rows.append([outcome.machine, INSTALLED, "", size, "", "", "deleted"])
+        rows.append(
+            [outcome.machine, INSTALLED, "", size_words(order.installed_bytes), "", "", "deleted"]
+        )
     return rows
 
 
@@ -130,13 +135,14 @@ def _question(orders: Sequence[Order]) -> str:
 
 
 def _tell(
-    console: Console, found: Sequence[Outcome[Order]], wiped: dict[str, Outcome[Wiped]]
+    console: Console,
+    fleet: Fleet,
+    found: Sequence[Outcome[Order]],
+    wiped: dict[str, Outcome[Wiped]],
 ) -> int:
     """Say what became of each machine, and return the exit code."""
     failures = {o.machine: o.failure for o in found if o.failure is not None}
     failures |= {o.machine: o.failure for o in wiped.values() if o.failure is not None}
-    for machine, failure in failures.items():
-        console.warn(f"{machine}: {failure}")
     done = {name: outcome.value for name, outcome in wiped.items() if outcome.value is not None}
     for machine, value in done.items():
         for path in value.left:
@@ -144,13 +150,21 @@ def _tell(
     runs = counted(sum(len(value.runs) for value in done.values()), "run")
     size = size_words(sum(value.bytes for value in done.values()))
     kept = sum(len(o.value.kept) for o in found if o.value is not None)
+    retry = offer_retry(console, fleet.sources, failed=failures, count=len(found))
     console.data(
         f"{counted(len(found), 'machine')}: {runs} deleted ({size}), {kept} kept,"
         f" {len(failures)} failed"
     )
     exit_code = ExitCode.MACHINES if failures else ExitCode.OK
-    machines = [_mapping(o, done.get(o.machine), failures.get(o.machine)) for o in found]
-    console.print_json({"machines": machines, "exit_code": int(exit_code)})
+    console.print_json(
+        {
+            "machines": (
+                [_mapping(o, done.get(o.machine), failures.get(o.machine)) for o in found]
+            ),
+            "retry": retry,
+            "exit_code": int(exit_code),
+        }
+    )
     return int(exit_code)
 
 

@@ -1,1 +1,1 @@
-"""What differs between two runs: settings, timing, and record by record what they recorded."""
+"""Differences between two runs: settings, timing, and record by record all that they recorded."""

@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Any
 
-from cosmos_cli.diff.constellation import Constellation, ConstellationDifference
+from cosmos_cli.collect.unread_files import find_unread, told_unread
 from cosmos_cli.diff.recorded import Key, Recorded
-from cosmos_cli.diff.settings import OF_THE_RUN, KeyDifference, differing_keys
 from cosmos_cli.diff.side import Side, check_comparable
 from cosmos_cli.diff.stream import (
-    Pairing,
     StreamDifference,
     choose_pairing,
     diff_stream,
     identical_stream,
 )
-from cosmos_cli.expectation import mapping_at
-from madns_runtime.recording.records import CLOCK, EVENTS, HEALTH, LOG, PROCESS, TICKS
+from cosmos_cli.evidence.completeness import mapping_at
+from cosmos_cli.evidence.simulation_calls import call_simulation
+from cosmos_cli.evidence.tables import no_tables, open_recorded_run
+from cosmos_cli.evidence.verdict import is_number
+from madns_runtime.analysis.tables import ComparedRun
+from madns_runtime.analysis.values import SimulationDifference
+from madns_runtime.errors import PluginError
+from madns_runtime.recording.records import FRAMEWORK_STREAMS
 
-FRAMEWORK_STREAMS = tuple(s.name for s in (TICKS, CLOCK, EVENTS, LOG, HEALTH, PROCESS))
-"""What the framework records measures the computers: it is compared when it is named."""
 Progress = Callable[[str, float], None]
+OF_THE_RUN = ("run", "base_directory", "network.port")
+"""Keys that differ between any two runs and say nothing of them."""
 TIMING = (
     ("exit code", ("exit_code",)),
     ("simulated time, s", ("duration_s",)),
@@ -42,6 +46,15 @@ TIMING = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class KeyDifference:
+    """One key whose values differ; None where a run does not have it."""
+
+    key: str
+    a: Any
+    b: Any
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Timed:
     """One figure of both summaries, side by side."""
 
@@ -54,7 +67,7 @@ class Timed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Selection:
-    """Which records are compared."""
+    """Selection of the records that are compared."""
 
     agents: tuple[str, ...] = ()
     """Globs of agents' names; empty for all."""
@@ -63,17 +76,17 @@ class Selection:
 
     def takes(self, recorded: Recorded) -> bool:
         """Tell whether a stream is compared."""
-        if recorded.role == "agent" and not _fits(recorded.source, self.agents, default=True):
+        if recorded.role == "agent" and self.agents and not _fits(recorded.source, self.agents):
             return False
         if self.streams:
-            names = (recorded.stream, recorded.table)
-            return any(_fits(name, self.streams, default=True) for name in names)
+            return any(_fits(name, self.streams) for name in (recorded.stream, recorded.table))
+        # What the framework records measures the computers: it is compared when it is named.
         return recorded.stream not in FRAMEWORK_STREAMS
 
 
 @dataclass(slots=True, kw_only=True)
 class Comparison:
-    """What differs between two runs."""
+    """Differences between two runs."""
 
     a: Side
     b: Side
@@ -83,11 +96,14 @@ class Comparison:
     """Of what the simulation summed up at its end."""
     timing: list[Timed] = field(default_factory=list)
     streams: list[StreamDifference] = field(default_factory=list)
-    """One a stream and source."""
+    """One per stream and source."""
     only_a: list[Key] = field(default_factory=list)
     """Streams that only the first run recorded."""
     only_b: list[Key] = field(default_factory=list)
-    constellation: ConstellationDifference | None = None
+    simulation: str = ""
+    """Name of what was simulated, as its descriptor tells it."""
+    by_simulation: SimulationDifference | None = None
+    """Differences that the simulation itself tells."""
     missing: list[str] = field(default_factory=list)
     """Data of either run that are missing or cut, each with the run's name first."""
     remarks: list[str] = field(default_factory=list)
@@ -108,10 +124,9 @@ class Comparison:
     @property
     def is_same(self) -> bool:
         """Whether the compared records of both runs are all there and the same; no records are never the same."""
-        whole = not self.only_a and not self.only_b and not self.missing
         return (
-            whole
-            and self.has_records
+            self.has_records
+            and not (self.only_a or self.only_b or self.missing)
             and all(one.is_identical or one.has_same_values for one in self.streams)
         )
 
@@ -138,20 +153,23 @@ def compare(
         MachineError: A file of theirs cannot be read.
     """
     check_comparable(a, b)
-    result = Comparison(a=a, b=b)
-    result.settings = differing_keys(a.settings, b.settings, without=OF_THE_RUN)
-    result.versions = _differing(a, b, "versions")
-    result.summaries = _differing(a, b, "simulation")
-    result.timing = [
-        Timed(title=title, key=".".join(path), a=_at(a, path), b=_at(b, path))
-        for title, path in TIMING
-    ]
-    result.missing = [f"{side.run.name}: {line}" for side in (a, b) for line in side.missing]
-    result.remarks = _remarks(a, b)
     of_a = {key: one for key, one in a.streams.items() if selection.takes(one)}
     of_b = {key: one for key, one in b.streams.items() if selection.takes(one)}
-    result.only_a = [key for key in of_a if key not in of_b]
-    result.only_b = [key for key in of_b if key not in of_a]
+    result = Comparison(
+        a=a,
+        b=b,
+        settings=differing_keys(a.settings, b.settings, without=OF_THE_RUN),
+        versions=_differing(a, b, "versions"),
+        summaries=_differing(a, b, "simulation"),
+        timing=[
+            Timed(title=title, key=".".join(path), a=_at(a, path), b=_at(b, path))
+            for title, path in TIMING
+        ],
+        only_a=[key for key in of_a if key not in of_b],
+        only_b=[key for key in of_b if key not in of_a],
+        missing=[f"{side.run.name}: {line}" for side in (a, b) for line in side.missing],
+        remarks=_remarks(a, b),
+    )
     _compare_streams(result, of_a, of_b, selection, progress)
     return result
 
@@ -164,35 +182,56 @@ def _compare_streams(
     progress: Progress,
 ) -> None:
     a, b = result.a, result.b
-    constellation = Constellation.of(a, b)
     common = [key for key in of_a if key in of_b]
     sizes = [_size(of_a[key]) + _size(of_b[key]) for key in common]
     done, total = 0, max(sum(sizes), 1)
+    identical: dict[Key, int] = {}
     for key, size in zip(common, sizes, strict=True):
         progress(f"comparing {key[1]}/{key[0]}", done / total)
         pairing = choose_pairing(of_a[key].fields, of_b[key].fields, (a.tick_hz, b.tick_hz))
-        found = _compare_one(of_a[key], of_b[key], pairing, selection, constellation)
+        lines = of_a[key].lines()
+        if lines is not None and lines == of_b[key].lines():
+            identical[key] = lines.records
+            found = identical_stream(of_a[key], pairing.by, lines.records)
+        else:
+            found = diff_stream(of_a[key], of_b[key], pairing, agents=selection.agents)
         result.streams.append(found)
         done += size
-    if constellation is not None:
-        result.constellation = constellation.finish(of_a, of_b)
+    progress("comparing by the simulation", 1.0)
+    try:
+        _compare_by_simulation(result, of_a, of_b, identical)
+    except PluginError as error:
+        result.remarks.append(f"{a.simulation} compared nothing itself: {error}")
 
 
-def _compare_one(
-    recorded: Recorded,
-    other: Recorded,
-    pairing: Pairing,
-    selection: Selection,
-    constellation: Constellation | None,
-) -> StreamDifference:
-    lines = recorded.lines()
-    if lines is not None and lines == other.lines():
-        same = identical_stream(recorded, pairing.by, lines.records)
-        if constellation is not None:
-            constellation.take_identical(recorded, same)
-        return same
-    observe = None if constellation is None else constellation.observer(recorded, pairing)
-    return diff_stream(recorded, other, pairing, agents=selection.agents, observe=observe)
+def _compare_by_simulation(
+    result: Comparison,
+    of_a: Mapping[Key, Recorded],
+    of_b: Mapping[Key, Recorded],
+    identical: Mapping[Key, int],
+) -> None:
+    """
+    Ask the simulation itself, by its descriptor's `compare`; nothing comes of it if it has none.
+
+    Raises:
+        PluginError: It could not be asked, or returned something else.
+    """
+    sides = tuple(
+        ComparedRun(
+            run=open_recorded_run(side.run, side.document), streams=streams, identical=identical
+        )
+        for side, streams in ((result.a, of_a), (result.b, of_b))
+    )
+    config = sides[1].run.config
+    if config is None:
+        return
+    result.simulation, found = call_simulation(config, "compare", *sides)
+    if found is not None and not isinstance(found, SimulationDifference):
+        raise PluginError(
+            f"compare() must return a madns_runtime.analysis.values.SimulationDifference,"
+            f" got {type(found).__name__}"
+        )
+    result.by_simulation = found
 
 
 def _remarks(a: Side, b: Side) -> list[str]:
@@ -207,6 +246,13 @@ def _remarks(a: Side, b: Side) -> list[str]:
             f"simulated times differ: {a.duration_s:g} s against {b.duration_s:g} s;"
             " what only the longer run has is alone"
         )
+    for side in (a, b):
+        unread = told_unread(side.run, find_unread(side.run))
+        remarks += [f"{side.run.name}: {name}: {why}" for name, why in unread.items()]
+        if names := no_tables(side.run.tables):
+            remarks.append(
+                f"{side.run.name}: not read, as they are links or no files: tables/{', '.join(names)}"
+            )
     return remarks
 
 
@@ -218,8 +264,8 @@ def _at(side: Side, path: Sequence[str]) -> Any:
     return mapping_at(side.document, *path[:-1]).get(path[-1])
 
 
-def _fits(name: str, globs: Sequence[str], *, default: bool) -> bool:
-    return any(fnmatchcase(name, glob) for glob in globs) if globs else default
+def _fits(name: str, globs: Sequence[str]) -> bool:
+    return any(fnmatchcase(name, glob) for glob in globs)
 
 
 def _size(recorded: Recorded) -> int:
@@ -231,3 +277,43 @@ def _size(recorded: Recorded) -> int:
         except OSError:
             continue
     return size
+
+
+def differing_keys(
+    a: Mapping[str, Any], b: Mapping[str, Any], *, without: Sequence[str] = ()
+) -> list[KeyDifference]:
+    """
+    Return the keys at which two trees differ, in the order of the first.
+
+    Args:
+        a: Mappings of mappings, lists and scalars.
+        b: The same.
+        without: Dotted keys that are not compared, nor what is below them.
+    """
+    of_a, of_b = dict(flat(a)), dict(flat(b))
+    return [
+        KeyDifference(key=key, a=of_a.get(key), b=of_b.get(key))
+        for key in dict.fromkeys((*of_a, *of_b))
+        if not _is_same(of_a, of_b, key)
+        and not any(key == other or key.startswith(f"{other}.") for other in without)
+    ]
+
+
+def flat(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Give every leaf with its dotted key; a list of scalars is one leaf."""
+    if isinstance(value, Mapping):
+        for name, item in value.items():
+            yield from flat(item, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, list | tuple) and any(isinstance(item, Mapping) for item in value):
+        for number, item in enumerate(value):
+            yield from flat(item, f"{key}[{number}]")
+    else:
+        yield key, list(value) if isinstance(value, tuple) else value
+
+
+def _is_same(a: Mapping[str, Any], b: Mapping[str, Any], key: str) -> bool:
+    if (key in a) != (key in b):
+        # Null here and a mapping there: the keys of the mapping tell, and this one would tell nothing.
+        return a.get(key) is None and b.get(key) is None
+    left, right = a[key], b[key]
+    return bool(left == right) and is_number(left) == is_number(right)

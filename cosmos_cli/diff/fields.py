@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cosmos_cli.diff.matching import Rows
-from cosmos_cli.report.style import as_array
+from madns_runtime.analysis.matching import Rows
+from madns_runtime.analysis.sampling import as_array
 from madns_runtime.recording.records import Field
 
 TURN = {"deg": 360.0, "rad": 2.0 * math.pi}
@@ -20,15 +20,15 @@ TEXT_CHARACTERS_MAX = 60
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """Where something was found: key of the record (tick or time), and whom it is about."""
+class RecordPlace:
+    """Place of a finding: key of the record (tick or time), and whom it is about."""
 
     key: float
     who: str = ""
 
-    def within(self, source: str) -> Place:
+    def within(self, source: str) -> RecordPlace:
         """Return the same place among the records of several sources."""
-        return Place(self.key, f"{source} {self.who}".strip())
+        return RecordPlace(self.key, f"{source} {self.who}".strip())
 
 
 class FieldDifference:
@@ -48,9 +48,9 @@ class FieldDifference:
         self.compared = 0
         """Records in which both have a number."""
         self.max = 0.0
-        self.at: Place | None = None
-        """Where the largest difference is; of texts, the first one."""
-        self.first: Place | None = None
+        self.at: RecordPlace | None = None
+        """Place of the largest difference; of texts, the first one."""
+        self.first: RecordPlace | None = None
         """The first record that differs."""
         self.values: tuple[Any, Any] | None = None
         """Both values there."""
@@ -121,10 +121,10 @@ class FieldDifference:
             self.first = place_of(a, int(is_different.argmax()))
 
 
-def place_of(rows: Rows, index: int) -> Place:
+def place_of(rows: Rows, index: int) -> RecordPlace:
     """Return where a record is."""
     who = rows.who[index]
-    return Place(float(rows.keys[index]), who if isinstance(who, str) else "")
+    return RecordPlace(float(rows.keys[index]), who if isinstance(who, str) else "")
 
 
 def _plain(value: Any) -> Any:

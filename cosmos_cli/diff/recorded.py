@@ -8,9 +8,17 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from cosmos_cli.rundir import RunDirectory
-from cosmos_cli.streams import DETAILS, Columns, Role, StreamFile, find_streams, read_batches
-from cosmos_cli.tables import TableReader, open_tables
+from cosmos_cli.collect.unread_files import find_unread
+from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.streams import (
+    DETAILS,
+    Columns,
+    RecordFile,
+    Role,
+    find_streams,
+    read_batches,
+)
+from cosmos_cli.evidence.tables import TableReader, open_tables
 from madns_runtime.errors import MachineError
 from madns_runtime.recording.reader import StreamReading
 from madns_runtime.recording.records import Field
@@ -27,7 +35,7 @@ Key = tuple[str, str]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lines:
-    """What a look at the lines of a stream tells without decoding them."""
+    """Figures of a stream's lines without decoding them."""
 
     sha256: str
     """Of all records, without the lines that name the run and its time."""
@@ -42,15 +50,10 @@ class Recorded:
     role: Role
     source: str
     fields: tuple[Field, ...]
-    files: tuple[StreamFile, ...]
+    files: tuple[RecordFile, ...]
     """In the order of incarnations; empty if only the table is left."""
     reader: TableReader | None
     """None if there is no table, or one that is older than the lines."""
-
-    @property
-    def key(self) -> Key:
-        """What the same stream of the other run is found by."""
-        return self.table, self.source
 
     @property
     def stream(self) -> str:
@@ -88,18 +91,19 @@ class Recorded:
         digest, records = hashlib.sha256(), 0
         for file in self.files:
             for block in _record_blocks(file.path):
-                if any(key in block for key in CONTROL_KEYS):
-                    block = CONTROL_LINE.sub(b"", block)  # noqa: PLW2901 - the same block without them
-                digest.update(block)
-                records += block.count(b"\n")
+                has_control = any(key in block for key in CONTROL_KEYS)
+                told = CONTROL_LINE.sub(b"", block) if has_control else block
+                digest.update(told)
+                records += told.count(b"\n")
         return Lines(sha256=digest.hexdigest(), records=records)
 
 
 def recorded_streams(run: RunDirectory) -> dict[Key, Recorded]:
     """Return every stream of a run that has a schema, by table and source."""
-    files: dict[Key, list[StreamFile]] = {}
+    files: dict[Key, list[RecordFile]] = {}
+    unread = find_unread(run)
     for file in find_streams(run.path):
-        if file.fields:
+        if file.fields and file.path not in unread:
             files.setdefault((file.table, file.source), []).append(file)
     tables = open_tables(run.tables)
     found = {
@@ -112,15 +116,15 @@ def recorded_streams(run: RunDirectory) -> dict[Key, Recorded]:
     return found
 
 
-def _from_lines(key: Key, files: Sequence[StreamFile], reader: TableReader | None) -> Recorded:
+def _from_lines(key: Key, files: Sequence[RecordFile], reader: TableReader | None) -> Recorded:
     fields: dict[str, Field] = {}
     for file in files:
         for field in (*file.fields, *(() if file.is_array else (DETAILS,))):
             fields.setdefault(field.name, field)
-    same = all(_names(file) == _names(files[0]) for file in files)
-    if not same and reader is None:
+    names = [tuple(field.name for field in file.fields) for file in files]
+    if len(set(names)) > 1 and reader is None:
         # Incarnations of different builds: what all of them have.
-        common = set.intersection(*(set(_names(file)) for file in files))
+        common = set.intersection(*map(set, names))
         fields = {name: field for name, field in fields.items() if name in common}
     return Recorded(
         table=key[0],
@@ -133,7 +137,7 @@ def _from_lines(key: Key, files: Sequence[StreamFile], reader: TableReader | Non
 
 
 def _from_table(reader: TableReader, source: str) -> Recorded:
-    role: Mapping[str, Role] = {"host": "host", "machine": "machine"}
+    role: Mapping[str, Role] = {"host": "host", "machine": "machine", "device": "device"}
     names = {field.name for field in reader.fields}
     fields = tuple(f for f in reader.fields if not (f.name == "t_s" and "tick" in names))
     return Recorded(
@@ -146,11 +150,7 @@ def _from_table(reader: TableReader, source: str) -> Recorded:
     )
 
 
-def _names(file: StreamFile) -> tuple[str, ...]:
-    return tuple(field.name for field in file.fields)
-
-
-def _fresh(reader: TableReader | None, files: Sequence[StreamFile]) -> TableReader | None:
+def _fresh(reader: TableReader | None, files: Sequence[RecordFile]) -> TableReader | None:
     """Return the table unless a line was written after it: then the lines tell more."""
     if reader is None:
         return None

@@ -1,4 +1,4 @@
-"""One of the two runs that are compared: its summary, its settings, and the streams it recorded."""
+"""One of two compared runs: its summary, its settings, and the streams it recorded."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from cosmos_cli.collect.previous_manifest import Earlier
 from cosmos_cli.diff.recorded import Key, Recorded, recorded_streams
-from cosmos_cli.earlier import Earlier
 from cosmos_cli.errors import InputError
-from cosmos_cli.expectation import mapping_at
-from cosmos_cli.rundir import RunDirectory
-from cosmos_cli.streams import SUFFIX
-from cosmos_cli.verdict import is_number
+from cosmos_cli.evidence.completeness import mapping_at
+from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.streams import SUFFIX
+from cosmos_cli.evidence.verdict import is_number
+from madns_runtime.config import to_mapping
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,10 +24,10 @@ class Side:
     document: Mapping[str, Any]
     """run.json."""
     settings: Mapping[str, Any]
-    """What every process of the run was told: the scenario with its defaults."""
+    """Settings of every process of the run: the scenario with its defaults."""
     streams: Mapping[Key, Recorded]
     missing: tuple[str, ...]
-    """What of its data is missing or cut, as its verdict names it, or since it was collected."""
+    """Data that are missing or cut, as its verdict names them, or since it was collected."""
 
     @property
     def simulation(self) -> str:
@@ -60,13 +61,16 @@ def open_side(run: RunDirectory, given: str) -> Side:
     document = run.read_json(run.run_json)
     if document is None or document.get("status") == "running":
         raise InputError(f"{run.name} is not collected yet; do that with: cosmos collect {given}")
-    settings = (run.read_json(run.plan_json) or {}).get("config")
+    config = run.read_config()
+    # By way of the class, which knows the old names of keys.
+    settings = to_mapping(config) if config else (run.read_json(run.plan_json) or {}).get("config")
     if not isinstance(settings, Mapping) or "simulation" not in settings:
         raise InputError(
             f"{run.plan_json}: expected the run's settings under config, found none;"
             f" without them {run.name} cannot be compared"
         )
-    told = mapping_at(document, "data").get("missing", ())
+    listed = mapping_at(document, "data").get("missing")
+    told = listed if isinstance(listed, list) else ()
     return Side(
         run=run,
         document=document,

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Any, Literal
 
 import numpy as np
 
-from cosmos_cli.diff.fields import FieldDifference, Place, place_of
-from cosmos_cli.diff.matching import Floats, Matched, Rows, joined, match
+from cosmos_cli.diff.fields import FieldDifference, RecordPlace, place_of
 from cosmos_cli.diff.recorded import ROWS_READ_MAX, Recorded
-from cosmos_cli.report.style import as_array
+from madns_runtime.analysis.matching import Matched, Rows, joined, match
+from madns_runtime.analysis.sampling import as_array
+from madns_runtime.analysis.values import Floats
 from madns_runtime.recording.records import Field
 
 TICK_TOLERANCE = 0.25
@@ -26,19 +27,17 @@ TIMES = ("t_s", "commanded_s", "sent_s", "rise_s", "at_s")
 OWNERS = ("agent", "sender")
 """Of these the first is the agent that a record of the host belongs to."""
 By = Literal["tick", "time", "order"]
-Observer = Callable[[str, Matched], None]
-"""Takes a source's name and what is matched of its records, piece by piece."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pairing:
-    """How records of a stream find each other."""
+    """Way in which records of a stream find each other."""
 
     by: By
     column: str
     """Field that holds the key; empty for the number of the record."""
     scales: tuple[float, float] = (1.0, 1.0)
-    """What the key is multiplied with, in the first and in the second run."""
+    """Factors of the key, in the first and in the second run."""
     tolerance: float = TICK_TOLERANCE
     identity: tuple[str, ...] = ()
 
@@ -48,37 +47,32 @@ class Alone:
     """Records that only one run has."""
 
     count: int = 0
-    first: Place | None = None
-    last: Place | None = None
+    first: RecordPlace | None = None
+    last: RecordPlace | None = None
 
     def add(self, rows: Rows) -> None:
         """Count them; the first and the last by key are kept."""
-        if not len(rows):
-            return
-        self.count += len(rows)
-        low, high = int(np.nanargmin(_finite(rows.keys))), int(np.nanargmax(_finite(rows.keys)))
-        first, last = place_of(rows, low), place_of(rows, high)
+        if len(rows):
+            keys = np.where(np.isfinite(rows.keys), rows.keys, 0.0)
+            first, last = place_of(rows, int(keys.argmin())), place_of(rows, int(keys.argmax()))
+            self._take(len(rows), first, last)
+
+    def merge(self, other: Alone, who: str) -> None:
+        """Take those of another source."""
+        if other.first is not None and other.last is not None:
+            self._take(other.count, other.first.within(who), other.last.within(who))
+
+    def _take(self, count: int, first: RecordPlace, last: RecordPlace) -> None:
+        self.count += count
         if self.first is None or first.key < self.first.key:
             self.first = first
         if self.last is None or last.key > self.last.key:
             self.last = last
 
-    def merge(self, other: Alone, who: str) -> None:
-        """Take those of another source."""
-        self.count += other.count
-        for place, name in ((other.first, "first"), (other.last, "last")):
-            if place is None:
-                continue
-            named = place.within(who)
-            if name == "first" and (self.first is None or named.key < self.first.key):
-                self.first = named
-            if name == "last" and (self.last is None or named.key > self.last.key):
-                self.last = named
-
 
 @dataclass(slots=True, kw_only=True)
 class StreamDifference:
-    """What a comparison of one stream found; of one source, or of all together."""
+    """Result of the comparison of one stream; of one source, or of all together."""
 
     table: str
     source: str
@@ -93,7 +87,6 @@ class StreamDifference:
     fields: dict[str, FieldDifference] = field(default_factory=dict)
     fields_only_a: tuple[str, ...] = ()
     fields_only_b: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
 
     @property
     def has_same_values(self) -> bool:
@@ -117,11 +110,9 @@ class StreamDifference:
         self.only_a.merge(other.only_a, who)
         self.only_b.merge(other.only_b, who)
         for name, found in other.fields.items():
-            mine = self.fields.setdefault(name, FieldDifference(found.field))
-            mine.merge(found, who)
+            self.fields.setdefault(name, FieldDifference(found.field)).merge(found, who)
         self.fields_only_a = _union(self.fields_only_a, other.fields_only_a)
         self.fields_only_b = _union(self.fields_only_b, other.fields_only_b)
-        self.remarks = _union(self.remarks, other.remarks)
 
 
 def choose_pairing(a: Sequence[Field], b: Sequence[Field], tick_hz: tuple[float, float]) -> Pairing:
@@ -143,8 +134,7 @@ def choose_pairing(a: Sequence[Field], b: Sequence[Field], tick_hz: tuple[float,
             )
     time = next((name for name in TIMES if name in common), None)
     if time is not None:
-        tolerance_s = 0.5 / max(tick_hz)
-        return Pairing(by="time", column=time, tolerance=tolerance_s, identity=identity)
+        return Pairing(by="time", column=time, tolerance=0.5 / max(tick_hz), identity=identity)
     return Pairing(by="order", column="", identity=())
 
 
@@ -154,7 +144,6 @@ def diff_stream(
     pairing: Pairing,
     *,
     agents: Sequence[str] = (),
-    observe: Observer | None = None,
 ) -> StreamDifference:
     """
     Compare one stream of one source, in bounded memory.
@@ -164,27 +153,27 @@ def diff_stream(
         b: The same stream in the second.
         pairing: How its records find each other.
         agents: Globs of the agents whose records count, where they are one of many; empty for all.
-        observe: Told of everything that is matched.
 
     Raises:
         MachineError: A file cannot be read.
     """
-    found = StreamDifference(table=a.table, source=a.source, by=pairing.by)
-    of_b = {f.name: f for f in b.fields}
-    found.fields_only_a = tuple(n for n in a.names() if n not in of_b)
-    found.fields_only_b = tuple(n for n in b.names() if n not in a.names())
-    values = [f for f in a.fields if f.name in of_b and f.name != pairing.column]
-    values = [f for f in values if f.name not in pairing.identity]
-    found.fields = {f.name: FieldDifference(f) for f in values}
-    names = tuple(f.name for f in a.fields if f.name in of_b)
+    names = tuple(n for n in a.names() if n in b.names())
+    keys = (pairing.column, *pairing.identity)
+    values = [f for f in a.fields if f.name in names and f.name not in keys]
+    found = StreamDifference(
+        table=a.table,
+        source=a.source,
+        by=pairing.by,
+        fields={f.name: FieldDifference(f) for f in values},
+        fields_only_a=tuple(n for n in a.names() if n not in names),
+        fields_only_b=tuple(n for n in b.names() if n not in names),
+    )
     sides = (
         _rows(a, names, pairing, scale=pairing.scales[0], agents=agents),
         _rows(b, names, pairing, scale=pairing.scales[1], agents=agents),
     )
     for piece in match(*sides, tolerance=pairing.tolerance):
         _take(found, piece)
-        if observe is not None:
-            observe(a.source, piece)
     found.is_identical = found.has_same_values and not (a.files or b.files)
     return found
 
@@ -264,10 +253,6 @@ def _who(columns: Mapping[str, Any], identity: tuple[str, ...], count: int) -> A
     who = np.empty(count, dtype=object)
     who[:] = [" ".join(str(p) for p in row if p is not None) for row in zip(*parts, strict=True)]
     return who
-
-
-def _finite(keys: Floats) -> Floats:
-    return np.where(np.isfinite(keys), keys, 0.0)
 
 
 def _union(first: tuple[str, ...], second: tuple[str, ...]) -> tuple[str, ...]:

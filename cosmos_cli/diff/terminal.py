@@ -4,18 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from cosmos_cli.console import Column, Console
-from cosmos_cli.counted import counted
-from cosmos_cli.diff.compare import Comparison, Timed
-from cosmos_cli.diff.constellation_terminal import print_constellation
-from cosmos_cli.diff.fields import Place
-from cosmos_cli.diff.settings import KeyDifference
+from cosmos_cli.diff.compare import Comparison, KeyDifference, Timed
+from cosmos_cli.diff.fields import RecordPlace
 from cosmos_cli.diff.stream import Alone, By, StreamDifference
-from cosmos_cli.report.model import format_cell
+from cosmos_cli.report.cells import format_cell
+from cosmos_cli.ui.console import Column, Console
+from cosmos_cli.ui.plural import counted
+from madns_runtime.analysis.values import ReportRemark, SimulationDifference, TableBlock
 
 KEYS_SHOWN_MAX = 40
 AGENTS_SHOWN_MAX = 12
 TEXT_CHARACTERS_MAX = 44
+STREAM_COLUMNS = (
+    Column("stream"),
+    Column("matched by"),
+    *(Column(name, True) for name in ("A", "B", "matched", "only A", "only B")),
+    Column(""),
+)
+FIELD_COLUMNS = (
+    Column("stream"),
+    Column("field"),
+    *(Column(name, True) for name in ("records", "rms", "max")),
+    Column("unit"),
+    Column("largest at"),
+    Column("first at"),
+)
 KEY_WORDS: Mapping[By, str] = {"tick": "tick ", "time": "t = ", "order": "record "}
 
 
@@ -35,8 +48,8 @@ def print_comparison(console: Console, found: Comparison) -> None:
         figures = counted(len(found.summaries), "figure")
         console.data(f"\n{figures} of the simulation's summaries differ; --json has them")
     _print_streams(console, found)
-    if found.constellation is not None:
-        print_constellation(console, found.constellation)
+    if found.by_simulation is not None:
+        _print_by_simulation(console, found.by_simulation)
     console.data("")
     console.data(verdict_of(found))
 
@@ -61,13 +74,31 @@ def verdict_of(found: Comparison) -> str:
     return f"DIFFERENT: {'; '.join(reasons)}"
 
 
+def _print_by_simulation(console: Console, found: SimulationDifference) -> None:
+    for block in found.blocks:
+        if isinstance(block, ReportRemark):
+            console.data(f"remark: {block.text}")
+        elif isinstance(block, TableBlock):
+            console.data(f"\n{block.title}" if block.title else "")
+            columns = [Column(h.text, is_number=h.is_number) for h in block.headings]
+            console.table(columns, [[format_cell(cell) for cell in row] for row in block.rows])
+            if block.note:
+                console.data(block.note)
+
+
+def _print_table(
+    console: Console, title: str, columns: Sequence[Column], rows: Sequence[Sequence[str]]
+) -> None:
+    """Print a table under its title; nothing without a row."""
+    if rows:
+        console.data(f"\n{title}" if title else "")
+        console.table(columns, rows)
+
+
 def _print_keys(console: Console, title: str, keys: Sequence[KeyDifference]) -> None:
-    if not keys:
-        return
-    _title(console, f"{title} that differ")
-    columns = [Column("key"), Column("A"), Column("B")]
     rows = [[one.key, _short(one.a), _short(one.b)] for one in keys[:KEYS_SHOWN_MAX]]
-    console.table(columns, rows)
+    columns = [Column("key"), Column("A"), Column("B")]
+    _print_table(console, f"{title} that differ", columns, rows)
     if len(keys) > KEYS_SHOWN_MAX:
         console.data(f"and {len(keys) - KEYS_SHOWN_MAX} more; --json has them all")
 
@@ -78,29 +109,15 @@ def _print_timing(console: Console, timing: Sequence[Timed]) -> None:
         for one in timing
         if one.a is not None or one.b is not None
     ]
-    if rows:
-        _title(console, "Timing")
-        console.table([Column(""), Column("A", True), Column("B", True)], rows)
+    _print_table(console, "Timing", [Column(""), Column("A", True), Column("B", True)], rows)
 
 
 def _print_streams(console: Console, found: Comparison) -> None:
     totals = found.totals()
-    if totals:
-        _title(console, "Records")
-        columns = [Column("stream"), Column("matched by")]
-        columns += [Column(n, True) for n in ("A", "B", "matched", "only A", "only B")]
-        columns.append(Column(""))
-        console.table(columns, [_stream_row(one) for one in totals])
+    _print_table(console, "Records", STREAM_COLUMNS, [_stream_row(one) for one in totals])
     rows = [row for total in totals for row in _field_rows(found, total)]
-    if rows:
-        _title(console, "Fields that differ")
-        columns = [Column("stream"), Column("field")]
-        columns += [Column(n, True) for n in ("records", "rms", "max")]
-        columns += [Column("unit"), Column("largest at"), Column("first at")]
-        console.table(columns, rows)
-        for line in _text_lines(found, totals):
-            console.data(line)
-    for line in _alone_lines(totals):
+    _print_table(console, "Fields that differ", FIELD_COLUMNS, rows)
+    for line in (*_text_lines(found, totals), *_alone_lines(totals)):
         console.data(line)
     for name, keys in (("A", found.only_a), ("B", found.only_b)):
         for table, sources in _by_table(keys).items():
@@ -108,11 +125,8 @@ def _print_streams(console: Console, found: Comparison) -> None:
 
 
 def _stream_row(one: StreamDifference) -> list[str]:
-    word = "different"
-    if one.is_identical:
-        word = "identical"
-    elif one.has_same_values:
-        word = "same values"
+    alike = "same values" if one.has_same_values else "different"
+    word = "identical" if one.is_identical else alike
     counts = (one.rows_a, one.rows_b, one.matched, one.only_a.count, one.only_b.count)
     return [one.table, one.by, *(format_cell(count) for count in counts), word]
 
@@ -134,14 +148,17 @@ def _field_rows(found: Comparison, total: StreamDifference) -> list[list[str]]:
     ]
 
 
-def _told_place(place: Place | None, by: By, found: Comparison) -> str:
+def _told_place(place: RecordPlace | None, by: By, found: Comparison) -> str:
     if place is None:
         return "-"
-    word = KEY_WORDS[by]
     unit = " s" if by == "time" else ""
     hz = found.a.tick_hz
     time = f" ({place.key / hz:g} s)" if by == "tick" and hz != 1.0 else ""
-    return f"{place.who} {word}{place.key:g}{unit}{time}".strip()
+    return f"{_words(place, by)}{unit}{time}"
+
+
+def _words(place: RecordPlace, by: By) -> str:
+    return f"{place.who} {KEY_WORDS[by]}{place.key:g}".strip()
 
 
 def _text_lines(found: Comparison, totals: Sequence[StreamDifference]) -> list[str]:
@@ -168,13 +185,10 @@ def _alone_lines(totals: Sequence[StreamDifference]) -> list[str]:
 
 
 def _told_alone(alone: Alone, by: By) -> str:
-    assert alone.first is not None
-    assert alone.last is not None
-    word = KEY_WORDS[by]
-    first = f"{alone.first.who} {word}{alone.first.key:g}".strip()
+    assert alone.first is not None and alone.last is not None
+    first, last = _words(alone.first, by), _words(alone.last, by)
     if alone.count == 1:
         return f"1 record ({first})"
-    last = f"{alone.last.who} {word}{alone.last.key:g}".strip()
     return f"{alone.count} records ({first} to {last})"
 
 
@@ -192,10 +206,6 @@ def _listed(names: Sequence[str]) -> str:
         if len(names) <= AGENTS_SHOWN_MAX
         else f"{shown} and {len(names) - AGENTS_SHOWN_MAX} more"
     )
-
-
-def _title(console: Console, text: str) -> None:
-    console.data(f"\n{text}")
 
 
 def _short(value: object) -> str:

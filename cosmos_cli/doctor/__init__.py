@@ -1,1 +1,1 @@
-"""What spoils real time or a run, on every machine and here: `probe` looks, the checks judge, and are pure."""
+"""Troubles of real time and of runs, on every machine and here: `probe` looks, the checks judge, and are pure."""

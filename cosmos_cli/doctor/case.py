@@ -1,30 +1,30 @@
-"""What the checks are given: what was probed on one machine, and what is wanted of it. Pure."""
+"""Input of the checks: the facts probed on one machine, and the wishes of a run. Pure."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
-from cosmos_cli.provision.facts import Facts
+from cosmos_cli.doctor.finding import HERE
+from cosmos_cli.models.machine_facts import MachineFacts
+from cosmos_cli.models.scenario import Scenario
 from madns_runtime.config import Agents, Deadline, Network, Scheduling
-
-if TYPE_CHECKING:
-    from cosmos_cli.models.scenario import Scenario
 
 _AGENTS, _DEADLINE, _NETWORK, _SCHEDULING = Agents(count=1), Deadline(), Network(), Scheduling()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wants:
-    """What a run would ask for: the scenario's settings, or the defaults without one."""
+    """Wishes of a run: the scenario's settings, or the defaults without one."""
 
     scenario: str | None = None
     receive_buffer_bytes: int = _NETWORK.receive_buffer_bytes
     policy: Literal["auto", "fifo", "normal"] = _SCHEDULING.policy
     priority: int = _SCHEDULING.priority
     """Of the agents; the host's is one above."""
-    tolerance_ms: float = _DEADLINE.tolerance_ms
+    lateness_ms: float = _DEADLINE.overrun_ms
+    """Of a wake-up, at most."""
     tick_hz: float = _AGENTS.tick_hz
     port: int = 0
     """UDP port of the host; 0 for any."""
@@ -39,12 +39,15 @@ class Wants:
     @classmethod
     def of(cls, scenario: Scenario, agents: Mapping[str, int], *, machines: int) -> Wants:
         """Return what a scenario asks for, whose agents are placed as given."""
+        deadline = scenario.deadline
         return cls(
             scenario=scenario.name,
             receive_buffer_bytes=scenario.network.receive_buffer_bytes,
             policy=scenario.scheduling.policy,
             priority=scenario.scheduling.priority,
-            tolerance_ms=scenario.deadline.tolerance_ms,
+            lateness_ms=deadline.overrun_ms
+            if deadline.lateness_ms is None
+            else deadline.lateness_ms,
             tick_hz=scenario.agents.tick_hz,
             port=scenario.network.port,
             agents=agents,
@@ -61,16 +64,26 @@ class Case:
     told: Mapping[str, Any]
     """The answer of the verb "doctor" and, here, of `probe_here`."""
     wants: Wants
-    facts: Facts
-    is_here: bool = False
-    """Whether it is this computer."""
+    facts: MachineFacts
 
     @classmethod
-    def of(cls, machine: str, told: Mapping[str, Any], wants: Wants, *, is_here: bool) -> Case:
+    def of(cls, machine: str, told: Mapping[str, Any], wants: Wants) -> Case:
         """Return the case of a machine that answered."""
         asked_s = told.get("asked_utc_s") or told["facts"]["clock"]["utc_s"]
-        facts = Facts.from_mapping(told["facts"], asked_utc_s=asked_s, answered_utc_s=asked_s)
-        return cls(machine=machine, told=told, wants=wants, facts=facts, is_here=is_here)
+        facts = MachineFacts.from_mapping(
+            told["facts"], asked_utc_s=asked_s, answered_utc_s=asked_s
+        )
+        return cls(machine=machine, told=told, wants=wants, facts=facts)
+
+    @property
+    def is_here(self) -> bool:
+        """Whether it is this computer."""
+        return self.machine == HERE
+
+    @property
+    def agents(self) -> int:
+        """Number of agents that the scenario would place there."""
+        return self.wants.agents.get(self.machine, 0)
 
     def part(self, name: str) -> Mapping[str, Any]:
         """Return one part of what was told; empty when it was left out."""

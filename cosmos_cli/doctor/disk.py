@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from cosmos_cli.doctor.case import Case
-from cosmos_cli.doctor.finding import Level, Remark
+from cosmos_cli.doctor.finding import CheckRemark, Severity
 
 FREE_BYTES_ERROR = 64 * 1024**2
 FREE_BYTES_WARNING = 512 * 1024**2
@@ -15,27 +15,31 @@ SYNC_S_WARNING = 1.0
 """Records wait in a bounded buffer while a disk is busy; some seconds of it lose some."""
 
 
-def disk_space(case: Case) -> Iterator[Remark]:
+def disk_space(case: Case) -> Iterator[CheckRemark]:
     """Room for records."""
     disk = case.part("facts").get("disk") or {}
     free_bytes, free_files = case.facts.disk.free_bytes, disk.get("free_files")
     if free_files is not None and free_files < FREE_FILES_ERROR:
-        yield Remark(
-            level=Level.ERROR,
+        yield CheckRemark(
+            level=Severity.ERROR,
             found="its disk has room for few more files",
             cure=_room_cure(case),
             figure=free_files,
         )
-    level = Level.OK
-    if free_bytes < FREE_BYTES_WARNING:
-        level = Level.ERROR if free_bytes < FREE_BYTES_ERROR else Level.WARNING
-    yield Remark(
+    level = (
+        Severity.ERROR
+        if free_bytes < FREE_BYTES_ERROR
+        else Severity.WARNING
+        if free_bytes < FREE_BYTES_WARNING
+        else Severity.OK
+    )
+    yield CheckRemark(
         level=level,
-        found="free disk space" if level == Level.OK else "little free disk space",
-        cure="" if level == Level.OK else _room_cure(case),
+        found="free disk space" if level == Severity.OK else "little free disk space",
+        cure="" if level == Severity.OK else _room_cure(case),
         figure=free_bytes / 1024**3,
         unit="GiB",
-        detail=case.facts.disk.path if level != Level.OK else "",
+        detail=case.facts.disk.path if level != Severity.OK else "",
     )
 
 
@@ -45,12 +49,12 @@ def _room_cure(case: Case) -> str:
     return "`cosmos collect RUN` and `cosmos wipe`; `cosmos exec --sudo -- apt-get clean`"
 
 
-def disk_writable(case: Case) -> Iterator[Remark]:
+def disk_writable(case: Case) -> Iterator[CheckRemark]:
     """A worn card turns read-only and looks healthy otherwise."""
     disk = case.facts.disk
     if disk.is_read_only:
-        yield Remark(
-            level=Level.ERROR,
+        yield CheckRemark(
+            level=Severity.ERROR,
             found="its disk is read-only",
             cure="another disk"
             if case.is_here
@@ -58,43 +62,47 @@ def disk_writable(case: Case) -> Iterator[Remark]:
             detail=disk.path,
         )
     elif not disk.is_writable:
-        yield Remark(
-            level=Level.ERROR,
+        yield CheckRemark(
+            level=Severity.ERROR,
             found=f"{case.facts.user} may not write in {disk.path}",
             cure="COSMOS_RUNS names another folder"
             if case.is_here
             else "cosmos_root in the inventory names a folder that may be written",
         )
     else:
-        yield Remark(found="its disk can be written")
+        yield CheckRemark(found="its disk can be written")
 
 
-def disk_write(case: Case) -> Iterator[Remark]:
-    """How long the disk takes to keep what it was given."""
+def disk_write(case: Case) -> Iterator[CheckRemark]:
+    """Check the time that the disk takes to keep its input."""
     told = case.part("disk_write")
     if told.get("error"):
-        yield Remark(
-            level=Level.ERROR,
+        yield CheckRemark(
+            level=Severity.ERROR,
             found=f"its disk takes nothing: {told['error']}",
             cure=_room_cure(case),
             detail=case.facts.disk.path,
         )
-        return
-    if not told:
-        return
-    level = Level.OK
-    longest_s = max(told["duration_s"], told["sync_s"])
-    if longest_s > SYNC_S_NOTE:
-        level = Level.WARNING if longest_s > SYNC_S_WARNING else Level.NOTE
-    rate_mb_s = told["bytes"] / 1e6 / max(told["duration_s"], 1e-9)
-    cure = "a faster card (class A2), or cosmos_root on another disk"
-    if case.is_here:
-        cure = "COSMOS_RUNS on another disk"
-    yield Remark(
-        level=level,
-        found="1 MiB is on its disk after",
-        cure="" if level == Level.OK else cure,
-        figure=told["duration_s"] * 1e3,
-        unit="ms",
-        detail=f"{rate_mb_s:.3g} MB/s; 4 KiB more after {told['sync_s'] * 1e3:.3g} ms",
-    )
+    elif told:
+        longest_s = max(told["duration_s"], told["sync_s"])
+        level = (
+            Severity.WARNING
+            if longest_s > SYNC_S_WARNING
+            else Severity.NOTE
+            if longest_s > SYNC_S_NOTE
+            else Severity.OK
+        )
+        rate_mb_s = told["bytes"] / 1e6 / max(told["duration_s"], 1e-9)
+        cure = (
+            "COSMOS_RUNS on another disk"
+            if case.is_here
+            else "a faster card (class A2), or cosmos_root on another disk"
+        )
+        yield CheckRemark(
+            level=level,
+            found="1 MiB is on its disk after",
+            cure="" if level == Severity.OK else cure,
+            figure=told["duration_s"] * 1e3,
+            unit="ms",
+            detail=f"{rate_mb_s:.3g} MB/s; 4 KiB more after {told['sync_s'] * 1e3:.3g} ms",
+        )

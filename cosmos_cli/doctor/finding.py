@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from cosmos_cli.fleet.names import compact
+from cosmos_cli.ui.name_ranges import compact
 
 HERE = "this computer"
 """Stands where a machine's name would; no machine of an inventory can be called so."""
 DETAILS_SHOWN_MAX = 3
 
 
-class Level(StrEnum):
-    """How bad; scripts may rely on these words."""
+class Severity(StrEnum):
+    """Severity of a finding; scripts may rely on these words."""
 
     OK = "ok"
     NOTE = "note"
@@ -26,23 +26,23 @@ class Level(StrEnum):
     """A run cannot be good like this."""
 
 
-ORDER = (Level.ERROR, Level.WARNING, Level.NOTE, Level.OK)
+ORDER = (Severity.ERROR, Severity.WARNING, Severity.NOTE, Severity.OK)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Remark:
-    """What a check has to say of one machine."""
+class CheckRemark:
+    """Result of a check on one machine."""
 
     found: str
     """A sentence that is the same for all machines of which the same is true."""
-    level: Level = Level.OK
+    level: Severity = Severity.OK
     cure: str = ""
     """A command, or a line of the inventory; empty when there is nothing to do."""
     figure: float | None = None
-    """What was measured, where the machines differ by it."""
+    """Measured value, where the machines differ by it."""
     unit: str = ""
     detail: str = ""
-    """What else is told when few machines are meant, such as the names of processes."""
+    """Addition for the case that few machines are meant, such as the names of processes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,11 +51,11 @@ class Finding:
 
     machine: str
     check: str
-    remark: Remark
+    remark: CheckRemark
 
     @property
-    def level(self) -> Level:
-        """How bad it is."""
+    def level(self) -> Severity:
+        """Severity of the finding."""
         return self.remark.level
 
     def to_mapping(self) -> dict[str, Any]:
@@ -72,11 +72,11 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Group:
+class FindingGroup:
     """One finding of many machines."""
 
     check: str
-    level: Level
+    level: Severity
     found: str
     cure: str
     machines: tuple[str, ...]
@@ -88,21 +88,20 @@ class Group:
         return ", ".join(filter(None, [HERE if HERE in self.machines else "", others]))
 
 
-def grouped(findings: Iterable[Finding]) -> list[Group]:
+def grouped(findings: Iterable[Finding]) -> list[FindingGroup]:
     """Return one group a finding that several machines share: the worst first, then in the order that they came."""
-    alike: dict[tuple[Level, str, str, str], list[Finding]] = {}
+    alike: dict[tuple[Severity, str, str, str], list[Finding]] = {}
     for finding in findings:
         remark = finding.remark
         key = (remark.level, finding.check, remark.found, remark.cure)
         alike.setdefault(key, []).append(finding)
-    keys = sorted(alike, key=lambda key: ORDER.index(key[0]))
-    return [_group(alike[key]) for key in keys]
+    return [_group(alike[key]) for key in sorted(alike, key=lambda key: ORDER.index(key[0]))]
 
 
-def _group(findings: Sequence[Finding]) -> Group:
+def _group(findings: Sequence[Finding]) -> FindingGroup:
     first = findings[0]
     remarks = [finding.remark for finding in findings]
-    return Group(
+    return FindingGroup(
         check=first.check,
         level=first.level,
         found=_sentence(first.remark.found, _figures(remarks), _details(findings)),
@@ -116,7 +115,7 @@ def _sentence(found: str, figures: str, detail: str) -> str:
     return f"{text} ({detail})" if detail else text
 
 
-def _figures(remarks: Sequence[Remark]) -> str:
+def _figures(remarks: Sequence[CheckRemark]) -> str:
     """Return the figures' range in words."""
     values = [remark.figure for remark in remarks if remark.figure is not None]
     if not values:
@@ -135,7 +134,7 @@ def _details(findings: Sequence[Finding]) -> str:
     told = [(f.machine, f.remark.detail) for f in findings if f.remark.detail]
     if len({detail for _, detail in told}) <= 1:
         return told[0][1] if told else ""
-    if findings[0].level == Level.OK:
+    if findings[0].level == Severity.OK:
         return ""
     shown = "; ".join(f"{machine}: {detail}" for machine, detail in told[:DETAILS_SHOWN_MAX])
     return shown + ("; ..." if len(told) > DETAILS_SHOWN_MAX else "")

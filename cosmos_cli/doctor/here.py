@@ -12,7 +12,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from cosmos_cli.rundir import list_runs, runs_root
+import psutil
+
+from cosmos_cli.evidence.run_directory import list_runs, runs_root
 
 AGENT_TIMEOUT_S = 2.0
 REQUEST_IDENTITIES = struct.pack(">IB", 1, 11)
@@ -41,8 +43,6 @@ def look_here(living: Sequence[str]) -> dict[str, Any]:
 
 def interface_of(address: str) -> str:
     """Return the interface that has one of this computer's addresses; lo when none does."""
-    import psutil
-
     for name, addresses in psutil.net_if_addrs().items():
         if any(item.address.partition("%")[0] == address for item in addresses):
             return str(name)
@@ -80,7 +80,7 @@ def _ssh_problems(folder: Path) -> Iterator[dict[str, str]]:
 
 def _uv() -> str | None:
     try:
-        import uv
+        import uv  # may be missing: that is the answer
 
         return str(uv.find_uv_bin())
     except (ImportError, FileNotFoundError):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 
-from cosmos_cli.doctor import board, disk, leftovers, network, operator, realtime
+from cosmos_cli.doctor import computer, disk, leftovers, network, operator, realtime
 from cosmos_cli.doctor.case import Case
-from cosmos_cli.doctor.finding import Finding, Remark
+from cosmos_cli.doctor.finding import CheckRemark, Finding
 
-Check = Callable[[Case], Iterator[Remark]]
+Check = Callable[[Case], Iterator[CheckRemark]]
 
 CHECKS: Mapping[str, Check] = {
-    "system": board.system,
+    "system": computer.system,
     "feasibility": operator.feasibility,
     "udp": network.udp,
     "udp_unasked": network.udp_unasked,
@@ -21,8 +21,8 @@ CHECKS: Mapping[str, Check] = {
     "link_errors": network.link_errors,
     "mtu": network.mtu,
     "wifi": network.wifi,
-    "throttled": board.throttled,
-    "temperature": board.temperature,
+    "throttled": computer.throttled,
+    "temperature": computer.temperature,
     "governor": realtime.governor,
     "realtime": realtime.realtime,
     "realtime_throttling": realtime.realtime_throttling,
@@ -34,10 +34,10 @@ CHECKS: Mapping[str, Check] = {
     "cpu_affinity": realtime.cpu_affinity,
     "timer": realtime.timer,
     "clock_source": realtime.clock_source,
-    "clock": board.clock,
-    "memory": board.memory,
+    "clock": computer.clock,
+    "memory": computer.memory,
     "memory_lock": realtime.memory_lock,
-    "swap": board.swap,
+    "swap": computer.swap,
     "disk_space": disk.disk_space,
     "disk_writable": disk.disk_writable,
     "disk_write": disk.disk_write,
@@ -45,11 +45,12 @@ CHECKS: Mapping[str, Check] = {
     "uncollected": leftovers.uncollected,
     "cut_off": operator.cut_off,
     "environments": leftovers.environments,
-    "radios": board.radios,
-    "uptime": board.uptime,
-    "sudo": board.sudo,
+    "radios": computer.radios,
+    "uptime": computer.uptime,
+    "sudo": computer.sudo,
     "container": operator.container,
     "open_files": operator.open_files,
+    "devices": operator.devices,
     "ssh_agent": operator.ssh_agent,
     "ssh_files": operator.ssh_files,
     "uv": operator.uv,

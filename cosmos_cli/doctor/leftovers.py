@@ -6,13 +6,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from cosmos_cli.doctor.case import Case
-from cosmos_cli.doctor.finding import Level, Remark
+from cosmos_cli.doctor.finding import CheckRemark, Severity
 
 ENVIRONMENTS_KEPT = 4
 NAMES_SHOWN_MAX = 3
 
 
-def living(case: Case) -> Iterator[Remark]:
+def living(case: Case) -> Iterator[CheckRemark]:
     """A run that goes on, and processes of one that does not."""
     entries: Sequence[Mapping[str, Any]] = case.part("cosmos").get("living") or ()
     by_run: dict[str, set[str]] = {}
@@ -22,50 +22,47 @@ def living(case: Case) -> Iterator[Remark]:
     left = sorted(run for run, roles in by_run.items() if roles == {"agent"})
     alive = sorted(run for run in by_run if run not in left)
     if left:
-        yield Remark(
-            level=Level.WARNING,
+        yield CheckRemark(
+            level=Severity.WARNING,
             found=f"processes of a dead run: {_shown(left)}",
             cure=f"`cosmos down {left[0]}`" + ("" if case.is_here else " -i INVENTORY"),
         )
     if alive:
-        yield Remark(
-            level=Level.NOTE,
+        yield CheckRemark(
+            level=Severity.NOTE,
             found=f"a run goes on, and disturbs what is measured here: {_shown(alive)}",
             cure="`cosmos ps` tells of it, `cosmos down` ends it",
         )
     if not entries:
-        yield Remark(found="no run lives there")
+        yield CheckRemark(found="no run lives there")
 
 
-def uncollected(case: Case) -> Iterator[Remark]:
+def uncollected(case: Case) -> Iterator[CheckRemark]:
     """Records that wait to be collected."""
     names: Sequence[str] = case.part("cosmos").get("runs") or ()
     alive = {
         str(e["run_directory"]).rpartition("/")[2] for e in case.part("cosmos").get("living") or ()
     }
     waiting = [name for name in names if name not in alive]
-    if not waiting:
-        return
-    cure = "`cosmos collect RUN`"
-    if not case.is_here:
-        cure += " here; `cosmos wipe --uncollected` if nobody wants them"
-    yield Remark(
-        level=Level.NOTE,
-        found=f"records that were not collected: {_shown(waiting)}",
-        cure=cure,
-        figure=float(len(waiting)),
-        unit="run" if len(waiting) == 1 else "runs",
-    )
+    if waiting:
+        where = "" if case.is_here else " here; `cosmos wipe --uncollected` if nobody wants them"
+        yield CheckRemark(
+            level=Severity.NOTE,
+            found=f"records that were not collected: {_shown(waiting)}",
+            cure=f"`cosmos collect RUN`{where}",
+            figure=float(len(waiting)),
+            unit="run" if len(waiting) == 1 else "runs",
+        )
 
 
-def environments(case: Case) -> Iterator[Remark]:
-    """What `cosmos up` made there, and what it left unfinished."""
+def environments(case: Case) -> Iterator[CheckRemark]:
+    """Check environments that `cosmos up` made there, and those that it left unfinished."""
     told = case.part("cosmos")
     if case.is_here:
         return
     if not told.get("has_root"):
-        yield Remark(
-            level=Level.NOTE,
+        yield CheckRemark(
+            level=Severity.NOTE,
             found="not set up yet: COSMoS's folder is not there",
             cure="`cosmos up`",
         )
@@ -73,23 +70,25 @@ def environments(case: Case) -> Iterator[Remark]:
     found: Sequence[Mapping[str, Any]] = told.get("environments") or ()
     whole = [item for item in found if item["is_whole"]]
     if len(whole) < len(found):
-        yield Remark(
-            level=Level.NOTE,
+        yield CheckRemark(
+            level=Severity.NOTE,
             found="environments that were not finished",
             cure="`cosmos up` finishes or removes them",
             figure=float(len(found) - len(whole)),
         )
     if len(whole) > ENVIRONMENTS_KEPT:
-        yield Remark(
-            level=Level.NOTE,
+        yield CheckRemark(
+            level=Severity.NOTE,
             found="old environments take room",
             cure="`cosmos up` removes those that nobody uses",
             figure=float(len(whole)),
         )
     elif not whole:
-        yield Remark(level=Level.NOTE, found="no environment is ready there", cure="`cosmos up`")
+        yield CheckRemark(
+            level=Severity.NOTE, found="no environment is ready there", cure="`cosmos up`"
+        )
     else:
-        yield Remark(found="environments that are ready", figure=float(len(whole)))
+        yield CheckRemark(found="environments that are ready", figure=float(len(whole)))
 
 
 def _shown(names: Sequence[str]) -> str:

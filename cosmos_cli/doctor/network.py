@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from cosmos_cli.doctor.case import Case
-from cosmos_cli.doctor.finding import Level, Remark
-from madns_runtime.protocol.seal import DATAGRAM_BYTES_MAX
+from cosmos_cli.doctor.finding import CheckRemark, Severity
+from madns_runtime.protocol.datagram import DATAGRAM_BYTES_MAX
 
 CAP_NET_ADMIN = 12
 IP_UDP_BYTES = 28
@@ -16,35 +16,35 @@ ERROR_SHARE_WARNING = 1e-6
 ROUND_TRIP_MS_NOTE = 5.0
 
 
-def receive_buffer(case: Case) -> Iterator[Remark]:
+def receive_buffer(case: Case) -> Iterator[CheckRemark]:
     """A burst of datagrams from many agents must fit: a small buffer loses most of it."""
     limit_bytes = case.facts.network.receive_buffer_bytes_max
     wanted_bytes = case.wants.receive_buffer_bytes
     if limit_bytes is None:
         return
     if limit_bytes >= wanted_bytes or case.has_capability(CAP_NET_ADMIN):
-        yield Remark(found=f"UDP receive buffer of {wanted_bytes} bytes is granted")
-        return
-    yield Remark(
-        level=Level.WARNING,
-        found=f"UDP receive buffer of {limit_bytes} bytes at most: {wanted_bytes} are asked for",
-        cure=case.cure(
-            f"cosmos_receive_buffer_bytes: {wanted_bytes}",
-            f"echo net.core.rmem_max={wanted_bytes} | sudo tee /etc/sysctl.d/90-cosmos.conf"
-            " && sudo sysctl --system",
-        ),
-    )
+        yield CheckRemark(found=f"UDP receive buffer of {wanted_bytes} bytes is granted")
+    else:
+        yield CheckRemark(
+            level=Severity.WARNING,
+            found=f"UDP receive buffer of {limit_bytes} bytes at most: {wanted_bytes} are asked for",
+            cure=case.cure(
+                f"cosmos_receive_buffer_bytes: {wanted_bytes}",
+                f"echo net.core.rmem_max={wanted_bytes} | sudo tee /etc/sysctl.d/90-cosmos.conf"
+                " && sudo sysctl --system",
+            ),
+        )
 
 
-def receive_drops(case: Case) -> Iterator[Remark]:
+def receive_drops(case: Case) -> Iterator[CheckRemark]:
     """Datagrams that came and found no room."""
-    total = case.part("receive_drops").get("total")
-    before = case.part("receive_drops").get("before")
+    told = case.part("receive_drops")
+    total, before = told.get("total"), told.get("before")
     if total is None:
         return
     is_new = before is not None and total > before
-    level = (Level.WARNING if is_new else Level.NOTE) if total else Level.OK
-    yield Remark(
+    level = (Severity.WARNING if is_new else Severity.NOTE) if total else Severity.OK
+    yield CheckRemark(
         level=level,
         found="datagrams dropped by full receive buffers, of any program since it was started",
         cure="a larger receive buffer (`receive_buffer` tells)" if total else "",
@@ -52,37 +52,39 @@ def receive_drops(case: Case) -> Iterator[Remark]:
     )
 
 
-def link(case: Case) -> Iterator[Remark]:
+def link(case: Case) -> Iterator[CheckRemark]:
     """Speed and duplex."""
     for item in _interfaces(case):
         name, speed, duplex = item["name"], item.get("speed_mbit"), item.get("duplex")
         if duplex == "half":
-            yield Remark(
-                level=Level.ERROR,
+            yield CheckRemark(
+                level=Severity.ERROR,
                 found=f"{name} is half-duplex: it cannot send while it receives",
                 cure="another cable or port of the switch; both ends must negotiate by themselves",
             )
         elif speed and 0 < speed < SPEED_MBIT_MIN:
-            yield Remark(
-                level=Level.WARNING,
+            yield CheckRemark(
+                level=Severity.WARNING,
                 found=f"{name} is slow: expected {SPEED_MBIT_MIN} Mbit/s or more",
                 cure="another cable or port of the switch",
                 figure=speed,
                 unit="Mbit/s",
             )
         elif speed and speed > 0:
-            yield Remark(found=f"{name}, {duplex or 'unknown'} duplex", figure=speed, unit="Mbit/s")
+            yield CheckRemark(
+                found=f"{name}, {duplex or 'unknown'} duplex", figure=speed, unit="Mbit/s"
+            )
 
 
-def link_errors(case: Case) -> Iterator[Remark]:
+def link_errors(case: Case) -> Iterator[CheckRemark]:
     """Frames that were damaged on their way."""
     for item in _interfaces(case):
         errors, packets = item.get("errors") or 0, item.get("packets") or 0
         is_bad = errors > 0 and (
             bool(item.get("new_errors")) or errors > ERROR_SHARE_WARNING * max(1, packets)
         )
-        level = (Level.WARNING if is_bad else Level.NOTE) if errors else Level.OK
-        yield Remark(
+        level = (Severity.WARNING if is_bad else Severity.NOTE) if errors else Severity.OK
+        yield CheckRemark(
             level=level,
             found=f"{item['name']}: errors since it was started",
             cure="another cable or port of the switch" if errors else "",
@@ -91,7 +93,7 @@ def link_errors(case: Case) -> Iterator[Remark]:
         )
 
 
-def mtu(case: Case) -> Iterator[Remark]:
+def mtu(case: Case) -> Iterator[CheckRemark]:
     """A datagram that does not fit is cut in two, and lost when either is."""
     for item in _interfaces(case):
         found = item.get("mtu")
@@ -99,33 +101,31 @@ def mtu(case: Case) -> Iterator[Remark]:
         if found is None:
             continue
         is_small = found < needed
-        yield Remark(
-            level=Level.WARNING if is_small else Level.OK,
+        yield CheckRemark(
+            level=Severity.WARNING if is_small else Severity.OK,
             found=f"{item['name']}: MTU" + (f": datagrams need {needed}, got" if is_small else ""),
             cure=case.cure_by(f"ip link set {item['name']} mtu 1500") if is_small else "",
             figure=found,
         )
 
 
-def wifi(case: Case) -> Iterator[Remark]:
+def wifi(case: Case) -> Iterator[CheckRemark]:
     """Wi-Fi loses and delays; saving power, it delays every packet up to a beacon's interval."""
-    for item in _interfaces(case):
-        if not item.get("is_wireless"):
-            continue
-        yield Remark(
-            level=Level.WARNING,
+    for item in filter(lambda item: item.get("is_wireless"), _interfaces(case)):
+        yield CheckRemark(
+            level=Severity.WARNING,
             found=f"reached over Wi-Fi ({item['name']}): delays and losses are not those of a cable",
             cure="a cable",
         )
         if item.get("saves_power"):
-            yield Remark(
-                level=Level.WARNING,
+            yield CheckRemark(
+                level=Severity.WARNING,
                 found=f"{item['name']} saves power: packets wait up to 100 ms and more",
                 cure=case.cure_by(f"iw dev {item['name']} set power_save off"),
             )
 
 
-def udp(case: Case) -> Iterator[Remark]:
+def udp(case: Case) -> Iterator[CheckRemark]:
     """Datagrams to this computer and back, as agents and host exchange them."""
     told = case.part("round_trips")
     if not told:
@@ -133,37 +133,36 @@ def udp(case: Case) -> Iterator[Remark]:
     where = f"{told['address']}:{told['port']}"
     sent, answered = told["sent"], told["answered"]
     if told.get("error"):
-        yield Remark(
-            level=Level.ERROR,
+        yield CheckRemark(
+            level=Severity.ERROR,
             found=f"cannot send UDP to {told['address']}: {told['error']}",
             cure="`cosmos_host_address` in the inventory says by which address this computer is reached",
         )
     elif not answered:
-        yield Remark(
-            level=Level.ERROR,
+        yield CheckRemark(
+            level=Severity.ERROR,
             found=f"no UDP from there to this computer ({told['address']})",
             cure=_firewall_cure(case),
             detail=f"{sent} datagrams to {where}",
         )
     elif answered < sent:
-        yield Remark(
-            level=Level.WARNING,
+        yield CheckRemark(
+            level=Severity.WARNING,
             found=f"of {sent} datagrams to this computer and back were lost",
             cure="cables, the switch, and who else uses the network (`link`, `link_errors` tell)",
             figure=sent - answered,
         )
-        yield _trip(told, Level.OK)
+        yield _trip(told, Severity.OK)
     else:
-        is_long = told["p50_ms"] > ROUND_TRIP_MS_NOTE
-        yield _trip(told, Level.NOTE if is_long else Level.OK)
+        yield _trip(told, Severity.NOTE if told["p50_ms"] > ROUND_TRIP_MS_NOTE else Severity.OK)
 
 
-def _trip(told: Mapping[str, Any], level: Level) -> Remark:
-    return Remark(
+def _trip(told: Mapping[str, Any], level: Severity) -> CheckRemark:
+    return CheckRemark(
         level=level,
         found=f"round trip of {told['sent']} datagrams to this computer: median",
         cure=""
-        if level == Level.OK
+        if level == Severity.OK
         else "a shorter way; a lead of maneuvers and buffers that allow for it"
         " (`cosmos plan --latency-ms`)",
         figure=told["p50_ms"],
@@ -185,20 +184,22 @@ def _firewall_cure(case: Case) -> str:
     )
 
 
-def udp_unasked(case: Case) -> Iterator[Remark]:
+def udp_unasked(case: Case) -> Iterator[CheckRemark]:
     """Datagrams that the machine had not asked for; only a host needs them."""
     came = case.part("round_trips").get("unasked")
     if came is None or case.is_here:
         return
     if came:
-        yield Remark(found="takes datagrams that it did not ask for: it could be the run's host")
-        return
-    yield Remark(
-        level=Level.NOTE,
-        found="a firewall there keeps out datagrams that it did not ask for: agents need none,"
-        " the host of a run does",
-        cure="only for `cosmos run --host`: open UDP there for the other machines",
-    )
+        yield CheckRemark(
+            found="takes datagrams that it did not ask for: it could be the run's host"
+        )
+    else:
+        yield CheckRemark(
+            level=Severity.NOTE,
+            found="a firewall there keeps out datagrams that it did not ask for: agents need none,"
+            " the host of a run does",
+            cure="only for `cosmos run --host`: open UDP there for the other machines",
+        )
 
 
 def _interfaces(case: Case) -> list[Mapping[str, Any]]:

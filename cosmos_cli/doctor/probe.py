@@ -1,17 +1,28 @@
-"""Asks a machine, or this computer, for everything that is judged: one connection, one request."""
+"""Asks a machine, or this computer, for everything that is judged, in one request, and answers its datagrams."""
 
 from __future__ import annotations
 
+import dataclasses
+import secrets
+import socket
 import time
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
-from cosmos_cli.doctor.case import Case, Wants
-from cosmos_cli.doctor.finding import HERE
-from cosmos_cli.doctor.responder import Responder
-from cosmos_cli.fleet.board import Board
+from cosmos_cli.doctor.case import Wants
+from cosmos_cli.doctor.device_needs import conditions_of, missing_of, need_questions
 from cosmos_cli.fleet.connection import Connection
-from cosmos_cli.fleet.layout import Layout
+from cosmos_cli.fleet.helper import Helper
+from cosmos_cli.fleet.layout import Layout, at_home
+from cosmos_cli.fleet.udp_server import DatagramServer, bound_socket
+from cosmos_cli.models.device_needs import MachineNeeds, needs_of_machines
+from cosmos_cli.models.inventory import Machine
+from cosmos_cli.models.text_forms import is_own_requirement
+from cosmos_cli.onboard.udp_probe import ANSWER, ASK, NONCE_BYTES, UNASKED, Datagram
+from cosmos_cli.provision.wheelhouse import EnvironmentNeed, remembered_key
+
+if TYPE_CHECKING:
+    from cosmos_cli.models.loading import ScenarioFile
 
 PARTS = (
     "files",
@@ -19,9 +30,9 @@ PARTS = (
     "facts",
     "madns_runtime.processes",
     "processes",
-    "busy",
-    "wakeups",
-    "round_trips",
+    "cpu_load",
+    "timer_latency",
+    "udp_probe",
     "interfaces",
     "doctor",
 )
@@ -32,12 +43,51 @@ TIMEOUT_S = 60.0
 """Some seconds are usual; a disk that has to wait for a worn card may take many."""
 
 
+class Responder(DatagramServer):
+    """
+    Answers machines that know its nonce; use it as a context manager.
+
+    Args:
+        port: UDP port to listen at, as the host of a run would; one that is free when it is 0 or taken.
+    """
+
+    def __init__(self, port: int = 0) -> None:
+        self.nonce = secrets.token_bytes(NONCE_BYTES)
+        self.ignored = 0
+        """Datagrams of somebody else."""
+        super().__init__(self._reply, port=port)
+        self._other = bound_socket(family=self.family)
+
+    def close(self) -> None:
+        """Hear no more; harmless when repeated."""
+        super().close()
+        self._other.close()
+
+    def _reply(self, own: socket.socket, data: bytes, where: Any) -> None:
+        received_s = time.clock_gettime(time.CLOCK_REALTIME)
+        asked = Datagram.decode(data)
+        if asked is None or asked.kind != ASK or asked.nonce != self.nonce:
+            self.ignored += 1
+            return
+        answer = dataclasses.replace(
+            asked,
+            kind=ANSWER,
+            received_s=received_s,
+            answered_s=time.clock_gettime(time.CLOCK_REALTIME),
+        )
+        own.sendto(answer.encode(), where)
+        if asked.port:
+            unasked = dataclasses.replace(asked, kind=UNASKED)
+            self._other.sendto(unasked.encode(), (where[0], asked.port, *where[2:]))
+
+
 def ask(
     connection: Connection,
     wants: Wants,
     responder: Responder,
     *,
-    host_address: str | None = None,
+    machine: Machine | None = None,
+    needs: DoctorNeeds | None = None,
 ) -> dict[str, Any]:
     """
     Return what a machine tells of itself.
@@ -46,7 +96,8 @@ def ask(
         connection: To the machine.
         wants: What a run would ask for.
         responder: Answers the machine's datagrams.
-        host_address: By which the machine reaches this computer; None for the way of the connection.
+        machine: Its entry in the inventory, if it has one.
+        needs: Of devices; None to leave them out.
 
     Raises:
         MachineFailure: It cannot be asked.
@@ -55,7 +106,8 @@ def ask(
     arguments = {
         "wake_ups": _wake_ups(wants, wants.priority),
         "round_trips": {
-            "address": host_address or connection.own_address,
+            "address": (machine and machine.variables.cosmos_host_address)
+            or connection.own_address,
             "port": responder.port,
             "nonce_hex": responder.nonce.hex(),
             "count": ROUND_TRIP_COUNT,
@@ -65,7 +117,11 @@ def ask(
         "environments": layout.environments,
         "state": layout.state,
     }
-    return _call(connection, arguments)
+    return _call(
+        connection,
+        arguments,
+        lambda board: needs.ask(board, machine) if needs and machine else [],
+    )
 
 
 def ask_here(
@@ -93,11 +149,6 @@ def ask_here(
     return _call(connection, arguments)
 
 
-def case_of(machine: str, told: Mapping[str, Any], wants: Wants) -> Case:
-    """Return the case that the checks judge."""
-    return Case.of(machine, told, wants, is_here=machine == HERE)
-
-
 def _wake_ups(wants: Wants, priority: int) -> dict[str, Any]:
     return {
         "count": WAKE_UP_COUNT,
@@ -107,9 +158,66 @@ def _wake_ups(wants: Wants, priority: int) -> dict[str, Any]:
     }
 
 
-def _call(connection: Connection, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    with Board.start(connection, PARTS) as board:
+def _call(
+    connection: Connection,
+    arguments: Mapping[str, Any],
+    ask_devices: Callable[[Helper], Any] = lambda board: (),
+) -> dict[str, Any]:
+    with Helper.start(connection, PARTS) as board:
         asked_s = time.clock_gettime(time.CLOCK_REALTIME)
         told = dict(board.call("doctor", arguments, timeout_s=TIMEOUT_S).value)
+        told["devices"] = ask_devices(board)
     told["asked_utc_s"] = asked_s
     return told
+
+
+class DoctorNeeds:
+    """
+    Asks machines what their devices need and is missing there.
+
+    Args:
+        machines: All of them.
+        scenario_file: Whose devices count as well; None for none.
+    """
+
+    def __init__(self, machines: Sequence[Machine], scenario_file: ScenarioFile | None) -> None:
+        self._needs = needs_of_machines(machines, scenario_file)
+        requirements = scenario_file.scenario.requirements if scenario_file else ()
+        self._requirements = tuple(text for text in requirements if not is_own_requirement(text))
+
+    def ask(self, board: Helper, machine: Machine) -> list[dict[str, Any]]:
+        """
+        Return what is missing on a machine, by device.
+
+        Raises:
+            MachineFailure: It cannot be asked.
+        """
+        needs = self._needs[machine.name]
+        if not needs.devices:
+            return []
+        asked = need_questions(
+            machine.name,
+            needs,
+            greeting=board.greeting,
+            environments=tuple(self._environments(board, machine, needs)),
+        )
+        conditions = conditions_of(asked)
+        told = board.call("look", {"conditions": conditions}, timeout_s=TIMEOUT_S).value
+        return missing_of(machine.name, needs, asked, told["conditions"])
+
+    def _environments(self, board: Helper, machine: Machine, needs: MachineNeeds) -> Iterator[str]:
+        """Yield the folders of environments that `cosmos up` would have made for these needs."""
+        layout = Layout(at_home(machine.variables.root, str(board.greeting["home"])))
+        for requirements in {(), self._requirements}:
+            for is_host in (False, True):
+                key = remembered_key(
+                    EnvironmentNeed.of_machine(
+                        board.greeting,
+                        machine.variables,
+                        requirements,
+                        is_host=is_host,
+                        needs=needs,
+                    )
+                )
+                if key is not None:
+                    yield layout.environment(key)

@@ -1,8 +1,8 @@
 """
-What the rest of COSMoS asks of a connection to a machine; SSH and this computer are two ways to have one.
+Contract of a connection to a machine; SSH and this computer are two ways to have one.
 
 `Stream` is made for two kinds of users: a loop, which polls `fileno` and never blocks, and a thread of
-the pool, which waits with a deadline through `read_some` and `write_all`.
+the pool, which waits with a deadline through `cosmos_cli.fleet.liveness.BlockingStream`.
 """
 
 from __future__ import annotations
@@ -13,12 +13,18 @@ from typing import Protocol
 from cosmos_cli.fleet.target import Target
 
 OUTPUT_BYTES_MAX = 4 * 1024 * 1024
-"""What `Connection.run` keeps of each output: one half of its begin, one of its end."""
+"""Bytes that `Connection.run` keeps of each output: one half of its begin, one of its end."""
+SAID_BYTES_MAX = 1024 * 1024 * 1024
+"""Bytes that a command may write at all before it is ended."""
+EXIT_STATUS_TIMEOUT_S = 1.0
+"""Wait for a program's exit status, once its output has ended."""
+SMALL_BYTES_MAX = 1024 * 1024
+"""Bytes for a command that has next to nothing to say; a start-up file there may talk."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConnectOptions:
-    """What an operator may decide about all connections of a command."""
+    """The operator's decisions about all connections of a command."""
 
     timeout_s: float = 10.0
     """Until a machine is logged in at; ConnectTimeout of the ssh configuration wins."""
@@ -35,7 +41,17 @@ class Completed:
     stdout: bytes
     stderr: bytes
     cut_bytes: int = 0
-    """How many bytes of both were too many to keep; a line in their midst says so."""
+    """Number of bytes of both that were too many to keep; a line in their midst says so."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamEnd:
+    """End of a program, as far as it is known."""
+
+    exit_status: int | None
+    """Negative for a signal; None while it runs or when nobody knows."""
+    errors: str
+    """The last of what it wrote to standard error, some kilobytes at most."""
 
 
 class Stream(Protocol):
@@ -44,55 +60,36 @@ class Stream(Protocol):
     def fileno(self) -> int:
         """Return what to poll: readable when `read` would not block."""
 
-    def read(self, count: int) -> bytes:
+    def read(self, count: int, *, timeout_s: float = 0.0) -> bytes:
         """
-        Return what has come, at most *count* bytes; empty at the end.
+        Return what has come or comes in time, at most *count* bytes; empty at the end.
 
         Raises:
             BlockingIOError: Nothing has come.
             MachineFailure: The connection is lost.
         """
 
-    def write(self, data: bytes) -> int:
+    def write(self, data: bytes | memoryview, *, timeout_s: float = 0.0) -> int:
         """
-        Hand over what fits, and return how many bytes that was.
+        Hand over what fits, as soon as anything does, and return how many bytes that was.
 
         Raises:
-            BlockingIOError: Nothing fits now.
+            BlockingIOError: Nothing fitted in time.
             MachineFailure: The program or the connection is gone.
-        """
-
-    def read_some(self, count: int, *, timeout_s: float) -> bytes:
-        """
-        Wait for bytes, at most *timeout_s*; empty at the end.
-
-        Raises:
-            MachineFailure: TIMEOUT, or the connection is lost.
-        """
-
-    def write_all(self, data: bytes, *, timeout_s: float) -> None:
-        """
-        Hand over everything, waiting for room; *timeout_s* is for each piece that is taken.
-
-        Raises:
-            MachineFailure: TIMEOUT, or the connection is lost.
         """
 
     def close_writing(self) -> None:
         """End the program's standard input; harmless when repeated."""
 
-    def exit_status(self) -> int | None:
-        """Return how the program ended, negative for a signal; None while it runs or when nobody knows."""
-
-    def errors(self) -> str:
-        """Return the last of what the program wrote to standard error, some kilobytes at most."""
+    def ending(self, *, timeout_s: float = 0.0) -> StreamEnd:
+        """Return how the program ended; after the end of its output its status may take a moment to come."""
 
     def close(self) -> None:
         """Let go of it; a program that watches its standard input ends."""
 
 
 class Connection(Protocol):
-    """A machine that answers. Made by `cosmos_cli.fleet.connect.connect`, closed by its owner."""
+    """A machine that answers. Made by `cosmos_cli.fleet.open_connection.connect`, closed by its owner."""
 
     @property
     def target(self) -> Target:
@@ -116,20 +113,28 @@ class Connection(Protocol):
 
     @property
     def opening_s(self) -> float:
-        """How long it took to be logged in there."""
+        """Duration of the login, s."""
 
-    def run(self, command: str, *, stdin: bytes | None = b"", timeout_s: float) -> Completed:
+    def run(
+        self,
+        command: str,
+        *,
+        stdin: bytes | None = b"",
+        timeout_s: float,
+        said_bytes_max: int = SAID_BYTES_MAX,
+    ) -> Completed:
         """
         Run a shell command to its end.
 
         Args:
             command: For the user's shell there.
             stdin: What it reads; None for nothing, and no end either before the connection closes, for
-                which `cosmos_cli.fleet.watched` waits.
+                which `cosmos_cli.fleet.shell` waits.
             timeout_s: Until it has ended.
+            said_bytes_max: What it may say; who says more is ended.
 
         Raises:
-            MachineFailure: TIMEOUT, or the connection is lost.
+            MachineFailure: TIMEOUT, or DATA: it said too much; or the connection is lost.
         """
 
     def is_alive(self, *, timeout_s: float = 2.0) -> bool:

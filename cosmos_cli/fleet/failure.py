@@ -7,7 +7,7 @@ from typing import Any
 
 
 class FailureKind(StrEnum):
-    """What went wrong; scripts may rely on these words."""
+    """Kinds of failure; scripts may rely on these words."""
 
     UNREACHABLE = "unreachable"
     """No route, or nothing answers."""
@@ -33,9 +33,9 @@ class FailureKind(StrEnum):
     STEP = "step"
     """A step of provisioning failed; the text quotes its last words."""
     UNSUPPORTED = "unsupported"
-    """What is asked cannot be done on such a machine."""
+    """The request cannot be carried out on such a machine."""
     DATA = "data"
-    """What came is not what was announced."""
+    """The data that came are not those announced."""
     DEFECT = "defect"
     """COSMoS itself is to blame."""
 

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
+import dataclasses
 import functools
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from cosmos_cli.fleet.connect import connect
 from cosmos_cli.fleet.connection import Connection, ConnectOptions
+from cosmos_cli.fleet.open_connection import connect
 from cosmos_cli.fleet.outcome import Outcome
 from cosmos_cli.fleet.pool import FORKS_DEFAULT, for_each
-from cosmos_cli.fleet.remembered import key_of, recall, remember
 from cosmos_cli.fleet.target import Target, target_of
+from cosmos_cli.fleet.target_cache import key_of, recall, remember
+from cosmos_cli.models.inventory_arguments import Given, sources_of
 
 if TYPE_CHECKING:
     from cosmos_cli.models.inventory import Machine
@@ -25,19 +25,27 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, kw_only=True)
 class Fleet:
-    """What -i and --limit mean."""
+    """Machines that -i and --limit mean."""
 
     targets: tuple[Target, ...]
-    """How to reach the machines, in the order of the inventory."""
+    """Addresses and logins of the machines, in the order of the inventory."""
     forks: int = FORKS_DEFAULT
     options: ConnectOptions = ConnectOptions()
     load: Callable[[], tuple[Machine, ...]] = tuple
     """Reads the inventory; who needs the targets alone is spared it."""
+    sources: tuple[str, ...] = ()
+    """Inventories that -i named."""
 
     @functools.cached_property
     def machines(self) -> tuple[Machine, ...]:
         """All that the inventory says of the targets, in the same order."""
         return self.load()
+
+    def elsewhere(self) -> Fleet:
+        """Return the fleet without this computer."""
+        return dataclasses.replace(
+            self, targets=tuple(target for target in self.targets if target.connection != "local")
+        )
 
     def each(
         self,
@@ -67,48 +75,34 @@ class Fleet:
         self,
         task: Callable[[Connection], T],
         on_done: Callable[[Outcome[T]], None] = lambda outcome: None,
+        on_wait: Callable[[], None] = lambda: None,
     ) -> list[Outcome[T]]:
-        """Do the same without asking what the inventory says beyond how to reach the machines."""
-        living = _Living()
+        """Do the same without asking what the inventory says beyond how to reach the machines; *on_wait* as `for_each`."""
+        lock = threading.Lock()
+        living: set[Connection] = set()
 
         def work(target: Target) -> T:
             connection = connect(target, self.options)
-            with living.holding(connection):
+            with lock:
+                living.add(connection)
+            try:
                 return task(connection)
+            finally:
+                with lock:
+                    living.discard(connection)
+                connection.close()
 
         try:
-            return for_each(self.targets, work, forks=self.forks, on_done=on_done)
-        finally:
-            living.close()
-
-
-class _Living:
-    """The connections that are open, to close them when a command is interrupted."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._connections: set[Connection] = set()
-
-    @contextlib.contextmanager
-    def holding(self, connection: Connection) -> Iterator[None]:
-        with self._lock:
-            self._connections.add(connection)
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._connections.discard(connection)
-            connection.close()
-
-    def close(self) -> None:
-        with self._lock:
-            left = list(self._connections)
-        for connection in left:
-            connection.close()
+            return for_each(self.targets, work, forks=self.forks, on_done=on_done, on_wait=on_wait)
+        finally:  # of a command that is interrupted some are open
+            with lock:
+                left = list(living)
+            for connection in left:
+                connection.close()
 
 
 def fleet_of(
-    inventory: Path,
+    inventory: Given,
     limit: str | None = None,
     forks: int = FORKS_DEFAULT,
     accept_new_host_keys: bool = False,
@@ -133,10 +127,11 @@ def fleet_of(
         forks=forks,
         options=ConnectOptions(accept_new_host_keys=accept_new_host_keys),
         load=load,
+        sources=sources_of(inventory),
     )
 
 
-def _machines(inventory: Path, limit: str | None) -> tuple[Machine, ...]:
+def _machines(inventory: Given, limit: str | None) -> tuple[Machine, ...]:
     from cosmos_cli.models.inventory import load_machines  # takes 0.2 s to import
 
     return load_machines(inventory, limit)

@@ -1,5 +1,5 @@
 """
-Where things are below COSMoS's folder on a machine: the one place that knows. Pure.
+Layout of COSMoS's folder on a machine: the one place that knows. Pure.
 
     <root>/trees/<hash>/            code and scenario files, by the hash of their content, never changed
     <root>/environments/<key>/      virtual environments, by the hash of their lock; whole when `.complete` is there
@@ -50,7 +50,7 @@ class Layout:
 
     @property
     def compiled(self) -> str:
-        """Where Python keeps what it compiles, by the path of the source: trees never change."""
+        """Folder of what Python compiles, by the path of the source: trees never change."""
         return self._below("state", "pycache")
 
     @property
@@ -76,3 +76,8 @@ class Layout:
 
     def _below(self, *parts: str) -> str:
         return str(PurePosixPath(self.root, *parts))
+
+
+def at_home(path: str, home: str) -> str:
+    """Return a path of a machine without ~, which root would take for its own."""
+    return home + path[1:] if path == "~" or path.startswith("~/") else path

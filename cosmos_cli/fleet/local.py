@@ -11,10 +11,10 @@ import subprocess
 import tempfile
 import time
 
-from cosmos_cli.fleet.connection import OUTPUT_BYTES_MAX, Completed
+from cosmos_cli.fleet.connection import OUTPUT_BYTES_MAX, SAID_BYTES_MAX, Completed, StreamEnd
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
-from cosmos_cli.fleet.output import BoundedOutput
 from cosmos_cli.fleet.target import Target
+from cosmos_cli.fleet.transfer_limits import BoundedOutput, OutputLimits, not_ended
 
 LOOPBACK = "127.0.0.1"
 ERROR_BYTES_MAX = 4096
@@ -41,23 +41,32 @@ class LocalConnection:
         """Start a shell command."""
         return LocalStream(command)
 
-    def run(self, command: str, *, stdin: bytes | None = b"", timeout_s: float) -> Completed:
+    def run(
+        self,
+        command: str,
+        *,
+        stdin: bytes | None = b"",
+        timeout_s: float,
+        said_bytes_max: int = SAID_BYTES_MAX,
+    ) -> Completed:
         """Run a shell command to its end."""
         half = OUTPUT_BYTES_MAX // 2
         output, errors = BoundedOutput(half, half), BoundedOutput(half, half)
-        process = subprocess.Popen(
+        limits = OutputLimits(timeout_s=timeout_s, said_bytes_max=said_bytes_max)
+        pending = None if stdin is None else memoryview(stdin)
+        with subprocess.Popen(
             ["/bin/sh", "-c", command],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             start_new_session=True,
-        )
-        try:
-            _converse(
-                process, None if stdin is None else memoryview(stdin), (output, errors), timeout_s
-            )
-        finally:
-            _end(process)
+        ) as process:
+            try:
+                _converse(process, pending, (output, errors), limits)
+            finally:
+                if process.poll() is None:  # with its children
+                    with contextlib.suppress(ProcessLookupError):
+                        os.killpg(process.pid, signal.SIGKILL)
         return Completed(
             exit_status=process.returncode,
             stdout=output.data,
@@ -88,6 +97,7 @@ class LocalStream:
         )
         assert self._process.stdin is not None and self._process.stdout is not None
         self._stdin, self._stdout = self._process.stdin, self._process.stdout
+        self._has_ended = False
         for pipe in (self._stdin, self._stdout):
             os.set_blocking(pipe.fileno(), False)
 
@@ -95,56 +105,39 @@ class LocalStream:
         """Return what to poll."""
         return self._stdout.fileno()
 
-    def read(self, count: int) -> bytes:
-        """Return what has come."""
-        return os.read(self._stdout.fileno(), count)
+    def read(self, count: int, *, timeout_s: float = 0.0) -> bytes:
+        """Return what has come or comes in time."""
+        wait_for(self._stdout.fileno(), select.POLLIN, timeout_s)
+        data = os.read(self._stdout.fileno(), count)
+        self._has_ended = not data
+        return data
 
-    def write(self, data: bytes) -> int:
+    def write(self, data: bytes | memoryview, *, timeout_s: float = 0.0) -> int:
         """Hand over what fits."""
         try:
+            wait_for(self._stdin.fileno(), select.POLLOUT, timeout_s)
             return os.write(self._stdin.fileno(), data)
         except (BrokenPipeError, ValueError):
             raise MachineFailure(FailureKind.LOST, "the program has ended") from None
-
-    def read_some(self, count: int, *, timeout_s: float) -> bytes:
-        """Wait for bytes."""
-        if not _is_ready(self._stdout.fileno(), select.POLLIN, timeout_s):
-            raise MachineFailure(FailureKind.TIMEOUT, f"no answer in {timeout_s:g} s")
-        return self.read(count)
-
-    def write_all(self, data: bytes, *, timeout_s: float) -> None:
-        """Hand over everything."""
-        view = memoryview(data)
-        while view:
-            try:
-                view = view[self.write(view) :]  # type: ignore[arg-type]
-            except BlockingIOError:
-                if not _is_ready(self._stdin.fileno(), select.POLLOUT, timeout_s):
-                    raise MachineFailure(
-                        FailureKind.TIMEOUT, f"took no more input for {timeout_s:g} s"
-                    ) from None
 
     def close_writing(self) -> None:
         """End its standard input."""
         with contextlib.suppress(OSError):
             self._stdin.close()
 
-    def exit_status(self) -> int | None:
-        """Return how it ended, waiting a moment when its output has ended already."""
-        until_s = time.monotonic() + 1.0
-        while (status := self._process.poll()) is None and self._stdout.closed:
-            if time.monotonic() > until_s:
-                break
-            time.sleep(0.01)
-        return status
-
-    def errors(self) -> str:
-        """Return the last of its standard error."""
+    def ending(self, *, timeout_s: float = 0.0) -> StreamEnd:
+        """Return how it ended, waiting for its status when its output has ended already."""
+        status = self._process.poll()
+        if status is None and self._has_ended:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                status = self._process.wait(timeout_s)
         if self._errors.closed:
-            return ""
+            return StreamEnd(exit_status=status, errors="")
         size = self._errors.seek(0, os.SEEK_END)
         self._errors.seek(max(0, size - ERROR_BYTES_MAX))
-        return self._errors.read(ERROR_BYTES_MAX).decode(errors="replace")
+        return StreamEnd(
+            exit_status=status, errors=self._errors.read(ERROR_BYTES_MAX).decode(errors="replace")
+        )
 
     def close(self) -> None:
         """Close the pipes and wait for its end; one that does not heed is killed."""
@@ -158,22 +151,23 @@ class LocalStream:
         self._errors.close()
 
 
-def _is_ready(descriptor: int, event: int, timeout_s: float) -> bool:
+def wait_for(descriptor: int, event: int, timeout_s: float) -> None:
     """Wait for a pipe; select() would fail for a descriptor above 1023."""
-    poll = select.poll()
-    poll.register(descriptor, event)
-    return bool(poll.poll(timeout_s * 1000.0))
+    if timeout_s > 0:
+        poll = select.poll()
+        poll.register(descriptor, event)
+        poll.poll(timeout_s * 1000.0)
 
 
 def _converse(
     process: subprocess.Popen[bytes],
     pending: memoryview | None,
     outputs: tuple[BoundedOutput, BoundedOutput],
-    timeout_s: float,
+    limits: OutputLimits,
 ) -> None:
     """Feed a command, unless *pending* is None, and read what it says until both its outputs have ended."""
     assert process.stdin is not None and process.stdout is not None and process.stderr is not None
-    until_s = time.monotonic() + timeout_s
+    until_s = time.monotonic() + limits.timeout_s
     with selectors.DefaultSelector() as selector:
         for pipe, output in zip((process.stdout, process.stderr), outputs, strict=True):
             selector.register(pipe, selectors.EVENT_READ, output)
@@ -181,10 +175,9 @@ def _converse(
             os.set_blocking(process.stdin.fileno(), False)
             selector.register(process.stdin, selectors.EVENT_WRITE)
         while process.stdout in selector.get_map() or process.stderr in selector.get_map():
-            ready = selector.select(max(0.0, until_s - time.monotonic()))
-            if not ready:
-                text = f"the command did not end in {timeout_s:g} s"
-                raise MachineFailure(FailureKind.TIMEOUT, text)
+            remaining_s = until_s - time.monotonic()
+            limits.check(remaining_s, outputs)
+            ready = selector.select(remaining_s)
             for key, _ in ready:
                 if key.data is None:
                     pending = _feed(key.fd, pending or memoryview(b""))
@@ -198,8 +191,7 @@ def _converse(
     try:
         process.wait(max(0.0, until_s - time.monotonic()))
     except subprocess.TimeoutExpired:
-        text = f"the command did not end in {timeout_s:g} s"
-        raise MachineFailure(FailureKind.TIMEOUT, text) from None
+        raise not_ended(limits.timeout_s) from None
 
 
 def _feed(descriptor: int, pending: memoryview) -> memoryview:
@@ -210,14 +202,3 @@ def _feed(descriptor: int, pending: memoryview) -> memoryview:
         return pending
     except BrokenPipeError:
         return memoryview(b"")
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """Kill what has not ended, with its children, and let go of its pipes."""
-    if process.poll() is None:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-    for pipe in (process.stdin, process.stdout, process.stderr):
-        if pipe is not None:
-            pipe.close()

@@ -1,4 +1,4 @@
-"""Many machines at once, a bounded number at a time."""
+"""Threads for machines: many at once, a bounded number at a time; and one for work of this computer meanwhile."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from queue import Empty, SimpleQueue
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 from cosmos_cli.errors import CosmosError
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.outcome import Outcome
 from cosmos_cli.fleet.target import Target
+from cosmos_cli.ui.step_times import WHOLE, timed
 
 T = TypeVar("T")
 
 FORKS_DEFAULT = 32
 """A real board keeps the operator waiting while it logs in: with 0.3 s each, 24 take 0.9 s at once and 1.6 s
 with 10 forks. Where the operator's processors are the limit, as with virtual boards, more cost nothing."""
-WAIT_S = 0.5
+WAIT_S = 0.25
 """Between looks at what is done, so that Ctrl-C is heard on every platform."""
 
 
@@ -29,6 +30,7 @@ def for_each(
     *,
     forks: int = FORKS_DEFAULT,
     on_done: Callable[[Outcome[T]], None] = lambda outcome: None,
+    on_wait: Callable[[], None] = lambda: None,
 ) -> list[Outcome[T]]:
     """
     Do *task* for every machine and return all outcomes, in the order of *targets*.
@@ -41,6 +43,7 @@ def for_each(
         task: Called in a thread; what it raises becomes its machine's failure.
         forks: Machines at a time.
         on_done: Called in this thread as each machine is done.
+        on_wait: Called in this thread when nobody was done for WAIT_S.
 
     Raises:
         KeyboardInterrupt: Machines that had not begun are left alone.
@@ -59,6 +62,7 @@ def for_each(
             try:
                 index, outcome = done.get(timeout=WAIT_S)
             except Empty:
+                on_wait()
                 continue
             if isinstance(outcome, CosmosError):
                 raise outcome
@@ -87,7 +91,8 @@ def _attempt(target: Target, task: Callable[[Target], T]) -> Outcome[T] | Cosmos
     value: T | None = None
     failure: MachineFailure | None = None
     try:
-        value = task(target)
+        with timed(target.name, WHOLE):
+            value = task(target)
     except MachineFailure as error:
         failure = error
     except CosmosError as error:
@@ -104,3 +109,32 @@ def _attempt(target: Target, task: Callable[[Target], T]) -> Outcome[T] | Cosmos
         failure=failure,
         duration_s=time.monotonic() - start_s,
     )
+
+
+class BackgroundCall(Generic[T]):
+    """
+    A function that is called at once, in a thread of its own.
+
+    Args:
+        function: What it returns or raises is had by `result`, from any thread, as often as wanted.
+    """
+
+    def __init__(self, function: Callable[[], T]) -> None:
+        self._function = function
+        self._value: T
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="background", daemon=True)
+        self._thread.start()
+
+    def result(self) -> T:
+        """Wait for the function's end; return what it returned, or raise what it raised."""
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+        return self._value
+
+    def _run(self) -> None:
+        try:
+            self._value = self._function()
+        except BaseException as error:  # noqa: BLE001 - it is raised where the result is asked for
+            self._error = error

@@ -1,14 +1,15 @@
-"""Where a machine is and how to log in there: what a connection needs of an inventory. Pure."""
+"""Address of a machine and login there: what a connection needs of an inventory. Pure."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, get_args
 
-if (
-    TYPE_CHECKING
-):  # what reads a target from a plan needs no inventory, whose models take long to import
+from cosmos_cli.models.connection_kind import ConnectionKind
+
+if TYPE_CHECKING:
+    # What reads a target from a plan needs no inventory, whose models take long to import.
     from cosmos_cli.models.inventory import Machine
 
 ROOT_DEFAULT = "~/cosmos"
@@ -22,9 +23,9 @@ class Target:
     name: str
     address: str
     """Host name, address, or an alias of the operator's ssh configuration."""
-    connection: Literal["local", "ssh"] = "ssh"
+    connection: ConnectionKind = "ssh"
     user: str | None = None
-    """Who logs in; None leaves it to the ssh configuration."""
+    """User who logs in; None leaves it to the ssh configuration."""
     port: int | None = None
     key_file: str | None = None
     """Path of a private key here; None leaves it to the ssh configuration and the ssh agent."""
@@ -41,8 +42,20 @@ class Target:
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> Target:
-        """Read back what `to_mapping` wrote."""
-        return cls(**mapping)
+        """
+        Read back what `to_mapping` wrote.
+
+        Raises:
+            TypeError: It is something else.
+        """
+        target = cls(**mapping)
+        for name, kinds in _KINDS.items():
+            value = getattr(target, name)
+            if not isinstance(value, kinds) or (name == "port" and isinstance(value, bool)):
+                raise TypeError(f"{name}: unexpected {value!r}")
+        if target.connection not in get_args(ConnectionKind):
+            raise TypeError(f"connection: unexpected {target.connection!r}")
+        return target
 
     @property
     def label(self) -> str:
@@ -50,16 +63,25 @@ class Target:
         return self.name if self.address == self.name else f"{self.name} ({self.address})"
 
 
+_KINDS: Mapping[str, tuple[type, ...]] = {
+    **dict.fromkeys(("name", "address", "connection", "root"), (str,)),
+    **dict.fromkeys(("user", "key_file", "python"), (str, type(None))),
+    "port": (int, type(None)),
+    "may_become_root": (bool,),
+}
+
+
 def target_of(machine: Machine) -> Target:
     """Return how to reach a machine of the inventory."""
+    variables = machine.variables
     return Target(
         name=machine.name,
         address=machine.address,
         connection=machine.connection,
-        user=machine.user,
-        port=machine.port,
-        key_file=None if machine.key_file is None else str(machine.key_file),
-        python=machine.python,
-        may_become_root=machine.may_become_root,
-        root=machine.root,
+        user=variables.user,
+        port=variables.port,
+        key_file=None if variables.key_file is None else str(variables.key_file),
+        python=variables.python,
+        may_become_root=variables.may_become_root,
+        root=variables.root,
     )

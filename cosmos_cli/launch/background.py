@@ -27,7 +27,7 @@ CLOSE_CHECK_S = 0.05
 Report = Callable[[], None]
 
 
-class Background:
+class BackgroundTasks:
     """
     Threads whose results come back through a pipe.
 
@@ -36,7 +36,7 @@ class Background:
     """
 
     def __init__(self, selector: selectors.BaseSelector) -> None:
-        self._selector = selector
+        self.selector = selector
         self._tasks: queue.SimpleQueue[Callable[[], Report] | None] = queue.SimpleQueue()
         self._reports: deque[Report] = deque()
         self._read_fd, self._write_fd = os.pipe()
@@ -76,7 +76,7 @@ class Background:
             time.sleep(CLOSE_CHECK_S)
         self._tell()
         self._is_closed = True
-        self._selector.unregister(self._read_fd)
+        self.selector.unregister(self._read_fd)
         if self.pending:  # a thread that is still at work needs its pipe
             return False
         for _ in range(self._threads):
@@ -111,7 +111,10 @@ def _attempt(
         caught = failure
         return lambda: on_done(None, caught)
     except Exception as error:  # noqa: BLE001 - a machine's surprise must not end the loop of all others
-        text = f"unexpected {type(error).__name__}: {error}"
-        surprise = MachineFailure(FailureKind.DEFECT, text, "please report this defect")
+        surprise = MachineFailure(
+            FailureKind.DEFECT,
+            f"unexpected {type(error).__name__}: {error}",
+            "please report this defect",
+        )
         return lambda: on_done(None, surprise)
     return lambda: on_done(value, None)

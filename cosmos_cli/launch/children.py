@@ -1,233 +1,159 @@
-"""The programs that a run starts: what the operator asks of each, and those on this computer."""
+"""
+The children of a run, and their end: SIGTERM, then SIGKILL to the whole process group, then proof that none of it lives.
+
+A child has ended when its group is empty, not merely when its leader has: a dead leader may leave
+agents and workers behind. Pure.
+"""
 
 from __future__ import annotations
 
-import os
-import selectors
-import signal
-import subprocess
-import sys
-import time
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Protocol
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
-from cosmos_cli.fleet.onboard.processes import MARK
-from cosmos_cli.launch.channel import Channel
-from cosmos_cli.launch.groups import describe_exit, living_members, signal_group
+from cosmos_cli.launch.actions import Agenda, CloseChild, Kill, LookAtGroup, Send, Terminate
+from cosmos_cli.launch.run_events import ChildStarted, GroupKilled, GroupSeen
 
-HOST_PROGRAM: tuple[str, ...] = (sys.executable, "-m", "madns_runtime.host")
-AGENT_PROGRAM: tuple[str, ...] = (sys.executable, "-m", "madns_runtime.agent")
-STDERR_LINES = 10
-STDERR_BYTES = 8192
+HOST = "host"
+TERM_GRACE_S = 3.0
+"""From SIGTERM to SIGKILL."""
+GROUP_GRACE_S = 5.0
+"""For what a dead child has left in its group: agents and workers end by themselves in this time."""
 KILL_WAIT_S = 5.0
 """For the kernel to carry out a SIGKILL; a process that hangs in a device outlives it."""
 GROUP_CHECK_S = 0.1
 
-ENVIRONMENT: Mapping[str, str] = {
-    # One thread a process: numpy's own pools would contend with the loops for the processors.
-    "OPENBLAS_NUM_THREADS": "1",
-    "OMP_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "PYTHONUNBUFFERED": "1",
-    "PYTHONFAULTHANDLER": "1",
-}
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Program:
-    """What to start, and where its standard error goes."""
+@dataclass(slots=True)
+class ChildRecord:
+    """One child as far as the supervision knows it."""
 
     name: str
-    arguments: Sequence[str]
-    stderr: Path
-    run_directory: str
-    environment: Mapping[str, str] = field(default_factory=dict)
-    """Beyond that of every program."""
+    machine: str | None
+    pid: int | None
+    doing: str = ""
+    """Its use of the plug-in's code before it can be heard again; empty once that is done."""
+    has_exited: bool = False
+    """Its leader's end was seen to."""
+    has_ended: bool = False
+    """None of its group lives, or nothing more can be done about it."""
+    is_killed: bool = False
+    group_until_s: float = math.inf
 
-
-class Child(Protocol):
-    """One started program, here or on another machine; none of its methods waits."""
-
-    @property
-    def name(self) -> str:
-        """host, or whose agents: agents@pi07."""
-
-    @property
-    def pid(self) -> int | None:
-        """The process, which is also its group's number; None while that is not known."""
+    def __str__(self) -> str:
+        return f"{self.name} (pid {self.pid})"
 
     @property
-    def stderr(self) -> str:
-        """Where its standard error goes, for people."""
-
-    def send(self, command: Mapping[str, Any]) -> None:
-        """Send one object; a child that is gone is none of the sender's business."""
-
-    def push(self) -> bool:
-        """Hand over what could not be sent at once; True if some of it still waits."""
-
-    def close_writing(self) -> None:
-        """Close its standard input, its life line."""
-
-    def drain(self) -> None:
-        """Read all that has come until now, and listen no more; called when it has ended."""
-
-    def release(self) -> None:
-        """Let go of it without ending it: it is detached."""
-
-    def close(self) -> None:
-        """Let go of what it was spoken to by; harmless when repeated."""
-
-    def has_exited(self) -> bool:
-        """Tell whether its leader has ended."""
-
-    def loss(self) -> str | None:
-        """Return why nobody knows how it ended, if its machine was lost."""
-
-    def returncode(self) -> int | None:
-        """Return how its leader ended, negative for a signal; None while it lives, or when nobody knows."""
-
-    def describe_exit(self) -> str:
-        """Return how its leader ended, in words."""
-
-    def members(self) -> list[int]:
-        """Return who of its group lives, as far as is known."""
-
-    def signal(self, number: signal.Signals) -> None:
-        """Send a signal to its whole group."""
-
-    def end_by_force(self) -> list[int]:
-        """Kill its group and wait: the last resort, in a thread; returns who outlived it."""
-
-    def tell_last_words(self, tell: Callable[[list[str]], None]) -> None:
-        """Call *tell* with the last lines of its standard error, now or later."""
+    def meanwhile(self) -> str:
+        """` while ...` of a child that was last heard of when it loaded the plug-in; else nothing."""
+        return f" while {self.doing}" if self.doing else ""
 
 
-class LocalChild:
+class Children:
     """
-    A program on this computer: leader of its own session, so that a terminal's Ctrl-C reaches the operator alone.
+    All children, by name; a machine that returns gets another one beside the first.
 
-    Its first line of input is *launch*, which holds the run key and therefore never touches argv,
-    environment or disk. Its standard input stays open as its life line.
+    Args:
+        agenda: The supervision's.
     """
 
-    def __init__(
-        self,
-        program: Program,
-        selector: selectors.BaseSelector,
-        *,
-        launch: Mapping[str, Any],
-        on_line: Callable[[bytes], None],
-    ) -> None:
-        self.name = program.name
-        self._stderr = program.stderr
-        program.stderr.parent.mkdir(parents=True, exist_ok=True)
-        with program.stderr.open("ab") as stderr:
-            self._process = subprocess.Popen(
-                list(program.arguments),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=stderr,
-                env={
-                    **os.environ,
-                    **ENVIRONMENT,
-                    **program.environment,
-                    MARK: program.run_directory,
-                },
-                start_new_session=True,
-                close_fds=True,
-                bufsize=0,
-            )
-        assert self._process.stdin is not None and self._process.stdout is not None
-        # The channel owns duplicates, so that Popen's own file objects can be closed at once.
-        fds = os.dup(self._process.stdout.fileno()), os.dup(self._process.stdin.fileno())
-        self._process.stdin.close()
-        self._process.stdout.close()
-        self._channel = Channel(selector, fds, on_line=on_line, on_end=lambda: None)
-        self._channel.send(launch)
+    def __init__(self, agenda: Agenda) -> None:
+        self._agenda = agenda
+        self._children: dict[str, ChildRecord] = {}
+
+    def __getitem__(self, name: str) -> ChildRecord:
+        return self._children[name]
+
+    def __iter__(self) -> Iterator[ChildRecord]:
+        return iter(tuple(self._children.values()))
+
+    def started(self, event: ChildStarted) -> None:
+        """Take a child in that was started."""
+        self._children[event.name] = ChildRecord(event.name, event.machine, event.pid)
+
+    def find(self, name: str) -> ChildRecord | None:
+        """Return a child; None for an agent that was started by hand."""
+        return self._children.get(name)
 
     @property
-    def pid(self) -> int:
-        """The process, which is also its group's number."""
-        return self._process.pid
+    def host(self) -> ChildRecord | None:
+        """The host, if it was started."""
+        return self._children.get(HOST)
 
     @property
-    def stderr(self) -> str:
-        """Where its standard error goes."""
-        return str(self._stderr)
+    def living(self) -> list[ChildRecord]:
+        """Those of whose group something lives, and may still be ended."""
+        return [child for child in self if not child.has_ended]
 
-    def send(self, command: Mapping[str, Any]) -> None:
-        """Send one object."""
-        self._channel.send(command)
+    @property
+    def supervisors(self) -> list[ChildRecord]:
+        """All but the host."""
+        return [child for child in self if child.name != HOST]
 
-    def push(self) -> bool:
-        """Do nothing: the selector tells when there is room."""
-        return False
+    def tell_host(self, command: Mapping[str, Any]) -> None:
+        """Send the host a command, if it is there to take it."""
+        if self.host is not None and not self.host.has_exited:
+            self._agenda.do(Send(HOST, command))
 
-    def close_writing(self) -> None:
-        """Close its standard input."""
-        self._channel.close_writing()
+    # Their end ------------------------------------------------------------------------------------
 
-    def drain(self) -> None:
-        """Read all that has come until now, and listen no more."""
-        self._channel.drain()
-        self._channel.close()
+    def expect_end(self, child: ChildRecord, wait_s: float, late: str) -> None:
+        """End the child by force if it lives after *wait_s*; *late* says what it failed to do."""
+        self._agenda.after(f"end {child.name}", wait_s, partial(self.end, child, late))
 
-    def release(self) -> None:
-        """Let go of it; its output from now on has no reader."""
-        self._channel.close()
-        self._process.returncode = 0  # it is not waited for: the kernel gives it another parent
-
-    def close(self) -> None:
-        """Close both directions, and reap it if it has ended."""
-        self._process.poll()
-        self._channel.close()
-
-    def has_exited(self) -> bool:
-        """Tell whether its leader has ended."""
-        return self._process.poll() is not None
-
-    def loss(self) -> str | None:
-        """Return None: this computer is not lost."""
-        return None
-
-    def returncode(self) -> int | None:
-        """Return how its leader ended."""
-        return self._process.poll()
-
-    def describe_exit(self) -> str:
-        """Return how its leader ended, in words."""
-        code = self.returncode()
-        return "is still running" if code is None else describe_exit(code)
-
-    def members(self) -> list[int]:
-        """Return who of its group lives."""
-        return living_members(self.pid)
-
-    def signal(self, number: signal.Signals) -> None:
-        """Send a signal to its whole group."""
-        signal_group(self.pid, number)
-
-    def end_by_force(self) -> list[int]:
-        """Kill its group and wait."""
-        until_s = time.monotonic() + KILL_WAIT_S
-        if self.members():
-            self.signal(signal.SIGKILL)
-        while (left := self.members()) and time.monotonic() < until_s:
-            self._process.poll()  # reaps
-            time.sleep(GROUP_CHECK_S)
-        return left
-
-    def tell_last_words(self, tell: Callable[[list[str]], None]) -> None:
-        """Tell the last lines of its standard error."""
-        try:
-            with self._stderr.open("rb") as file:
-                file.seek(max(0, self._stderr.stat().st_size - STDERR_BYTES))
-                text = file.read(STDERR_BYTES).decode(errors="replace")
-        except OSError:
+    def end(self, child: ChildRecord, late: str) -> None:
+        """SIGTERM now, SIGKILL after a grace; *late* says what it failed to do."""
+        if child.has_ended:
             return
-        lines = (line for line in text.splitlines() if line.strip())
-        tell(list(deque(lines, STDERR_LINES)))
+        self._agenda.problem(f"{child} {late}: it is being ended", child.machine)
+        self._agenda.do(Terminate(child.name))
+        unheeded = partial(self.kill, child, f"did not heed SIGTERM for {TERM_GRACE_S:g} s")
+        self._agenda.after(f"end {child.name}", TERM_GRACE_S, unheeded)
+
+    def kill(self, child: ChildRecord, why: str) -> None:
+        """SIGKILL to the whole group, now."""
+        child.is_killed = True
+        self._agenda.do(Kill(child.name, why))
+        self._agenda.after(f"end {child.name}", KILL_WAIT_S, partial(self._give_up, child))
+
+    def killed(self, event: GroupKilled) -> None:
+        """Say whom a SIGKILL met."""
+        if event.pids:
+            child, pids = self[event.name], ", ".join(map(str, event.pids))
+            self._agenda.problem(
+                f"{child} {event.why}: killed with SIGKILL ({pids})", child.machine
+            )
+
+    def _give_up(self, child: ChildRecord) -> None:
+        """Take a child for ended that even SIGKILL has not ended."""
+        child.has_ended = True
+
+    def leader_ended(self, child: ChildRecord) -> None:
+        """Watch what a dead leader has left until it has ended too, or kill it."""
+        child.has_exited = True
+        child.group_until_s = self._agenda.now_s + GROUP_GRACE_S
+        self._agenda.do(LookAtGroup(child.name))
+
+    def group_seen(self, event: GroupSeen) -> None:
+        """Take a child for ended of whose group none lives; kill what stays too long."""
+        child = self[event.name]
+        if not event.pids:
+            child.has_ended = True
+            self._agenda.cancel(f"end {child.name}")
+            return
+        if self._agenda.now_s >= child.group_until_s and not child.is_killed:
+            self.kill(child, f"left {len(event.pids)} running that should have ended with it")
+        if not child.has_ended:
+            self._agenda.after(
+                f"group {child.name}",
+                GROUP_CHECK_S,
+                partial(self._agenda.do, LookAtGroup(child.name)),
+            )
+
+    def abandon(self, child: ChildRecord) -> None:
+        """Take a child for ended: its machine is lost, and nothing can be done from here."""
+        child.has_exited = child.has_ended = True
+        self._agenda.cancel(f"end {child.name}", f"group {child.name}")
+        self._agenda.do(CloseChild(child.name))

@@ -1,5 +1,5 @@
 """
-What children say on their standard output, one JSON object a line, as typed events.
+Events on the children's standard output, one JSON object per line.
 
 Pure: bytes in, a value out. A line that is none of these is a `Noise`, which is logged and never fatal:
 a plug-in may print.
@@ -7,11 +7,15 @@ a plug-in may print.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import orjson
+
+from cosmos_cli.ui.foreign_text import clean_line
+from madns_runtime.plain_values import mapping_at
+from madns_runtime.recording.newest_values import Value, clean_values
 
 NOISE_CHARACTERS_MAX = 500
 """Of a line that is no event, this much is shown."""
@@ -34,17 +38,15 @@ class StateChanged:
 
 @dataclass(frozen=True, slots=True)
 class AgentChanged:
-    """An agent has come further, or is lost."""
+    """An agent has come further, or is lost: the counts show it, and the host's log gives the reason."""
 
     agent: str
     state: str
-    reason: str | None
-    incarnation: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Progress:
-    """How the run fares, about twice a second."""
+    """Progress of the run, about twice per second."""
 
     t_s: float | None = None
     rtf: float | None = None
@@ -60,6 +62,12 @@ class Progress:
     records_dropped: int = 0
     is_lockstep: bool = False
     """Simulated time waits for everybody: rtf is the speed, and no tick has a lateness."""
+    columns: tuple[str, ...] = ()
+    """Fields of agents' streams that the simulation wants shown."""
+    values: Mapping[str, Sequence[Value]] = field(default_factory=dict)
+    """Their newest values by agent, of the first agents."""
+    values_left_out: int = 0
+    """Agents that have values, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +108,31 @@ class AgentExited:
     pid: int
     how: str
     is_abnormal: bool
-    will_restart: bool
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceChanged:
+    """A device has another status: never, ok, stale or lost."""
+
+    device: str
+    """Its full name, such as pi22/imu."""
+    status: str
+    why: str = ""
+
+    @property
+    def text(self) -> str:
+        """The change in words."""
+        because = f": {self.why}" if self.why else ""
+        return f"device {self.device}: {self.status}{because}"
+
+
+@dataclass(frozen=True, slots=True)
+class FaultInserted:
+    """A supervisor's answer to the order to insert a fault; *refusal* is empty if it is in force."""
+
+    target: str
+    action: str
+    refusal: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +143,14 @@ class ProcessKnown:
 
 
 @dataclass(frozen=True, slots=True)
-class Pong:
+class Loading:
+    """Plug-in code that a child loads before it can be heard again; empty once that is done."""
+
+    doing: str
+
+
+@dataclass(frozen=True, slots=True)
+class PingAnswered:
     """The answer to ping number *n*."""
 
     n: int
@@ -133,8 +172,11 @@ Event = (
     | Finished
     | AgentStarted
     | AgentExited
+    | DeviceChanged
+    | FaultInserted
     | ProcessKnown
-    | Pong
+    | Loading
+    | PingAnswered
     | Noise
 )
 
@@ -148,25 +190,9 @@ def parse_event(line: bytes) -> Event:
         return Noise(line.decode(errors="replace").strip()[:NOISE_CHARACTERS_MAX])
 
 
-def _listening(d: Mapping[str, Any]) -> Event:
-    return Listening(str(d["address"]), int(d["port"]))
-
-
-def _state(d: Mapping[str, Any]) -> Event:
-    return StateChanged(str(d["state"]))
-
-
-def _agent(d: Mapping[str, Any]) -> Event:
-    reason = d.get("reason")
-    return AgentChanged(
-        str(d["agent"]),
-        str(d["state"]),
-        None if reason is None else str(reason),
-        int(d.get("incarnation") or 1),
-    )
-
-
 def _progress(d: Mapping[str, Any]) -> Event:
+    columns = tuple(map(str, d.get("columns") or ()))
+    values = mapping_at(d, "values")
     return Progress(
         t_s=_float(d.get("t_s")),
         rtf=_float(d.get("rtf")),
@@ -181,20 +207,15 @@ def _progress(d: Mapping[str, Any]) -> Event:
         lost_messages=int(d.get("lost_messages") or 0),
         records_dropped=int(d.get("records_dropped") or 0),
         is_lockstep=bool(d.get("is_lockstep")),
+        columns=columns,
+        values={str(agent): clean_values(own, len(columns)) for agent, own in values.items()},
+        values_left_out=int(d.get("values_left_out") or 0),
     )
-
-
-def _log(d: Mapping[str, Any]) -> Event:
-    return Logged(str(d["level"]), str(d.get("source") or ""), str(d["text"]))
 
 
 def _finished(d: Mapping[str, Any]) -> Event:
     result = d.get("result")
     return Finished(result if isinstance(result, dict) else None)
-
-
-def _started(d: Mapping[str, Any]) -> Event:
-    return AgentStarted(str(d["agent"]), int(d["pid"]), int(d.get("incarnation") or 1))
 
 
 def _exited(d: Mapping[str, Any]) -> Event:
@@ -205,16 +226,12 @@ def _exited(d: Mapping[str, Any]) -> Event:
         int(d["pid"]),
         str(how),
         is_abnormal=signal_name is not None or code != 0,
-        will_restart=bool(d.get("will_restart")),
     )
 
 
-def _process(d: Mapping[str, Any]) -> Event:
-    return ProcessKnown(int(d["pid"]))
-
-
-def _pong(d: Mapping[str, Any]) -> Event:
-    return Pong(int(d["n"]))
+def _line(value: Any) -> str:
+    """Return text of a driver or a board as one line that may be shown."""
+    return clean_line(str(value))
 
 
 def _float(value: Any) -> float | None:
@@ -222,14 +239,23 @@ def _float(value: Any) -> float | None:
 
 
 _PARSERS: Mapping[str, Callable[[Mapping[str, Any]], Event]] = {
-    "listening": _listening,
-    "state": _state,
-    "agent": _agent,
+    "listening": lambda d: Listening(str(d["address"]), int(d["port"])),
+    "state": lambda d: StateChanged(str(d["state"])),
+    "agent": lambda d: AgentChanged(str(d["agent"]), str(d["state"])),
     "progress": _progress,
-    "log": _log,
+    "log": lambda d: Logged(str(d["level"]), str(d.get("source") or ""), str(d["text"])),
     "finished": _finished,
-    "started": _started,
+    "started": lambda d: AgentStarted(
+        str(d["agent"]), int(d["pid"]), int(d.get("incarnation") or 1)
+    ),
     "exited": _exited,
-    "process": _process,
-    "pong": _pong,
+    "device": lambda d: DeviceChanged(
+        _line(d["device"]), _line(d["status"]), _line(d.get("why") or "")
+    ),
+    "injected": lambda d: FaultInserted(
+        _line(d["target"]), _line(d["action"]), _line(d.get("refusal") or "")
+    ),
+    "process": lambda d: ProcessKnown(int(d["pid"])),
+    "loading": lambda d: Loading(str(d["doing"])),
+    "pong": lambda d: PingAnswered(int(d["n"])),
 }

@@ -10,20 +10,30 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from cosmos_cli.counted import counted
 from cosmos_cli.errors import CosmosError, ExitCode, InputError
+from cosmos_cli.evidence.run_directory import (
+    RunDirectory,
+    alone,
+    begin_run,
+    create_run,
+    discard_run,
+)
+from cosmos_cli.evidence.run_documents import Problem
 from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.pool import FORKS_DEFAULT
-from cosmos_cli.launch.fleet_run import (
+from cosmos_cli.launch.access import chosen_access, with_access
+from cosmos_cli.launch.device_plan import plan_devices
+from cosmos_cli.launch.machines import RETURN_TIMEOUT_S, RemoteMachine, close_machines
+from cosmos_cli.launch.operator import Operator
+from cosmos_cli.launch.plan import LaunchPlan, make_plan
+from cosmos_cli.launch.preparation import (
     host_config,
     inventory_text,
     places_of,
     plan_mapping,
     reach,
 )
-from cosmos_cli.launch.machines import RETURN_TIMEOUT_S, RemoteMachine, close_machines
-from cosmos_cli.launch.operator import Operator
-from cosmos_cli.launch.outcome import (
+from cosmos_cli.launch.request import (
     LaunchOutcome,
     LaunchRequest,
     View,
@@ -31,19 +41,23 @@ from cosmos_cli.launch.outcome import (
     with_manual_agents,
 )
 from cosmos_cli.launch.signals import OperatorSignals
+from cosmos_cli.models.agent_labels import AgentLabels
 from cosmos_cli.models.inventory import Machine
+from cosmos_cli.models.inventory.machine import LOOPBACK
 from cosmos_cli.models.loading import ScenarioFile
-from cosmos_cli.plan import LOOPBACK, LaunchPlan, make_plan
-from cosmos_cli.problem import Problem
-from cosmos_cli.rundir import RunDirectory, alone, begin_run, create_run, discard_run
-from madns_runtime.lockstep.shares import processors_here
+from cosmos_cli.ui.plural import counted
+from madns_runtime.config import DeviceLaunch, to_mapping
+from madns_runtime.lockstep.partition import processors_here
 from madns_runtime.processes import register
+from madns_runtime.recording.access import Access, access_applied
 
 if TYPE_CHECKING:
-    from cosmos_cli.collect import RunSummary
+    from cosmos_cli.collect.finish import RunSummary
 
+COLLECTOR_PATIENCE_S = 10.0
+"""For somebody else's command that holds the run at its end."""
 OPERATOR_NICE = 5
-"""What the operator draws and collects can wait; agents on the same processors cannot."""
+"""Niceness of the operator: its drawing and collecting can wait; agents on the same processors cannot."""
 
 
 class CollectionInterrupted(CosmosError):
@@ -55,7 +69,7 @@ class CollectionInterrupted(CosmosError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunOptions:
-    """How a scenario is to be run."""
+    """Options of a run."""
 
     runs: Path
     """Folder of all runs."""
@@ -63,7 +77,7 @@ class RunOptions:
     """Agents that a person starts by hand."""
     has_report: bool = True
     machines: tuple[Machine, ...] = (LOOPBACK,)
-    """Where its agents may run."""
+    """Machines that its agents may run on."""
     host: str | None = None
     """The machine that runs the host; None for this computer."""
     is_detached: bool = False
@@ -80,7 +94,7 @@ class Detached:
 
     @property
     def words(self) -> str:
-        """What a person is told."""
+        """Account in words, for a person."""
         number = self.run.number or self.run.name
         return (
             f"detached: run {self.run.name} goes on;"
@@ -101,7 +115,7 @@ class Detached:
 def execute(
     scenario: ScenarioFile,
     options: RunOptions,
-    make_view: Callable[[str, float], View],
+    make_view: Callable[[str, float, AgentLabels], View],
     say: Callable[[str], None] = lambda text: None,
 ) -> RunSummary | Detached:
     """
@@ -110,7 +124,7 @@ def execute(
     Args:
         scenario: What to run.
         options: How, and where.
-        make_view: Called with the run's name and simulated time, s; returns where talk goes.
+        make_view: Called with the run's name, simulated time, s, and second names of agents; returns where talk goes.
         say: Where talk goes before there is a run.
 
     Raises:
@@ -118,20 +132,37 @@ def execute(
         MachinesError: Not all machines could be reached; nothing was started.
         CollectionInterrupted: What is on disk can be collected again.
     """
+    access = chosen_access(scenario.scenario.recording)
+    plan = plan_of(scenario, options)
+    manual = tuple(manual_agents(options, plan, scenario.labels))
+    options = dataclasses.replace(options, manual=manual)
+    remote = reach(plan, scenario, options=options.connecting, forks=options.forks, say=say)
+    try:
+        with access_applied(access):
+            prepared = _prepare(scenario, options, plan, remote, access=access)
+            return _execute(prepared, options, make_view)
+    finally:
+        close_machines(tuple(remote.values()))
+
+
+def plan_of(scenario: ScenarioFile, options: RunOptions) -> LaunchPlan:
+    """
+    Return who runs where.
+
+    Raises:
+        InputError: An option does not fit the scenario.
+    """
     plan = make_plan(
         scenario.scenario,
         options.machines,
         host=options.host,
         fault_at=scenario.fault,
         processors=processors_here(),
+        labels=scenario.labels,
     )
-    _check_manual(options, plan)
-    remote = reach(plan, scenario, options=options.connecting, forks=options.forks, say=say)
-    try:
-        prepared = _prepare(scenario, options, plan, remote)
-        return _execute(prepared, options, make_view)
-    finally:
-        close_machines(tuple(remote.values()))
+    manual_agents(options, plan, scenario.labels)
+    plan_devices(scenario, plan)  # what is wrong with them is told before any machine is reached
+    return plan
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +171,7 @@ class _Prepared:
     plan: LaunchPlan
     request: LaunchRequest
     remote: Mapping[str, RemoteMachine]
+    labels: AgentLabels
 
 
 def _prepare(
@@ -147,41 +179,78 @@ def _prepare(
     options: RunOptions,
     plan: LaunchPlan,
     remote: Mapping[str, RemoteMachine],
+    *,
+    access: Access,
 ) -> _Prepared:
-    run = create_run(options.runs, scenario.scenario.name)
+    run = create_run(options.runs, scenario.scenario.name, access)
+    try:
+        request = _begin(scenario, options, plan, remote, run=run, access=access)
+    except BaseException:  # whatever it was: nothing was started
+        discard_run(run)
+        raise
+    return _Prepared(run, plan, request, remote, scenario.labels)
+
+
+def _begin(  # noqa: PLR0913 - all that a run is made of; two by name
+    scenario: ScenarioFile,
+    options: RunOptions,
+    plan: LaunchPlan,
+    remote: Mapping[str, RemoteMachine],
+    *,
+    run: RunDirectory,
+    access: Access,
+) -> LaunchRequest:
+    """Write what is known before a run's start, and return what its operator is to do."""
+    devices = plan_devices(scenario, plan)
     session_hex = make_session()
     config = with_manual_agents(scenario.run_config(run.name), options.manual)
     places = places_of(plan, remote, config, run=run, session_hex=session_hex)
-    config = host_config(config, places)
+    config = with_access(host_config(config, places), access)
     mapping = plan_mapping(plan, places, session_hex, is_detached=options.is_detached)
     try:
-        begin_run(run, config, mapping)
+        begin_run(run, config, {**mapping, **_declared(scenario), **_named(devices)})
         (run.path / "scenario.yaml").write_text(scenario_text(scenario), encoding="utf-8")
         if options.machines != (LOOPBACK,):
             (run.path / "inventory.yaml").write_text(inventory_text(plan), encoding="utf-8")
     except OSError as error:
-        discard_run(run)
         raise InputError(f"{run.path}: cannot write there: {error.strerror or error}") from error
-    request = LaunchRequest(
+    return LaunchRequest(
         config=config,
+        devices=devices,
         directory=run.path,
         machines=plan.agents_by_machine,
         places=places,
         host_machine=plan.host.name if plan.host and plan.host.name in remote else None,
         manual=options.manual,
+        labels=scenario.labels,
         is_detached=options.is_detached,
         nice=OPERATOR_NICE,
         session_hex=session_hex,
     )
-    return _Prepared(run, plan, request, remote)
+
+
+def _named(devices: Mapping[str, tuple[DeviceLaunch, ...]]) -> dict[str, Any]:
+    """Return what plan.json keeps of the devices: by machine, the full names of those that must be accounted for."""
+    named = {machine: [each.full_name for each in there] for machine, there in devices.items()}
+    return {"devices": named} if any(named.values()) else {}
+
+
+def _declared(scenario: ScenarioFile) -> dict[str, Any]:
+    """Return what plan.json keeps of the simulation's own words, for whoever reads the records without it."""
+    found: dict[str, Any] = {}
+    if scenario.streams is not None:
+        found["streams"] = [to_mapping(stream) for stream in scenario.streams]
+    if scenario.labels.names:
+        found["labels"] = to_mapping(scenario.labels)
+    return found
 
 
 def _execute(
-    prepared: _Prepared, options: RunOptions, make_view: Callable[[str, float], View]
+    prepared: _Prepared, options: RunOptions, make_view: Callable[[str, float, AgentLabels], View]
 ) -> RunSummary | Detached:
     run, request = prepared.run, prepared.request
     with OperatorSignals() as signals, register(run.name, "operator", "operator", run.path) as own:
-        view = make_view(run.name, request.config.time.duration_s)
+        view = make_view(run.name, request.config.time.duration_s, prepared.labels)
         try:
             view.say(_greeting(prepared))
             for text in (*prepared.plan.notes, own.problem):
@@ -214,17 +283,18 @@ def _finish(
     prepared: _Prepared, outcome: LaunchOutcome, options: RunOptions, *, view: View
 ) -> RunSummary:
     # Imported late: the tables' library is large, and the run need not wait for it.
-    from cosmos_cli.collect import finish_run
-    from cosmos_cli.expectation import Expected
+    from cosmos_cli.collect.finish import finish_run
+    from cosmos_cli.evidence.completeness import ExpectedRecords
 
     view.state("COLLECTING")
     is_patient = outcome.interruption != "at once"
-    with alone(prepared.run):
+    # This command made the folder, whatever owner a mounted file system tells.
+    with alone(prepared.run, patience_s=COLLECTOR_PATIENCE_S, must_own=False):
         missing = _retrieve(prepared, options, view, is_wanted=is_patient)
         return finish_run(
             prepared.run,
             outcome.host_result or prepared.run.read_left_result(),
-            Expected.of(prepared.request.config, prepared.plan.agents_by_machine),
+            ExpectedRecords.of(prepared.request.config, prepared.plan.agents_by_machine),
             interrupted=outcome.interruption != "no",
             problems=(*outcome.problems, *missing),
             has_report=options.has_report and is_patient,
@@ -241,23 +311,27 @@ def _retrieve(
     if not is_wanted:
         text = f"its records were not fetched; fetch them with: cosmos collect {prepared.run.path}"
         return tuple(Problem(text=text, machine=name, step="collect") for name in prepared.remote)
-    from cosmos_cli.retrieve import problems_of, retrieve
+    # Imported late: agents run meanwhile on the same processors, and a run on this computer needs none of it.
+    from cosmos_cli.collect.retrieve import Retrieval, problems_of
 
-    outcomes = retrieve(
+    retrieval = Retrieval(
         prepared.run,
         # Who is connected still is not asked again; who is not has been looked for already.
         options=dataclasses.replace(options.connecting, timeout_s=RETURN_TIMEOUT_S),
         forks=options.forks,
         progress=view.work,
         connections={name: machine.connection for name, machine in prepared.remote.items()},
+        say=lambda text: view.say(text, "warning"),
     )
-    problems = problems_of(outcomes)
+    with retrieval:
+        problems = problems_of(retrieval.fetch())
     for problem in problems:
         view.say(f"{problem.machine}: {problem.text}", "error")
     return problems
 
 
-def _check_manual(options: RunOptions, plan: LaunchPlan) -> None:
+def manual_agents(options: RunOptions, plan: LaunchPlan, labels: AgentLabels) -> list[str]:
+    """Return the agents that --manual means, by name or label; it may be a glob."""
     manual = options.manual
     if manual and plan.is_lockstep:
         raise InputError(
@@ -267,17 +341,18 @@ def _check_manual(options: RunOptions, plan: LaunchPlan) -> None:
     if manual and options.is_detached:
         raise InputError("--manual and --detach: a hand-started agent needs its operator")
     names = [name for agents in plan.agents_by_machine.values() for name in agents]
-    unknown = [name for name in manual if name not in names]
+    unknown = [name for name in manual if not labels.like(name, names)]
     if unknown:
         shown = ", ".join(names[:10]) + (", ..." if len(names) > 10 else "")
         raise InputError(f"--manual {', '.join(unknown)}: no such agent; there are {shown}")
     for planned in plan.machines:
-        there = [name for name in manual if name in planned.agents]
-        if there and planned.connection != "local":
+        there = labels.like_any(manual, planned.agents)
+        if there and planned.machine.connection != "local":
             raise InputError(
                 f"--manual {', '.join(there)}: placed on {planned.name}, and only an agent on this"
                 " computer can be started by hand; place it there, or leave out the inventory"
             )
+    return labels.like_any(manual, names)
 
 
 def _greeting(prepared: _Prepared) -> str:

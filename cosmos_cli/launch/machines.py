@@ -6,6 +6,7 @@ For the threads of `Background` and of the pool; the operator's loop never calls
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -13,14 +14,14 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from cosmos_cli.errors import MachinesError
-from cosmos_cli.fleet.board import Board
-from cosmos_cli.fleet.connection import Connection, ConnectOptions, Stream
+from cosmos_cli.fleet.connection import Connection, ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
 from cosmos_cli.fleet.outcome import Outcome, raise_if_failed
 from cosmos_cli.fleet.pool import for_each
 from cosmos_cli.fleet.target import Target
-from cosmos_cli.launch.places import expanded
+from cosmos_cli.onboard.request_loop import BOOT_ID_FILE
 
 PARTS = ("madns_runtime.processes", "processes")
 ASK_TIMEOUT_S = 10.0
@@ -34,7 +35,7 @@ Connect = Callable[[Target, ConnectOptions], Connection]
 
 
 class Prepared(Protocol):
-    """What a machine needs of a run is there; see `cosmos_cli.provision.ready`."""
+    """Everything that a machine needs of a run is there; see `cosmos_cli.provision.before_run`."""
 
     @property
     def python(self) -> str:
@@ -44,22 +45,27 @@ class Prepared(Protocol):
     def base_directory(self) -> str:
         """The scenario's folder there."""
 
+    @property
+    def driver_directory(self) -> str:
+        """The folder of drivers beside the inventory; "" for none."""
+
     def variables(self) -> Mapping[str, str]:
         """Return the environment that programs of a run need, PYTHONPATH among it."""
 
 
-Prepare = Callable[[Connection, Board], Prepared]
+Prepare = Callable[[Target, Helper], Prepared]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Paths:
-    """Where things are on one machine, with ~ resolved."""
+class MachinePaths:
+    """Paths on one machine, with ~ resolved."""
 
     root: str
     state: str
     python: str
     variables: Mapping[str, str]
     base_directory: str
+    driver_directory: str = ""
 
 
 class RemoteMachine:
@@ -77,7 +83,7 @@ class RemoteMachine:
     def __init__(
         self,
         connection: Connection,
-        board: Board,
+        board: Helper,
         prepared: Prepared,
         *,
         options: ConnectOptions,
@@ -87,17 +93,20 @@ class RemoteMachine:
         root = expanded(connection.target.root, home)
         self.target = connection.target
         self.connection = connection
-        self.paths = Paths(
+        self.paths = MachinePaths(
             root=root,
             state=Layout(root).state,
             python=expanded(prepared.python, home),
             variables=prepared.variables(),
             base_directory=expanded(prepared.base_directory, home),
+            driver_directory=expanded(prepared.driver_directory, home),
         )
         self._options = dataclasses.replace(options, timeout_s=RETURN_TIMEOUT_S)
         self._connect = connect
-        self._board: Board | None = board
+        self._board: Helper | None = board
         self._lock = threading.Lock()
+        self._connecting = threading.Lock()
+        self._boot_id = str(board.greeting["boot_id"])
 
     @property
     def name(self) -> str:
@@ -107,15 +116,6 @@ class RemoteMachine:
     def directory_of(self, run: str, session_hex: str) -> str:
         """Return the run's directory there."""
         return Layout(self.paths.root).run(run, session_hex)
-
-    def open(self, command: str) -> Stream:
-        """
-        Start a shell command there.
-
-        Raises:
-            MachineFailure: The connection is lost.
-        """
-        return self.connection.open(command)
 
     def ask(
         self, verb: str, arguments: Mapping[str, Any], *, timeout_s: float = ASK_TIMEOUT_S
@@ -130,7 +130,7 @@ class RemoteMachine:
             raise MachineFailure(FailureKind.TIMEOUT, f"another question took over {timeout_s:g} s")
         try:
             if self._board is None:
-                self._board = Board.start(self.connection, PARTS, timeout_s=timeout_s)
+                self._board = Helper.start(self.connection, PARTS, timeout_s=timeout_s)
             return self._board.call(verb, arguments, timeout_s=timeout_s).value
         except MachineFailure as failure:
             if failure.kind in OUT_OF_STEP and self._board is not None:
@@ -144,6 +144,30 @@ class RemoteMachine:
         """Ask for a sign of life of the machine itself."""
         return self.connection.is_alive(timeout_s=timeout_s)
 
+    def has_started_anew(self) -> bool:
+        """
+        Tell whether it is another boot that answers than the one that was reached first.
+
+        Raises:
+            MachineFailure: It does not answer.
+        """
+        asked = self.connection.run(f"cat {BOOT_ID_FILE}", timeout_s=ASK_TIMEOUT_S)
+        return asked.stdout.decode(errors="replace").strip() != self._boot_id
+
+    def connect_again(self) -> None:
+        """
+        Make another connection if the present one is broken.
+
+        Raises:
+            MachineFailure: It does not answer.
+        """
+        with self._connecting:  # several programs there may miss it at the same time
+            if self.is_alive():
+                return
+            self.connection.close()
+            self.connection = self._connect(self.target, self._options)
+            self._drop_helper()  # it has gone with the old one
+
     def return_to(self, directory: str, *, clean_s: float, forced_s: float) -> None:
         """
         Reach a machine that was lost, and end what still lives there of the run in *directory*.
@@ -151,9 +175,7 @@ class RemoteMachine:
         Raises:
             MachineFailure: It does not answer.
         """
-        if not self.is_alive():
-            self.connection.close()
-            self.connection = self._connect(self.target, self._options)
+        self.connect_again()
         arguments = {
             "state": self.paths.state,
             "directory": directory,
@@ -166,62 +188,64 @@ class RemoteMachine:
         except MachineFailure as failure:
             if failure.kind not in OUT_OF_STEP or not self.is_alive():
                 raise
-            ending = self.ask(
-                "end_run", arguments, timeout_s=timeout_s
-            )  # the helper had gone with it
+            # The helper had gone with it.
+            ending = self.ask("end_run", arguments, timeout_s=timeout_s)
         if ending["left"]:
             pids = ", ".join(str(entry["pid"]) for entry in ending["left"])
             raise MachineFailure(FailureKind.STEP, f"even SIGKILL did not end {pids}")
 
     def close(self) -> None:
         """Let the helper end and close the connection."""
+        self._drop_helper()
+        self.connection.close()
+
+    def _drop_helper(self) -> None:
         if self._lock.acquire(timeout=ASK_TIMEOUT_S):
             board, self._board = self._board, None
             self._lock.release()
             if board is not None:
                 board.close()
-        self.connection.close()
 
 
 def reach_machines(  # noqa: PLR0913 - how machines are reached and prepared; all by name
     targets: Sequence[Target],
-    prepare_of: Callable[[Target], Prepare],
+    prepare: Prepare,
     *,
     parts: Sequence[str],
     options: ConnectOptions,
     connect: Connect,
     forks: int,
+    say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, RemoteMachine]:
     """
-    Connect to all machines and prepare each; whoever calls closes them.
+    Connect to all machines and prepare each; whoever calls closes them. *say* is told each failure at once.
 
     Raises:
         MachinesError: Some failed, each is named; the others are closed again.
     """
 
     def reach(target: Target) -> RemoteMachine:
-        connection = connect(target, options)
-        try:
-            board = Board.start(connection, (*PARTS, *parts))
-            try:
-                prepared = prepare_of(target)(connection, board)
-                return RemoteMachine(connection, board, prepared, options=options, connect=connect)
-            except BaseException:
-                board.close()
-                raise
-        except BaseException:
-            connection.close()
-            raise
+        with contextlib.ExitStack() as opened:
+            connection = opened.enter_context(contextlib.closing(connect(target, options)))
+            board = opened.enter_context(Helper.start(connection, (*PARTS, *parts)))
+            machine = RemoteMachine(
+                connection, board, prepare(target, board), options=options, connect=connect
+            )
+            opened.pop_all()  # whoever has the machine closes them
+            return machine
 
     reached: dict[str, RemoteMachine] = {}
 
     def done(outcome: Outcome[RemoteMachine]) -> None:
         if outcome.value is not None:
             reached[outcome.machine] = outcome.value
+        if outcome.failure is not None:
+            say(f"{outcome.machine}: failed: {outcome.failure}")
 
     try:
-        outcomes = for_each(targets, reach, forks=forks, on_done=done)
-        raise_if_failed(outcomes, "the run was not started")
+        raise_if_failed(
+            for_each(targets, reach, forks=forks, on_done=done), "the run was not started"
+        )
     except (KeyboardInterrupt, MachinesError):
         close_machines(tuple(reached.values()))
         raise
@@ -235,3 +259,9 @@ def close_machines(machines: Sequence[RemoteMachine]) -> None:
         thread.start()
     for thread in threads:
         thread.join(ASK_TIMEOUT_S)
+
+
+def expanded(path: str, home: str) -> str:
+    """Return a path of a machine with ~ resolved, as that machine's shell would."""
+    is_at_home = path == "~" or path.startswith("~/")
+    return home.rstrip("/") + path[1:] if is_at_home else path

@@ -1,52 +1,63 @@
 """
-The operator's side of a run: one loop over the children's lines, hand-started agents, signals and deadlines.
+The operator's side of a run: one loop that tells the supervision what happens, and carries out what it decides.
 
-It starts the host, then one supervisor a machine, passes on who died, and leaves only when no process
-of the run lives: first they are asked to stop, then `Reaper` ends them. Of a detached run it leaves
-everything once it is under way.
+What is decided stands in `Supervision`; here are the descriptors, processes, threads and the clock. Of a
+detached run the operator leaves everything once it is under way.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import selectors
-import signal
 import time
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
-from cosmos_cli.launch import events
-from cosmos_cli.launch.children import Child
-from cosmos_cli.launch.crew import Crew
-from cosmos_cli.launch.deadlines import STALL_S
-from cosmos_cli.launch.host_limits import OPEN_STATES, RUNNING_STATE, HostLimits
-from cosmos_cli.launch.loop import Loop
-from cosmos_cli.launch.machine_care import Company, Decisions, MachineCare
+from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.fleet.failure import MachineFailure
+from cosmos_cli.launch import actions, events
+from cosmos_cli.launch import child as programs
+from cosmos_cli.launch import run_events as happened
+from cosmos_cli.launch.actions import Action
+from cosmos_cli.launch.background import BackgroundTasks
+from cosmos_cli.launch.child import ChildProgram, LocalChild, RemoteProgram
+from cosmos_cli.launch.children import HOST
 from cosmos_cli.launch.machines import RemoteMachine
-from cosmos_cli.launch.outcome import FIRST_LIFE, LaunchOutcome, LaunchRequest, Life, View
-from cosmos_cli.launch.reaper import Reaper
-from cosmos_cli.launch.roll import Roll
-from cosmos_cli.launch.seats import Seats
+from cosmos_cli.launch.manual_seat import ManualSeat
+from cosmos_cli.launch.order_socket import SelectorReaders
+from cosmos_cli.launch.remote_child import RemoteChild
+from cosmos_cli.launch.reporter import Reporter
+from cosmos_cli.launch.request import LaunchOutcome, LaunchRequest, View
+from cosmos_cli.launch.run_events import RunEvent
 from cosmos_cli.launch.signals import OperatorSignals
-from cosmos_cli.launch.starter import HOST, Starter, Told
-from cosmos_cli.launch.talk import Talk
-from cosmos_cli.rundir import RunDirectory
+from cosmos_cli.launch.supervision import Supervision
+from madns_runtime.hardware.order_socket import Fault, OrderSocket
+from madns_runtime.timing.granted_clock import GrantedClock
 
-STOP_GRACE_S = 2.0
-"""From the host's end until supervisors are told to stop: agents that follow the host need less."""
-END_MARGIN_S = 5.0
-"""A supervisor kills its own late agents and names them; the operator's deadline comes after that."""
+HOST_MODULE = "madns_runtime.host"
+AGENT_MODULE = "madns_runtime.agent"
+LOCKSTEP_ENVIRONMENT: Mapping[str, str] = {"PYTHONHASHSEED": "0"}
+"""The order of a set of names depends on it: with it, that is the same in every run."""
+STALL_S = 5.0
+"""A turn of the loop that took this long means that the operator was stopped (Ctrl-Z), not its children."""
 SELECT_MAX_S = 1.0
 """A wake-up lost to a bug costs this long, not the run."""
+SELECT_MIN_S = 0.005  # while what is nearly due waits for a clock that stands
 PUSH_INTERVAL_S = 0.02
 """While a line to another machine is full, it is tried again this often."""
 BACKGROUND_END_S = 10.0
 """For what machines are still being asked when the run is over."""
-
-HOST_EXIT_CODES = (0, 1)
-"""Of a host that came to its end: the run was complete, or was not."""
+CLEAN_S = 3.0
+FORCED_S = 3.0
+"""For what a lost machine's earlier life has left there."""
 NO_MACHINES: Mapping[str, RemoteMachine] = {}
+
+Child = LocalChild | RemoteChild
+"""One started program, here or on another machine; none of its methods waits."""
 
 
 class Operator:
@@ -68,325 +79,299 @@ class Operator:
         remote: Mapping[str, RemoteMachine] = NO_MACHINES,
     ) -> None:
         self._request = request
+        self._remote = remote
         self._run = RunDirectory(request.directory)
-        self._timeouts = request.config.timeouts
         self._view = view
-        self._talk = Talk(view)
+        self._reporter = Reporter(view)
         self._signals = signals
-        self._loop = Loop.make()
-        self._deadlines = self._loop.deadlines
-        self._reaper = Reaper(self._deadlines, self._problem_of)
-        self._starter = Starter(request, remote, self._loop)
-        self._crew = Crew()
-        self._roll = Roll(request)
-        self._care = self._make_care(remote)
-        self._watch = self._care.watch
-        self._limits = HostLimits(
-            self._deadlines,
-            request.config,
-            give_up=self._give_up_on_host,
-            stop=partial(self._ask_host_to_stop, "failed"),
-        )
-        self._seats = Seats(
-            self._loop,
-            on_line=self._said,
-            on_left=self._seat_left,
-            talk=self._talk,
-            within_s=self._timeouts.agents_ready_s,
-        )
-        self._listening: events.Listening | None = None
-        self._host_result: Mapping[str, Any] | None = None
-        self._has_host_finished = False
-        self._is_closing = False
-        self._is_detached = False
-        self._interruption: Literal["no", "clean", "at once"] = "no"
-
-    def _make_care(self, remote: Mapping[str, RemoteMachine]) -> MachineCare:
-        company = Company(self._loop, self._crew, self._roll, self._reaper, self._talk)
-        decisions = Decisions(
-            is_open=self._is_open,
-            agents_lost=self._agents_lost,
-            host_lost=partial(self._close_down, grace_s=0.0),
-            start_supervisor=self._start_supervisor,
-        )
-        return MachineCare(self._request, remote, company, decisions)
+        self._selector = selectors.DefaultSelector()
+        self._background = BackgroundTasks(self._selector)
+        self._supervision = Supervision(request, remote)
+        self._children: dict[str, Child] = {}
+        self._is_lockstep = request.config.time.is_lockstep
+        # In lockstep nobody is late because the computer is busy: while the host, or anything that it started,
+        # waits for a processor, none of the operator's limits comes closer.
+        self._now_s = GrantedClock(self._living).now_s if self._is_lockstep else time.monotonic
+        self._exited: set[str] = set()
+        self._seats: dict[str, ManualSeat] = {}
+        self._orders: OrderSocket | None = None
+        self._events: deque[RunEvent] = deque()
+        self._is_handling = False
+        self._do: Mapping[type, Callable[[Any], object]] = {
+            actions.StartHost: lambda _: self._start(
+                HOST, request.host_machine, request.host_launch()
+            ),
+            actions.StartAgents: self._start_agents,
+            actions.StepBack: lambda action: os.nice(action.nice),
+            actions.Send: lambda action: self._children[action.name].send(action.command),
+            actions.Terminate: lambda action: self._children[action.name].terminate(),
+            actions.Kill: self._kill,
+            actions.LookAtGroup: self._look_at_group,
+            actions.CloseChild: self._close_child,
+            actions.Reattach: lambda action: self._children[action.name].reattach(),
+            actions.QuoteLastWords: self._quote_last_words,
+            actions.FindLastCall: self._find_last_call,
+            actions.AskMachine: self._ask_machine,
+            actions.ReachMachine: self._reach_machine,
+            actions.OpenSeat: self._open_seat,
+            actions.SendSeat: lambda action: self._seats[action.agent].send(action.command),
+            actions.StopSeat: lambda action: self._seats[action.agent].stop_listening(),
+            actions.CloseSeat: lambda action: self._seats.pop(action.agent).close(),
+            actions.AnswerOrder: self._answer_order,
+            actions.Say: lambda action: self._view.say(action.text, action.level),
+            actions.ReportProblem: lambda a: self._reporter.problem(a.text, a.machine),
+            actions.Show: lambda action: self._reporter.show(action.name, action.event),
+        }
 
     def run(self) -> LaunchOutcome:
         """Start everything, wait for the end of everything, and say how it went."""
-        self._loop.selector.register(self._signals, selectors.EVENT_READ, self._signalled)
+        self._selector.register(self._signals, selectors.EVENT_READ, self._signalled)
+        supervision = self._supervision
         try:
-            self._start_host()
-            while not self._is_over():
+            self._listen_for_orders()
+            self._post(happened.Begun())
+            while not supervision.is_over:
                 self._turn()
         finally:
-            leftovers = self._let_go() if self._is_detached else self._clear_up()
+            if self._orders is not None:
+                self._orders.close()
+                self._orders = None
+            leftovers = self._let_go() if supervision.is_detached else self._clear_up()
+            self._background.close(BACKGROUND_END_S)
+            self._selector.close()
         return LaunchOutcome(
-            host_result=self._host_result or self._run.read_left_result(),
-            interruption=self._interruption,
-            problems=self._talk.problems,
+            host_result=supervision.host_result or self._run.read_left_result(),
+            interruption=supervision.interruption,
+            problems=self._reporter.problems,
             leftovers=leftovers,
-            is_detached=self._is_detached,
+            is_detached=supervision.is_detached,
         )
 
+    # The loop -------------------------------------------------------------------------------------
+
     def _turn(self) -> None:
-        turned_s = time.monotonic()
-        for key, mask in self._loop.selector.select(self._wait_s(turned_s)):
+        turned_s = self._now_s()
+        for key, mask in self._selector.select(self._wait_s(turned_s)):
             # An earlier callback of this round may have closed this one's descriptor.
-            if self._loop.selector.get_map().get(key.fd) is key:
+            if self._selector.get_map().get(key.fd) is key:
                 key.data(mask)
-        for child in self._crew.newly_exited():
-            self._child_exited(child)
-        now_s = time.monotonic()
+        for name, child in tuple(self._children.items()):
+            if name not in self._exited and child.has_exited():
+                self._child_exited(name, child)
+        now_s = self._now_s()
         if now_s - turned_s > STALL_S:
-            self._deadlines.postpone(now_s - turned_s)
-        self._deadlines.fire(now_s)
+            self._supervision.postpone(now_s - turned_s)
+        self._carry_out(self._supervision.tick(now_s))
+        self._handle_events()
 
     def _wait_s(self, now_s: float) -> float:
-        wait_s = self._deadlines.wait_s(now_s)
-        limit_s = PUSH_INTERVAL_S if self._crew.push() else SELECT_MAX_S
-        return limit_s if wait_s is None else min(wait_s, limit_s)
+        wait_s = self._supervision.wait_s(now_s)
+        waits = [child.push() for child in self._children.values()]
+        limit_s = PUSH_INTERVAL_S if any(waits) else SELECT_MAX_S
+        return limit_s if wait_s is None else min(max(wait_s, SELECT_MIN_S * bool(wait_s)), limit_s)
 
-    def _is_over(self) -> bool:
-        is_ended = all(map(self._reaper.has_ended, self._crew.everybody()))
-        is_quiet = not self._seats and not self._watch.is_trying
-        return self._is_detached or (is_ended and is_quiet)
+    def _post(self, event: RunEvent) -> None:
+        """Tell the supervision of an event; one that comes of carrying out another waits for its turn."""
+        self._events.append(event)
+        if not self._is_handling:
+            self._handle_events()
 
-    def _is_open(self) -> bool:
-        """Tell whether agents may still join the run."""
-        return self._limits.is_open and not self._is_closing and self._interruption == "no"
+    def _handle_events(self) -> None:
+        while self._events:
+            self._carry_out(self._supervision.handle(self._events.popleft(), self._now_s()))
+
+    def _carry_out(self, decided: list[Action]) -> None:
+        self._is_handling = True
+        try:
+            for action in decided:
+                self._do[type(action)](action)
+        finally:
+            self._is_handling = False
+
+    def _living(self) -> Iterator[int]:
+        """Yield the processes that the run's clock waits for."""
+        for name, child in self._children.items():
+            if not child.has_exited():
+                yield from () if child.pid is None else (child.pid,)
+            elif not self._supervision.has_ended(name):
+                yield from child.members()
 
     def _let_go(self) -> tuple[int, ...]:
         """Leave a detached run to itself; nobody is left over from it."""
-        for child in self._crew.everybody():
+        for child in self._children.values():
             child.release()
-        self._loop.background.close(BACKGROUND_END_S)
-        self._loop.selector.close()
         return ()
 
     def _clear_up(self) -> tuple[int, ...]:
-        self._seats.close()
-        self._watch.stop_seeking()
-        leftovers = self._reaper.kill_whatever_lives(self._crew.everybody())
+        """End whatever lives, outside of the loop: the last resort, also when the loop itself has failed."""
+        for seat in self._seats.values():
+            seat.close()
+        self._carry_out(self._supervision.stop_seeking())
+        children = tuple(self._children.values())
+        with ThreadPoolExecutor(max(1, len(children))) as pool:
+            ended = pool.map(lambda child: child.end_by_force(), children)
+            leftovers = tuple(pid for pids in ended for pid in pids)
+        for child in children:
+            child.close()
         if leftovers:
-            self._talk.problem(f"processes {', '.join(map(str, leftovers))} outlived SIGKILL")
-        self._loop.background.close(BACKGROUND_END_S)
-        self._loop.selector.close()
-        self._talk.noise_in_all()
+            self._reporter.problem(f"processes {', '.join(map(str, leftovers))} outlived SIGKILL")
+        self._reporter.noise_in_all()
         return leftovers
 
-    def _problem_of(self, child: Child, text: str) -> None:
-        self._talk.problem(text, self._crew.machine_of(child.name))
-
-    def _start_host(self) -> None:
-        machine = self._request.host_machine
-        if machine is not None:
-            self._crew.place(HOST, machine)
-        try:
-            child = self._starter.start_host(self._told(HOST, machine))
-        except OSError as error:
-            self._cannot_start(HOST, error)
-            return
-        self._crew.add(child)
-        if machine is not None:
-            self._watch.add(machine, child, is_host=True)
-        self._limits.started(is_here=machine is None)
-
-    def _start_agents(self, listening: events.Listening) -> None:
-        self._listening = listening
-        for machine, names in self._request.machines.items():
-            started = tuple(name for name in names if name not in self._request.manual)
-            if started:
-                self._start_supervisor(machine, started)
-            for name in names:
-                if name in self._request.manual:
-                    launch = self._request.agent_launch(machine, (name,), listening)
-                    self._seats.open(name, launch)
-        if self._request.nice:  # after the children, who would inherit it
-            os.nice(self._request.nice)
-
-    def _start_supervisor(
-        self, machine: str, agents: tuple[str, ...], life: Life = FIRST_LIFE
-    ) -> None:
-        assert self._listening is not None
-        name = f"agents@{machine}" + (f" ({life.number})" if life.number > 1 else "")
-        self._crew.place(name, machine)
-        launch = self._request.agent_launch(machine, agents, self._listening, life)
-        try:
-            told = self._told(name, machine)
-            child = self._starter.start_agents(name, machine, launch, told)
-        except OSError as error:
-            self._cannot_start(name, error)
-            return
-        self._crew.add(child)
-        self._limits.not_alone()
-        self._watch.add(machine, child, is_host=False)
-
-    def _told(self, name: str, machine: str | None) -> Told:
-        return Told(
-            on_line=partial(self._said, name),
-            on_unreachable=lambda why: self._care.machine_gone(machine or ""),
-        )
-
-    def _cannot_start(self, name: str, error: OSError) -> None:
-        reason = f"{name} cannot be started: {error}"
-        self._talk.problem(reason, self._crew.machine_of(name))
-        self._ask_host_to_stop("failed", reason)
-
-    def _said(self, name: str, line: bytes) -> None:
-        event = events.parse_event(line)
-        if isinstance(event, events.Logged):
-            self._talk.logged(name, event)
-        elif isinstance(event, events.Noise):
-            self._talk.noise(name, event)
-        elif isinstance(event, events.Pong):
-            self._watch.pong(self._crew.machine_of(name) or "", name, event.n)
-        elif name == HOST:
-            self._host_said(event)
-        else:
-            self._supervisor_said(event)
-
-    def _host_said(self, event: events.Event) -> None:
-        if isinstance(event, events.Progress):
-            self._view.progress(event)
-            self._limits.heard()
-        elif isinstance(event, events.AgentChanged):
-            self._view.agent(event)
-        elif isinstance(event, events.StateChanged):
-            self._view.state(event.state)
-            self._limits.entered(event.state)
-            if event.state not in OPEN_STATES:
-                self._watch.expect_ends()
-            if event.state == RUNNING_STATE and self._interruption == "no":
-                self._is_detached = self._request.is_detached
-        elif isinstance(event, events.Listening):
-            self._limits.expect_next_state()
-            if self._listening is None and self._interruption == "no":
-                self._start_agents(event)
-        elif isinstance(event, events.Finished):
-            self._host_finished(event.result)
-
-    def _host_finished(self, result: Mapping[str, Any] | None) -> None:
-        self._host_result = result or self._run.read_left_result()
-        self._has_host_finished = True
-        self._close_down(grace_s=STOP_GRACE_S)
-
-    def _supervisor_said(self, event: events.Event) -> None:
-        if isinstance(event, events.AgentStarted):
-            self._roll.started(event.agent, event.incarnation)
-        elif isinstance(event, events.AgentExited):
-            self._roll.exited(event.agent, is_abnormal=event.is_abnormal)
-            if event.is_abnormal:
-                self._tell_host_exited(event.agent, event.how, event.pid)
-
-    def _tell_host_exited(self, agent: str, how: str, pid: int | None = None) -> None:
-        if not self._has_host_finished:
-            command = {"command": "agent_exited", "agent": agent, "how": how, "pid": pid}
-            self._crew.tell_host(command)
-
-    def _seat_left(self, agent: str) -> None:
-        if agent not in self._roll.ended:
-            self._tell_host_exited(agent, "its hand-started process is gone")
-
-    def _ask_host_to_stop(self, status: str, reason: str) -> None:
-        if self._crew.host is not None and not self._is_closing:
-            self._crew.tell_host({"command": "stop", "reason": reason, "status": status})
-            self._limits.told_to_stop()
-
-    def _give_up_on_host(self, what: str) -> None:
-        host = self._crew.host
-        assert host is not None, "a host that was not started has no deadline"
-        self._reaper.end(host, what)
-        self._talk.last_words(host)
-        self._close_down(grace_s=0.0)
-
-    def _child_exited(self, child: Child) -> None:
-        machine = self._crew.machine_of(child.name)
-        if machine is not None and child.loss() is not None:
-            self._watch.lose(machine, child.loss() or "")
-            return
-        self._crew.mark_exited(child)
-        child.drain()
-        self._reaper.leader_ended(child)
-        if machine is not None:
-            self._watch.remove(machine, child)
-        if child.name != HOST:
-            self._supervisor_exited(child)
-        elif not self._has_host_finished and not self._is_closing:
-            self._host_exited(child)
-
-    def _host_exited(self, child: Child) -> None:
-        """The host is gone and nothing was heard of its result: too long for a line, or cut off."""
-        result = self._run.read_left_result()
-        if result is not None and child.returncode() in HOST_EXIT_CODES:
-            self._host_finished(result)
-        else:
-            how = child.describe_exit()
-            self._problem_of(child, f"host (pid {child.pid}) {how} before the run was over")
-            self._talk.last_words(child)
-            self._close_down(grace_s=0.0)
-
-    def _supervisor_exited(self, child: Child) -> None:
-        if self._is_closing:
-            return
-        machine = self._crew.machine_of(child.name) or ""
-        left = self._roll.left_on(machine)
-        if left:
-            how = f"{child.name} (pid {child.pid}) {child.describe_exit()}"
-            self._problem_of(child, f"{how} before its agents {', '.join(left)} were done")
-            self._talk.last_words(child)
-            self._agents_lost(left, f"its supervisor {how}")
-        self._care.supervisor_ended(machine)
-        if self._crew.are_supervisors_over() and not self._seats:
-            self._limits.alone()
-
-    def _agents_lost(self, agents: tuple[str, ...], how: str) -> None:
-        for agent in () if self._is_closing else agents:
-            self._roll.exited(agent, is_abnormal=True)
-            self._tell_host_exited(agent, how)
-
-    def _close_down(self, *, grace_s: float) -> None:
-        """The host is done or gone: the rest has to end too, in the time that shutdown is given."""
-        if self._is_closing:
-            return
-        self._is_closing = True
-        self._limits.over()
-        self._watch.stop_seeking()
-        now_s = time.monotonic()
-        self._deadlines.set("stop", now_s + grace_s, self._tell_stop)
-        limit_s = grace_s + self._timeouts.shutdown_s + END_MARGIN_S
-        late = f"has not ended within {limit_s:g} s of the end of the run"
-        for child in self._crew.everybody():
-            is_due = child.name != HOST or self._has_host_finished
-            if is_due and not self._reaper.has_ended(child):
-                self._reaper.expect_end(child, now_s + limit_s, late)
-        self._seats.end(now_s + limit_s)
-
-    def _tell_stop(self) -> None:
-        command = {"command": "stop", "reason": "the run is over"}
-        self._crew.tell_supervisors(command)
-        self._seats.send(command)
+    # Events ---------------------------------------------------------------------------------------
 
     def _signalled(self, mask: int) -> None:
         for number in self._signals.take():
-            if self._interruption == "no":
-                self._interrupt(number)
-            elif self._interruption == "clean" and number is not signal.SIGHUP:
-                self._end_at_once()  # a closing terminal sends two SIGHUP: that is no second word
+            self._post(happened.Signalled(number))
 
-    def _interrupt(self, number: signal.Signals) -> None:
-        self._interruption = "clean"
-        self._watch.stop_seeking()
-        self._talk.say("stopping; press Ctrl-C again to end at once", "warning")
-        by = "the operator" if number is signal.SIGINT else number.name
-        self._ask_host_to_stop("interrupted", f"interrupted by {by}")
+    def _listen_for_orders(self) -> None:
+        """Open the door for faults that are to be inserted, where a run has devices that take them."""
+        is_hosts = self._request.is_detached  # it goes on when this process leaves
+        if self._is_lockstep or is_hosts or not any(self._request.devices.values()):
+            return
+        try:
+            self._orders = OrderSocket(
+                self._run.path, SelectorReaders(self._selector), self._ordered
+            )
+        except OSError as error:
+            self._view.say(f"no fault can be inserted in this run: {error}", "warning")
 
-    def _end_at_once(self) -> None:
-        self._interruption = "at once"
-        self._talk.say("ending at once", "warning")
-        self._is_closing = True
-        self._limits.over()
-        self._deadlines.cancel("stop")
-        self._seats.close()
-        for child in self._crew.everybody():
-            if not self._reaper.has_ended(child):
-                self._reaper.kill(child, "was ended at once on the operator's word")
+    def _ordered(self, number: int, fault: Fault) -> None:
+        self._post(happened.FaultOrdered(number, *fault))
+
+    def _answer_order(self, action: actions.AnswerOrder) -> None:
+        if self._orders is not None:
+            self._orders.answer(action.number, action.refusal)
+
+    def _said(self, name: str, line: bytes) -> None:
+        event = events.parse_event(line)
+        if name == HOST and isinstance(event, events.Finished) and event.result is None:
+            event = dataclasses.replace(event, result=self._run.read_left_result())
+        self._post(happened.ChildSaid(name, event))
+
+    def _child_exited(self, name: str, child: Child) -> None:
+        self._exited.add(name)
+        if child.loss is not None:
+            self._post(happened.ChildLost(name, child.loss))
+            return
+        child.drain()
+        result = self._run.read_left_result() if name == HOST else None
+        how, code = child.describe_exit(), child.returncode()
+        self._post(happened.ChildExited(name, how, code, result))
+
+    # Actions --------------------------------------------------------------------------------------
+
+    def _start_agents(self, action: actions.StartAgents) -> None:
+        launch = self._request.agent_launch(
+            action.machine, action.agents, action.listening, action.life
+        )
+        self._start(action.name, action.machine, launch)
+
+    def _start(self, name: str, machine: str | None, launch: Mapping[str, Any]) -> None:
+        try:
+            if machine is not None and machine in self._remote:
+                started: Child = self._start_there(name, machine, launch)
+            else:
+                started = self._start_here(name, machine, launch)
+        except OSError as error:
+            self._post(happened.StartFailed(name, machine, str(error)))
+        else:
+            self._children[name] = started
+            self._post(happened.ChildStarted(name, machine, started.pid))
+
+    def _start_here(self, name: str, machine: str | None, launch: Mapping[str, Any]) -> LocalChild:
+        directory = self._request.directory
+        program = ChildProgram(
+            name=name,
+            arguments=programs.HOST_PROGRAM if name == HOST else programs.AGENT_PROGRAM,
+            stderr=directory / _stderr_of(name, machine),
+            run_directory=str(directory),
+            environment=LOCKSTEP_ENVIRONMENT if self._is_lockstep else {},
+        )
+        return LocalChild(program, self._selector, launch=launch, on_line=partial(self._said, name))
+
+    def _start_there(self, name: str, machine: str, launch: Mapping[str, Any]) -> RemoteChild:
+        program = RemoteProgram(
+            name=name,
+            module=HOST_MODULE if name == HOST else AGENT_MODULE,
+            run_directory=self._request.place_of(machine).directory,
+            stderr=_stderr_of(name, machine),
+            access=self._request.config.recording.access,
+        )
+        return RemoteChild(
+            program,
+            self._remote[machine],
+            self._background,
+            launch=launch,
+            on_line=partial(self._said, name),
+            tell=self._post,
+        )
+
+    def _kill(self, action: actions.Kill) -> None:
+        child = self._children[action.name]
+        self._post(happened.GroupKilled(action.name, action.why, tuple(child.members())))
+        child.kill()
+
+    def _look_at_group(self, action: actions.LookAtGroup) -> None:
+        members = tuple(self._children[action.name].members())
+        self._post(happened.GroupSeen(action.name, members))
+
+    def _close_child(self, action: actions.CloseChild) -> None:
+        self._exited.add(action.name)
+        self._children[action.name].close()
+
+    def _quote_last_words(self, action: actions.QuoteLastWords) -> None:
+        child = self._children[action.name]
+
+        def show(lines: list[str]) -> None:
+            if lines:
+                shown = "\n".join(f"  | {line}" for line in lines)
+                self._view.say(f"the last lines of {child.stderr}:\n{shown}", "error")
+
+        child.tell_last_words(show)
+
+    def _find_last_call(self, action: actions.FindLastCall) -> None:
+        self._children[action.name].tell_last_call(
+            self._request.session_hex,
+            lambda where: self._post(happened.LastCallFound(action.name, action.how, where)),
+        )
+
+    def _ask_machine(self, action: actions.AskMachine) -> None:
+        def answered(is_alive: bool | None, failure: MachineFailure | None) -> None:
+            event = happened.MachineAsked(action.machine, bool(is_alive))
+            self._post(dataclasses.replace(event, why=failure.text) if failure else event)
+
+        self._background.submit(self._remote[action.machine].is_alive, answered)
+
+    def _reach_machine(self, action: actions.ReachMachine) -> None:
+        directory = self._request.place_of(action.machine).directory
+        self._background.submit(
+            partial(
+                self._remote[action.machine].return_to,
+                directory,
+                clean_s=CLEAN_S,
+                forced_s=FORCED_S,
+            ),
+            lambda _, failure: self._post(happened.MachineReached(action.machine, failure is None)),
+        )
+
+    def _open_seat(self, action: actions.OpenSeat) -> None:
+        agent = action.agent
+        seat = self._seats[agent] = ManualSeat(
+            agent,
+            self._selector,
+            launch=self._request.agent_launch(action.machine, (agent,), action.listening),
+            on_line=partial(self._said, agent),
+            on_presence=lambda is_here: self._post(
+                happened.ManualAgentJoined(agent) if is_here else happened.ManualAgentLeft(agent)
+            ),
+        )
+        within_s = self._request.config.timeouts.agents_ready_s
+        named = self._request.labels.named(agent)
+        text = f"start {named} by hand within {within_s:g} s, in another terminal:"
+        self._view.say(f"{text}\n  {seat.command()}", "manual")
+
+
+def _stderr_of(name: str, machine: str | None) -> str:
+    """Return the file of a child's standard error, below the run directory."""
+    return f"{HOST if name == HOST else f'machines/{machine}'}/stderr.txt"

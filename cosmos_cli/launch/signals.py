@@ -50,8 +50,7 @@ class OperatorSignals:
     def take(self) -> list[signal.Signals]:
         """Return the stop signals that came since the last call; others only wake."""
         with contextlib.suppress(BlockingIOError):
-            numbers = self._reader.recv(4096)
-            return [signal.Signals(n) for n in numbers if n in STOP_SIGNALS]
+            return [signal.Signals(n) for n in self._reader.recv(4096) if n in STOP_SIGNALS]
         return []
 
     def raise_from_now(self) -> None:

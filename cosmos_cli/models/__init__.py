@@ -1,1 +1,1 @@
-"""What a person writes, as pydantic models, and how it is read."""
+"""Files that a person writes, as pydantic models, and their reading."""

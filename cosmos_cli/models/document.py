@@ -9,15 +9,20 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from typing import Any
 
-from cosmos_cli.errors import Fault, InputError
-from cosmos_cli.models.yaml_source import Node, Source, compose
+from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault, InputError
+from cosmos_cli.models.yaml_source import DEPTH_MAX, Node, YamlSource, compose
 
 VALUES_MAX = 200_000
 """Bound of the values that a document may unfold to: aliases of aliases grow without end."""
 
+KEY_CHARACTERS_SHOWN = 60
+OVERRIDES_MAX = 1000
+GUESSES_MAX = 20_000
+"""Words that are compared with what was written, for all faults of a kind together: a third of a second."""
 Path = tuple[str | int, ...]
 _STEP = re.compile(r"([^.\[\]]+)|\[([0-9]{1,9})\]")
 _INDEX = re.compile(r"[0-9]{1,9}")
@@ -25,8 +30,8 @@ _KEY = re.compile(r"[^.\[\]]+(?:\.[^.\[\]]+|\[[0-9]{1,9}\])*")
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """Where a value was written: line and column of the file, or the key of --set."""
+class SourcePlace:
+    """Place of a value: line and column of the file, or the key of --set."""
 
     line: int = 0
     column: int = 0
@@ -37,30 +42,23 @@ class Place:
 class Document:
     """Plain values, and the place of each value and key."""
 
-    source: Source
+    source: YamlSource
     value: dict[str, Any] = field(default_factory=dict)
-    value_places: dict[Path, Place] = field(default_factory=dict)
-    key_places: dict[Path, Place] = field(default_factory=dict)
+    value_places: dict[Path, SourcePlace] = field(default_factory=dict)
+    key_places: dict[Path, SourcePlace] = field(default_factory=dict)
     texts: dict[Path, str] = field(default_factory=dict)
     """Scalars as they are written."""
     faults: list[Fault] = field(default_factory=list)
     """Of single scalars, which are None in `value`: everything else can be checked all the same."""
 
     def fault(self, path: Path, text: str, *, at_key: bool = False) -> Fault:
-        """Return a fault at the place of *path*, or of the nearest parent that was written."""
+        """Return a fault at the place of *path*; of one that was not written, at the key above."""
         place = self._place(path, at_key)
         if place.override:
             return Fault(text=text, path=dotted(path), override=place.override)
         return self.source.fault(text, line=place.line, column=place.column, path=dotted(path))
 
-    def missing(self, path: Path, text: str) -> Fault:
-        """Return a fault about a path that was not written: it stands at the key above."""
-        place = self._place(path[:-1], True)
-        if place.override:
-            return Fault(text=text, path=dotted(path), override=place.override)
-        return self.source.fault(text, line=place.line, column=place.column, path=dotted(path))
-
-    def _place(self, path: Path, at_key: bool) -> Place:
+    def _place(self, path: Path, at_key: bool) -> SourcePlace:
         for length in range(len(path), 0, -1):
             part = path[:length]
             exact = self.key_places if at_key or length < len(path) else self.value_places
@@ -68,7 +66,7 @@ class Document:
             place = exact.get(part) or other.get(part)
             if place is not None:
                 return place
-        return Place(1, 1)
+        return SourcePlace(1, 1)
 
     def set(self, key: str, path: Path, value: Any) -> None:
         """Replace the value at *path*; what stood below it is forgotten."""
@@ -79,7 +77,19 @@ class Document:
         written = _assign(parent, (*written, path[-1]), key, value)
         for places in (self.value_places, self.key_places, self.texts):
             _forget(places, written)
-        self.value_places[written] = self.key_places[written] = Place(override=key)
+        self.value_places[written] = self.key_places[written] = SourcePlace(override=key)
+
+    def rename(self, path: Path, name: str) -> None:
+        """Call the key at *path*, a scalar's, *name*: its value and places stay."""
+        new = (*path[:-1], name)
+        parent: Any = self.value
+        for step in path[:-1]:
+            parent = parent[step]
+        parent[name] = parent.pop(path[-1])
+        maps: tuple[dict[Path, Any], ...] = (self.value_places, self.key_places, self.texts)
+        for places in maps:
+            if path in places:
+                places[new] = places.pop(path)
 
 
 def _forget(places: dict[Path, Any], path: Path) -> None:
@@ -95,27 +105,28 @@ def dotted(path: Sequence[str | int]) -> str:
     return text
 
 
-def read_document(source: Source) -> Document:
+def read_document(source: YamlSource, *, has_64_bits: bool = True) -> Document:
     """
     Parse *source*, whose top level must be a mapping.
+
+    Args:
+        source: YAML.
+        has_64_bits: Whether whole numbers must fit into what messages and JSON hold.
 
     Raises:
         InputError: Every fault of syntax, and every duplicate or unsuitable key.
 
     A scalar without a meaning, such as a number that is not finite, is in the document's `faults`.
     """
-    root = compose(source)
+    root = compose(source, has_64_bits=has_64_bits)
     document = Document(source)
     if root is None:
-        raise InputError(
-            faults=[Fault(text="expected a mapping, got an empty file", file=source.label)]
-        )
+        empty = Fault(text="expected a mapping, got an empty file", file=source.label)
+        raise InputError(faults=[empty])
     builder = _Builder(document)
     value = builder.build(root, ())
-    if builder.faults:
+    if builder.faults or (document.faults and not isinstance(value, dict)):
         raise InputError(faults=builder.faults + document.faults)
-    if document.faults and not isinstance(value, dict):
-        raise InputError(faults=document.faults)
     if not isinstance(value, dict):
         text = f"expected a mapping (key: value), got {kind_of(value)}"
         raise InputError(faults=[source.fault(text, line=root.line, column=root.column)])
@@ -132,7 +143,7 @@ def kind_of(value: Any) -> str:
     if isinstance(value, list):
         return "a list"
     if isinstance(value, bool):
-        return "true" if value else "false"
+        return str(value).lower()
     if isinstance(value, str):
         return repr(value) if len(value) <= 60 else repr(value[:57] + "...")
     return str(value)
@@ -145,36 +156,49 @@ class _Builder:
         self.document = document
         self.faults: list[Fault] = []
         self.values = 0
+        self.told: set[tuple[int, int]] = set()
+        """Places of scalars without a value."""
 
     def build(self, node: Node, path: Path) -> Any:
-        self.values += 1
-        if self.values > VALUES_MAX:
-            text = f"expected at most {VALUES_MAX} values, aliases unfolded"
+        self._count(node, path)
+        if len(path) > DEPTH_MAX:  # aliases nest deeper than what is written
+            text = f"expected at most {DEPTH_MAX} levels of nesting, aliases unfolded"
             raise InputError(faults=[self._at(node, text, path)])
-        self.document.value_places[path] = Place(node.line, node.column)
+        self.document.value_places[path] = SourcePlace(node.line, node.column)
         if node.is_mapping:
             return self.mapping(node, path)
         if isinstance(node.value, list):
             items: Any = node.value
             return [self.build(item, (*path, index)) for index, item in enumerate(items)]
-        if node.fault:
-            fault = self._at(node, node.fault, path)
-            if all((f.line, f.column) != (node.line, node.column) for f in self.document.faults):
-                self.document.faults.append(fault)  # an alias stands for what was told already
+        place = (node.line, node.column)
+        if node.fault and place not in self.told:  # an alias stands for what was told already
+            self.told.add(place)
+            self.document.faults.append(self._at(node, node.fault, path))
         if node.is_plain:
             self.document.texts[path] = node.text
         return node.value
 
-    def mapping(self, node: Node, path: Path) -> dict[str, Any]:
+    def _count(self, node: Node, path: Path) -> None:
+        self.values += 1
+        if self.values > VALUES_MAX:
+            text = f"expected at most {VALUES_MAX} values, aliases unfolded"
+            raise InputError(faults=[self._at(node, text, path)])
+
+    def mapping(
+        self, node: Node, path: Path, taken: AbstractSet[str] = frozenset(), merges: int = 0
+    ) -> dict[str, Any]:
+        """Return a mapping, which *merges* others were taken over into, without keys that are *taken* by them."""
         pairs: Any = node.value
+        merged = [value for key, value in pairs if _is_merge(key)]
+        written = [(key, value) for key, value in pairs if not _is_merge(key)]
         result: dict[str, Any] = {}
-        for key, value in pairs:
-            if key.is_plain and key.text == "<<":
-                self.merge(value, path, result)
+        if merged:
+            stronger = set(taken)
+            stronger.update(key.value for key, _ in written if isinstance(key.value, str))
+            for value in merged:
+                self.merge(value, path, result, stronger, merges + 1)
         seen: dict[str, Node] = {}
-        for key, value in pairs:
-            if key.is_plain and key.text == "<<":
-                continue
+        for key, value in written:
             name = key.value
             if not isinstance(name, str):
                 text = f"expected a text as key, got {key.text or kind_of(name)}"
@@ -188,28 +212,30 @@ class _Builder:
                 self.faults.append(self._at(key, text, inner))
                 continue
             seen[name] = key
-            self.forget(inner)
-            self.document.key_places[inner] = Place(key.line, key.column)
-            result[name] = self.build(value, inner)
+            if name in taken:
+                self._count(key, inner)
+            else:
+                self.document.key_places[inner] = SourcePlace(key.line, key.column)
+                result[name] = self.build(value, inner)
         return result
 
-    def merge(self, node: Node, path: Path, result: dict[str, Any]) -> None:
+    def merge(
+        self, node: Node, path: Path, result: dict[str, Any], stronger: set[str], merges: int
+    ) -> None:
         """Take over the keys of `<<: *anchor`, or of a list of them, the earlier the stronger."""
         nodes: Any = [node] if node.is_mapping else node.value
         if not isinstance(nodes, list) or not all(item.is_mapping for item in nodes):
-            self.faults.append(
-                self._at(node, "expected a mapping or a list of mappings after <<", path)
-            )
+            text = "expected a mapping or a list of mappings after <<"
+            self.faults.append(self._at(node, text, path))
             return
-        for item in reversed(nodes):
-            result.update(self.mapping(item, path))
-
-    def forget(self, path: Path) -> None:
-        """Drop the places that a merged mapping left under a key that is written out."""
-        if path not in self.document.value_places:
-            return
-        for places in (self.document.value_places, self.document.key_places, self.document.texts):
-            _forget(places, path)
+        if merges > DEPTH_MAX:
+            text = f"expected at most {DEPTH_MAX} mappings that are taken over into each other"
+            raise InputError(faults=[self._at(node, text, path)])
+        for item in nodes:
+            self._count(item, path)
+            found = self.mapping(item, path, stronger, merges)
+            stronger.update(found)
+            result.update(found)
 
     def _at(self, node: Node, text: str, path: Path) -> Fault:
         return self.document.source.fault(
@@ -217,16 +243,42 @@ class _Builder:
         )
 
 
+def _is_merge(key: Node) -> bool:
+    return key.is_plain and key.text == "<<"
+
+
 def apply_overrides(document: Document, overrides: Sequence[str]) -> list[Fault]:
     """Apply every KEY=VALUE of --set, in order; return the faults of those that are malformed or have no place."""
     faults: list[Fault] = []
+    seen: dict[tuple[str, ...], str] = {}
+    if len(overrides) > OVERRIDES_MAX:
+        text = f"expected at most {OVERRIDES_MAX} of --set, got {len(overrides)}; write a file"
+        return [Fault(text=text, override=overrides[OVERRIDES_MAX].partition("=")[0])]
     for override in overrides:
         try:
             key, path, value = parse_override(override)
+            _refuse_replacing(key, path, seen)
             document.set(key, path, value)
         except InputError as error:
             faults += error.faults
     return faults
+
+
+def _refuse_replacing(key: str, path: Path, seen: dict[tuple[str, ...], str]) -> None:
+    """
+    Enter a key of --set, unless it would replace what an earlier one said.
+
+    Raises:
+        InputError: It would, in silence.
+    """
+    steps = tuple(map(str, path))
+    for other, other_key in seen.items():
+        if other == steps:
+            also = " (--duration sets it, too)" if key == "time.duration_s" else ""
+            raise _override_error(key, f"is given twice, and only one could count{also}")
+        if other[: len(steps)] == steps:
+            raise _override_error(key, f"would replace what --set {other_key} says; give it first")
+    seen[steps] = key
 
 
 def parse_override(override: str) -> tuple[str, Path, Any]:
@@ -242,11 +294,14 @@ def parse_override(override: str) -> tuple[str, Path, Any]:
         raise _override_error(override, "expected KEY=VALUE, such as agents.count=5")
     if not _KEY.fullmatch(key):
         raise _override_error(key or override, "expected a dotted path, such as agents.names[0]")
+    if len(_STEP.findall(key)) > DEPTH_MAX:
+        text = f"expected at most {DEPTH_MAX} levels of nesting"
+        raise _override_error(f"{key[:KEY_CHARACTERS_SHOWN]}...", text)
     path = tuple(
         int(index) if index else int(name) if _INDEX.fullmatch(name) else name
         for name, index in _STEP.findall(key)
     )
-    source = Source.of("", text)
+    source = YamlSource.of("", text)
     try:
         root = compose(source)
         builder = _Builder(Document(source))
@@ -300,6 +355,11 @@ def _checked_step(parent: Any, path: Path, key: str) -> Path:
     if step > len(parent):
         raise _override_error(key, f"{above} has {len(parent)} items: got the index {step}")
     return path
+
+
+def may_guess(faults: int, known: int) -> bool:
+    """Tell whether a fault after so many others may be given a guess among so many words: each word is compared."""
+    return faults < FAULTS_SHOWN_MAX and faults * known < GUESSES_MAX
 
 
 def did_you_mean(word: str, known: Sequence[str]) -> str:

@@ -1,11 +1,12 @@
 """
-Which machines a --limit pattern means: Ansible's patterns, over the machines of an inventory. Pure.
+Patterns of --limit: Ansible's, over the machines of an inventory. Pure but for @FILE.
 
     pi07                  a machine              tower            a group
     pi0*, ~pi[0-9]+       names and groups that a glob, or a regular expression from their start, fits
     tower,lab  tower:lab  either                 all, *           every machine
     tower:&hwil           both                   tower:!chiefs    the first without the second
     tower[0] tower[-1]    by its place in what a pattern means; tower[1:3] both ends included, tower[5:]
+    @FILE                 what the lines of a file mean (`limit_file` reads it: --limit alone, not a scenario)
 
 As in Ansible, whatever the order: first all that is added, then what must be shared, then what is left out.
 """
@@ -17,8 +18,9 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from cosmos_cli.errors import InputError
-from cosmos_cli.models.document import did_you_mean
+from cosmos_cli.errors import FAULTS_SHOWN_MAX, InputError
+from cosmos_cli.models.document import did_you_mean, may_guess
+from cosmos_cli.models.limit_file import MARK, file_patterns, has_stray_bracket, pieces_of
 
 if TYPE_CHECKING:
     from cosmos_cli.models.inventory.machine import Machine
@@ -27,7 +29,6 @@ PATTERN_CHARACTERS_MAX = 4096
 NAMES_SHOWN_MAX = 4
 ALL = "all"
 
-_PIECES = re.compile(r"(?:[^\s:\[\]]|\[[^\]]*\])+")
 _SUBSCRIPT = re.compile(r"(.+)\[(?:(-?[0-9]{1,9})|([0-9]{1,9}):([0-9]{0,9}))\]")
 _OLD_SUBSCRIPT = re.compile(r"(.+)\[([0-9]+)-([0-9]*)\]")
 
@@ -51,7 +52,7 @@ def select_machines(
         InputError: The pattern is malformed, names what there is not, or means no machine.
     """
     try:
-        return matching_machines(machines, pattern, groups=groups)
+        return _matching(machines, _split(pattern, has_files=True), groups)
     except PatternError as error:
         raise InputError(f"--limit {pattern}: {error}") from None
 
@@ -65,7 +66,12 @@ def matching_machines(
     Raises:
         PatternError: It is malformed, names what there is not, or means no machine.
     """
-    pieces = _split(pattern)
+    return _matching(machines, _split(pattern), groups)
+
+
+def _matching(
+    machines: Sequence[Machine], pieces: Sequence[str], groups: Sequence[str]
+) -> tuple[Machine, ...]:
     matcher = _Matcher(machines, groups)
     added: set[str] = set()
     plain = [piece for piece in pieces if piece[0] not in "!&"]
@@ -78,31 +84,38 @@ def matching_machines(
         if piece[0] == "!":
             added.difference_update(matcher.names(piece[1:]))
     if matcher.faults:
-        raise PatternError("; ".join(dict.fromkeys(matcher.faults)))
+        raise PatternError(_listed(list(dict.fromkeys(matcher.faults))))
     if not added:
         raise PatternError(f"means no machine; there are {_some(m.name for m in machines)}")
     return tuple(machine for machine in machines if machine.name in added)
 
 
-def _split(pattern: str) -> list[str]:
-    """Return the pieces of a pattern, at commas, or at colons outside of brackets if there is no comma."""
+def _split(pattern: str, *, has_files: bool = False) -> list[str]:
+    """Return the pieces of a pattern, files replaced by their lines."""
     if len(pattern) > PATTERN_CHARACTERS_MAX:
         raise PatternError(f"expected at most {PATTERN_CHARACTERS_MAX} characters")
-    if "," in pattern:
-        pieces = [piece.strip() for piece in pattern.split(",")]
-    else:
-        pieces = _PIECES.findall(pattern)
-        if _PIECES.sub("", pattern).strip(": \t\r\n"):
-            raise PatternError("a bracket is never closed, or was never opened")
-    pieces = [piece for piece in pieces if piece]
+    if has_stray_bracket(pattern):
+        raise PatternError("a bracket is never closed, or was never opened")
+    pieces: list[str] = []
+    for piece in pieces_of(pattern):
+        is_file = has_files and piece[0] == MARK
+        pieces += file_patterns(piece[1:]) if is_file else [piece]
     if not pieces:
         raise PatternError("expected a machine, a group or a pattern, got nothing")
     for piece in pieces:
-        if piece in ("!", "&", "~"):
-            raise PatternError(f"expected a name after {piece!r}")
-        if piece[0] == "@":
-            raise PatternError("files of names (@FILE) are not understood: write the names")
+        _check_piece(piece, has_files=has_files)
     return pieces
+
+
+def _check_piece(piece: str, *, has_files: bool) -> None:
+    if piece in ("!", "&", "~"):
+        raise PatternError(f"expected a name after {piece!r}")
+    if piece.lstrip("!&").startswith(MARK):
+        raise PatternError(
+            "expected a file of names (@FILE) by itself, not behind ! or &"
+            if has_files
+            else "files of names (@FILE) are not understood here: write the names"
+        )
 
 
 class _Matcher:
@@ -110,6 +123,8 @@ class _Matcher:
 
     def __init__(self, machines: Sequence[Machine], groups: Sequence[str]) -> None:
         self.faults: list[str] = []
+        self.broken: set[str] = set()
+        """Regular expressions that are none, and told as such."""
         self.machines = dict.fromkeys(machine.name for machine in machines)
         self.groups: dict[str, list[str]] = {ALL: [], **{name: [] for name in groups}}
         places: dict[str, dict[str, int]] = {ALL: {}}
@@ -140,21 +155,25 @@ class _Matcher:
         return self._cut(found, match) if found else []
 
     def _matches(self, text: str, subscript: re.Match[str] | None = None) -> list[str]:
-        try:
-            if text[0] == "~":
-                fits = re.compile(text[1:]).match
-            else:
-                fits = re.compile(fnmatch.translate(text)).match
-        except re.error as error:
-            self.faults.append(f"{text}: not a regular expression: {error}")
-            return []
-        groups = [group for group in self.groups if fits(group)]
+        groups, singles = self._fitting(text)
         found = [name for group in groups for name in self.groups[group]]
         if not groups or text[0] == "~" or _is_glob(text) or "." in text:
-            found += [name for name in self.machines if fits(name)]
-        if not found and not groups:
+            found += singles
+        if not found and not groups and text not in self.broken:
             self.faults.append(self._no_places(subscript) if subscript else self._unknown(text))
         return found
+
+    def _fitting(self, text: str) -> tuple[list[str], list[str]]:
+        """Return the groups and the machines of a name, a glob or a regular expression."""
+        if text[0] != "~" and not _is_glob(text):
+            return [text] * (text in self.groups), [text] * (text in self.machines)
+        try:
+            fits = re.compile(text[1:] if text[0] == "~" else fnmatch.translate(text)).match
+        except re.error as error:
+            self.faults.append(f"{text}: not a regular expression: {error}")
+            self.broken.add(text)
+            return [], []
+        return list(filter(fits, self.groups)), list(filter(fits, self.machines))
 
     def _cut(self, found: list[str], match: re.Match[str]) -> list[str]:
         if match.group(2) is None:
@@ -169,6 +188,8 @@ class _Matcher:
     def _no_places(self, subscript: re.Match[str]) -> str:
         """Say that brackets count places, and how to write the names that were perhaps meant."""
         base, only, first, last = subscript.groups()
+        if not self._may_guess():
+            return f"{subscript.group()} counts places in a group, and none is named {base}"
         meant = self._numbered(base, only or first, last if only is None else only)
         if not meant:
             hint = did_you_mean(base, list(self.groups))
@@ -195,13 +216,25 @@ class _Matcher:
         ]
 
     def _unknown(self, text: str) -> str:
+        is_like = text[0] == "~" or _is_glob(text)
+        if not self._may_guess():
+            return f"no machine or group is {'like' if is_like else 'named'} {text}"
         names = [*self.groups, *self.machines]
-        if text[0] == "~" or _is_glob(text):
+        if is_like:
             return f"no machine or group is like {text}; there are {_some(names)}"
         hint = did_you_mean(text, names)
         if not hint.endswith("?"):
             hint = f"; there are {_some(names)}"
         return f"no machine or group is named {text}{hint}"
+
+    def _may_guess(self) -> bool:
+        return may_guess(len(self.faults), len(self.groups) + len(self.machines))
+
+
+def _listed(faults: Sequence[str]) -> str:
+    """Return the first faults in a line, and how many more there are."""
+    more = len(faults) - FAULTS_SHOWN_MAX
+    return "; ".join(faults[:FAULTS_SHOWN_MAX]) + (f"; and {more} more" if more > 0 else "")
 
 
 def _is_glob(text: str) -> bool:

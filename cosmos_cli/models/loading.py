@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,18 +11,17 @@ from typing import Any
 from pydantic import ValidationError
 
 from cosmos_cli.errors import Fault, InputError
-from cosmos_cli.models.document import Document, apply_overrides, parse_override, read_document
+from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
+from cosmos_cli.models.document import Document, apply_overrides, read_document
 from cosmos_cli.models.document import Path as ValuePath
-from cosmos_cli.models.parameters import adapter_of
+from cosmos_cli.models.hardware import hardware_faults
+from cosmos_cli.models.own_requirements import own_requirement_faults
+from cosmos_cli.models.plugin_answers import ask_plugin, ask_plugin_demand
 from cosmos_cli.models.scenario import Scenario, cross_faults
 from cosmos_cli.models.translate import faults_of
-from cosmos_cli.models.yaml_source import Source, read_source
-from madns_runtime.config import Agents, RunConfig, to_mapping
-from madns_runtime.errors import MadnsError, PluginError
-from madns_runtime.plugin.api import Simulation
-from madns_runtime.plugin.guard import blame, said
-from madns_runtime.plugin.questions import ask_check
-from madns_runtime.plugin.registry import is_file, part_faults, resolve
+from cosmos_cli.models.yaml_source import YamlSource, read_source
+from madns_runtime.config import RunConfig, to_mapping
+from madns_runtime.plugin.api import DeclaredStream, Demand
 
 _PLACEHOLDERS = {"name": "x", "simulation": "x", "agents": {"count": 1}}
 """Stand in for sections with faults, while the others are checked against each other."""
@@ -38,47 +37,62 @@ class ScenarioFile:
     overrides: tuple[str, ...]
     """Of --set, applied after reading."""
     scenario: Scenario
-    simulation: Simulation
-    """The descriptor that `scenario.simulation` names."""
-    parameters: Any
-    """An instance of the simulation's parameters class."""
+    parameters: Mapping[str, Any]
+    """The simulation's, as a plain mapping, defaults filled in."""
+    has_demand: bool
+    """Whether the simulation tells what it asks of host and network."""
+    streams: tuple[DeclaredStream, ...] | None = None
+    """Streams that the simulation declares; None if it declares none."""
+    labels: AgentLabels = NO_LABELS
+    """Second names of the agents."""
 
     @property
     def base_directory(self) -> Path:
         """The folder of the file, absolute: relative files are found from here."""
         return self.path.resolve().parent
 
-    @property
-    def parameters_mapping(self) -> dict[str, Any]:
-        """The parameters as a plain mapping, defaults filled in."""
-        return to_mapping(self.parameters)
-
     def fault(self, path: ValuePath, text: str) -> Fault:
         """Return a fault at its place in the file, for what only a later step can find wrong."""
-        document = read_document(Source.of(str(self.path), self.text))
+        return self._document().fault(path, text)
+
+    def demand(self) -> Demand:
+        """
+        Return what the simulation asks of host and network, if it `has_demand`.
+
+        Raises:
+            PluginError: It raised, returned no proper Demand, or did not come to an end.
+            MissingExtraError: It needs an optional dependency that is not installed.
+        """
+        agents = self.scenario.agents
+        return ask_plugin_demand(self._document(), self.parameters, agents, self.base_directory)
+
+    def _document(self) -> Document:
+        document = read_document(YamlSource.of(str(self.path), self.text))
         apply_overrides(document, self.overrides)
-        written = _is_written(document, path)
-        return document.fault(path, text) if written else document.missing(path, text)
+        return document
 
     def run_config(self, run: str) -> RunConfig:
         """Return what host and agents of the run named *run* are told."""
         return self.scenario.run_config(
-            run=run, base_directory=self.base_directory, parameters=self.parameters_mapping
+            run=run, base_directory=self.base_directory, parameters=self.parameters
         )
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the scenario as plain values, overrides applied and defaults filled in."""
         values = {key: getattr(self.scenario, key) for key in Scenario.model_fields}
-        return to_mapping(values | {"parameters": self.parameters_mapping})
+        return to_mapping(values | {"parameters": self.parameters})
 
 
-def load_scenario(path: Path, overrides: Sequence[str] = ()) -> ScenarioFile:
+def load_scenario(
+    path: Path, overrides: Sequence[str] = (), *, warn: Callable[[str], None] = lambda remark: None
+) -> ScenarioFile:
     """
     Read and check a scenario.
 
     Args:
         path: The YAML file.
         overrides: KEY=VALUE of --set.
+        warn: Told of settings that are read for now and should be written otherwise, each with its place.
 
     Raises:
         InputError: With every fault found, in the order of the file; faults of --set come last.
@@ -87,145 +101,93 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> ScenarioFile:
     document = read_document(read_source(path))
     faults = apply_overrides(document, overrides)
     faults += document.faults
-    return _check(document, path, tuple(overrides), faults)
+    remarks, old_faults = _rename_old_keys(document)
+    checked = _check(document, path, tuple(overrides), faults + old_faults)
+    for remark in remarks:
+        warn(remark)
+    return checked
+
+
+def _rename_old_keys(document: Document) -> tuple[tuple[str, ...], list[Fault]]:
+    """Give old keys their new names; return a remark on each, and a fault on each beside its new one."""
+    remarks, faults = [], []
+    for section, field in Scenario.model_fields.items():
+        written = document.value.get(section)
+        old_keys: Mapping[str, str] = getattr(field.annotation, "__old_keys__", {})
+        if not isinstance(written, dict):
+            continue
+        for old in sorted(old_keys.keys() & written):
+            path, new = (section, old), old_keys[old]
+            if new in written:
+                text = f"is the old name of {section}.{new}, which is given as well: leave it out"
+                faults.append(document.fault(path, text, at_key=True))
+                del written[old]
+            else:
+                text = f"is an old name: write {section}.{new}"
+                remarks.append(document.fault(path, text, at_key=True).render())
+                document.rename(path, new)
+    return tuple(remarks), faults
 
 
 def _check(
     document: Document, path: Path, overrides: tuple[str, ...], faults: list[Fault]
 ) -> ScenarioFile:
-    scenario, scenario_faults = _scenario(document)
+    scenario, broken, scenario_faults = _scenario(document)
     faults = faults + scenario_faults
     base_directory = path.resolve().parent
-    simulation, simulation_faults = _simulation(document, base_directory)
-    faults += simulation_faults
-    parameters: Any = None
-    if simulation is not None:
-        parameters, parameter_faults = _parameters(document, simulation)
-        if parameters is not None and scenario is not None:
-            parameter_faults += _plugin_faults(
-                document, simulation, parameters, scenario.agents, base_directory
-            )
-        faults += parameter_faults
-    if scenario is None or simulation is None or faults:
-        raise InputError(faults=sorted(_told_once(faults, document.faults), key=_order))
+    agents, duration_s = (None, 0.0) if broken else (scenario.agents, scenario.time.duration_s)
+    requirements = () if broken else scenario.requirements
+    faults += [
+        document.fault(where, text)
+        for where, text in own_requirement_faults(requirements, base_directory)
+    ]
+    answers = ask_plugin(document, agents, base_directory, duration_s=duration_s)
+    faults += answers.faults
+    if not broken:
+        faults += hardware_faults(document, scenario, base_directory, answers.labels)
+    faults += [
+        document.fault(where, text)
+        for where, text in cross_faults(scenario, skip=broken, labels=answers.labels)
+    ]
+    if broken or answers.parameters is None or faults:
+        told = sorted(_told_once(faults, document.faults), key=_order)
+        raise InputError(faults=told, omitted=answers.omitted)
     return ScenarioFile(
         path=path,
         text=document.source.text,
         overrides=overrides,
         scenario=scenario,
-        simulation=simulation,
-        parameters=parameters,
+        parameters=answers.parameters,
+        has_demand=answers.has_demand,
+        streams=answers.streams,
+        labels=answers.labels or NO_LABELS,
     )
 
 
 def _told_once(faults: Sequence[Fault], scalars: Sequence[Fault]) -> list[Fault]:
     """Leave out what follows from a scalar without a value: that it is missing, or of the wrong type."""
     places = {(fault.line, fault.column) for fault in scalars}
-    return [f for f in faults if f in scalars or f.override or (f.line, f.column) not in places]
+    own = set(scalars)
+    return [f for f in faults if f in own or f.override or (f.line, f.column) not in places]
 
 
 def _order(fault: Fault) -> tuple[bool, int, int]:
     return bool(fault.override), fault.line or 0, fault.column or 0
 
 
-def _scenario(document: Document) -> tuple[Scenario | None, list[Fault]]:
-    """Return the scenario, and faults; sections without faults are checked against each other anyway."""
+def _scenario(document: Document) -> tuple[Scenario, frozenset[str], list[Fault]]:
+    """Return the scenario, which keys of it have faults of their own and stand as placeholders, and the faults."""
     try:
-        scenario = _validate_scenario(document.value)
+        return _validate_scenario(document.value), frozenset(), []
     except ValidationError as error:
         errors = error.errors(include_url=False)
         faults = faults_of(document, errors, Scenario)
         broken = frozenset(str(item["loc"][0]) for item in errors)
         rest = {key: value for key, value in document.value.items() if key not in broken}
         spared = {key: value for key, value in _PLACEHOLDERS.items() if key in broken}
-        partial = _validate_scenario(rest | spared)
-        return None, faults + _cross(document, partial, broken)
-    return scenario, _cross(document, scenario, frozenset())
+        return _validate_scenario(rest | spared), broken, faults
 
 
 def _validate_scenario(value: Any) -> Scenario:
     """Validate as JSON and strictly: no text passes for a number, yet a list does for a tuple."""
     return Scenario.model_validate_json(json.dumps(value), strict=True)
-
-
-def _cross(document: Document, scenario: Scenario, broken: frozenset[str]) -> list[Fault]:
-    return [
-        document.fault(path, text) if _is_written(document, path) else document.missing(path, text)
-        for path, text in cross_faults(scenario, skip=broken)
-    ]
-
-
-def _is_written(document: Document, path: ValuePath) -> bool:
-    return path in document.value_places
-
-
-def _simulation(document: Document, base_directory: Path) -> tuple[Simulation | None, list[Fault]]:
-    spec = document.value.get("simulation")
-    if not isinstance(spec, str) or not spec:
-        return None, []  # the model has said so already
-    try:
-        simulation = resolve(spec, base_directory)
-    except MadnsError as error:
-        return None, [document.fault(("simulation",), str(error))]
-    except OSError as error:  # such as a name that is too long for a file
-        return None, [document.fault(("simulation",), f"not to be found: {error.strerror}")]
-    # Whoever writes a file wants to hear of all its slips; an installed simulation's halves stay unloaded.
-    texts = part_faults(simulation, base_directory) if is_file(spec) else []
-    return simulation, [document.fault(("simulation",), text) for text in texts]
-
-
-def _parameters(document: Document, simulation: Simulation) -> tuple[Any, list[Fault]]:
-    value = document.value.get("parameters", {})
-    if not isinstance(value, Mapping):
-        return None, []  # the model has said so already
-    try:
-        adapter = adapter_of(simulation.parameters)
-        return adapter.validate_json(json.dumps(value), strict=True), []
-    except ValidationError as error:
-        if "parameters" not in document.value:
-            document.value["parameters"] = {}
-        errors = error.errors(include_url=False)
-        return None, faults_of(document, errors, simulation.parameters, below=("parameters",))
-    except Exception as error:  # noqa: BLE001 - a plug-in's class may raise anything
-        kind = simulation.parameters
-        text = f"{blame(error, kind)}: {kind.__name__}: {said(error)}"
-        return None, [document.fault(("simulation",), text)]
-
-
-def _plugin_faults(
-    document: Document,
-    simulation: Simulation,
-    parameters: Any,
-    agents: Agents,
-    base_directory: Path,
-) -> list[Fault]:
-    """Ask the simulation itself: it knows of missing files and of what fits together."""
-    if simulation.check is None:
-        return []
-    try:
-        texts = ask_check(
-            simulation.check,
-            base_directory,
-            parameters=parameters,
-            agents=agents.count,
-            names=agents.resolved_names(),
-        )
-    except PluginError as error:
-        return [document.fault(("simulation",), str(error))]
-    return [_plugin_fault(document, text) for text in texts]
-
-
-def _plugin_fault(document: Document, text: str) -> Fault:
-    """Find the place of `dotted.name: what is wrong`; the name may leave out `parameters.`."""
-    name, colon, message = text.partition(":")
-    path: ValuePath = ("parameters",)
-    if not colon or " " in name:
-        return document.fault(path, text, at_key=True)
-    try:
-        steps = parse_override(f"{name}=")[1]
-    except InputError:
-        return document.fault(path, text, at_key=True)
-    path = steps if steps[:1] == path else path + steps
-    if _is_written(document, path):
-        return document.fault(path, message.strip())
-    return document.missing(path, message.strip())

@@ -14,6 +14,9 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from madns_runtime.config import FORBID_EXTRA
+from madns_runtime.errors import PluginError
+from madns_runtime.plugin.code_places import place_of
+from madns_runtime.plugin.parameter_kinds import kind_faults
 
 _CONFIG = "__pydantic_config__"
 
@@ -23,8 +26,11 @@ def adapter_of(parameters: type) -> TypeAdapter[Any]:
     Return the validator of a parameters class.
 
     Raises:
-        TypeError: A field's type is none that a scenario can hold.
+        PluginError: A field's type is none that a scenario can hold.
     """
+    faults = kind_faults(parameters)
+    if faults:
+        raise PluginError(f"{place_of(parameters)}: {'; '.join(faults)}; see docs/plugins.md")
     _forbid_extra(parameters, set())
     return TypeAdapter(parameters)
 

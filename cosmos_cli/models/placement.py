@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import fnmatch
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Annotated
 
 from annotated_types import Ge
 
-from cosmos_cli.models.document import did_you_mean
-from cosmos_cli.models.texts import DeviceName, NonBlank
+from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
+from cosmos_cli.models.document import did_you_mean, may_guess
+from cosmos_cli.models.text_forms import DeviceName, NonBlank
 from madns_runtime.config import FORBID_EXTRA
 
 RuleFault = tuple[tuple[str | int, ...], str]
@@ -26,7 +27,7 @@ class PlacementRule:
     agents: tuple[NonBlank, ...] = ()
     """Names of agents, or globs such as sat-0*; without them and `count`, all that are left."""
     count: Annotated[int, Ge(1)] | None = None
-    """How many agents, instead of names: the next ones that no earlier rule has taken."""
+    """Number of agents, instead of names: the next ones that no earlier rule has taken."""
     machines: NonBlank | None = None
     """Machines, as --limit names them: a group, a glob, tower:!chiefs; all if not given."""
     devices: tuple[DeviceName, ...] = ()
@@ -36,7 +37,7 @@ class PlacementRule:
 
 
 @dataclass(frozen=True, slots=True)
-class Claims:
+class RuledAgents:
     """The agents of each rule, and those that none has taken."""
 
     taken: tuple[tuple[str, ...], ...]
@@ -45,30 +46,44 @@ class Claims:
     faults: tuple[RuleFault, ...]
 
 
-def claim_agents(names: Sequence[str], rules: Sequence[PlacementRule]) -> Claims:
+def claim_agents(
+    names: Sequence[str], rules: Sequence[PlacementRule], labels: AgentLabels = NO_LABELS
+) -> RuledAgents:
     """
     Let each rule in turn take its agents from those that are not taken yet.
 
     Args:
         names: Of all agents, in order.
         rules: In order.
+        labels: Second names, by which a rule finds agents, too.
     """
-    claiming = _Claiming(names)
+    claiming = _Claiming(names, labels)
     taken = tuple(claiming.take(index, rule) for index, rule in enumerate(rules))
-    return Claims(taken, tuple(claiming.left), tuple(claiming.faults))
+    return RuledAgents(taken, tuple(claiming.left), tuple(claiming.faults))
 
 
 @dataclass(slots=True)
 class _Claiming:
     names: Sequence[str]
+    labels: AgentLabels
     owners: dict[str, int] = field(default_factory=dict)
-    """Which rule has taken an agent."""
+    """Rule that has taken an agent, by agent."""
+    free: dict[str, None] = field(init=False)
+    """Those that none has taken, in order."""
+    known: frozenset[str] = field(init=False)
+    by_label: dict[str, list[str]] = field(default_factory=dict)
     rest_taken_by: int | None = None
     faults: list[RuleFault] = field(default_factory=list)
 
+    def __post_init__(self) -> None:
+        self.free = dict.fromkeys(self.names)
+        self.known = frozenset(self.names)
+        for name, label in self.labels.names.items():
+            self.by_label.setdefault(label, []).append(name)
+
     @property
     def left(self) -> list[str]:
-        return [name for name in self.names if name not in self.owners]
+        return list(self.free)
 
     def take(self, index: int, rule: PlacementRule) -> tuple[str, ...]:
         before = len(self.owners)
@@ -89,19 +104,23 @@ class _Claiming:
         return tuple(self.owners)[before:]
 
     def _take_next(self, index: int, count: int) -> None:
-        left = self.left
-        if count > len(left):
-            text = f"expected <= {len(left)}, the agents that no earlier rule takes, got {count}"
+        if count > len(self.free):
+            text = (
+                f"expected <= {len(self.free)}, the agents that no earlier rule takes, got {count}"
+            )
             self.faults.append(((index, "count"), text))
-        self._own(index, left[:count])
+        self._own(index, list(islice(self.free, count)))
 
     def _take_named(self, index: int, place: int, pattern: str) -> None:
         is_glob = any(character in pattern for character in "*?[")
-        fitting = [name for name in self.names if fnmatch.fnmatchcase(name, pattern)]
+        # Looked up: thousands may be named one by one.
+        named = [pattern] if pattern in self.known else self.by_label.get(pattern, [])
+        fitting = self.labels.like(pattern, self.names) if is_glob else named
         free = [name for name in fitting if name not in self.owners]
         path = (index, "agents", place)
         if not fitting:
-            known = did_you_mean(pattern, self.names)
+            has_hint = may_guess(len(self.faults), len(self.names))
+            known = did_you_mean(pattern, (*self.names, *self.by_label)) if has_hint else ""
             hint = known if known.endswith("?") else f"; there are {_ends(self.names)}"
             text = f"no agent is {'like' if is_glob else 'named'} {pattern}{hint}"
             self.faults.append((path, text))
@@ -113,6 +132,8 @@ class _Claiming:
 
     def _own(self, index: int, names: Sequence[str]) -> None:
         self.owners.update(dict.fromkeys(names, index))
+        for name in names:
+            self.free.pop(name, None)
 
 
 def _ends(names: Sequence[str]) -> str:

@@ -1,5 +1,5 @@
 """
-What a group of machines declares for itself in `cosmos_provision`: idempotent steps of few kinds.
+Steps that a group of machines declares for itself in `cosmos_provision`: idempotent, of few kinds.
 
 A step says what should be, never how to get there; the plan of `cosmos up` compares it with what is.
 """
@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from cosmos_cli.models.texts import (
+from cosmos_cli.models.text_forms import (
     NOT_EMPTY,
     FileMode,
     MachinePath,
@@ -23,23 +23,23 @@ from cosmos_cli.models.texts import (
     SystemUser,
     like,
 )
+from madns_runtime.bounded_files import FileRefused, check_regular_file
 
-FILE_BYTES_MAX = 64 * 1024 * 1024
-KINDS = ("packages", "file", "line", "service", "command")
+FILE_BYTES_MAX = 64 * 1024 * 1024  # CONTENT_BYTES_MAX there
 
 StepFault = tuple[tuple[str | int, ...], str]
 """The path within `cosmos_provision`, and what is wrong there."""
 
-_CONFIG = ConfigDict(extra="forbid", frozen=True)
+
+class _Declared(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class FileContent(BaseModel):
+class FileContent(_Declared):
     """A file with a given content."""
 
-    model_config = _CONFIG
-
     dest: MachinePath
-    """Where it belongs on the machine."""
+    """Path on the machine."""
     src: NonBlank | None = None
     """The file here, relative to the inventory's folder; of a `Machine` it is absolute."""
     content: str | None = None
@@ -52,10 +52,8 @@ class FileContent(BaseModel):
     """Its group."""
 
 
-class LineInFile(BaseModel):
+class LineInFile(_Declared):
     """One line that a file has, or has not."""
-
-    model_config = _CONFIG
 
     path: MachinePath
     """The file on the machine."""
@@ -69,10 +67,8 @@ class LineInFile(BaseModel):
     """Whether a file that is missing is made; otherwise that is a failure."""
 
 
-class Service(BaseModel):
+class SystemdService(_Declared):
     """A unit of systemd."""
-
-    model_config = _CONFIG
 
     name: Annotated[str, like(r"[A-Za-z0-9_][A-Za-z0-9_.@:\\-]*", "the name of a systemd unit")]
     """Name of the unit; `.service` may be left out."""
@@ -82,30 +78,26 @@ class Service(BaseModel):
     """Whether it runs; as it is if not given."""
 
 
-class Command(BaseModel):
+class ShellCommand(_Declared):
     """A shell command for what no other kind can say, with a test that tells whether it was done."""
 
-    model_config = _CONFIG
-
     run: NonBlank
-    """What /bin/sh runs."""
+    """Command for /bin/sh."""
     creates: MachinePath | None = None
     """A path that exists once it is done."""
     unless: NonBlank | None = None
     """A shell command that succeeds once it is done; it must change nothing."""
 
 
-Action = tuple[str, ...] | FileContent | LineInFile | Service | Command
-"""What a step wants; a tuple holds the names of system packages."""
+Action = tuple[str, ...] | FileContent | LineInFile | SystemdService | ShellCommand
+"""Desired state of a step; a tuple holds the names of system packages."""
 
 
-class ProvisionStep(BaseModel):
+class ProvisionStep(_Declared):
     """One step: exactly one kind of action."""
 
-    model_config = _CONFIG
-
     name: NonBlank | None = None
-    """What people read about it."""
+    """Description for people."""
     become: bool = True
     """Whether it is done as root."""
     packages: Annotated[tuple[SystemPackage, ...], NOT_EMPTY] | None = None
@@ -114,38 +106,21 @@ class ProvisionStep(BaseModel):
     """A file with a given content."""
     line: LineInFile | None = None
     """One line that a file has, or has not."""
-    service: Service | None = None
+    service: SystemdService | None = None
     """A unit of systemd."""
-    command: Command | None = None
+    command: ShellCommand | None = None
     """A shell command with a test that tells whether it was done."""
 
     @property
     def kind(self) -> str:
-        """Which of KINDS it is."""
+        """Kind, one of KINDS."""
         return next(kind for kind in KINDS if getattr(self, kind) is not None)
 
     @property
     def action(self) -> Action:
-        """What it wants."""
+        """Desired state."""
         action: Action = getattr(self, self.kind)
         return action
-
-    @property
-    def label(self) -> str:
-        """The name, or what it does in a few words."""
-        if self.name:
-            return self.name
-        match self.action:
-            case FileContent(dest=dest):
-                return f"file {dest}"
-            case LineInFile(path=path):
-                return f"line in {path}"
-            case Service(name=name):
-                return f"service {name}"
-            case Command(run=run):
-                return f"command {run.splitlines()[0].strip()}"
-            case packages:
-                return f"packages {' '.join(packages)}"
 
     def with_source_in(self, folder: Path) -> ProvisionStep:
         """Return the step with the absolute path of its `src`, which is relative to *folder*."""
@@ -153,6 +128,10 @@ class ProvisionStep(BaseModel):
             return self
         source = str(source_path(self.file.src, folder))
         return self.model_copy(update={"file": self.file.model_copy(update={"src": source})})
+
+
+KINDS = tuple(name for name in ProvisionStep.model_fields if name not in ("name", "become"))
+"""Of steps: every field that is an action."""
 
 
 def source_path(src: str, folder: Path) -> Path:
@@ -183,7 +162,7 @@ def _faults_of_step(step: Mapping[str, Any], folder: Path) -> Iterator[StepFault
         got = " and ".join(kinds) or "none of them"
         yield (), f"expected exactly one of {', '.join(KINDS)} in a step, got {got}"
     for kind in kinds:
-        if isinstance(step[kind], Mapping):
+        if kind in _CHECKS and isinstance(step[kind], Mapping):
             for path, text in _CHECKS[kind](step[kind], folder):
                 yield (kind, *path), text
 
@@ -201,15 +180,13 @@ def _file_faults(file: Mapping[str, Any], folder: Path) -> Iterator[StepFault]:
 
 def _source_problem(path: Path) -> str:
     try:
-        if not path.exists():
-            return f"no such file: {path}; it is looked for from the inventory's folder"
-        if not path.is_file():
-            return f"expected a file, got the folder {path}"
-        size_bytes = path.stat().st_size
+        check_regular_file(path, bytes_max=FILE_BYTES_MAX)
+    except FileNotFoundError:
+        return f"no such file: {path}; it is looked for from the inventory's folder"
+    except FileRefused as error:
+        return str(error)
     except OSError as error:
         return f"{path} cannot be read: {error.strerror}"
-    if size_bytes > FILE_BYTES_MAX:
-        return f"expected at most {FILE_BYTES_MAX} bytes, got {size_bytes} in {path}"
     return ""
 
 
@@ -246,7 +223,6 @@ def _command_faults(command: Mapping[str, Any], folder: Path) -> Iterator[StepFa
 
 
 _CHECKS: Mapping[str, Callable[[Mapping[str, Any], Path], Iterator[StepFault]]] = {
-    "packages": lambda packages, folder: iter(()),
     "file": _file_faults,
     "line": _line_faults,
     "service": _service_faults,

@@ -13,13 +13,15 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
 from cosmos_cli.models.placement import PlacementRule, claim_agents
-from cosmos_cli.models.texts import NAME_PATTERN, Requirement
+from cosmos_cli.models.text_forms import NAME_PATTERN, ScenarioRequirement
 from madns_runtime.config import (
     SEED_MAX,
     Agents,
     Deadline,
     ExecutorSettings,
+    HardwareSettings,
     Health,
     Network,
     Recording,
@@ -38,42 +40,44 @@ SectionFault = tuple[tuple[str | int, ...], str]
 
 
 class Scenario(BaseModel):
-    """What to simulate. On which machines is the inventory's; `placement` says what belongs where."""
+    """Scenario: the simulation and its agents. Machines are the inventory's; `placement` says what belongs where."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: Annotated[str, Field(pattern=NAME_PATTERN, max_length=64)]
     """Name of the scenario; runs are named after it: lower-case letters, digits and hyphens."""
     description: str = ""
-    """What the scenario is for, in a sentence."""
+    """Purpose of the scenario, in a sentence."""
     simulation: Annotated[str, Field(min_length=1)]
     """A registered simulation, module:attribute, or ./file.py:attribute beside this file."""
     agents: Agents
-    """How many agents, their names and their rate."""
+    """Number of agents, their names and their rate."""
     time: TimeSettings = TimeSettings()
-    """How simulated time passes, and for how long."""
+    """Passing of simulated time, and its duration."""
     deadline: Deadline = Deadline()
     """The real-time budget that a run is judged by."""
     network: Network = Network()
-    """Where the host listens."""
+    """Address of the host, and what its sockets ask for."""
     timeouts: Timeouts = Timeouts()
     """The end of every wait."""
     scheduling: Scheduling = Scheduling()
-    """What is asked of the kernel for the loops."""
+    """Requests to the kernel for the loops."""
     recording: Recording = Recording()
-    """How records reach the disk."""
+    """Settings of the records and of their way to the disk."""
     health: Health = Health()
     """State of health of the machines."""
     executor: ExecutorSettings = ExecutorSettings()
-    """Who does the host's long work."""
+    """The executor of the host's long work."""
+    hardware: HardwareSettings = HardwareSettings()
+    """Devices in the loop: which agents use what, whether outputs may move, what a loss means."""
     on_agent_loss: Literal["abort", "continue"] = "abort"
     """Whether the run ends when an agent is lost, or goes on without it."""
     seed: Annotated[int, Field(ge=0, le=SEED_MAX)] = 0
     """Seed of every random number in the run."""
-    requirements: tuple[Requirement, ...] = ()
-    """Python packages that the simulation needs on the agents' machines, as pip names them."""
+    requirements: tuple[ScenarioRequirement, ...] = ()
+    """Python packages that the simulation needs on the agents' machines, as pip names them; or ./paths of wheels or of sources, which need no index."""
     placement: tuple[PlacementRule, ...] = ()
-    """Which agents run on which machines, rule by rule; the rest is spread evenly over all."""
+    """Machines of agents, rule by rule; the rest is spread evenly over all."""
     parameters: dict[str, Any] = {}
     """The simulation's own settings."""
 
@@ -102,26 +106,36 @@ class Scenario(BaseModel):
             recording=self.recording,
             health=self.health,
             executor=self.executor,
+            hardware=self.hardware,
             on_agent_loss=self.on_agent_loss,
             seed=self.seed,
             parameters=dict(self.parameters if parameters is None else parameters),
         )
 
 
-def cross_faults(scenario: Scenario, *, skip: frozenset[str] = frozenset()) -> list[SectionFault]:
+def cross_faults(
+    scenario: Scenario,
+    *,
+    skip: frozenset[str] = frozenset(),
+    labels: AgentLabels | None = NO_LABELS,
+) -> list[SectionFault]:
     """
     Return what no single field can know to be wrong.
 
     Args:
         scenario: The scenario.
         skip: Top-level keys with faults of their own: checks that need them are left out.
+        labels: Second names of agents; None if they are not known, and then placement is not judged.
     """
-    return [
+    faults = [
         fault
         for needed, check in _CHECKS
         if not skip.intersection(needed)
         for fault in check(scenario)
     ]
+    if labels is not None and not skip.intersection(("agents", "placement")):
+        faults += _placement(scenario, labels)
+    return faults
 
 
 def _names(scenario: Scenario) -> Iterator[SectionFault]:
@@ -187,10 +201,11 @@ def _executor(scenario: Scenario) -> Iterator[SectionFault]:
         yield ("executor", "address"), f"expected nothing with executor.kind {kind}; say kind: dask"
 
 
-def _placement(scenario: Scenario) -> Iterator[SectionFault]:
-    if scenario.agents.names and len(scenario.agents.names) != scenario.agents.count:
+def _placement(scenario: Scenario, labels: AgentLabels) -> Iterator[SectionFault]:
+    names = scenario.agents.resolved_names()
+    if len(names) != scenario.agents.count:
         return  # told already, and what the names mean is open
-    for path, text in claim_agents(scenario.agents.resolved_names(), scenario.placement).faults:
+    for path, text in claim_agents(names, scenario.placement, labels).faults:
         yield ("placement", *path), text
 
 
@@ -201,5 +216,4 @@ _CHECKS: tuple[tuple[frozenset[str], Callable[[Scenario], Iterator[SectionFault]
     (frozenset({"agents", "on_agent_loss"}), _restarts),
     (frozenset({"time", "on_agent_loss"}), _lockstep),
     (frozenset({"executor"}), _executor),
-    (frozenset({"agents", "placement"}), _placement),
 )

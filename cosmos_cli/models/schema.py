@@ -1,14 +1,23 @@
-"""The JSON Schema of a scenario, with the parameters of every registered simulation: for editors' completion."""
+"""
+The JSON Schema of a scenario, with the parameters of every registered simulation: for editors' completion.
+
+Its descriptions are the docstrings of fields. pydantic can take them along itself, but then every command that reads
+a scenario parses our sources first.
+"""
 
 from __future__ import annotations
 
+import ast
+import functools
+import inspect
 import json
+import textwrap
 from collections.abc import Mapping
 from typing import Any
 
 from pydantic import TypeAdapter
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 
-from cosmos_cli.models.docstrings import DescribedSchema
 from cosmos_cli.models.parameters import adapter_of
 from cosmos_cli.models.scenario import Scenario
 
@@ -16,11 +25,52 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 FILE_PATTERN = ":[A-Za-z_][A-Za-z_0-9]*$"
 
 
-class _Untitled(DescribedSchema):
-    """Without titles that only repeat the field's name."""
+@functools.lru_cache(maxsize=256)
+def field_docstrings(cls: type) -> dict[str, str]:
+    """Return the texts under a class's annotated fields, by the fields' names; its own come before its bases'."""
+    found: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        if base is not object and base.__dict__.get("__annotations__"):
+            found.update(_own(base))
+    return found
+
+
+def _own(cls: type) -> dict[str, str]:
+    try:
+        body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
+    except (OSError, TypeError, SyntaxError):  # made without a source
+        return {}
+    statements = body.body if isinstance(body, ast.ClassDef) else []
+    found = {}
+    for statement, following in zip(statements, statements[1:], strict=False):
+        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
+            match following:
+                case ast.Expr(value=ast.Constant(value=str(text))):
+                    found[statement.target.id] = inspect.cleandoc(text)
+                case _:
+                    pass
+    return found
+
+
+class _DescribedSchema(GenerateJsonSchema):
+    """Schemas whose properties say what their fields' docstrings say, without titles that only repeat their names."""
+
+    def model_schema(self, schema: Any) -> JsonSchemaValue:
+        return _described(super().model_schema(schema), schema["cls"])
+
+    def dataclass_schema(self, schema: Any) -> JsonSchemaValue:
+        return _described(super().dataclass_schema(schema), schema["cls"])
 
     def field_title_should_be_set(self, schema: Any) -> bool:
         return False
+
+
+def _described(json_schema: JsonSchemaValue, cls: type) -> JsonSchemaValue:
+    texts = field_docstrings(cls)
+    for name, field in json_schema.get("properties", {}).items():
+        if name in texts:
+            field.setdefault("description", texts[name])
+    return json_schema
 
 
 def scenario_schema(parameters: Mapping[str, type]) -> dict[str, Any]:
@@ -34,7 +84,7 @@ def scenario_schema(parameters: Mapping[str, type]) -> dict[str, Any]:
         ("", "validation", TypeAdapter(Scenario)),
         *((name, "validation", adapter_of(kind)) for name, kind in sorted(parameters.items())),
     ]
-    places, shared = TypeAdapter.json_schemas(inputs, schema_generator=_Untitled)
+    places, shared = TypeAdapter.json_schemas(inputs, schema_generator=_DescribedSchema)
     definitions = shared["$defs"]
     root = definitions.pop(_definition_of(places[("", "validation")]))
     root["properties"]["simulation"] = {

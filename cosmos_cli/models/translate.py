@@ -8,9 +8,9 @@ import typing
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Union
 
-from cosmos_cli.errors import Fault
+from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault
 from cosmos_cli.models.document import Document, Path, did_you_mean, kind_of
-from cosmos_cli.models.texts import NAME_PATTERN
+from cosmos_cli.models.text_forms import NAME_PATTERN
 
 _EXPECTED = {
     "bool_type": "true or false",
@@ -43,6 +43,14 @@ _LIMITS = {
     "string_pattern_mismatch": ("a text like ", "pattern"),
     "union_tag_invalid": ("", "expected_tags"),
 }
+_LENGTHS = {
+    "string_too_short": ("at least", "min_length", "characters"),
+    "too_short": ("at least", "min_length", "items"),
+    "string_too_long": ("at most", "max_length", "characters"),
+    "too_long": ("at most", "max_length", "items"),
+}
+HINTS_MAX = 2 * FAULTS_SHOWN_MAX
+"""Of all faults, some of which give way to others."""
 _PATTERNS = {NAME_PATTERN: "lower-case letters, digits and hyphens"}
 _MISSING = ("missing", "missing_argument", "missing_keyword_only_argument")
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
@@ -55,7 +63,7 @@ class Located:
     path: Path
     """Only steps that are in the document, but for a missing key."""
     branch: Path
-    """Where a union was entered, and the label of its member; empty outside of unions."""
+    """Entry into a union, and the label of its member; empty outside of unions."""
     error: Mapping[str, Any]
 
     @property
@@ -77,7 +85,11 @@ def faults_of(
         below: Path of the validated value within the document.
     """
     located = [_located(document, below, error) for error in errors]
-    return [_fault(document, item, model, below) for item in _likeliest(located)]
+    return [
+        # To guess what was meant takes a thousand times as long as to tell what is wrong.
+        _fault(document, item, (model, below), has_hints=number < HINTS_MAX)
+        for number, item in enumerate(_likeliest(located))
+    ]
 
 
 def _located(document: Document, below: Path, error: Mapping[str, Any]) -> Located:
@@ -154,26 +166,28 @@ def _is_tag(item: Located) -> bool:
     return " or " not in str(item.error["ctx"]["expected"])
 
 
-def _fault(document: Document, item: Located, model: Any, below: Path) -> Fault:
+def _fault(
+    document: Document, item: Located, within: tuple[Any, Path], *, has_hints: bool
+) -> Fault:
     kind, path = item.error["type"], item.path
+    model, below = within
     context = item.error.get("ctx", {})
     if kind in _MISSING:
-        about = _about(model, path[len(below) :])
-        return document.missing(path, f"missing{about}")
+        about = _about(model, path[len(below) :]) if has_hints else ""
+        return document.fault(path, f"missing{about}")
     if kind in _UNKNOWN:
-        known = known_keys(model, path[len(below) : -1], member=item.member)
-        text = f"unknown key{did_you_mean(str(path[-1]), known)}"
-        return document.fault(path, text, at_key=True)
-    return document.fault(path, _text(kind, context, item.error, _got(document, path, item.error)))
+        inner = path[len(below) : -1]
+        known = known_keys(model, inner, member=item.member) if has_hints else []
+        hint = did_you_mean(str(path[-1]), known)
+        return document.fault(path, f"unknown key{hint}", at_key=True)
+    value, written = item.error["input"], document.texts.get(path)
+    got = written if written and not isinstance(value, str) else kind_of(value)
+    return document.fault(path, _text(kind, context, item.error, got, has_hints=has_hints))
 
 
-def _got(document: Document, path: Path, error: Mapping[str, Any]) -> str:
-    value = error["input"]
-    written = document.texts.get(path)
-    return written if written and not isinstance(value, str) else kind_of(value)
-
-
-def _text(kind: str, context: Mapping[str, Any], error: Mapping[str, Any], got: str) -> str:
+def _text(
+    kind: str, context: Mapping[str, Any], error: Mapping[str, Any], got: str, *, has_hints: bool
+) -> str:
     if kind in _EXPECTED:
         return f"expected {_EXPECTED[kind]}, got {got}"
     if kind == "string_pattern_mismatch" and context["pattern"] in _PATTERNS:
@@ -182,21 +196,16 @@ def _text(kind: str, context: Mapping[str, Any], error: Mapping[str, Any], got: 
         prefix, key = _LIMITS[kind]
         limit = context.get(key, "")
         expected = f"{limit:.15g}" if isinstance(limit, float) else str(limit).replace("'", "")
-        if kind == "literal_error" and isinstance(error["input"], str):
+        if has_hints and kind == "literal_error" and isinstance(error["input"], str):
             options = expected.replace(" or ", ", ").split(", ")
             hint = did_you_mean(error["input"], options)
             got += hint if hint.startswith(",") else ""
         return f"expected {prefix}{expected}, got {got}"
-    if kind in ("string_too_short", "too_short"):
-        return f"expected at least {context.get('min_length')} {_unit(kind)}, got {got}"
-    if kind in ("string_too_long", "too_long"):
-        return f"expected at most {context.get('max_length')} {_unit(kind)}, got {got}"
+    if kind in _LENGTHS:
+        bound, key, unit = _LENGTHS[kind]
+        return f"expected {bound} {context.get(key)} {unit}, got {got}"
     message = str(context.get("error") or error["msg"])
     return f"{message[:1].lower()}{message[1:]}, got {got}"
-
-
-def _unit(kind: str) -> str:
-    return "characters" if kind.startswith("string") else "items"
 
 
 def known_keys(model: Any, path: Path, *, member: str = "") -> list[str]:
@@ -216,10 +225,7 @@ def _about(model: Any, path: Path) -> str:
 def _types_at(model: Any, path: Path) -> list[Any]:
     kinds = _members(model)
     for step in path:
-        inner = []
-        for kind in kinds:
-            inner += _members(_inside(kind, step))
-        kinds = inner
+        kinds = [member for kind in kinds for member in _members(_inside(kind, step))]
     return kinds
 
 
@@ -247,9 +253,8 @@ def _fields(kind: Any) -> dict[str, Any]:
     if not isinstance(kind, type):
         return {}
     if dataclasses.is_dataclass(kind):
-        hints = typing.get_type_hints(kind, include_extras=True)
-        return {item.name: hints[item.name] for item in dataclasses.fields(kind) if item.init}
-    if hasattr(kind, "model_fields"):
-        hints = typing.get_type_hints(kind, include_extras=True)
-        return {name: hints[name] for name in kind.model_fields}
-    return {}
+        names = [item.name for item in dataclasses.fields(kind) if item.init]
+    else:
+        names = list(getattr(kind, "model_fields", ()))
+    hints = typing.get_type_hints(kind, include_extras=True) if names else {}
+    return {name: hints[name] for name in names}

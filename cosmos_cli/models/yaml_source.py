@@ -8,6 +8,8 @@ without a bound: a file of 200,000 brackets would end the process.
 
 from __future__ import annotations
 
+import difflib
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,17 +18,24 @@ from typing import Any
 
 import yaml
 
-from cosmos_cli.errors import Fault, InputError
+from cosmos_cli.errors import Fault, InputError, check_path_is_text
+from madns_runtime.bounded_files import FileRefused, read_regular_file
 
 FILE_BYTES_MAX = 4 * 1024 * 1024
 DEPTH_MAX = 64
 DIGITS_MAX = 300
+DIGITS_SHOWN_MAX = 40
+WHOLE_MIN, WHOLE_MAX = -(2**63), 2**63 - 1
+"""Bounds of a configuration's whole numbers, as they are sent and written: JSON and messages have 64 bits."""
 
 _PARSER: Any = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 _TAG = "tag:yaml.org,2002:"
-_INTEGER = re.compile(r"[-+]?[0-9]+")
-_OCTAL = re.compile(r"0o[0-7]+")
-_HEXADECIMAL = re.compile(r"0x[0-9a-fA-F]+")
+_WHOLE = (
+    (10, re.compile(r"[-+]?[0-9]+")),
+    (8, re.compile(r"0o[0-7]+")),
+    (16, re.compile(r"0x[0-9a-fA-F]+")),
+)
+"""Whole numbers by their base."""
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
 _POWER = re.compile(r"[-+]?[0-9]+[eE]\+?[0-9]+")
 _NOT_FINITE = re.compile(r"[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)")
@@ -45,6 +54,28 @@ _WORDS: dict[str, bool | None] = {
 }
 _UNPRINTABLE = re.compile("[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
+_MEANINGS = (
+    ("quoted scalar", "", True, "this quoted text is never closed"),
+    ("flow sequence", "", True, "this list is never closed: expected ',' or ']'"),
+    ("flow mapping", "", True, "this mapping is never closed: expected ',' or '}}'"),
+    (
+        "",
+        "expected node content",
+        False,
+        "expected a value, or the bracket that closes what was opened before",
+    ),
+    (
+        "",
+        "mapping values are not allowed",
+        False,
+        "a second ': ' on this line: put the text in quotes, or check the indentation",
+    ),
+    ("", "could not find expected ':'", True, "expected `key: value`, got no ':' after the key"),
+    ("", "cannot start any token", False, "{} cannot start a value: put it in quotes"),
+    ("block mapping", "block end", False, "expected a key at the indentation of its neighbours"),
+)
+"""The parser's terms: within what, which problem, whether the fault is where that began, and what it means."""
+
 Scalar = str | int | float | bool | None
 
 
@@ -59,12 +90,12 @@ class Node:
     text: str = ""
     """A scalar as it is written."""
     fault: str = ""
-    """What is wrong with a scalar that has no value; the rest of the file can be read all the same."""
+    """Fault of a scalar that has no value; the rest of the file can be read all the same."""
     is_plain: bool = False
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class YamlSource:
     """The text of a file, and the name it is shown by."""
 
     label: str
@@ -72,7 +103,7 @@ class Source:
     lines: tuple[str, ...]
 
     @classmethod
-    def of(cls, label: str, text: str) -> Source:
+    def of(cls, label: str, text: str) -> YamlSource:
         """Make a source; the lines are what carets stand under."""
         return cls(label, text, tuple(re.split(r"\r\n|\r|\n", text)))
 
@@ -82,25 +113,23 @@ class Source:
         return Fault(text=text, path=path, file=self.label, line=line, column=column, source=source)
 
 
-def read_source(path: Path) -> Source:
+def read_source(path: Path) -> YamlSource:
     """
     Read a file that a person wrote.
 
     Raises:
-        InputError: It is missing, unreadable, too large, or no UTF-8 text.
+        InputError: It is missing, unreadable, no regular file, too large, no UTF-8 text, or its path is none.
     """
     label = str(path)
     try:
-        with path.open("rb") as file:
-            raw = file.read(FILE_BYTES_MAX + 1)
+        raw = read_regular_file(path, bytes_max=FILE_BYTES_MAX)
     except FileNotFoundError:
         raise _whole(label, f"no such file{_similar(path)}") from None
-    except IsADirectoryError:
-        raise _whole(label, "expected a file, got a folder") from None
+    except FileRefused as error:
+        raise _whole(label, str(error.strerror)) from None
     except OSError as error:
         raise _whole(label, f"cannot be read: {error.strerror}") from error
-    if len(raw) > FILE_BYTES_MAX:
-        raise _whole(label, f"expected at most {FILE_BYTES_MAX} bytes, got more")
+    check_path_is_text(path)
     if b"\0" in raw:
         raise _whole(label, "expected UTF-8 text, got binary data")
     try:
@@ -110,7 +139,7 @@ def read_source(path: Path) -> Source:
         raise _whole(
             label, f"expected UTF-8 text, got byte 0x{raw[error.start]:02x} in line {line}"
         ) from None
-    return Source.of(label, text)
+    return YamlSource.of(label, text)
 
 
 def _whole(label: str, text: str) -> InputError:
@@ -118,8 +147,6 @@ def _whole(label: str, text: str) -> InputError:
 
 
 def _similar(path: Path) -> str:
-    import difflib
-
     try:
         names = [entry.name for entry in path.parent.iterdir()]
     except OSError:
@@ -128,9 +155,13 @@ def _similar(path: Path) -> str:
     return f", did you mean {path.parent / close[0]}?" if close else ""
 
 
-def compose(source: Source) -> Node | None:
+def compose(source: YamlSource, *, has_64_bits: bool = True) -> Node | None:
     """
     Return the root node of the one document in *source*; None if there is none.
+
+    Args:
+        source: YAML.
+        has_64_bits: Whether whole numbers must fit into what messages and JSON hold.
 
     Raises:
         InputError: It is not valid YAML, has a second document, or nests deeper than DEPTH_MAX.
@@ -142,7 +173,7 @@ def compose(source: Source) -> Node | None:
         text = f"expected text, got the control character U+{ord(bad.group()):04X}"
         raise InputError(faults=[source.fault(text, line=line, column=column)])
     try:
-        return _Composer(source).document()
+        return _Composer(source, has_64_bits).document()
     except yaml.MarkedYAMLError as error:
         raise InputError(faults=[_syntax_fault(source, error)]) from None
     except yaml.YAMLError as error:
@@ -150,8 +181,9 @@ def compose(source: Source) -> Node | None:
 
 
 class _Composer:
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: YamlSource, has_64_bits: bool) -> None:
         self.source = source
+        self.has_64_bits = has_64_bits
         self.anchors: dict[str, Node] = {}
         self.events: Iterator[Any] = yaml.parse(source.text, Loader=_PARSER)
 
@@ -207,7 +239,7 @@ class _Composer:
             node.value = event.value
             return
         try:
-            node.value = resolve_scalar(event.value)
+            node.value = resolve_scalar(event.value, has_64_bits=self.has_64_bits)
         except ValueError as error:
             node.value, node.fault = None, str(error)
             return
@@ -230,40 +262,46 @@ def _tag_text(tag: str) -> str:
     return f"expected a plain value, got the tag {tag.replace(_TAG, '!!')}"
 
 
-def resolve_scalar(text: str) -> Scalar:
+def resolve_scalar(text: str, *, has_64_bits: bool = True) -> Scalar:
     """
     Return what an unquoted scalar means.
 
     A power of ten without a fraction, such as 4e6, is a whole number.
 
     Raises:
-        ValueError: It is a number, but not a finite one of reasonable length.
+        ValueError: It is a number, but not a finite one of reasonable length, or a whole one beyond 64 bits
+            where *has_64_bits*.
     """
     if text in _WORDS:
         return _WORDS[text]
-    if _INTEGER.fullmatch(text):
-        if len(text) > DIGITS_MAX:
-            raise ValueError(f"expected a number of at most {DIGITS_MAX} digits")
-        return int(text, 10)
-    if _OCTAL.fullmatch(text):
-        return int(text[2:], 8)
-    if _HEXADECIMAL.fullmatch(text):
-        return int(text[2:], 16)
-    if _NOT_FINITE.fullmatch(text):
+    for base, pattern in _WHOLE:
+        if pattern.fullmatch(text):
+            return _whole_number(text, base, has_64_bits)
+    if _NOT_FINITE.fullmatch(text) or (_FLOAT.fullmatch(text) and math.isinf(float(text))):
         raise ValueError(f"expected a finite number, got {text}")
     if _FLOAT.fullmatch(text):
         number = float(text)
-        if number in (float("inf"), float("-inf")):
-            raise ValueError(f"expected a finite number, got {text}")
         return int(number) if _POWER.fullmatch(text) and abs(number) < 2**53 else number
     return text
 
 
-def _syntax_fault(source: Source, error: yaml.MarkedYAMLError) -> Fault:
+def _whole_number(digits: str, base: int, has_64_bits: bool) -> int:
+    if len(digits) > DIGITS_MAX:
+        raise ValueError(f"expected a number of at most {DIGITS_MAX} digits, got {len(digits)}")
+    number = int(digits, base)
+    if has_64_bits and not WHOLE_MIN <= number <= WHOLE_MAX:
+        shown = digits if len(digits) <= DIGITS_SHOWN_MAX else f"one of {len(digits)} digits"
+        raise ValueError(
+            f"expected a whole number from -2^63 to 2^63 - 1, got {shown}: write one that need not be"
+            " whole such as 1e20, and a text in quotes"
+        )
+    return number
+
+
+def _syntax_fault(source: YamlSource, error: yaml.MarkedYAMLError) -> Fault:
     """Say in plain words what the parser's terms mean."""
     context, problem = error.context or "", error.problem or "not understood"
     mark = error.problem_mark or error.context_mark
-    start = error.context_mark or mark
     if mark is None:
         return Fault(text=f"not valid YAML: {problem}", file=source.label)
     line = source.lines[mark.line] if mark.line < len(source.lines) else ""
@@ -272,21 +310,10 @@ def _syntax_fault(source: Source, error: yaml.MarkedYAMLError) -> Fault:
         "\t"
     ):
         text = "expected spaces, got a tab: YAML is indented with spaces"
-    elif "quoted scalar" in context:
-        mark, text = start, "this quoted text is never closed"
-    elif "flow sequence" in context:
-        mark, text = start, "this list is never closed: expected ',' or ']'"
-    elif "flow mapping" in context:
-        mark, text = start, "this mapping is never closed: expected ',' or '}'"
-    elif "expected node content" in problem:
-        text = "expected a value, or the bracket that closes what was opened before"
-    elif "mapping values are not allowed" in problem:
-        text = "a second ': ' on this line: put the text in quotes, or check the indentation"
-    elif "could not find expected ':'" in problem:
-        mark, text = start, "expected `key: value`, got no ':' after the key"
-    elif "cannot start any token" in problem:
-        text = f"{line[mark.column : mark.column + 1]!r} cannot start a value: put it in quotes"
-    elif "block mapping" in context and "block end" in problem:
-        text = "expected a key at the indentation of its neighbours"
-    assert mark is not None
+    else:
+        for in_context, in_problem, is_at_start, meaning in _MEANINGS:
+            if in_context in context and in_problem in problem:
+                mark = (error.context_mark or mark) if is_at_start else mark
+                text = meaning.format(repr(line[mark.column : mark.column + 1]))
+                break
     return source.fault(text, line=mark.line + 1, column=mark.column + 1)

@@ -9,14 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
-from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
 from cosmos_cli.provision.environment import install_environment
-from cosmos_cli.provision.step import Kind, Request, Step
-from cosmos_cli.provision.trees import send_tree
+from cosmos_cli.provision.step import Done, Kind, Step, StepRequest
+from cosmos_cli.provision.trees import Progress, send_tree
+from cosmos_cli.provision.up_view import MachineTeller
+from cosmos_cli.ui.step_times import timed
 
 OWN_KINDS = (
     FailureKind.STEP,
@@ -31,28 +33,6 @@ OWN_KINDS = (
 REPEAT = "repeat `cosmos up` when it answers again: it goes on from there"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Done:
-    """A step that was carried out, or would be."""
-
-    step: Step
-    changed: bool
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return plain values for --json."""
-        return {"kind": self.step.kind.value, "title": self.step.title, "changed": self.changed}
-
-
-class Teller(Protocol):
-    """Shows people what is done on one machine."""
-
-    def step(self, title: str) -> None:
-        """Say that a step begins."""
-
-    def detail(self, text: str) -> None:
-        """Say how far it is, or what else is done; may be left out."""
-
-
 @dataclass(slots=True, kw_only=True)
 class Applier:
     """
@@ -64,9 +44,9 @@ class Applier:
         teller: Told each step as it begins, and how far a long one is.
     """
 
-    board: Board
+    board: Helper
     layout: Layout
-    teller: Teller
+    teller: MachineTeller
     done: list[Done] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -80,24 +60,26 @@ class Applier:
         for step in steps:
             self.teller.step(step.title)
             try:
-                changed = _CARRIERS.get(step.kind, Applier._ask_all)(self, step)
+                with timed(self.board.machine, step.title):
+                    changed = self._carry_out(step)
             except MachineFailure as failure:
                 raise _of_step(step, failure) from None
             self.done.append(Done(step=step, changed=changed))
 
-    def _ask_all(self, step: Step) -> bool:
-        changed = False
-        for request in step.requests:
-            changed |= self._ask(request, step)
-        return changed
+    def _carry_out(self, step: Step) -> bool:
+        if step.kind in _SENDERS:
+            return _SENDERS[step.kind](self.board, self.layout, step.subject, self._tell_share)
+        return any([self._ask(request, step) for request in step.requests])  # every one is asked
 
-    def _ask(self, request: Request, step: Step) -> bool:
+    def _ask(self, request: StepRequest, step: Step) -> bool:
         how: dict[str, Any] = {"as_root": request.as_root, "timeout_s": request.timeout_s}
         if not request.streams:
             answer = self.board.call(request.verb, request.arguments, body=request.body, **how)
             return _has_changed(request.verb, answer.value)
         value: Mapping[str, Any] = {}
-        for part in self.board.parts(request.verb, request.arguments, **how):
+        for part in self.board.parts(
+            request.verb, request.arguments, **how, whole_s=request.whole_s
+        ):
             value = part.value or {}
             if value.get("doing"):
                 self.teller.detail(str(value["doing"]))
@@ -107,31 +89,24 @@ class Applier:
     def _tell_share(self, what: str, share: float) -> None:
         self.teller.detail(f"{what} ({share:.0%})")
 
-    def _environment(self, step: Step) -> bool:
-        return install_environment(self.board, self.layout, step.subject, self._tell_share)
 
-    def _tree(self, step: Step) -> bool:
-        return send_tree(self.board, self.layout, step.subject, self._tell_share)
-
-
-_CARRIERS: Mapping[Kind, Callable[[Applier, Step], bool]] = {
-    Kind.ENVIRONMENT: Applier._environment,
-    Kind.TREE: Applier._tree,
+_SENDERS: Mapping[Kind, Callable[[Helper, Layout, Any, Progress], bool]] = {
+    Kind.ENVIRONMENT: install_environment,
+    Kind.TREE: send_tree,
 }
 """Steps that are more than requests."""
+_CHANGES: Mapping[str, Callable[[Any], Any]] = {
+    "packages": lambda value: value.get("changes"),
+    "command": lambda value: value.get("ran"),
+    "prune_installed": lambda value: any(value.values()),
+    "service": lambda value: True,
+    "set_values": lambda value: True,
+}
+"""What tells of a change in the answer of a verb; of others it is the answer itself."""
 
 
 def _has_changed(verb: str, value: Any) -> bool:
-    match verb:
-        case "packages":
-            return bool(value.get("changes"))
-        case "command":
-            return bool(value.get("ran"))
-        case "prune_installed":
-            return any(value.values())
-        case "service" | "set_values":
-            return True
-    return bool(value)
+    return bool(_CHANGES.get(verb, bool)(value))
 
 
 def _of_step(step: Step, failure: MachineFailure) -> MachineFailure:

@@ -1,7 +1,7 @@
 """
 Gives machines their environments, and asks them what is installed, whether it runs, and what nobody needs.
 
-The operator's side of `cosmos_cli.fleet.onboard.environment` and `.installed`.
+The operator's side of `cosmos_cli.onboard.environment` and `.installed`.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from cosmos_cli.fleet.board import Board
+from packaging.specifiers import SpecifierSet
+
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
 from cosmos_cli.provision.lock import Locked, normal_name
 from cosmos_cli.provision.trees import Progress, no_progress
 from cosmos_cli.provision.wheelhouse import Environment
 from cosmos_cli.provision.wheels import see_verified
 
-PARTS = ("store", "installed", "keep", "trees", "wheels", "environment")
-"""What a `Board` must be started with for trees and environments."""
 PIECE_BYTES = 1024 * 1024
 """More at once makes the SSH server there copy what it holds back over and over: measured 65 ms against 207 ms of its
 processor for numpy in pieces of 4 MB."""
@@ -33,15 +33,13 @@ START_TIMEOUT_S = 120.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Installed:
-    """What a machine says is installed there."""
+    """A machine's answer on what is installed there."""
 
     trees: Mapping[str, bool]
     """Of each tree asked for: whether it is there and really of that content."""
     environments: Mapping[str, bool]
     prunable: Mapping[str, Sequence[str]]
     """By "trees", "environments" and "wheels": what nobody needs any more."""
-    folders: Mapping[str, str]
-    """The same folders as absolute paths there."""
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> Installed:
@@ -50,13 +48,12 @@ class Installed:
             trees=mapping["trees"],
             environments=mapping["environments"],
             prunable=mapping["prunable"],
-            folders=mapping["folders"],
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RuntimeCheck:
-    """What is to be seen to run on a machine."""
+    """Check of programs on a machine."""
 
     key: str
     """Of the environment."""
@@ -71,7 +68,7 @@ class RuntimeCheck:
     base: str = ""
     """Hash of the scenario's tree."""
     udp: Mapping[str, Any] | None = None
-    """What `cosmos_cli.provision.echo.Echo.question` returned; None leaves the network out."""
+    """Return value of `cosmos_cli.provision.udp_echo.Echo.question`; None leaves the network out."""
 
 
 def installed_request(
@@ -103,12 +100,12 @@ def installed_request(
     }
 
 
-def ask_installed(board: Board, request: Mapping[str, Any]) -> Installed:
+def ask_installed(board: Helper, request: Mapping[str, Any]) -> Installed:
     """
     Ask a machine what is installed there.
 
     Args:
-        board: Started with `PARTS`.
+        board: Started with `cosmos_cli.provision.STORE_PARTS`.
         request: Made by `installed_request`.
 
     Raises:
@@ -118,13 +115,13 @@ def ask_installed(board: Board, request: Mapping[str, Any]) -> Installed:
 
 
 def install_environment(
-    board: Board, layout: Layout, environment: Environment, progress: Progress = no_progress
+    board: Helper, layout: Layout, environment: Environment, progress: Progress = no_progress
 ) -> bool:
     """
     See that an environment is on a machine; wheels that are there already are not sent.
 
     Args:
-        board: Started with `PARTS`, holding the machine's lock.
+        board: Started with `cosmos_cli.provision.STORE_PARTS`, holding the machine's lock.
         layout: Of the machine.
         environment: What is wanted.
         progress: Told while wheels are sent and installed.
@@ -164,15 +161,13 @@ def install_environment(
     return bool(told["changed"])
 
 
-def check_distribution(board: Board, environment: Environment) -> None:
+def check_distribution(board: Helper, environment: Environment) -> None:
     """
     See that the machine's distribution has what no wheel brings, new enough.
 
     Raises:
         MachineFailure: UNSUPPORTED: it has not; every package is named.
     """
-    from packaging.specifiers import SpecifierSet
-
     wanted = environment.content.distributed
     if not wanted:
         return
@@ -188,10 +183,11 @@ def check_distribution(board: Board, environment: Environment) -> None:
         elif not SpecifierSet(each.specifier).contains(version, prereleases=True):
             faults.append(f"{each.package} brings {each.name} {version}, needed: {needed}")
     if faults:
-        missing = (
-            f"install them there: sudo apt-get install {' '.join(packages)}" if packages else ""
+        advice = (
+            f"install them there: sudo apt-get install {' '.join(packages)}"
+            if packages
+            else "use a newer release of the distribution there, or a 64-bit one"
         )
-        advice = missing or "use a newer release of the distribution there, or a 64-bit one"
         raise MachineFailure(
             FailureKind.UNSUPPORTED,
             f"no wheels are made for {environment.platform.label}, and of its distribution "
@@ -227,7 +223,7 @@ RUNTIME_NAMES = ("annotated-types", "msgpack", "numpy", "orjson", "psutil")
 
 
 def _send_wheels(
-    board: Board,
+    board: Helper,
     layout: Layout,
     environment: Environment,
     wheels: Sequence[tuple[Locked, int]],

@@ -1,5 +1,5 @@
 """
-What exactly an environment is made of: every wheel by its hash, and what the distribution must bring. Pure.
+Exact content of an environment: every wheel by its hash, and what the distribution must bring. Pure.
 
 `parse_pylock` and `choose` read what the resolver found; nothing here runs a program or opens a file.
 """
@@ -15,10 +15,15 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
+from packaging.markers import Marker
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+
 from cosmos_cli.provision.platform import Platform, wheel_rank
 
 KEY_CHARACTERS = 24
 DISTRIBUTION_PACKAGES: Mapping[str, str] = {
+    "gpiod": "python3-libgpiod",
     "lgpio": "python3-lgpio",
     "lxml": "python3-lxml",
     "matplotlib": "python3-matplotlib",
@@ -61,12 +66,12 @@ class Distributed:
     package: str
     """Name of the system package, such as python3-numpy."""
     specifier: str = ""
-    """Which versions will do, such as >=1.24."""
+    """Versions that will do, such as >=1.24."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lock:
-    """What an environment is made of."""
+    """Content of an environment."""
 
     platform: Platform
     wheels: tuple[Locked, ...]
@@ -146,23 +151,16 @@ def parse_pylock(text: str, platform: Platform) -> tuple[Candidate, ...]:
     Raises:
         ValueError: It is none.
     """
-    from packaging.markers import Marker
-
     environment = platform.marker_environment()
-    found = []
-    for package in tomllib.loads(text).get("packages", ()):
-        marker = package.get("marker")
-        if marker and not Marker(marker).evaluate(environment):
-            continue
-        wheels = [_link(wheel) for wheel in package.get("wheels", ())]
-        found.append(
-            Candidate(
-                name=normal_name(package["name"]),
-                version=package.get("version", ""),
-                wheels=tuple(wheel for wheel in wheels if wheel is not None),
-            )
+    return tuple(
+        Candidate(
+            name=normal_name(package["name"]),
+            version=package.get("version", ""),
+            wheels=tuple(filter(None, map(_link, package.get("wheels", ())))),
         )
-    return tuple(found)
+        for package in tomllib.loads(text).get("packages", ())
+        if not package.get("marker") or Marker(package["marker"]).evaluate(environment)
+    )
 
 
 def choose(
@@ -176,14 +174,13 @@ def choose(
             for wheel in candidate.wheels
             if (rank := wheel_rank(wheel.filename, platform)) is not None
         ]
-        if not ranked:
+        if ranked:
+            _, filename, url, sha256 = min(ranked)
+            name, version = candidate.name, candidate.version
+            locked = Locked(name=name, version=version, sha256=sha256, filename=filename)
+            chosen.append(Chosen(locked=locked, url=url))
+        else:
             missing.append(candidate)
-            continue
-        _, filename, url, sha256 = min(ranked)
-        locked = Locked(
-            name=candidate.name, version=candidate.version, sha256=sha256, filename=filename
-        )
-        chosen.append(Chosen(locked=locked, url=url))
     return tuple(chosen), tuple(missing)
 
 
@@ -191,14 +188,9 @@ def with_specifiers(
     distributed: Sequence[Distributed], requirements: Sequence[str], platform: Platform
 ) -> tuple[Distributed, ...]:
     """Return the same, each with all that *requirements* ask of its version."""
-    from packaging.requirements import Requirement
-    from packaging.specifiers import SpecifierSet
-
     asked: dict[str, SpecifierSet] = {}
-    for text in requirements:
-        requirement = Requirement(text)
-        marker = requirement.marker
-        if marker is None or marker.evaluate(platform.marker_environment()):
+    for requirement in map(Requirement, requirements):
+        if platform.needs(requirement):
             name = normal_name(requirement.name)
             asked[name] = asked.get(name, SpecifierSet()) & requirement.specifier
     return tuple(replace(each, specifier=str(asked.get(each.name, ""))) for each in distributed)

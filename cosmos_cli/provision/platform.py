@@ -1,5 +1,5 @@
 """
-What a machine's interpreter can load: the architecture, the Python and the C library of a wheel. Pure.
+Platform of a machine's interpreter: the architecture, the Python and the C library of a wheel. Pure.
 
 Boards have no internet, so wheels are chosen here, for there.
 """
@@ -12,10 +12,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from packaging import tags
+from packaging.requirements import Requirement
+from packaging.utils import InvalidWheelFilename, parse_wheel_filename
+
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 
 MACHINES = ("x86_64", "aarch64", "armv7l", "armv6l")
 """Architectures that boards have; the last two are 32-bit ARM."""
+INTERPRETER_MACHINES: Mapping[bool, Mapping[str, str]] = {
+    True: {"x86_64": "x86_64", "amd64": "x86_64", "aarch64": "aarch64", "arm64": "aarch64"},
+    False: {
+        "armv6l": "armv6l",
+        **dict.fromkeys(("armv7l", "armv8l", "aarch64", "arm64"), "armv7l"),
+    },
+}
+"""The architecture of 64-bit interpreters, and of others, by what the kernel calls itself."""
 LIBC_MAJOR = 2
 LIBC_MINOR_MIN = {"x86_64": 5, "aarch64": 17, "armv7l": 17, "armv6l": 17}
 """The oldest glibc that wheels of an architecture were ever made for."""
@@ -26,11 +38,11 @@ RESOLVER_LIBC_MINORS = (17, 28, *range(31, 41))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Platform:
-    """Where wheels are to run."""
+    """Platform that wheels are to run on."""
 
     python: tuple[int, int]
     machine: str
-    """One of `MACHINES`: what the interpreter is made for, which may be less than the kernel can."""
+    """One of `MACHINES`: the interpreter's architecture, which may be less than the kernel can."""
     libc_version: tuple[int, int]
 
     @property
@@ -65,6 +77,11 @@ class Platform:
             if minor in LEGACY_TAGS:
                 tags.append(f"{LEGACY_TAGS[minor]}_{self.machine}")
         return (*tags, f"linux_{self.machine}")
+
+    def needs(self, requirement: Requirement, *, extra: str = "") -> bool:
+        """Tell whether a requirement's marker, if it has one, holds there."""
+        marker = requirement.marker
+        return marker is None or marker.evaluate({**self.marker_environment(), "extra": extra})
 
     def marker_environment(self) -> dict[str, str]:
         """Return what the markers of requirements are judged by there."""
@@ -104,7 +121,7 @@ def platform_of(*, python: Sequence[int], machine: str, bits: int, libc: str) ->
             f"expected a system with the GNU C library, found {libc or 'another one'}",
             "use a distribution such as Raspberry Pi OS, Debian or Ubuntu there",
         )
-    own = _interpreter_machine(machine, bits)
+    own = INTERPRETER_MACHINES[bits == 64].get(machine)
     if own is None:
         raise MachineFailure(
             FailureKind.UNSUPPORTED,
@@ -133,21 +150,9 @@ def greeted_platform(greeting: Mapping[str, Any]) -> Platform:
     )
 
 
-def _interpreter_machine(machine: str, bits: int) -> str | None:
-    if bits == 64:
-        names = {"arm64": "aarch64", "amd64": "x86_64"}
-        name = names.get(machine, machine)
-        return name if name in ("x86_64", "aarch64") else None
-    if machine == "armv6l":
-        return machine
-    return "armv7l" if machine in ("armv7l", "armv8l", "aarch64", "arm64") else None
-
-
 @functools.lru_cache
 def wheel_tags(platform: Platform) -> dict[str, int]:
     """Return every tag of the wheels that run on a platform, each with its rank: the lowest is best."""
-    from packaging import tags
-
     platforms = platform.platform_tags()
     found = [str(t) for t in tags.cpython_tags(platform.python, platforms=platforms)]
     interpreter = f"cp{platform.python[0]}{platform.python[1]}"
@@ -157,8 +162,6 @@ def wheel_tags(platform: Platform) -> dict[str, int]:
 
 def wheel_rank(filename: str, platform: Platform) -> int | None:
     """Return how well a wheel suits a platform, the lowest best; None when it does not run there."""
-    from packaging.utils import InvalidWheelFilename, parse_wheel_filename
-
     try:
         tags = parse_wheel_filename(filename)[3]
     except InvalidWheelFilename:

@@ -18,6 +18,10 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import uv
+from packaging.specifiers import SpecifierSet
+from packaging.version import InvalidVersion, Version
+
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.provision.lock import (
     DISTRIBUTION_PACKAGES,
@@ -27,6 +31,7 @@ from cosmos_cli.provision.lock import (
     parse_pylock,
 )
 from cosmos_cli.provision.platform import Platform
+from cosmos_cli.system.bounded_process import run_bounded
 
 RESOLVE_TIMEOUT_S = 300.0
 DOWNLOAD_TIMEOUT_S = 3600.0
@@ -50,8 +55,6 @@ def resolve(requirements: Sequence[str], platform: Platform) -> tuple[Candidate,
     Raises:
         MachineFailure: They cannot be met there, or the index cannot be reached.
     """
-    import uv
-
     where = ["--python-platform", platform.resolver_name] if platform.resolver_name else None
     command = [
         *(uv.find_uv_bin(), "pip", "compile", "-", "--quiet", "--no-header", "--no-annotate"),
@@ -107,16 +110,11 @@ def newest_version(
         platform: Of the machine; versions for another Python do not count.
         with_wheel: Count only those with a wheel for the platform, else those in any form.
     """
-    from packaging.specifiers import SpecifierSet
-    from packaging.version import InvalidVersion, Version
-
-    python = ["--python-version", platform.python_text]
-    where = _pip_platform(platform) if with_wheel else python
+    where = _pip_platform(platform) if with_wheel else ["--python-version", platform.python_text]
     command = [*PIP, "index", "versions", name, "--json", *where]
     done = _run(command, timeout_s=QUESTION_TIMEOUT_S, environment=pip_environment(os.environ))
     try:
-        told = json.loads(done.stdout)["versions"]
-        versions = [Version(text) for text in told]
+        versions = [Version(text) for text in json.loads(done.stdout)["versions"]]
     except (ValueError, KeyError, TypeError, InvalidVersion):
         return None
     matching = list(SpecifierSet(specifier).filter(versions))
@@ -132,10 +130,11 @@ def pip_settings() -> dict[str, str]:
         section, _, key = place.rpartition(".")
         with contextlib.suppress(ValueError, SyntaxError):
             found.setdefault(section, {})[key] = str(ast.literal_eval(value))
-    merged: dict[str, str] = {}
-    for section in ("global", "download", ":env:"):
-        merged |= found.get(section, {})
-    return merged
+    return {
+        key: value
+        for section in ("global", "download", ":env:")
+        for key, value in found.get(section, {}).items()
+    }
 
 
 def index_lines(settings: Mapping[str, str], environment: Mapping[str, str]) -> list[str]:
@@ -144,15 +143,23 @@ def index_lines(settings: Mapping[str, str], environment: Mapping[str, str]) -> 
 
     An address may hold a password, which has no business in arguments or in the environment.
     """
-    lines = []
-    for setting, names in {
+    own_names = {
         "index-url": ("UV_DEFAULT_INDEX", "UV_INDEX_URL"),
         "extra-index-url": EXTRA_INDEXES,
         "find-links": ("UV_FIND_LINKS",),
-    }.items():
-        if not any(name in environment for name in names):
-            lines += [f"--{setting} {value}" for value in settings.get(setting, "").split()]
-    return lines
+    }
+    return [
+        f"--{setting} {value}"
+        for setting, names in own_names.items()
+        if not any(name in environment for name in names)
+        for value in settings.get(setting, "").split()
+        if _can_be_looked_at(value)
+    ]
+
+
+def _can_be_looked_at(place: str) -> bool:
+    """Tell whether a place of packages is an address or there: pip passes over a folder that is not, uv ends."""
+    return "://" in place or Path(place).expanduser().exists()
 
 
 def uv_environment(settings: Mapping[str, str], environment: Mapping[str, str]) -> dict[str, str]:
@@ -179,14 +186,14 @@ def uv_environment(settings: Mapping[str, str], environment: Mapping[str, str]) 
 def pip_environment(environment: Mapping[str, str]) -> dict[str, str]:
     """Return an environment in which pip sees the indexes that uv was told of; what is said to pip wins."""
     told = dict(environment)
-    for name, older_names in {
-        "PIP_INDEX_URL": ("UV_DEFAULT_INDEX", "UV_INDEX_URL"),
-        "PIP_EXTRA_INDEX_URL": ("UV_EXTRA_INDEX_URL",),
-        "PIP_CERT": ("SSL_CERT_FILE",),
-    }.items():
-        for older_name in older_names:
-            if older_name in told:
-                told.setdefault(name, told[older_name])
+    for name, older_name in (
+        ("PIP_INDEX_URL", "UV_DEFAULT_INDEX"),
+        ("PIP_INDEX_URL", "UV_INDEX_URL"),
+        ("PIP_EXTRA_INDEX_URL", "UV_EXTRA_INDEX_URL"),
+        ("PIP_CERT", "SSL_CERT_FILE"),
+    ):
+        if older_name in told:
+            told.setdefault(name, told[older_name])
     return told
 
 
@@ -206,8 +213,7 @@ def no_wheel(name: str, text: str, platform: Platform, *, pin: str = "") -> Mach
         platform: Of the machine.
         pin: A version that has one, if there is any.
     """
-    system = DISTRIBUTION_PACKAGES.get(normal_name(name))
-    known = f"{system}" if system else "python3-... there"
+    known = DISTRIBUTION_PACKAGES.get(normal_name(name), "python3-... there")
     pinned = f"pin the older one if it will do ({name}=={pin}), or " if pin else ""
     return MachineFailure(
         FailureKind.UNSUPPORTED,
@@ -218,11 +224,10 @@ def no_wheel(name: str, text: str, platform: Platform, *, pin: str = "") -> Mach
 
 
 def _resolve_failure(said: str, requirements: Sequence[str], platform: Platform) -> MachineFailure:
-    flat = " ".join(said.split())
-    names = list(dict.fromkeys(NO_WHEELS.findall(flat)))
-    if names:
+    lacking = NO_WHEELS.search(" ".join(said.split()))
+    if lacking:
         written = {normal_name(name): name for name in map(_name_of, requirements)}
-        name = written.get(normal_name(names[0]), names[0])
+        name = written.get(normal_name(lacking[1]), lacking[1])
         return no_wheel(name, "no wheel for", platform)
     if NO_NETWORK.search(said):
         return _unreachable(said)
@@ -269,20 +274,10 @@ def _run(
     environment: Mapping[str, str] | None = None,
 ) -> subprocess.CompletedProcess[str]:
     try:
-        return subprocess.run(
-            command,
-            input=stdin,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=timeout_s,
-            env=environment,
-            check=False,
-        )
+        return run_bounded(command, timeout_s=timeout_s, stdin=stdin, environment=environment)
     except subprocess.TimeoutExpired:
-        program = Path(command[0]).name
         raise MachineFailure(
             FailureKind.TIMEOUT,
-            f"the package index did not answer in {timeout_s:g} s ({program} on this computer)",
+            f"the package index did not answer in {timeout_s:g} s ({Path(command[0]).name} on this computer)",
             "look at this computer's connection, then repeat",
         ) from None

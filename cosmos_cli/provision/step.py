@@ -11,7 +11,7 @@ REQUEST_TIMEOUT_S = 30.0
 
 
 class Kind(StrEnum):
-    """What a step changes; scripts may rely on these words."""
+    """Kinds of change; scripts may rely on these words."""
 
     DIRECTORY = "directory"
     PACKAGE = "package"
@@ -27,8 +27,8 @@ class Kind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Request:
-    """What a machine is asked: a verb of the helper there."""
+class StepRequest:
+    """Request to a machine: a verb of the helper there."""
 
     verb: str
     arguments: Mapping[str, Any] = field(default_factory=dict)
@@ -36,6 +36,8 @@ class Request:
     as_root: bool = False
     timeout_s: float = REQUEST_TIMEOUT_S
     """For the answer; of one that streams, for each sign of life."""
+    whole_s: float = REQUEST_TIMEOUT_S
+    """For all of an answer that streams."""
     streams: bool = False
     """Whether the answer comes in parts: signs of life, and the result as the last one."""
 
@@ -56,10 +58,10 @@ class Step:
     kind: Kind
     title: str
     """For people, such as "package i2c-tools: install"."""
-    requests: tuple[Request, ...] = ()
+    requests: tuple[StepRequest, ...] = ()
     """In this order; a cut between two of them is repaired by the next `up`."""
     subject: Any = None
-    """What the step is about, where others ask: an environment, a tree, the name of a setting."""
+    """Subject of the step, where others ask: an environment, a tree, the name of a setting."""
     change: Change | None = None
     size_bytes: int = 0
     """Room that it takes on the machine's disk."""
@@ -68,3 +70,15 @@ class Step:
     def needs_root(self) -> bool:
         """Whether any of it is done as root."""
         return any(request.as_root for request in self.requests)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Done:
+    """A step that was carried out, or would be."""
+
+    step: Step
+    changed: bool
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values for --json."""
+        return {"kind": self.step.kind.value, "title": self.step.title, "changed": self.changed}

@@ -1,5 +1,5 @@
 """
-The plan of `cosmos up`: from what a machine is and what it should be, the steps between them. Pure.
+The plan of `cosmos up`: from what a machine is and what it should be, the steps between them, and notes. Pure.
 
 Only what must change is a step. PLANNERS is the order of things: a new kind of step has its place there.
 """
@@ -10,32 +10,35 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
-from cosmos_cli.provision.declared import declared_steps
+from cosmos_cli.models.machine_facts import MachineFacts
+from cosmos_cli.provision.desired import DesiredState
+from cosmos_cli.provision.device_steps import boot_notes, device_steps
 from cosmos_cli.provision.environment import installed_request
-from cosmos_cli.provision.facts import Facts
-from cosmos_cli.provision.packages import package_step
+from cosmos_cli.provision.inventory_steps import declared_steps, package_step
 from cosmos_cli.provision.settings import setting_steps
-from cosmos_cli.provision.step import Kind, Request, Step
-from cosmos_cli.provision.wanted import Wanted
+from cosmos_cli.provision.step import Kind, Step, StepRequest
 
 RESERVE_BYTES = 16_000_000
-"""Left free on a machine's disk by any plan: records of a run, and the system's own needs."""
+"""Bytes that any plan leaves free on a machine's disk: records of a run, and the system's own needs."""
 TITLES_SHOWN_MAX = 3
+CLOCK_OFFSET_S_MAX = 5.0
+THROTTLED_NOW = {0: "its supply voltage is too low", 1: "its clock is capped", 2: "it is throttled"}
+"""Bits of a Raspberry Pi's firmware that tell of this moment."""
 
-Planner = Callable[[Facts, Wanted], Iterator[Step]]
+Planner = Callable[[MachineFacts, DesiredState], Iterator[Step]]
 
 
-def plan_steps(facts: Facts, wanted: Wanted) -> tuple[Step, ...]:
+def plan_steps(facts: MachineFacts, desired: DesiredState) -> tuple[Step, ...]:
     """
     Return what must change, in the order in which it is done.
 
     Raises:
         MachineFailure: Something that is wanted cannot be had on this machine.
     """
-    return tuple(step for planner in PLANNERS for step in planner(facts, wanted))
+    return tuple(step for planner in PLANNERS for step in planner(facts, desired))
 
 
-def check_possible(facts: Facts, steps: tuple[Step, ...]) -> None:
+def check_possible(facts: MachineFacts, steps: tuple[Step, ...]) -> None:
     """
     Refuse a plan that would fail midway: no room, no right to write, nobody becomes root.
 
@@ -83,11 +86,11 @@ def megabytes(size_bytes: int) -> str:
     return f"{size_bytes / 1e6:.0f} MB"
 
 
-def _directories(facts: Facts, wanted: Wanted) -> Iterator[Step]:
-    for path in wanted.directories:
+def _directories(facts: MachineFacts, desired: DesiredState) -> Iterator[Step]:
+    for path in desired.directories:
         kind = facts.file(path).kind
         if kind == "missing":
-            request = Request(verb="make_directories", arguments={"paths": [path]})
+            request = StepRequest(verb="make_directories", arguments={"paths": [path]})
             yield Step(kind=Kind.DIRECTORY, title=f"directory {path}: make", requests=(request,))
         elif kind != "directory":
             text = f"{path}: expected a folder, got something else"
@@ -96,16 +99,17 @@ def _directories(facts: Facts, wanted: Wanted) -> Iterator[Step]:
             )
 
 
-def _packages(facts: Facts, wanted: Wanted) -> Iterator[Step]:
-    yield from package_step(facts, wanted.packages, set())
+def _packages(facts: MachineFacts, desired: DesiredState) -> Iterator[Step]:
+    yield from package_step(facts, desired.packages, set())
 
 
-def _declared(facts: Facts, wanted: Wanted) -> Iterator[Step]:
-    yield from declared_steps(facts, wanted.declared, wanted.packages)
+def _declared(facts: MachineFacts, desired: DesiredState) -> Iterator[Step]:
+    declared = (*device_steps(facts, desired.needs, desired.paths), *desired.declared)
+    yield from declared_steps(facts, declared, desired.packages)
 
 
-def _environments(facts: Facts, wanted: Wanted) -> Iterator[Step]:
-    for environment in wanted.distinct_environments:
+def _environments(facts: MachineFacts, desired: DesiredState) -> Iterator[Step]:
+    for environment in desired.distinct_environments:
         if environment.key not in facts.environments:
             yield Step(
                 kind=Kind.ENVIRONMENT,
@@ -115,8 +119,8 @@ def _environments(facts: Facts, wanted: Wanted) -> Iterator[Step]:
             )
 
 
-def _trees(facts: Facts, wanted: Wanted) -> Iterator[Step]:
-    for tree in wanted.trees:
+def _trees(facts: MachineFacts, desired: DesiredState) -> Iterator[Step]:
+    for tree in desired.trees:
         if tree.hash not in facts.trees:
             yield Step(
                 kind=Kind.TREE,
@@ -126,10 +130,10 @@ def _trees(facts: Facts, wanted: Wanted) -> Iterator[Step]:
             )
 
 
-def _prune(facts: Facts, wanted: Wanted) -> Iterator[Step]:
+def _prune(facts: MachineFacts, desired: DesiredState) -> Iterator[Step]:
     if not facts.prunable:
         return
-    request = Request(verb="prune_installed", arguments=installed_question(wanted))
+    request = StepRequest(verb="prune_installed", arguments=installed_question(desired))
     yield Step(
         kind=Kind.PRUNE,
         title=f"prune what nobody uses: {', '.join(facts.prunable)}",
@@ -137,12 +141,12 @@ def _prune(facts: Facts, wanted: Wanted) -> Iterator[Step]:
     )
 
 
-def installed_question(wanted: Wanted, *, touch: bool = False) -> dict[str, Any]:
+def installed_question(desired: DesiredState, *, touch: bool = False) -> dict[str, Any]:
     """Return the arguments of the verbs "installed" and "prune_installed"; *touch* as `installed_request`."""
     return installed_request(
-        wanted.layout,
-        trees=[tree.hash for tree in wanted.trees],
-        environments=[environment.key for environment in wanted.distinct_environments],
+        desired.layout,
+        trees=[tree.hash for tree in desired.trees],
+        environments=[environment.key for environment in desired.distinct_environments],
         touch=touch,
     )
 
@@ -156,3 +160,64 @@ PLANNERS: tuple[Planner, ...] = (
     _trees,
     _prune,
 )
+
+
+def notes_of(facts: MachineFacts, desired: DesiredState) -> tuple[str, ...]:
+    """Return what is worth a word about a machine that is ready all the same, each with what to do."""
+    return tuple(
+        [
+            *_clock_note(facts),
+            *_throttled_note(facts),
+            *_priority_note(facts, desired),
+            *desired.needs.faults,
+            *boot_notes(facts, desired.needs, desired.paths),
+        ]
+    )
+
+
+def _clock_note(facts: MachineFacts) -> Iterator[str]:
+    offset_s = facts.clock_offset_s
+    if abs(offset_s) > CLOCK_OFFSET_S_MAX:
+        side = "ahead of" if offset_s > 0 else "behind"
+        yield (
+            f"its clock is {_duration_words(abs(offset_s))} {side} this computer's; runs do not mind,"
+            " dates of its files and package sources do: let a time service set it"
+        )
+
+
+def _duration_words(seconds: float) -> str:
+    for size_s, word in ((86_400, "days"), (3600, "h"), (60, "min")):
+        if seconds >= 2 * size_s:
+            return f"{seconds / size_s:.0f} {word}"
+    return f"{seconds:.0f} s"
+
+
+def _throttled_note(facts: MachineFacts) -> Iterator[str]:
+    found = [words for bit, words in THROTTLED_NOW.items() if (facts.throttled or 0) & (1 << bit)]
+    if found:
+        yield f"{' and '.join(found)} at this moment; see `cosmos doctor`"
+
+
+def _priority_note(facts: MachineFacts, desired: DesiredState) -> Iterator[str]:
+    """Yield a note if a login is not granted what the inventory asks for; root needs no grant."""
+    priority, granted = desired.variables.cosmos_realtime_priority, facts.realtime_priority_max
+    if priority is not None and facts.uid != 0 and granted is not None and granted < priority:
+        yield f"a login is granted real-time priority {granted}, not {priority}: {_priority_cause(facts)}"
+
+
+def _priority_cause(facts: MachineFacts) -> str:
+    """Say why a login is not granted what its limits file says, and what to do about it."""
+    if facts.uses_pam is False:
+        return (
+            "its SSH server does not read /etc/security/limits.d; set `UsePAM yes` in"
+            " /etc/ssh/sshd_config there"
+        )
+    if facts.uses_pam:
+        return (
+            "its SSH server uses PAM (`UsePAM yes`), so perhaps pam_limits is missing in"
+            " /etc/pam.d/sshd there, or a later file of /etc/security/limits.d says less"
+        )
+    return (
+        "perhaps its SSH server does not read /etc/security/limits.d; see whether"
+        " /etc/ssh/sshd_config there says `UsePAM yes`, and /etc/pam.d/sshd names pam_limits"
+    )

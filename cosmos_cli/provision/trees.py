@@ -20,10 +20,11 @@ from typing import TYPE_CHECKING, Any
 
 import madns_runtime
 from cosmos_cli.errors import InputError
-from cosmos_cli.fleet.board import Board
+from cosmos_cli.evidence.run_directory import BUNDLE_SUFFIX, RUN_NAME
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
-from cosmos_cli.rundir import BUNDLE_SUFFIX, RUN_NAME
+from madns_runtime.bounded_files import FileRefused, read_regular_file
 
 if TYPE_CHECKING:  # importing the scenario's model takes longer than all that is done with it here
     from cosmos_cli.models.loading import ScenarioFile
@@ -61,7 +62,7 @@ class TreeFile:
     """0o555 for a program, 0o444 for any other file: nobody changes a tree."""
     size_bytes: int
     source: Path | bytes = field(repr=False)
-    """Where its content is here, or the content itself."""
+    """Path of its content here, or the content itself."""
 
     def read(self) -> bytes:
         """
@@ -70,8 +71,15 @@ class TreeFile:
         Raises:
             MachineFailure: It is no longer what it was when the tree was made.
         """
-        content = self.source if isinstance(self.source, bytes) else self.source.read_bytes()
-        if hashlib.sha256(content).hexdigest() != self.sha256:
+        try:
+            content = (
+                self.source
+                if isinstance(self.source, bytes)
+                else read_regular_file(self.source, bytes_max=self.size_bytes)
+            )
+        except FileRefused:  # it has grown, or a pipe has taken its place
+            content = None
+        if content is None or hashlib.sha256(content).hexdigest() != self.sha256:
             raise MachineFailure(
                 FailureKind.DATA, f"{self.source!s} was changed while it was sent", "repeat"
             )
@@ -83,7 +91,7 @@ class Tree:
     """Files that belong together; made by `tree_of`."""
 
     label: str
-    """What it is, in words; no part of the hash."""
+    """Description in words; no part of the hash."""
     hash: str
     files: tuple[TreeFile, ...]
 
@@ -96,10 +104,11 @@ class Tree:
 def tree_of(label: str, files: Sequence[TreeFile]) -> Tree:
     """Return a tree of these files, in the order of their paths."""
     ordered = tuple(sorted(files, key=lambda file: file.path))
-    digest = hashlib.sha256()
-    for file in ordered:
-        kind = "x" if file.mode & stat.S_IXUSR else "-"
-        digest.update(f"{kind} {file.sha256} {file.path}\n".encode())
+    lines = (
+        f"{'x' if file.mode & stat.S_IXUSR else '-'} {file.sha256} {file.path}\n"
+        for file in ordered
+    )
+    digest = hashlib.sha256("".join(lines).encode())
     return Tree(label=label, hash=digest.hexdigest(), files=ordered)
 
 
@@ -112,7 +121,7 @@ def runtime_tree() -> Tree:
     """
     package = Path(madns_runtime.__file__).parent
     files = [
-        _read(path, f"{package.name}/{name}")
+        read_tree_file(path, f"{package.name}/{name}")
         for path, name in _walk(package, package)
         if name.endswith((".py", ".json", "py.typed")) or "/data/" in f"/{name}"
     ]
@@ -129,7 +138,16 @@ def scenario_tree(scenario_file: ScenarioFile) -> Tree:
     Raises:
         InputError: The folder is larger than a scenario's should be, or has a link that leads outside.
     """
-    folder = scenario_file.base_directory
+    return folder_tree(f"scenario {scenario_file.scenario.name}", scenario_file.base_directory)
+
+
+def folder_tree(label: str, folder: Path) -> Tree:
+    """
+    Return what is in a folder, but for what `scenario_tree` leaves out.
+
+    Raises:
+        InputError: As `scenario_tree`.
+    """
     found = []
     total_bytes = 0
     for path, name in _walk(folder, folder):
@@ -137,15 +155,15 @@ def scenario_tree(scenario_file: ScenarioFile) -> Tree:
         total_bytes += path.stat().st_size
         if len(found) > FILES_MAX or total_bytes > TREE_BYTES_MAX:
             raise _too_large(folder, found)
-    return tree_of(f"scenario {scenario_file.scenario.name}", [_read(*each) for each in found])
+    return tree_of(label, [read_tree_file(*each) for each in found])
 
 
-def send_tree(board: Board, layout: Layout, tree: Tree, progress: Progress = no_progress) -> bool:
+def send_tree(board: Helper, layout: Layout, tree: Tree, progress: Progress = no_progress) -> bool:
     """
     See that a tree is on a machine; what is there already is verified, not sent.
 
     Args:
-        board: Started with `cosmos_cli.provision.environment.PARTS`.
+        board: Started with `cosmos_cli.provision.STORE_PARTS`.
         layout: Of the machine.
         tree: What is wanted.
         progress: Told while files are sent.
@@ -162,11 +180,12 @@ def send_tree(board: Board, layout: Layout, tree: Tree, progress: Progress = no_
         "label": tree.label,
         "files": [[file.path, file.sha256, file.mode] for file in tree.files],
     }
+    by_hash = {file.sha256: file for file in reversed(tree.files)}  # one of equal ones
     for _ in range(ROUNDS_MAX):
         told: Mapping[str, Any] = board.call("tree", asked, timeout_s=ASSEMBLE_TIMEOUT_S).value
         if not told["missing"]:
             return bool(told["changed"])
-        _send_blobs(board, layout, _first_of_each(tree, told["missing"]), progress)
+        _send_blobs(board, layout, [by_hash[sha256] for sha256 in told["missing"]], progress)
     raise MachineFailure(
         FailureKind.DATA,
         f"{tree.label}: files that were sent are not there ({len(told['missing'])} missing)",
@@ -174,13 +193,8 @@ def send_tree(board: Board, layout: Layout, tree: Tree, progress: Progress = no_
     )
 
 
-def _first_of_each(tree: Tree, wanted: Sequence[str]) -> list[TreeFile]:
-    by_hash = {file.sha256: file for file in reversed(tree.files)}
-    return [by_hash[sha256] for sha256 in wanted]
-
-
 def _send_blobs(
-    board: Board, layout: Layout, files: Sequence[TreeFile], progress: Progress
+    board: Helper, layout: Layout, files: Sequence[TreeFile], progress: Progress
 ) -> None:
     whole_bytes = sum(file.size_bytes for file in files)
     sent_bytes = 0
@@ -223,9 +237,15 @@ def _distribution_files() -> Iterator[TreeFile]:
     yield _file(f"{folder}/entry_points.txt", entries.encode(), FILE_MODE)
 
 
-def _read(path: Path, name: str) -> TreeFile:
+def read_tree_file(path: Path, name: str) -> TreeFile:
+    """
+    Return a file of this computer as *name* of a tree.
+
+    Raises:
+        InputError: It cannot be read.
+    """
     try:
-        content = path.read_bytes()
+        content = read_regular_file(path, bytes_max=TREE_BYTES_MAX)
         is_program = bool(path.stat().st_mode & stat.S_IXUSR)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
@@ -242,14 +262,23 @@ def _file(name: str, content: bytes, mode: int, source: Path | None = None) -> T
     )
 
 
+def entries_in(folder: Path) -> list[os.DirEntry[str]]:
+    """
+    Return what lies in a folder, by name.
+
+    Raises:
+        InputError: It cannot be read.
+    """
+    try:
+        return sorted(os.scandir(folder), key=lambda entry: entry.name)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read: {error.strerror or error}") from error
+
+
 def _walk(folder: Path, top: Path, above: tuple[Path, ...] = ()) -> Iterator[tuple[Path, str]]:
     """Yield the files of a folder that belong to a tree, each with its path within *top*."""
     above = (*above, folder.resolve())
-    try:
-        entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be read: {error.strerror or error}") from error
-    for entry in entries:
+    for entry in entries_in(folder):
         path = folder / entry.name
         if entry.name.startswith(".") or entry.name.endswith(CACHE_SUFFIXES):
             continue
@@ -258,11 +287,11 @@ def _walk(folder: Path, top: Path, above: tuple[Path, ...] = ()) -> Iterator[tup
         if entry.is_symlink():
             _refuse_outside(path, top)
         if entry.is_dir():
-            is_loop = path.resolve() in above
-            if not is_loop and not _is_left_out(path):
+            if path.resolve() not in above and not _is_left_out(path):
                 yield from _walk(path, top, above)
         elif entry.is_file():
-            if not _is_bundle(entry.name):
+            is_bundle = entry.name.endswith(BUNDLE_SUFFIX) and RUN_NAME.match(entry.name)
+            if not is_bundle:
                 yield path, path.relative_to(top).as_posix()
         elif entry.is_symlink():
             raise InputError(f"{path}: a link that leads nowhere; remove it")
@@ -272,10 +301,6 @@ def _is_left_out(path: Path) -> bool:
     """Tell whether a folder is a cache, a virtual environment or a run."""
     is_run = RUN_NAME.match(path.name) is not None and (path / "plan.json").exists()
     return is_run or path.name in CACHE_FOLDERS or (path / "pyvenv.cfg").exists()
-
-
-def _is_bundle(name: str) -> bool:
-    return name.endswith(BUNDLE_SUFFIX) and RUN_NAME.match(name) is not None
 
 
 def _refuse_outside(path: Path, top: Path) -> None:

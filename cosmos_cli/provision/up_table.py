@@ -1,72 +1,90 @@
-"""What `cosmos up` prints: the plan, differences, a line a machine, the verdict, and the same as JSON. Pure."""
+"""Output of `cosmos up`: the plan, differences, one line per machine, the verdict, and the same as JSON. Pure."""
 
 from __future__ import annotations
 
+import dataclasses
+import difflib
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
 
-from cosmos_cli.console import Column
 from cosmos_cli.fleet.failure import MachineFailure
-from cosmos_cli.fleet.names import compact
-from cosmos_cli.provision.brought import Brought
-from cosmos_cli.provision.step import Change, Step
+from cosmos_cli.fleet.outcome import Outcome
+from cosmos_cli.ui.console import Column
+from cosmos_cli.ui.name_ranges import compact, names_by
+
+if TYPE_CHECKING:  # what plans is imported while machines are logged in at
+    from cosmos_cli.models.machine_facts import MachineFacts
+    from cosmos_cli.provision.step import Change, Done, Step
 
 COLUMNS = (Column("machine"), Column("board"), Column("result"))
 FAILURE_CHARACTERS_MAX = 600
 """Of a failure in the table; --json has all of it."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class MachineResult:
-    """One machine's line."""
+    """Result of one machine; filled while it is worked on, so that a failure hides nothing."""
 
     machine: str
-    brought: Brought
+    facts: MachineFacts | None = None
+    planned: tuple[Step, ...] = ()
+    done: Sequence[Done] = ()
+    notes: list[str] = field(default_factory=list)
+    failure: MachineFailure | None = None
+    is_local: bool = False
     duration_s: float = 0.0
 
     @property
-    def failure(self) -> MachineFailure | None:
-        """Why it failed; None if it did not."""
-        return self.brought.failure
+    def changed_count(self) -> int:
+        """Number of steps that changed something, or would."""
+        return sum(done.changed for done in self.done)
 
     @property
     def status(self) -> Literal["ok", "changed", "failed"]:
-        """What became of it."""
+        """Status of the machine."""
         if self.failure is not None:
             return "failed"
-        return "changed" if self.brought.changed_count else "ok"
+        return "changed" if self.changed_count else "ok"
 
     def row(self, *, is_check: bool) -> tuple[str, str, str]:
         """Return its line of the table."""
-        facts = self.brought.facts
-        board = "" if facts is None else facts.board.model or facts.board.machine
-        return self.machine, board, self._words(is_check=is_check)
+        board = "" if self.facts is None else self.facts.board.model or self.facts.board.machine
+        return self.machine, board, self.words(is_check=is_check)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for --json."""
-        brought = self.brought
         return {
             "machine": self.machine,
             "status": self.status,
-            "local": brought.is_local,
-            "steps": [done.to_mapping() for done in brought.done],
-            "facts": brought.facts.to_mapping() if brought.facts else {},
-            "notes": list(brought.notes),
+            "local": self.is_local,
+            "steps": [done.to_mapping() for done in self.done],
+            "facts": self.facts.to_mapping() if self.facts else {},
+            "notes": list(self.notes),
             "failure": self.failure.to_mapping() if self.failure else None,
             "duration_s": round(self.duration_s, 3),
         }
 
-    def _words(self, *, is_check: bool) -> str:
-        count = self.brought.changed_count
+    def words(self, *, is_check: bool) -> str:
+        """Return what became of it in one line."""
+        count = self.changed_count
         if self.failure is not None:
             done = f" after {count} {'change' if count == 1 else 'changes'}" if count else ""
             return f"failed{done}: {_one_line(str(self.failure))}"
-        if self.brought.is_local:
+        if self.is_local:
             return "ok (local: nothing is installed on this computer)"
         if not count:
             return "ok"
         return f"would change ({count})" if is_check else f"changed ({count})"
+
+
+def result_of(outcome: Outcome[MachineResult | None]) -> MachineResult:
+    """Return what became of one machine; this computer, which is left alone, has no value."""
+    result = outcome.value or MachineResult(
+        machine=outcome.machine, failure=outcome.failure, is_local=outcome.failure is None
+    )
+    return dataclasses.replace(result, duration_s=outcome.duration_s)
 
 
 def _one_line(text: str) -> str:
@@ -78,9 +96,7 @@ def _one_line(text: str) -> str:
 
 def verdict(results: Sequence[MachineResult], *, is_check: bool, duration_s: float) -> str:
     """Return the last line, such as "24 machines: 0 changed, 24 ok, 0 failed in 1.2 s"."""
-    counts = {status: 0 for status in ("changed", "ok", "failed")}
-    for result in results:
-        counts[result.status] += 1
+    counts = Counter(result.status for result in results)
     machines = "1 machine" if len(results) == 1 else f"{len(results)} machines"
     changed = "would change" if is_check else "changed"
     return (
@@ -101,13 +117,13 @@ def document(results: Sequence[MachineResult], *, is_check: bool) -> dict[str, A
 
 def plan_lines(results: Sequence[MachineResult], *, has_diffs: bool) -> Iterator[str]:
     """Yield the plans, machines with the same one together, with what changes in files if asked for."""
-    groups: dict[tuple[str, ...], list[MachineResult]] = {}
-    for result in results:
-        if result.brought.planned:
-            lines = tuple(_step_lines(result.brought.planned, has_diffs=has_diffs))
-            groups.setdefault(lines, []).append(result)
-    for lines, members in groups.items():
-        yield f"{compact(member.machine for member in members)}:"
+    groups = names_by(
+        (tuple(_step_lines(result.planned, has_diffs=has_diffs)), result.machine)
+        for result in results
+        if result.planned
+    )
+    for lines, machines in groups.items():
+        yield f"{compact(machines)}:"
         yield from lines
 
 
@@ -120,8 +136,6 @@ def _step_lines(steps: Sequence[Step], *, has_diffs: bool) -> Iterator[str]:
 
 def diff_lines(change: Change) -> Iterator[str]:
     """Yield what changes in a file, as `diff -u` would."""
-    import difflib
-
     before, after = _shown(change.before), _shown(change.after)
     if "\0" in before or "\0" in after:
         yield "a content that is no text"
@@ -141,9 +155,6 @@ def _shown(text: str | None) -> str:
 
 def note_lines(results: Sequence[MachineResult]) -> Iterator[str]:
     """Yield each note once, with the machines that it is about."""
-    about: dict[str, list[str]] = {}
-    for result in results:
-        for note in result.brought.notes:
-            about.setdefault(note, []).append(result.machine)
+    about = names_by((note, result.machine) for result in results for note in result.notes)
     for note, machines in about.items():
         yield f"{compact(machines)}: {note}"

@@ -1,5 +1,7 @@
 """
-Progress of `cosmos up`: one live line a machine on a terminal, a plain line a step elsewhere.
+Progress of `cosmos up`: one live line per machine on a terminal, one plain line per machine elsewhere.
+
+The plain line comes when the machine is done; now and then another tells who is still at work.
 
 The pool's threads tell; whoever tells draws, at most a few times a second. Nothing is drawn, and Rich is
 not imported, for what is over in a moment: the second `up` of an unchanged tower.
@@ -13,11 +15,19 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from cosmos_cli.console import Console, is_terminal
+from cosmos_cli.ui.console import Console, is_terminal
+from cosmos_cli.ui.foreign_text import clean_line
+from cosmos_cli.ui.name_ranges import compact, names_by
+from cosmos_cli.ui.plural import counted
+from cosmos_cli.ui.step_times import is_on
 
 QUIET_S = 1.0
 REDRAW_INTERVAL_S = 0.2
 TEXT_CHARACTERS_MAX = 100
+STILL_INTERVAL_S = 15.0
+"""Between lines about who is still at work, where nobody looks at a terminal."""
+STILL_SHOWN_MAX = 4
+"""Of the things that machines are at, in such a line."""
 
 
 class MachineTeller:
@@ -37,7 +47,7 @@ class MachineTeller:
     def step(self, title: str) -> None:
         """Say that a step begins."""
         self._step = title
-        self._view.tell(self._machine, title, is_step=True)
+        self._view.tell(self._machine, title)
 
     def detail(self, text: str) -> None:
         """Say how far it is."""
@@ -62,10 +72,12 @@ class UpView:
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._console = console
-        self._is_live = not console.quiet and is_terminal(sys.stderr)
+        self._is_live = not (console.quiet or is_on()) and is_terminal(sys.stderr)
         self._now_s = now_s
         self._start_s = self._drawn_s = now_s()
-        self._lines = dict.fromkeys(machines, "waiting")
+        self._lines = dict.fromkeys(machines, "waiting for its answer")
+        self._done: set[str] = set()
+        self._said_s = self._start_s
         self._lock = threading.Lock()
         self._live: Any = None
 
@@ -73,18 +85,37 @@ class UpView:
         """Return who tells of one machine."""
         return MachineTeller(self, machine)
 
-    def tell(self, machine: str, text: str, *, is_step: bool = False) -> None:
+    def tell(self, machine: str, text: str) -> None:
         """Show what is done on a machine; for any thread."""
         with self._lock:
-            self._lines[machine] = text[:TEXT_CHARACTERS_MAX]
+            self._lines[machine] = clean_line(text, length_max=TEXT_CHARACTERS_MAX)
             if self._is_live:
                 self._draw_if_due()
-            elif is_step:
+
+    def done(self, machine: str, text: str) -> None:
+        """Show what became of a machine; a failure is told when it happens, not in the table at the end."""
+        with self._lock:
+            self._done.add(machine)
+            self._lines[machine] = clean_line(text, length_max=TEXT_CHARACTERS_MAX)
+            if self._is_live:
+                self._draw_if_due()
+            else:
                 self._console.say(f"{machine}: {text}")
 
-    def done(self, machine: str) -> None:
-        """Show that a machine is done with; the table will tell how."""
-        self.tell(machine, "done")
+    def say(self, text: str) -> None:
+        """Say what is done on this computer, above what is shown of machines."""
+        with self._lock:
+            (self._live or self._console).say(text)
+
+    def look(self) -> None:
+        """Say elsewhere than on a terminal who is still at work, when nothing has been said of it for long."""
+        with self._lock:
+            now_s = self._now_s()
+            if self._is_live or now_s - self._said_s < STILL_INTERVAL_S:
+                return
+            self._said_s = now_s
+            if still := _still(self._lines, self._done):
+                self._console.say(f"after {now_s - self._start_s:.0f} s: {still}")
 
     def close(self) -> None:
         """Give the terminal back; what was shown goes, for the table follows."""
@@ -106,30 +137,15 @@ class UpView:
             return
         self._drawn_s = now_s
         if self._live is None:
-            self._live = _start_live()
-        self._live.update(_picture(self._lines), refresh=True)
+            from cosmos_cli.ui.rich_console import LiveRows  # a tenth of a second to import
+
+            self._live = LiveRows()
+        self._live.show(self._lines)
 
 
-def _start_live() -> Any:
-    from rich.console import Console as RichConsole
-    from rich.live import Live
-
-    live = Live(
-        console=RichConsole(stderr=True),
-        auto_refresh=False,
-        transient=True,
-        redirect_stdout=False,
-        redirect_stderr=False,
-    )
-    live.start()
-    return live
-
-
-def _picture(lines: dict[str, str]) -> Any:
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table.grid(padding=(0, 2))
-    for machine, text in lines.items():
-        table.add_row(Text(machine, "bold"), Text(text, no_wrap=True, overflow="ellipsis"))
-    return table
+def _still(lines: dict[str, str], done: set[str]) -> str:
+    """Return who is at what, machines at the same thing together."""
+    at = names_by((text, machine) for machine, text in lines.items() if machine not in done)
+    shown = [f"{compact(names)}: {text}" for text, names in list(at.items())[:STILL_SHOWN_MAX]]
+    rest = sum(len(names) for names in list(at.values())[STILL_SHOWN_MAX:])
+    return "; ".join([*shown, *([f"{counted(rest, 'machine')} more at work"] if rest else [])])

@@ -11,18 +11,23 @@ not used for a long time goes when something new comes (`cosmos_cli.provision.wh
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import importlib.metadata
 import json
 import os
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+from packaging.requirements import InvalidRequirement, Requirement
+from packaging.version import Version
 
 from cosmos_cli.cache import cache_folder
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.models.device_needs import NO_NEEDS, MachineNeeds
+from cosmos_cli.models.inventory import Variables
 from cosmos_cli.provision import resolver
 from cosmos_cli.provision.lock import (
     DISTRIBUTION_PACKAGES,
@@ -35,16 +40,20 @@ from cosmos_cli.provision.lock import (
     normal_name,
     with_specifiers,
 )
-from cosmos_cli.provision.platform import Platform
+from cosmos_cli.provision.platform import Platform, greeted_platform, wheel_rank
 from cosmos_cli.provision.trees import DISTRIBUTION, Progress, no_progress
 from cosmos_cli.provision.wheels import (
     fetch,
+    is_own_wheel,
     lacking,
+    own_wheel,
     remove_unused,
     requirements_of,
     wheel_path,
 )
-from cosmos_cli.rundir import write_atomically
+from cosmos_cli.system.file_lock import LockHeld, locked
+from cosmos_cli.system.ownership import read_own_file
+from madns_runtime.partial_file import write_whole
 
 SCHEMA = 1
 """Of what is remembered; what another one wrote is resolved anew."""
@@ -52,8 +61,8 @@ TRUTH_EXTRA = "truth"
 SYSTEM_PREFIX = "python3-"
 FAILURE_KEPT_S = 30.0
 """Other machines of a kind need not wait for the same answer; a later command asks anew."""
+LOCK_BYTES_MAX = 16 * 1024 * 1024
 LOCK_TIMEOUT_S = 3600.0
-LOCK_POLL_S = 0.05
 
 _failures: dict[str, tuple[float, MachineFailure]] = {}
 
@@ -122,48 +131,92 @@ def prepare(
     Raises:
         MachineFailure: A requirement has no wheel for such a machine, or the index cannot be reached.
     """
-    need, cache = (
-        _need(platform, requirements, is_host=is_host, sees_system=sees_system),
-        cache_folder(),
-    )
+    need = EnvironmentNeed.of(platform, requirements, is_host=is_host, sees_system=sees_system)
+    return prepare_needed(need, progress)
+
+
+def prepare_needed(need: EnvironmentNeed, progress: Progress = no_progress) -> Environment:
+    """Return what is needed, its wheels downloaded; see `prepare`."""
+    cache = cache_folder()
     path = need.path(cache)
     content = _read_lock(path)
     if content is None or lacking(content.wheels, cache / "wheels"):
         with _locked(path.with_suffix(".lock")):
             content = _read_lock(path) or _make_lock(path, need, cache, progress)
             chosen = [Chosen(locked=wheel) for wheel in content.wheels]
-            fetch(chosen, cache / "wheels", platform, progress)
+            fetch(chosen, cache / "wheels", need.platform, progress)
     return Environment(content=content, wheels=cache / "wheels")
 
 
-def environment_key(
-    platform: Platform,
-    requirements: Sequence[str],
-    *,
-    is_host: bool = False,
-    sees_system: bool = False,
-) -> str:
+def environment_key(need: EnvironmentNeed) -> str:
     """
     Return the key of an environment; its wheels may be gone from the cache, as machines have them.
 
     Raises:
         MachineFailure: As `prepare`, for one that was never prepared here.
     """
-    need = _need(platform, requirements, is_host=is_host, sees_system=sees_system)
     content = _read_lock(need.path(cache_folder()))
-    if content is None:
-        return prepare(platform, requirements, is_host=is_host, sees_system=sees_system).key
-    return content.key
+    return prepare_needed(need).key if content is None else content.key
+
+
+def remembered_key(need: EnvironmentNeed) -> str | None:
+    """Return the key of an environment; None for one that was never prepared here. Asks nobody."""
+    content = _read_lock(need.path(cache_folder()))
+    return None if content is None else content.key
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Need:
-    """What is asked for."""
+class EnvironmentNeed:
+    """Needs of an environment."""
 
     platform: Platform
     requirements: tuple[str, ...]
     is_host: bool
     sees_system: bool
+
+    @classmethod
+    def of(
+        cls,
+        platform: Platform,
+        requirements: Sequence[str],
+        *,
+        is_host: bool = False,
+        sees_system: bool = False,
+    ) -> EnvironmentNeed:
+        """Return a need; requirements in any order, however often each is named."""
+        return cls(
+            platform=platform,
+            requirements=tuple(sorted({text.strip() for text in requirements})),
+            is_host=is_host,
+            sees_system=sees_system,
+        )
+
+    @classmethod
+    def of_machine(
+        cls,
+        greeting: Mapping[str, Any],
+        variables: Variables,
+        requirements: Sequence[str],
+        *,
+        is_host: bool,
+        needs: MachineNeeds = NO_NEEDS,
+    ) -> EnvironmentNeed:
+        """
+        Return the need of a machine.
+
+        Args:
+            greeting: First words of its helper.
+            variables: The machine's, of the inventory.
+            requirements: Of the scenario, beside the machine's own.
+            is_host: Whether the host's half runs there.
+            needs: Of its devices.
+        """
+        return cls.of(
+            greeted_platform(greeting),
+            (*(variables.cosmos_requirements or ()), *requirements, *needs.requirements),
+            is_host=is_host,
+            sees_system=needs.sees_system or sees_system_packages(variables.cosmos_packages or ()),
+        )
 
     def path(self, cache: Path) -> Path:
         """Return where the answer is remembered."""
@@ -181,30 +234,13 @@ class _Need:
 
     def runtime_requirements(self) -> tuple[str, ...]:
         """Return what the installed distribution says that the runtime needs on such a machine."""
-        from packaging.requirements import Requirement
-
-        environment = self.platform.marker_environment()
-        environment["extra"] = TRUTH_EXTRA if self.is_host else ""
-        needed = []
-        for text in importlib.metadata.requires(DISTRIBUTION) or ():
-            requirement = Requirement(text)
-            if requirement.marker is None or requirement.marker.evaluate(environment):
-                needed.append(f"{requirement.name}{requirement.specifier}")
-        return tuple(sorted(needed))
+        extra = TRUTH_EXTRA if self.is_host else ""
+        known = map(Requirement, importlib.metadata.requires(DISTRIBUTION) or ())
+        needed = [each for each in known if self.platform.needs(each, extra=extra)]
+        return tuple(sorted(f"{each.name}{each.specifier}" for each in needed))
 
 
-def _need(
-    platform: Platform, requirements: Sequence[str], *, is_host: bool, sees_system: bool
-) -> _Need:
-    return _Need(
-        platform=platform,
-        requirements=tuple(sorted({text.strip() for text in requirements})),
-        is_host=is_host,
-        sees_system=sees_system,
-    )
-
-
-def _make_lock(path: Path, need: _Need, cache: Path, progress: Progress) -> Lock:
+def _make_lock(path: Path, need: EnvironmentNeed, cache: Path, progress: Progress) -> Lock:
     failed_s, failure = _failures.get(str(path), (0.0, None))
     if failure is not None and time.monotonic() - failed_s < FAILURE_KEPT_S:
         raise failure
@@ -213,20 +249,24 @@ def _make_lock(path: Path, need: _Need, cache: Path, progress: Progress) -> Lock
     except MachineFailure as error:
         _failures[str(path)] = (time.monotonic(), error)
         raise
-    write_atomically(path, json.dumps(content.to_mapping(), indent=1).encode())
+    write_whole(path, json.dumps(content.to_mapping(), indent=1).encode())
     remove_unused(cache, now_s=time.clock_gettime(time.CLOCK_REALTIME))
     return content
 
 
-def _resolve(need: _Need, cache: Path, progress: Progress) -> Lock:
+def _resolve(need: EnvironmentNeed, cache: Path, progress: Progress) -> Lock:
     platform = need.platform
-    _check(need.requirements)
-    everything = [*need.runtime_requirements(), *need.requirements]
+    own = [own_wheel(text) for text in need.requirements if is_own_wheel(text)]
+    indexed = tuple(text for text in need.requirements if not is_own_wheel(text))
+    _check(indexed)
+    _expect_fitting([locked for locked, _ in own], platform)
+    everything = [*need.runtime_requirements(), *indexed, *_requirements_of_own(own, platform)]
     progress(f"resolving {len(everything)} requirements for {platform.label}", 0.0)
     chosen, missing = choose(resolver.resolve(everything, platform), platform)
     distributed = _distributed(missing, platform)
     _refuse_ancient(need, {candidate.name for candidate in missing})
-    wheels = fetch(chosen, cache / "wheels", platform, progress)
+    fetched = fetch(chosen, cache / "wheels", platform, progress)
+    wheels = (*fetched, *(locked for locked, _ in own))
     for wheel in wheels:
         everything += requirements_of(wheel_path(cache / "wheels", wheel))
     return Lock(
@@ -237,9 +277,28 @@ def _resolve(need: _Need, cache: Path, progress: Progress) -> Lock:
     )
 
 
-def _check(requirements: Sequence[str]) -> None:
-    from packaging.requirements import InvalidRequirement, Requirement
+def _expect_fitting(own: Sequence[Locked], platform: Platform) -> None:
+    for wheel in own:
+        if wheel_rank(wheel.filename, platform) is None:
+            raise MachineFailure(
+                FailureKind.UNSUPPORTED,
+                f"{wheel.filename} is no wheel for {platform.label}",
+                "name one that is, or its sources if they are of Python alone",
+            )
 
+
+def _requirements_of_own(own: Sequence[tuple[Locked, Path]], platform: Platform) -> list[str]:
+    """Return what distributions of one's own need of an index: what they need of each other is there."""
+    known = {DISTRIBUTION, *(locked.name for locked, _ in own)}
+    found = []
+    for text in (text for _, path in own for text in requirements_of(path)):
+        requirement = Requirement(text)
+        if platform.needs(requirement) and normal_name(requirement.name) not in known:
+            found.append(text)
+    return found
+
+
+def _check(requirements: Sequence[str]) -> None:
     for text in requirements:
         try:
             requirement = Requirement(text)
@@ -270,22 +329,19 @@ def _distributed(missing: Sequence[Candidate], platform: Platform) -> tuple[Dist
     return tuple(found)
 
 
-def _refuse_ancient(need: _Need, missing: set[str]) -> None:
+def _refuse_ancient(need: EnvironmentNeed, missing: set[str]) -> None:
     """
     Refuse a version that is taken only because newer ones have no wheel for the machine.
 
     Resolvers go back in time silently: for Python 3.13 they find lgpio of 2020. Who wants that says so.
     """
-    from packaging.requirements import Requirement
-    from packaging.version import Version
-
     platform = need.platform
     for requirement in map(Requirement, need.requirements):
+        if requirement.url is not None:  # a wheel of one's own: nobody has a newer one
+            continue
         name, specifier = requirement.name, str(requirement.specifier)
-        marker = requirement.marker
         is_pinned = any(each.operator in ("==", "===") for each in requirement.specifier)
-        is_elsewhere = marker is not None and not marker.evaluate(platform.marker_environment())
-        if is_pinned or is_elsewhere or normal_name(name) in missing:
+        if is_pinned or not platform.needs(requirement) or normal_name(name) in missing:
             continue
         newest = resolver.newest_version(name, specifier, platform, with_wheel=False)
         usable = resolver.newest_version(name, specifier, platform, with_wheel=True)
@@ -297,7 +353,7 @@ def _refuse_ancient(need: _Need, missing: set[str]) -> None:
 def _read_lock(path: Path) -> Lock | None:
     """Return what is remembered, which then counts as used now; None if nothing is."""
     try:
-        content = Lock.from_mapping(json.loads(path.read_bytes()))
+        content = Lock.from_mapping(json.loads(read_own_file(path, bytes_max=LOCK_BYTES_MAX)))
     except (OSError, ValueError, KeyError, TypeError):
         return None
     with contextlib.suppress(OSError):
@@ -309,18 +365,12 @@ def _read_lock(path: Path) -> Lock | None:
 def _locked(path: Path) -> Iterator[None]:
     """Hold a lock between threads and processes; the kernel drops it when its holder dies."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    until_s = time.monotonic() + LOCK_TIMEOUT_S
-    with path.open("wb") as file:
-        while True:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if time.monotonic() > until_s:
-                    raise MachineFailure(
-                        FailureKind.BUSY,
-                        f"another command on this computer holds {path}",
-                        "wait for its end, then repeat",
-                    ) from None
-                time.sleep(LOCK_POLL_S)
-        yield
+    try:
+        with locked(path, timeout_s=LOCK_TIMEOUT_S):
+            yield
+    except LockHeld as held:
+        raise MachineFailure(
+            FailureKind.BUSY,
+            f"another command on this computer holds {path}: {held}",
+            "wait for its end, then repeat",
+        ) from None

@@ -1,4 +1,12 @@
-"""The cache of wheels on this computer: each in a folder named after its hash, shared by runs and processes."""
+"""
+The cache of wheels on this computer: each in a folder named after its hash, shared by runs and processes.
+
+    <cache>/wheels/<sha256>/<wheel>      those of the index, and of one's own
+    <cache>/built/<tree hash>            which wheel was built of a folder: built once, until a file of it changes
+
+A scenario names distributions of one's own by path: a wheel file, or a folder that a wheel is built of. Such a
+requirement is written `name @ file:///...` from here on.
+"""
 
 from __future__ import annotations
 
@@ -8,23 +16,37 @@ import hashlib
 import json
 import os
 import shutil
+import subprocess
 import tempfile
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from email.parser import HeaderParser
 from pathlib import Path
+from urllib.parse import unquote, urlsplit
 
+from cosmos_cli.cache import cache_folder
+from cosmos_cli.errors import InputError
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.models.text_forms import is_own_requirement
 from cosmos_cli.provision import resolver
-from cosmos_cli.provision.lock import Chosen, Locked
+from cosmos_cli.provision.lock import Chosen, Locked, normal_name
 from cosmos_cli.provision.platform import Platform
-from cosmos_cli.provision.trees import Progress
+from cosmos_cli.provision.trees import Progress, folder_tree
+from cosmos_cli.system.bounded_process import run_bounded
+from cosmos_cli.ui.step_times import HERE, timed
+from madns_runtime.bounded_files import read_regular_file
+from madns_runtime.partial_file import write_whole
 
 UNUSED_S_MAX = 90 * 86_400.0
-"""What nobody has asked for in so long is not kept."""
+"""Age at which a wheel that nobody asks for is deleted."""
 MAKING_S_MAX = 86_400.0
-"""What belongs to nothing may be younger: somebody is just downloading it."""
+"""Age below which a file that belongs to nothing stays: somebody is just downloading it."""
+WHEEL_BYTES_MAX = 256 * 1024 * 1024
+BUILD_TIMEOUT_S = 600.0
+LAST_LINES = 8
+NOTE_BYTES_MAX = 4096
+SCHEME = "file://"
 
 
 def wheel_path(folder: Path, locked: Locked) -> Path:
@@ -34,15 +56,7 @@ def wheel_path(folder: Path, locked: Locked) -> Path:
 
 def lacking(wheels: Sequence[Locked], folder: Path) -> list[Locked]:
     """Return the wheels that are not there, or not of their size."""
-    found = []
-    for wheel in wheels:
-        try:
-            size_bytes = wheel_path(folder, wheel).stat().st_size
-        except FileNotFoundError:
-            size_bytes = -1
-        if size_bytes < 0 or wheel.size_bytes not in (0, size_bytes):
-            found.append(wheel)
-    return found
+    return [wheel for wheel in wheels if not _is_there(wheel_path(folder, wheel), wheel)]
 
 
 def fetch(
@@ -54,8 +68,7 @@ def fetch(
     Raises:
         MachineFailure: The index cannot be reached, or gives something else.
     """
-    gone = lacking([each.locked for each in chosen], folder)
-    wanted = [each for each in chosen if each.locked in gone]
+    wanted = [each for each in chosen if lacking([each.locked], folder)]
     if wanted:
         progress(f"downloading {len(wanted)} wheels for {platform.label}", 0.5)
         folder.mkdir(parents=True, exist_ok=True)
@@ -96,6 +109,41 @@ def requirements_of(path: Path) -> list[str]:
     return []
 
 
+def with_own_wheels(
+    requirements: Sequence[str], folder: Path, say: Callable[[str], None] = lambda text: None
+) -> tuple[str, ...]:
+    """
+    Return requirements in which every path has become the wheel that stands for it, in the cache.
+
+    Args:
+        requirements: Of a scenario.
+        folder: Its folder, from which paths are found.
+        say: Told what is built, before it is: that may take long.
+
+    Raises:
+        InputError: There is no such thing, it is no wheel, or none can be built of it.
+    """
+    return tuple(
+        _wheel_of(folder / text, text, say) if is_own_requirement(text) else text
+        for text in requirements
+    )
+
+
+def is_own_wheel(requirement: str) -> bool:
+    """Tell whether a requirement is one that `with_own_wheels` has written."""
+    return f" @ {SCHEME}" in requirement
+
+
+def own_wheel(requirement: str) -> tuple[Locked, Path]:
+    """Return the wheel that a requirement of `with_own_wheels` means, and where it is."""
+    path = Path(unquote(urlsplit(requirement.partition(" @ ")[2]).path))
+    name, version = path.name.split("-")[:2]
+    locked = Locked(
+        name=normal_name(name), version=version, sha256=path.parent.name, filename=path.name
+    )
+    return _sized(locked, path), path
+
+
 def remove_unused(cache: Path, *, now_s: float) -> None:
     """
     Remove what was not used for UNUSED_S_MAX, the wheels that nothing else needs, and what was left half made.
@@ -116,6 +164,14 @@ def remove_unused(cache: Path, *, now_s: float) -> None:
         with contextlib.suppress(OSError):
             if path.name not in needed and now_s - path.stat().st_mtime > MAKING_S_MAX:
                 shutil.rmtree(path)
+
+
+def _is_there(path: Path, locked: Locked) -> bool:
+    try:
+        size_bytes = path.stat().st_size
+    except FileNotFoundError:
+        return False
+    return locked.size_bytes in (0, size_bytes)
 
 
 def _keep(downloaded: Path, locked: Locked, folder: Path) -> None:
@@ -147,3 +203,77 @@ def _sized(locked: Locked, path: Path) -> Locked:
 def _has_hash(path: Path, sha256: str, _changed_ns: int) -> bool:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest() == sha256
+
+
+def _wheel_of(path: Path, text: str, say: Callable[[str], None]) -> str:
+    path = path.resolve()
+    kept = _kept_of_folder(path, text, say) if path.is_dir() else _keep_own(path, text)
+    name = kept.name.split("-")[0].replace("_", "-")
+    return f"{name} @ {kept.as_uri()}"
+
+
+def _kept_of_folder(folder: Path, text: str, say: Callable[[str], None]) -> Path:
+    tree = folder_tree(f"requirement {text}", folder)
+    note = cache_folder() / "built" / tree.hash
+    try:
+        kept = Path(read_regular_file(note, bytes_max=NOTE_BYTES_MAX).decode())
+        if kept.is_file():
+            return kept
+    except OSError:
+        pass  # never built, or forgotten
+    with tempfile.TemporaryDirectory(prefix="cosmos-build-") as private:
+        # What a build leaves beside its sources must not make another tree of them.
+        source, made = Path(private, "source"), Path(private, "made")
+        for file in tree.files:
+            target = source / file.path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(file.read())
+        say(f"building a wheel of {text}")
+        with timed(HERE, f"build a wheel of {text}"):
+            wheel = _built(source, made, text)
+        kept = _keep_own(wheel, text)
+    note.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(note, str(kept).encode())
+    return kept
+
+
+def _built(source: Path, made: Path, text: str) -> Path:
+    command = [
+        *resolver.PIP,
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--wheel-dir",
+        str(made),
+        str(source),
+    ]
+    try:
+        done = run_bounded(command, timeout_s=BUILD_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        raise InputError(
+            f"requirements: {text}: no wheel was built within {BUILD_TIMEOUT_S:g} s; see what it waits for"
+            f" with: pip wheel --no-deps {text}, or build the wheel elsewhere and name its file instead"
+        ) from None
+    wheels = sorted(made.glob("*.whl"))
+    if done.returncode or len(wheels) != 1:
+        last = " | ".join(done.stderr.strip().splitlines()[-LAST_LINES:])
+        raise InputError(
+            f"requirements: {text}: no wheel can be built of it: {last or 'pip said nothing'};"
+            f" try: pip wheel --no-deps {text}"
+        )
+    return wheels[0]
+
+
+def _keep_own(path: Path, text: str) -> Path:
+    """Put a wheel beside those of the index, under its hash."""
+    try:
+        content = read_regular_file(path, bytes_max=WHEEL_BYTES_MAX)
+    except OSError as error:
+        raise InputError(f"requirements: {text}: {error.strerror or error}") from error
+    kept = cache_folder() / "wheels" / hashlib.sha256(content).hexdigest() / path.name
+    if not kept.is_file() or kept.stat().st_size != len(content):
+        if not zipfile.is_zipfile(path):
+            raise InputError(f"requirements: {text}: expected a wheel, got another kind of file")
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(kept, content)
+    return kept

@@ -1,1 +1,1 @@
-"""What a run recorded, as tables and figures."""
+"""The report of a run: tables and figures of its records, on a page and on the terminal."""

@@ -2,110 +2,203 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import PurePosixPath
 from typing import Any
 
-from cosmos_cli.expectation import mapping_at
-from cosmos_cli.report.control import as_document, read_control
-from cosmos_cli.report.figures import FIGURES, TEXT_STREAMS, Chapter, chapter_of
-from cosmos_cli.report.figures.slots import slot_blocks
-from cosmos_cli.report.model import Block, Heading, Remark, Section, TableBlock
-from cosmos_cli.report.source import Source
-from cosmos_cli.rundir import RunDirectory
-from cosmos_cli.statistics import tick_statistics
-from cosmos_cli.tables import TableReader, open_tables
+from cosmos_cli.evidence.completeness import mapping_at
+from cosmos_cli.evidence.datagrams import WORDS
+from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.simulation_calls import call_simulation
+from cosmos_cli.evidence.table_labels import run_labels
+from cosmos_cli.evidence.tables import no_tables, open_recorded_run
+from cosmos_cli.report.devices import device_sections, is_told_in_words
+from cosmos_cli.report.health import health_blocks, process_blocks
+from cosmos_cli.report.second_names import with_second_names
+from cosmos_cli.report.timing import clock_blocks, tick_blocks
+from madns_runtime.analysis import chapters
+from madns_runtime.analysis.chapters import Chapter
+from madns_runtime.analysis.lines import generic_blocks
+from madns_runtime.analysis.tables import RecordedRun, Tables
+from madns_runtime.analysis.values import Heading, ReportRemark, Section, TableBlock, headings
+from madns_runtime.errors import PluginError
+from madns_runtime.recording.records import CLOCK, HEALTH, PROCESS, TICKS
 
 SENTENCES_MAX = 60
-CONTROL = "Control"
 LEVELS_TOLD = ("critical", "error", "warning")
 NOT_MEASURED = "not measured"
-OF_MACHINES = ("machine_health", "host_health", "process", "clock")
+CORE_FIELDS = 3
+"""The first of each stream: later versions may record more, and earlier ones recorded less."""
+TIME_CHAPTERS = {"ticks": Chapter("Real time", tick_blocks, TICKS.fields[:CORE_FIELDS])}
+MACHINE_CHAPTERS = {
+    "machine_health": Chapter("State of health", health_blocks, HEALTH.fields[:CORE_FIELDS]),
+    "host_health": Chapter(
+        "State of health of the host", health_blocks, HEALTH.fields[:CORE_FIELDS]
+    ),
+    "process": Chapter("Processes", process_blocks, PROCESS.fields[:CORE_FIELDS]),
+    "clock": Chapter("Clock", clock_blocks, CLOCK.fields[:CORE_FIELDS]),
+}
+"""Chapters on machines and clocks, which come after those of the simulation."""
+TEXT_STREAMS = ("events", "log", "host_events", "host_log")
+"""Told in words, not drawn."""
 
 
-def open_source(run: RunDirectory, document: Mapping[str, Any]) -> Source:
-    """Open what a run's report is made from."""
-    config = run.read_config()
-    tables = open_tables(run.tables)
-    return Source(
-        document=document,
-        tables=tables,
-        tick_hz=config.agents.tick_hz if config else None,
-        ticks=tick_statistics(tables.get("ticks")),
-        control=read_control(tables, config),
-        unread=_unread(run, tables),
-    )
+def build_sections(run: RunDirectory, document: Mapping[str, Any]) -> list[Section]:
+    """
+    Return the report's sections: real time, the simulation's own, other streams, machines, words.
+
+    Args:
+        run: A gathered run.
+        document: run.json.
+    """
+    recorded = open_recorded_run(run, document)
+    own = _simulation_sections(recorded)
+    drawn = {name for section in own for name in section.tables}
+    before = chapters.build_sections(TIME_CHAPTERS, recorded)
+    after = chapters.build_sections(MACHINE_CHAPTERS, recorded)
+    drawn |= {name for section in (*before, *after) for name in section.tables}
+    others = {
+        name: Chapter(f"Stream {name}", generic_blocks)
+        for name in recorded.tables
+        if name not in drawn and name not in TEXT_STREAMS and not is_told_in_words(name)
+    }
+    unknown = chapters.build_sections(others, recorded)
+    drawn_sections = [s for s in (*before, *own, *unknown, *after) if s.blocks]
+    return [
+        *_gaps(run, recorded),
+        *with_second_names(drawn_sections, run_labels(run)),
+        *device_sections(document, recorded),
+        *_load_sections(document),
+        *_words(recorded.tables),
+    ]
 
 
-def _unread(run: RunDirectory, tables: Mapping[str, TableReader]) -> tuple[str, ...]:
+def with_simulation(
+    run: RunDirectory, document: Mapping[str, Any], warn: Callable[[str], None]
+) -> dict[str, Any]:
+    """Return run.json with what the run's simulation tells of it in numbers; *warn* hears why it could not."""
+    recorded = open_recorded_run(run, document)
+    if recorded.config is None:
+        return dict(document)
+    try:
+        _, told = call_simulation(recorded.config, "document", recorded)
+        if not isinstance(told, Mapping | None):
+            raise PluginError(f"document() must return a mapping, got {type(told).__name__}")
+    except PluginError as error:
+        warn(f"{recorded.config.simulation} tells nothing itself: {error}")
+        return dict(document)
+    return {**(told or {}), **document}
+
+
+def _simulation_sections(recorded: RecordedRun) -> list[Section]:
+    """Return the sections that a run's simulation makes of it; a remark if it could not."""
+    config = recorded.config
+    if config is None:
+        return []
+    try:
+        _, found = call_simulation(config, "figures", recorded)
+        if found is None:
+            return []
+        if not isinstance(found, list) or not all(isinstance(one, Section) for one in found):
+            raise PluginError("figures() must return madns_runtime.analysis.values.Section")
+    except PluginError as error:
+        return [
+            Section(
+                title="Figures of the simulation",
+                blocks=[
+                    ReportRemark(text=f"{config.simulation} drew no figures of its own: {error}")
+                ],
+            )
+        ]
+    return found
+
+
+def _gaps(run: RunDirectory, recorded: RecordedRun) -> list[Section]:
     listed = mapping_at(run.read_json(run.manifest_json) or {}, "files")
     paths = [PurePosixPath(name) for name in listed]
-    folder = run.tables.name
-    return tuple(str(path) for path in paths if path.parts[0] == folder and path.stem not in tables)
-
-
-def with_control(run: RunDirectory, document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return run.json, for a constellation under control with its slots over time."""
-    config = run.read_config()
-    control = as_document(read_control(open_tables(run.tables), config), config)
-    return {**document, **({} if control is None else {"control": control})}
-
-
-def build_sections(source: Source) -> list[Section]:
-    """Return the report's sections: known streams in the order of `FIGURES`, then others, then words."""
-    sections: dict[str, list[Block]] = {}
-    slots = slot_blocks(source.control)
-    for table, chapter in _chapters(source.tables):
-        # What flight software believes, and what it commanded, comes after what became of its slots.
-        first = slots if chapter.title == CONTROL else []
-        sections.setdefault(chapter.title, [*first]).extend(_build(table, chapter, source))
-    built = [Section(title=title, blocks=blocks) for title, blocks in sections.items() if blocks]
-    return [*_gaps(source), *built, *_words(source)]
-
-
-def _gaps(source: Source) -> list[Section]:
-    if not source.unread:
+    folder, tables = run.tables.name, recorded.tables
+    unread = [str(p) for p in paths if p.parts[0] == folder and p.stem not in tables]
+    unread += (f"{folder}/{name}" for name in no_tables(run.tables))
+    if not unread:
         return []
     text = (
-        f"{', '.join(source.unread)} cannot be read: what they hold is not shown;"
-        f" cosmos collect {source.document.get('run')} makes them anew."
+        f"{', '.join(dict.fromkeys(unread))} cannot be read: what they hold is not shown;"
+        f" cosmos collect {recorded.document.get('run')} makes anew what was recorded."
     )
-    return [Section(title="Tables that are missing", blocks=[Remark(text=text)])]
+    return [Section(title="Tables that are missing", blocks=[ReportRemark(text=text)])]
 
 
-def _chapters(tables: Mapping[str, TableReader]) -> Iterator[tuple[TableReader, Chapter]]:
-    order = [name for name in FIGURES if name in tables]
-    order += [name for name in tables if name not in FIGURES and name not in TEXT_STREAMS]
-    # What the simulation recorded comes before what the framework knows of machines and clocks.
-    for name in sorted(order, key=lambda name: name in OF_MACHINES):
-        yield tables[name], chapter_of(tables[name])
+def _load_sections(document: Mapping[str, Any]) -> list[Section]:
+    """Return the chapters of refused datagrams and of long calls; none where there was nothing of the kind."""
+    datagrams = list(_datagram_tables(mapping_at(document, "datagrams")))
+    calls = list(_call_tables(mapping_at(document, "host_calls")))
+    return [
+        Section(title=title, blocks=blocks)
+        for title, blocks in (("Datagrams refused", datagrams), ("Long calls of the host", calls))
+        if blocks
+    ]
 
 
-def _build(table: TableReader, chapter: Chapter, source: Source) -> list[Block]:
-    try:
-        return chapter.build(table, source)
-    except Exception as error:  # noqa: BLE001 - a figure of anybody's stream must not cost a run its report
-        text = f"The figures of {table.name} could not be drawn: {type(error).__name__}: {error}"
-        return [Remark(text=text)]
+def _datagram_tables(account: Mapping[str, Any]) -> Iterator[TableBlock]:
+    processes = {"host": mapping_at(account, "host"), **mapping_at(account, "agents")}
+    refusing = {name: entry for name, entry in processes.items() if entry and entry.get("refused")}
+    if not refusing:
+        return
+    seen = {reason for entry in refusing.values() for reason in mapping_at(entry, "by_reason")}
+    reasons = [reason for reason in WORDS if reason in seen] + sorted(seen - WORDS.keys())
+    yield TableBlock(
+        title="Datagrams refused, by process and reason",
+        headings=headings("process", "received", "refused", *(WORDS.get(r, r) for r in reasons)),
+        rows=[
+            [
+                name,
+                entry.get("received"),
+                entry.get("refused"),
+                *(mapping_at(entry, "by_reason").get(reason, 0) for reason in reasons),
+            ]
+            for name, entry in refusing.items()
+        ],
+        note="Each was counted and dropped; none of what it held was used.",
+    )
 
 
-def _words(source: Source) -> list[Section]:
-    rows = [row for name in ("host_log", "log") for row in _sentences(source, name)]
+def _call_tables(account: Mapping[str, Any]) -> Iterator[TableBlock]:
+    methods = mapping_at(account, "methods")
+    if not methods:
+        return
+    yield TableBlock(
+        title="Calls of the host's half that held its loop for long",
+        headings=(
+            Heading(text="method", is_number=False),
+            *(Heading(text=text) for text in ("long calls", "longest, s", "at t, s")),
+        ),
+        rows=[
+            [name, entry.get("long"), entry.get("longest_s"), entry.get("longest_t_s")]
+            for name in methods
+            if (entry := mapping_at(methods, name))
+        ],
+        note="While one of them went on, the host heard no agent and answered none.",
+    )
+
+
+def _words(tables: Tables) -> list[Section]:
+    rows = [row for name in ("host_log", "log") for row in _sentences(tables, name)]
     rows.sort(key=lambda row: str(row[0]))
     if not rows:
         return []
     note = f"The first {SENTENCES_MAX} of {len(rows)}." if len(rows) > SENTENCES_MAX else ""
-    headings = [
-        Heading(text=text, is_number=False) for text in ("UTC", "who", "level", "what was said")
-    ]
+    heads = ("UTC", "who", "level", "what was said")
     table = TableBlock(
-        title="Warnings and errors", headings=headings, rows=rows[:SENTENCES_MAX], note=note
+        title="Warnings and errors",
+        headings=[Heading(text=text, is_number=False) for text in heads],
+        rows=rows[:SENTENCES_MAX],
+        note=note,
     )
     return [Section(title="What was said", blocks=[table])]
 
 
-def _sentences(source: Source, name: str) -> Iterator[list[object]]:
-    table = source.tables.get(name)
+def _sentences(tables: Tables, name: str) -> Iterator[list[object]]:
+    table = tables.get(name)
     if table is None or not table.has("utc", "level", "text"):
         return
     for who, columns in table.each(("utc", "level", "text")):

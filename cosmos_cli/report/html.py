@@ -1,28 +1,53 @@
-"""The report of a run as one self-contained HTML file: no request leaves it."""
+"""
+The report of a run as one self-contained HTML file: no request leaves it.
+
+Every text of a run is foreign to the page (cleaned and escaped by the template's environment, and by `_figure_text`
+within figures): a check's name or a line of a log may hold markup, a template's placeholder, the end of a script or
+characters that turn text round.
+"""
 
 from __future__ import annotations
 
 import base64
+import functools
 import html
+import importlib.util
 from collections.abc import Iterator, Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import orjson
+from markupsafe import Markup
 from numpy.typing import NDArray
 
-from cosmos_cli.counted import counted
-from cosmos_cli.expectation import mapping_at
-from cosmos_cli.report.build import build_sections, figures_of, open_source
-from cosmos_cli.report.model import Figure, Remark, Section, TableBlock, format_cell
-from cosmos_cli.rundir import RunDirectory, write_atomically
+from cosmos_cli.evidence.completeness import mapping_at
+from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.report.build import build_sections, figures_of
+from cosmos_cli.report.cells import format_cell
+from cosmos_cli.report.plotly_figures import to_plotly
+from cosmos_cli.ui.foreign_text import clean_text
+from cosmos_cli.ui.plural import counted
+from madns_runtime.analysis.values import (
+    Block,
+    Figure,
+    ReportRemark,
+    Section,
+    SpaceFigure,
+    TableBlock,
+)
+from madns_runtime.errors import MissingExtraError
+from madns_runtime.partial_file import write_whole
+
+if TYPE_CHECKING:
+    import jinja2
 
 RESOLUTION = 1e-3
 """Numbers are drawn in 4 bytes each if that moves none by more than this share of the curve's height."""
 ROWS_OPEN_MAX = 26
-TEMPLATES = files("cosmos_cli.report") / "templates"
+"""A longer table starts folded."""
+_OWN_MARKUP = "<extra></extra>"
+"""The only markup that a figure's texts hold: it leaves out the second part of a label."""
 
 
 def write_report(run: RunDirectory, document: Mapping[str, Any], path: Path | None = None) -> Path:
@@ -38,41 +63,57 @@ def write_report(run: RunDirectory, document: Mapping[str, Any], path: Path | No
         OSError: The file cannot be written.
     """
     target = path or run.report_html
-    sections = build_sections(open_source(run, document))
-    write_atomically(target, render_page(document, sections).encode())
+    write_whole(target, render_page(document, build_sections(run, document)).encode())
     return target
 
 
 def render_page(document: Mapping[str, Any], sections: Sequence[Section]) -> str:
     """Return the whole page."""
-    page = _Page()
-    body = "\n".join([_head(document), *(page.section(section) for section in sections)])
-    values = {
-        "title": html.escape(str(document.get("run", "run"))),
-        "css": _template("page.css"),
-        "body": body + _foot(document),
-        "plotly": _plotly() if page.figures else "",
-        "figures": page.data(),
-        "script": _template("page.js"),
-    }
-    text = _template("page.html")
-    for name, value in values.items():
-        text = text.replace("{{" + name + "}}", value, 1)
-    return text
+    drawn = _Drawn()
+    told = [
+        {"title": s.title, "intro": s.intro, "blocks": [drawn.block(block) for block in s.blocks]}
+        for s in sections
+    ]
+    environment = _environment()
+    loader = environment.loader
+    assert loader is not None
+    css, script = (loader.get_source(environment, f"page.{kind}")[0] for kind in ("css", "js"))
+    return environment.get_template("page.html").render(
+        document=document,
+        facts=list(_facts(document)),
+        tiles=figures_of(document),
+        gaps=_gaps(document),
+        versions=mapping_at(document, "versions"),
+        sections=told,
+        rows_open_max=ROWS_OPEN_MAX,
+        css=Markup(css),
+        script=Markup(script),
+        plotly=Markup(_plotly()) if drawn.figures else "",
+        figures=Markup(drawn.data()),
+    )
 
 
-class _Page:
-    """Collects the figures' data while the body is written."""
+@functools.cache
+def _environment() -> jinja2.Environment:
+    import jinja2  # 0.04 s that only a page needs, at the end of a run
+
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("cosmos_cli.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=lambda value: value if isinstance(value, Markup) else clean_text(str(value)),
+    )
+    environment.filters |= {"cell": format_cell, "breakable": _breakable}
+    return environment
+
+
+class _Drawn:
+    """Collects the figures' data while the page's blocks are made."""
 
     def __init__(self) -> None:
         self.figures: list[dict[str, Any]] = []
         self._arrays: list[dict[str, str]] = []
         self._known: dict[int, tuple[int, NDArray[Any]]] = {}
-
-    def section(self, section: Section) -> str:
-        intro = f"<p>{html.escape(section.intro)}</p>" if section.intro else ""
-        blocks = "\n".join(self._block(block) for block in section.blocks)
-        return f"<section><h2>{html.escape(section.title)}</h2>{intro}{blocks}</section>"
 
     def data(self) -> str:
         """Return the figures as JSON that may stand inside a script element."""
@@ -81,34 +122,33 @@ class _Page:
         ).decode()
         return text.replace("<", "\\u003c")
 
-    def _block(self, block: Figure | TableBlock | Remark) -> str:
-        if isinstance(block, Remark):
-            return f'<p class="remark">{html.escape(block.text)}</p>'
+    def block(self, block: Block) -> tuple[str, Any]:
+        """Return a block's kind and what the template shows of it."""
+        if isinstance(block, ReportRemark):
+            return "remark", block
         if isinstance(block, TableBlock):
-            return render_table(block)
-        return self._figure(block)
+            return "table", block
+        try:
+            return "figure", self._figure(block)
+        except Exception as error:  # noqa: BLE001 - a figure of anybody's must not cost a run its report
+            text = f"The figure {block.title} could not be drawn: {type(error).__name__}: {error}"
+            return "remark", ReportRemark(text=text)
 
-    def _figure(self, figure: Figure) -> str:
-        number = len(self.figures)
-        self.figures.append(
-            {
-                "choices": [
-                    {"name": choice.name, "traces": self._encode(list(choice.traces))}
-                    for choice in figure.choices
-                ],
-                "layout": self._encode(dict(figure.layout)),
-                "group": figure.group,
-            }
-        )
-        select = _select(figure, number) if len(figure.choices) > 1 else ""
-        note = f'<p class="note">{html.escape(figure.note)}</p>' if figure.note else ""
-        height = f"{figure.height_px}px"
-        if figure.is_square:
-            height = f"min({height}, 90vw)"
-        return (
-            f"<figure><figcaption><h3>{html.escape(figure.title)}</h3>{select}{note}</figcaption>"
-            f'<div class="plot" id="plot{number}" style="height:{height}"></div></figure>'
-        )
+    def _figure(self, figure: Figure | SpaceFigure) -> dict[str, Any]:
+        made = to_plotly(figure)
+        group = getattr(figure, "group", "")
+        choices = [{"name": name, "traces": self._encode(traces)} for name, traces in made.choices]
+        layout = self._encode(made.layout)
+        self.figures.append({"choices": choices, "layout": layout, "group": group})
+        height = f"{made.height_px}px"
+        return {
+            "title": figure.title,
+            "note": figure.note,
+            "group": group,
+            "number": len(self.figures) - 1,
+            "choices": [name for name, _ in made.choices],
+            "height": f"min({height}, 90vw)" if made.is_square else height,
+        }
 
     def _encode(self, value: Any) -> Any:
         if isinstance(value, np.ndarray):
@@ -117,7 +157,7 @@ class _Page:
             return {str(key): self._encode(item) for key, item in value.items()}
         if isinstance(value, list | tuple):
             return [self._encode(item) for item in value]
-        return value
+        return _figure_text(value) if isinstance(value, str) else value
 
     def _array(self, values: NDArray[Any]) -> dict[str, int]:
         """Store an array once, however many traces share it, and return the reference to it."""
@@ -145,60 +185,6 @@ def encode_array(values: NDArray[Any]) -> dict[str, str]:
     }
 
 
-def render_table(table: TableBlock) -> str:
-    """Return a table; a long one starts folded."""
-    head = "".join(
-        f'<th class="{"n" if h.is_number else ""}">{html.escape(h.text)}</th>'
-        for h in table.headings
-    )
-    rows = "".join(
-        "<tr>"
-        + "".join(
-            f'<td class="{"n" if h.is_number else ""}">{html.escape(format_cell(cell))}</td>'
-            for h, cell in zip(table.headings, row, strict=True)
-        )
-        + "</tr>"
-        for row in table.rows
-    )
-    is_open = " open" if len(table.rows) <= ROWS_OPEN_MAX else ""
-    note = f'<p class="note">{html.escape(table.note)}</p>' if table.note else ""
-    return (
-        f"<details{is_open}><summary>{html.escape(table.title)}</summary>{note}"
-        f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
-        "</details>"
-    )
-
-
-def _select(figure: Figure, number: int) -> str:
-    options = "".join(
-        f'<option value="{index}">{html.escape(choice.name)}</option>'
-        for index, choice in enumerate(figure.choices)
-    )
-    label = figure.group or "view"
-    return (
-        f'<label class="choice">{html.escape(label)} '
-        f'<select data-figure="{number}">{options}</select></label>'
-    )
-
-
-def _head(document: Mapping[str, Any]) -> str:
-    exit_code = document.get("exit_code")
-    state = "good" if exit_code == 0 else "bad"
-    tiles = "".join(
-        f'<div class="tile"><span>{html.escape(name)}</span><b>{html.escape(value)}</b>'
-        f"<small>{html.escape(remark)}</small></div>"
-        for name, value, remark in figures_of(document)
-    )
-    facts = " · ".join(html.escape(fact) for fact in _facts(document))
-    return (
-        f'<header><p class="kind">COSMoS run report</p><h1>{html.escape(str(document.get("run")))}</h1>'
-        f'<p class="facts">{facts}</p></header>'
-        f'<div class="verdict {state}"><b>{html.escape(str(document.get("verdict")))}</b>'
-        f"<span>status {html.escape(str(document.get('status')))}, exit code {exit_code}</span></div>"
-        f'<div class="tiles">{tiles}</div>{_checks(document)}{_gaps(document)}'
-    )
-
-
 def _facts(document: Mapping[str, Any]) -> Iterator[str]:
     agents = mapping_at(document, "agents")
     yield f"scenario {document.get('scenario')}"
@@ -211,61 +197,33 @@ def _facts(document: Mapping[str, Any]) -> Iterator[str]:
     yield f"seed {document.get('seed')}"
 
 
-def _checks(document: Mapping[str, Any]) -> str:
-    rows = []
-    for check in document.get("checks", ()):
-        passed = check.get("passed") is True
-        mark = '<td class="mark good">holds</td>' if passed else '<td class="mark bad">broken</td>'
-        rows.append(
-            f"<tr><td>{_breakable(str(check.get('name')))}</td>"
-            f'<td class="n">{html.escape(_measured(check.get("got")))}</td>'
-            f'<td class="n">{html.escape(format_cell(check.get("limit")))}</td>{mark}</tr>'
-        )
-    remarks = "".join(f"<p>{html.escape(str(text))}</p>" for text in document.get("remarks", ()))
-    return (
-        '<section><h2>Checks</h2><div class="wide"><table class="checks"><thead><tr><th>check</th>'
-        '<th class="n">measured</th><th class="n">limit</th><th></th></tr></thead>'
-        f"<tbody>{''.join(rows)}</tbody></table></div>{remarks}</section>"
-    )
-
-
-def _breakable(name: str) -> str:
-    """Return a name that may go on in the next line behind each of its parts."""
-    return html.escape(name).replace("_", "_<wbr>").replace(".", ".<wbr>")
-
-
-def _measured(value: object) -> str:
-    return "not measured" if value is None else format_cell(value)
-
-
-def _gaps(document: Mapping[str, Any]) -> str:
-    parts = []
-    problem_texts = [problem.get("text") for problem in document.get("problems", ())]
-    for title, lines in (
+def _gaps(document: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    return [
         ("Data that are missing", mapping_at(document, "data").get("missing")),
-        ("What did not go as it should", problem_texts),
-    ):
-        if lines:
-            items = "".join(f"<li>{html.escape(str(item))}</li>" for item in lines)
-            parts.append(f'<section class="gaps"><h2>{title}</h2><ul>{items}</ul></section>')
-    return "".join(parts)
+        (
+            "What did not go as it should",
+            [problem.get("text") for problem in document.get("problems", ())],
+        ),
+    ]
 
 
-def _foot(document: Mapping[str, Any]) -> str:
-    versions = mapping_at(document, "versions")
-    listed = " · ".join(f"{html.escape(str(k))} {html.escape(str(v))}" for k, v in versions.items())
-    return (
-        "<footer><p>Statistics are made of all samples; curves are thinned for drawing and keep every "
-        f"peak. The samples are in tables/*.parquet and *.jsonl of the run.</p><p>{listed}</p></footer>"
-    )
+def _breakable(name: object) -> Markup:
+    """Return a name that may go on in the next line behind each of its parts."""
+    text = html.escape(clean_text(str(name)))
+    return Markup(text.replace("_", "_<wbr>").replace(".", ".<wbr>"))
 
 
-def _template(name: str) -> str:
-    return (TEMPLATES / name).read_text(encoding="utf-8")
+def _figure_text(text: str) -> str:
+    """Return a text within a figure; plotly.js reads some tags and all entities, and draws them as letters then."""
+    own = _OWN_MARKUP if text.endswith(_OWN_MARKUP) else ""
+    return html.escape(clean_text(text.removesuffix(own)), quote=False) + own
 
 
 def _plotly() -> str:
-    from plotly.offline import get_plotlyjs
-
+    """Return the library for browsers; the package that it comes in is not imported, as that takes 0.2 s."""
+    found = importlib.util.find_spec("plotly")
+    if found is None or not found.submodule_search_locations:
+        raise MissingExtraError("plotly", "host")
+    path = Path(found.submodule_search_locations[0]) / "package_data/plotly.min.js"
     # A script element ends at the first of these, wherever it stands.
-    return str(get_plotlyjs()).replace("</script", "<\\/script")
+    return path.read_text(encoding="utf-8").replace("</script", "<\\/script")

@@ -1,4 +1,4 @@
-"""How figures look: colours, axes, traces. Calm, light, printable."""
+"""Style of figures: colours and axes, as plotly.js takes them. Calm, light, printable."""
 
 from __future__ import annotations
 
@@ -6,17 +6,19 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from cosmos_cli.report.model import Trace
+from madns_runtime.analysis.values import Tone
 
 INK, MUTED, GRID = "#1f2933", "#667085", "#e9edf2"
 ACCENT, WARM, BAD = "#2b5c8a", "#c4692b", "#b42318"
 PALETTE = ("#2b5c8a", "#c4692b", "#3d8361", "#7d5a9b", "#b08c2e")
 """Five that stay apart on paper and for most colour-blind eyes: a group of agents is five, as in the thesis."""
-GROUP_SIZE = len(PALETTE)
-NAMES_SHOWN_MAX = 40
+TONES: Mapping[Tone, str] = {
+    "main": ACCENT,
+    "warm": WARM,
+    "bad": BAD,
+    "pale": "#e2a49a",
+    "muted": MUTED,
+}
 DECADES_FINE_MAX = 3
 FONT = "Inter, 'Segoe UI', 'Helvetica Neue', Arial, sans-serif"
 
@@ -35,11 +37,6 @@ def axis(title: str = "", **more: Any) -> dict[str, Any]:
         "automargin": True,
         **more,
     }
-
-
-def layout(x_title: str = "", y_title: str = "", **more: Any) -> dict[str, Any]:
-    """Return the layout of a plain figure with one pair of axes."""
-    return base_layout(xaxis=axis(x_title, showgrid=False), yaxis=axis(y_title)) | more
 
 
 def base_layout(**more: Any) -> dict[str, Any]:
@@ -78,70 +75,6 @@ def log_axis(low: float, high: float) -> dict[str, Any]:
     return {"type": "log", "tickvals": ticks, "ticktext": [f"{tick:g}" for tick in ticks]}
 
 
-def line(x: NDArray[Any], y: NDArray[Any], name: str, index: int = 0, **more: Any) -> Trace:
-    """Return a line in the colour of its place among five."""
-    return {
-        "type": "scatter",
-        "mode": "lines",
-        "name": name,
-        "x": x,
-        "y": y,
-        "line": {"width": 1.3, "color": PALETTE[index % len(PALETTE)]},
-        **more,
-    }
-
-
-def envelope_lines(x: NDArray[Any], curves: Mapping[str, NDArray[Any]]) -> list[Trace]:
-    """Return the curves of a `TimeEnvelope`: the largest behind, the median in front."""
-    colours = {"max": "#e2a49a", "p99": WARM, "p50": ACCENT}
-    return [
-        line(x, curves[name], name, line={"width": 1.5, "color": colour})
-        for name, colour in colours.items()
-    ]
-
-
-def bars(names: Sequence[str], values: Sequence[float | None], **more: Any) -> Trace:
-    """Return a bar a name."""
-    return {
-        "type": "bar",
-        "x": list(names),
-        "y": list(values),
-        "marker": {"color": ACCENT},
-        "showlegend": False,
-        "hovertemplate": "%{x}: %{y:.4g}<extra></extra>",
-        **more,
-    }
-
-
-def bar_grid(
-    names: Sequence[str], quantities: Mapping[str, Sequence[float | None]], columns: int = 2
-) -> tuple[list[Trace], dict[str, Any], int]:
-    """
-    Return small bar charts, one a quantity, as traces, layout and height in pixels.
-
-    Args:
-        names: What the bars stand for, the same in every chart.
-        quantities: Title of each chart, and its bars.
-        columns: Charts side by side.
-    """
-    traces = [
-        bars(names, values, xaxis=f"x{index}", yaxis=f"y{index}")
-        for index, values in enumerate(quantities.values(), start=1)
-    ]
-    figure_layout, height_px = grid_layout(tuple(quantities), columns=columns, row_px=190)
-    for index in range(1, len(quantities) + 1):
-        # The charts stand in columns over the same names: the lowest one's serve all.
-        is_lowest = index + columns > len(quantities)
-        shown = is_lowest and len(names) <= NAMES_SHOWN_MAX
-        figure_layout[f"xaxis{index}"] |= {"type": "category", "showticklabels": shown}
-        figure_layout[f"xaxis{index}"] |= {
-            "showgrid": False,
-            "tickangle": -90 if len(names) > 6 else 0,
-        }
-        figure_layout[f"yaxis{index}"] |= {"rangemode": "tozero"}
-    return traces, figure_layout, height_px
-
-
 def grid_layout(
     titles: Sequence[str], *, columns: int = 2, row_px: int = 170, x_title: str = ""
 ) -> tuple[dict[str, Any], int]:
@@ -161,20 +94,6 @@ def grid_layout(
         result[f"yaxis{number}"] = axis(domain=[max(y1 - height, 0), y1], anchor=f"x{number}")
         result["annotations"].append(_plot_title(title, x0, y1))
     return result, 78 + rows * row_px
-
-
-def groups_of_agents(names: Sequence[str]) -> list[tuple[str, list[str]]]:
-    """Return the names in groups of five, each with the label of its choice."""
-    groups = [list(names[start : start + GROUP_SIZE]) for start in range(0, len(names), GROUP_SIZE)]
-    return [(g[0] if len(g) == 1 else f"{g[0]} … {g[-1]}", g) for g in groups]
-
-
-def as_array(values: NDArray[Any]) -> NDArray[np.float64]:
-    """Return a column as floats; what is no number becomes NaN."""
-    if values.dtype.kind in "fiub":
-        return values.astype(np.float64)
-    numbers = [v if isinstance(v, int | float) else np.nan for v in values.tolist()]
-    return np.array(numbers, dtype=np.float64)
 
 
 def _plot_title(text: str, x: float, y: float) -> dict[str, Any]:

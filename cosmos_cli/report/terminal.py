@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cosmos_cli.console import Column, Console
-from cosmos_cli.expectation import mapping_at
+from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.report.build import figures_of
-from cosmos_cli.report.model import Remark, Section, TableBlock, format_cell
+from cosmos_cli.report.cells import format_cell
+from cosmos_cli.ui.console import Column, Console
+from madns_runtime.analysis.values import ReportRemark, Section, TableBlock
 
 CHECK_COLUMNS = (
     Column("check"),
     Column("measured", is_number=True),
     Column("limit", is_number=True),
     Column(""),
+    Column("worst"),
 )
 
 
@@ -37,12 +39,12 @@ def print_report(
 
 
 def _print_section(console: Console, section: Section) -> None:
-    told = [block for block in section.blocks if isinstance(block, TableBlock | Remark)]
+    told = [block for block in section.blocks if isinstance(block, TableBlock | ReportRemark)]
     if not told:
         return
     console.data(f"\n{section.title}")
     for block in told:
-        if isinstance(block, Remark):
+        if isinstance(block, ReportRemark):
             console.data(block.text)
             continue
         console.data(f"\n{block.title}")
@@ -57,4 +59,5 @@ def _check_row(check: Mapping[str, Any]) -> list[str]:
         "not measured" if got is None else format_cell(got),
         format_cell(check.get("limit")),
         "holds" if check.get("passed") is True else "BROKEN",
+        str(check.get("worst") or ""),
     ]

@@ -1,1 +1,1 @@
-"""What a running scenario looks like on a terminal."""
+"""Views of a running scenario on a terminal."""

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TextIO
 
-from cosmos_cli.console import paint
-from cosmos_cli.launch.events import AgentChanged, Progress
-from cosmos_cli.view.words import progress_line, state_words, work_words
+from cosmos_cli.launch.events import Progress
+from cosmos_cli.ui.console import tell
+from cosmos_cli.ui.progress import work_words
+from cosmos_cli.view.words import progress_line, state_words
 
 PROGRESS_INTERVAL_S = 10.0
 LOUD_LEVELS = frozenset({"error", "critical", "manual"})
-"""What even --quiet shows: without the command line of a hand-started agent nobody could start it."""
+"""Levels that even --quiet shows: without the command line of a hand-started agent nobody could start it."""
 COLOURS = {"critical": "red", "error": "red", "warning": "yellow"}
 
 
@@ -35,10 +36,8 @@ class PlainView:
 
     def say(self, text: str, level: str = "info") -> None:
         """Write a sentence; warnings and worse are named so."""
-        if level in COLOURS:
-            word = "error" if level == "critical" else level
-            text = f"{paint(word, COLOURS[level], self._stream)}: {text}"
-        self._write(text)
+        word = "error" if level == "critical" else level
+        self._write(text, word=word if level in COLOURS else "", colour=COLOURS.get(level, ""))
 
     def state(self, state: str) -> None:
         """Write what the run is doing now."""
@@ -46,9 +45,6 @@ class PlainView:
         if words is not None:
             self._write(words)
         self._shown_s = self._now_s()
-
-    def agent(self, change: AgentChanged) -> None:
-        """A lost agent is told by the host's log, with the reason; the rest shows in the counts."""
 
     def progress(self, progress: Progress) -> None:
         """Write how the run fares, if ten seconds have gone."""
@@ -69,12 +65,11 @@ class PlainView:
     def close(self) -> None:
         """Leave nothing behind; there is nothing."""
 
-    def _write(self, text: str) -> None:
+    def _write(self, text: str, *, word: str = "", colour: str = "") -> None:
         if self._is_broken:
             return
         try:
-            self._stream.write(text + "\n")
-            self._stream.flush()
+            tell(self._stream, text, word=word, colour=colour)
         except (OSError, ValueError):
             self._is_broken = True
 

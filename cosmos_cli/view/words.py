@@ -1,4 +1,4 @@
-"""What a run's progress looks like in words. Pure."""
+"""Progress of a run in words. Pure."""
 
 from __future__ import annotations
 
@@ -70,17 +70,19 @@ def timing_words(progress: Progress) -> tuple[str, ...]:
     return rtf_words(progress), tick_words(progress), lateness_words(progress)
 
 
+def value_words(value: float | str | None) -> str:
+    """Return a recorded value: a float to four digits, from 1000 on to tenths; a dash for none."""
+    if not isinstance(value, float):
+        return "-" if value is None else str(value)
+    return f"{value:.1f}" if 1e3 <= abs(value) < 1e12 else f"{value:.4g}"
+
+
 def loss_words(progress: Progress) -> str:
     """Return lost messages, and dropped records where there are any."""
     text = f"{progress.lost_messages} messages lost"
     if progress.records_dropped:
         text += f", {progress.records_dropped} records dropped"
     return text
-
-
-def work_words(what: str) -> str:
-    """Return the stage of the work after a run, without the file that it is at."""
-    return "reading the records" if what.startswith("reading ") else what
 
 
 def has_trouble(progress: Progress) -> bool:

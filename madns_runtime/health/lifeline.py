@@ -40,10 +40,10 @@ class Lifeline:
 
 
 ChildMain = Callable[[Lifeline], Mapping[str, Any]]
-"""What a child does; returns its report, plain mappings and scalars."""
+"""Function that a child runs; returns its report, plain mappings and scalars."""
 
 
-class Child:
+class ChildProcess:
     """The parent's end of a child process."""
 
     def __init__(self, pid: int, life_fd: int, report_fd: int) -> None:
@@ -91,7 +91,7 @@ class Child:
         self._report = {}
 
 
-_children: weakref.WeakSet[Child] = weakref.WeakSet()
+_children: weakref.WeakSet[ChildProcess] = weakref.WeakSet()
 
 
 def _forget_children() -> None:
@@ -103,7 +103,7 @@ def _forget_children() -> None:
 os.register_at_fork(after_in_child=_forget_children)
 
 
-def fork_child(main: ChildMain, *, nice: int = 0) -> Child:
+def fork_child(main: ChildMain, *, nice: int = 0) -> ChildProcess:
     """
     Fork a process that runs *main* and ends with this one.
 
@@ -123,7 +123,7 @@ def fork_child(main: ChildMain, *, nice: int = 0) -> Child:
     if pid:
         os.close(life_read)
         os.close(report_write)
-        return Child(pid, life_write, report_read)
+        return ChildProcess(pid, life_write, report_read)
     code = 1
     try:
         os.close(life_write)

@@ -12,18 +12,11 @@ import resource
 import time
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import psutil
 
-from madns_runtime.health.snapshot import (
-    CpuTimes,
-    DiskCounters,
-    DiskSpace,
-    Memory,
-    NetworkCounters,
-    Reading,
-    parse_throttled,
-)
+from madns_runtime.health.snapshot import CpuTimes, HealthReading, parse_throttled
 
 THERMAL_ZONES = "sys/class/thermal/thermal_zone*"
 CPU_ZONE_TYPES = ("cpu-thermal", "cpu_thermal", "x86_pkg_temp", "soc_thermal", "cpu", "soc")
@@ -48,31 +41,29 @@ class Probe:
         self._throttled_file = _find_throttled_file(root)
         self._started_s = time.monotonic()
 
-    def read(self) -> Reading:
+    def read(self) -> HealthReading:
         """Take one look."""
         memory = psutil.virtual_memory()
         now_s = time.monotonic()
-        return Reading(
-            utc=datetime.now(UTC).isoformat(timespec="milliseconds"),
-            monotonic_s=now_s,
-            cpus=_read_cpus(),
-            core_temperature_c=self._read_temperature(),
-            throttled_bits=self._read_throttled(),
-            memory=Memory(
-                total_bytes=memory.total,
-                used_bytes=memory.used,
-                free_bytes=memory.available,
-                percent=memory.percent,
-            ),
-            disk_space=_read_disk_space(self._directory),
-            disk=_read_disk(),
-            network=_read_network(),
-            udp_sockets=self._count_sockets("UDP"),
-            tcp_connections=self._count_sockets("TCP"),
-            load=_read_load(),
-            process_uptime_s=now_s - self._started_s,
-            board_uptime_s=_read_board_uptime_s(),
-        )
+        values = {
+            "utc": datetime.now(UTC).isoformat(timespec="milliseconds"),
+            "monotonic_s": now_s,
+            "core_temperature_c": self._read_temperature(),
+            "throttled_bits": self._read_throttled(),
+            "ram_total_bytes": memory.total,
+            "ram_used_bytes": memory.used,
+            "ram_free_bytes": memory.available,  # what could be had without swapping
+            "ram_percent": memory.percent,
+            **_read_disk_space(self._directory),
+            **_read_disk(),
+            **_read_network(),
+            "udp_sockets": self._count_sockets("UDP"),
+            "tcp_connections": self._count_sockets("TCP"),
+            **_read_load(),
+            "process_uptime_s": round(now_s - self._started_s, 1),
+            "board_uptime_s": _read_board_uptime_s(),
+        }
+        return HealthReading(cpus=_read_cpus(), values=values)
 
     def _read_temperature(self) -> float | None:
         text = _read_text(self._temperature_file)
@@ -104,7 +95,7 @@ class Probe:
 
 
 class ProcessUsage:
-    """What this process uses; the share of CPU is between one call and the next."""
+    """Use of resources by this process; the share of CPU is between one call and the next."""
 
     def __init__(self) -> None:
         self._wall_s = time.monotonic()
@@ -152,24 +143,17 @@ def _find_temperature_file(root: Path) -> Path | None:
     for zone in sorted(root.glob(THERMAL_ZONES)):
         kind = (_read_text(zone / "type") or "").strip()
         zones.setdefault(kind, zone / "temp")
-    for kind in CPU_ZONE_TYPES:
-        if kind in zones:
-            return zones[kind]
-    return next(iter(zones.values()), None)
+    return next((zones[kind] for kind in (*CPU_ZONE_TYPES, *zones) if kind in zones), None)
 
 
 def _find_throttled_file(root: Path) -> Path | None:
-    for pattern in THROTTLED_FILES:
-        for path in sorted(root.glob(f"{pattern}/get_throttled")):
-            return path
-    return None
+    found = (sorted(root.glob(f"{pattern}/get_throttled")) for pattern in THROTTLED_FILES)
+    return next((path for paths in found for path in paths), None)
 
 
 def _read_text(path: Path | None) -> str | None:
-    if path is None:
-        return None
     try:
-        return path.read_text(encoding="ascii", errors="replace")
+        return path.read_text(encoding="ascii", errors="replace") if path else None
     except OSError:
         return None
 
@@ -185,59 +169,61 @@ def _read_cpus() -> tuple[CpuTimes, ...]:
     return tuple(cpus)
 
 
-def _read_disk_space(directory: Path) -> DiskSpace | None:
+def _read_disk_space(directory: Path) -> dict[str, Any]:
     try:
         usage = psutil.disk_usage(str(directory))
     except OSError:
-        return None
-    return DiskSpace(
-        total_bytes=usage.total,
-        used_bytes=usage.used,
-        free_bytes=usage.free,
-        percent=usage.percent,
-    )
+        return {}
+    return {
+        "disk_total_bytes": usage.total,
+        "disk_used_bytes": usage.used,
+        "disk_free_bytes": usage.free,  # what this user may still fill
+        "disk_percent": usage.percent,
+    }
 
 
-def _read_disk() -> DiskCounters | None:
+def _read_disk() -> dict[str, Any]:
+    """Return the counters of all disks together, since the machine's start."""
     try:
         counters = psutil.disk_io_counters()
     except (OSError, RuntimeError, NotImplementedError):
-        return None
+        counters = None
     if counters is None:
-        return None
-    return DiskCounters(
-        reads=counters.read_count,
-        writes=counters.write_count,
-        read_bytes=counters.read_bytes,
-        written_bytes=counters.write_bytes,
-        read_time_ms=counters.read_time,
-        write_time_ms=counters.write_time,
-    )
+        return {}
+    return {
+        "disk_reads": counters.read_count,
+        "disk_writes": counters.write_count,
+        "disk_read_bytes": counters.read_bytes,
+        "disk_written_bytes": counters.write_bytes,
+        "disk_read_time_ms": counters.read_time,
+        "disk_write_time_ms": counters.write_time,
+    }
 
 
-def _read_network() -> NetworkCounters | None:
+def _read_network() -> dict[str, Any]:
+    """Return the counters of all interfaces but loopback together, since they came up."""
     try:
         by_interface = psutil.net_io_counters(pernic=True)
     except OSError:
-        return None
+        return {}
     real = [counters for name, counters in by_interface.items() if name != "lo"]
     loopback = by_interface.get("lo")
-    return NetworkCounters(
-        sent_bytes=sum(c.bytes_sent for c in real),
-        received_bytes=sum(c.bytes_recv for c in real),
-        sent_packets=sum(c.packets_sent for c in real),
-        received_packets=sum(c.packets_recv for c in real),
-        errors=sum(c.errin + c.errout for c in real),
-        drops=sum(c.dropin + c.dropout for c in real),
-        loopback_bytes=loopback.bytes_sent if loopback else 0,
-    )
+    return {
+        "network_sent_bytes": sum(c.bytes_sent for c in real),
+        "network_received_bytes": sum(c.bytes_recv for c in real),
+        "network_sent_packets": sum(c.packets_sent for c in real),
+        "network_received_packets": sum(c.packets_recv for c in real),
+        "network_errors": sum(c.errin + c.errout for c in real),
+        "network_drops": sum(c.dropin + c.dropout for c in real),
+        "loopback_bytes": loopback.bytes_sent if loopback else 0,
+    }
 
 
-def _read_load() -> tuple[float, float, float] | None:
+def _read_load() -> dict[str, Any]:
     try:
-        return os.getloadavg()
+        return dict(zip(("load_1min", "load_5min", "load_15min"), os.getloadavg(), strict=True))
     except OSError:
-        return None
+        return {}
 
 
 def _read_board_uptime_s() -> float | None:

@@ -12,17 +12,18 @@ from pathlib import Path
 from typing import Any
 
 from madns_runtime.config import Health, Recording
-from madns_runtime.health.lifeline import Child, Lifeline, fork_child
+from madns_runtime.health.lifeline import ChildProcess, Lifeline, fork_child
 from madns_runtime.health.probe import Probe
 from madns_runtime.health.snapshot import to_record
+from madns_runtime.recording.record_files import RecordFiles
+from madns_runtime.recording.recorder import Recorder
 from madns_runtime.recording.records import HEALTH
-from madns_runtime.recording.writer import Recorder
 
 NICENESS = 10
 """Added to the sampler's niceness: it waits for the loops, not they for it."""
 RECORDS_TIMEOUT_S = 5.0
 SAMPLER_TIMEOUT_S = RECORDS_TIMEOUT_S + 1.0
-"""How long whoever ends the sampler should wait for it: its records need their own time."""
+"""Wait for the sampler's end: its records need their own time."""
 
 
 def start_sampler(  # noqa: PLR0913 - who records, and how; all by name
@@ -33,9 +34,11 @@ def start_sampler(  # noqa: PLR0913 - who records, and how; all by name
     settings: Health,
     recording: Recording,
     life: int = 1,
-) -> Child:
+) -> ChildProcess:
     """
     Start the process that records this machine's state of health. Call it before threads are started.
+
+    To wait for the process ends it, and its report is its record counts (`RecordCounts.to_mapping`).
 
     Args:
         directory: Where health.jsonl goes.
@@ -47,7 +50,8 @@ def start_sampler(  # noqa: PLR0913 - who records, and how; all by name
     """
 
     def main(lifeline: Lifeline) -> Mapping[str, Any]:
-        recorder = Recorder(directory, run=run, source=machine, settings=recording, life=life)
+        files = RecordFiles(directory, run=run, source=machine, life=life)
+        recorder = Recorder(files, recording)
         recorder.open_stream(HEALTH)
         recorder.start()
         _sample(lifeline, Probe(directory), recorder, period_s=settings.period_s)
@@ -56,29 +60,16 @@ def start_sampler(  # noqa: PLR0913 - who records, and how; all by name
     return fork_child(main, nice=NICENESS)
 
 
-def stop_sampler(handle: Child, timeout_s: float) -> Mapping[str, Any]:
-    """
-    End the sampler and return its record counts (`RecordCounts.to_mapping`).
-
-    Args:
-        handle: What `start_sampler` returned.
-        timeout_s: After this it is killed, and "errors" says so.
-    """
-    return handle.wait(timeout_s)
-
-
 def _sample(lifeline: Lifeline, probe: Probe, recorder: Recorder, *, period_s: float) -> None:
     """Record a sample now, every period, and at the end."""
     started_s = time.monotonic()
-    before = None
-    count = 0
-    is_over = False
-    while True:
-        reading = probe.read()
-        recorder.record(HEALTH.name, to_record(reading, before))
-        before = reading
-        if is_over:
-            return
+    before = probe.read()
+    recorder.record(HEALTH.name, to_record(before, None))
+    count, is_over = 0, False
+    while not is_over:
         # The next whole period, so that a slow look does not shift those after it.
         count = max(count + 1, int((time.monotonic() - started_s) / period_s))
         is_over = lifeline.has_ended(started_s + count * period_s - time.monotonic())
+        now = probe.read()
+        recorder.record(HEALTH.name, to_record(now, before))
+        before = now

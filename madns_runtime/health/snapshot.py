@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from madns_runtime.recording.records import HEALTH
+
+RATED = ("network_sent_bytes", "network_received_bytes", "disk_read_bytes", "disk_written_bytes")
+"""Counters whose increase per second is recorded, too."""
 THROTTLING_BITS = {
     0: "under_voltage",
     1: "frequency_capped",
@@ -28,70 +33,12 @@ class CpuTimes:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Memory:
-    """RAM of the machine."""
+class HealthReading:
+    """One look at a machine."""
 
-    total_bytes: int
-    used_bytes: int
-    free_bytes: int
-    """What could be had without swapping."""
-    percent: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DiskSpace:
-    """The file system that the run records on."""
-
-    total_bytes: int
-    used_bytes: int
-    free_bytes: int
-    """What this user may still fill."""
-    percent: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DiskCounters:
-    """All disks together, since the board's start."""
-
-    reads: int
-    writes: int
-    read_bytes: int
-    written_bytes: int
-    read_time_ms: int
-    write_time_ms: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NetworkCounters:
-    """All interfaces but loopback together, since they came up."""
-
-    sent_bytes: int
-    received_bytes: int
-    sent_packets: int
-    received_packets: int
-    errors: int
-    drops: int
-    loopback_bytes: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reading:
-    """One look at a machine; None is what it does not offer."""
-
-    utc: str
-    monotonic_s: float
     cpus: tuple[CpuTimes, ...]
-    core_temperature_c: float | None
-    throttled_bits: int | None
-    memory: Memory
-    disk_space: DiskSpace | None
-    disk: DiskCounters | None
-    network: NetworkCounters | None
-    udp_sockets: int | None
-    tcp_connections: int | None
-    load: tuple[float, float, float] | None
-    process_uptime_s: float
-    board_uptime_s: float | None
+    values: Mapping[str, Any]
+    """By field of the HEALTH stream; what the machine does not offer is None, or not there."""
 
 
 def decode_throttling(bits: int | None) -> tuple[str, ...] | None:
@@ -131,7 +78,7 @@ def compute_rate(before: int | None, now: int | None, elapsed_s: float) -> float
     return round((now - before) / elapsed_s, 1)
 
 
-def to_record(now: Reading, before: Reading | None) -> dict[str, Any]:
+def to_record(now: HealthReading, before: HealthReading | None) -> dict[str, Any]:
     """
     Return a record of the HEALTH stream, by field name.
 
@@ -140,54 +87,17 @@ def to_record(now: Reading, before: Reading | None) -> dict[str, Any]:
         before: An earlier one; without it loads and rates are None.
     """
     by_core = compute_cpu_percent(before.cpus, now.cpus) if before else []
+    earlier = before.values if before else {}
+    elapsed_s = now.values["monotonic_s"] - earlier.get("monotonic_s", math.inf)
     return {
-        "utc": now.utc,
-        "monotonic_s": round(now.monotonic_s, 3),
+        **dict.fromkeys(field.name for field in HEALTH.fields),
+        **now.values,
+        "monotonic_s": round(now.values["monotonic_s"], 3),
         "cpu_percent": round(sum(by_core) / len(by_core), 1) if by_core else None,
         "cpu_percent_by_core": by_core or None,
-        "core_temperature_c": now.core_temperature_c,
-        "throttled_bits": now.throttled_bits,
-        "throttling": decode_throttling(now.throttled_bits),
-        **_prefixed("ram", Memory, now.memory),
-        **_prefixed("disk", DiskSpace, now.disk_space),
-        **_prefixed("disk", DiskCounters, now.disk),
-        **_network(now.network),
-        **_rates(now, before),
-        "udp_sockets": now.udp_sockets,
-        "tcp_connections": now.tcp_connections,
-        **dict(zip(("load_1min", "load_5min", "load_15min"), now.load or (None,) * 3, strict=True)),
-        "process_uptime_s": round(now.process_uptime_s, 1),
-        "board_uptime_s": now.board_uptime_s,
+        "throttling": decode_throttling(now.values.get("throttled_bits")),
+        **{
+            f"{name}_per_s": compute_rate(earlier.get(name), now.values.get(name), elapsed_s)
+            for name in RATED
+        },
     }
-
-
-def _prefixed(prefix: str, cls: type, value: Any) -> dict[str, Any]:
-    return {
-        f"{prefix}_{f.name}": None if value is None else getattr(value, f.name)
-        for f in dataclasses.fields(cls)
-    }
-
-
-def _network(counters: NetworkCounters | None) -> dict[str, Any]:
-    record = _prefixed("network", NetworkCounters, counters)
-    record["loopback_bytes"] = record.pop("network_loopback_bytes")
-    return record
-
-
-def _rates(now: Reading, before: Reading | None) -> dict[str, float | None]:
-    pairs = {
-        "network_sent_bytes": ("network", "sent_bytes"),
-        "network_received_bytes": ("network", "received_bytes"),
-        "disk_read_bytes": ("disk", "read_bytes"),
-        "disk_written_bytes": ("disk", "written_bytes"),
-    }
-    elapsed_s = now.monotonic_s - before.monotonic_s if before else 0.0
-    return {
-        f"{name}_per_s": compute_rate(_get(before, *path), _get(now, *path), elapsed_s)
-        for name, path in pairs.items()
-    }
-
-
-def _get(reading: Reading | None, part: str, name: str) -> int | None:
-    counters = getattr(reading, part, None)
-    return getattr(counters, name, None)

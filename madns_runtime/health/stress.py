@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from madns_runtime.health.lifeline import Child, Lifeline, fork_child
+from madns_runtime.health.lifeline import ChildProcess, Lifeline, fork_child
 
 NUMBER_BITS = 36
 """Size of the numbers: trial division of the worst takes some 10 ms on a board."""
@@ -16,46 +16,35 @@ NUMBER_BITS = 36
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StressReport:
-    """What the workers have done."""
+    """Work done by the workers."""
 
     factored: tuple[int, ...]
     """Numbers factorised, one entry a worker."""
     errors: tuple[str, ...] = ()
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the report as a plain mapping."""
-        return {"factored": list(self.factored), "errors": list(self.errors)}
 
-
-@dataclass(frozen=True, slots=True)
-class Stress:
-    """The running workers."""
-
-    workers: tuple[Child, ...]
-
-
-def start_stress(workers: int) -> Stress:
+def start_stress(workers: int) -> tuple[ChildProcess, ...]:
     """
     Start the processes; each uses what it gets of a processor, at ordinary niceness.
 
     Args:
         workers: How many; 0 for none.
     """
-    return Stress(tuple(fork_child(_worker(seed)) for seed in range(workers)))
+    return tuple(fork_child(_worker(seed)) for seed in range(workers))
 
 
-def stop_stress(handle: Stress, timeout_s: float) -> StressReport:
+def stop_stress(workers: Sequence[ChildProcess], timeout_s: float) -> StressReport:
     """
     End the workers and return what they have done.
 
     Args:
-        handle: What `start_stress` returned.
+        workers: What `start_stress` returned.
         timeout_s: For all of them; who takes longer is killed, and "errors" says so.
     """
     end_s = time.monotonic() + timeout_s
-    for worker in handle.workers:
+    for worker in workers:
         worker.stop()
-    reports = [worker.wait(max(0.0, end_s - time.monotonic())) for worker in handle.workers]
+    reports = [worker.wait(max(0.0, end_s - time.monotonic())) for worker in workers]
     return StressReport(
         factored=tuple(int(report.get("factored", 0)) for report in reports),
         errors=tuple(error for report in reports for error in report.get("errors", ())),
@@ -71,8 +60,7 @@ def factorise(number: int) -> list[int]:
     """
     if number < 1:
         raise ValueError(f"expected a positive number, got {number}")
-    factors = []
-    divisor = 2
+    factors, divisor = [], 2
     while divisor * divisor <= number:
         while number % divisor == 0:
             factors.append(divisor)

@@ -1,33 +1,49 @@
-"""One agent of a worker: its half of the simulation, its context, its records."""
+"""
+One agent in lockstep: its half, records, mailbox and devices, which its worker drives by simulated time alone.
+
+Nothing here waits. What is sent is kept until the worker answers the host; devices are asked before each step.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from madns_runtime.config import RunConfig
-from madns_runtime.context import RunContext, check_sending
-from madns_runtime.half import Half, Program
+from madns_runtime.config import DeviceLaunch, RunConfig
+from madns_runtime.errors import PluginError
+from madns_runtime.hardware.inline import InlineDevice
+from madns_runtime.hardware.kind_registry import prepare
+from madns_runtime.hardware.port import Hardware
+from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.frames import POSITIONS, STEPPING, Sent
-from madns_runtime.lockstep.post import Allowance, encode
-from madns_runtime.lockstep.recorder import LockstepRecorder
+from madns_runtime.lockstep.messages import Allowance, encode
+from madns_runtime.lockstep.recorder import open_journal
+from madns_runtime.medium.mailbox import Mailbox
 from madns_runtime.plugin.api import HOST
-from madns_runtime.protocol.messages import Service
+from madns_runtime.plugin.context import PeerContext, check_sending, describe_exception
+from madns_runtime.plugin.device_view import DeviceStatus
+from madns_runtime.plugin.half import Half, RoleProgram
+from madns_runtime.protocol.codec import encode_message
+from madns_runtime.protocol.messages import Service, Transmission
+from madns_runtime.recording.newest_values import NewestValues
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Crewmates:
-    """What the agents of one worker share."""
+    """State that the agents of one worker share."""
 
     config: RunConfig
     directory: Path
     """The run directory."""
-    program: Program
+    program: RoleProgram
     clock: SimulatedClock
+    devices: tuple[DeviceLaunch, ...] = ()
+    """Those of all agents."""
     outbox: list[Sent] = field(default_factory=list)
-    """What was sent since the last answer to the host, in order."""
+    """Messages sent since the last answer to the host, in order."""
 
 
 class LockstepAgent:
@@ -48,25 +64,40 @@ class LockstepAgent:
         self.name = mates.config.agents.resolved_names()[index]
         self._clock = mates.clock
         self._outbox = mates.outbox
-        self.recorder = LockstepRecorder(
+        self.journal = open_journal(
             mates.directory / "agents" / self.name,
             mates.config,
             source=self.name,
             clock=mates.clock,
         )
-        self.half = Half(mates.program.make, self.recorder.say)
+        self.columns = NewestValues(self.journal.recorder, mates.program.columns)
+        self.half = Half(mates.program.make, self.journal.say)
         self.step = self.half.simulation.step
         self.stepping = index * POSITIONS + STEPPING
         self.is_running = False
         self.deadlines_broken = 0
         self._allowance = Allowance()
-        self.context = RunContext(
+        self.mailbox = Mailbox(
+            self.name,
+            mates.config.agents.resolved_names(),
+            has_medium=mates.program.has_medium,
+            post=self._transmit,
+        )
+        self.devices = AgentDevices(
+            [each for each in mates.devices if self.name in each.users],
+            mates.config,
+            directory=mates.directory,
+            clock=mates.clock,
+        )
+        self.context = PeerContext(
             name=self.name,
             config=mates.config,
             parameters=mates.program.parameters,
-            recorder=self.recorder,
+            journal=self.journal,
             now_s=mates.clock.now_s,
             send=self.send,
+            mailbox=self.mailbox,
+            hardware=self.devices.hardware,
         )
 
     def send(
@@ -76,13 +107,95 @@ class LockstepAgent:
         service: Service = Service.RELIABLE,
         *,
         deadline_s: float | None = None,
-    ) -> None:
-        """Send to the host's half; see `plugin.api.Context.send`."""
+    ) -> int | None:
+        """Send to the host's half or to other agents; see `plugin.api.Context.send`."""
+        if to != HOST:
+            return self.mailbox.send(to, message, service, deadline_s)
         check_sending(to, (HOST,), service, deadline_s, is_running=self.is_running)
         t_s = self._clock.t_s
         body = encode(message, service)
         self._allowance.take(len(body), t_s)
         if deadline_s is not None and deadline_s < t_s:  # it arrives when it is sent
             self.deadlines_broken += 1
-            self.recorder.event("sync_deadline_broken", late_s=t_s - deadline_s)
+            self.journal.event("sync_deadline_broken", late_s=t_s - deadline_s)
         self._outbox.append(Sent(self.index, int(service), body))
+        return None
+
+    def _transmit(self, transmission: Transmission) -> None:
+        body = encode_message(transmission)
+        self._allowance.take(len(body), self._clock.t_s)
+        self._outbox.append(Sent(self.index, int(Service.RELIABLE), body))
+
+
+class AgentDevices:
+    """
+    The devices of one agent.
+
+    Args:
+        launches: What it uses.
+        config: The run.
+        directory: The run directory.
+        clock: Simulated time.
+
+    Raises:
+        MadnsError: A kind cannot be found, does not follow simulated time, or cannot record.
+    """
+
+    def __init__(
+        self,
+        launches: Iterable[DeviceLaunch],
+        config: RunConfig,
+        *,
+        directory: Path,
+        clock: SimulatedClock,
+    ) -> None:
+        self._devices = []
+        for launch in launches:
+            program = prepare(launch.kind, launch.parameters, Path(launch.base_directory))
+            folder = directory / "devices" / launch.place / launch.name
+            journal = open_journal(folder, config, source=launch.full_name, clock=clock)
+            records = DeviceRecords(journal, program.channels)
+            device = InlineDevice(launch, program, records, now_s=clock.now_s)
+            self._devices.append(device)
+        self.hardware = Hardware({device.name: device.port for device in self._devices})
+
+    def __bool__(self) -> bool:
+        return bool(self._devices)
+
+    def open(self) -> None:
+        """
+        Open all.
+
+        Raises:
+            PluginError: A driver raised; the text says where.
+        """
+        for device in self._devices:
+            _with_blame(device.name, "open", device.open)
+
+    def advance(self, t_s: float) -> list[tuple[str, DeviceStatus]]:
+        """
+        Take all samples up to *t_s*, and return the devices whose status has changed.
+
+        Raises:
+            PluginError: A driver raised; the text says where.
+        """
+        for device in self._devices:
+            _with_blame(device.name, "sample_at", device.advance, t_s)
+        return self.hardware.changes()
+
+    def close(self) -> dict[str, Any]:
+        """Close all, and return what the run came to, by device."""
+        return {device.name: device.close() for device in self._devices}
+
+
+def _with_blame(name: str, doing: str, call: Any, *arguments: Any) -> None:
+    """
+    Call a driver.
+
+    Raises:
+        PluginError: It raised; the text says where.
+    """
+    try:
+        call(*arguments)
+    except BaseException as error:
+        raise PluginError(describe_exception(error, f"device {name}: {doing}")) from error

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime, timedelta
 
 T0 = datetime(1970, 1, 1, tzinfo=UTC)
-"""Where records put simulated time zero, so that two runs of one seed have the same bytes."""
+"""Wall time of simulated time zero in records, so that two runs of one seed have the same bytes."""
 T0_UTC = "1970-01-01T00:00:00.000000Z"
 
 

@@ -1,5 +1,5 @@
 """
-What host and workers say to each other: length-prefixed MessagePack on a socket pair. Pure.
+Frames between host and workers: length-prefixed MessagePack on a socket pair. Pure.
 
 Every frame is a list that begins with its kind. Plug-ins' messages are in it as the bytes that would
 travel between machines: what cannot be sent there cannot be sent here.
@@ -31,9 +31,10 @@ STOP: Final = 5
 READY: Final = 11
 """[READY]: the agents' half is loaded."""
 DONE: Final = 12
-"""[DONE, [[index, service, body], ...]]: SETUP, TICK or DRAIN is carried out, and this was sent."""
+"""[DONE, [[index, service, body], ...], [newest values of columns, ...]]: SETUP, TICK or DRAIN is carried out, and
+this was sent; now and then with the values of each of the worker's agents."""
 SUMMARIES: Final = 13
-"""[SUMMARIES, [[index, summary, counters], ...]]"""
+"""[SUMMARIES, [[index, summary, deadlines broken, counts of messages between agents, newest values], ...]]"""
 FAILED: Final = 14
 """[FAILED, index, reason]"""
 CLOSED: Final = 15
@@ -43,10 +44,10 @@ FRAME_BYTES_MAX: Final = 1 << 30
 HEAD: Final = Struct("<I")
 
 # Positions: what a worker is doing, in memory that it shares with the host.
-IDLE, LOADING, SETTING_UP, RECEIVING, STEPPING, FINISHING, CLOSING = range(7)
-METHODS: Final = ("", "", "setup", "receive", "step", "finish", "")
+IDLE, LOADING, SETTING_UP, RECEIVING, STEPPING, FINISHING, CLOSING, HEARING, REFUSED = range(9)
+METHODS: Final = ("", "", "setup", "receive", "step", "finish", "", "hear", "refused")
 """The plug-in's method at each position; empty where the framework is at work."""
-POSITIONS: Final = 8
+POSITIONS: Final = 16
 
 
 class Sent(NamedTuple):

@@ -9,32 +9,36 @@ clock to what comes next. Nothing in it depends on the wall clock but how long i
 from __future__ import annotations
 
 import contextlib
-import signal
+import resource
+from functools import partial
 from pathlib import Path
 from time import monotonic
 
 from madns_runtime.config import HostLaunch
-from madns_runtime.context import JobContext
-from madns_runtime.executor import make_executor
-from madns_runtime.half import HostHalf, Program
 from madns_runtime.lockstep import frames
+from madns_runtime.lockstep.barrier import Meeting, RunEnds
 from madns_runtime.lockstep.clock import SimulatedClock
-from madns_runtime.lockstep.crew import Crew
-from madns_runtime.lockstep.half import LockstepHalf
-from madns_runtime.lockstep.meeting import Meeting, RunEnds
-from madns_runtime.lockstep.outbox import Outbox
-from madns_runtime.lockstep.post import decode
-from madns_runtime.lockstep.recorder import LockstepRecorder
-from madns_runtime.lockstep.result import Ending, RunAccount
-from madns_runtime.lockstep.shares import processors_here, share_out
+from madns_runtime.lockstep.host_half import LockstepHalf
+from madns_runtime.lockstep.messages import Outbox, decode
+from madns_runtime.lockstep.partition import processors_here, share_out
+from madns_runtime.lockstep.recorder import open_journal
+from madns_runtime.lockstep.result import EarlyEnd, RunAccount
+from madns_runtime.lockstep.workers import Workers
+from madns_runtime.medium.carrier import Carrier
 from madns_runtime.plugin.api import HOST
+from madns_runtime.plugin.context import JobContext
+from madns_runtime.plugin.executor import make_executor
+from madns_runtime.plugin.half import HostHalf, RoleProgram
+from madns_runtime.plugin.host_calls import HostCalls
 from madns_runtime.protocol.codec import pack
 from madns_runtime.protocol.states import HostEvent, host_machine
-from madns_runtime.reactor.scheduling import freeze_garbage, outlive_parent
-from madns_runtime.reactor.watchdog import end_after_hang_up, tell_stack_on
-from madns_runtime.result_file import hand_over, leave
+from madns_runtime.reactor.host_signals import heed_signals
+from madns_runtime.reactor.operator_link import tell_loading
+from madns_runtime.reactor.scheduling import freeze_garbage
+from madns_runtime.reactor.watchdog import end_after_hang_up
+from madns_runtime.recording.result_file import hand_over, leave
 from madns_runtime.timing.clock import utc_now_iso
-from madns_runtime.timing.rate import Pacer
+from madns_runtime.timing.rate import count_ticks
 
 HANG_GRACE_S = 2.0
 """Beyond twice the time for shutdown: a host that hangs, without an operator, ends by force."""
@@ -60,19 +64,25 @@ class LockstepHost:
         _allow_many_files()
         shares = share_out(config.agents, processors_here())
         # Everything that forks comes before every thread; workers load their half at the same time.
-        self._crew = Crew(config, self._directory.parent, shares)
-        program = Program.load(config, "host")
+        self._crew = Workers(launch, self._directory.parent, shares)
+        program = RoleProgram.load(config, "host", tell=partial(tell_loading, fds[1]))
+        self._calls = calls = HostCalls(launch.session_hex)
         executor = make_executor(config.executor)
         self._clock = clock = SimulatedClock(-config.timeouts.start_lead_s)
-        self._account = account = RunAccount(self._names, config.time.duration_s, len(shares))
-        self._recorder = LockstepRecorder(self._directory, config, source=HOST, clock=clock)
-        self._outbox = Outbox(shares, account=account, clock=clock, recorder=self._recorder)
+        self._account = account = RunAccount(
+            self._names, config.time.duration_s, len(shares), program.columns
+        )
+        self._journal = open_journal(self._directory, config, source=HOST, clock=clock)
+        self._outbox = Outbox(shares, account=account, clock=clock, journal=self._journal)
         self._meeting = Meeting(
             launch, self._crew, account=account, clock=clock, fds=fds, pending=pending
         )
         self._operator = self._meeting.operator
-        self._half = LockstepHalf(
-            HostHalf(program.make, self._recorder.say),
+        calls.t_s = self._t_s
+        self._carrier = carrier = Carrier(self._names, self._outbox.post, clock.now_s)
+        self._half = HostHalf(program, self._journal.say, carrier=carrier, calls=calls)
+        self._guarded = LockstepHalf(
+            self._half,
             config.timeouts,
             meeting=self._meeting,
             executor=executor,
@@ -82,23 +92,22 @@ class LockstepHost:
             name=HOST,
             config=config,
             parameters=program.parameters,
-            recorder=self._recorder,
+            journal=self._journal,
             now_s=clock.now_s,
             send=self._outbox.send,
+            half=self._half,
+            submit=self._guarded.submit,
+            wake=self._half.wake,
         )
-        self._context.submit, self._context.wake = self._half.submit, self._half.wake
         self._machine = host_machine()
 
     def run(self) -> int:
         """Run to the end and return the process's exit code."""
-        if self._launch.is_detached:
-            signal.signal(signal.SIGHUP, signal.SIG_IGN)
-        else:
+        is_detached, meeting = self._launch.is_detached, self._meeting
+        if not is_detached:
             end_after_hang_up(self._line_fd, 2 * self._config.timeouts.shutdown_s + HANG_GRACE_S)
-        outlive_parent()
-        on_signal = self._meeting.reactor.on_signal
-        tell_stack_on(signal.SIGTERM, lambda: on_signal(signal.SIGTERM, self._terminated))
-        on_signal(signal.SIGINT, lambda: None)  # a terminal's Ctrl-C is the operator's
+        terminated = partial(meeting.end, HOST, "ended by SIGTERM", status="interrupted")
+        heed_signals(meeting.reactor, terminated, is_detached=is_detached)
         self._operator.emit({"event": "state", "state": self._machine.state.value})
         try:
             with contextlib.suppress(RunEnds):
@@ -113,12 +122,13 @@ class LockstepHost:
     def _script(self) -> None:
         self._set_up()
         self._start()
-        for number in range(self._tick_count()):
-            self._advance(number / self._config.agents.tick_hz)
+        duration_s, tick_hz = self._config.time.duration_s, self._config.agents.tick_hz
+        for number in range(count_ticks(duration_s, tick_hz)):
+            self._advance(number / tick_hz)
             self._meeting.exchange((frames.TICK, number), self._outbox.boxes)
             self._account.ticks = number + 1
             self._take_messages()
-        self._advance(self._config.time.duration_s)
+        self._advance(duration_s)
         self._drain()
         self._finish()
 
@@ -128,10 +138,10 @@ class LockstepHost:
         self._account.set_states("ready")
         self._fire(HostEvent.AGENTS_READY)
         limit_s = timeouts.host_setup_s
-        self._half.call("setup", self._context, limit_s=limit_s)
+        self._guarded.set_up(self._context, limit_s)
         initial = []
         for number, name in enumerate(self._names):
-            data = self._half.call("initial_data", name, limit_s=limit_s)
+            data = self._guarded.call("initial_data", name, limit_s=limit_s)
             initial.append((number, pack(data)))
             meeting.serve()
         self._fire(HostEvent.SETUP_FINISHED)
@@ -146,21 +156,18 @@ class LockstepHost:
         freeze_garbage()  # what set-up made stays: no collection walks it in mid-run
         self._account.t0_utc = utc_now_iso()
         self._account.began_s = monotonic()
-        self._half.call("start", self._clock.t_s)
-        self._half.call_timer(self._clock.t_s)
-
-    def _tick_count(self) -> int:
-        time, tick_hz = self._config.time, self._config.agents.tick_hz
-        pacer = Pacer(tick_hz=tick_hz, phase_s=0.0, duration_s=time.duration_s, tolerance_s=0.0)
-        return pacer.tick_count
+        self._guarded.call("start", self._clock.t_s)
+        self._half.begin_timer(self._clock.t_s)
+        self._guarded.call_timer(self._clock.t_s)
 
     def _advance(self, t_s: float) -> None:
         """Let simulated time go on to *t_s*, and do all that the half wants done until then."""
         while (next_s := self._half.next_s) is not None and next_s <= t_s:
             self._clock.t_s = max(self._clock.t_s, next_s)
-            self._half.call_timer(self._clock.t_s)
+            self._guarded.call_timer(self._clock.t_s)
             self._meeting.serve()
         self._clock.t_s = t_s
+        self._carrier.hand_over()
 
     def _drain(self) -> None:
         """Hand out what was answered to the last tick, and the answers to that."""
@@ -180,76 +187,76 @@ class LockstepHost:
         limit_s = max(timeouts.complete_s, timeouts.tick_s)
         self._meeting.await_all(limit_s, "has not summed itself up")
         for answer in self._crew.answers():
-            for number, summary, deadlines_broken in answer[1]:
+            for number, summary, deadlines_broken, counts, newest in answer[1]:
                 account.agents[number].summary = summary
                 account.agents[number].deadlines_broken += deadlines_broken
+                account.agents[number].peer_messages = counts
+                account.agents[number].columns = newest
         account.set_states("complete")
-        account.simulation = self._half.finish()
+        account.simulation = self._guarded.finish()
+
+    def _t_s(self) -> float | None:
+        return None if self._account.began_s is None else self._clock.t_s
 
     # Messages -------------------------------------------------------------------------------------
 
     def _take_messages(self) -> None:
         """Hand what the agents sent to the half, in the order of agents and of sending."""
-        names, accounts, half = self._names, self._account.agents, self._half
+        names, accounts, half = self._names, self._account.agents, self._guarded
         for number, service, body in self._meeting.messages():
             accounts[number].up[service] += 1
-            half.call("receive", names[number], decode(body))
+            half.take(names[number], decode(body))
             self._meeting.serve()
 
     # The end --------------------------------------------------------------------------------------
 
-    def _terminated(self) -> None:
-        """End on SIGTERM, which does not come from the operator: it has a line of its own."""
-        self._meeting.end(HOST, "ended by SIGTERM", status="interrupted")
-
     def _shut_down(self) -> None:
-        ending = self._account.ending = self._meeting.ending
+        ending, reason = self._meeting.ending, None
+        self._account.ending = ending
         if ending is None:
             self._fire(HostEvent.STOP_ORDERED)
         else:
-            self._declare(ending)
-        reason = None if ending is None else f"{ending.who}: {ending.reason}"
+            reason = f"{ending.who}: {ending.reason}"
+            self._fire(HostEvent.EMERGENCY)
+            self._journal.event("emergency", who=ending.who, reason=ending.reason)
+            self._log("critical", f"emergency shutdown: {reason}")
         missing = self._account.not_stopped = self._meeting.stop_workers(reason)
         if missing:
             self._log("error", f"{', '.join(missing)}: no word that records are closed")
         self._fire(HostEvent.AGENTS_STOPPED)
-        self._half.close()
+        self._guarded.close()
         self._fire(HostEvent.CLEANED_UP)
-        self._account.records = self._recorder.close().to_mapping()
+        self._account.records = self._journal.close().to_mapping()
+        self._account.peer_messages = self._carrier.to_mapping()
         self._fire(HostEvent.RECORDS_CLOSED)
         self._fire(HostEvent.SERVER_STOPPED)
 
-    def _declare(self, ending: Ending) -> None:
-        self._fire(HostEvent.EMERGENCY)
-        self._recorder.event("emergency", who=ending.who, reason=ending.reason)
-        self._log("critical", f"emergency shutdown: {ending.who}: {ending.reason}")
-
     def _close(self) -> int:
         code = hand_over(self._account.result(), self._directory, self._operator)
+        self._calls.close()
         self._meeting.reactor.close()
         return code
 
     def _leave_hanging(self, reason: str) -> None:
         """Leave a result although the half hangs; called in another thread, before the process ends."""
-        self._account.ending = Ending(who=HOST, reason=reason)
+        self._account.ending = EarlyEnd(who=HOST, reason=reason)
         leave(self._account.result(), self._directory)
+        self._calls.close()
 
     # Telling --------------------------------------------------------------------------------------
 
     def _fire(self, event: HostEvent) -> None:
         state = self._machine.fire(event).value
-        self._recorder.event("state", state=state)
+        self._journal.event("state", state=state)
         self._operator.emit({"event": "state", "state": state})
 
     def _log(self, level: str, text: str) -> None:
-        self._recorder.say(level, text)
+        self._journal.say(level, text)
         self._operator.emit({"event": "log", "level": level, "source": HOST, "text": text})
 
 
 def _allow_many_files() -> None:
     """Raise the number of open files to what the system allows: a worker holds those of many agents."""
-    import resource  # Does not exist everywhere.
-
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != hard:
         with contextlib.suppress(OSError, ValueError):

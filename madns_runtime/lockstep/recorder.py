@@ -6,22 +6,55 @@ No thread, and no byte that depends on the wall clock: a run recorded twice is r
 
 from __future__ import annotations
 
-import contextlib
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from madns_runtime.config import RunConfig
 from madns_runtime.errors import MachineError
 from madns_runtime.lockstep.clock import T0_UTC, SimulatedClock
-from madns_runtime.recording.counts import RecordCounts
-from madns_runtime.recording.run_recorder import RunRecorder
-from madns_runtime.recording.writer import CLOSE_TIMEOUT_S
+from madns_runtime.recording.record_files import RecordFiles
+from madns_runtime.recording.recorder import Recorder
+from madns_runtime.recording.run_journal import RunJournal
 
 
-class LockstepRecorder(RunRecorder):
+class DirectWriter:
     """
-    The record streams of the host or of one agent, written by whoever records.
+    Writes what waits in whoever records, when much does; see `RecordWriter`.
+
+    Args:
+        files: What it writes.
+    """
+
+    def __init__(self, files: RecordFiles) -> None:
+        self._files = files
+        self._is_closed = False
+
+    def start(self) -> None:
+        """Do nothing: there is no thread."""
+
+    def flush(self) -> None:
+        """
+        Write what waits.
+
+        Raises:
+            MachineError: The disk refuses: a run that goes on would only lose records.
+        """
+        if not self._is_closed and not self._files.write_waiting():
+            raise MachineError(f"records cannot be written: {'; '.join(self._files.errors)}")
+
+    def close(self, timeout_s: float) -> None:
+        """Write what waits and the end lines, and make it durable."""
+        del timeout_s  # the host waits, not this process
+        if not self._is_closed:
+            self._is_closed = True
+            self._files.write_waiting()
+            self._files.finish()
+
+
+def open_journal(
+    directory: Path, config: RunConfig, *, source: str, clock: SimulatedClock
+) -> RunJournal:
+    """
+    Return the journal, with a recorder, of the host or of one agent.
 
     The schema lines name the scenario where those of other runs name the run: its number would
     differ from one run to the next.
@@ -33,52 +66,9 @@ class LockstepRecorder(RunRecorder):
         clock: What events and logged sentences carry the time of.
 
     Raises:
-        MachineError: The directory cannot be made.
+        MachineError: The directory cannot be made, or takes no new file.
     """
-
-    def __init__(
-        self, directory: Path, config: RunConfig, *, source: str, clock: SimulatedClock
-    ) -> None:
-        self._clock = clock
-        named = replace(config, run=config.scenario)
-        super().__init__(directory, named, source=source, t_s=clock.now_s)
-        self.set_t0(T0_UTC)
-
-    def start(self) -> None:
-        """Do nothing: there is no thread."""
-
-    def event(self, event: str, **values: Any) -> None:
-        """Record that something happened, as a run's end, which no full disk may hold up."""
-        with contextlib.suppress(MachineError):  # what is recorded next, or flushed, says it
-            super().event(event, **values)
-
-    def log(self, level: str, text: str, t_s: float | None = None) -> None:
-        """Log a sentence, as of a run's end, which no full disk may hold up."""
-        with contextlib.suppress(MachineError):
-            super().log(level, text, t_s)
-
-    def flush(self) -> None:
-        """
-        Write what waits.
-
-        Raises:
-            MachineError: The disk refuses: a run that goes on would only lose records.
-        """
-        if not self._flush():
-            raise MachineError(f"records cannot be written: {self.problem}")
-
-    def close(self, timeout_s: float = CLOSE_TIMEOUT_S) -> RecordCounts:
-        """Write what waits and the end lines, make it durable, and return the last counts."""
-        del timeout_s  # the host waits, not this process
-        if not self._is_ended:
-            self.event("end")
-            self._is_ended = self._is_closing = True
-            self._flush()
-            self._finish_files()
-        return self.counts()
-
-    def _hurry(self) -> None:
-        self.flush()
-
-    def _utc(self) -> str:
-        return self._clock.utc()
+    files = RecordFiles(directory, run=config.scenario, source=source)
+    recorder = Recorder(files, config.recording, DirectWriter(files))
+    recorder.set_t0(T0_UTC)
+    return RunJournal(recorder, config.recording.verbosity, t_s=clock.now_s, utc=clock.utc)

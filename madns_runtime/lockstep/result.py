@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
-from madns_runtime.lockstep.post import SERVICES
+from madns_runtime.medium.outcomes import between_agents
+from madns_runtime.recording.newest_values import Value, told_columns
+
+SERVICES: Final = ("best", "reliable", "sync")
+"""By the number of the class of service."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Ending:
+class EarlyEnd:
     """Why a run ends before its time."""
 
     who: str
@@ -20,7 +24,7 @@ class Ending:
 
 @dataclass(slots=True)
 class AgentAccount:
-    """What the host counts of one agent."""
+    """The host's counts of one agent."""
 
     up: list[int] = field(default_factory=lambda: [0] * len(SERVICES))
     """Messages to the host, by class of service."""
@@ -28,14 +32,14 @@ class AgentAccount:
     too_late: int = 0
     """Of those, sent when nobody was to receive any more."""
     deadlines_broken: int = 0
+    peer_messages: Mapping[str, int] = field(default_factory=dict)
+    """Its counts of messages between agents."""
+    columns: list[Value] | None = None
+    """The newest values of its columns; None before any were told."""
     state: str = "starting"
+    """stopped once there is word that its records are closed."""
     summary: Mapping[str, Any] = field(default_factory=dict)
     records: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def is_open(self) -> bool:
-        """Whether there is no word that its records are closed."""
-        return self.state != "stopped"
 
     def to_mapping(self, ticks: int, reason: str | None) -> dict[str, Any]:
         """
@@ -54,6 +58,7 @@ class AgentAccount:
             "clock": None,
             "messages": self.messages(),
             "records": dict(self.records),
+            "columns": self.columns or [],
             "simulation": dict(self.summary),
         }
 
@@ -70,23 +75,27 @@ class AgentAccount:
 
 @dataclass(slots=True)
 class RunAccount:
-    """What a run has come to."""
+    """Counts and times of a whole run."""
 
     names: tuple[str, ...]
     duration_s: float
     workers: int
+    columns: tuple[str, ...] = ()
+    """Fields of agents' streams whose newest values are told."""
     agents: list[AgentAccount] = field(init=False)
     ticks: int = 0
     """Run by every agent."""
     lost: dict[str, str] = field(default_factory=dict)
     not_stopped: tuple[str, ...] = ()
-    ending: Ending | None = None
+    ending: EarlyEnd | None = None
     t0_utc: str | None = None
     began_s: float | None = None
-    """When simulated time began, on a monotonic clock."""
+    """Begin of simulated time on a monotonic clock, s."""
     wall_s: float | None = None
-    """What all of the simulated time took."""
+    """Wall time of the whole simulated time, s."""
     simulation: Mapping[str, Any] = field(default_factory=dict)
+    peer_messages: Mapping[str, Any] = field(default_factory=dict)
+    """The host's account of messages between agents."""
     records: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -98,11 +107,21 @@ class RunAccount:
         for agent in self.agents:
             agent.state = state
 
+    def note_values(self, agents: Iterable[int], newest: Iterable[list[Value]]) -> None:
+        """Keep the newest values of columns that a worker told of its *agents*, if it did."""
+        for number, values in zip(agents, newest, strict=False):
+            self.agents[number].columns = values
+
     def progress(self, t_s: float, now_s: float) -> dict[str, Any]:
         """Return the progress event at simulated time *t_s* and *now_s* of the monotonic clock."""
         speed = None
         if self.began_s is not None and now_s > self.began_s:
             speed = max(t_s, 0.0) / (now_s - self.began_s)
+        told = [
+            (name, agent.columns)
+            for name, agent in zip(self.names, self.agents, strict=True)
+            if agent.columns is not None
+        ]
         counts = {
             state: sum(agent.state == state for agent in self.agents)
             for state in ("ready", "running", "complete")
@@ -115,6 +134,7 @@ class RunAccount:
             **counts,
             "lost": len(self.lost),
             "ticks": self.ticks * len(self.names),
+            **told_columns(self.columns, told),
         }
 
     def result(self) -> dict[str, Any]:
@@ -139,8 +159,12 @@ class RunAccount:
             "not_stopped": list(self.not_stopped),
             "network": {},
             "messages": self._totals(),
+            "between_agents": between_agents(
+                self.peer_messages, (agent.peer_messages for agent in self.agents)
+            ),
             "refused": {},
             "records": dict(self.records),
+            "columns": list(self.columns),
             "simulation": dict(self.simulation),
             "scheduling": {},
         }

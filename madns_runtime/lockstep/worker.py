@@ -13,28 +13,30 @@ import signal
 import socket
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import Any, NoReturn
 
-from madns_runtime.config import RunConfig
-from madns_runtime.context import clean_text
+from madns_runtime.config import DeviceLaunch, RunConfig
 from madns_runtime.errors import MadnsError
-from madns_runtime.half import HalfFailed, Program
 from madns_runtime.lockstep import frames
 from madns_runtime.lockstep.agent import Crewmates, LockstepAgent
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.frames import POSITIONS, FrameReader, encode_frame
-from madns_runtime.lockstep.post import decode
+from madns_runtime.lockstep.messages import decode
 from madns_runtime.plugin.api import Tick
+from madns_runtime.plugin.context import clean_text
+from madns_runtime.plugin.half import HalfFailed, RoleProgram
 from madns_runtime.processes import register
 from madns_runtime.protocol.codec import unpack
+from madns_runtime.protocol.messages import Delivery, TransmissionRefusal
 from madns_runtime.reactor.forking import leave_parent
 from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.watchdog import end_after_hang_up
+from madns_runtime.recording.newest_values import Value
 
 READ_BYTES = 1 << 18
 HANG_GRACE_S = 2.0
@@ -45,9 +47,11 @@ STACK_SIGNAL = signal.SIGUSR1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Assignment:
-    """What one worker is to run."""
+    """The task of one worker."""
 
     config: RunConfig
+    devices: tuple[DeviceLaunch, ...]
+    """Those of all agents."""
     directory: Path
     """The run directory."""
     agents: range
@@ -141,7 +145,7 @@ class Worker:
             self._check_terminated()
             answer = carry_out()
         except AgentFailed as failure:
-            answer = self._failed(failure)
+            answer = encode_frame(frames.FAILED, failure.index, clean_text(failure.reason))
         self._position[0] = frames.IDLE
         self._say(answer)
 
@@ -150,9 +154,6 @@ class Worker:
             self._line.sendall(frame)
         except OSError as error:
             raise _HostGone from error
-
-    def _failed(self, failure: AgentFailed) -> bytes:
-        return encode_frame(frames.FAILED, failure.index, clean_text(failure.reason))
 
     def _next_order(self) -> list[Any]:
         data = b""
@@ -190,8 +191,9 @@ class Worker:
             self._mates = Crewmates(
                 config=config,
                 directory=self._assignment.directory,
-                program=Program.load(config, "agent"),
+                program=RoleProgram.load(config, "agent"),
                 clock=self._clock,
+                devices=self._assignment.devices,
             )
             for index in self._assignment.agents:
                 self._agents.append(LockstepAgent(index, self._mates))
@@ -202,7 +204,8 @@ class Worker:
     def _set_up(self, initial: list[tuple[int, bytes]]) -> bytes:
         for agent, (index, packed) in zip(self._agents, initial, strict=True):
             self._position[0] = index * POSITIONS + frames.SETTING_UP
-            agent.recorder.event("start")
+            agent.journal.event("start")
+            self._ask_devices(agent, agent.devices.open)
             self._call(agent, "setup", agent.context, unpack(packed))
         freeze_garbage()  # what set-up made stays: no collection walks it in mid-run
         return self._done()
@@ -215,17 +218,42 @@ class Worker:
         if messages:
             self._hand_out(messages)
         tick = Tick(number, t_s, self._period_s, 0.0, 0, t_s)
-        position = self._position
+        position, has_medium = self._position, self._mates.program.has_medium
         agent = self._agents[0]
         try:
             for agent in self._agents:
+                if has_medium:
+                    self._hear(agent, t_s)
+                if agent.devices:
+                    self._look_at_devices(agent, t_s)
                 position[0] = agent.stepping
                 agent.step(tick)
+        except AgentFailed:
+            raise
         except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
             raise AgentFailed(agent.index, str(agent.half.failure("step", error))) from error
-        if monotonic() - self._flushed_s > self._flush_interval_s:
-            self._flush()
-        return self._done()
+        if monotonic() - self._flushed_s <= self._flush_interval_s:
+            return self._done()
+        self._flush()
+        return self._done([agent.columns.read() for agent in self._agents])
+
+    def _hear(self, agent: LockstepAgent, t_s: float) -> None:
+        for delivery in agent.mailbox.due(t_s):
+            self._position[0] = agent.index * POSITIONS + frames.HEARING
+            self._call(agent, "hear", delivery)
+
+    def _look_at_devices(self, agent: LockstepAgent, t_s: float) -> None:
+        """Take the devices' samples up to *t_s*, and tell the half whose status has changed."""
+        self._position[0] = agent.stepping
+        for name, status in self._ask_devices(agent, partial(agent.devices.advance, t_s)):
+            agent.journal.event("device", device=name, status=status)
+            self._call(agent, "device_changed", name, status)
+
+    def _ask_devices(self, agent: LockstepAgent, ask: Callable[[], Any]) -> Any:
+        try:
+            return ask()
+        except MadnsError as error:
+            raise AgentFailed(agent.index, str(error)) from error
 
     def _drain(self, messages: list[tuple[int, bytes]]) -> bytes:
         self._check_terminated()
@@ -238,20 +266,28 @@ class Worker:
         for agent in self._agents:
             self._position[0] = agent.index * POSITIONS + frames.FINISHING
             summary = self._call(agent, "finish")
-            summaries.append((agent.index, summary, agent.deadlines_broken))
+            counts = agent.mailbox.counts()
+            newest = agent.columns.read()
+            summaries.append((agent.index, summary, agent.deadlines_broken, counts, newest))
         return encode_frame(frames.SUMMARIES, summaries)
 
-    def _done(self) -> bytes:
+    def _done(self, newest: Sequence[list[Value]] = ()) -> bytes:
         outbox = self._mates.outbox
-        answer = encode_frame(frames.DONE, outbox)
+        answer = encode_frame(frames.DONE, outbox, newest)
         outbox.clear()
         return answer
 
     def _hand_out(self, messages: list[tuple[int, bytes]]) -> None:
         first = self._assignment.agents[0]
         for index, body in messages:
-            self._position[0] = index * POSITIONS + frames.RECEIVING
-            self._call(self._agents[index - first], "receive", decode(body))
+            agent, message = self._agents[index - first], decode(body)
+            if isinstance(message, Delivery):
+                agent.mailbox.add(message)
+                continue
+            is_refusal = isinstance(message, TransmissionRefusal)
+            doing = frames.REFUSED if is_refusal else frames.RECEIVING
+            self._position[0] = index * POSITIONS + doing
+            self._call(agent, frames.METHODS[doing], message)
 
     # Faults and records ------------------------------------------------------------------------------
 
@@ -264,7 +300,7 @@ class Worker:
     def _flush(self) -> None:
         for agent in self._agents:
             try:
-                agent.recorder.flush()
+                agent.journal.recorder.flush()
             except MadnsError as error:
                 raise AgentFailed(agent.index, str(error)) from error
         self._flushed_s = monotonic()
@@ -273,9 +309,11 @@ class Worker:
         for agent in self._agents:
             self._position[0] = agent.index * POSITIONS + frames.CLOSING
             if reason is not None:
-                agent.recorder.event("emergency", reason=reason)
-                agent.recorder.say("critical", f"emergency shutdown: {reason}")
-            counts = agent.recorder.close().to_mapping()
+                agent.journal.event("emergency", reason=reason)
+                agent.journal.say("critical", f"emergency shutdown: {reason}")
+            counts = agent.journal.close().to_mapping()
+            if agent.devices:
+                counts["devices"] = agent.devices.close()
             if is_told:
                 self._say(encode_frame(frames.CLOSED, agent.index, counts))
         for index in self._assignment.agents[len(self._agents) :] if is_told else ():

@@ -14,11 +14,44 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from madns_runtime.protocol.messages import Service
+from madns_runtime.errors import BlamedError
+from madns_runtime.medium.outcomes import EVERYBODY, LinkOutcome, Medium, MessageAccount
+from madns_runtime.plugin.device_view import ChannelFrame, ChannelReading, DeviceStatus, DeviceView
+from madns_runtime.plugin.returned_values import Check, DeclaredStream, Demand, Flow, Tabulated
+from madns_runtime.protocol.messages import Delivery, Service, Transmission, TransmissionRefusal
 from madns_runtime.recording.records import Field
 
 if TYPE_CHECKING:
     import numpy as np  # 0.2 s of import time that `cosmos validate` has no use for
+
+__all__ = [
+    "EVERYBODY",
+    "HOST",
+    "AgentContext",
+    "AgentSimulation",
+    "Check",
+    "Context",
+    "DeclaredStream",
+    "Delivery",
+    "DeviceStatus",
+    "DeviceView",
+    "Demand",
+    "Field",
+    "Flow",
+    "ChannelFrame",
+    "HostContext",
+    "HostSimulation",
+    "LinkOutcome",
+    "Medium",
+    "MessageAccount",
+    "ChannelReading",
+    "Service",
+    "Simulation",
+    "Tabulated",
+    "Tick",
+    "Transmission",
+    "TransmissionRefusal",
+]
 
 HOST = "host"
 
@@ -40,7 +73,7 @@ class Tick(NamedTuple):
 
 
 class Context(Protocol):
-    """What the framework offers to either half of a simulation."""
+    """The framework as either half of a simulation sees it."""
 
     name: str
     """host, or the agent's name."""
@@ -67,9 +100,13 @@ class Context(Protocol):
         service: Service = Service.RELIABLE,
         *,
         deadline_s: float | None = None,
-    ) -> None:
+    ) -> int | None:
         """
-        Send *message* to an agent by name, or from an agent to "host".
+        Send *message* to an agent by name, or from an agent to "host" or to another agent.
+
+        From one agent to another, or to all of them (EVERYBODY), it goes through the medium that the simulation
+        declares, bears the time of the newest tick, and reaches `AgentSimulation.hear` of its receivers in their
+        first tick at or after the simulated time of its arrival.
 
         Args:
             to: The receiver's name.
@@ -79,11 +116,15 @@ class Context(Protocol):
             deadline_s: SYNC only: simulated time by which it must have arrived; a broken one is
                 counted, recorded and reported.
 
+        Returns:
+            Of a message to other agents the number by which a refusal names it.
+
         Raises:
             MessageTooLarge: It does not fit its class of service.
             SendQueueFull: The receiver has not taken what was sent before.
             PluginError: It holds what messages do not carry, or there is no such receiver, class of
-                service or deadline.
+                service or deadline; to agents: the simulation declares no medium, it is not RELIABLE, or no
+                tick has begun.
         """
 
     def open_stream(self, name: str, fields: Sequence[Field]) -> None:
@@ -92,15 +133,26 @@ class Context(Protocol):
     def record(self, stream: str, values: Sequence[Any]) -> None:
         """Record one value a field. Never blocks; what does not fit is counted."""
 
+    def keep_text(self, name: str, data: bytes) -> None:
+        """
+        Keep what a program of one's own wrote in NAME.txt beside the records; never blocks.
+
+        Of what is too long the first 1 MiB and the last 64 KiB are kept. It is no record: neither judged
+        nor part of what two lockstep runs have in common.
+        """
+
     def log(self, level: str, text: str) -> None:
         """Log a sentence at critical, error, warning, info or debug."""
 
 
 class HostContext(Context, Protocol):
-    """What the framework offers to the host's half."""
+    """The framework as the host's half sees it."""
 
     workers: int
     """Workers of the executor, N_p: jobs that may be under way at once."""
+    timer_lateness_s: float
+    """Delay of the last call of `HostSimulation.timer` behind the time it asked for, s; in lockstep more
+    than 0 only after a `wake` for a time that had passed."""
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> int:
         """
@@ -112,9 +164,50 @@ class HostContext(Context, Protocol):
     def wake(self, t_s: float) -> None:
         """Have `HostSimulation.timer` called at simulated time *t_s* if it wants a later one, or none."""
 
+    def enter(
+        self, sender: str, transmission: Transmission, outcomes: Sequence[LinkOutcome]
+    ) -> None:
+        """
+        See to a message of *sender*, a place that is no agent, such as a ground station.
+
+        It is delivered to those of its *outcomes* that are agents, and counted, as what `Medium.carry` returns.
+
+        Raises:
+            PluginError: There is no outcome, or one arrives no later than it was sent.
+        """
+
+    def account(self, channel: str = "") -> MessageAccount:
+        """Return what became of the messages between agents, of a channel of the medium's outcomes."""
+
 
 class AgentContext(Context, Protocol):
-    """What the framework offers to an agent's half."""
+    """The framework as an agent's half sees it."""
+
+    hardware: Mapping[str, DeviceView]
+    """The devices that this agent uses, by name, as the scenario's `hardware:` says."""
+
+    def transmit(self, to: str, message: Any, *, number: int | None = None) -> int:
+        """
+        Hand *message* to the medium, for whatever receiver the medium knows: `send` takes agents alone.
+
+        Args:
+            to: An agent, EVERYBODY, or a place such as a ground station; the medium refuses what it does not know.
+            message: As of `send`.
+            number: The sender's own, greater than all before; the next one if None. Refusals name it, and chance
+                is drawn for it.
+
+        Returns:
+            The number.
+
+        Raises:
+            MessageTooLarge: It is longer than messages are.
+            SendQueueFull: The host has not taken what was sent before.
+            PluginError: It holds what messages do not carry, the simulation declares no medium, or no tick has
+                begun.
+        """
+
+    def message_counts(self) -> Mapping[str, int]:
+        """Return how many messages of agents were received, are held until their time, came late, found no room."""
 
 
 class HostSimulation(Protocol):
@@ -134,7 +227,12 @@ class HostSimulation(Protocol):
         """Take a message that *agent* sent."""
 
     def timer(self, t_s: float) -> float | None:
-        """Do what is due at simulated time *t_s* and return the next time wanted; called once after start."""
+        """
+        Do what is due at simulated time *t_s*, the time that was asked for, and return the next time wanted.
+
+        Called for the first time right after `start`. The next time must be later than *t_s*, or None;
+        how much later than asked for the call came says `HostContext.timer_lateness_s`.
+        """
         return None
 
     def result(self, job: int, value: Any) -> None:
@@ -163,53 +261,28 @@ class AgentSimulation(Protocol):
     def receive(self, message: Any) -> None:
         """Take a message that the host sent."""
 
+    def hear(self, delivery: Delivery) -> None:
+        """
+        Take a message of another agent, right before the step of the first tick at or after its arrival.
+
+        Messages are taken in the order of (arrival, sender, time sent).
+
+        Raises:
+            BlamedError: Always, where this is not overridden.
+        """
+        raise BlamedError(
+            f"{delivery.sender} sent a message, and {type(self).__name__} has no hear(delivery)"
+        )
+
+    def refused(self, refusal: TransmissionRefusal) -> None:
+        """Take that the medium refused a message to other agents; of one that is lost nobody is told."""
+
+    def device_changed(self, device: str, status: DeviceStatus) -> None:
+        """Take that a device's status has changed; right before the step of the first tick that finds it so."""
+
     def finish(self) -> Mapping[str, Any]:
         """Return this agent's summary; a list under "checks" is judged (see `Check`)."""
         return {}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Check:
-    """One line of a verdict. In a summary it stands as a plain mapping with these keys."""
-
-    name: str
-    limit: float
-    got: float
-    passed: bool
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Flow:
-    """Messages of one kind that every agent exchanges with the host."""
-
-    name: str
-    message_bytes: int
-    """Encoded size of one message, without datagram overhead."""
-    rate_hz: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Demand:
-    """What a simulation asks of host and network: the terms of the thesis's inequalities 2.7-2.10."""
-
-    flows: tuple[Flow, ...]
-    """S_Di and R_Di of every planned flow, a single agent's."""
-    buffer_s: float
-    """T_bi: how long an agent can go on from what it holds; infinity if it needs nothing."""
-    batch_bytes: int
-    """S_b: encoded size of one asynchronous batch, of one agent."""
-    batch_compute_s: float
-    """T_p(S_b): host time to make one agent's batch."""
-    sync_bytes: int
-    """S_sync: encoded size of one synchronous batch; 0 without maneuvers."""
-    sync_compute_s: float
-    """T_p(S_sync)."""
-    sync_rate_hz: float
-    """N_sync: synchronous exchanges a second, of one agent, at worst."""
-    lead_s: float
-    """T_m - T_s: how far ahead of its execution a maneuver is commanded."""
-    measured: bool
-    """Whether the compute times were measured on this machine (else they are declared)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -228,4 +301,32 @@ class Simulation:
     check: str | None = None
     """module:function of (parameters, agents: int, base_directory: Path) -> list[str]: faults beyond bounds,
     such as a missing file, each starting with the dotted parameter name and a colon. A fourth parameter
-    called names is given the agents' names."""
+    called names is given the agents' names, a fifth called duration_s the run's simulated duration."""
+    streams: str | None = None
+    """module:function of (parameters, agents: tuple[str, ...]) -> sequence of `DeclaredStream`: all that either
+    half may open. What a run recorded otherwise is a remark in its run.json; None if nothing is declared."""
+    labels: str | None = None
+    """module:function of (parameters, agents: tuple[str, ...], base_directory: Path) -> mapping of agents to second
+    names: placement, selections of agents and tables find an agent by either; None if it has but one."""
+    columns: tuple[str, ...] = ()
+    """Fields of the agents' declared streams, as "drive.speed_m_s", at most six: whoever watches a run is shown
+    their newest values per agent."""
+    label_column: str = "label"
+    """Kind of the second names, and the column of tables that bears them, such as satellite."""
+    medium: str | None = None
+    """module:function of (host: the host's half, context: HostContext) -> `Medium` for messages between agents, or
+    None for a run without; called right after the host half's `setup`. None: agents cannot send to each other."""
+    tabulate: str | None = None
+    """module:function of (host_directory: Path, agents: tuple[str, ...], times_s: array) -> iterator of
+    `Tabulated`: what the host recorded of each agent in a form of its own, at any times; None if nothing."""
+    figures: str | None = None
+    """module:function of (run: madns_runtime.analysis.tables.RecordedRun) -> list of
+    `madns_runtime.analysis.values.Section`: what a report shows of a run beyond a line per number; None for no
+    more. Loaded by the operator's side alone, after a run."""
+    document: str | None = None
+    """module:function of (run: madns_runtime.analysis.tables.RecordedRun) -> mapping of names to plain values: what
+    `cosmos report --json` tells beside run.json; None for nothing. Loaded as `figures`."""
+    compare: str | None = None
+    """module:function of two `madns_runtime.analysis.tables.ComparedRun` ->
+    `madns_runtime.analysis.values.SimulationDifference`: what differs between two runs beyond their records; None
+    for nothing. Loaded by the operator's side alone, after a run."""

@@ -11,40 +11,71 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import difflib
+import functools
 import hashlib
 import importlib
 import importlib.util
 import inspect
 import re
 import sys
-import traceback
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
 
+from madns_runtime.bounded_files import FileRefused, check_regular_file
 from madns_runtime.config import from_mapping
-from madns_runtime.errors import MissingExtraError, PluginError
+from madns_runtime.errors import MadnsError, MissingExtraError, PluginError
 from madns_runtime.plugin.api import AgentSimulation, HostSimulation, Simulation
-from madns_runtime.plugin.guard import missing_extra, place_of, said, talk_on_stderr
+from madns_runtime.plugin.code_places import (
+    CODE_BYTES_MAX,
+    MODULE_PREFIX,
+    blame,
+    last_place,
+    line_in,
+    told_place,
+)
+from madns_runtime.plugin.columns import shape_faults
+from madns_runtime.plugin.isolation import missing_extra, said
+from madns_runtime.plugin.time_limit import PluginStopped, hold
 
 GROUP = "madns.simulations"
-MODULE_PREFIX = "madns_plugin_"
-HOST_METHODS = (
-    "setup",
-    "initial_data",
-    "start",
-    "receive",
-    "timer",
-    "result",
-    "agent_lost",
-    "agent_rejoined",
-    "finish",
+PARTS = (
+    "agent",
+    "host",
+    "demand",
+    "check",
+    "streams",
+    "labels",
+    "medium",
+    "tabulate",
+    "figures",
+    "document",
+    "compare",
 )
-AGENT_METHODS = ("setup", "step", "receive", "finish")
+"""Fields of a descriptor that name a part of the simulation, the halves first."""
 
 Role = Literal["host", "agent"]
+CONTRACTS: Mapping[Role, tuple[type, tuple[str, ...]]] = {
+    "host": (
+        HostSimulation,
+        (
+            "setup",
+            "initial_data",
+            "start",
+            "receive",
+            "timer",
+            "result",
+            "agent_lost",
+            "agent_rejoined",
+            "finish",
+        ),
+    ),
+    "agent": (AgentSimulation, ("setup", "step", "receive", "finish")),
+}
+"""Base class of each half, and the methods that a half must have."""
 
 
 class IdleHost(HostSimulation):
@@ -53,7 +84,13 @@ class IdleHost(HostSimulation):
 
 def registered_names() -> tuple[str, ...]:
     """Return the names of all installed simulations, sorted."""
-    return tuple(sorted({entry.name for entry in metadata.entry_points(group=GROUP)}))
+    return tuple(sorted({name for name, _ in _registered(tuple(sys.path))}))
+
+
+@functools.lru_cache(maxsize=8)
+def _registered(path: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
+    """Return name and place of all installed simulations; read once per path of imports, as that takes 8 ms."""
+    return tuple((entry.name, entry.value) for entry in metadata.entry_points(group=GROUP))
 
 
 def resolve(spec: str, base_directory: Path) -> Simulation:
@@ -71,12 +108,11 @@ def resolve(spec: str, base_directory: Path) -> Simulation:
     if ":" in spec:
         where = spec
     else:
-        entries = {entry.name: entry.value for entry in metadata.entry_points(group=GROUP)}
+        entries = dict(_registered(tuple(sys.path)))
         if spec not in entries:
             raise PluginError(_unknown_name(spec, sorted(entries), base_directory))
         where = entries[spec]
-    module, attribute = _load_module_of(where, base_directory)
-    descriptor = _attribute(module, attribute, where)
+    module, descriptor = load_object(where, base_directory)
     return _checked(descriptor, where, module)
 
 
@@ -91,26 +127,26 @@ def load_half(descriptor: Simulation, role: Role, base_directory: Path) -> Calla
     where = descriptor.host if role == "host" else descriptor.agent
     if where is None:
         return IdleHost
-    module, attribute = _load_module_of(where, base_directory)
-    half = _attribute(module, attribute, where)
+    _, half = load_object(where, base_directory)
     faults = _contract_faults(half, role)
     if faults:
-        raise PluginError(f"{_told(where, half)}: {'; '.join(faults)}")
+        raise PluginError(f"{told_place(where, half)}: {'; '.join(faults)}")
     return half  # type: ignore[no-any-return]
 
 
 def load_function(where: str, base_directory: Path) -> Callable[..., Any]:
     """
-    Import a descriptor's `demand` or `check`.
+    Import a descriptor's `demand`, `check` or `medium`.
 
     Raises:
         PluginError: It cannot be found or is no function.
         MissingExtraError: It needs an optional dependency that is not installed.
     """
-    module, attribute = _load_module_of(where, base_directory)
-    function = _attribute(module, attribute, where)
+    _, function = load_object(where, base_directory)
     if not callable(function):
-        raise PluginError(f"{_told(where)}: expected a function, got {type(function).__name__}")
+        raise PluginError(
+            f"{told_place(where)}: expected a function, got {type(function).__name__}"
+        )
     return function  # type: ignore[no-any-return]
 
 
@@ -121,13 +157,16 @@ def part_faults(descriptor: Simulation, base_directory: Path) -> list[str]:
     For a file that somebody is writing just now: a registered simulation's parts are loaded when
     they are needed, as its host may import a large library.
     """
-    faults = []
-    for role in ("agent", "host"):
-        faults += _fault_of(lambda role=role: load_half(descriptor, role, base_directory))  # type: ignore[misc]
-    for where in (descriptor.demand, descriptor.check):
-        if where is not None:
-            faults += _fault_of(lambda where=where: load_function(where, base_directory))  # type: ignore[misc]
-    return faults
+    roles: tuple[Role, ...] = ("agent", "host")
+    loads: list[Callable[[], object]] = [
+        *(partial(load_half, descriptor, role, base_directory) for role in roles),
+        *(
+            partial(load_function, where, base_directory)
+            for where in (getattr(descriptor, part) for part in PARTS[2:])
+            if where is not None
+        ),
+    ]
+    return [fault for load in loads if (fault := _fault_of(load))]
 
 
 def is_file(spec: str) -> bool:
@@ -136,14 +175,30 @@ def is_file(spec: str) -> bool:
     return place.endswith(".py") or "/" in place
 
 
+def is_shipped(spec: str) -> bool:
+    """Tell whether a spec means a simulation of this package; nothing is imported."""
+    if ":" not in spec:
+        found = [place for name, place in _registered(tuple(sys.path)) if name == spec]
+        return bool(found) and all(map(is_shipped, found))
+    return not is_file(spec) and spec.startswith(f"{__name__.partition('.')[0]}.")
+
+
 def parse_parameters(descriptor: Simulation, mapping: Mapping[str, Any]) -> Any:
     """
     Build the simulation's parameters from a plain mapping that was validated where the file was read.
 
     Raises:
         ConfigurationError: A name is unknown or missing, or a value has another type.
+        PluginError: The class itself refuses them.
     """
-    return from_mapping(descriptor.parameters, mapping, "parameters")
+    kind = descriptor.parameters
+    try:
+        with hold():
+            return from_mapping(kind, mapping, "parameters")
+    except MadnsError:
+        raise
+    except (Exception, SystemExit, PluginStopped) as error:  # of its own __post_init__
+        raise PluginError(f"{blame(error, kind)}: {kind.__name__}: {said(error)}") from error
 
 
 def _unknown_name(spec: str, known: list[str], base_directory: Path) -> str:
@@ -158,25 +213,38 @@ def _unknown_name(spec: str, known: list[str], base_directory: Path) -> str:
     return f"{text}; installed are {', '.join(known) or 'none'}"
 
 
-def _load_module_of(where: str, base_directory: Path) -> tuple[ModuleType, str]:
+def load_object(where: str, base_directory: Path) -> tuple[ModuleType, Any]:
+    """
+    Import what a spec names, and return its module and itself.
+
+    Args:
+        where: module:NAME or ./file.py:NAME.
+        base_directory: Folder from which files are found.
+
+    Raises:
+        PluginError: It cannot be found, or its module does not load.
+        MissingExtraError: It needs an optional dependency that is not installed.
+    """
     place, _, attribute = where.rpartition(":")
     if not place or not attribute.isidentifier():
         raise PluginError(f"{where!r}: expected module:attribute or ./file.py:attribute")
     if is_file(where):
-        return _load_file(base_directory / place, where), attribute
-    if place.startswith(MODULE_PREFIX) and place in sys.modules:
-        return sys.modules[place], attribute
-    return _load_module(place, where), attribute
+        module = _load_file(base_directory / place, where)
+    elif place.startswith(MODULE_PREFIX) and place in sys.modules:
+        module = sys.modules[place]
+    else:
+        module = _load_module(place, where)
+    return module, _attribute(module, attribute, where)
 
 
 def _load_module(name: str, where: str) -> ModuleType:
     try:
-        with talk_on_stderr():
+        with hold():
             return importlib.import_module(name)
     except ImportError as error:
         raise _translated(error, where) from error
-    except (Exception, SystemExit) as error:  # a plug-in may raise anything while it is imported
-        raise PluginError(f"{where}: {_last_place(error, name)}{said(error)}") from error
+    except (Exception, SystemExit, PluginStopped) as error:  # a plug-in may raise anything
+        raise PluginError(f"{where}: {last_place(error, name)}{said(error)}") from error
 
 
 def _load_file(path: Path, where: str) -> ModuleType:
@@ -184,22 +252,26 @@ def _load_file(path: Path, where: str) -> ModuleType:
     name = module_name(path)
     if name in sys.modules:
         return sys.modules[name]
-    if not path.is_file():
-        raise PluginError(f"{where}: no file {path}")
+    try:
+        check_regular_file(path, bytes_max=CODE_BYTES_MAX)
+    except FileNotFoundError:
+        raise PluginError(f"{where}: no file {path}") from None
+    except FileRefused as error:
+        raise PluginError(f"{where}: {error}") from None
     specification = importlib.util.spec_from_file_location(name, path)
     if specification is None or specification.loader is None:
         raise PluginError(f"{where}: expected a Python file ending in .py, got {path.name}")
     module = importlib.util.module_from_spec(specification)
     sys.modules[name] = module  # before it runs: its dataclasses look their module up by name
     try:
-        with talk_on_stderr(), _neighbours_importable(path.parent):
+        with _neighbours_importable(path.parent), hold():
             specification.loader.exec_module(module)
     except BaseException as error:
         del sys.modules[name]
         if isinstance(error, ImportError):
-            raise _translated(error, f"{path}{_line_in(error, path)}") from error
-        if isinstance(error, Exception | SystemExit):
-            raise PluginError(f"{path}{_line_in(error, path)}: {said(error)}") from error
+            raise _translated(error, f"{path}{line_in(error, path)}") from error
+        if isinstance(error, Exception | SystemExit | PluginStopped):
+            raise PluginError(f"{path}{line_in(error, path)}: {said(error)}") from error
         raise
     return module
 
@@ -227,53 +299,12 @@ def _translated(error: ImportError, where: str) -> PluginError | MissingExtraErr
     return missing_extra(error) or PluginError(f"{where}: {error}")
 
 
-def _fault_of(load: Callable[[], object]) -> list[str]:
+def _fault_of(load: Callable[[], object]) -> str | None:
     try:
         load()
     except (PluginError, MissingExtraError) as error:
-        return [str(error)]
-    return []
-
-
-def _told(where: str, thing: Any = None) -> str:
-    """Return *where* as its writer knows it: of a file's part, its file and line instead of the module's name."""
-    place, _, attribute = where.rpartition(":")
-    module = sys.modules.get(place)
-    if not place.startswith(MODULE_PREFIX) or module is None:
-        return where
-    file = str(module.__file__)
-    if getattr(thing, "__module__", None) == place:
-        return f"{place_of(thing)}: {attribute}"
-    return f"{file}{_line_naming(file, attribute)}: {attribute}"
-
-
-def _line_naming(file: str, attribute: str) -> str:
-    """Return :LINE of the line that names a part as the descriptor does."""
-    with contextlib.suppress(OSError, UnicodeDecodeError):
-        for number, line in enumerate(Path(file).read_text(encoding="utf-8").splitlines(), 1):
-            if f':{attribute}"' in line or f":{attribute}'" in line:
-                return f":{number}"
-    return ""
-
-
-def _line_in(error: BaseException, path: Path) -> str:
-    """Return :LINE of the last line of *path* that took part in *error*."""
-    if isinstance(error, SyntaxError) and error.filename == str(path):
-        return f":{error.lineno}"
-    lines = [
-        frame.lineno
-        for frame in traceback.extract_tb(error.__traceback__)
-        if frame.filename == str(path)
-    ]
-    return f":{lines[-1]}" if lines else ""
-
-
-def _last_place(error: BaseException, module: str) -> str:
-    frames = traceback.extract_tb(error.__traceback__)
-    if isinstance(error, SyntaxError):
-        return f"{error.filename}:{error.lineno}: "
-    outside = [f for f in frames if "importlib" not in f.filename and f.filename != __file__]
-    return f"{outside[-1].filename}:{outside[-1].lineno}: " if outside else f"{module}: "
+        return str(error)
+    return None
 
 
 def _attribute(module: ModuleType, name: str, where: str) -> Any:
@@ -284,7 +315,7 @@ def _attribute(module: ModuleType, name: str, where: str) -> Any:
         close = difflib.get_close_matches(name, public, n=1)
         hint = f", did you mean {close[0]}?" if close else ""
         if where.startswith(MODULE_PREFIX):
-            raise PluginError(f"{_told(where)}: there is no {name!r}{hint}") from None
+            raise PluginError(f"{told_place(where)}: there is no {name!r}{hint}") from None
         file = getattr(module, "__file__", None) or module.__name__
         raise PluginError(f"{where}: {file} has no {name!r}{hint}") from None
 
@@ -299,8 +330,9 @@ def _checked(descriptor: Any, where: str, module: ModuleType) -> Simulation:
     parameters: Any = descriptor.parameters
     if not (isinstance(parameters, type) and dataclasses.is_dataclass(parameters)):
         faults.append("parameters: expected a dataclass (the class itself)")
+    faults += shape_faults(descriptor.columns)
     parts: dict[str, Any] = {}
-    for part in ("agent", "host", "demand", "check"):
+    for part in PARTS:
         value = getattr(descriptor, part)
         if value is None and part != "agent":
             continue
@@ -315,39 +347,27 @@ def _checked(descriptor: Any, where: str, module: ModuleType) -> Simulation:
 
 
 def _contract_faults(half: Any, role: Role) -> list[str]:
-    contract: type = HostSimulation if role == "host" else AgentSimulation
-    methods = HOST_METHODS if role == "host" else AGENT_METHODS
+    contract, methods = CONTRACTS[role]
     if not isinstance(half, type):
         return [f"expected a class, got {type(half).__name__}"]
     faults = [f"no method {name}()" for name in methods if not callable(getattr(half, name, None))]
     if faults:
         faults.append(f"subclass {contract.__name__} to inherit what is not needed")
     for name in methods:
-        method = getattr(half, name, None)
-        if callable(method):
-            faults += _signature_faults(name, method, getattr(contract, name))
-    faults += _constructor_faults(half)
+        method, agreed = getattr(half, name, None), getattr(contract, name)
+        wanted = tuple(inspect.signature(agreed).parameters)
+        if callable(method) and not _takes(method, wanted):
+            faults.append(f"{name}() must take ({', '.join(wanted)})")
+    if not _takes(half, ()):
+        faults.append("it must be made without arguments; take what it needs in setup()")
     return faults
 
 
-def _signature_faults(
-    name: str, method: Callable[..., Any], agreed: Callable[..., Any]
-) -> list[str]:
-    wanted = list(inspect.signature(agreed).parameters)
+def _takes(function: Callable[..., Any], arguments: tuple[str, ...]) -> bool:
     try:
-        inspect.signature(method).bind(*wanted)
+        inspect.signature(function).bind(*arguments)
     except TypeError:
-        return [f"{name}() must take ({', '.join(wanted)})"]
-    except ValueError:  # a method written in C tells no signature
-        return []
-    return []
-
-
-def _constructor_faults(half: type) -> list[str]:
-    try:
-        inspect.signature(half).bind()
-    except TypeError:
-        return ["it must be made without arguments; take what it needs in setup()"]
-    except ValueError:
-        return []
-    return []
+        return False
+    except ValueError:  # what is written in C tells no signature
+        return True
+    return True

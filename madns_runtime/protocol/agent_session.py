@@ -13,18 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from madns_runtime.config import Timeouts
-from madns_runtime.protocol.agent_events import (
-    AgentSessionEvent,
-    ClockEstimated,
-    DataReceived,
-    EmergencyDeclared,
-    ExpelledFromRun,
-    SessionEnded,
-    SetupReceived,
-    StartReceived,
-    StateEntered,
-    StopReceived,
-)
+from madns_runtime.protocol import events as told
+from madns_runtime.protocol import messages
 from madns_runtime.protocol.codec import (
     NO_DATA,
     MalformedMessage,
@@ -33,27 +23,12 @@ from madns_runtime.protocol.codec import (
     encode_data,
     encode_message,
 )
-from madns_runtime.protocol.deadlines import BrokenDeadline
+from madns_runtime.protocol.events import AgentSessionEvent
 from madns_runtime.protocol.link import Link
-from madns_runtime.protocol.messages import (
-    AgentStopped,
-    EmergencyShutdown,
-    Expelled,
-    Hello,
-    Message,
-    Ping,
-    Pong,
-    Service,
-    SimulationComplete,
-    SimulationData,
-    SimulationReady,
-    SimulationSetup,
-    SimulationStart,
-    SystemStop,
-)
-from madns_runtime.protocol.silence import Wakefulness, host_silence_limit_s
+from madns_runtime.protocol.link_settings import PLUGIN_CHANNEL, LinkSettings
+from madns_runtime.protocol.messages import Message, Service, Transmission
+from madns_runtime.protocol.silence_limits import Wakefulness, host_silence_limit_s
 from madns_runtime.protocol.states import AGENT_LIVE, AgentEvent, AgentState, agent_machine
-from madns_runtime.protocol.wire import PLUGIN_CHANNEL, Wire
 from madns_runtime.timing.clocksync import ClockEstimate
 
 PING_INTERVAL_S = 0.25
@@ -64,7 +39,7 @@ CLOCK_ERROR_S_MAX = 0.02
 CLOCK_WAIT_S = 2.0
 """An agent is ready once it knows the host's clock this well, or has tried for this long."""
 LINGER_S = 1.0
-"""How long an agent waits at the end for its last words to be acknowledged."""
+"""Longest wait of an agent at its end for its last words to be acknowledged."""
 HELD_MAX = 1024
 """Messages that may wait for the agent's half to be set up."""
 
@@ -73,7 +48,7 @@ _RUNNING = AgentState.RUN_SIMULATION
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AgentIdentity:
-    """Who an agent is on the wire; *incarnation* is random, new at every start."""
+    """Identity of an agent on the wire; *incarnation* is random, new at every start."""
 
     name: str
     index: int
@@ -97,7 +72,7 @@ class AgentSession:
     def __init__(
         self,
         identity: AgentIdentity,
-        wire: Wire,
+        wire: LinkSettings,
         *,
         timeouts: Timeouts,
         report: Callable[[], Mapping[str, Any]],
@@ -112,6 +87,8 @@ class AgentSession:
             identity.incarnation,
             limits=wire.limits,
         )
+        self.datagrams_to_send = self.link.datagrams_to_send
+        self.next_broken_deadline = self.link.next_broken_deadline
         self._timeouts = timeouts
         self._report = report
         self._machine = agent_machine()
@@ -126,16 +103,18 @@ class AgentSession:
         self._ready_due_s: float | None = None
         """Until when readiness waits for the clock; None while it does not wait."""
         self._started_s = now_s
-        self._held: list[DataReceived] = []
+        self._held: list[told.HostDataReceived] = []
         self.held_dropped_count = 0
         self.malformed_count = 0
         self._send(
-            Hello(identity.name, identity.runtime_version, identity.pid), Service.SYNC, now_s
+            messages.Hello(identity.name, identity.runtime_version, identity.pid),
+            Service.SYNC,
+            now_s,
         )
 
     @property
     def state(self) -> AgentState:
-        """Where this agent stands."""
+        """Present state of this agent."""
         return self._machine.state
 
     def setup_finished(self, now_s: float) -> None:
@@ -153,20 +132,20 @@ class AgentSession:
         timeouts = self._timeouts
         self._state_deadline_s = now_s + timeouts.complete_s + timeouts.shutdown_s
         # Behind whatever the agent's half has sent: RELIABLE, so that it overtakes nothing.
-        self._send(SimulationComplete(summary), Service.RELIABLE, now_s)
+        self._send(messages.SimulationComplete(summary), Service.RELIABLE, now_s)
 
     def records_closed(self, records: Mapping[str, Any], now_s: float) -> None:
         """Say that the records are on disk; the session ends when that is acknowledged."""
         self._fire(AgentEvent.RECORDS_CLOSED)
-        self._send(AgentStopped(records), Service.SYNC, now_s)
+        self._send(messages.AgentStopped(records), Service.SYNC, now_s)
         self._fire(AgentEvent.STOPPED_SAID)
         self._state_deadline_s = now_s + LINGER_S
 
     def emergency(self, reason: str, now_s: float) -> None:
         """Declare an emergency and tell the host; no effect when already ending."""
         if self._machine.allows(AgentEvent.EMERGENCY):
-            self._send(EmergencyShutdown(self.identity.name, reason), Service.SYNC, now_s)
-            self._end(EmergencyDeclared(self.identity.name, reason))
+            self._send(messages.EmergencyShutdown(self.identity.name, reason), Service.SYNC, now_s)
+            self._end(told.EmergencyOrdered(self.identity.name, reason))
 
     def send(
         self, payload: Any, service: Service, now_s: float, *, deadline_s: float | None = None
@@ -180,6 +159,19 @@ class AgentSession:
         """
         body = encode_data(payload)
         self.link.send(body, service, now_s, channel=PLUGIN_CHANNEL, deadline_s=deadline_s)
+
+    def transmit(self, transmission: Transmission, now_s: float) -> None:
+        """
+        Send a message for other agents.
+
+        Raises:
+            UnencodableValue: It holds what messages do not carry.
+            MessageTooLarge: It is longer than messages are.
+            SendQueueFull: The host has not taken what was sent before.
+        """
+        self.link.send(
+            encode_message(transmission), Service.RELIABLE, now_s, channel=PLUGIN_CHANNEL
+        )
 
     def seal_data(self, payload: Any, now_s: float) -> bytes | None:
         """
@@ -219,10 +211,6 @@ class AgentSession:
         while (received := link.next_message()) is not None:
             self._take(received.body, now_s)
 
-    def datagrams_to_send(self, now_s: float) -> list[bytes]:
-        """Return what is to be sent to the host now."""
-        return self.link.datagrams_to_send(now_s)
-
     def get_timer(self) -> float | None:
         """Return when `handle_timer` wants to be called, at the latest."""
         if self.state is AgentState.EXIT:
@@ -251,12 +239,8 @@ class AgentSession:
         """Return the oldest event not yet taken."""
         return self._events.popleft() if self._events else None
 
-    def next_broken_deadline(self) -> BrokenDeadline | None:
-        """Return a SYNC message of this side that broke its deadline, once each."""
-        return self.link.next_broken_deadline()
-
     def _fire(self, event: AgentEvent) -> None:
-        self._events.append(StateEntered(self._machine.fire(event)))
+        self._events.append(told.AgentStateEntered(self._machine.fire(event)))
 
     def _send(self, message: Message, service: Service, now_s: float) -> None:
         self.link.send_urgent(encode_message(message), service, now_s)
@@ -270,35 +254,37 @@ class AgentSession:
             self._receive(message, now_s)
 
     def _receive(self, message: Message, now_s: float) -> None:
-        if isinstance(message, SimulationData):
-            self._take_data(message.payload)
-        elif isinstance(message, Pong):
-            self.clock.add_exchange(
-                message.t_agent_s, message.t_host_received_s, message.t_host_sent_s, now_s
-            )
-            self._events.append(ClockEstimated())
-            if self._ready_due_s is not None and self._is_clock_known(now_s):
-                self._say_ready(now_s)
-        elif isinstance(message, SimulationSetup):
-            self._move(AgentEvent.SETUP_RECEIVED, SetupReceived(message.initial))
-        elif isinstance(message, SimulationStart):
-            if self._machine.allows(AgentEvent.START_RECEIVED):
-                self.clock.settle(now_s)
-            self._move(AgentEvent.START_RECEIVED, StartReceived(message.t0_host_s))
-        elif isinstance(message, SystemStop):
-            self._move(AgentEvent.STOP_RECEIVED, StopReceived())
-        elif isinstance(message, EmergencyShutdown):
-            self._end(EmergencyDeclared(message.who, message.reason))
-        elif isinstance(message, Expelled):
-            self._end(ExpelledFromRun(message.reason))
-        else:
-            self.malformed_count += 1  # a message that only agents send
+        match message:
+            case messages.SimulationData(payload):
+                self._take_data(payload)
+            case messages.Delivery() | messages.TransmissionRefusal() | messages.FaultOrder():
+                self._take_data(message)
+            case messages.Pong(t_agent_s, t_host_received_s, t_host_sent_s):
+                self.clock.add_exchange(t_agent_s, t_host_received_s, t_host_sent_s, now_s)
+                self._events.append(told.ClockEstimated())
+                if self._ready_due_s is not None and self._is_clock_known(now_s):
+                    self._say_ready(now_s)
+            case messages.SimulationSetup(initial):
+                self._move(AgentEvent.SETUP_RECEIVED, told.SetupReceived(initial))
+            case messages.SimulationStart(t0_host_s):
+                if self._machine.allows(AgentEvent.START_RECEIVED):
+                    self.clock.settle(now_s)
+                self._move(AgentEvent.START_RECEIVED, told.StartReceived(t0_host_s))
+            case messages.SystemStop():
+                self._move(AgentEvent.STOP_RECEIVED, told.StopReceived())
+            case messages.EmergencyShutdown(who, reason):
+                self._end(told.EmergencyOrdered(who, reason))
+            case messages.Expelled(reason):
+                self._end(told.ExpelledFromRun(reason))
+            case _:
+                self.malformed_count += 1  # a message that only agents send
 
     def _take_data(self, payload: Any) -> None:
+        event = told.HostDataReceived(payload)
         if self.state not in (AgentState.AGENT_READY, AgentState.SIMULATION_SETUP):
-            self._events.append(DataReceived(payload))
+            self._events.append(event)
         elif len(self._held) < HELD_MAX:
-            self._held.append(DataReceived(payload))  # until the agent's half can take it
+            self._held.append(event)  # until the agent's half can take it
         else:
             self.held_dropped_count += 1
 
@@ -310,7 +296,7 @@ class AgentSession:
         else:
             self.malformed_count += 1
 
-    def _end(self, outcome: EmergencyDeclared | ExpelledFromRun) -> None:
+    def _end(self, outcome: told.EmergencyOrdered | told.ExpelledFromRun) -> None:
         if self._machine.allows(AgentEvent.EMERGENCY):
             self._ready_due_s = None
             self._move(AgentEvent.EMERGENCY, outcome)
@@ -323,7 +309,7 @@ class AgentSession:
         self._fire(AgentEvent.SETUP_FINISHED)
         self._state_deadline_s = now_s + self._timeouts.agent_setup_s + self._timeouts.silence_s
         self._heard_s = now_s
-        self._send(SimulationReady(), Service.SYNC, now_s)
+        self._send(messages.SimulationReady(), Service.SYNC, now_s)
         self._events.extend(self._held)
         self._held.clear()
 
@@ -331,7 +317,7 @@ class AgentSession:
         self._ping_count += 1
         first = self._ping_count <= PINGS_FIRST
         self._ping_due_s = now_s + (PING_INTERVAL_FIRST_S if first else PING_INTERVAL_S)
-        self._send(Ping(now_s, self._report()), Service.BEST, now_s)
+        self._send(messages.Ping(now_s, self._report()), Service.BEST, now_s)
 
     def _check_deadlines(self, now_s: float) -> None:
         state = self.state
@@ -339,7 +325,7 @@ class AgentSession:
             deadline_s = self._state_deadline_s
             if self.link.is_flushed or (deadline_s is not None and now_s >= deadline_s):
                 self._fire(AgentEvent.SERVER_STOPPED)
-                self._events.append(SessionEnded())
+                self._events.append(told.SessionEnded())
             return
         if state not in AGENT_LIVE:
             return

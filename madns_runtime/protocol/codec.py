@@ -18,7 +18,7 @@ from typing import Any, Final, cast
 import msgpack
 import numpy as np
 
-from madns_runtime.errors import PeerError, PluginError
+from madns_runtime.errors import MadnsError, PeerError, PluginError
 from madns_runtime.protocol.messages import MESSAGES, Message, SimulationData
 
 DEPTH_MAX: Final = 32
@@ -101,7 +101,7 @@ def decode_message(body: bytes) -> Message:
 _DATA_HEAD: Final = bytes([SimulationData.KIND, 0x91])
 """A SimulationData's first bytes: its kind, and a MessagePack list of one."""
 NO_DATA: Final = object()
-"""What `decode_data` returns for a body that it leaves to `decode_message`."""
+"""Return value of `decode_data` for a body that it leaves to `decode_message`."""
 _UNPACKING_ERRORS: Final = (ValueError, TypeError, OverflowError, RecursionError, MemoryError)
 _pack_plain: Final[Callable[[list[Any]], bytes]] = msgpack.Packer().pack
 _unpack_plain: Final[Callable[[bytes], Any]] = msgpack.unpackb
@@ -157,33 +157,34 @@ def pack(value: object) -> bytes:
         UnencodableValue: The value or a part of it is something else.
     """
     if type(value) not in _SCALARS:
-        _check_encodable(value, 0)
+        _check(value, UnencodableValue)
     try:
         return cast("bytes", msgpack.packb(value, default=_encode_other))
     except (OverflowError, ValueError, TypeError) as error:
         raise UnencodableValue(f"a message cannot carry this: {error}") from error
 
 
-def _check_encodable(value: object, depth: int) -> None:
+def _check(value: object, fault: type[MadnsError], depth: int = 0) -> None:
+    """Raise *fault* where a value, or a part of it, is nested too deep, too long, or has keys that are no strings."""
     if isinstance(value, list | tuple):
         items: Any = value
     elif isinstance(value, Mapping):
         for key in value:
             if not isinstance(key, str):
-                raise UnencodableValue(f"a mapping's keys must be strings, got {key!r}")
+                raise fault(f"a mapping's keys must be strings, got {key!r}")
         items = value.values()
     else:
         return
     if depth >= DEPTH_MAX:
-        raise UnencodableValue(f"values must not be nested more than {DEPTH_MAX} deep")
+        raise fault(f"values must not be nested more than {DEPTH_MAX} deep")
     if len(value) > ITEMS_MAX:
-        raise UnencodableValue(
+        raise fault(
             f"a list or mapping holds at most {ITEMS_MAX} items, got {len(value)}; "
             "send numbers as a float64 array"
         )
     for item in items:
         if type(item) not in _SCALARS:
-            _check_encodable(item, depth + 1)
+            _check(item, fault, depth + 1)
 
 
 def _encode_other(value: object) -> object:
@@ -240,7 +241,7 @@ def unpack(data: bytes) -> Any:
     except _UNPACKING_ERRORS as error:
         raise MalformedMessage(f"not a packed value: {error!r}") from error
     if type(value) not in _SCALARS:
-        _check_decoded(value, 0)
+        _check(value, MalformedMessage)
     return value
 
 
@@ -257,23 +258,6 @@ def _check_complete(data: bytes) -> None:
         unpacker.skip()
     except msgpack.OutOfData as error:
         raise ValueError("the bytes end early") from error
-
-
-def _check_decoded(value: object, depth: int) -> None:
-    if type(value) is list:
-        items: Any = value
-    elif type(value) is dict:
-        for key in value:
-            if type(key) is not str:
-                raise MalformedMessage(f"a mapping has the key {key!r}, which is no string")
-        items = value.values()
-    else:
-        return
-    if depth >= DEPTH_MAX:
-        raise MalformedMessage(f"values are nested more than {DEPTH_MAX} deep")
-    for item in items:
-        if type(item) not in _SCALARS:
-            _check_decoded(item, depth + 1)
 
 
 def _decode_ext(code: int, data: bytes) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -1,4 +1,4 @@
-"""What a link counts: everything sent, received, lost, late, repeated and refused."""
+"""Counters of a link: everything sent, received, lost, late, repeated and refused."""
 
 from __future__ import annotations
 

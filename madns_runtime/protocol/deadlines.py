@@ -25,7 +25,7 @@ class BrokenDeadline:
     body: bytes
     sent_s: float
     deadline_s: float
-    """As `sent_s`, on this side's monotonic clock."""
+    """Deadline on the clock of `sent_s`, this side's monotonic one."""
     late_s: float | None
     """Acknowledgement minus deadline; None if there was none when the deadline's timer came, or will be none."""
 

@@ -1,19 +1,19 @@
 """
 The host's side of a run, pure: datagrams and now_s in, datagrams and events out.
 
-Owns one link an agent, the host's state machine, who is ready, running, complete or lost, and every
-deadline. The composition root feeds it and carries out what its events say.
+Owns a link per agent, the state machine, the roster and every deadline; its owner carries its events out.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from madns_runtime import __version__
 from madns_runtime.config import Timeouts
-from madns_runtime.protocol import host_events as told
+from madns_runtime.protocol import events as told
 from madns_runtime.protocol import messages
 from madns_runtime.protocol.codec import (
     NO_DATA,
@@ -21,22 +21,23 @@ from madns_runtime.protocol.codec import (
     decode_data,
     decode_message,
     encode_data,
+    encode_message,
 )
-from madns_runtime.protocol.host_events import Address, HostSessionEvent, Peer, Phase
-from madns_runtime.protocol.host_links import HostLinks
-from madns_runtime.protocol.host_roster import Roster
+from madns_runtime.protocol.datagram import PREFIX_BYTES
+from madns_runtime.protocol.events import HostSessionEvent, Phase
+from madns_runtime.protocol.host_peers import Address, HostLinks, Peer, Roster
 from madns_runtime.protocol.link import Link
+from madns_runtime.protocol.link_settings import PLUGIN_CHANNEL, LinkSettings
 from madns_runtime.protocol.messages import Message, Service
-from madns_runtime.protocol.seal import PREFIX_BYTES
 from madns_runtime.protocol.states import HOST_LIVE, HostEvent, HostState, host_machine
-from madns_runtime.protocol.wire import PLUGIN_CHANNEL, Wire
 
 CHECK_INTERVAL_S = 0.1
-"""How often silence and deadlines are looked at."""
+"""Interval between two looks at silence and deadlines."""
 LINGER_S = 0.5
-"""How long the host waits at the end for its last acknowledgements to leave."""
+"""Longest wait of the host at its end for its last acknowledgements to leave."""
 
 _NOT_THERE = (Phase.ABSENT, Phase.JOINING, Phase.STOPPED, Phase.LOST)
+_FRAMEWORKS_OWN = (messages.Delivery, messages.TransmissionRefusal, messages.FaultOrder)
 _ENDING = (HostState.BEGIN_SHUTDOWN, HostState.EMERGENCY_SHUTDOWN)
 _BEFORE_STOP = tuple(state for state in HOST_LIVE if state is not HostState.BEGIN_SHUTDOWN)
 _AWAITED = {
@@ -44,7 +45,7 @@ _AWAITED = {
     HostState.HOST_SIMULATION_READY: ("AGENT_SIMULATION_READY", Phase.SIMULATION_READY),
     HostState.SIMULATION_START: ("SIMULATION_COMPLETE", Phase.COMPLETE),
 }
-"""What a state waits for: a word of every agent, and the phase that it brings them to."""
+"""Word of every agent that a state waits for, and the phase that it brings them to."""
 
 
 class HostSession:
@@ -62,7 +63,7 @@ class HostSession:
     def __init__(
         self,
         agents: Sequence[str],
-        wire: Wire,
+        wire: LinkSettings,
         *,
         timeouts: Timeouts,
         on_agent_loss: Literal["abort", "continue"],
@@ -71,6 +72,7 @@ class HostSession:
         self._events: deque[HostSessionEvent] = deque()
         self._roster = Roster(agents, timeouts, events=self._events, now_s=now_s)
         self.peers = self._roster.peers
+        self.agents_in = self._roster.names_in
         self._running = self._roster.running
         self._links = HostLinks(self.peers, wire, self._events)
         self.seal_data = self._links.seal_data
@@ -88,12 +90,8 @@ class HostSession:
 
     @property
     def state(self) -> HostState:
-        """Where the host stands."""
+        """Present state of the host."""
         return self._machine.state
-
-    def agents_in(self, *phases: Phase) -> tuple[str, ...]:
-        """Return the names of agents in any of *phases*."""
-        return self._roster.names_in(*phases)
 
     def setup_finished(self, initial: Mapping[str, Any], now_s: float) -> None:
         """Send each agent its initial data (by name); their readiness is awaited."""
@@ -175,7 +173,7 @@ class HostSession:
         deadline_s: float | None = None,
     ) -> bool:
         """
-        Send a plug-in's message; False if that agent is lost or not there yet.
+        Send a plug-in's message, or what another agent's has come to; False if that agent is lost or not there yet.
 
         Raises:
             MessageTooLarge: It does not fit its class of service.
@@ -185,9 +183,10 @@ class HostSession:
         if peer.link is None or peer.phase in _NOT_THERE:
             peer.not_sent += 1
             return False
-        body = encode_data(payload)
-        peer.link.send(body, service, now_s, channel=PLUGIN_CHANNEL, deadline_s=deadline_s)
         self._links.mark(peer)
+        is_message = isinstance(payload, _FRAMEWORKS_OWN)
+        body = encode_message(payload) if is_message else encode_data(payload)
+        peer.link.send(body, service, now_s, channel=PLUGIN_CHANNEL, deadline_s=deadline_s)
         return True
 
     def receive_data(self, data: bytes, address: Address, now_s: float) -> tuple[str, Any] | None:
@@ -235,8 +234,8 @@ class HostSession:
         self._links.handle_timer(now_s)
         if now_s >= self._check_due_s:
             self._check_due_s = now_s + CHECK_INTERVAL_S
-            is_over = now_s > self._end_host_s
-            self._lose(self._roster.find_silent(self.state, now_s, is_over=is_over), now_s)
+            lost = self._roster.find_silent(self.state, now_s, is_over=now_s > self._end_host_s)
+            self._lose(lost, now_s)
             self._check_state_deadline(now_s)
 
     def next_event(self) -> HostSessionEvent | None:
@@ -262,43 +261,45 @@ class HostSession:
             self._receive(peer, message, now_s)
 
     def _receive(self, peer: Peer, message: Message, now_s: float) -> None:
-        if isinstance(message, messages.EmergencyShutdown):
-            # It ends itself: that loses one member, and under abort the run.
-            if peer.phase not in (Phase.LOST, Phase.STOPPED):
-                self._lose({peer.name: message.reason}, now_s)
-        elif isinstance(message, messages.AgentStopped):
-            self._agent_stopped(peer, message, now_s)
-        elif isinstance(message, messages.Hello) and peer.pid is None:
-            self._welcome(peer, message, now_s)
-        elif peer.phase is Phase.LOST:
-            self._send_expelled(peer, now_s)
-        elif isinstance(message, messages.SimulationData):
-            self._events.append(told.DataReceived(peer.name, message.payload))
-        elif isinstance(message, messages.Ping):
-            peer.report = message.report
-            peer.pings.append((message.t_agent_s, now_s))
-            self._links.mark(peer)
-        elif isinstance(message, messages.SimulationReady) and peer.phase is Phase.SETTING_UP:
-            self._agent_simulation_ready(peer, now_s)
-        elif isinstance(message, messages.SimulationComplete) and peer.phase is Phase.RUNNING:
-            peer.summary = message.summary
-            self._roster.move(peer, Phase.COMPLETE)
-            self._progress(now_s)
-        else:
-            self.malformed_count += 1  # a message that only hosts send, or out of turn
+        match message:
+            case messages.EmergencyShutdown(_, reason):
+                # It ends itself: that loses one member, and under abort the run.
+                if peer.phase not in (Phase.LOST, Phase.STOPPED):
+                    self._lose({peer.name: reason}, now_s)
+            case messages.AgentStopped(records):
+                self._agent_stopped(peer, records, now_s)
+            case messages.Hello() if peer.pid is None:
+                self._welcome(peer, message, now_s)
+            case _ if peer.phase is Phase.LOST:
+                self._send_expelled(peer, now_s)
+            case messages.SimulationData(payload):
+                self._events.append(told.AgentDataReceived(peer.name, payload))
+            case messages.Transmission() if math.isfinite(message.sent_s):
+                self._events.append(told.AgentDataReceived(peer.name, message))
+            case messages.Ping(t_agent_s, report):
+                peer.report = report
+                peer.pings.append((t_agent_s, now_s))
+                self._links.mark(peer)
+            case messages.SimulationReady() if peer.phase is Phase.SETTING_UP:
+                self._agent_simulation_ready(peer, now_s)
+            case messages.SimulationComplete(summary) if peer.phase is Phase.RUNNING:
+                peer.summary = summary
+                self._roster.move(peer, Phase.COMPLETE)
+                self._progress(now_s)
+            case _:
+                self.malformed_count += 1  # a message that only hosts send, or out of turn
 
     def _welcome(self, peer: Peer, hello: messages.Hello, now_s: float) -> None:
-        state = self.state
         peer.pid = hello.pid
         if hello.runtime_version != __version__ or hello.agent != peer.name:
             reason = f"{hello.agent} runs MADNS {hello.runtime_version}, the host {__version__}"
             self._lose({peer.name: reason}, now_s)
             self._send_expelled(peer, now_s)
             return
-        if state in (HostState.HOST_STARTUP, HostState.SIMULATION_SETUP):
+        if self.state in (HostState.HOST_STARTUP, HostState.SIMULATION_SETUP):
             self._roster.move(peer, Phase.READY)
             self._progress(now_s)
-        elif state in (HostState.HOST_SIMULATION_READY, HostState.SIMULATION_START):
+        elif self.state in (HostState.HOST_SIMULATION_READY, HostState.SIMULATION_START):
             self._roster.move(peer, Phase.READY)
             self._events.append(told.AgentRejoining(peer.name))
         else:
@@ -319,8 +320,8 @@ class HostSession:
             self._links.send(peer, messages.SimulationStart(self._t0_host_s), Service.SYNC, now_s)
             self._roster.move(peer, Phase.RUNNING)
 
-    def _agent_stopped(self, peer: Peer, message: messages.AgentStopped, now_s: float) -> None:
-        peer.records = message.records
+    def _agent_stopped(self, peer: Peer, records: Mapping[str, Any], now_s: float) -> None:
+        peer.records = records
         if self.state in _BEFORE_STOP and peer.phase is not Phase.LOST:
             self._lose({peer.name: "it stopped before it was told to"}, now_s)
         elif peer.phase is not Phase.LOST:
@@ -333,7 +334,7 @@ class HostSession:
             peer.loss_reason = None  # said once an incarnation
 
     def _fire(self, event: HostEvent) -> None:
-        self._events.append(told.StateEntered(self._machine.fire(event)))
+        self._events.append(told.HostStateEntered(self._machine.fire(event)))
 
     def _enter(self, now_s: float, deadline_s: float) -> None:
         self._entered_s = now_s
@@ -389,9 +390,8 @@ class HostSession:
             reason = f"no {word} in {waited_s:g} s"
             self._lose(dict.fromkeys(self._roster.names_outside(phase), reason), now_s)
         elif state is HostState.SIMULATION_SETUP:
-            self.emergency(
-                "host", f"setup of the simulation took longer than {waited_s:g} s", now_s
-            )
+            text = f"setup of the simulation took longer than {waited_s:g} s"
+            self.emergency("host", text, now_s)
         elif state in _ENDING:
             self._stop(now_s, self._roster.names_outside(Phase.STOPPED, Phase.ABSENT))
         elif state is HostState.WAITING_SERVER_STOP:

@@ -15,17 +15,26 @@ from __future__ import annotations
 
 from typing import Final
 
-from madns_runtime.protocol.best import BEST_BYTES_MAX
 from madns_runtime.protocol.counters import LinkCounters
-from madns_runtime.protocol.datagram import AT_ONCE, ELICITING, HEADER_REST, STREAMS
+from madns_runtime.protocol.datagram import (
+    AT_ONCE,
+    BEST_BYTES_MAX,
+    CHANNEL_MAX,
+    ELICITING,
+    HEADER_REST,
+    MESSAGE_BYTES_MAX,
+    PREFIX_BYTES,
+    STREAMS,
+    Role,
+    Seal,
+    derive_keys,
+)
 from madns_runtime.protocol.deadlines import BrokenDeadline
-from madns_runtime.protocol.delivery import CHANNEL_MAX, MESSAGE_BYTES_MAX, Received
-from madns_runtime.protocol.incoming import Incoming
-from madns_runtime.protocol.limits import LinkLimits, SendQueueFull
+from madns_runtime.protocol.incoming import Incoming, Received
+from madns_runtime.protocol.link_settings import LinkLimits, SendQueueFull
 from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.outgoing import Outgoing
 from madns_runtime.protocol.packets import Packets
-from madns_runtime.protocol.seal import PREFIX_BYTES, Role, Seal, derive_keys
 
 __all__ = [
     "BEST_BYTES_MAX",
@@ -58,15 +67,21 @@ class Link:
         "datagrams_to_send",
         "get_timer",
         "handle_timer",
+        "incarnation",
         "next_broken_deadline",
         "next_message",
         "open_best",
+        "peer_prefix",
         "seal_best",
     )
 
     def __init__(self, *, seal: Seal, limits: LinkLimits = LinkLimits()) -> None:  # noqa: B008 - frozen
         self._counters = counters = LinkCounters()
         self._seal = seal
+        self.incarnation = seal.incarnation
+        """Incarnation of the agent's process in this conversation."""
+        self.peer_prefix = seal.peer_prefix
+        """The first bytes of every datagram from this peer: a key to find the link by."""
         self._packets = packets = Packets()
         self._incoming = incoming = Incoming(seal, limits, counters=counters, packets=packets)
         self._outgoing = outgoing = Outgoing(
@@ -90,7 +105,7 @@ class Link:
         *,
         limits: LinkLimits = LinkLimits(),  # noqa: B008 - frozen
     ) -> Link:
-        """Return the agent's end of a conversation; see `seal.derive_keys` for the arguments."""
+        """Return the agent's end of a conversation; see `datagram.derive_keys` for the arguments."""
         return cls(
             seal=_seal(run_key, session, agent_index, incarnation, Role.AGENT), limits=limits
         )
@@ -105,14 +120,14 @@ class Link:
         *,
         limits: LinkLimits = LinkLimits(),  # noqa: B008 - frozen
     ) -> Link:
-        """Return the host's end of a conversation; see `seal.derive_keys` for the arguments."""
+        """Return the host's end of a conversation; see `datagram.derive_keys` for the arguments."""
         return cls(seal=_seal(run_key, session, agent_index, incarnation, Role.HOST), limits=limits)
 
     # What the owner asks.
 
     @property
     def counters(self) -> LinkCounters:
-        """What was sent, received and refused until now."""
+        """Counts of everything sent, received and refused until now."""
         counters = self._counters
         # What their numbers tell is not counted again with every tick.
         counters.datagrams_sent = self._packets.newest
@@ -122,7 +137,7 @@ class Link:
     @property
     def is_flushed(self) -> bool:
         """Whether nothing reliable is queued or unacknowledged."""
-        return all(stream.is_flushed for stream in self._outgoing.streams)
+        return not self.queued_bytes
 
     @property
     def queued_bytes(self) -> int:
@@ -138,16 +153,6 @@ class Link:
     def srtt_s(self) -> float | None:
         """Smoothed round trip, s, without the peer's delay; None before the first."""
         return self._packets.round_trip.srtt_s
-
-    @property
-    def incarnation(self) -> int:
-        """Which process of the agent this conversation is with."""
-        return self._seal.incarnation
-
-    @property
-    def peer_prefix(self) -> bytes:
-        """The first bytes of every datagram from this peer: a key to find the link by."""
-        return self._seal.peer_prefix
 
     # Sending.
 

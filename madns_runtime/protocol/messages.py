@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 VERSION = 1
 
@@ -23,7 +23,7 @@ class Service(IntEnum):
     RELIABLE = 1
     """Ordered, fragmented, windowed, exactly once."""
     SYNC = 2
-    """As RELIABLE, in a stream of its own that is sent before any fragment, with a deadline."""
+    """Delivery of RELIABLE, in a stream of its own that is sent before any fragment, with a deadline."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +126,62 @@ class SimulationData:
     payload: Any
 
 
+@dataclass(frozen=True, slots=True)
+class Transmission:
+    """Agent -> host: a message for other agents, by the simulation's medium."""
+
+    KIND: ClassVar[int] = 13
+    to: str
+    """An agent's name, * for all in reach, or a place that the medium knows."""
+    number: int
+    """The sender's own, growing."""
+    sent_s: float
+    """Simulated time of the tick that sent it."""
+    payload: Any
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """Host -> agent: a message of another agent, or of a place that the medium knows."""
+
+    KIND: ClassVar[int] = 14
+    sender: str
+    """An agent's name, or the place's."""
+    sent_s: float
+    """Simulated time of the tick that sent it."""
+    arrives_s: float
+    """Simulated time of its arrival: it is received in the first tick at or after it."""
+    payload: Any
+
+
+@dataclass(frozen=True, slots=True)
+class TransmissionRefusal:
+    """Host -> agent: a message for other agents that its medium refused."""
+
+    KIND: ClassVar[int] = 15
+    number: int
+    """The message's."""
+    to: str
+    """Receiver, as it was given."""
+    sent_s: float
+    reason: str
+    """The medium's word, such as out_of_range."""
+
+
+@dataclass(frozen=True, slots=True)
+class FaultOrder:
+    """Host -> agent: insert a fault around a device that you use; the answer comes with a ping's report."""
+
+    KIND: ClassVar[int] = 16
+    number: int
+    """The order's."""
+    device: str
+    """Its full name, such as pi22/imu."""
+    action: str
+    value: float
+    """Not a number for an action without one."""
+
+
 Message = (
     Hello
     | SimulationSetup
@@ -139,19 +195,10 @@ Message = (
     | Ping
     | Pong
     | SimulationData
+    | Transmission
+    | Delivery
+    | TransmissionRefusal
+    | FaultOrder
 )
 
-MESSAGES: tuple[type[Message], ...] = (
-    Hello,
-    SimulationSetup,
-    SimulationReady,
-    SimulationStart,
-    SimulationComplete,
-    SystemStop,
-    AgentStopped,
-    EmergencyShutdown,
-    Expelled,
-    Ping,
-    Pong,
-    SimulationData,
-)
+MESSAGES: tuple[type[Message], ...] = get_args(Message)

@@ -1,5 +1,5 @@
 """
-What a link sends: queues of messages, and the datagrams that carry them.
+The sending half of a link: queues of messages, and the datagrams that carry them.
 
 Everything that says how much, how fast and in what order is decided here; what the header tells of the
 other direction comes from `incoming`.
@@ -7,26 +7,64 @@ other direction comes from `incoming`.
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Final
 
 from madns_runtime.errors import MessageTooLarge
-from madns_runtime.protocol.best import BEST_BYTES_MAX, BestSender
-from madns_runtime.protocol.counters import LinkCounters
-from madns_runtime.protocol.datagram import ALONE, BEST_ALONE, HEADER_REST, PROBE
+from madns_runtime.protocol.counters import ClassCounters, LinkCounters
+from madns_runtime.protocol.datagram import (
+    ALONE,
+    BEST_ALONE,
+    BEST_BYTES_MAX,
+    FRAME,
+    HEADER_REST,
+    MAC_BYTES,
+    MESSAGE_BYTES_MAX,
+    PAYLOAD_BYTES_MAX,
+    PROBE,
+    Seal,
+)
 from madns_runtime.protocol.deadlines import DeadlineWatch
-from madns_runtime.protocol.delivery import MESSAGE_BYTES_MAX
 from madns_runtime.protocol.incoming import Incoming
-from madns_runtime.protocol.limits import LinkLimits, SendQueueFull
+from madns_runtime.protocol.link_settings import LinkLimits, SendQueueFull
 from madns_runtime.protocol.messages import Service
-from madns_runtime.protocol.packets import Packets
-from madns_runtime.protocol.recovery import PACE_QUANTUM_S, Pacer
-from madns_runtime.protocol.seal import MAC_BYTES, PAYLOAD_BYTES_MAX, Seal
+from madns_runtime.protocol.packets import PACE_QUANTUM_S, Packets, TokenBucket
 from madns_runtime.protocol.sending import MESSAGES_QUEUED_MAX, Fragment, SendStream
 
 _BEST: Final = int(Service.BEST)
 _RELIABLE_BIT: Final = 1 << Service.RELIABLE
 _SYNC_BIT: Final = 1 << Service.SYNC
 _NEVER: Final = float("inf")
+
+
+class BestSender:
+    """Frames that wait for the next datagram; when the queue is full the oldest gives way."""
+
+    __slots__ = ("_counters", "numbers", "queue")
+
+    def __init__(self, queue_max: int, counters: ClassCounters) -> None:
+        self._counters = counters
+        self.numbers: dict[int, int] = {}
+        """Number of the next message by channel, which is how many there were."""
+        self.queue: deque[bytes] = deque(maxlen=queue_max)
+
+    def push(self, body: bytes, channel: int) -> None:
+        """
+        Queue a message.
+
+        Raises:
+            MessageTooLarge: It does not fit one datagram.
+        """
+        if len(body) > BEST_BYTES_MAX:
+            raise MessageTooLarge(
+                f"a BEST message must fit one datagram: expected at most {BEST_BYTES_MAX} bytes, "
+                f"got {len(body)}; send it RELIABLE or make it smaller"
+            )
+        if len(self.queue) == self.queue.maxlen:
+            self._counters.dropped += 1
+        number = self.numbers.get(channel, 0)
+        self.numbers[channel] = number + 1
+        self.queue.append(FRAME.pack(_BEST, channel, len(body), number) + body)
 
 
 class Outgoing:
@@ -75,7 +113,7 @@ class Outgoing:
         self._counters = counters
         self._packets = packets
         self._incoming = incoming
-        self._pacer = Pacer(limits.pace_bytes_per_s, limits.pace_burst_bytes)
+        self._pacer = TokenBucket(limits.pace_bytes_per_s, limits.pace_burst_bytes)
         self.best = BestSender(limits.best_queue_max, counters.best)
         self.reliable = SendStream(Service.RELIABLE, packets.round_trip, counters.reliable)
         self.sync = SendStream(Service.SYNC, packets.round_trip, counters.sync)

@@ -1,7 +1,7 @@
 """
 The sending half of a stream: cuts messages into fragments and sends again what was lost.
 
-See delivery.py for the other half and for what a stream is. When a packet is lost: recovery.py.
+See incoming.py for the other half and for what a stream is. When a packet is lost: packets.py.
 """
 
 from __future__ import annotations
@@ -10,15 +10,9 @@ from collections import deque
 from typing import Final, NamedTuple
 
 from madns_runtime.protocol.counters import ClassCounters
-from madns_runtime.protocol.delivery import (
-    FRAME,
-    FRAME_BYTES,
-    MESSAGE_PREFIX,
-    WINDOW_FRAGMENTS_MIN,
-)
+from madns_runtime.protocol.datagram import FRAME, FRAME_BYTES, MESSAGE_PREFIX, WINDOW_FRAGMENTS_MIN
 from madns_runtime.protocol.messages import Service
-from madns_runtime.protocol.packets import ACK_BITS
-from madns_runtime.protocol.recovery import REORDER_PACKETS, RoundTrip
+from madns_runtime.protocol.packets import ACK_BITS, REORDER_PACKETS, RoundTrip
 
 FRAGMENT_BYTES_MIN: Final = 256
 """A long message does not start in less room than this: a new datagram is cheaper."""
@@ -48,7 +42,7 @@ class Fragment:
 
 
 class Packet(NamedTuple):
-    """What became of fragments: sent when, together with which, and when it may be held to be lost."""
+    """Fragments sent together: when, and from when on they may be held to be lost."""
 
     sent_s: float
     fragments: list[Fragment]
@@ -112,11 +106,6 @@ class SendStream:
     def is_full(self) -> bool:
         """Whether no further message is taken, whatever its size."""
         return len(self._pending) >= MESSAGES_QUEUED_MAX
-
-    @property
-    def is_flushed(self) -> bool:
-        """Whether the peer has everything."""
-        return not self.queued_bytes
 
     @property
     def has_output(self) -> bool:

@@ -19,7 +19,7 @@ E = TypeVar("E", bound=Enum)
 
 
 class HostState(Enum):
-    """Where the host stands."""
+    """States of the host."""
 
     HOST_STARTUP = "HOST_STARTUP"
     SIMULATION_SETUP = "SIMULATION_SETUP"
@@ -35,7 +35,7 @@ class HostState(Enum):
 
 
 class HostEvent(Enum):
-    """What moves the host."""
+    """Events that move the host."""
 
     AGENTS_READY = "every agent has said hello"
     SETUP_FINISHED = "host half set up, initial data sent"
@@ -50,7 +50,7 @@ class HostEvent(Enum):
 
 
 class AgentState(Enum):
-    """Where an agent stands."""
+    """States of an agent."""
 
     AGENT_READY = "AGENT_READY"
     SIMULATION_SETUP = "SIMULATION_SETUP"
@@ -65,7 +65,7 @@ class AgentState(Enum):
 
 
 class AgentEvent(Enum):
-    """What moves an agent."""
+    """Events that move an agent."""
 
     SETUP_RECEIVED = "initial data received"
     SETUP_FINISHED = "agent half set up"
@@ -85,10 +85,6 @@ class Transition(Generic[S, E]):
     state: S
     event: E
     target: S
-
-
-def _emergencies(states: Iterable[S], event: E, target: S) -> list[Transition[S, E]]:
-    return [Transition(state, event, target) for state in states]
 
 
 _H, _HE = HostState, HostEvent
@@ -114,7 +110,7 @@ HOST_TABLE: tuple[Transition[HostState, HostEvent], ...] = (
     Transition(_H.CLEANUP_FUNCTIONS, _HE.CLEANED_UP, _H.END_HOST),
     Transition(_H.END_HOST, _HE.RECORDS_CLOSED, _H.WAITING_SERVER_STOP),
     Transition(_H.WAITING_SERVER_STOP, _HE.SERVER_STOPPED, _H.EXIT),
-    *_emergencies(HOST_LIVE, _HE.EMERGENCY, _H.EMERGENCY_SHUTDOWN),
+    *(Transition(state, _HE.EMERGENCY, _H.EMERGENCY_SHUTDOWN) for state in HOST_LIVE),
 )
 
 _A, _AE = AgentState, AgentEvent
@@ -138,7 +134,7 @@ AGENT_TABLE: tuple[Transition[AgentState, AgentEvent], ...] = (
     Transition(_A.EMERGENCY_SHUTDOWN, _AE.RECORDS_CLOSED, _A.END_AGENT),
     Transition(_A.END_AGENT, _AE.STOPPED_SAID, _A.WAITING_SERVER_STOP),
     Transition(_A.WAITING_SERVER_STOP, _AE.SERVER_STOPPED, _A.EXIT),
-    *_emergencies(AGENT_LIVE, _AE.EMERGENCY, _A.EMERGENCY_SHUTDOWN),
+    *(Transition(state, _AE.EMERGENCY, _A.EMERGENCY_SHUTDOWN) for state in AGENT_LIVE),
 )
 
 

@@ -1,1 +1,1 @@
-"""The only home of sockets, timers and signals: one epoll loop a process."""
+"""The only home of sockets, timers and signals: one epoll loop per process."""

@@ -1,4 +1,4 @@
-"""What a forked child leaves behind of its parent."""
+"""Clean-up in a forked child of what it got from its parent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What Linux offers and Python 3.11 does not: the few calls of libc, through ctypes."""
+"""The few calls of libc that Linux offers and Python 3.11 does not, through ctypes."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 """
-What a loop asks of the kernel: scheduling class, processors, timer slack, resident memory.
+Requests of a loop to the kernel: scheduling class, processors, timer slack, resident memory.
 
 Nothing here raises for a refusal. What was granted and why the rest was not is recorded, because the
 tail of the lateness depends on it more than on anything else.
@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
+import resource
 import signal
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +26,7 @@ STATUS_FILE = Path("/proc/self/status")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SchedulingGrant:
-    """What the kernel granted to the calling thread; a refusal is None where there was none."""
+    """The kernel's grants to the calling thread; a refusal is None where there was none."""
 
     policy_asked: Literal["auto", "fifo", "normal"]
     policy: Literal["fifo", "normal"]
@@ -36,7 +37,7 @@ class SchedulingGrant:
     """Processors that the thread may use; empty where the system does not tell."""
     cpu_affinity_refusal: str | None
     timer_slack_ns: int | None
-    """As read back; None where the system has none. Without meaning, and read as 0, under SCHED_FIFO."""
+    """Value read back; None where the system has none. Without meaning, and read as 0, under SCHED_FIFO."""
     timer_slack_refusal: str | None
     memory_locked: bool
     """The host's memory stays resident; agents never ask for it."""
@@ -46,13 +47,11 @@ class SchedulingGrant:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the scenario asked for by name and did not get."""
-        found = []
-        if self.policy_asked == "fifo" and self.policy_refusal is not None:
-            found.append(f"scheduling.policy fifo: {self.policy_refusal}")
-        if self.cpu_affinity_refusal is not None:
-            found.append(f"scheduling.cpu_affinity: {self.cpu_affinity_refusal}")
-        return tuple(found)
+        """Requests that the scenario made by name and that were not granted."""
+        return _refused(
+            ("scheduling.policy fifo", self.policy_asked == "fifo" and self.policy_refusal),
+            ("scheduling.cpu_affinity", self.cpu_affinity_refusal),
+        )
 
     @property
     def warning(self) -> str | None:
@@ -61,19 +60,21 @@ class SchedulingGrant:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What would be better but was not asked for by name."""
-        found = []
-        if self.policy_asked == "auto" and self.policy_refusal is not None:
-            found.append(f"normal scheduling: {self.policy_refusal}")
-        if self.timer_slack_refusal is not None:
-            found.append(f"timer slack: {self.timer_slack_refusal}")
-        if self.memory_lock_refusal is not None:
-            found.append(f"memory may be paged out: {self.memory_lock_refusal}")
-        return tuple(found)
+        """Settings that would be better but were not asked for by name."""
+        return _refused(
+            ("normal scheduling", self.policy_asked == "auto" and self.policy_refusal),
+            ("timer slack", self.timer_slack_refusal),
+            ("memory may be paged out", self.memory_lock_refusal),
+        )
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the grant for records, with its warning (a text or None) and notes."""
         return {**to_mapping(self), "warning": self.warning, "notes": list(self.notes)}
+
+
+def _refused(*refusals: tuple[str, str | Literal[False] | None]) -> tuple[str, ...]:
+    """Return what was refused, each with its reason."""
+    return tuple(f"{what}: {reason}" for what, reason in refusals if reason)
 
 
 def apply(scheduling: Scheduling, *, is_host: bool) -> SchedulingGrant:
@@ -90,14 +91,17 @@ def apply(scheduling: Scheduling, *, is_host: bool) -> SchedulingGrant:
             locked: it answers many, and there is only one.
     """
     priority = scheduling.priority + (1 if is_host else 0)
-    policy_refusal = None if scheduling.policy == "normal" else _set_fifo(priority)
-    is_fifo = scheduling.policy != "normal" and policy_refusal is None
-    slack_ns, slack_refusal = _set_timer_slack(scheduling.timer_slack_ns)
-    affinity_refusal = None
-    if scheduling.cpu_affinity and not is_host:
-        affinity_refusal = _set_affinity(scheduling.cpu_affinity)
-    limit_bytes = _memory_lock_limit_bytes()
-    lock_refusal = _lock_memory(limit_bytes) if is_host else None
+    refusal = None if libc.IS_LINUX else NOT_LINUX
+    wants_fifo, processors = scheduling.policy != "normal", scheduling.cpu_affinity
+    policy_refusal = (refusal or _set_fifo(priority)) if wants_fifo else None
+    is_fifo = wants_fifo and policy_refusal is None
+    slack_ns, slack_refusal = (
+        (None, refusal) if refusal else _set_timer_slack(scheduling.timer_slack_ns)
+    )
+    binds = bool(processors) and not is_host
+    affinity_refusal = (refusal or _set_affinity(processors)) if binds else None
+    limit_bytes = None if refusal else _memory_lock_limit_bytes()
+    lock_refusal = (refusal or _lock_memory(limit_bytes)) if is_host else None
     return SchedulingGrant(
         policy_asked=scheduling.policy,
         policy="fifo" if is_fifo else "normal",
@@ -156,8 +160,6 @@ def outlive_parent() -> None:
 
 def _set_fifo(priority: int) -> str | None:
     """Return why SCHED_FIFO was refused, or None."""
-    if not libc.IS_LINUX:
-        return NOT_LINUX
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except OSError as error:
@@ -169,8 +171,6 @@ def _set_fifo(priority: int) -> str | None:
 
 
 def _set_affinity(processors: tuple[int, ...]) -> str | None:
-    if not libc.IS_LINUX:
-        return NOT_LINUX
     try:
         os.sched_setaffinity(0, processors)
     except (OSError, ValueError, OverflowError) as error:
@@ -194,8 +194,6 @@ def _affinity() -> tuple[int, ...]:
 
 def _set_timer_slack(slack_ns: int) -> tuple[int | None, str | None]:
     """Return the slack as read back and why it could not be set, if so."""
-    if not libc.IS_LINUX:
-        return None, NOT_LINUX
     try:
         libc.prctl(libc.PR_SET_TIMERSLACK, slack_ns)
         return libc.prctl(libc.PR_GET_TIMERSLACK), None
@@ -205,8 +203,6 @@ def _set_timer_slack(slack_ns: int) -> tuple[int | None, str | None]:
 
 def _lock_memory(limit_bytes: int | None) -> str | None:
     """Return why memory cannot be locked, or None when it is."""
-    if not libc.IS_LINUX:
-        return NOT_LINUX
     if limit_bytes is not None and not _may_exceed_lock_limit():
         # Locked with a limit, the first allocation beyond it would fail in the middle of the run.
         return (
@@ -222,21 +218,14 @@ def _lock_memory(limit_bytes: int | None) -> str | None:
 
 
 def _memory_lock_limit_bytes() -> int | None:
-    if not libc.IS_LINUX:
-        return None
-    import resource  # Does not exist everywhere.
-
     soft_bytes, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     return None if soft_bytes == resource.RLIM_INFINITY else soft_bytes
 
 
 def _may_exceed_lock_limit() -> bool:
     """Tell whether this process has the capability that lifts RLIMIT_MEMLOCK."""
-    try:
-        status = STATUS_FILE.read_text()
-    except OSError:
-        return False
-    for line in status.splitlines():
-        if line.startswith("CapEff:"):
-            return bool(int(line.split()[1], 16) >> CAP_IPC_LOCK & 1)
+    with contextlib.suppress(OSError):
+        for line in STATUS_FILE.read_text().splitlines():
+            if line.startswith("CapEff:"):
+                return bool(int(line.split()[1], 16) >> CAP_IPC_LOCK & 1)
     return False

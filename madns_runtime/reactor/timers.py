@@ -29,7 +29,7 @@ class Timer:
         self.sequence = sequence
         self.callback = callback
         self.when_s = when_s
-        """When it fires or fired, s of the reactor's clock."""
+        """Time at which it fires or fired, s of the reactor's clock."""
 
     @property
     def is_pending(self) -> bool:

@@ -23,6 +23,14 @@ SO_MEMINFO_DROPS = 8
 """Index of the drop counter among the words of SO_MEMINFO (linux/sock_diag.h)."""
 SO_SNDBUFFORCE = 32
 SO_RCVBUFFORCE = 33
+BIND_REFUSALS = {
+    errno.EADDRINUSE: "the UDP port is taken; `ss -lunp` shows by whom;"
+    " choose another network.port, or 0 for one that is free",
+    errno.EADDRNOTAVAIL: "this machine has no such address; set network.address to one that"
+    " `ip address` lists, or to 0.0.0.0",
+    errno.EACCES: "not permitted; choose a network.port of 1024 or above",
+}
+"""Why no socket could be bound, and what to do."""
 
 
 class UdpSocket:
@@ -168,13 +176,16 @@ class UdpSocket:
             self.received += 1
             yield datagram
 
-    def send(self, data: bytes, address: Address | None = None) -> bool:
+    def send(
+        self, data: bytes, address: Address | None = None, *, is_repeated: bool = False
+    ) -> bool:
         """
         Send one datagram; False, and counted, if the kernel did not take it.
 
         Args:
             data: The datagram.
             address: The receiver; None on a connected socket.
+            is_repeated: Whether this is its second and last try.
         """
         try:
             if address is None:
@@ -183,9 +194,10 @@ class UdpSocket:
                 self._send_to(data, address)
         except OSError as error:
             self._count(error)
-            # An answer to an earlier datagram: reading it took this one's place.
-            if not isinstance(error, ConnectionRefusedError) or not self._sent_again(data, address):
+            if is_repeated or not isinstance(error, ConnectionRefusedError):
                 return False
+            # An answer to an earlier datagram: reading it took this one's place.
+            return self.send(data, address, is_repeated=True)
         self.sent += 1
         return True
 
@@ -206,17 +218,6 @@ class UdpSocket:
         """Close the socket; take it out of the reactor first."""
         self._is_closed = True
         self._socket.close()
-
-    def _sent_again(self, data: bytes, address: Address | None) -> bool:
-        try:
-            if address is None:
-                self._send_bytes(data)
-            else:
-                self._send_to(data, address)
-        except OSError as error:
-            self._count(error)
-            return False
-        return True
 
     def _note_receive(self, error: OSError) -> None:
         if not self._is_closed and not isinstance(error, BlockingIOError):
@@ -274,17 +275,6 @@ def _name(address: str, port: int) -> str:
 
 
 def _bind_refused(address: str, port: int, error: OSError) -> str:
-    name = _name(address, port)
-    if error.errno == errno.EADDRINUSE:
-        return (
-            f"{name}: the UDP port is taken; `ss -lunp` shows by whom;"
-            " choose another network.port, or 0 for one that is free"
-        )
-    if error.errno == errno.EADDRNOTAVAIL:
-        return (
-            f"{name}: this machine has no such address; set network.address to one that"
-            " `ip address` lists, or to 0.0.0.0"
-        )
-    if error.errno == errno.EACCES:
-        return f"{name}: not permitted; choose a network.port of 1024 or above"
-    return f"{name}: cannot listen: {os.strerror(error.errno or 0)}"
+    number = error.errno or 0
+    reason = BIND_REFUSALS.get(number, f"cannot listen: {os.strerror(number)}")
+    return f"{_name(address, port)}: {reason}"

@@ -7,8 +7,8 @@ or holds lines that are no records, is taken line by line.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -30,9 +30,9 @@ _NEWLINE = ord("\n")
 Columns = dict[str, NDArray[Any]]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class StreamState:
-    """What a pass over the file has found."""
+    """Result of a pass over the file."""
 
     records: int = 0
     is_cut: bool = True
@@ -42,7 +42,7 @@ class StreamState:
     damaged: int = 0
     """Lines before the last that do not decode or have the wrong number of values; they are skipped."""
     dropped: int = 0
-    """What the recorder itself gave up, by the end line."""
+    """Number of records that the recorder itself gave up, by the end line."""
     not_finite: int = 0
     """Values that were NaN or infinite and are null here, by the end line."""
     recorded: int | None = None
@@ -56,13 +56,16 @@ class StreamReading:
 
     Args:
         path: The file.
+        take: Called with all bytes of the file, in order, as a pass over it reads them: a hash needs no pass
+            of its own.
 
     Raises:
         MachineError: The file cannot be opened.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, take: Callable[[bytes], None] | None = None) -> None:
         self.path = path
+        self._take = take or (lambda data: None)
         with _open(path) as file:
             first = file.readline(LINE_BYTES_MAX)
         header = _decode(first)
@@ -73,7 +76,7 @@ class StreamReading:
 
     @property
     def state(self) -> StreamState:
-        """What a whole pass finds; makes that pass if there was none."""
+        """Result of a whole pass; makes that pass if there was none."""
         if self._state is None:
             for _ in self.chunks():
                 pass
@@ -83,6 +86,11 @@ class StreamReading:
     def is_array(self) -> bool:
         """Whether records are arrays (else objects)."""
         return self.schema.get("shape") == "array"
+
+    @property
+    def kinds(self) -> dict[str, str]:
+        """Kinds of the fields by their names, in order."""
+        return {field["name"]: field["kind"] for field in self.schema.get("fields", ())}
 
     @property
     def field_names(self) -> tuple[str, ...]:
@@ -103,8 +111,7 @@ class StreamReading:
 
     def column_chunks(self) -> Iterator[Columns]:
         """Give the columns of each block, as `read_columns` does of the file."""
-        decoder = _Decoder(self.schema)
-        kinds = {field["name"]: field["kind"] for field in self.schema.get("fields", ())}
+        decoder, kinds = _Decoder(self.schema), self.kinds
         for block, is_last in self._blocks():
             flat = decoder.decode_numbers(block)
             if flat is not None:
@@ -119,9 +126,9 @@ class StreamReading:
     def _blocks(self) -> Iterator[tuple[bytes, bool]]:
         """Give whole lines in blocks and whether the block is the file's last; that one may lack its newline."""
         with _open(self.path) as file:
-            file.seek(self._first_bytes)
+            self._take(file.read(self._first_bytes))
             held = b""
-            for block in _whole_lines(file):
+            for block in _whole_lines(file, self._take):
                 if held:
                     yield held, False
                 held = block
@@ -152,10 +159,9 @@ def read_columns(path: Path) -> Columns:
     """
     reading = StreamReading(path)
     chunks = list(reading.column_chunks())
-    kinds = {field["name"]: field["kind"] for field in reading.schema.get("fields", ())}
     return {
         name: np.concatenate([chunk[name] for chunk in chunks]) if chunks else _column([], kind)
-        for name, kind in kinds.items()
+        for name, kind in reading.kinds.items()
     }
 
 
@@ -179,7 +185,7 @@ class _Decoder:
         rows = self._decode_whole(block)
         if rows is None:
             rows = self._decode_lines(block, is_last=is_last)
-        self.state = replace(self.state, records=self.state.records + len(rows))
+        self.state.records += len(rows)
         return rows
 
     def decode_numbers(self, block: bytes) -> list[float | int | None] | None:
@@ -200,7 +206,7 @@ class _Decoder:
             return None
         if len(numbers) != self.width * len(line_ends):
             return None
-        self.state = replace(self.state, records=self.state.records + len(line_ends))
+        self.state.records += len(line_ends)
         return numbers  # type: ignore[no-any-return]
 
     def _decode_whole(self, block: bytes) -> list[Any] | None:
@@ -225,45 +231,37 @@ class _Decoder:
             if self._is_record(value):
                 rows.append(value)
             elif not self._take_control(value):
-                self._count_broken(is_last=is_last and index == len(lines) - 1)
+                is_cut = is_last and index == len(lines) - 1
+                self.state.truncated_lines += is_cut
+                self.state.damaged += not is_cut
         return rows
 
     def _is_record(self, value: Any) -> bool:
-        if not self._is_readable:
-            return False
         if self._type is list:
             return isinstance(value, list) and len(value) == self.width
-        return isinstance(value, dict) and not _is_control(value)
+        return self._is_readable and isinstance(value, dict) and not _is_control(value)
 
     def _take_control(self, value: Any) -> bool:
         if not _is_control(value):
             return False
         if "t0_utc" in value:
-            self.state = replace(self.state, t0_utc=value["t0_utc"])
+            self.state.t0_utc = value["t0_utc"]
             return True
         end = value["end"]
         counts: list[Any] = [end.get(name) for name in END_COUNTS] if isinstance(end, dict) else []
         if not counts or not all(type(count) is int for count in counts):
             return False
-        recorded, dropped, not_finite = counts
-        self.state = replace(
-            self.state, is_cut=False, recorded=recorded, dropped=dropped, not_finite=not_finite
-        )
+        self.state.recorded, self.state.dropped, self.state.not_finite = counts
+        self.state.is_cut = False
         return True
 
-    def _count_broken(self, *, is_last: bool) -> None:
-        state = self.state
-        if is_last:
-            self.state = replace(state, truncated_lines=state.truncated_lines + 1)
-        else:
-            self.state = replace(state, damaged=state.damaged + 1)
 
-
-def _whole_lines(file: BinaryIO) -> Iterator[bytes]:
+def _whole_lines(file: BinaryIO, take: Callable[[bytes], None]) -> Iterator[bytes]:
     """Give blocks that end with a newline; the file's last may lack it, a line over the limit is shortened."""
     held: list[bytes] = []
     held_bytes = 0
     while block := file.read(BLOCK_BYTES):
+        take(block)
         end = block.rfind(b"\n") + 1
         if end:
             yield b"".join((*held, block[:end]))

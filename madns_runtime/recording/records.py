@@ -22,7 +22,8 @@ class Field:
 
     name: str
     unit: str = ""
-    kind: Literal["float", "int", "str", "bool", "json"] = "float"
+    kind: Literal["float", "int", "str", "bool", "json", "packed"] = "float"
+    """packed: text that its simulation alone reads; it is left out of tables."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +94,7 @@ LOG = StreamSchema(
     ),
     shape="object",
 )
-"""What was worth a sentence, as loud as recording.verbosity lets through."""
+"""Logged sentences, as loud as recording.verbosity lets through."""
 
 HEALTH = StreamSchema(
     "health",
@@ -154,4 +155,9 @@ PROCESS = StreamSchema(
         Field("involuntary_switches", "", "int"),
     ),
 )
-"""What a process of the run uses: CPU since its last record, memory, and counters since its start."""
+"""Use of resources by a process of the run: CPU since its last record, memory, and counters since its start."""
+
+FRAMEWORK_STREAMS = frozenset(
+    schema.name for schema in (TICKS, CLOCK, EVENTS, LOG, HEALTH, PROCESS)
+)
+"""Names that no simulation's stream can have."""

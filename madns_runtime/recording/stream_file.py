@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +22,23 @@ from madns_runtime.recording.records import StreamSchema
 
 LINES_PER_WRITE_MAX = 1024
 LINE_OVERHEAD_BYTES = 56
-"""What a waiting line costs beside its text: the bytes object and its place in the list."""
+"""Bytes that a waiting line costs beside its text: the bytes object and its place in the list."""
 FILES_MAX = 10_000
 NAME_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 CONTROL_KEYS = ("end", "t0_utc")
+
+
+def check_name(name: str) -> None:
+    """
+    Check that a stream or a text may be called so.
+
+    Raises:
+        PluginError: It is no file name.
+    """
+    if not NAME_PATTERN.fullmatch(name):
+        raise PluginError(
+            f"stream {name!r}: expected a name of letters, digits, - and _, at most 64"
+        )
 
 
 def check_schema(schema: StreamSchema) -> None:
@@ -35,10 +48,7 @@ def check_schema(schema: StreamSchema) -> None:
     Raises:
         PluginError: Its name is no file name, it has no fields, or two of one name.
     """
-    if not NAME_PATTERN.fullmatch(schema.name):
-        raise PluginError(
-            f"stream {schema.name!r}: expected a name of letters, digits, - and _, at most 64"
-        )
+    check_name(schema.name)
     names = [field.name for field in schema.fields]
     if not names or len(set(names)) != len(names):
         raise PluginError(f"stream {schema.name}: expected fields with distinct names, got {names}")
@@ -61,9 +71,10 @@ def create_file(directory: Path, name: str, first: int) -> tuple[Path, int, int]
     Raises:
         MachineError: The directory takes no new file.
     """
-    for number, path in _candidates(directory, name, first):
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
+    for number in range(first, first + FILES_MAX):
+        path = directory / (f"{name}.jsonl" if number == 1 else f"{name}.{number}.jsonl")
         try:
-            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
             return path, os.open(path, flags, 0o644), number
         except FileExistsError:
             continue
@@ -72,17 +83,13 @@ def create_file(directory: Path, name: str, first: int) -> tuple[Path, int, int]
     raise MachineError(f"{directory}: holds {FILES_MAX} files of stream {name}; clear it out")
 
 
-def _candidates(directory: Path, name: str, first: int) -> Iterator[tuple[int, Path]]:
-    for number in range(first, first + FILES_MAX):
-        yield number, directory / (f"{name}.jsonl" if number == 1 else f"{name}.{number}.jsonl")
-
-
 class StreamFile:
     """One open stream: what waits, what was written, and how its values become a line."""
 
     __slots__ = (
         "_control_left",
         "_descriptor",
+        "_newest_taken",
         "_pending",
         "_pending_cost",
         "_synced_bytes",
@@ -121,6 +128,7 @@ class StreamFile:
         self.has_t0 = False
         """Whether the file states simulated time zero, or is about to."""
         self._descriptor = descriptor
+        self._newest_taken = b""
         self._pending: bytes = b""
         self._pending_cost = 0
         self._control_left = 0
@@ -131,6 +139,12 @@ class StreamFile:
     def dropped(self) -> int:
         """Records that will never be in the file."""
         return self.overflowed + self.unwritten
+
+    @property
+    def newest(self) -> bytes:
+        """The record that was added last; empty before the first."""
+        # In this order: the writer keeps what it is about to cut off.
+        return b"".join(self.lines[-1:]) or self._newest_taken
 
     # What follows is called by the loop's thread.
 
@@ -206,8 +220,10 @@ class StreamFile:
 
     def _take(self, head: bytes, count: int) -> None:
         text = b"".join(self.lines[:count])
+        if count:
+            self._newest_taken = self.lines[count - 1]
         del self.lines[:count]
-        self._pending = head + text if head else text
+        self._pending = head + text
         self._pending_cost = len(text) + LINE_OVERHEAD_BYTES * count
         self._control_left = 1 if head else 0
 
@@ -255,18 +271,19 @@ class StreamFile:
         self.unwritten += len(self.lines) + max(0, records_left)
         self.lines.clear()
         self._pending = b""
+        fd = self._descriptor
         counts = {
             "records": self.written,
             "dropped": self.dropped,
             "not_finite": self.not_finite,
         }
         end = orjson.dumps({"end": counts}, option=orjson.OPT_APPEND_NEWLINE)
-        for step in (self._cut_to_whole_line, lambda: self._write_end(end), self._sync):
+        for step in (self._cut_to_whole_line, lambda: self._write_end(end), lambda: os.fsync(fd)):
             try:
                 step()
             except OSError as error:
                 errors.append(error)
-        os.close(self._descriptor)
+        os.close(fd)
         return errors
 
     def _cut_to_whole_line(self) -> None:
@@ -279,15 +296,11 @@ class StreamFile:
         if not self.bytes_written:
             return
         try:
-            left = end
-            while left:
-                count = os.write(self._descriptor, left)
+            while end:
+                count = os.write(self._descriptor, end)
                 self.bytes_written += count
-                left = left[count:]
+                end = end[count:]
             self._whole_bytes = self.bytes_written
         except OSError:
             self._cut_to_whole_line()
             raise
-
-    def _sync(self) -> None:
-        os.fsync(self._descriptor)

@@ -29,7 +29,7 @@ DRIFT_MAX = 700e-6
 DRIFT_PRIOR = 100e-6
 """Standard deviation of the drift before anything is known."""
 DRIFT_WANDER = 1e-6
-"""How far drift may have moved since the newest exchange."""
+"""Distance that drift may have moved since the newest exchange."""
 STAMP_NOISE_S = 5e-6
 """Between reading the clock and the system call lies some of the interpreter."""
 STEP_UNCERTAINTIES = 2.0
@@ -146,7 +146,7 @@ class ClockEstimate:
 
     @property
     def drift_ppm(self) -> float:
-        """How much faster the host's clock runs, 1e-6; 0 before the first exchange."""
+        """Drift of the host's clock against this one, 1e-6, positive if it is faster; 0 before the first exchange."""
         return self._line.drift * 1e6 if self._line else 0.0
 
     @property

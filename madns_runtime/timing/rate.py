@@ -18,6 +18,19 @@ COUNT_ROUNDING = 1e-9
 GOLDEN_FRACTION = 0.6180339887498949
 
 
+def count_ticks(duration_s: float, tick_hz: float) -> int:
+    """
+    Return how many ticks of *tick_hz* a run of *duration_s* has: one at 0 s, and all others before its end.
+
+    Neither 0.29 nor 0.7 is a float, so that a product is a little off: 0.29 * 100 is 28.999999999999996 and
+    0.7 * 10 is 7.000000000000001. A share of a tick below COUNT_ROUNDING of the product is taken for such an error.
+    """
+    exact = duration_s * tick_hz
+    nearest = round(exact)
+    is_whole = abs(exact - nearest) <= COUNT_ROUNDING * max(1.0, exact)
+    return max(1, nearest if is_whole else math.ceil(exact))
+
+
 class TickTiming(NamedTuple):
     """One tick that is due now. A tuple, because one is made for every tick of every agent."""
 
@@ -26,9 +39,9 @@ class TickTiming(NamedTuple):
     t_s: float
     """Nominal simulated time, index / tick_hz: without phase, the same for every agent."""
     deadline_s: float
-    """When it should have begun: t_s plus the agent's phase."""
+    """Time at which it should have begun: t_s plus the agent's phase."""
     lateness_s: float
-    """How long after its deadline it begins."""
+    """Delay of its begin behind its deadline."""
     missed: int
     """Ticks skipped just before this one."""
 
@@ -92,7 +105,7 @@ class Pacer:
         tick_hz: Rate, Hz.
         phase_s: Offset of every deadline, within [0, 1 / tick_hz), s; see `stagger`.
         duration_s: Simulated time of the run: ticks with index / tick_hz below it are run, s.
-        tolerance_s: A step that ends this long after its period is an error, before that a warning, s.
+        overrun_s: A step that ends this long after its period is an error, before that a warning, s.
 
     Raises:
         ConfigurationError: An argument is out of its range.
@@ -107,7 +120,7 @@ class Pacer:
         "_margin_s_min",
         "_phase_s",
         "_tick_hz",
-        "_tolerance_s",
+        "_overrun_s",
         "missed",
         "not_run",
         "overrun_errors",
@@ -117,19 +130,19 @@ class Pacer:
     )
 
     def __init__(
-        self, *, tick_hz: float, phase_s: float, duration_s: float, tolerance_s: float
+        self, *, tick_hz: float, phase_s: float, duration_s: float, overrun_s: float
     ) -> None:
-        if not (0 < tick_hz < math.inf and 0 < duration_s < math.inf and tolerance_s >= 0):
+        if not (0 < tick_hz < math.inf and 0 < duration_s < math.inf and overrun_s >= 0):
             raise ConfigurationError(
-                "expected tick_hz > 0, duration_s > 0 and tolerance_s >= 0, got"
-                f" {tick_hz:g}, {duration_s:g} and {tolerance_s:g}"
+                "expected tick_hz > 0, duration_s > 0 and overrun_s >= 0, got"
+                f" {tick_hz:g}, {duration_s:g} and {overrun_s:g}"
             )
         if not 0 <= phase_s * tick_hz < 1:
             raise ConfigurationError(f"expected 0 <= phase_s < 1 / {tick_hz:g}, got {phase_s:g}")
         self._tick_hz = tick_hz
         self._phase_s = phase_s
-        self._tolerance_s = tolerance_s
-        self.tick_count = _count_ticks(tick_hz, duration_s)
+        self._overrun_s = overrun_s
+        self.tick_count = count_ticks(duration_s, tick_hz)
         self.run = 0
         self.missed = 0
         self.not_run = 0
@@ -160,7 +173,7 @@ class Pacer:
             return None
         missed = 0
         if now_s >= self._closing_s:
-            missed = self._skip_late(now_s)
+            missed = self._skip(self._newest_due(now_s), "missed")
             if self._index >= self.tick_count:
                 return None
             deadline_s = self._deadline_s
@@ -176,7 +189,7 @@ class Pacer:
         """
         End the step that began last, and return its margin: time left until the next deadline, s.
 
-        A negative margin is an overrun: a warning up to the tolerance, an error beyond (thesis
+        A negative margin is an overrun: a warning up to `overrun_s`, an error beyond (thesis
         A.2.5 warns from 0 and calls 5 ms an error).
 
         Raises:
@@ -189,7 +202,7 @@ class Pacer:
         if margin_s < self._margin_s_min:
             self._margin_s_min = margin_s
         if margin_s < 0:
-            if -margin_s <= self._tolerance_s:
+            if -margin_s <= self._overrun_s:
                 self.overrun_warnings += 1
             else:
                 self.overrun_errors += 1
@@ -203,8 +216,7 @@ class Pacer:
         count as `not_run`, not as missed.
         """
         due = self._newest_due(now_s)
-        first = due if self._deadline_of(due) == now_s else due + 1
-        return self._skip(first, "not_run")
+        return self._skip(due if self._deadline_of(due) == now_s else due + 1, "not_run")
 
     def finish(self, now_s: float) -> None:
         """Close the account at *now_s*: whatever was due until then and never run is missed."""
@@ -257,9 +269,6 @@ class Pacer:
             index -= 1
         return index
 
-    def _skip_late(self, now_s: float) -> int:
-        return self._skip(self._newest_due(now_s), "missed")
-
     def _skip(self, index: int, account: Literal["missed", "not_run"]) -> int:
         skipped = min(index, self.tick_count) - self._index
         if skipped <= 0:
@@ -310,11 +319,3 @@ def stagger(
     position = index * GOLDEN_FRACTION % 1.0
     rank = sum(other * GOLDEN_FRACTION % 1.0 < position for other in range(count))
     return rank / count / tick_hz
-
-
-def _count_ticks(tick_hz: float, duration_s: float) -> int:
-    exact = tick_hz * duration_s
-    nearest = round(exact)
-    is_whole = abs(exact - nearest) <= COUNT_ROUNDING * max(1.0, exact)
-    # Tick 0 lies at simulated time zero, before any end.
-    return max(1, nearest if is_whole else math.ceil(exact))

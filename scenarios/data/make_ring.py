@@ -1,10 +1,12 @@
 """
-Write a ring of satellites as Orbit Mean-Elements Messages (OMM, CSV): one circular orbit, with slot errors.
+Write satellites of one circular orbit, with slot errors, as Orbit Mean-Elements Messages (OMM, CSV).
 
     python scenarios/data/make_ring.py --count 93 --altitude-km 780 --inclination-deg 86.4 > ring93.csv
+    python scenarios/data/make_ring.py --count 77 --spacing-deg 2 --wave-share 0.5 --name CHAIN > chain77.csv
 
-Satellites are evenly spaced but for errors of a normal distribution, scaled to exactly the spread asked
-for and free of a common part. The same seed gives the same file.
+They are evenly spaced, all around or by --spacing-deg, but for errors of a normal distribution and, with
+--wave-share, half a wave from the first to the last, which neighbours see least of. Errors are scaled to
+exactly the spread asked for and free of a common part. The same seed gives the same file.
 """
 
 from __future__ import annotations
@@ -31,11 +33,28 @@ def kozai_revs_per_day(a_km: float, i_rad: float) -> float:
     return brouwer_rad_s * (1.0 + share) * 86_400.0 / math.tau
 
 
-def slot_errors_deg(count: int, rms_deg: float, seed: int) -> np.ndarray:
-    """Return errors with this root mean square and no mean, shape (count,)."""
-    errors = np.random.default_rng(seed).normal(size=count)
-    errors -= errors.mean()
-    return errors * rms_deg / math.sqrt(float(np.mean(errors**2)))
+def slot_errors_deg(
+    count: int, rms_deg: float, seed: int, *, wave_share: float = 0.0
+) -> np.ndarray:
+    """
+    Return errors with this root mean square and no mean, shape (count,).
+
+    Args:
+        count: Satellites.
+        rms_deg: Root mean square, deg.
+        seed: Of the normal distribution.
+        wave_share: Share of the variance that lies in half a wave from the first to the last.
+    """
+    noise = np.random.default_rng(seed).normal(size=count)
+    noise -= noise.mean()
+    if not wave_share:
+        return noise * rms_deg / math.sqrt(float(np.mean(noise**2)))
+    wave = np.cos(math.pi * (np.arange(count) + 0.5) / count)
+    # Free of the wave, the rest adds to it as variances do.
+    noise -= wave * float(noise @ wave) / float(wave @ wave)
+    noise *= math.sqrt((1.0 - wave_share) / float(np.mean(noise**2)))
+    wave *= math.sqrt(wave_share / float(np.mean(wave**2)))
+    return rms_deg * (noise + wave)
 
 
 def main() -> None:
@@ -50,16 +69,22 @@ def main() -> None:
     parser.add_argument("--inclination-deg", type=float, default=86.4)
     parser.add_argument("--rms-deg", type=float, default=0.2, help="slot errors at the epoch")
     parser.add_argument("--seed", type=int, default=93)
+    parser.add_argument("--spacing-deg", type=float, help="between slots; 360 / count by default")
+    parser.add_argument(
+        "--wave-share", type=float, default=0.0, help="of the errors' variance, in half a wave"
+    )
+    parser.add_argument("--name", default="RING", help="of the satellites, before their number")
     parser.add_argument("--epoch", default="2020-05-06T00:00:00.000000")
     given = parser.parse_args()
     revs = kozai_revs_per_day(6378.1363 + given.altitude_km, math.radians(given.inclination_deg))
     lines = [COLUMNS]
-    for number, error in enumerate(
-        slot_errors_deg(given.count, given.rms_deg, given.seed).tolist()
-    ):
-        latitude = (360.0 * number / given.count + error) % 360.0
+    errors = slot_errors_deg(given.count, given.rms_deg, given.seed, wave_share=given.wave_share)
+    for number, error in enumerate(errors.tolist()):
+        spacing = given.spacing_deg
+        slot = 360.0 * number / given.count if spacing is None else spacing * number
+        latitude = (slot + error) % 360.0
         lines.append(
-            f"RING-{number + 1:02d},2020-900A,{given.epoch},{revs:.8f},.0000000,{given.inclination_deg:.4f},"
+            f"{given.name}-{number + 1:02d},2020-900A,{given.epoch},{revs:.8f},.0000000,{given.inclination_deg:.4f},"
             f"0.0000,0.0000,{latitude:.6f},0,U,{90001 + number},999,1,0,0,0"
         )
     sys.stdout.write("\n".join(lines) + "\n")

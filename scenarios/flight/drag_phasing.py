@@ -9,7 +9,7 @@ dB = Cd A / m smaller, the argument of latitude gains
 (Foster et al., Differential drag control scheme for large constellation of Planet satellites, 2018).
 A satellite commands its coefficient by turning: high drag, low drag, or what is between once its slot
 is near. It brakes in time along the parabola of a full-drag approach. Where the slot is, and how fast
-the ring's phase moves, it learns from its two neighbours alone, as `slot_keeping` does.
+the ring's phase moves, it learns through its two neighbours alone, as `slot_keeping` does.
 
 flight.settings: see `RingSettings`, and
 
@@ -33,7 +33,10 @@ from madns_runtime.simulations.constellation.flight.api import (
     FlightSoftware,
     Readings,
 )
-from madns_runtime.simulations.constellation.flight.ring import RingMember, position_reading
+from madns_runtime.simulations.constellation.flight.ring_consensus import (
+    RingMember,
+    position_reading,
+)
 from madns_runtime.simulations.constellation.messages import CommandResult, Delivery
 
 COMMAND_SHARE_MIN = 0.02
@@ -82,6 +85,7 @@ class DragPhasing(FlightSoftware):
                 "sma_ring_m": ring.sma_ring_m,
                 "ballistic_m2_kg": self._ballistic,
                 "messages": ring.sent,
+                "members": ring.members,
             }
         )
 
@@ -102,6 +106,7 @@ class DragPhasing(FlightSoftware):
             "refused": self._refused,
             "messages": self._ring.sent,
             "neighbours": len(self._ring.neighbours),
+            "members": self._ring.members,
         }
 
     def _decide(self, t_s: float) -> None:

@@ -27,7 +27,7 @@ from madns_runtime.simulations.constellation.flight.api import (
     Reading,
     Readings,
 )
-from madns_runtime.simulations.constellation.flight.ring import position_reading
+from madns_runtime.simulations.constellation.flight.ring_consensus import position_reading
 from madns_runtime.simulations.constellation.messages import CommandResult
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.orbit.elements import elements_from_state

@@ -6,7 +6,7 @@ A satellite ahead of its slot goes a little higher, where it is slower: with a t
     da = 2 a dlam / (3 n tau)
 
 on top of the ring's mean semi-major axis, reached by two along-track burns half an orbit apart, which
-leave the orbit as round as it was. Where the slot is, it learns from its two neighbours alone.
+leave the orbit as round as it was. Where the slot is, it learns through its two neighbours alone.
 
 flight.settings: see `RingSettings`, and
 
@@ -27,7 +27,10 @@ from madns_runtime.simulations.constellation.flight.api import (
     FlightSoftware,
     Readings,
 )
-from madns_runtime.simulations.constellation.flight.ring import RingMember, position_reading
+from madns_runtime.simulations.constellation.flight.ring_consensus import (
+    RingMember,
+    position_reading,
+)
 from madns_runtime.simulations.constellation.messages import CommandResult, Delivery
 
 SAMPLES_MIN = 4
@@ -38,7 +41,7 @@ class SlotKeeping(FlightSoftware):
     """One satellite of the ring."""
 
     def setup(self, context: FlightContext) -> None:
-        """Read the settings; the first command waits until neighbours agree on the ring."""
+        """Read the settings; the first command waits until news has come some way."""
         self.context = context
         self._ring = RingMember(context, follows_sma=False)
         settings = context.settings
@@ -78,6 +81,7 @@ class SlotKeeping(FlightSoftware):
                 "sma_wanted_m": self._sma_wanted_m,
                 "delta_v_m_s": self._delta_v_m_s,
                 "messages": ring.sent,
+                "members": ring.members,
             }
         )
 
@@ -101,6 +105,7 @@ class SlotKeeping(FlightSoftware):
             "refused": self._refused,
             "messages": self._ring.sent,
             "neighbours": len(self._ring.neighbours),
+            "members": self._ring.members,
         }
 
     def _command(self, t_s: float) -> None:

@@ -8,10 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from madns_runtime.config import from_mapping
+from madns_runtime.medium.carrier import Carrier
+from madns_runtime.medium.mailbox import Mailbox
 from madns_runtime.plugin.api import Tick
-from madns_runtime.protocol.codec import pack, unpack
+from madns_runtime.protocol.codec import decode_message, encode_message, pack, unpack
+from madns_runtime.protocol.messages import Delivery, Transmission, TransmissionRefusal
 from madns_runtime.simulations.constellation.agent import ConstellationAgent
-from madns_runtime.simulations.constellation.host import ConstellationHost
+from madns_runtime.simulations.constellation.host import ConstellationHost, radio_of
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
@@ -38,10 +41,25 @@ class FakeContext:
     records: dict = field(default_factory=lambda: defaultdict(list))
     streams: dict = field(default_factory=dict)
     logs: list = field(default_factory=list)
+    texts: dict = field(default_factory=dict)
     jobs: list = field(default_factory=list)
     is_lockstep: bool = False
     wake_s: float = math.inf
     random: np.random.Generator = field(default_factory=lambda: np.random.default_rng(7))
+    transmitted: list = field(default_factory=list)
+
+    def __post_init__(self):
+        self.mailbox = Mailbox(self.name, self.agents, has_medium=True, post=self._transmit)
+        self.transmit, self.message_counts = self.mailbox.transmit, self.mailbox.counts
+        self.carrier = Carrier(self.agents, self._hand_over, self.now_s)
+        self.enter, self.account = self.carrier.enter, self.carrier.account
+
+    def _transmit(self, transmission):
+        self.transmitted.append((self.clock_s, travelled(transmission)))
+
+    def _hand_over(self, to, message):
+        self.sent.append((self.clock_s, to, travelled(message)))
+        return True
 
     def now_s(self):
         return self.clock_s
@@ -61,12 +79,43 @@ class FakeContext:
     def log(self, level, text):
         self.logs.append((level, text))
 
+    def keep_text(self, name, data):
+        self.texts[name] = self.texts.get(name, b"") + data
+
     def submit(self, function, *arguments):
         self.jobs.append((function, arguments))
         return len(self.jobs)
 
     def wake(self, t_s):
         self.wake_s = min(self.wake_s, t_s)
+
+
+def travelled(message):
+    return decode_message(encode_message(message))
+
+
+def carry(host, context, name, transmission):
+    """Give the host's medium what an agent sent to others, as the runtime does."""
+    outcomes = radio_of(host, context).carry(name, transmission)
+    context.carrier.enter(name, transmission, outcomes)
+    context.carrier.hand_over()
+
+
+def tell(agent, message):
+    """Give an agent what came for it, as the runtime does."""
+    if isinstance(message, Delivery):
+        agent._context.mailbox.add(message)
+    elif isinstance(message, TransmissionRefusal):
+        agent.refused(message)
+    else:
+        agent.receive(message)
+
+
+def tick(agent, tick):
+    """Have an agent do a tick, as the runtime does."""
+    for delivery in agent._context.mailbox.due(tick.t_s):
+        agent.hear(delivery)
+    agent.step(tick)
 
 
 class Star:
@@ -118,12 +167,12 @@ class Star:
                 self.context.wake_s = math.inf
                 timer_s = self.host.timer(t_s)
                 assert timer_s is None or timer_s > t_s
+            self.context.carrier.hand_over()
             self._deliver(t_s)
             self._hear(t_s)
             if index % ratio == 0:
-                tick = Tick(index // ratio, t_s, ratio * step_s, 0.0, 0)
                 for agent in self.agents.values():
-                    agent.step(tick)
+                    tick(agent, Tick(index // ratio, t_s, ratio * step_s, 0.0, 0))
 
     def summaries(self):
         return {name: agent.finish() for name, agent in self.agents.items()}
@@ -146,11 +195,16 @@ class Star:
     def _hear(self, t_s):
         for name, context in self.contexts.items():
             self._up += [(sent_s + self.up_s, name, message) for sent_s, _, message in context.sent]
+            self._up += [(sent_s + self.up_s, name, one) for sent_s, one in context.transmitted]
             context.sent.clear()
+            context.transmitted.clear()
         due = [mail for mail in self._up if mail[0] <= t_s]
         self._up = [mail for mail in self._up if mail[0] > t_s]
         for _, name, message in due:
-            self.host.receive(name, message)
+            if isinstance(message, Transmission):
+                carry(self.host, self.context, name, message)
+            else:
+                self.host.receive(name, message)
 
     def _deliver(self, t_s):
         for sent_s, to, message in self.context.sent[self._read :]:
@@ -162,7 +216,7 @@ class Star:
         self._mail = [mail for mail in self._mail if mail[0] > t_s]
         for _, to, message in sorted(due, key=lambda mail: mail[0]):
             if to in self.agents:
-                self.agents[to].receive(message)
+                tell(self.agents[to], message)
 
 
 def state_rows(star, name):

@@ -20,7 +20,7 @@ from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.orbit.frames import rtn_to_inertial
 from madns_runtime.simulations.constellation.parameters import ScipyPropagator
 from madns_runtime.simulations.constellation.truth.propagation import PropagationParameters
-from madns_runtime.simulations.constellation.truth.scipy_propagator import ScipyDop853
+from madns_runtime.simulations.constellation.truth.propagators.scipy_propagator import ScipyDop853
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 _numbers = itertools.count()
@@ -114,7 +114,10 @@ class Fleet:
         ballistic_range=(0.0, np.inf),
         duration_s=86_400.0,
         sign=1.0,
+        dies_s=None,
     ):
+        self.dies_s = dict(dies_s or {})
+        """By index, from when on a vehicle's software and radio are silent."""
         self.states = np.array(states, dtype=np.float64)
         count = len(self.states)
         agents = tuple(f"agent-{number:03d}" for number in range(count))
@@ -153,9 +156,14 @@ class Fleet:
             delivery = Delivery(
                 sender=name, sent_s=sent_s, arrives_s=sent_s + 0.01, payload=payload
             )
-            self.software[to].receive(delivery)
-        for one, state in zip(self.software, self.states.tolist(), strict=True):
-            one.step(self.t_s, {TRUTH: Reading(self.t_s, tuple(state))})
+            if self._lives(to):
+                self.software[to].receive(delivery)
+        for index, state in enumerate(self.states.tolist()):
+            if self._lives(index):
+                self.software[index].step(self.t_s, {TRUTH: Reading(self.t_s, tuple(state))})
+
+    def _lives(self, index):
+        return self.t_s < self.dies_s.get(index, np.inf)
 
     def _advance(self):
         """Propagate by a tick, stopping at the time of each command in it."""

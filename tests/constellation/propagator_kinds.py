@@ -23,7 +23,7 @@ from madns_runtime.simulations.constellation.truth.propagation import Propagatio
 EXTRAS = {"numba": "numba", "basilisk": "Basilisk"}
 OWN = """
 from madns_runtime.simulations.constellation.parameters import ScipyPropagator
-from madns_runtime.simulations.constellation.truth.scipy_propagator import ScipyDop853
+from madns_runtime.simulations.constellation.truth.propagators.scipy_propagator import ScipyDop853
 from dataclasses import replace
 
 class Mine:

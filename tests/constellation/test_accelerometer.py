@@ -16,8 +16,8 @@ from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
     propagate,
 )
-from madns_runtime.simulations.constellation.vehicle.sensors.scene import Scene
-from madns_runtime.simulations.constellation.vehicle.sensors.suite import SensorSuite
+from madns_runtime.simulations.constellation.vehicle.sensors.environment import Scene
+from madns_runtime.simulations.constellation.vehicle.sensors.sensor import SensorSuite
 from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBuffer
 
 EPOCH = "2026-03-20T12:00:00Z"

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from madns_runtime.simulations.constellation.equipment import ReactionWheels, Thruster, Vehicle
-from madns_runtime.simulations.constellation.truth.actuators import (
+from madns_runtime.simulations.constellation.truth.maneuvers.actuators import (
+    ActuatorRefusal,
     Burn,
-    Refusal,
     Tank,
     chance_of,
     fire,
@@ -60,7 +60,7 @@ def test_a_finite_burn_takes_propellant_times_exhaust_velocity_over_thrust():
 
 
 def test_what_cannot_be_burnt_is_refused_with_figures():
-    assert fire(EXACT, tank(), (0.0, 0.0, 0.0), chance()) == Refusal(
+    assert fire(EXACT, tank(), (0.0, 0.0, 0.0), chance()) == ActuatorRefusal(
         reason="a change of velocity of 0 m/s"
     )
     needs = fire(EXACT, tank(), (1000.0, 0.0, 0.0), chance())
@@ -71,6 +71,7 @@ def test_what_cannot_be_burnt_is_refused_with_figures():
     assert isinstance(fire(coarse, tank(coarse), (0.021, 0.0, 0.0), chance()), Burn)
 
 
+@pytest.mark.slow
 def test_errors_have_the_deviations_that_the_scenario_says():
     thruster = Thruster(
         isp_s=220.0, propellant_kg=20.0, magnitude_error=0.02, direction_error_deg=1.5
@@ -133,9 +134,9 @@ def test_wheels_saturate_by_the_opposite_of_what_they_give():
     assert nearly.limits == ("x: wheels saturate",)
     assert back.torque_n_m[0] == -0.1
     full = turn(WHEELS, (-1.0, 0.0, 0.0), (0.1, 0.0, 0.0), 10.0, chance())
-    assert full == Refusal(reason="the wheels are saturated")
+    assert full == ActuatorRefusal(reason="the wheels are saturated")
 
 
 def test_a_vehicle_without_wheels_turns_exactly_as_commanded():
     assert turn(None, (9.0, 0.0, 0.0), (5.0, 0.0, 0.0), 1.0, chance()).torque_n_m == (5.0, 0.0, 0.0)
-    assert isinstance(turn(None, (0.0,) * 3, (0.0, 0.0, 0.0), 1.0, chance()), Refusal)
+    assert isinstance(turn(None, (0.0,) * 3, (0.0, 0.0, 0.0), 1.0, chance()), ActuatorRefusal)

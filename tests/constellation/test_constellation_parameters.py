@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 from constellation_fakes import IRIDIUM, SCENARIOS, WALKER, parameters
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.loading import load_scenario
+from cosmos_cli.models.parameters import adapter_of
 from madns_runtime.config import from_mapping, to_mapping
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.protocol.codec import pack
@@ -17,10 +18,10 @@ from madns_runtime.simulations.constellation.messages import Initial, Segment
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.orbit.elements import elements_from_state
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters, Maneuvers
-from madns_runtime.simulations.constellation.truth.fleet import load_fleet
-from madns_runtime.simulations.constellation.truth.propagation import Stretch
+from madns_runtime.simulations.constellation.truth.initial_states import load_fleet
+from madns_runtime.simulations.constellation.truth.propagation import TruthStretch
+from madns_runtime.simulations.constellation.truth.satellite_selection import parse_walker
 from madns_runtime.simulations.constellation.truth.segments import RefillSchedule, TruthStore
-from madns_runtime.simulations.constellation.truth.walker import parse_walker
 
 KEPLERIAN = {
     "keplerian": [
@@ -40,7 +41,7 @@ VALID = {
 
 @pytest.mark.parametrize("mapping", VALID.values(), ids=VALID)
 def test_pydantic_and_the_runtime_read_the_same(mapping):
-    validated = TypeAdapter(ConstellationParameters).validate_python(mapping)
+    validated = adapter_of(ConstellationParameters).validate_python(mapping)
 
     assert from_mapping(ConstellationParameters, to_mapping(validated)) == validated
     assert from_mapping(ConstellationParameters, mapping) == validated
@@ -81,7 +82,7 @@ def test_what_is_valid_has_no_faults(mapping):
 )
 def test_what_is_out_of_bounds_is_refused_where_it_is_read(mapping):
     with pytest.raises(ValidationError):
-        TypeAdapter(ConstellationParameters).validate_python(mapping)
+        adapter_of(ConstellationParameters).validate_python(mapping)
 
 
 def orbit(**values):
@@ -260,7 +261,9 @@ def test_segments_and_initial_data_survive_their_messages():
 def stretch(first_knot, knots, vehicles=2):
     states = np.zeros((vehicles, knots, 6))
     states[..., 0] = np.arange(first_knot, first_knot + knots)
-    return Stretch(first_knot=first_knot, states=states, invariants=np.ones((vehicles, knots, 3)))
+    return TruthStretch(
+        first_knot=first_knot, states=states, invariants=np.ones((vehicles, knots, 3))
+    )
 
 
 def test_the_store_cuts_windows_that_share_their_joints():

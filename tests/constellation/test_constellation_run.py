@@ -11,7 +11,7 @@ from constellation_fakes import IRIDIUM, Star, parameters, state_rows
 
 from madns_runtime.errors import PluginError
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
-from madns_runtime.simulations.constellation.truth.fleet import load_fleet
+from madns_runtime.simulations.constellation.truth.initial_states import load_fleet
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
     load_propagator,
@@ -43,7 +43,7 @@ def test_sixty_seconds_serve_every_tick_with_the_propagators_own_states(kind):
     for number, name in enumerate(star.agents):
         rows = state_rows(star, name)
         assert rows[:, 0].tolist() == list(range(600))
-        # Records are rounded to 0.1 mm and 0.1 um/s; SGP4's positions carry noise of 1e-5 m.
+        # Records are rounded to 1 um and 1 nm/s; SGP4's positions carry noise of 1e-5 m.
         noise_m_s = 3e-5 if kind == "sgp4" else 0.0
         assert np.abs(rows[:, 1:4] - truth[number, :, :3]).max() < 0.7e-4
         assert np.abs(rows[:, 4:] - truth[number, :, 3:]).max() < 1.3e-7 + noise_m_s
@@ -72,6 +72,7 @@ def test_no_agent_has_less_than_half_its_buffer_when_its_refill_comes():
         assert 4.0 - 0.02 <= summary["left_at_refill_s_min"] <= 6.0
 
 
+@pytest.mark.slow
 def test_refills_are_spread_so_that_no_instant_sees_a_burst():
     star = Star(parameters(), 60, duration_s=60.0)
 
@@ -337,6 +338,7 @@ def test_the_timer_asks_for_times_that_move_forward():
     assert len(times) < 1000
 
 
+@pytest.mark.process
 def test_the_agents_half_needs_neither_scipy_nor_sgp4():
     code = (
         "import sys, madns_runtime.simulations.constellation.agent\n"
@@ -350,6 +352,7 @@ def test_the_agents_half_needs_neither_scipy_nor_sgp4():
     assert done.stdout.strip() == "[]"
 
 
+@pytest.mark.process
 def test_naming_and_checking_a_constellation_loads_neither_scipy_nor_sgp4():
     code = (
         "import sys\n"

@@ -16,7 +16,7 @@ from madns_runtime.simulations.constellation.parameters import (
     ConstellationParameters,
     ElementSetSatellites,
 )
-from madns_runtime.simulations.constellation.truth.fleet import load_fleet
+from madns_runtime.simulations.constellation.truth.initial_states import load_fleet
 
 APOGEE_M = 42_164e3
 LOW_M = 6378.137e3 + 780e3
@@ -53,6 +53,7 @@ def test_first_burn_from_a_circular_orbit_is_the_textbooks():
     assert MODULE["injection_m_s"](circle(), APOGEE_M, 0.0) == pytest.approx(2295.160, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_second_burn_comes_after_half_an_ellipse_and_makes_the_orbit_round():
     fleet = Fleet(
         MODULE["Hohmann"],

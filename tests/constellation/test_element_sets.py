@@ -11,15 +11,14 @@ from constellation_fakes import SCENARIOS
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.simulations.constellation.orbit.constants import EARTH_POLAR_RADIUS_M, EGM_96
 from madns_runtime.simulations.constellation.parameters import Sgp4Propagator
-from madns_runtime.simulations.constellation.truth.element_sets import (
-    read_element_sets,
-    tle_checksum,
-)
+from madns_runtime.simulations.constellation.truth.element_sets import read_element_sets
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
     propagate,
 )
-from madns_runtime.simulations.constellation.truth.sgp4_sets import julian_date, sgp4_states
+from madns_runtime.simulations.constellation.truth.propagators.sgp4_propagator import sgp4_states
+from madns_runtime.simulations.constellation.truth.propagators.sgp4_records import julian_date
+from madns_runtime.simulations.constellation.truth.tle_files import tle_checksum
 
 DATA = SCENARIOS / "data"
 TLE = (DATA / "iridium10.tle").read_text()
@@ -178,7 +177,7 @@ def test_a_missing_file_is_named(tmp_path):
 
 
 def test_a_folder_or_a_binary_file_is_refused(tmp_path):
-    with pytest.raises(ConfigurationError, match="cannot be read"):
+    with pytest.raises(ConfigurationError, match="expected a file, got a folder"):
         read_element_sets(tmp_path)
     (tmp_path / "a.tle").write_bytes(b"\xff\xfe\x00\x01")
     with pytest.raises(ConfigurationError, match="cannot be read"):
@@ -208,7 +207,7 @@ def test_a_day_beyond_its_year_is_refused(tmp_path):
     text = "\n".join((line + str(tle_checksum(line)), TLE.splitlines()[2]))
 
     assert faults_of(tmp_path / "a.tle", text) == [
-        "1: expected a day of the year, got 367.00000000"
+        "1: expected a day of its year, got 17367.00000000"
     ]
 
 

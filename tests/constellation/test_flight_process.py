@@ -10,21 +10,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from constellation_fakes import SCENARIOS, WALKER, FakeContext, parameters
+from constellation_fakes import SCENARIOS, WALKER, FakeContext, parameters, tell, tick
+from harness.waiting import is_alive, wait_until
 
 from madns_runtime.errors import BlamedError
 from madns_runtime.plugin.api import Tick
 from madns_runtime.simulations.constellation.agent import ConstellationAgent
 from madns_runtime.simulations.constellation.flight import line_process, process
-from madns_runtime.simulations.constellation.flight.line_process import TALK_LINES_MAX
 from madns_runtime.simulations.constellation.flight.process import LATE_CHECK, UNANSWERED_MAX
 from madns_runtime.simulations.constellation.messages import (
     Command,
     CommandResult,
     Delivery,
     Initial,
-    Refusal,
     Segment,
+    TransmissionRefusal,
 )
 
 pytestmark = pytest.mark.process
@@ -84,12 +84,12 @@ class Ship:
 
     @property
     def process(self):
-        return self.agent._cockpit._pilot._software._process
+        return self.agent._cockpit._software._process
 
     def run(self, ticks):
         for _ in range(ticks):
             index, self._next = self._next, self._next + 1
-            self.agent.step(Tick(index, index / HZ, 1.0 / HZ, 0.0, 0))
+            tick(self.agent, Tick(index, index / HZ, 1.0 / HZ, 0.0, 0))
         return self
 
     def run_until(self, is_done):
@@ -103,7 +103,7 @@ class Ship:
 
     def run_until_answered(self, count):
         """Tick when an answer has come, until *count* were taken."""
-        software = self.agent._cockpit._pilot._software
+        software = self.agent._cockpit._software
         self.run(1)
         while software._counts["answers"] < count:
             self.process.wait(PATIENCE_S)
@@ -157,10 +157,9 @@ print("{}", flush=True)
     with Ship(tmp_path, command, crosslinks={}, flight={"settings": {"k": [1.0]}}) as ship:
         message = Delivery(sender="agent-02", sent_s=0.0, arrives_s=0.0, payload={"b": b"\x00"})
         result = CommandResult(number=4, status="refused", at_s=1.0, revision=0, reason="no fuel")
-        ship.agent.receive(message.to_message())
-        ship.agent.receive(result.to_message())
-        refusal = Refusal(number=1, to="*", sent_s=0.0, reason="no_line_of_sight")
-        ship.agent.receive(refusal.to_message())
+        refusal = TransmissionRefusal(number=1, to="*", sent_s=0.0, reason="no_line_of_sight")
+        for one in (message, result.to_message(), refusal):
+            tell(ship.agent, one)
         ship.run(1)
 
     setup, tick = map(json.loads, (tmp_path / "told.json").read_text().splitlines())
@@ -202,8 +201,8 @@ print(json.dumps({"send": [{"to": "*", "payload": [1, "x"]}],
     with Ship(tmp_path, program(tmp_path, body), crosslinks={}) as ship:
         ship.run(1)
 
-    message = ship.context.sent[0][2]
-    assert (message["to"], message["payload"]) == ("*", [1, "x"])
+    ((_, message),) = ship.context.transmitted
+    assert (message.to, message.payload) == ("*", [1, "x"])
     assert ("warning", "hello") in ship.context.logs
 
 
@@ -243,10 +242,12 @@ def test_a_program_that_dies_fails_the_agent_with_its_exit_code_and_its_last_wor
     body = "print('out of ideas', file=sys.stderr, flush=True)\nsys.exit(7)"
     ship = Ship(tmp_path, program(tmp_path, body))
 
-    with pytest.raises(BlamedError, match=r"\(pid \d+\) ended with exit code 7"):
+    with pytest.raises(BlamedError, match=r"\(pid \d+\) ended with exit code 7") as caught:
         ship.run(1)
 
-    assert [text for _, text in ship.context.logs if "out of ideas" in text]
+    told = "; its last words: 'out of ideas' (agents/agent-01/flight_stderr.txt)"
+    assert str(caught.value).endswith(told)
+    assert ship.context.texts == {"flight_stderr": b"out of ideas\n"}
 
 
 def test_a_program_that_does_not_answer_in_lockstep_fails_the_agent(tmp_path):
@@ -338,22 +339,20 @@ def test_one_that_answers_in_time_breaks_none(tmp_path):
     assert ship.late == {"name": LATE_CHECK, "limit": 0, "got": 0, "passed": True}
 
 
-def test_what_it_says_on_standard_error_is_logged_within_bounds(tmp_path):
-    body = f"""
-for n in range({TALK_LINES_MAX + 10}):
+def test_what_it_says_on_standard_error_is_kept_and_counted(tmp_path):
+    body = """
+for n in range(3000):
     print("word", n, file=sys.stderr)
 sys.stderr.flush()
-print("{{}}", flush=True)
+print("{}", flush=True)
 """
     with Ship(tmp_path, program(tmp_path, body)) as ship:
         ship.run(1)
 
-    words = [text for _, text in ship.context.logs if ": word " in text]
-    assert len(words) == TALK_LINES_MAX
-    assert ship.summary["log_lines"] == TALK_LINES_MAX + 10
-    assert [level for level, text in ship.context.logs if "no more of its words" in text] == [
-        "warning"
-    ]
+    kept = ship.context.texts["flight_stderr"].decode().splitlines()
+    assert kept == [f"word {n}" for n in range(3000)]
+    assert ship.summary["stderr_lines"] == 3000
+    assert ship.summary["stderr_bytes"] == len("".join(f"{line}\n" for line in kept))
 
 
 def test_a_word_on_standard_error_without_end_holds_nobody_up(tmp_path):
@@ -366,9 +365,9 @@ print("{}", flush=True)
         ship.run(20)
 
     assert ship.summary["answers"] == 20
-    assert ship.summary["log_lines"] == 1
-    logged = [text for _, text in ship.context.logs if text.endswith("x")]
-    assert [text.count("x") for text in logged] == [500 + sys.executable.count("x")]
+    assert ship.summary["stderr_lines"] == 1
+    assert ship.summary["stderr_bytes"] % 60_000 == 0
+    assert set(ship.context.texts["flight_stderr"]) == {ord("x")}
 
 
 def test_a_program_that_does_not_end_with_its_input_is_stopped(tmp_path, monkeypatch):
@@ -397,7 +396,8 @@ def test_what_a_program_starts_itself_ends_with_it(tmp_path):
         ship.run(2)
 
     assert ship.summary["exit_code"] == 0
-    _wait_until_gone(int((tmp_path / "pid").read_text()))
+    pid = int((tmp_path / "pid").read_text())
+    wait_until(lambda: not is_alive(pid))
 
 
 def test_a_missing_program_is_named_at_set_up(tmp_path):
@@ -418,21 +418,7 @@ def test_a_program_dies_with_its_agents_process(tmp_path):
     os.close(reader)
     os.waitpid(child, 0)
 
-    _wait_until_gone(pid)
-
-
-def _wait_until_gone(pid):
-    deadline_s = time.monotonic() + PATIENCE_S
-    while _lives(pid):
-        assert time.monotonic() < deadline_s
-        time.sleep(0.01)
-
-
-def _lives(pid):
-    try:
-        return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()
-    except OSError:
-        return False
+    wait_until(lambda: not is_alive(pid))
 
 
 def test_the_example_in_c_holds_its_semi_major_axis(tmp_path):

@@ -6,11 +6,11 @@ import types
 
 import numpy as np
 import pytest
-from constellation_fakes import WALKER, FakeContext, parameters
+from constellation_fakes import WALKER, FakeContext, parameters, tell, tick
 
-from madns_runtime.context import describe_exception
 from madns_runtime.errors import BlamedError
 from madns_runtime.plugin.api import Tick
+from madns_runtime.plugin.context import describe_exception
 from madns_runtime.protocol.messages import Service
 from madns_runtime.simulations.constellation.agent import ConstellationAgent
 from madns_runtime.simulations.constellation.messages import (
@@ -18,9 +18,9 @@ from madns_runtime.simulations.constellation.messages import (
     CommandResult,
     Delivery,
     Initial,
-    Refusal,
+    Message,
     Segment,
-    Transmission,
+    TransmissionRefusal,
 )
 from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBuffer
 
@@ -76,11 +76,11 @@ class Ship:
     def run(self, until_s, from_s=0.0):
         for index in range(round(from_s * HZ), round(until_s * HZ)):
             self.context.clock_s = index / HZ
-            self.agent.step(Tick(index, index / HZ, 1.0 / HZ, 0.0, 0))
+            tick(self.agent, Tick(index, index / HZ, 1.0 / HZ, 0.0, 0))
         return self
 
     def tell(self, message):
-        self.agent.receive(message.to_message())
+        tell(self.agent, message.to_message() if isinstance(message, Message) else message)
         return self
 
     @property
@@ -143,7 +143,7 @@ class G:
         return {}
 """
     ship = Ship(tmp_path, text, crosslinks={}, flight={"settings": {"a": [1.0]}}).run(1.0)
-    given = ship.agent._cockpit._pilot._software.given
+    given = ship.agent._cockpit._software.given
 
     def leaks():
         holders = (TruthBuffer, Segment, Initial, FakeContext, ConstellationAgent)
@@ -228,8 +228,9 @@ def test_an_agent_that_rejoins_gives_no_number_twice(tmp_path):
     first = Ship(tmp_path, text, crosslinks={}).run(2.0)
     again = Ship(tmp_path, text, crosslinks={}, joined_s=1.91).run(4.0, 2.0)
 
-    for kind in ("command", "transmission"):
-        numbers = [message["number"] for ship in (first, again) for message in ship.sent(kind)]
+    commands = [message["number"] for ship in (first, again) for message in ship.sent("command")]
+    messages = [one.number for ship in (first, again) for _, one in ship.context.transmitted]
+    for numbers in (commands, messages):
         assert numbers[0] == 0
         assert len(set(numbers)) == len(numbers) > 40
 
@@ -324,14 +325,14 @@ class G:
 """
     ship = Ship(tmp_path, text, crosslinks={}).run(0.2)
 
-    sent = [Transmission.from_message(message) for message in ship.sent("transmission")]
+    sent = [transmission for _, transmission in ship.context.transmitted]
     assert [(m.to, m.sent_s, m.number, m.payload) for m in sent] == [
         ("agent-02", 0.0, 0, {"t": 0.0}),
         ("*", 0.0, 1, "all"),
         ("agent-02", 0.1, 2, {"t": 0.1}),
         ("*", 0.1, 3, "all"),
     ]
-    assert {service for service, _ in ship.context.services} == {Service.RELIABLE}
+    assert ship.context.sent == []
 
 
 def test_estimates_are_recorded_apart_with_the_units_of_their_names(tmp_path):
@@ -353,6 +354,22 @@ class G:
     assert ship.context.records["estimates"] == [(0, 0.0, 7e6), (1, 0.1, 7e6)]
 
 
+def test_estimate_of_nothing_is_null_and_no_number_that_is_none(tmp_path):
+    ship = Ship(tmp_path, body("self.context.estimate({'a_m': None, 'b_m': t_s})")).run(0.1)
+
+    assert ship.context.records["estimates"] == [(0, None, 0.0)]
+
+
+@pytest.mark.parametrize("what", ["(float('nan'), 0, 0)", "(0, 0, -float('inf'))"])
+def test_torque_of_no_finite_number_is_refused(tmp_path, what):
+    call = f"self.context.torque({what}, at_s=1.0, duration_s=1.0)"
+    attitude = {"inertia_kg_m2": [10.0, 12.0, 14.0]}
+    ship = Ship(tmp_path, body(call), vehicles=[{"attitude": attitude}])
+
+    with pytest.raises(BlamedError, match="torque: expected a finite number for component"):
+        ship.run(0.1)
+
+
 def body(*lines):
     return "\n".join(
         [
@@ -371,6 +388,13 @@ def body(*lines):
         ("self.context.delta_v((1, 2), at_s=1.0)", "expected three numbers in m/s, got (1, 2)"),
         ("self.context.delta_v((1, 2, float('nan')), at_s=1.0)", "expected a finite number"),
         ("self.context.delta_v((1, 2, 3), at_s=None)", "expected a finite number for at_s"),
+        ("self.context.delta_v((1, 2, 3), at_s=1e999)", "expected a finite number for at_s"),
+        ("self.context.delta_v((1, 2, 10**400), at_s=1.0)", "expected a finite number for comp"),
+        (
+            "self.context.ballistic(float('nan'), at_s=1.0)",
+            "expected a finite number for ballistic",
+        ),
+        ("self.context.estimate({'a': 10**400})", "numbers for a,"),
         ("self.context.delta_v((1, 2, 3), at_s=1.0, frame='RTN')", "inertial, rtn, body"),
         ("self.context.delta_v((1, 2, 3), at_s=1.0, frame='body')", "vehicles.attitude"),
         ("self.context.torque((1, 2, 3), at_s=1.0, duration_s=1.0)", "vehicles.attitude"),
@@ -438,7 +462,7 @@ def test_a_message_that_cannot_leave_is_refused_counted_and_told_in_the_next_tic
     }
     summary = ship.agent.finish()
     assert (summary["messages_sent"], summary["sends_refused"]) == (0, {reason: 2})
-    assert ship.sent("transmission") == []
+    assert ship.context.transmitted == []
     assert ship.context.records["refusals"] == [(1, 0, to, 0.0, reason), (2, 1, to, 0.1, reason)]
     ((level, words),) = ship.context.logs
     assert level == "warning"
@@ -448,7 +472,9 @@ def test_a_message_that_cannot_leave_is_refused_counted_and_told_in_the_next_tic
 def test_what_the_host_refuses_is_told_like_what_the_board_does(tmp_path):
     call = "self.context.send('agent-02', 1)"
     ship = Ship(tmp_path, TOLD.format(call=call), crosslinks={}).run(0.1)
-    ship.tell(Refusal(number=0, to="agent-02", sent_s=0.0, reason="out_of_range")).run(0.5, 0.1)
+    ship.tell(TransmissionRefusal(number=0, to="agent-02", sent_s=0.0, reason="out_of_range")).run(
+        0.5, 0.1
+    )
 
     assert ship.flight["told"] == [[0, "agent-02", 0.0, "out_of_range"]]
     assert ship.agent.finish()["sends_refused"] == {"out_of_range": 1}

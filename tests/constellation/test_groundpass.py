@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from constellation_fakes import Star
+from constellation_fakes import Star, carry
 
 from cosmos_cli.models.document import read_document
 from cosmos_cli.models.yaml_source import read_source
@@ -13,7 +13,7 @@ from madns_runtime.simulations.constellation.parameters import (
     ConstellationParameters,
     Crosslinks,
 )
-from madns_runtime.simulations.constellation.truth.medium import OUTCOMES
+from madns_runtime.simulations.constellation.truth.radio.channel import OUTCOMES
 
 SCENARIO = Path(__file__).parents[2] / "scenarios/groundpass.yaml"
 RISE_S = 525.525 - 480.0
@@ -27,9 +27,9 @@ class TalkingStar(Star):
     def _deliver(self, t_s):
         super()._deliver(t_s)
         for name, context in self.contexts.items():
-            said, context.sent = context.sent, []
-            for _, _, message in said:
-                self.host.receive(name, message)
+            said, context.transmitted = context.transmitted, []
+            for _, transmission in said:
+                carry(self.host, self.context, name, transmission)
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,8 @@ from madns_runtime.simulations.constellation.equipment import (
 )
 from madns_runtime.simulations.constellation.messages import Command
 from madns_runtime.simulations.constellation.parameters import Maneuvers
-from madns_runtime.simulations.constellation.truth.effects import Timeline
-from madns_runtime.simulations.constellation.truth.maneuvers import (
+from madns_runtime.simulations.constellation.truth.maneuvers.effects import Timeline
+from madns_runtime.simulations.constellation.truth.maneuvers.rules import (
     WAITING_MAX,
     ManeuverDesk,
     Rules,
@@ -109,6 +109,9 @@ def test_late_commands_are_refused_where_the_scenario_says_so():
         ({"at_s": math.inf}, "finite"),
         ({"phase_s": math.nan}, "finite"),
         ({"vector": (math.nan, 0.0, 0.0)}, "finite"),
+        ({"kind": "torque", "frame": "body", "duration_s": math.nan}, "finite"),
+        ({"kind": "torque", "frame": "body", "vector": (0.0, 0.0, -math.inf)}, "finite"),
+        ({"kind": "ballistic", "vector": (math.nan, 0.0, 0.0)}, "finite"),
         ({"vector": (900.0, 0.0, 0.0)}, "propellant"),
         ({"frame": "body"}, "without attitude"),
         ({"kind": "torque", "frame": "body", "duration_s": 1.0}, "without attitude"),

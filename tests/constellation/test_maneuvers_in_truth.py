@@ -10,7 +10,7 @@ from constellation_fakes import SCENARIOS, Star, parameters, state_rows
 
 from madns_runtime.errors import ConfigurationError, PluginError
 from madns_runtime.protocol.messages import Service
-from madns_runtime.simulations.constellation.hosting.refills import URGENT_KNOTS_MAX
+from madns_runtime.simulations.constellation.host_side.truth_distribution import URGENT_KNOTS_MAX
 from madns_runtime.simulations.constellation.messages import Command
 
 SCRIPT = '''
@@ -197,6 +197,7 @@ def test_a_vehicle_may_leave_the_earth_and_has_no_elements_then(fly):
     assert star.underruns() == 0
 
 
+@pytest.mark.slow
 def test_a_body_spun_up_beyond_what_knots_can_tell_ends_the_run_by_name(fly):
     star = fly(
         ["agent-02 10 torque 1 0 0 20 1", "agent-02 20 torque 2 0 0 20 1"],
@@ -314,7 +315,7 @@ def test_commands_with_time_ahead_are_made_by_the_executor_and_urgent_ones_in_th
     later = [function.__name__ for function, _ in star.context.jobs][len(jobs) :]
     assert later == ["propagate_part"]
     assert star.host.finish()["maneuvers"]["executed"] == 10
-    assert star.host._supply._bases == {}
+    assert star.host._supply.jobs._owners == {}
 
 
 def test_a_job_that_is_not_back_in_time_is_overtaken(fly):
@@ -330,7 +331,7 @@ def test_a_job_that_is_not_back_in_time_is_overtaken(fly):
     maneuvers = star.host.finish()["maneuvers"]
     assert (maneuvers["executed"], maneuvers["propagated_anew"]) == (1, 1)
     assert record(star)["propagation_s"] == pytest.approx(12.85 - 10.11, abs=0.02)
-    assert star.host._maneuvering._overtaken == set()
+    assert star.host._supply.jobs._owners == {}
     assert star.underruns() == 0
 
 
@@ -510,6 +511,7 @@ def test_in_lockstep_everything_is_carried_out_when_it_is_heard(fly):
     assert all(row[10] == 0.0 for row in star.context.records["maneuvers"])
 
 
+@pytest.mark.slow
 def test_memory_of_what_was_done_is_bounded(fly):
     star = fly(
         [f"agent-01 {n} rtn 2 0 0.01 0" for n in range(10, 900, 5)],
@@ -519,10 +521,10 @@ def test_memory_of_what_was_done_is_bounded(fly):
 
     star.run(95.0, step_s=0.1)
 
-    supply = star.host._supply
+    store = star.host._supply.store
     assert star.host.finish()["maneuvers"]["executed"] > 160
-    assert len(supply.timelines[0].effects) < 50
-    assert len(supply.store._pieces[0]) < 200
+    assert len(store.timelines[0].effects) < 50
+    assert len(store._pieces[0]) < 200
     assert star.underruns() == 0
 
 

@@ -21,7 +21,7 @@ from madns_runtime.simulations.constellation.orbit.mean_elements import (
 )
 from madns_runtime.simulations.constellation.parameters import ScipyPropagator
 from madns_runtime.simulations.constellation.truth.propagation import PropagationParameters
-from madns_runtime.simulations.constellation.truth.scipy_propagator import ScipyDop853
+from madns_runtime.simulations.constellation.truth.propagators.scipy_propagator import ScipyDop853
 
 MU = EGM_96.mu_m3_s2
 ORBITS_S = 5 * 6030.0
@@ -52,6 +52,7 @@ def means(states):
     return [mean_from_state(tuple(s[:3]), tuple(s[3:]), EGM_96) for s in states]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("i_deg", [30.0, 60.0, 86.4, 97.4])
 def test_mean_semi_major_axis_holds_to_tens_of_metres_where_the_osculating_one_swings(i_deg):
     _, states = truth(replace(MEAN, i_rad=math.radians(i_deg)))
@@ -72,6 +73,7 @@ def test_mean_semi_major_axis_holds_to_tens_of_metres_where_the_osculating_one_s
     assert np.mean(mean) == pytest.approx(MEAN.a_m, abs=20.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("i_deg", [30.0, 53.0, 86.4])
 def test_mean_argument_of_latitude_and_node_turn_at_the_rates_of_theory(i_deg):
     mean = replace(MEAN, i_rad=math.radians(i_deg))

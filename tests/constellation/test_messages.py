@@ -8,11 +8,8 @@ from madns_runtime.protocol.codec import pack, unpack
 from madns_runtime.simulations.constellation.messages import (
     Command,
     CommandResult,
-    Delivery,
     Initial,
-    Refusal,
     Segment,
-    Transmission,
 )
 from madns_runtime.simulations.constellation.thrust import Thrust
 
@@ -38,9 +35,6 @@ COMMAND = Command(
 MESSAGES = [
     COMMAND,
     CommandResult(number=4, status="refused", at_s=2.0, revision=1, reason="no"),
-    Transmission(to="ground:A", sent_s=1.0, number=7, payload={"x": [1, None]}),
-    Delivery(sender="b", sent_s=1.0, arrives_s=1.01, payload="text"),
-    Refusal(number=7, to="*", sent_s=1.0, reason="no_radio"),
 ]
 
 
@@ -82,7 +76,7 @@ def test_segments_survive_with_attitude_and_thrust_and_inside_of_initial_data():
         (ARC, {"states": [1.0] * 6}, "segment: expected states"),
         (ARC, {"thrust": [1.0]}, "segment: expected thrust"),
         (MESSAGES[1], {"status": "done"}, "command_result: expected status"),
-        (MESSAGES[2], {"to": 3}, "transmission: expected to: str, got 3"),
+        (COMMAND, {"frame": 3}, "command: expected frame: CommandFrame, got 3"),
     ],
     ids=lambda value: str(value)[:20],
 )

@@ -10,20 +10,18 @@ from hypothesis import strategies as st
 
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96, GRAVITY_MODELS
 from madns_runtime.simulations.constellation.orbit.elements import (
+    ConvergenceError,
     Elements,
     elements_from_state,
+    mean_from_true,
+    solve_kepler,
     state_from_elements,
+    true_from_eccentric,
 )
-from madns_runtime.simulations.constellation.orbit.hermite import (
+from madns_runtime.simulations.constellation.orbit.interpolation import (
     coefficients,
     evaluate,
     interpolate,
-)
-from madns_runtime.simulations.constellation.orbit.kepler import (
-    ConvergenceError,
-    mean_from_true,
-    solve_kepler,
-    true_from_eccentric,
 )
 
 MU = EGM_96.mu_m3_s2
@@ -56,15 +54,17 @@ def test_mean_anomaly_of_true_anomaly_is_keplers(eccentric, e):
 
 
 @given(
-    a=st.floats(6.6e6, 5e7),
-    e=st.floats(0.0, 0.9),
-    i=st.floats(0.0, math.pi),
-    raan=ANGLES,
-    argp=ANGLES,
-    mean=ANGLES,
+    st.builds(
+        Elements,
+        a_m=st.floats(6.6e6, 5e7),
+        e=st.floats(0.0, 0.9),
+        i_rad=st.floats(0.0, math.pi),
+        raan_rad=ANGLES,
+        argp_rad=ANGLES,
+        mean_anomaly_rad=ANGLES,
+    )
 )
-def test_elements_and_state_are_each_others_inverse(a, e, i, raan, argp, mean):
-    orbit = Elements(a_m=a, e=e, i_rad=i, raan_rad=raan, argp_rad=argp, mean_anomaly_rad=mean)
+def test_elements_and_state_are_each_others_inverse(orbit):
     r, v = state_from_elements(orbit, MU)
 
     found = elements_from_state(r, v, MU)
@@ -72,11 +72,11 @@ def test_elements_and_state_are_each_others_inverse(a, e, i, raan, argp, mean):
 
     # State to elements to state holds for circular and equatorial orbits too; what float64 resolves
     # grows with eccentricity, and where perigee or node is dropped 1e-11 of the radius is.
-    assert math.dist(r, again_r) < 1e-9 * a
+    assert math.dist(r, again_r) < 1e-9 * orbit.a_m
     assert math.dist(v, again_v) < 1e-9 * math.hypot(*v)
-    assert found.a_m == pytest.approx(a, rel=1e-12)
-    assert found.e == pytest.approx(e, abs=1e-10)
-    assert found.i_rad == pytest.approx(i, abs=1e-7)
+    assert found.a_m == pytest.approx(orbit.a_m, rel=1e-12)
+    assert found.e == pytest.approx(orbit.e, abs=1e-10)
+    assert found.i_rad == pytest.approx(orbit.i_rad, abs=1e-7)
     assert all(0.0 <= angle < math.tau for angle in astuple(found)[3:])
 
 

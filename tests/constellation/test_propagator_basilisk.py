@@ -7,35 +7,28 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
-
-pytest.importorskip("Basilisk", reason="the extra `basilisk` is not installed")
-
 from constellation_fakes import Star, parameters
+from harness.late_module import LateModule, needs_library
 
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.simulations.constellation.equipment import Attitude
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.orbit.quaternions import normalised, rotate
 from madns_runtime.simulations.constellation.parameters import BasiliskPropagator, ScipyPropagator
-from madns_runtime.simulations.constellation.truth.attitude import (
-    RigidBody,
-    initial_attitude,
-    propagate_attitude,
-)
-from madns_runtime.simulations.constellation.truth.basilisk_propagator import (
-    SETS_MAX,
-    Basilisk,
-    drifted,
-    whole_steps,
-)
-from madns_runtime.simulations.constellation.truth.basilisk_simulation import (
-    mrp_of,
-    quaternions_of,
-)
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
     propagate,
 )
+from madns_runtime.simulations.constellation.truth.propagators.attitude import propagate_attitude
+from madns_runtime.simulations.constellation.truth.propagators.rigid_body import (
+    RigidBody,
+    initial_attitude,
+)
+
+PROPAGATORS = "madns_runtime.simulations.constellation.truth.propagators"
+propagator = LateModule(f"{PROPAGATORS}.basilisk_propagator")
+simulation = LateModule(f"{PROPAGATORS}.basilisk_simulation")
+pytestmark = needs_library("Basilisk", "basilisk")
 
 
 def make(kind="basilisk", forces=("two_body", "j2"), rest=None, **settings):
@@ -57,6 +50,7 @@ def orbits(count=3, radius_m=7.0e6):
     return np.hstack((r * radius_m, v * math.sqrt(EGM_96.mu_m3_s2 / radius_m)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("forces", [("two_body",), ("two_body", "j2")], ids="+".join)
 def test_it_agrees_with_scipy_over_four_hours(forces):
     end = np.array([14_400.0])
@@ -90,14 +84,14 @@ def test_a_delta_v_is_taken_up_from_any_state_at_any_time():
 
 
 def test_simulations_are_kept_and_bounded():
-    basilisk = Basilisk()
+    basilisk = propagator.Basilisk()
     for step_s in (0.1, 0.2, 0.25, 0.5, 1.0, 1.25):
         basilisk.propagate(orbits(), 0.0, np.array([5.0]), make(step_s=step_s))
     kept = dict(basilisk._kept.sets)
 
     basilisk.propagate(orbits(), 5.0, np.array([10.0]), make(step_s=1.25))
 
-    assert len(basilisk._kept.sets) == SETS_MAX
+    assert len(basilisk._kept.sets) == propagator.SETS_MAX
     assert all(basilisk._kept.sets[key] is kept[key] for key in kept)
 
 
@@ -127,18 +121,18 @@ def test_a_coarse_step_costs_accuracy():
 )
 def test_steps_end_on_knots_and_are_no_longer_than_set(gap_ns, step_ns_max, expected):
     if gap_ns == 999_999_937:
-        step_ns, steps = whole_steps(gap_ns, step_ns_max)
+        step_ns, steps = propagator.whole_steps(gap_ns, step_ns_max)
         assert 0 < gap_ns - step_ns * steps < steps
         assert step_ns <= step_ns_max
         return
 
-    assert whole_steps(gap_ns, step_ns_max) == expected
+    assert propagator.whole_steps(gap_ns, step_ns_max) == expected
 
 
 def test_what_whole_nanoseconds_leave_is_drifted():
     states = orbits()
 
-    found = drifted(states, 1e-6, make())
+    found = propagator.drifted(states, 1e-6, make())
 
     # 1 us of 7.5 km/s is 7.5 mm; the rest of the series 1e-18 m.
     assert found[:, :3] - states[:, :3] == pytest.approx(1e-6 * states[:, 3:], abs=2e-9)
@@ -149,8 +143,8 @@ def test_parameters_of_attitude_go_there_and_back():
     for q in ((0.1, 0.2, 0.3, 0.9), (0.5, -0.5, 0.5, -0.5), (1.0, 0.0, 0.0, 0.0), (0, 0, 0, -1.0)):
         q = normalised(q)
 
-        mrp = mrp_of(list(q))
-        back = quaternions_of(np.array([mrp]))[0]
+        mrp = simulation.mrp_of(list(q))
+        back = simulation.quaternions_of(np.array([mrp]))[0]
 
         assert np.linalg.norm(mrp) <= 1.0 + 1e-15
         # Of the two quaternions of an attitude it may be the other one.
@@ -183,6 +177,7 @@ def turned_rad(a, b):
     return 2.0 * np.linalg.norm(a[..., 6:10] - b[..., 6:10], axis=-1)
 
 
+@pytest.mark.slow
 def test_our_rigid_bodies_turn_as_basilisks():
     bodies, states = bodies_in_orbit()
     knots_s = np.append(np.arange(1, 60) * 10.0, (595.5, 600.0))
@@ -201,7 +196,7 @@ def test_bodies_fly_the_orbits_of_points_to_the_last_digit_also_with_thrust():
     parameters = make(rest={"thrust_m_s2": np.full((3, 3), 1e-3)})
 
     found = turned(bodies, states, knots_s, parameters, t0_s=3.25)
-    itself = Basilisk().propagate_bodies(
+    itself = propagator.Basilisk().propagate_bodies(
         bodies, states, offsets_s=knots_s - 3.25, parameters=parameters
     )
 
@@ -266,7 +261,7 @@ def test_wheels_are_refused_by_name():
 
 
 def test_threads_do_not_step_the_same_simulations():
-    basilisk, knots_s = Basilisk(), np.arange(1.0, 41.0)
+    basilisk, knots_s = propagator.Basilisk(), np.arange(1.0, 41.0)
     fleets = [orbits(radius_m=radius_m) for radius_m in (6.9e6, 7.0e6, 7.1e6, 7.2e6)] * 3
     expected = [basilisk.propagate(fleet, 0.0, knots_s, make()) for fleet in fleets]
 
@@ -278,13 +273,13 @@ def test_threads_do_not_step_the_same_simulations():
 
 def test_a_run_with_basilisk_has_its_rigid_bodies_turned_by_it(monkeypatch):
     turned_by_it = []
-    propagate_bodies = Basilisk.propagate_bodies
+    propagate_bodies = propagator.Basilisk.propagate_bodies
 
     def count(self, bodies, states, **rest):
         turned_by_it.append(len(bodies))
         return propagate_bodies(self, bodies, states, **rest)
 
-    monkeypatch.setattr(Basilisk, "propagate_bodies", count)
+    monkeypatch.setattr(propagator.Basilisk, "propagate_bodies", count)
     body = {"attitude": {"inertia_kg_m2": [10, 24, 17], "rates_deg_s": [1, -2, 0.5]}}
     last = []
     for kind in ("basilisk", "scipy"):

@@ -2,6 +2,7 @@
 
 import math
 import pickle  # noqa: TID251 - as executors do with arguments
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -10,15 +11,14 @@ import pytest
 from propagator_kinds import EXTRAS, OWN, distance_m, make_kind, orbits
 
 from madns_runtime.errors import ConfigurationError, MissingExtraError
-from madns_runtime.simulations.constellation import truth
 from madns_runtime.simulations.constellation.orbit.constants import EARTH_POLAR_RADIUS_M
 from madns_runtime.simulations.constellation.orbit.invariants import ENERGY
 from madns_runtime.simulations.constellation.parameters import (
     CustomPropagator,
 )
+from madns_runtime.simulations.constellation.truth import propagators
 from madns_runtime.simulations.constellation.truth.propagation import (
     PROPAGATORS,
-    can_maneuver,
     conserved_by,
     load_propagator,
     propagate,
@@ -211,8 +211,8 @@ def test_a_thrust_arc_in_orbit_adds_to_gravity(numerical):
 def test_who_cannot_maneuver_says_so(kind, folder):
     own = replace(make_kind("custom", folder).settings, can_maneuver=False)
 
-    assert can_maneuver(kind.settings) == kind.is_numerical
-    assert not can_maneuver(own)
+    assert kind.settings.can_maneuver == kind.is_numerical
+    assert not own.can_maneuver
 
 
 def test_a_thrust_is_refused_by_who_cannot_maneuver(folder):
@@ -253,6 +253,7 @@ def test_a_vehicle_that_meets_the_earth_stands_still_there_and_the_others_fly_on
     assert not found[1, met + 1 :, 3:].any()
 
 
+@pytest.mark.slow
 def test_a_call_that_begins_inside_the_earth_stays_where_it_began(kind):
     states = orbits()
     states[2, :3] = 3e6, 3e6, 3e6
@@ -320,6 +321,37 @@ def test_parameters_travel_to_another_process(kind):
     assert np.array_equal(propagate(orbits(), 0.0, knots_s, there), expected)
 
 
+@pytest.mark.process
+def test_properties_are_known_without_any_library():
+    code = (
+        "import sys; from madns_runtime.simulations.constellation.parameters import AnyPropagator;"
+        "from typing import get_args;"
+        "print(*(p.PROPERTIES.engine for p in get_args(AnyPropagator)));"
+        "print({'scipy', 'numba', 'sgp4', 'Basilisk'} & set(sys.modules))"
+    )
+
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+    engines, imported = done.stdout.splitlines()
+    assert len(engines.split()) == len(PROPAGATORS)
+    assert imported == "set()"
+
+
+def test_properties_are_those_of_the_engine(kind):
+    properties = kind.settings.PROPERTIES
+    engine = load_propagator(kind.settings.kind)
+    states, knots_s, given = orbits(), np.array([10.0, 400.0]), kind.parameters()
+    alone = replace(given, element_sets=given.element_sets[1:2])
+    together = propagate(states, 0.0, knots_s, given)
+
+    by_itself = propagate(states[1:2], 0.0, knots_s, alone)
+
+    assert hasattr(engine, "propagate_bodies") == properties.turns_bodies
+    assert np.array_equal(by_itself[0], together[1]) == properties.is_independent
+    elsewhere = propagate(states + 1.0, 0.0, knots_s, given)
+    assert np.array_equal(elsewhere, together) == properties.needs_element_sets
+
+
 @pytest.mark.parametrize(("name", "extra"), [("numba", "fast"), ("basilisk", "basilisk")])
 def test_a_missing_extra_is_named(name, extra, monkeypatch):
     monkeypatch.setitem(sys.modules, EXTRAS[name], None)
@@ -331,8 +363,8 @@ def test_a_missing_extra_is_named(name, extra, monkeypatch):
         "basilisk_propagator",
         "basilisk_simulation",
     ):
-        monkeypatch.delitem(sys.modules, f"{truth.__name__}.{module}", raising=False)
-        monkeypatch.delattr(truth, module, raising=False)
+        monkeypatch.delitem(sys.modules, f"{propagators.__name__}.{module}", raising=False)
+        monkeypatch.delattr(propagators, module, raising=False)
     load_propagator.cache_clear()
 
     with pytest.raises(MissingExtraError, match=rf"cosmos-madns\[{extra}\]"):

@@ -42,7 +42,7 @@ def test_a_propagator_of_ones_own_that_is_none_is_refused(folder, implementation
 
 
 def test_a_propagator_of_ones_own_may_be_an_installed_module(folder):
-    module = "madns_runtime.simulations.constellation.truth.sgp4_propagator:Sgp4"
+    module = "madns_runtime.simulations.constellation.truth.propagators.sgp4_propagator:Sgp4"
     settings = CustomPropagator(kind="custom", implementation=module, can_maneuver=False)
     sgp4 = make_kind("sgp4", folder)
 

@@ -30,15 +30,15 @@ from madns_runtime.simulations.constellation.orbit.invariants import (
     specific_energy,
 )
 from madns_runtime.simulations.constellation.parameters import NumbaPropagator, ScipyPropagator
-from madns_runtime.simulations.constellation.truth.forces import (
-    FORCES,
-    acceleration_of,
-    two_body,
-)
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
     conserved_by,
     propagate,
+)
+from madns_runtime.simulations.constellation.truth.propagators.forces import (
+    FORCES,
+    acceleration_of,
+    two_body,
 )
 
 ALL = ("two_body", "j2", "j3", "j4", "drag")
@@ -140,6 +140,7 @@ def test_energy_and_axial_momentum_stay_under_all_harmonics(kind):
     assert np.abs(wrong / wrong[0] - 1.0).max() > 1e-7
 
 
+@pytest.mark.slow
 def test_j3_makes_the_eccentricity_of_a_frozen_orbit():
     """First order: omega stays at 90 deg where e = -J3 R sin i / (2 J2 a)."""
     a_m, i_rad = 7.2e6, math.radians(98.0)

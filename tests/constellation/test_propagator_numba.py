@@ -6,26 +6,22 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
-
-pytest.importorskip("numba", reason="the extra `fast` is not installed")
+from harness.late_module import LateModule, needs_library
 
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.orbit.elements import Elements, state_from_elements
 from madns_runtime.simulations.constellation.parameters import NumbaPropagator, ScipyPropagator
-from madns_runtime.simulations.constellation.truth import numba_dop853
-from madns_runtime.simulations.constellation.truth.forces import acceleration_of
-from madns_runtime.simulations.constellation.truth.numba_propagator import (
-    NumbaDop853,
-    air,
-    limits_of,
-    model_of,
-    tableau,
-)
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
     propagate,
 )
+from madns_runtime.simulations.constellation.truth.propagators.forces import acceleration_of
+
+PROPAGATORS = "madns_runtime.simulations.constellation.truth.propagators"
+propagator = LateModule(f"{PROPAGATORS}.numba_propagator")
+numba_dop853 = LateModule(f"{PROPAGATORS}.numba_dop853")
+pytestmark = needs_library("numba", "fast")
 
 ALL = ("two_body", "j2", "j3", "j4", "drag")
 
@@ -66,12 +62,15 @@ def test_the_derivative_is_that_of_the_shared_forces():
 
     for n, state in enumerate(states):
         vehicle = np.array((ballistic[n], *thrust[n]))
-        numba_dop853.derive(state, found, model_of(parameters), air(), vehicle)
+        numba_dop853.derive(
+            state, found, propagator.model_of(parameters), propagator.air(), vehicle
+        )
 
         assert found[:3].tolist() == state[3:].tolist()
         assert found[3:] == pytest.approx(expected[n], rel=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("forces", [ALL[:1], ALL[:2], ALL], ids="+".join)
 def test_it_agrees_with_scipy_over_four_hours(forces):
     states = fleet(20)
@@ -143,7 +142,7 @@ def test_all_failed_vehicles_are_named_up_to_a_limit():
     parameters = make(rest={"names": tuple("ABCDEFGH")})
 
     with pytest.raises(ConfigurationError) as error:
-        NumbaDop853().propagate(states, 5.0, np.array([100.0]), parameters)
+        propagator.NumbaDop853().propagate(states, 5.0, np.array([100.0]), parameters)
 
     lines = str(error.value).splitlines()
     assert lines[0] == "A: numba DOP853 from 5 s: no step passes"
@@ -153,18 +152,18 @@ def test_all_failed_vehicles_are_named_up_to_a_limit():
 
 def test_every_function_has_a_cache_of_its_own():
     """numba tells functions in its cache by name and line: two from one factory would share one."""
-    functions = [value for value in vars(numba_dop853).values() if hasattr(value, "py_func")]
+    functions = [value for value in vars(numba_dop853.load()).values() if hasattr(value, "py_func")]
 
     places = {(f.py_func.__qualname__, f.py_func.__code__.co_firstlineno) for f in functions}
 
-    assert len(places) == len(functions) == 6
+    assert len(places) == len(functions) == 7
     assert all("<locals>" not in name for name, _ in places)
     # Compiled while imported, for one signature each: nothing is left to be compiled in a job.
     assert all(len(f.signatures) == 1 for f in functions)
 
 
 def test_tables_have_the_layout_that_the_code_reads():
-    table = tableau()
+    table = propagator.tableau()
 
     assert table.shape == (22, 16)
     # A stage's coefficients add up to its time; the step's own to one.
@@ -174,7 +173,7 @@ def test_tables_have_the_layout_that_the_code_reads():
     assert not np.triu(table[:16]).any()
     # Error estimates of a constant derivative vanish.
     assert table[16:18].sum(axis=1) == pytest.approx([0.0, 0.0], abs=1e-13)
-    assert limits_of(make().settings)[:3].tolist() == [1e-12, 1e-6, 30.0]
-    two_body = model_of(make(ALL[:1]))
+    assert propagator.limits_of(make().settings)[:3].tolist() == [1e-12, 1e-6, 30.0]
+    two_body = propagator.model_of(make(ALL[:1]))
     assert two_body[[numba_dop853.K2, numba_dop853.K3, numba_dop853.K4]].tolist() == [0.0] * 3
     assert replace(make(), settings=make(ALL[:2]).settings).has_j2

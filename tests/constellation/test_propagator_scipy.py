@@ -7,9 +7,9 @@ import pytest
 
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.parameters import ScipyPropagator
-from madns_runtime.simulations.constellation.truth import scipy_propagator
 from madns_runtime.simulations.constellation.truth.propagation import PropagationParameters
-from madns_runtime.simulations.constellation.truth.scipy_propagator import (
+from madns_runtime.simulations.constellation.truth.propagators import scipy_propagator
+from madns_runtime.simulations.constellation.truth.propagators.scipy_propagator import (
     NODES,
     ScipyDop853,
     first_step_s,

@@ -18,15 +18,17 @@ from madns_runtime.simulations.constellation.orbit.quaternions import (
     rotation_between,
 )
 from madns_runtime.simulations.constellation.parameters import ScipyPropagator
-from madns_runtime.simulations.constellation.truth.attitude import (
-    ATTITUDE,
-    RigidBody,
-    initial_attitude,
-    propagate_attitude,
-)
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
     load_propagator,
+)
+from madns_runtime.simulations.constellation.truth.propagators.attitude import (
+    ATTITUDE,
+    propagate_attitude,
+)
+from madns_runtime.simulations.constellation.truth.propagators.rigid_body import (
+    RigidBody,
+    initial_attitude,
 )
 
 RADIUS_M = EGM_96.radius_m + 780e3
@@ -129,6 +131,7 @@ def test_a_body_that_points_to_the_earth_turns_with_its_orbit():
     assert result[-1, 6:10] == pytest.approx(-result[0, 6:10], abs=1e-9)
 
 
+@pytest.mark.slow
 def test_small_pitch_angles_librate_at_the_frequency_of_theory():
     attitude = Attitude(inertia_kg_m2=INERTIA)
     pitch_rad = 1e-5

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from radio_harness import Air
 from sgp4.api import Satrec, SatrecArray, jday
 
 from madns_runtime.errors import ConfigurationError
+from madns_runtime.medium.carrier import LEAD_S
 from madns_runtime.protocol.codec import pack
-from madns_runtime.simulations.constellation.messages import Transmission
+from madns_runtime.protocol.messages import Transmission
 from madns_runtime.simulations.constellation.orbit.constants import EARTH_RADIUS_M
 from madns_runtime.simulations.constellation.orbit.earth import (
     days_since_j2000,
@@ -23,9 +25,9 @@ from madns_runtime.simulations.constellation.orbit.earth import (
 )
 from madns_runtime.simulations.constellation.orbit.visibility import LIGHT_SPEED_M_S
 from madns_runtime.simulations.constellation.parameters import GroundStation, Uplink
-from madns_runtime.simulations.constellation.truth.contacts import CONTACT_FIELDS
-from madns_runtime.simulations.constellation.truth.medium import LEAD_S, OUTCOMES
-from madns_runtime.simulations.constellation.truth.stations import GroundSegment
+from madns_runtime.simulations.constellation.streams import CONTACTS
+from madns_runtime.simulations.constellation.truth.radio.channel import OUTCOMES, TO_GROUND
+from madns_runtime.simulations.constellation.truth.radio.ground_stations import GroundSegment
 
 ROOT = Path(__file__).parents[2]
 AUTHORITY = json.loads((ROOT / "tests/authorities/passes.json").read_text())
@@ -86,7 +88,7 @@ class Truth:
 
 def ground(*stations, uplinks=(), vehicles=1, states=None, seed=1):
     names = tuple(f"v{number}" for number in range(vehicles))
-    return GroundSegment(
+    segment = GroundSegment(
         stations or (station(),),
         [Uplink(at_s=at_s, to=to, text=text) for at_s, to, text in uplinks],
         agents=names,
@@ -95,6 +97,7 @@ def ground(*stations, uplinks=(), vehicles=1, states=None, seed=1):
         random=np.random.default_rng(seed),
         truth=Truth(states or equatorial(vehicles)),
     )
+    return Air(segment, names, TO_GROUND)
 
 
 def fly(segment, until_s, *, from_s=0.0, step_s=1.0):
@@ -135,6 +138,7 @@ def skyfield_satellites():
     return names, states
 
 
+@pytest.mark.slow
 def test_passes_of_iridium_are_skyfields():
     names, states = skyfield_satellites()
     segment = GroundSegment(
@@ -147,7 +151,7 @@ def test_passes_of_iridium_are_skyfields():
         truth=Truth(states),
     )
 
-    contacts, _, _ = fly(segment, AUTHORITY["span_s"], step_s=30.0)
+    contacts, _, _ = fly(Air(segment, names, TO_GROUND), AUTHORITY["span_s"], step_s=30.0)
 
     got = {}
     for contact in contacts:
@@ -179,9 +183,10 @@ def test_pass_over_the_equator_is_that_computed_by_hand():
     assert end.set_s == pytest.approx(SET_S, abs=1e-4)
     assert end.elevation_deg_max == pytest.approx(90.0, abs=1e-2)
     assert (rise.set_s, rise.elevation_deg_max) == (None, None)
-    assert len(end.to_record()) == len(CONTACT_FIELDS)
+    assert len(end.to_record()) == len(CONTACTS)
 
 
+@pytest.mark.slow
 @given(short_s=st.floats(0.01, 15.0), phase_s=st.floats(0.0, 10.0))
 @settings(deadline=None, max_examples=40)
 def test_pass_shorter_than_the_step_is_not_missed(short_s, phase_s):
@@ -200,6 +205,7 @@ def test_pass_shorter_than_the_step_is_not_missed(short_s, phase_s):
     assert contacts[1].set_s == pytest.approx(middle_s + short_s / 2.0, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_passes_are_the_same_however_little_truth_is_known_ahead():
     clock = [0.0]
     truth = equatorial(1)
@@ -231,7 +237,7 @@ def test_passes_survive_a_host_that_fell_behind_and_forgot():
         truth=truth,
     )
 
-    contacts, _, _ = fly(segment, SET_S + 5.0)
+    contacts, _, _ = fly(Air(segment, names, TO_GROUND), SET_S + 5.0)
 
     assert contacts[1].rise_s == pytest.approx(RISE_S, abs=1e-3)
     assert contacts[1].set_s == pytest.approx(SET_S, abs=1e-3)
@@ -294,6 +300,7 @@ def test_without_stations_nothing_is_wanted():
         random=np.random.default_rng(1),
         truth=Truth(equatorial(1)),
     )
+    segment = Air(segment, ("v0",), TO_GROUND)
 
     assert segment.due(0.0) == []
     assert segment.next_s() is None
@@ -495,6 +502,7 @@ def test_downlink_that_cannot_be_judged_is_accounted(states, sent_s, number, out
     assert segment.send(0, message(sent_s=sent_s, number=number), 0.0)[0].outcome == outcome
 
 
+@pytest.mark.slow
 @given(
     sends=st.lists(
         st.tuples(

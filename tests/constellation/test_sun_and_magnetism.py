@@ -20,7 +20,7 @@ from madns_runtime.simulations.constellation.orbit.sun import (
     is_in_umbra,
     sun_m,
 )
-from madns_runtime.simulations.constellation.vehicle.sensors.magnetometer import (
+from madns_runtime.simulations.constellation.vehicle.sensors.instruments import (
     igrf_coefficients,
     read_coefficients,
 )

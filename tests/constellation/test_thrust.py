@@ -15,14 +15,24 @@ from madns_runtime.simulations.constellation.equipment import (
 )
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
 from madns_runtime.simulations.constellation.thrust import Thrust, velocity_gain_s, way_gain_s2
-from madns_runtime.simulations.constellation.truth import jobs
-from madns_runtime.simulations.constellation.truth.actuators import Tank, chance_of, fire
-from madns_runtime.simulations.constellation.truth.attitude import RigidBody, initial_attitude
-from madns_runtime.simulations.constellation.truth.effects import Effect
-from madns_runtime.simulations.constellation.truth.fleet import load_fleet
-from madns_runtime.simulations.constellation.truth.forces import acceleration_of
-from madns_runtime.simulations.constellation.truth.jobs import VehicleRequest, propagate_vehicle
+from madns_runtime.simulations.constellation.truth import vehicle_propagation
+from madns_runtime.simulations.constellation.truth.initial_states import load_fleet
+from madns_runtime.simulations.constellation.truth.maneuvers.actuators import (
+    Tank,
+    chance_of,
+    fire,
+)
+from madns_runtime.simulations.constellation.truth.maneuvers.effects import Effect
 from madns_runtime.simulations.constellation.truth.propagation import PropagationParameters
+from madns_runtime.simulations.constellation.truth.propagators.forces import acceleration_of
+from madns_runtime.simulations.constellation.truth.propagators.rigid_body import (
+    RigidBody,
+    initial_attitude,
+)
+from madns_runtime.simulations.constellation.truth.vehicle_propagation import (
+    VehicleRequest,
+    propagate_vehicle,
+)
 
 PARAMETERS = parameters()
 STATE = load_fleet(PARAMETERS, 1, None).states[0]
@@ -140,7 +150,7 @@ def test_wheels_take_up_their_torque_through_all_legs_of_a_burn(monkeypatch):
     )
 
     in_legs = propagate_vehicle(request, PROPAGATION)
-    monkeypatch.setattr(jobs, "THRUST_LEG_S", 100.0)
+    monkeypatch.setattr(vehicle_propagation, "THRUST_LEG_S", 100.0)
     at_once = propagate_vehicle(request, PROPAGATION)
 
     assert np.abs(in_legs.attitude - at_once.attitude).max() < 1e-9

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from control_harness import SCENARIOS, Fleet, flight_class
 
-from cosmos_cli.diff.settings import differing_keys
+from cosmos_cli.diff.compare import differing_keys
 from cosmos_cli.models.loading import load_scenario
 from madns_runtime.simulations.constellation.flight.api import TRUTH, Reading
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
@@ -85,6 +85,7 @@ def fly(software, *, until_s=HALF_DAY_S, sign=1.0):
     return fleet
 
 
+@pytest.mark.slow
 def test_fed_with_truth_it_reaches_its_slot():
     fleet = fly(guidance())
 
@@ -92,6 +93,7 @@ def test_fed_with_truth_it_reaches_its_slot():
     assert all(1.0 < spent < 6.0 for spent in fleet.delta_v_m_s)
 
 
+@pytest.mark.slow
 def test_fed_with_measurements_it_reaches_its_slot_and_knows_where_it_is():
     fleet = fly(measuring())
 
@@ -107,6 +109,7 @@ def test_thrusters_the_wrong_way_round_are_noticed():
     assert max(map(abs, slot_errors_deg(fleet.states, fleet.t_s))) > 0.3
 
 
+@pytest.mark.process
 def test_pair_differs_in_what_the_study_varies_alone():
     truth, sensors = (load_scenario(path).to_mapping() for path in (TRUTH_FED, SENSOR_FED))
 

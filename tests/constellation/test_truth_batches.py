@@ -15,12 +15,15 @@ from madns_runtime.simulations.constellation.parameters import (
     ScipyPropagator,
     Sgp4Propagator,
 )
-from madns_runtime.simulations.constellation.truth import batches
-from madns_runtime.simulations.constellation.truth.fleet import load_fleet
+from madns_runtime.simulations.constellation.truth import propagation
+from madns_runtime.simulations.constellation.truth.initial_states import load_fleet
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
     StretchRequest,
+    merge,
+    propagate_part,
     propagate_stretch,
+    split,
 )
 
 SCIPY = ScipyPropagator(kind="scipy", forces=("two_body", "j2", "drag"))
@@ -46,8 +49,8 @@ def fleet(count, settings=SCIPY):
 
 
 def in_parts(request, given, workers):
-    parts = batches.split(request, given, workers)
-    return batches.merge([batches.propagate_part(*part) for part in parts])
+    parts = split(request, given, workers)
+    return merge([propagate_part(*part) for part in parts])
 
 
 @pytest.mark.parametrize(
@@ -65,7 +68,7 @@ def in_parts(request, given, workers):
 )
 def test_parts_are_whole_blocks_in_order(count, workers, sizes):
     request, given = fleet(count)
-    parts = batches.split(request, given, workers)
+    parts = split(request, given, workers)
 
     assert [len(part.states) for part, _ in parts] == sizes
     assert np.array_equal(np.concatenate([part.states for part, _ in parts]), request.states)
@@ -75,8 +78,10 @@ def test_parts_are_whole_blocks_in_order(count, workers, sizes):
 
 
 def test_the_number_of_workers_changes_no_digit(monkeypatch):
-    monkeypatch.setattr(batches, "BLOCK", 7)
-    request, given = fleet(45)
+    monkeypatch.setattr(propagation, "BLOCK", 7)
+    # Steps that the error bounds, not their limit: those differ with who is in a call, on any processor.
+    request, given = fleet(45, replace(SCIPY, step_s_max=300.0))
+    request = replace(request, knot_s=30.0)
     given = replace(given, thrust_m_s2=np.random.default_rng(1).normal(size=(45, 3)) * 1e-3)
     one = in_parts(request, given, 1)
 
@@ -86,13 +91,12 @@ def test_the_number_of_workers_changes_no_digit(monkeypatch):
         assert np.array_equal(one.invariants, several.invariants)
     assert one.first_knot == 30
     # Were the blocks those of the workers, digits would differ: all vehicles in one call do.
-    assert not np.array_equal(one.states, propagate_stretch(request, given).states)
-    assert np.abs(one.states - propagate_stretch(request, given).states).max() < 1e-6
+    assert 1e-9 < np.abs(one.states - propagate_stretch(request, given).states).max() < 1e-6
 
 
 @pytest.mark.parametrize("kind", ["sgp4", "numba", "basilisk"])
 def test_propagators_of_single_vehicles_may_be_cut_anywhere(monkeypatch, kind):
-    monkeypatch.setattr(batches, "INDEPENDENT_BLOCK", 1)
+    monkeypatch.setattr(propagation, "INDEPENDENT_BLOCK", 1)
     if kind == "numba":
         pytest.importorskip("numba", reason="the extra `fast` is not installed")
         request, given = fleet(7, NumbaPropagator(kind="numba"))
@@ -111,7 +115,7 @@ def test_propagators_of_single_vehicles_may_be_cut_anywhere(monkeypatch, kind):
     one = in_parts(request, given, 1)
 
     for workers in (2, 3, 7):
-        assert len(batches.split(request, given, workers)) == workers
+        assert len(split(request, given, workers)) == workers
         assert np.array_equal(one.states, in_parts(request, given, workers).states)
 
 
@@ -120,4 +124,4 @@ def test_parts_of_different_stretches_are_not_put_together():
     one, other = (propagate_stretch(replace(request, knots=n), given) for n in (3, 4))
 
     with pytest.raises(ValueError, match="one stretch"):
-        batches.merge([one, other])
+        merge([one, other])

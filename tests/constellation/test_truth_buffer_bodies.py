@@ -11,19 +11,22 @@ from hypothesis import strategies as st
 from madns_runtime.simulations.constellation.equipment import Attitude
 from madns_runtime.simulations.constellation.messages import Segment
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
+from madns_runtime.simulations.constellation.orbit.interpolation import (
+    evaluate_turn,
+    turn_between,
+)
 from madns_runtime.simulations.constellation.orbit.quaternions import (
     normalised,
     rotation_between,
 )
-from madns_runtime.simulations.constellation.orbit.turning import evaluate_turn, turn_between
 from madns_runtime.simulations.constellation.parameters import ScipyPropagator
 from madns_runtime.simulations.constellation.thrust import Thrust
-from madns_runtime.simulations.constellation.truth.attitude import (
+from madns_runtime.simulations.constellation.truth.propagation import PropagationParameters
+from madns_runtime.simulations.constellation.truth.propagators.attitude import propagate_attitude
+from madns_runtime.simulations.constellation.truth.propagators.rigid_body import (
     RigidBody,
     initial_attitude,
-    propagate_attitude,
 )
-from madns_runtime.simulations.constellation.truth.propagation import PropagationParameters
 from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBuffer
 
 START = (7_158_136.3, 0.0, 0.0, 0.0, 500.0, 7445.0)

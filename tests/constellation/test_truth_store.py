@@ -5,18 +5,28 @@ import pytest
 from constellation_fakes import parameters
 
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
-from madns_runtime.simulations.constellation.truth.attitude import RigidBody, initial_attitude
-from madns_runtime.simulations.constellation.truth.effects import Effect, Timeline
-from madns_runtime.simulations.constellation.truth.fleet import load_fleet
-from madns_runtime.simulations.constellation.truth.jobs import VehicleRequest, propagate_vehicle
-from madns_runtime.simulations.constellation.truth.pieces import lay_out, snap
+from madns_runtime.simulations.constellation.truth.initial_states import load_fleet
+from madns_runtime.simulations.constellation.truth.maneuvers.effects import (
+    Effect,
+    Timeline,
+    lay_out,
+    snap,
+)
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
     StretchRequest,
     propagate,
     propagate_stretch,
 )
+from madns_runtime.simulations.constellation.truth.propagators.rigid_body import (
+    RigidBody,
+    initial_attitude,
+)
 from madns_runtime.simulations.constellation.truth.segments import TruthStore
+from madns_runtime.simulations.constellation.truth.vehicle_propagation import (
+    VehicleRequest,
+    propagate_vehicle,
+)
 from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBuffer
 
 PARAMETERS = parameters()
@@ -117,6 +127,7 @@ def flown(effects, t_s, vehicle=1):
     return state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at_s", [12.3, 12.0, 12.95, 20.0, 29.5, 30.0])
 def test_a_maneuver_at_any_time_changes_truth_from_then_on_and_nothing_before(at_s):
     before, after = Truth(), Truth()

@@ -4,7 +4,7 @@ import pytest
 from constellation_fakes import parameters
 
 from madns_runtime.simulations.constellation.equipment import Vehicle
-from madns_runtime.simulations.constellation.parameters import FlightSoftware
+from madns_runtime.simulations.constellation.parameters import FlightClass
 from madns_runtime.simulations.constellation.vehicles import flight_of, vehicle_of
 
 VEHICLES = [
@@ -37,7 +37,7 @@ def test_a_name_with_brackets_fits_itself():
 
 
 def test_the_short_form_flies_on_every_agent():
-    assert flight_of(parameters(flight="guidance.py:G"), "a", "b") == FlightSoftware(
+    assert flight_of(parameters(flight="guidance.py:G"), "a", "b") == FlightClass(
         software="guidance.py:G"
     )
 

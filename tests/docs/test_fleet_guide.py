@@ -1,24 +1,26 @@
 """docs/fleet.md: its tables are complete and true, and its examples are read as they stand."""
 
+import json
 import re
 
 import pytest
 import yaml
-from guides import FLEET, GUIDES, ROOT, blocks, row_keys
+from guides import FLEET, GUIDES, ROOT, blocks, commands, row_keys
 
+from cosmos_cli import app
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.fleet.failure import FailureKind
 from cosmos_cli.fleet.layout import Layout
-from cosmos_cli.fleet.ssh_config import KEYWORDS
+from cosmos_cli.fleet.ssh.config import KEYWORDS
+from cosmos_cli.launch.plan import make_plan
 from cosmos_cli.models.inventory import load_machines
-from cosmos_cli.models.inventory.variables import Variables
+from cosmos_cli.models.inventory.machine import Variables
+from cosmos_cli.models.inventory.settings import SETTINGS
 from cosmos_cli.models.limit import select_machines
 from cosmos_cli.models.loading import load_scenario
+from cosmos_cli.models.machine_facts import SystemPaths
 from cosmos_cli.models.provision_steps import KINDS
-from cosmos_cli.plan import make_plan
-from cosmos_cli.provision.settings import SETTINGS, setting_files
 from cosmos_cli.provision.steps import PLANNERS
-from cosmos_cli.provision.wanted import Paths
 
 INVENTORY, PROVISION, PLACEMENT = blocks(FLEET, "yaml")
 SCENARIO = "name: placed\nsimulation: counter\nagents: {count: 12}\n"
@@ -40,6 +42,31 @@ def test_every_variable_of_cosmos_is_documented_and_no_other():
 
     assert sorted(row_keys(FLEET, "### COSMoS's variables")) == sorted(own)
     assert mentioned == own
+
+
+def test_table_of_variables_says_what_is_declared():
+    section = FLEET.split("### COSMoS's variables", 1)[1].split("\n#", 1)[0]
+    rows = re.findall(r"^\| (`cosmos_[^|]+) \| ([^|]+) \| ([^|]+) \|", section, flags=re.M)
+    told = {
+        name: (kind, default)
+        for names, kind, default in rows
+        for name in re.findall(r"cosmos_\w+", names)
+    }
+    declared = {name: str(field.annotation) for name, field in Variables.model_fields.items()}
+
+    def of(is_it):
+        return {name for name, row in told.items() if is_it(*row)}
+
+    def declared_as(part):
+        return {name for name in told if part in declared[name]}
+
+    assert of(lambda kind, _: kind.startswith("list")) == declared_as("tuple[")
+    assert of(lambda kind, _: kind == "`true`, `false`") == declared_as("bool")
+    assert of(lambda kind, _: kind in ("number", "bytes", "1 to 99")) == {
+        name for name in declared_as("int") if "tuple[" not in declared[name]
+    }
+    assert of(lambda _, default: default == "left as it is") == {s.variable for s in SETTINGS}
+    assert told["cosmos_root"][1] == f"`{Variables().root}`"
 
 
 def test_every_variable_of_ansible_that_counts_is_documented_and_no_other():
@@ -72,7 +99,7 @@ def test_every_keyword_of_the_ssh_configuration_is_documented_and_no_other():
 
 
 def test_every_file_of_a_setting_is_documented():
-    for path in setting_files(Paths()):
+    for path in (setting.file(SystemPaths()) for setting in SETTINGS):
         assert path in FLEET or f"`{path.rsplit('/', 1)[1]}`" in FLEET
 
 
@@ -81,7 +108,7 @@ def test_table_of_settings_says_where_each_is_kept():
     section = FLEET.split(heading, 1)[1].split("\n#", 1)[0]
     rows = re.findall(r"^\| `(cosmos_\w+)` \| `([^`]+)`", section, flags=re.M)
 
-    assert rows == [(setting.variable, setting.file(Paths())) for setting in SETTINGS]
+    assert rows == [(setting.variable, setting.file(SystemPaths())) for setting in SETTINGS]
 
 
 def test_every_kind_of_planned_step_has_its_place_in_the_order_of_up():
@@ -103,12 +130,25 @@ def test_example_of_an_inventory_is_one(tmp_path):
     machines = {machine.name: machine for machine in machines_of(tmp_path, INVENTORY)}
 
     assert len(machines) == 25
-    assert machines["pi22"].devices == ("sense_hat",)
-    assert machines["pi22"].receive_buffer_bytes == 4194304
+    assert machines["pi22"].variables.cosmos_devices == ("sense_hat",)
+    assert machines["pi22"].variables.cosmos_receive_buffer_bytes == 4194304
     assert machines["here"].connection == "local"
 
 
-def test_every_pattern_of_the_table_means_what_it_says(tmp_path):
+def test_several_inventories_of_the_guide_are_one(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "inventory").mkdir()
+    (tmp_path / "inventory/tower.yaml").write_text(INVENTORY, "utf-8")
+    (tmp_path / "lab.yaml").write_text("lab: {hosts: {lab1: }}\n")
+    (words,) = [words for words in commands(FLEET) if "lab.yaml" in words]
+
+    assert app.run([*words[1:], "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["machines"]) == 27
+
+
+def test_every_pattern_of_the_table_means_what_it_says(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "failed.txt").write_text("# again\npi07\npi11\n")
     machines = machines_of(tmp_path, INVENTORY)
     counts = {
         pattern: len(select_machines(machines, pattern))
@@ -118,6 +158,7 @@ def test_every_pattern_of_the_table_means_what_it_says(tmp_path):
     assert counts == {
         **{"pi07": 1, "tower": 24, "pi0*": 9, "~pi0[1-4]": 4},
         **{"tower,laptop": 25, "tower:laptop": 25, "tower:&hwil": 1, "tower:!hwil": 23},
+        "@failed.txt": 2,
         **{"tower[0]": 1, "tower[-1]": 1, "tower[0:3]": 4, "tower[5:]": 19},
     }
 
@@ -128,7 +169,12 @@ def test_example_of_steps_is_valid(tmp_path):
     variables = {"hosts": {"pi01": yaml.safe_load(PROVISION)}}
     [machine] = machines_of(tmp_path, yaml.safe_dump({"all": variables}))
 
-    assert [step.kind for step in machine.provision] == ["line", "file", "service", "command"]
+    assert [step.kind for step in machine.variables.cosmos_provision] == [
+        "line",
+        "file",
+        "service",
+        "command",
+    ]
 
 
 def test_example_of_placement_does_what_it_says(tmp_path):

@@ -32,8 +32,8 @@ def test_readme_shows_an_inventory_of_24_boards(tmp_path):
     machines = load_machines(write_box(tmp_path))
 
     assert [machine.name for machine in machines] == [f"pi{n:02d}" for n in range(1, 25)]
-    assert machines[0].user == "pi"
-    assert machines[0].cpu_governor == "performance"
+    assert machines[0].variables.user == "pi"
+    assert machines[0].variables.cosmos_cpu_governor == "performance"
 
 
 @pytest.mark.root

@@ -9,6 +9,10 @@ from pathlib import Path
 import pytest
 import yaml
 
+from cosmos_cli import app
+
+pytestmark = pytest.mark.process
+
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text("utf-8")
 TESTED = re.findall(r"<!-- tested -->\n```sh\n(.*?)```", README, flags=re.S)
@@ -32,7 +36,6 @@ def run(command, folder, **variables):
     )
 
 
-@pytest.mark.process
 def test_tutorial_runs_from_its_first_command_to_its_last(tmp_path):
     for block in TESTED:
         # A shared machine may miss ticks; what the tutorial shows is the way, not the verdict.
@@ -49,7 +52,6 @@ def test_tutorial_runs_from_its_first_command_to_its_last(tmp_path):
     assert "rover" in done.stdout
 
 
-@pytest.mark.process
 def test_tutorials_broken_rover_fails_its_check_with_code_4(tmp_path):
     assert run("cosmos init rover --template plugin --directory rover", tmp_path).returncode == 0
     program = tmp_path / "rover" / "rover.py"
@@ -95,8 +97,6 @@ def test_make_has_the_readmes_two_targets():
         assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.process
-def test_every_shipped_scenario_is_valid(tmp_path):
-    for scenario in sorted((ROOT / "scenarios").glob("*.yaml")):
-        done = run(f"cosmos validate {scenario}", tmp_path)
-        assert done.returncode == 0, done.stderr
+def test_every_shipped_scenario_is_valid(capsys):
+    for scenario in sorted((ROOT / "scenarios").glob("**/*.yaml")):
+        assert app.run(["validate", str(scenario)]) == 0, capsys.readouterr().err

@@ -11,19 +11,18 @@ import json
 import os
 import secrets
 import shutil
-import signal
 import subprocess
 import sys
 import tarfile
-import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 import zstandard
+from harness.talking_process import Marked, TalkingProcess, find_marked
+from harness.waiting import wait_until
 
 from madns_runtime.recording.reader import read_stream
 
@@ -40,19 +39,11 @@ SCENARIO: dict[str, Any] = {
     "simulation": "./faulty_simulation.py:simulation",
     "agents": {"count": 3, "tick_hz": 20},
     "time": {"duration_s": 2, "rtf_tolerance": 0.9},
-    "deadline": {"tolerance_ms": 1000, "max_miss_ratio": 1},
+    "deadline": {"overrun_ms": 1000, "max_miss_ratio": 1},
     "timeouts": {"start_lead_s": 0.3, "shutdown_s": 5},
     "recording": {"flush_interval_s": 0.1},
     "executor": {"kind": "thread"},
 }
-
-
-@dataclass(frozen=True)
-class Living:
-    """A process that belongs to a test."""
-
-    pid: int
-    command: str
 
 
 class Laboratory:
@@ -104,21 +95,9 @@ class Laboratory:
             check=False,
         )
 
-    def living(self) -> list[Living]:
+    def living(self) -> list[Marked]:
         """Return every process of this test that has not ended."""
-        mark = f"{TEST_ID}={self.id}".encode()
-        found = []
-        for folder in Path("/proc").iterdir():
-            if folder.name.isdecimal():
-                try:
-                    is_marked = mark in (folder / "environ").read_bytes().split(b"\0")
-                    state = (folder / "stat").read_text().rpartition(")")[2].split()[0]
-                    command = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode()
-                except OSError:
-                    continue
-                if is_marked and state not in "ZX":
-                    found.append(Living(int(folder.name), command.strip()))
-        return found
+        return find_marked(f"{TEST_ID}={self.id}")
 
     def entries(self) -> list[dict[str, Any]]:
         """Return what the register holds."""
@@ -139,58 +118,32 @@ class Laboratory:
         return registered + parts + [path.name for path in self.temporary.iterdir()]
 
 
-class Run:
+class Run(TalkingProcess):
     """One `cosmos run`."""
+
+    patience_s = PATIENCE_S
 
     def __init__(
         self, laboratory: Laboratory, command: Sequence[str], environment: dict[str, str], new: bool
     ) -> None:
         self.laboratory = laboratory
-        self.process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=environment,
-            start_new_session=new,
-        )
-        self._lines: list[str] = []
-        self._out = ""
-        self._threads = [
-            threading.Thread(target=self._read_err, daemon=True),
-            threading.Thread(target=self._read_out, daemon=True),
-        ]
-        for thread in self._threads:
-            thread.start()
+        self.launch(command, environment, start_new_session=new)
 
     # While it runs --------------------------------------------------------------------------------
 
-    @property
-    def stderr(self) -> str:
-        return "".join(self._lines)
-
-    @property
-    def stdout(self) -> str:
-        return self._out
-
-    def wait_for_text(self, text: str) -> None:
-        """Wait until the talk holds *text*."""
-        self.wait_until(lambda: text in self.stderr, f"{text!r} in its talk")
-
     def wait_until_running(self, then_s: float = 0.5) -> None:
         """Wait until simulated time has run for *then_s*."""
-        self.wait_for_text("\nrunning\n")
+        self.wait_for("\nrunning\n")
         time.sleep(SCENARIO["timeouts"]["start_lead_s"] + then_s)
 
     def wait_until(self, condition: Callable[[], Any], what: str) -> Any:
         """Wait for something that must come while the run lives."""
-        until_s = time.monotonic() + PATIENCE_S
-        while not (value := condition()):
-            assert time.monotonic() < until_s, f"no {what}\n{self.stderr}"
-            assert self.process.poll() is None, f"ended before {what}\n{self.stderr}"
-            time.sleep(POLL_S)
-        return value
+        return wait_until(
+            condition,
+            lambda: f"no {what}\n{self.talk}",
+            patience_s=self.patience_s,
+            process=self.process,
+        )
 
     def pid_of(self, name: str, *, but: int = 0) -> int:
         """Wait for a process (host, loopback, agent-02, operator) to register and return its number."""
@@ -200,19 +153,6 @@ class Run:
             return next((pid for pid in found if pid != but), None)
 
         return int(self.wait_until(find, f"process of {name}"))
-
-    def signal(self, number: signal.Signals) -> None:
-        self.process.send_signal(number)
-
-    def finish(self, patience_s: float = PATIENCE_S) -> int:
-        """Wait for its end and return the exit code."""
-        try:
-            code = self.process.wait(patience_s)
-        except subprocess.TimeoutExpired:
-            raise AssertionError(f"did not end in {patience_s:g} s:\n{self.stderr}") from None
-        for thread in self._threads:
-            thread.join(PATIENCE_S)
-        return code
 
     # What it leaves -------------------------------------------------------------------------------
 
@@ -237,19 +177,12 @@ class Run:
             for path in self.laboratory.folder.rglob("stderr.txt")
             if path.stat().st_size
         ]
-        return "\n".join([self.stderr, self.stdout, *errors])
-
-    def _read_err(self) -> None:
-        assert self.process.stderr is not None
-        for line in self.process.stderr:
-            self._lines.append(line)
-
-    def _read_out(self) -> None:
-        assert self.process.stdout is not None
-        self._out = self.process.stdout.read()
+        return "\n".join([self.talk, self.out, *errors])
 
 
-def check_ending(run: Run, code: int, status: str, *said: str) -> dict[str, Any]:
+def check_ending(
+    run: Run, code: int, status: str, *said: str, has_records: bool = True
+) -> dict[str, Any]:
     """
     Assert how a run ended: code, status, what its talk and verdict hold, and sound evidence.
 
@@ -258,26 +191,27 @@ def check_ending(run: Run, code: int, status: str, *said: str) -> dict[str, Any]
         code: Exit code.
         status: Of run.json.
         said: Each must be in what `cosmos run` printed.
+        has_records: Whether anybody must have come so far as to record.
     """
     assert run.finish() == code, run.describe()
     document = run.document
     assert (document["status"], document["exit_code"]) == (status, code), run.describe()
     for text in said:
-        assert text in run.stderr + run.stdout, f"{text!r} is not in:\n{run.describe()}"
+        assert text in run.talk + run.out, f"{text!r} is not in:\n{run.describe()}"
     # The last line is the verdict, and where the evidence lies.
-    assert run.stdout.splitlines()[-1] == f"{document['verdict']} | {run.directory}"
+    assert run.out.splitlines()[-1] == f"{document['verdict']} | {run.directory}"
     if code in (1, 130):
         assert document["who"], document
         assert document["reason"], document
-    assert "Traceback" not in run.stderr, run.describe()
-    check_evidence(run.directory, document)
+    assert "Traceback" not in run.talk, run.describe()
+    check_evidence(run.directory, document, has_records=has_records)
     return document
 
 
-def check_evidence(directory: Path, document: dict[str, Any]) -> None:
+def check_evidence(directory: Path, document: dict[str, Any], *, has_records: bool = True) -> None:
     """Assert that every stream can be read, and that the manifest and the package hold every file."""
     streams = sorted(directory.glob("*/**/*.jsonl"))
-    assert streams
+    assert streams or not has_records
     for path in streams:
         reading = read_stream(path)
         for _ in reading.records():

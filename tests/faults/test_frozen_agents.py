@@ -49,7 +49,7 @@ def test_agent_frozen_past_its_deadline_aborts_the_run_and_closes_its_records_wh
     laboratory,
 ):
     run, pid = freeze(laboratory, *SILENCE, *LONG)
-    run.wait_for_text("agent-02 is lost: silent for 2 s while running")
+    run.wait_for("agent-02 is lost: silent for 2 s while running")
     os.kill(pid, signal.SIGCONT)
 
     document = check_ending(run, 1, "failed", "FAILED: agent-02: silent for 2 s while running")
@@ -74,7 +74,7 @@ def test_agent_that_stays_frozen_is_killed_and_named(laboratory):
 
 def test_thawed_agent_is_expelled_and_the_others_complete(laboratory):
     run, pid = freeze(laboratory, *SILENCE, *LONG, "--set", "on_agent_loss=continue")
-    run.wait_for_text("agent-02 is lost: silent for 2 s while running")
+    run.wait_for("agent-02 is lost: silent for 2 s while running")
     os.kill(pid, signal.SIGCONT)
 
     # Its records are all there, but the run lacks a part of its flight.
@@ -95,7 +95,7 @@ def test_expelled_agent_rejoins_if_it_may_be_restarted(laboratory):
         "--set",
         "agents.restarts_max=1",
     )
-    run.wait_for_text("agent-02 is lost: silent for 2 s while running")
+    run.wait_for("agent-02 is lost: silent for 2 s while running")
     os.kill(pid, signal.SIGCONT)
 
     document = check_ending(run, 4, "complete", "agent-02 has rejoined at t = ")

@@ -70,7 +70,7 @@ def test_other_stop_signals_do_as_ctrl_c_does(laboratory, number):
 
 def test_ctrl_c_before_any_agent_is_there_ends_the_run(laboratory):
     run = laboratory.start(*LONG)
-    run.wait_for_text("records go to")
+    run.wait_for("records go to")
     run.signal(signal.SIGINT)
 
     check_ending(run, 130, "interrupted", "INTERRUPTED by operator")
@@ -81,7 +81,7 @@ def test_second_ctrl_c_ends_at_once_what_hangs(laboratory):
     run = laboratory.start(*LONG, "--set", "timeouts.shutdown_s=80", faults=STUCK, new_group=True)
     run.wait_until_running(then_s=1.0)
     press_ctrl_c(run)
-    run.wait_for_text("press Ctrl-C again to end at once")
+    run.wait_for("press Ctrl-C again to end at once")
     time.sleep(0.3)  # a terminal's second Ctrl-C comes no sooner
     press_ctrl_c(run)
 
@@ -143,7 +143,7 @@ def test_down_ends_a_run_whose_operator_hangs(laboratory):
 def start_by_hand(run: Run) -> subprocess.Popen[bytes]:
     """Do what the operator asks for: type the command that it prints."""
     asked = r"start agent-02 by hand within .*\n +(.*)\n"
-    command = run.wait_until(lambda: re.search(asked, run.stderr), "command to type")[1]
+    command = run.wait_until(lambda: re.search(asked, run.talk), "command to type")[1]
     return subprocess.Popen(shlex.split(command), env=run.laboratory.environment)
 
 
@@ -169,7 +169,7 @@ def test_hand_started_agent_that_is_killed_is_lost(laboratory):
 
 def test_ctrl_c_while_an_agent_is_awaited_ends_the_run(laboratory):
     run = laboratory.start("--manual", "agent-02")
-    run.wait_for_text("start agent-02 by hand")
+    run.wait_for("start agent-02 by hand")
     run.signal(signal.SIGINT)
 
     check_ending(run, 130, "interrupted", "INTERRUPTED by operator")

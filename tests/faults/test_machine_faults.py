@@ -25,7 +25,8 @@ def test_taken_port_is_named(laboratory):
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
         run = laboratory.start("--set", f"network.port={port}")
-        document = check_ending(run, 1, "failed", f"FAILED: host: 127.0.0.1:{port}")
+        said = f"FAILED: host: 127.0.0.1:{port}"
+        document = check_ending(run, 1, "failed", said, has_records=False)
 
     assert document["who"] == "host"
     assert "the UDP port is taken" in document["reason"]
@@ -81,12 +82,12 @@ def test_full_disk_ends_with_5_names_the_source_and_counts_what_was_dropped(
     gaps = [line for line in document["data"]["missing"] if line.startswith(f"{source}: ")]
     assert len(gaps) == 1
     assert "No space left on device" in gaps[0]
-    assert "No space left on device" in run.stdout
-    assert source in run.stdout
-    assert run.stdout.splitlines()[-1].startswith("DATA INCOMPLETE: ")
+    assert "No space left on device" in run.out
+    assert source in run.out
+    assert run.out.splitlines()[-1].startswith("DATA INCOMPLETE: ")
     # It was said at once, not only in the end.
     whose = "" if source == "host" else f"{source}: "
-    assert f"error: host: {whose}records are being lost: " in run.stderr
+    assert f"error: host: {whose}records are being lost: " in run.talk
     folder = directory / ("host" if source == "host" else f"agents/{source}")
     reading = read_stream(folder / f"{stream}.jsonl")
     held = sum(1 for _ in reading.records())
@@ -109,7 +110,7 @@ def test_disk_without_room_for_the_summary_is_bad_input(laboratory):
     run = laboratory.start(prefix=("unshare", "--mount", "sh", "-c", script, "sh"))
 
     assert run.finish() == 2
-    assert "cannot make a run directory: No space left on device" in run.stderr
+    assert "cannot make a run directory: No space left on device" in run.talk
 
 
 @pytest.mark.root

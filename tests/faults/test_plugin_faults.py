@@ -87,7 +87,7 @@ def test_what_a_plugin_prints_is_kept_and_taken_for_no_event(laboratory, side, m
     check_ending(run, 0, "complete", "PASSED: ")
     folder = run.directory / ("host" if side == "host" else "machines/loopback")
     assert "a plug-in talks\n" in (folder / "stderr.txt").read_text()
-    assert "a plug-in talks" not in run.stdout
+    assert "a plug-in talks" not in run.out
 
 
 @pytest.mark.parametrize(
@@ -109,6 +109,7 @@ def test_step_of_50_ms_on_one_tick_costs_accounted_ticks(laboratory, max_miss_ra
     assert document["timing"]["missed"] >= 4
 
 
+@pytest.mark.nightly
 def test_step_of_10_s_aborts_the_run_and_names_the_agent(laboratory):
     run = laboratory.start(
         *("--set", "time.duration_s=5", "--set", "timeouts.shutdown_s=1"),
@@ -129,6 +130,7 @@ def test_step_of_10_s_aborts_the_run_and_names_the_agent(laboratory):
     )
 
 
+@pytest.mark.nightly
 def test_host_half_that_is_stuck_for_10_s_aborts_the_run_and_is_blamed(laboratory):
     run = laboratory.start(
         *("--set", "time.duration_s=5"),
@@ -167,14 +169,23 @@ def test_unregistered_simulation_is_bad_input_and_starts_nothing(laboratory):
     run = laboratory.start("--set", "simulation=countr")
 
     assert run.finish() == 2
-    assert "no simulation named 'countr', did you mean counter?" in run.stderr
-    assert "constellation" in run.stderr
+    assert "no simulation named 'countr', did you mean counter?" in run.talk
+    assert "constellation" in run.talk
     assert not laboratory.runs.exists()
     assert laboratory.leftovers() == []
 
 
 def test_agent_half_that_takes_for_ever_to_import_is_named(laboratory):
     hang_on_import(laboratory)
+    run = laboratory.start(*SHORT, "--set", "timeouts.agents_ready_s=8")
+
+    check_ending(run, 1, "failed", "half.py:4: it was not done within ")
+    assert run.document["who"].startswith("agent-0")
+
+
+def test_agent_half_whose_import_cannot_be_stopped_is_given_up(laboratory):
+    deaf = "import signal; signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())"
+    do_on_import(laboratory, f"{deaf}; time.sleep(600)")
     run = laboratory.start(
         *SHORT, "--set", "timeouts.agents_ready_s=2", "--set", "timeouts.shutdown_s=1"
     )

@@ -5,23 +5,17 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 import tarfile
 from pathlib import Path
 
+from harness.cosmos_command import CosmosCommand
+from harness.split_run import SESSION, SplitRun, hashes
 from tower import Tower
 
 from cosmos_cli.fleet.target import Target
 
-sys.path.append(
-    str(Path(__file__).parents[1] / "cosmos_cli")
-)  # whoever runs this folder's tests alone
-
-from split_run import SESSION, SplitRun, hashes  # noqa: E402
-
 ROOT = "/home/pi/cosmos"
 PATIENCE_S = 120.0
-COSMOS = (sys.executable, "-m", "cosmos_cli.app")
 
 
 class BoardRun:
@@ -33,13 +27,9 @@ class BoardRun:
         self.split.leave_result()
         self.run = self.split.run
         self.names = self.split.names
-        self.environment = {
-            **os.environ,
-            **tower.operator_environment(),
-            "COSMOS_RUNS": str(root / "runs"),
-            "COSMOS_STATE_DIR": str(root / "state"),
-            "COSMOS_CACHE": str(root / "cache"),
-        }
+        self.cosmos = CosmosCommand(
+            root, COSMOS_CACHE=str(root / "cache"), **tower.operator_environment()
+        )
         if noise_bytes:
             noise = self.split.directory("pi01") / "agents/agent-01/noise.bin"
             noise.write_bytes(os.urandom(noise_bytes))
@@ -52,27 +42,6 @@ class BoardRun:
     def directory(self) -> str:
         """The run's, on every board."""
         return f"{ROOT}/runs/{self.run.name}-{SESSION[:8]}"
-
-    def cosmos(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """Run the command line to its end."""
-        return subprocess.run(
-            [*COSMOS, *arguments],
-            env=self.environment,
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE_S,
-            check=False,
-        )
-
-    def start(self, *arguments: str) -> subprocess.Popen[str]:
-        """Start the command line."""
-        return subprocess.Popen(
-            [*COSMOS, *arguments],
-            env=self.environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
 
     def lies_on(self, name: str) -> bool:
         """Tell whether the run's directory is on a board."""

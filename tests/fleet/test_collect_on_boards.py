@@ -44,9 +44,10 @@ def test_records_of_all_boards_come_and_are_released(tower8, tmp_path):
     assert run.cosmos("collect").stdout == done.stdout
 
 
+@pytest.mark.nightly
 def test_link_that_is_cut_in_the_midst_of_a_large_file_is_taken_up_again(tower8, tmp_path):
     run = BoardRun(tmp_path, tower8, boards=2, noise_bytes=LARGE_BYTES)
-    process = run.start("collect")
+    process = run.cosmos.start("collect")
     wait_for_part(run, 2_000_000)
     tower8.fault("pi01", "down")
 
@@ -68,7 +69,7 @@ def test_link_that_is_cut_in_the_midst_of_a_large_file_is_taken_up_again(tower8,
 
 def test_link_that_comes_back_soon_is_not_even_an_error(tower8, tmp_path):
     run = BoardRun(tmp_path, tower8, boards=2, noise_bytes=LARGE_BYTES)
-    process = run.start("collect")
+    process = run.cosmos.start("collect")
     wait_for_part(run, 2_000_000)
     tower8.fault("pi01", "cut")  # every connection is torn, the link itself stays
 
@@ -78,13 +79,13 @@ def test_link_that_comes_back_soon_is_not_even_an_error(tower8, tmp_path):
     assert run.is_here()
 
 
-@pytest.mark.parametrize("fault", ["reboot", "crash"])
+@pytest.mark.parametrize("fault", [pytest.param("reboot", marks=pytest.mark.nightly), "crash"])
 def test_board_that_starts_anew_in_the_midst_of_a_large_file_is_collected_whole(
     tower8, tmp_path, fault
 ):
     run = BoardRun(tmp_path, tower8, boards=2, noise_bytes=LARGE_BYTES)
     tower8.run("pi01", "sync")
-    process = run.start("collect")
+    process = run.cosmos.start("collect")
     wait_for_part(run, 2_000_000)
     restart(tower8, "pi01", fault)
 
@@ -99,9 +100,10 @@ def test_board_that_starts_anew_in_the_midst_of_a_large_file_is_collected_whole(
     assert not run.lies_on("pi01")
 
 
+@pytest.mark.nightly
 def test_frozen_board_is_named_and_collected_once_it_thaws(tower8, tmp_path):
     run = BoardRun(tmp_path, tower8, boards=2, noise_bytes=LARGE_BYTES)
-    process = run.start("collect")
+    process = run.cosmos.start("collect")
     wait_for_part(run, 2_000_000)
     tower8.fault("pi01", "freeze")
 
@@ -114,6 +116,7 @@ def test_frozen_board_is_named_and_collected_once_it_thaws(tower8, tmp_path):
     assert run.is_here()
 
 
+@pytest.mark.nightly
 def test_board_that_is_off_is_named_and_collected_once_it_is_on(tower8, tmp_path):
     run = BoardRun(tmp_path, tower8, boards=3)
     tower8.fault("pi02", "poweroff")
@@ -188,11 +191,11 @@ def test_read_only_disk_of_a_board_gives_its_records_and_keeps_them(tower8, tmp_
 
 def test_interrupted_collect_ends_at_once_and_is_taken_up_again(tower8, tmp_path):
     run = BoardRun(tmp_path, tower8, boards=2, noise_bytes=LARGE_BYTES)
-    process = run.start("collect")
+    process = run.cosmos.start("collect")
     wait_for_part(run, 2_000_000)
     process.send_signal(signal.SIGINT)
 
-    process.communicate(timeout=20)
+    process.communicate(timeout=120)
 
     assert process.returncode == 130
     assert run.lies_on("pi01")

@@ -3,17 +3,15 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
 
 import pytest
+from harness.cosmos_command import CosmosCommand
 from tower import Tower
 from tower.fixtures import need_tower
 
 pytestmark = pytest.mark.root
 
-COSMOS = (sys.executable, "-m", "cosmos_cli.app")
 PATIENCE_S = 120.0
 SCENARIO = """
 name: fleet
@@ -31,37 +29,15 @@ class Operator:
         self.folder = folder
         self.inventory = folder / "tower.yaml"
         tower.write_inventory(self.inventory)
-        self.environment = {
-            **os.environ,
-            **tower.operator_environment(),
-            "COSMOS_STATE_DIR": str(folder / "state"),
-            "COSMOS_RUNS": str(folder / "runs"),
-            "COSMOS_CACHE": str(folder / "cache"),
-        }
-
-    def cosmos(self, *arguments):
-        return subprocess.run(
-            [*COSMOS, *map(str, arguments)],
-            env=self.environment,
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE_S,
-            check=False,
+        self.cosmos = CosmosCommand(
+            folder, COSMOS_CACHE=str(folder / "cache"), **tower.operator_environment()
         )
 
     def start(self, name, duration_s):
         """Start a run, and wait until its agents record."""
         scenario = self.folder / f"{name}.yaml"
         scenario.write_text(SCENARIO.replace("DURATION", str(duration_s)))
-        arguments = ("run", scenario, "-i", self.inventory)
-        process = subprocess.Popen(
-            [*COSMOS, *map(str, arguments)],
-            env=self.environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
+        process = self.cosmos.start("run", scenario, "-i", self.inventory, start_new_session=True)
         heard = []
         for line in process.stderr:
             heard.append(line)
@@ -121,14 +97,20 @@ def test_board_whose_card_fails_during_a_run_is_named_and_keeps_what_it_has(oper
 
         assert process.returncode == 5, talk
         assert {"agent-01", "agent-02"} <= operator.named() <= {"agent-01", "agent-02", "pi01"}
-        assert "Read-only file system" in " ".join(operator.document()["data"]["missing"])
+        missing = " ".join(operator.document()["data"]["missing"])
+        # The agents met it when they wrote, or it took a folder that the kernel had not written yet.
+        assert "Read-only file system" in missing or "cannot be read there: Bad message" in missing
         assert operator.tower.run("pi01", "ls cosmos/runs").stdout != ""
         assert operator.tower.run("pi02", "ls cosmos/runs").stdout == ""
     finally:
         operator.tower.fault("pi01", "reboot")
         operator.tower.wait_until_on("pi01", boots + 1)
-    assert operator.cosmos("collect").returncode == 5
-    assert operator.tower.run("pi01", "ls cosmos/runs").stdout == ""
+    again = operator.cosmos("collect")
+    assert again.returncode == 5, again.stderr
+    # A file that the card has damaged cannot be read after the repair either: then nothing is deleted, and it is said.
+    is_damaged = "kept there" in again.stderr or "could not be deleted there" in again.stderr
+    assert operator.tower.run("pi01", "ls cosmos/runs").stdout == "" or is_damaged, again.stderr
+    operator.tower.run("pi01", "rm -rf cosmos/runs/*", check=False)
 
 
 def test_run_that_lost_the_power_of_everything_is_collected_afterwards(operator):
@@ -139,6 +121,10 @@ def test_run_that_lost_the_power_of_everything_is_collected_afterwards(operator)
     assert process.pid in own
     for name in ("pi01", "pi02"):
         operator.tower.run(name, "sync")  # else the kernel keeps the records for half a minute
+    # Nobody notices that the first is gone, and ends the run in good order on the second.
+    for pid in own:
+        os.kill(pid, signal.SIGSTOP)
+    for name in ("pi01", "pi02"):
         operator.tower.fault(name, "crash")
     for pid in own:
         os.kill(pid, signal.SIGKILL)

@@ -12,16 +12,16 @@ import pytest
 from tower import BoardSpec
 from tower.roots import why_unavailable
 
-from cosmos_cli.fleet import ssh_keys, ssh_settings
-from cosmos_cli.fleet.board import Board
-from cosmos_cli.fleet.connect import ConnectOptions, connect
+from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
-from cosmos_cli.fleet.silence import WatchedConnection
+from cosmos_cli.fleet.liveness import SilenceWatch
+from cosmos_cli.fleet.open_connection import connect
+from cosmos_cli.fleet.ssh import keys, settings
 from cosmos_cli.fleet.target import Target
-from cosmos_cli.provision.echo import Echo
+from cosmos_cli.provision import STORE_PARTS
 from cosmos_cli.provision.environment import (
-    PARTS,
     RuntimeCheck,
     ask_installed,
     check_request,
@@ -31,6 +31,7 @@ from cosmos_cli.provision.environment import (
 )
 from cosmos_cli.provision.platform import greeted_platform
 from cosmos_cli.provision.trees import runtime_tree, send_tree
+from cosmos_cli.provision.udp_echo import Echo
 from cosmos_cli.provision.wheelhouse import prepare
 
 pytestmark = pytest.mark.root
@@ -76,8 +77,8 @@ def operate(cache, monkeypatch):
     def begin(tower):
         for name, value in tower.operator_environment().items():
             monkeypatch.setenv(name, value)
-        ssh_keys._load_key.cache_clear()  # towers of other tests had their files at the same place
-        ssh_settings._read.cache_clear()
+        keys._load_key.cache_clear()  # towers of other tests had their files at the same place
+        settings._read.cache_clear()
         return tower
 
     return begin
@@ -107,8 +108,8 @@ def on(name):
     target = Target(name=name, address=name, root=LAYOUT.root)
     connection = connect(target, ConnectOptions(timeout_s=CONNECT_TIMEOUT_S))
     try:
-        watched = WatchedConnection(connection)
-        with Board.start(watched, PARTS, timeout_s=START_TIMEOUT_S) as board:
+        watch = SilenceWatch(connection)
+        with Helper.start(connection, STORE_PARTS, timeout_s=START_TIMEOUT_S, watch=watch) as board:
             yield connection, board
     finally:
         connection.close()
@@ -270,6 +271,7 @@ def test_closed_udp_is_told_with_the_address(tower):
     assert time.monotonic() - started_s < 10
 
 
+@pytest.mark.nightly
 def test_32_bit_board_is_served_with_what_its_distribution_brings(foreign):
     """A 64-bit one is, from first to last, in test_foreign_run.py."""
     foreign("armhf")
@@ -287,6 +289,7 @@ def test_32_bit_board_is_served_with_what_its_distribution_brings(foreign):
     assert not bring("foreign")[2]
 
 
+@pytest.mark.nightly
 def test_32_bit_board_without_its_distributions_packages_says_what_to_install(foreign):
     tower = foreign("armhf")
     tower.run("foreign", "sudo rm -r /usr/lib/python3/dist-packages/msgpack*")

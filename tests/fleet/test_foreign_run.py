@@ -17,6 +17,7 @@ PATIENT = {"host_setup_s": 120, "agents_ready_s": 120, "agent_setup_s": 120, "sh
 
 @pytest.mark.root
 @pytest.mark.timeout(1200)  # whichever test needs these systems first waits until they are built
+@pytest.mark.nightly
 def test_boards_of_other_processors_are_made_ready_run_and_are_collected(
     make_tower, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

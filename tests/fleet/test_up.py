@@ -288,6 +288,7 @@ def test_whatever_happens_in_the_midst_the_next_up_repairs(fleet):
     assert all(found == files["pi01"] for found in files.values())
 
 
+@pytest.mark.nightly
 def test_power_and_connections_cut_while_code_and_packages_come_leave_nothing_half(fleet):
     """The moments differ from run to run; what must come of it does not."""
     tower = fleet.tower

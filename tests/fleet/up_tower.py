@@ -6,16 +6,15 @@ import json
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from harness.waiting import wait_until
 from tower import Tower
 
 PATIENCE_S = 180.0
-POLL_S = 0.05
 COSMOS = (sys.executable, "-m", "cosmos_cli.start")
 PLACES = "/home/pi /etc /boot/firmware /root /var/lib/dpkg/status /proc/sys/net /sys/class/rfkill"
 """All that `up` may change; contents of the kernel's files are compared by `SHOW_VALUES`."""
@@ -127,7 +126,4 @@ class UpTower:
 
     @staticmethod
     def wait(condition: Callable[[], bool]) -> None:
-        until_s = time.monotonic() + PATIENCE_S
-        while not condition():
-            assert time.monotonic() < until_s, "waited in vain"
-            time.sleep(POLL_S)
+        wait_until(condition, patience_s=PATIENCE_S)

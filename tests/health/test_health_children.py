@@ -6,12 +6,12 @@ import subprocess
 import sys
 import time
 
-import psutil
 import pytest
+from harness.waiting import is_alive, wait_until
 
 from madns_runtime.config import Health, Recording
 from madns_runtime.health.lifeline import fork_child
-from madns_runtime.health.sampler import start_sampler, stop_sampler
+from madns_runtime.health.sampler import start_sampler
 from madns_runtime.health.stress import factorise, start_stress, stop_stress
 from madns_runtime.recording.reader import read_columns, read_stream
 
@@ -30,7 +30,7 @@ stress = start_stress(2)
 sibling = os.fork()  # an agent, say: it must not hold the others' life
 if not sibling:
     time.sleep(600)
-print(sampler.pid, *(worker.pid for worker in stress.workers), sibling, flush=True)
+print(sampler.pid, *(worker.pid for worker in stress), sibling, flush=True)
 time.sleep(600)
 """
 
@@ -47,7 +47,7 @@ def test_sampler_records_health_until_it_is_stopped(tmp_path):
     sampler = start(tmp_path / "machines/pi07")
     path = tmp_path / "machines/pi07/health.jsonl"
     wait_until(lambda: path.exists() and read_stream(path).state.records >= 3)
-    counts = stop_sampler(sampler, timeout_s=60)
+    counts = sampler.wait(60)
 
     reading = read_stream(path)
     columns = read_columns(path)
@@ -66,7 +66,7 @@ def test_short_run_has_a_sample_of_its_start_and_of_its_end(tmp_path):
         tmp_path, run="r", machine="m", settings=settings, recording=Recording()
     )
 
-    assert stop_sampler(sampler, timeout_s=60)["written"] == 2
+    assert sampler.wait(60)["written"] == 2
 
 
 @pytest.mark.process
@@ -74,7 +74,7 @@ def test_sampler_that_cannot_record_says_why(tmp_path):
     (tmp_path / "file").write_text("")
     sampler = start(tmp_path / "file/below")
 
-    assert "cannot record there" in stop_sampler(sampler, timeout_s=60)["errors"][0]
+    assert "cannot record there" in sampler.wait(60)["errors"][0]
 
 
 @pytest.mark.process
@@ -85,7 +85,7 @@ def test_sampler_ends_in_good_order_when_it_is_asked_by_signal(tmp_path):
     os.kill(sampler.pid, signal.SIGTERM)
     wait_until(lambda: not read_stream(path).state.is_cut)
 
-    assert stop_sampler(sampler, timeout_s=60)["errors"] == []
+    assert sampler.wait(60)["errors"] == []
 
 
 @pytest.mark.process
@@ -121,8 +121,7 @@ def test_stress_workers_count_what_they_factorised():
 
     assert len(report.factored) == 2
     assert report.errors == ()
-    assert report.to_mapping() == {"factored": list(report.factored), "errors": []}
-    assert not any(is_alive(worker.pid) for worker in stress.workers)
+    assert not any(is_alive(worker.pid) for worker in stress)
 
 
 def test_no_stress_is_no_process():
@@ -168,17 +167,3 @@ def test_factors_are_prime_and_complete(number, factors):
 def test_only_positive_numbers_have_factors():
     with pytest.raises(ValueError, match="got 0"):
         factorise(0)
-
-
-def is_alive(pid):
-    try:
-        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return False
-
-
-def wait_until(condition, deadline_s=60.0):
-    end_s = time.monotonic() + deadline_s
-    while not condition():
-        assert time.monotonic() < end_s, "condition not met in time"
-        time.sleep(0.01)

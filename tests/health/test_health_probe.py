@@ -6,6 +6,7 @@ import pytest
 
 from madns_runtime.health import probe
 from madns_runtime.health.probe import Probe, ProcessUsage, pss_bytes
+from madns_runtime.recording.records import HEALTH
 
 
 def put(path, text):
@@ -23,9 +24,9 @@ def root(tmp_path):
 def test_machine_without_sensors_has_no_temperature_and_no_flags(tmp_path, root):
     reading = Probe(tmp_path, root=root).read()
 
-    assert reading.core_temperature_c is None
-    assert reading.throttled_bits is None
-    assert reading.udp_sockets is None
+    assert reading.values["core_temperature_c"] is None
+    assert reading.values["throttled_bits"] is None
+    assert reading.values["udp_sockets"] is None
 
 
 def test_processors_own_thermal_zone_is_preferred(tmp_path, root):
@@ -35,14 +36,14 @@ def test_processors_own_thermal_zone_is_preferred(tmp_path, root):
     put(zones / "thermal_zone1/type", "cpu-thermal\n")
     put(zones / "thermal_zone1/temp", "48312\n")
 
-    assert Probe(tmp_path, root=root).read().core_temperature_c == 48.312
+    assert Probe(tmp_path, root=root).read().values["core_temperature_c"] == 48.312
 
 
 def test_any_thermal_zone_is_better_than_none(tmp_path, root):
     put(root / "sys/class/thermal/thermal_zone0/type", "odd\n")
     put(root / "sys/class/thermal/thermal_zone0/temp", "21000\n")
 
-    assert Probe(tmp_path, root=root).read().core_temperature_c == 21.0
+    assert Probe(tmp_path, root=root).read().values["core_temperature_c"] == 21.0
 
 
 @pytest.mark.parametrize("text", ["", "no number"])
@@ -50,14 +51,14 @@ def test_zone_that_gives_no_number_is_no_temperature(tmp_path, root, text):
     put(root / "sys/class/thermal/thermal_zone0/type", "cpu-thermal\n")
     put(root / "sys/class/thermal/thermal_zone0/temp", text)
 
-    assert Probe(tmp_path, root=root).read().core_temperature_c is None
+    assert Probe(tmp_path, root=root).read().values["core_temperature_c"] is None
 
 
 @pytest.mark.parametrize("folder", ["soc/soc:firmware", "soc@107c000000/soc@107c000000:firmware"])
 def test_firmwares_throttling_flags_are_read(tmp_path, root, folder):
     put(root / "sys/devices/platform" / folder / "get_throttled", "50005\n")
 
-    assert Probe(tmp_path, root=root).read().throttled_bits == 0x50005
+    assert Probe(tmp_path, root=root).read().values["throttled_bits"] == 0x50005
 
 
 def test_sockets_of_both_families_are_counted(tmp_path, root):
@@ -68,21 +69,23 @@ def test_sockets_of_both_families_are_counted(tmp_path, root):
     put(root / "proc/net/sockstat6", "TCP6: inuse 2\nUDP6: inuse 4\nUDPLITE6: inuse 9\n")
     reading = Probe(tmp_path, root=root).read()
 
-    assert (reading.tcp_connections, reading.udp_sockets) == (7, 7)
+    assert (reading.values["tcp_connections"], reading.values["udp_sockets"]) == (7, 7)
 
 
 def test_this_machine_can_be_read(tmp_path):
     reading = Probe(tmp_path).read()
+    values = reading.values
 
     assert len(reading.cpus) >= 1
     assert all(0 <= cpu.busy_s <= cpu.total_s for cpu in reading.cpus)
-    assert 0 < reading.memory.used_bytes < reading.memory.total_bytes
-    assert reading.disk_space.total_bytes > 0
-    assert reading.utc.endswith("+00:00")
+    assert 0 < values["ram_used_bytes"] < values["ram_total_bytes"]
+    assert values["disk_total_bytes"] > 0
+    assert values["utc"].endswith("+00:00")
+    assert values.keys() < {field.name for field in HEALTH.fields}
 
 
 def test_vanished_directory_has_no_space(tmp_path):
-    assert Probe(tmp_path / "none").read().disk_space is None
+    assert "disk_total_bytes" not in Probe(tmp_path / "none").read().values
 
 
 def test_usage_is_a_record_of_the_process_stream():

@@ -10,6 +10,8 @@ from madns_runtime.plugin.api import HOST, AgentSimulation, HostSimulation, Simu
 from madns_runtime.protocol.messages import Service
 from madns_runtime.recording.records import Field
 
+WORK_S = 0.5
+"""What a call that works needs of a processor."""
 SERVICES = (Service.BEST, Service.RELIABLE, Service.SYNC)
 
 
@@ -32,6 +34,22 @@ def go_wrong(fault):
         raise ValueError("told to")
     if what == "hang":
         time.sleep(60)
+    if what == "spin":
+        while True:
+            pass
+    if what == "work":
+        sys.stderr.write(f"working {os.getpid()} \n")
+        sys.stderr.flush()
+        began_s = time.process_time()
+        while time.process_time() - began_s < WORK_S:
+            pass
+    if what == "stop":
+        os.kill(os.getpid(), signal.SIGSTOP)
+        time.sleep(60)
+    if what == "pause":
+        sys.stderr.write(f"paused {os.getpid()} \n")
+        sys.stderr.flush()
+        os.kill(os.getpid(), signal.SIGSTOP)
     if what == "idle":
         sys.stderr.write("idle\n")
         time.sleep(1.0)
@@ -79,11 +97,17 @@ class Host(HostSimulation):
         self.note("timer", t_s)
         if t_s >= 0.2:
             self.meets("timer")
-        if self.fault == "timer_stands":
+            self.fault = "" if self.fault == "timer_work" else self.fault
+        if self.fault == "timer_same":
             return t_s
+        if self.fault == "timer_stands":
+            self.context.wake(t_s)
+            return None
         if self.fault == "job_raise" and t_s >= 0.2:
             self.context.submit(square, -1)
         if self.fault == "job_kill" and t_s >= 0.2:
+            self.context.submit(go_wrong, self.fault)
+        if self.fault == "job_work" and 0.2 <= t_s < 0.23:
             self.context.submit(go_wrong, self.fault)
         if self.fault == "job_hang" and t_s >= 0.2:
             self.context.submit(time.sleep, 60)

@@ -1,10 +1,9 @@
 """What goes wrong in lockstep is named: who, in which call, why; and nothing of the run lives on."""
 
-import os
 import signal
-import time
 
 import pytest
+from harness.waiting import is_alive, wait_until
 
 from madns_runtime.config import Timeouts
 from madns_runtime.processes import list_processes
@@ -14,26 +13,11 @@ pytestmark = pytest.mark.process
 IMPATIENT = Timeouts(tick_s=1.5, agent_setup_s=1.5, host_setup_s=1.5, shutdown_s=5.0)
 
 
-def is_alive(pid):
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
-
-
 def workers_of(run):
     """Return the process numbers of a living host's children."""
     pid = run.process.pid
     with open(f"/proc/{pid}/task/{pid}/children", encoding="ascii") as file:
         return [int(number) for number in file.read().split()]
-
-
-def wait_until(is_so, what):
-    until_s = time.monotonic() + 30.0
-    while not is_so():
-        assert time.monotonic() < until_s, what
-        time.sleep(0.01)
 
 
 @pytest.mark.parametrize(
@@ -54,6 +38,7 @@ def wait_until(is_so, what):
         ),
         ("hostreceive_raise", "host", "Host.receive raised ValueError: told to"),
         ("timer_raise", "host", "Host.timer raised ValueError: told to"),
+        ("timer_same", "host", "Host.timer returned -0.5, called for t = -0.5 s: expected a later"),
         ("timer_stands", "host", "Host.timer asked 100000 times in a row for t = -0.5 s"),
         ("job_kill", "host", "Host: job 13: a worker of the executor has died: was it"),
         ("job_raise", "host", "Host: job 13: square raised ValueError: no such job"),
@@ -129,8 +114,13 @@ def slow_host(start_host):
 
 def test_the_operators_word_ends_it_in_good_order(start_host):
     run, workers = slow_host(start_host)
+    run.say({"command": "dance"})
     run.say({"command": "stop", "reason": "interrupted by the operator", "status": "interrupted"})
     result = run.result()
+
+    assert [e["text"] for e in run.events if e.get("level") == "warning"] == [
+        "no command here: {'command': 'dance'}"
+    ]
 
     assert (result["status"], result["who"]) == ("interrupted", "operator")
     assert result["reason"] == "interrupted by the operator"

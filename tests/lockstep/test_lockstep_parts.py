@@ -10,15 +10,15 @@ import pytest
 
 from madns_runtime.config import Agents, RunConfig, TimeSettings
 from madns_runtime.errors import MachineError, MessageTooLarge, PeerError
-from madns_runtime.lockstep import crew, frames
+from madns_runtime.lockstep import frames, workers
 from madns_runtime.lockstep.clock import SimulatedClock
-from madns_runtime.lockstep.crew import Crew, WorkerProcess
 from madns_runtime.lockstep.frames import FRAME_BYTES_MAX, HEAD, FrameReader, encode_frame
-from madns_runtime.lockstep.post import QUEUE_BYTES_MAX, Allowance, decode, encode
-from madns_runtime.lockstep.recorder import LockstepRecorder
-from madns_runtime.lockstep.result import Ending, RunAccount
-from madns_runtime.lockstep.shares import share_out
-from madns_runtime.protocol.limits import SendQueueFull
+from madns_runtime.lockstep.messages import QUEUE_BYTES_MAX, Allowance, decode, encode
+from madns_runtime.lockstep.partition import share_out
+from madns_runtime.lockstep.recorder import open_journal
+from madns_runtime.lockstep.result import EarlyEnd, RunAccount
+from madns_runtime.lockstep.workers import WorkerProcess, Workers
+from madns_runtime.protocol.link_settings import SendQueueFull
 from madns_runtime.protocol.messages import Service
 from madns_runtime.recording import stream_file
 from madns_runtime.recording.records import Field, StreamSchema
@@ -95,11 +95,11 @@ def lines(path):
 
 
 def test_records_wait_for_the_disk_and_none_is_dropped(tmp_path):
-    recorder = LockstepRecorder(tmp_path, config(), source="host", clock=SimulatedClock(0.0))
-    recorder.open_stream(OWN)
+    journal = open_journal(tmp_path, config(), source="host", clock=SimulatedClock(0.0))
+    journal.recorder.open_stream(OWN)
     for number in range(20_000):  # many times what a real-time recorder would hold
-        recorder.record("own", (number, "x" * 1000))
-    counts = recorder.close()
+        journal.recorder.record("own", (number, "x" * 1000))
+    counts = journal.close()
 
     assert (counts.streams["own"].written, counts.dropped, counts.errors) == (20_000, 0, ())
     assert len(lines(tmp_path / "own.jsonl")) == 20_002
@@ -107,11 +107,11 @@ def test_records_wait_for_the_disk_and_none_is_dropped(tmp_path):
 
 def test_records_carry_simulated_time_alone(tmp_path):
     clock = SimulatedClock(-0.5)
-    recorder = LockstepRecorder(tmp_path, config(), source="agent-01", clock=clock)
-    recorder.event("start")
+    journal = open_journal(tmp_path, config(), source="agent-01", clock=clock)
+    journal.event("start")
     clock.t_s = 86_400.25
-    recorder.log("error", "late", clock.t_s)
-    recorder.close()
+    journal.log("error", "late", clock.t_s)
+    journal.close()
 
     header, start, end, _ = lines(tmp_path / "events.jsonl")
     assert (header["run"], header["t0_utc"]) == ("name", "1970-01-01T00:00:00.000000Z")
@@ -121,8 +121,8 @@ def test_records_carry_simulated_time_alone(tmp_path):
 
 
 def test_a_full_disk_ends_it_instead_of_costing_records(tmp_path, monkeypatch):
-    recorder = LockstepRecorder(tmp_path, config(), source="host", clock=SimulatedClock(0.0))
-    recorder.open_stream(OWN)
+    journal = open_journal(tmp_path, config(), source="host", clock=SimulatedClock(0.0))
+    journal.recorder.open_stream(OWN)
 
     def refuse(fd, data):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -130,7 +130,7 @@ def test_a_full_disk_ends_it_instead_of_costing_records(tmp_path, monkeypatch):
     monkeypatch.setattr(stream_file.os, "write", refuse)
     with pytest.raises(MachineError, match="own.jsonl: No space left on device"):
         for number in range(1000):
-            recorder.record("own", (number, "x" * 1000))
+            journal.recorder.record("own", (number, "x" * 1000))
 
 
 def test_the_account_tells_speed_and_result():
@@ -144,25 +144,36 @@ def test_the_account_tells_speed_and_result():
 
     assert (progress["rtf"], progress["ticks"], progress["running"]) == (100.0, 100, 2)
     assert (account.result()["status"], account.result()["rtf"]) == ("complete", 200.0)
-    account.ending = Ending(who="a", reason="told to")
+    account.ending = EarlyEnd(who="a", reason="told to")
     assert (account.result()["status"], account.result()["rtf"]) == ("failed", None)
+
+
+def test_the_account_tells_newest_values_of_those_whose_worker_has_told_them():
+    account = RunAccount(("a", "b"), duration_s=100.0, workers=1, columns=("drive.speed_m_s",))
+
+    account.note_values(range(1, 2), [[2.5]])
+    account.note_values(range(1, 2), [])
+
+    progress = account.progress(1.0, 7.0)
+    assert (progress["columns"], progress["values"]) == (["drive.speed_m_s"], {"b": [2.5]})
+    assert account.result()["agents"]["b"]["columns"] == [2.5]
 
 
 @pytest.mark.process
 def test_a_worker_that_only_closes_its_line_does_not_live_on(tmp_path, monkeypatch):
-    monkeypatch.setattr(crew, "EXIT_WAIT_S", 0.05)
+    monkeypatch.setattr(workers, "EXIT_WAIT_S", 0.05)
     here, _ = socket.socketpair()
     with subprocess.Popen(["sleep", "60"]) as process:
         worker = WorkerProcess(range(1), process.pid, here, memoryview(bytes(8)).cast("q"))
-        how = Crew(config(), tmp_path, ()).let_go(worker)
+        how = Workers(config(), tmp_path, ()).let_go(worker)
 
     assert how == "has closed its line to the host and not ended"
     assert not os.path.exists(f"/proc/{process.pid}")
 
 
 def test_a_run_on_a_full_disk_still_comes_to_its_end(tmp_path, monkeypatch):
-    recorder = LockstepRecorder(tmp_path, config(), source="host", clock=SimulatedClock(0.0))
-    recorder.open_stream(OWN)
+    journal = open_journal(tmp_path, config(), source="host", clock=SimulatedClock(0.0))
+    journal.recorder.open_stream(OWN)
 
     def refuse(fd, data):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -170,10 +181,10 @@ def test_a_run_on_a_full_disk_still_comes_to_its_end(tmp_path, monkeypatch):
     monkeypatch.setattr(stream_file.os, "write", refuse)
     with pytest.raises(MachineError):
         for number in range(1000):
-            recorder.record("own", (number, "x" * 1000))
-    recorder.event("emergency", who="host", reason="x")
-    recorder.say("critical", "emergency shutdown: host: x")
-    counts = recorder.close()
+            journal.recorder.record("own", (number, "x" * 1000))
+    journal.event("emergency", who="host", reason="x")
+    journal.say("critical", "emergency shutdown: host: x")
+    counts = journal.close()
 
     assert counts.dropped > 60
     assert "No space left on device" in counts.errors[0]

@@ -28,4 +28,6 @@ def test_every_module_of_the_framework_may_not_know_a_simulation():
 def test_pure_modules_of_the_operators_side_are_held_to_it():
     name = "Pure modules touch no socket, clock, thread, file system or chance"
 
-    assert {"cosmos_cli.plan", "cosmos_cli.feasibility"} <= set(CONTRACTS[name]["source_modules"])
+    assert {"cosmos_cli.launch.plan", "cosmos_cli.launch.feasibility"} <= set(
+        CONTRACTS[name]["source_modules"]
+    )

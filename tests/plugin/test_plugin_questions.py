@@ -1,13 +1,14 @@
 """Faults of what a plug-in does outside of a run: while it is imported, in check and in demand."""
 
+import re
 import sys
 import textwrap
 
 import pytest
 
 from madns_runtime.errors import PluginError
-from madns_runtime.plugin import registry
-from madns_runtime.plugin.questions import ask_check, ask_demand
+from madns_runtime.plugin import code_places, registry
+from madns_runtime.plugin.queries import ask_check, ask_demand, ask_labels, ask_streams
 
 HEAD = """\
 from dataclasses import dataclass
@@ -110,10 +111,49 @@ def test_check_with_a_fourth_parameter_names_is_given_the_agents_names(plugin):
     assert found == ["a", "b", "2"]
 
 
+def test_check_with_a_fifth_parameter_duration_s_is_given_the_runs_duration(plugin):
+    path = plugin("def check(p, n, base, names, duration_s): return [f'{names} {duration_s}']")
+    where = f"{path}:check"
+
+    found = ask_check(where, path.parent, parameters=None, agents=1, names=("a",), duration_s=60.0)
+
+    assert found == ["('a',) 60.0"]
+
+
 def test_check_that_raises_while_it_yields_is_told_with_its_line(plugin):
     path = plugin("def check(*_):\n    yield 'a: b'\n    raise ValueError('late')\n")
 
     assert refusal(path, "check") == f"{path}:{LAST_LINE + 3}: check(): ValueError: late"
+
+
+@pytest.mark.parametrize(
+    ("body", "told"),
+    [
+        ("return 3", "must return DeclaredStreams of madns_runtime.plugin.api, got 3"),
+        ("return [D(role='agent', name='ticks', fields=())]", "which belongs to the framework"),
+        ("return 2 * [D(role='host', name='a', fields=())]", "which belongs to another of them"),
+        ("return [D(role='chief', name='a', fields=())]", "of role host or agent, got ('chief'"),
+        ("return [D(role='host', name='a', fields=(3,))]", "fields as a tuple of Field, got (3,)"),
+    ],
+)
+def test_streams_that_are_no_declaration_are_told(plugin, body, told):
+    path = plugin(f"""
+from madns_runtime.plugin.api import DeclaredStream as D
+def streams(parameters, agents):
+    {body}
+""")
+
+    with pytest.raises(PluginError, match=re.escape(told)):
+        ask_streams(f"{path}:streams", path.parent, parameters=None, agents=("a",))
+
+
+@pytest.mark.parametrize("value", ["None", "{'b': 'x'}", "{'a': 3}", "{'a': ''}"])
+def test_labels_that_are_no_second_names_are_told(plugin, value):
+    path = plugin(f"def labels(parameters, agents, base):\n    return {value}\n")
+    told = f"labels() must return a mapping of agents' names to texts, got {value}"
+
+    with pytest.raises(PluginError, match=re.escape(told)):
+        ask_labels(f"{path}:labels", path.parent, parameters=None, agents=("a",))
 
 
 @pytest.mark.parametrize("value", ["None", "3", "'gain: odd'", "[3]"])
@@ -143,6 +183,39 @@ def test_demand_with_a_bad_figure_is_told_with_its_place(plugin, field, value):
 
     assert message.startswith(f"{path}:{LAST_LINE + 5}: demand() must return")
     assert field in message
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        *((field, "float('inf')") for field in ("batch_bytes", "batch_compute_s", "sync_bytes")),
+        *((field, "float('inf')") for field in ("sync_compute_s", "sync_rate_hz", "lead_s")),
+        *((field, "10**400") for field in ("buffer_s", "batch_bytes", "lead_s")),
+        *((field, "10**5000") for field in ("buffer_s", "batch_bytes")),
+        ("flows", "(Flow(name='a', message_bytes=float('inf'), rate_hz=1),)"),
+        ("flows", "(Flow(name='a', message_bytes=1, rate_hz=10**400),)"),
+        ("flows", "(Flow(name=3, message_bytes=1, rate_hz=1),)"),
+        ("flows", "[10**5000]"),
+    ],
+)
+def test_demand_beyond_all_measure_is_told_with_its_place(plugin, field, value):
+    path = plugin(f"""
+        GOOD = dict(flows=(), buffer_s=float("inf"), batch_bytes=0, batch_compute_s=0.0, sync_bytes=0,
+            sync_compute_s=0.0, sync_rate_hz=0.0, lead_s=0.0, measured=False)
+        def demand(*_):
+            return Demand(**GOOD | {{"{field}": {value}}})
+    """)
+
+    message = refusal(path, "demand")
+
+    assert message.startswith(f"{path}:{LAST_LINE + 4}: demand() must ")
+    assert ("flow" if field == "flows" else field) in message
+
+
+def test_check_that_returns_what_cannot_be_shown_is_told_with_its_place(plugin):
+    path = plugin("def check(*_):\n    return [10**5000]\n")
+
+    assert refusal(path, "check").endswith("got a list that cannot be shown")
 
 
 def test_demand_that_is_none_is_told_with_its_place(plugin):
@@ -188,4 +261,4 @@ def test_every_faulty_part_of_a_file_is_told_with_its_line_and_not_with_a_module
     ]
     assert "there is no 'Agnt', did you mean Agent?" in faults[0]
     assert "no method initial_data()" in faults[1]
-    assert registry.MODULE_PREFIX not in "".join(faults)
+    assert code_places.MODULE_PREFIX not in "".join(faults)

@@ -117,6 +117,7 @@ def test_files_of_one_name_in_two_folders_are_two_modules(tmp_path):
     assert len({registry.module_name(path) for path in paths}) == 2
 
 
+@pytest.mark.process
 def test_module_name_is_the_same_in_every_process(tmp_path):
     path = tmp_path / "my-plugin.py"
     code = (
@@ -293,6 +294,7 @@ def test_unknown_parameter_is_refused_by_the_runtime_too(write, tmp_path):
         registry.parse_parameters(descriptor, {"gian": 3})
 
 
+@pytest.mark.process
 def test_resolving_a_registered_simulation_imports_neither_numpy_nor_the_halves():
     code = (
         "import sys; from pathlib import Path; from madns_runtime.plugin.registry import resolve;"
@@ -313,3 +315,18 @@ def test_registry_needs_only_a_path_to_find_a_file(write, tmp_path):
     by_absolute_path = registry.resolve(f"{tmp_path / 'plugin.py'}:simulation", Path("/"))
 
     assert by_absolute_path.name == "p"
+
+
+@pytest.mark.parametrize(
+    ("columns", "told"),
+    [
+        ("['a.b']", r"columns: expected a tuple of texts 'stream.field', got \['a.b'\]"),
+        ("('speed_m_s',)", "columns: expected a tuple of texts 'stream.field'"),
+        ("7 * ('a.b',)", "columns: expected at most 6, got 7"),
+    ],
+)
+def test_columns_that_are_no_fields_of_streams_are_told(write, tmp_path, columns, told):
+    write(PLUGIN.replace('host=":Host")', f'host=":Host", columns={columns})'))
+
+    with pytest.raises(PluginError, match=told):
+        registry.resolve("./plugin.py:simulation", tmp_path)

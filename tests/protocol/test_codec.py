@@ -27,8 +27,10 @@ from madns_runtime.protocol.codec import (
 from madns_runtime.protocol.messages import (
     MESSAGES,
     AgentStopped,
+    Delivery,
     EmergencyShutdown,
     Expelled,
+    FaultOrder,
     Hello,
     Ping,
     Pong,
@@ -38,6 +40,8 @@ from madns_runtime.protocol.messages import (
     SimulationSetup,
     SimulationStart,
     SystemStop,
+    Transmission,
+    TransmissionRefusal,
 )
 
 EXAMPLES = (
@@ -53,6 +57,10 @@ EXAMPLES = (
     Ping(t_agent_s=1.25, report={"missed": 0}),
     Pong(t_agent_s=1.25, t_host_received_s=2.0, t_host_sent_s=2.5),
     SimulationData(payload=[1, None, b"\x00", "text", True]),
+    Transmission(to="ground:A", number=7, sent_s=1.0, payload={"x": [1, None]}),
+    Delivery(sender="b", sent_s=1.0, arrives_s=1.01, payload="text"),
+    TransmissionRefusal(number=7, to="*", sent_s=1.0, reason="no_radio"),
+    FaultOrder(number=3, device="pi22/imu", action="bias", value=0.5),
 )
 
 SCALARS = (
@@ -84,6 +92,7 @@ def test_message_survives_the_wire(message):
     assert decode_message(body) == message
 
 
+@pytest.mark.slow
 @given(VALUES)
 @settings(derandomize=True, deadline=None)
 def test_value_survives_the_wire(value):

@@ -9,9 +9,7 @@ import pytest
 from lossy_wire import RUN_KEY, SESSION
 from test_link_hostile import frame
 
-from madns_runtime.protocol.link import Link, LinkLimits, SendQueueFull
-from madns_runtime.protocol.messages import Service
-from madns_runtime.protocol.seal import (
+from madns_runtime.protocol.datagram import (
     DATAGRAM_BYTES_MAX,
     PAYLOAD_BYTES_MAX,
     REST,
@@ -19,6 +17,8 @@ from madns_runtime.protocol.seal import (
     Seal,
     derive_keys,
 )
+from madns_runtime.protocol.link import Link, LinkLimits, SendQueueFull
+from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.sending import LOST_PACKETS_MAX
 
 STEPS = 500

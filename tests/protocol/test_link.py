@@ -7,8 +7,16 @@ from lossy_wire import RUN_KEY, SESSION, Faults, LossyWire
 
 from madns_runtime.errors import MadnsError, MessageTooLarge
 from madns_runtime.protocol import sending
+from madns_runtime.protocol.datagram import (
+    DATAGRAM_BYTES_MAX,
+    FRAME,
+    FRAME_BYTES,
+    HEADER_BYTES,
+    MAC_BYTES,
+    OVERHEAD_BYTES,
+    Header,
+)
 from madns_runtime.protocol.deadlines import BROKEN_UNREAD_MAX
-from madns_runtime.protocol.delivery import FRAME, FRAME_BYTES
 from madns_runtime.protocol.link import (
     BEST_BYTES_MAX,
     MESSAGE_BYTES_MAX,
@@ -19,14 +27,7 @@ from madns_runtime.protocol.link import (
     SendQueueFull,
 )
 from madns_runtime.protocol.messages import Service
-from madns_runtime.protocol.recovery import ACK_DELAY_MAX_S, Pacer, RoundTrip
-from madns_runtime.protocol.seal import (
-    DATAGRAM_BYTES_MAX,
-    HEADER_BYTES,
-    MAC_BYTES,
-    OVERHEAD_BYTES,
-    peek,
-)
+from madns_runtime.protocol.packets import ACK_DELAY_MAX_S, RoundTrip, TokenBucket
 
 BEST, RELIABLE, SYNC = Service
 
@@ -100,8 +101,8 @@ def test_datagrams_of_a_peer_start_with_its_prefix():
     (datagram,) = agent.datagrams_to_send(1.0)
 
     assert datagram.startswith(host.peer_prefix)
-    assert peek(datagram).agent_index == 1
-    assert peek(datagram).incarnation == 2
+    assert Header.peek(datagram).agent_index == 1
+    assert Header.peek(datagram).incarnation == 2
 
 
 def test_best_must_fit_one_datagram():
@@ -356,7 +357,7 @@ def test_first_resend_waits_a_tenth_of_a_second_at_least():
     (again,) = agent.datagrams_to_send(due_s)
 
     assert frames_in(again) == [(RELIABLE, 0)]
-    assert peek(again).packet_number == 2
+    assert Header.peek(again).packet_number == 2
     assert agent.counters.reliable.resent == 1
 
 
@@ -745,7 +746,7 @@ def test_resend_delay_of_a_long_round_trip_never_shrinks():
 
 
 def test_pacer_allows_a_burst_and_then_the_rate():
-    pacer = Pacer(1000.0, 500)
+    pacer = TokenBucket(1000.0, 500)
 
     pacer.spend(500, 10.0)
     assert pacer.opens_at_s == pytest.approx(10.0)

@@ -9,16 +9,9 @@ import pytest
 from lossy_wire import RUN_KEY, SESSION, LossyWire
 
 from madns_runtime.protocol.counters import ClassCounters, LinkCounters
-from madns_runtime.protocol.delivery import FRAME
+from madns_runtime.protocol.datagram import DATAGRAM_BYTES_MAX, FRAME, REST, Role, Seal, derive_keys
 from madns_runtime.protocol.link import Link
 from madns_runtime.protocol.messages import Service
-from madns_runtime.protocol.seal import (
-    DATAGRAM_BYTES_MAX,
-    REST,
-    Role,
-    Seal,
-    derive_keys,
-)
 
 FUZZED_COUNT = 10_000
 

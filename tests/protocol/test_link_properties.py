@@ -10,9 +10,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from lossy_wire import Faults, LossyWire
 
+from madns_runtime.protocol.datagram import PREFIX_BYTES, REST
 from madns_runtime.protocol.link import LinkLimits, SendQueueFull
 from madns_runtime.protocol.messages import Service
-from madns_runtime.protocol.seal import PREFIX_BYTES, REST
 
 STREAMS = (Service.RELIABLE, Service.SYNC)
 BIT = {service: 1 << service for service in Service}
@@ -65,6 +65,7 @@ def peers(wire):
     return (("agent", wire.host), ("host", wire.agent))
 
 
+@pytest.mark.slow
 @given(SEEDS, FAULTS)
 @few
 def test_streams_arrive_exactly_once_and_in_order(seed, faults):
@@ -83,6 +84,7 @@ def test_streams_arrive_exactly_once_and_in_order(seed, faults):
         assert end.link.get_timer() is None
 
 
+@pytest.mark.slow
 @given(SEEDS, FAULTS)
 @few
 def test_best_arrives_at_most_once_and_the_newest_wins(seed, faults):
@@ -102,6 +104,7 @@ def test_best_arrives_at_most_once_and_the_newest_wins(seed, faults):
         assert newest + 1 == counters.received + counters.lost + counters.late
 
 
+@pytest.mark.slow
 @given(SEEDS, st.sampled_from([0.0, 0.0003, 0.005, 0.02, 0.06, 0.1, 0.15, 0.2]))
 @few
 def test_nothing_is_sent_again_without_need_when_nothing_is_lost(seed, delay_s):
@@ -116,6 +119,7 @@ def test_nothing_is_sent_again_without_need_when_nothing_is_lost(seed, delay_s):
             assert counters.resent <= (2 if 2 * delay_s + 0.01 > 0.2 else 0)
 
 
+@pytest.mark.slow
 @given(SEEDS, FAULTS)
 @few
 def test_resends_stay_within_a_small_multiple_of_what_was_lost(seed, faults):
@@ -131,6 +135,7 @@ def test_resends_stay_within_a_small_multiple_of_what_was_lost(seed, faults):
     assert total < 4 * len(wire.carried) + 40
 
 
+@pytest.mark.slow
 @given(SEEDS, FAULTS, st.integers(0, 40_000))
 @few
 def test_memory_for_unfinished_messages_is_bounded_by_the_window(seed, faults, window_bytes):
@@ -147,6 +152,7 @@ def test_memory_for_unfinished_messages_is_bounded_by_the_window(seed, faults, w
         assert receiver.held_bytes_max <= (reliable + sync) * 1400 + largest + 1400
 
 
+@pytest.mark.slow
 @given(SEEDS, st.floats(0, 0.2))
 @few
 def test_receiver_that_does_not_read_stops_the_sender_and_then_gets_all(seed, loss):

@@ -18,11 +18,15 @@ from madns_runtime.protocol.codec import (
     encode_data,
     encode_message,
 )
+from madns_runtime.protocol.datagram import DATAGRAM_BYTES_MAX, MAC_BYTES, OVERHEAD_BYTES
 from madns_runtime.protocol.link import BEST_BYTES_MAX, Link
 from madns_runtime.protocol.messages import Ping, Service, SimulationData
-from madns_runtime.protocol.packets import ACK_BITS, REPLAY_WINDOW_PACKETS, Packets
-from madns_runtime.protocol.recovery import MEASURE_INTERVAL_S
-from madns_runtime.protocol.seal import DATAGRAM_BYTES_MAX, MAC_BYTES, OVERHEAD_BYTES
+from madns_runtime.protocol.packets import (
+    ACK_BITS,
+    MEASURE_INTERVAL_S,
+    REPLAY_WINDOW_PACKETS,
+    Packets,
+)
 
 BEST, RELIABLE, SYNC = Service
 
@@ -323,6 +327,7 @@ PAYLOADS = st.recursive(
 )
 
 
+@pytest.mark.slow
 @given(PAYLOADS)
 def test_data_are_encoded_as_any_message_is_and_decoded_if_they_are_plain(payload):
     body = encode_data(payload)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from test_sessions import World
 
-from madns_runtime.protocol import agent_events as a
-from madns_runtime.protocol import host_events as h
+from madns_runtime.protocol import events as a
+from madns_runtime.protocol import events as h
 from madns_runtime.protocol.codec import NO_DATA, UnencodableValue
-from madns_runtime.protocol.host_events import Phase
+from madns_runtime.protocol.events import Phase
 from madns_runtime.protocol.link import BEST_BYTES_MAX
 from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.states import HostState
@@ -61,7 +61,7 @@ class QuickWorld(World):
         self.run_for(0.01)
 
     def all_up(self, name):
-        general = [e.payload for e in self.host_events if isinstance(e, h.DataReceived)]
+        general = [e.payload for e in self.host_events if isinstance(e, h.AgentDataReceived)]
         return sorted(p[0] for p in self.up[name] + general)
 
 
@@ -144,8 +144,8 @@ def test_reliable_data_beside_the_quick_way_arrives_once_and_in_order():
     w.loss = 0.0
     w.run_for(2)
 
-    up = [e.payload["n"] for e in w.host_events if is_numbered(e, h.DataReceived)]
-    down = [e.payload["n"] for e in w.agent_events["agent-1"] if is_numbered(e, a.DataReceived)]
+    up = [e.payload["n"] for e in w.host_events if is_numbered(e, h.AgentDataReceived)]
+    down = [e.payload["n"] for e in w.agent_events["agent-1"] if is_numbered(e, a.HostDataReceived)]
     assert up == list(range(60))
     assert down == list(range(60))
 

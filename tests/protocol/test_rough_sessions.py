@@ -8,7 +8,7 @@ import random
 import pytest
 from test_sessions import World
 
-from madns_runtime.protocol import host_events as h
+from madns_runtime.protocol import events as h
 from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.states import AgentState, HostState
 
@@ -100,5 +100,5 @@ def test_every_run_ends_on_both_sides_and_takes_no_message_twice(seed):
     w.run_for(20)
 
     assert {s.state for s in w.agents.values()} <= {AgentState.EXIT}
-    numbers = [e.payload for e in w.host_events if isinstance(e, h.DataReceived)]
+    numbers = [e.payload for e in w.host_events if isinstance(e, h.AgentDataReceived)]
     assert len(numbers) == len(set(numbers))

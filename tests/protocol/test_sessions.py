@@ -7,22 +7,22 @@ import pytest
 
 from madns_runtime import __version__
 from madns_runtime.config import Timeouts
-from madns_runtime.protocol import agent_events as a
-from madns_runtime.protocol import host_events as h
+from madns_runtime.protocol import events as a
+from madns_runtime.protocol import events as h
 from madns_runtime.protocol.agent_session import (
     CLOCK_ERROR_S_MAX,
     CLOCK_WAIT_S,
     AgentIdentity,
     AgentSession,
 )
-from madns_runtime.protocol.host_events import Phase
+from madns_runtime.protocol.events import Phase
 from madns_runtime.protocol.host_session import HostSession
+from madns_runtime.protocol.link_settings import LinkSettings
 from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.states import AgentState, HostState
-from madns_runtime.protocol.wire import Wire
 from madns_runtime.timing.clocksync import ClockEstimate
 
-WIRE = Wire(run_key=b"k" * 32, session=b"s" * 8)
+WIRE = LinkSettings(run_key=b"k" * 32, session=b"s" * 8)
 TIMEOUTS = Timeouts(
     agents_ready_s=5,
     host_setup_s=5,
@@ -136,7 +136,7 @@ class World:
             is_in_setup = session.state is AgentState.SIMULATION_SETUP
             if isinstance(event, a.SetupReceived) and name not in self.mute and is_in_setup:
                 session.setup_finished(self.now_s)
-            elif isinstance(event, a.StopReceived | a.EmergencyDeclared | a.ExpelledFromRun):
+            elif isinstance(event, a.StopReceived | a.EmergencyOrdered | a.ExpelledFromRun):
                 session.records_closed({"written": 7}, self.now_s)
         over = self.t0_s is not None and self.now_s > self.t0_s + DURATION_S
         if session.state is AgentState.RUN_SIMULATION and over and name not in self.mute:
@@ -249,8 +249,8 @@ def test_data_reaches_the_other_half_in_both_directions():
 
     w.run_for(0.5)
 
-    assert w.host_event(h.DataReceived) == h.DataReceived("agent-1", [1, 2.5])
-    assert w.agent_saw("agent-1", a.DataReceived) == a.DataReceived({"x": "y"})
+    assert w.host_event(h.AgentDataReceived) == h.AgentDataReceived("agent-1", [1, 2.5])
+    assert w.agent_saw("agent-1", a.HostDataReceived) == a.HostDataReceived({"x": "y"})
 
 
 def test_agents_that_never_say_hello_are_all_named():
@@ -292,8 +292,8 @@ def test_lost_agent_aborts_run_within_three_seconds():
     w.run_for(5)
     assert w.host.state is HostState.EXIT
     assert w.agents["agent-1"].state is AgentState.EXIT
-    told = w.agent_saw("agent-1", a.EmergencyDeclared)
-    assert told == a.EmergencyDeclared("agent-2", "silent for 2.5 s while running")
+    told = w.agent_saw("agent-1", a.EmergencyOrdered)
+    assert told == a.EmergencyOrdered("agent-2", "silent for 2.5 s while running")
 
 
 def test_swarm_survives_a_lost_agent_and_takes_it_back():
@@ -341,7 +341,7 @@ def test_agents_end_by_themselves_when_the_host_dies():
 
     for name, session in w.agents.items():
         assert session.state is AgentState.EXIT
-        told = w.agent_saw(name, a.EmergencyDeclared)
+        told = w.agent_saw(name, a.EmergencyOrdered)
         assert told.reason == "host: silent for 2.5 s"
 
 
@@ -367,8 +367,8 @@ def test_emergency_of_the_host_reaches_every_agent():
 
     assert w.host.state is HostState.EXIT
     for name in w.names:
-        told = w.agent_saw(name, a.EmergencyDeclared)
-        assert told == a.EmergencyDeclared("operator", "interrupted")
+        told = w.agent_saw(name, a.EmergencyOrdered)
+        assert told == a.EmergencyOrdered("operator", "interrupted")
 
 
 def test_host_setup_has_a_deadline():
@@ -428,7 +428,7 @@ def test_datagrams_of_strangers_change_nothing_but_counters():
     stranger.join("agent-1")
     session = AgentSession(
         AgentIdentity(name="agent-1", index=1, incarnation=77, runtime_version=__version__, pid=1),
-        Wire(run_key=b"x" * 32, session=WIRE.session),
+        LinkSettings(run_key=b"x" * 32, session=WIRE.session),
         timeouts=TIMEOUTS,
         report=dict,
         now_s=w.now_s,
@@ -437,7 +437,7 @@ def test_datagrams_of_strangers_change_nothing_but_counters():
         w.host.receive_datagram(data, ("x",), w.now_s)
 
     assert {n: p.phase for n, p in w.host.peers.items()} == before
-    assert w.host.refused["not_ours"] >= 2001
+    assert sum(w.host.refused.values()) >= 2001
 
 
 def test_all_agents_lost_ends_even_a_run_that_may_lose_members():
@@ -502,8 +502,8 @@ def test_stop_overtakes_no_reliable_data():
 
     w.run_for(8)
 
-    got = [e.payload for e in w.agent_events["agent-1"] if isinstance(e, a.DataReceived)]
-    back = [e.payload for e in w.host_events if isinstance(e, h.DataReceived)]
+    got = [e.payload for e in w.agent_events["agent-1"] if isinstance(e, a.HostDataReceived)]
+    back = [e.payload for e in w.host_events if isinstance(e, h.AgentDataReceived)]
     assert got == list(range(40))
     assert back == list(range(40))
 
@@ -514,13 +514,13 @@ def test_data_sent_before_set_up_waits_for_the_agents_half():
     w.run_for(0.5)
     w.host.send("agent-1", "early", Service.SYNC, w.now_s)
     w.run_for(0.3)
-    assert w.agent_saw("agent-1", a.DataReceived) is None
+    assert w.agent_saw("agent-1", a.HostDataReceived) is None
 
     w.host.setup_finished({"agent-1": {}}, w.now_s)
     w.run_for(0.5)
 
     kinds = [type(e) for e in w.agent_events["agent-1"]]
-    assert kinds.index(a.SetupReceived) < kinds.index(a.DataReceived)
+    assert kinds.index(a.SetupReceived) < kinds.index(a.HostDataReceived)
 
 
 def test_messages_to_a_lost_agent_are_counted():

@@ -4,11 +4,11 @@ import pytest
 from test_sessions import STEP_S, TIMEOUTS, WIRE, World, world
 
 from madns_runtime import __version__
-from madns_runtime.protocol import agent_events as a
-from madns_runtime.protocol import host_events as h
+from madns_runtime.protocol import events as a
+from madns_runtime.protocol import events as h
 from madns_runtime.protocol.agent_session import HELD_MAX, AgentIdentity, AgentSession
 from madns_runtime.protocol.codec import encode_message
-from madns_runtime.protocol.host_events import Phase
+from madns_runtime.protocol.events import Phase
 from madns_runtime.protocol.messages import (
     AgentStopped,
     Hello,
@@ -18,6 +18,7 @@ from madns_runtime.protocol.messages import (
     SimulationReady,
     SimulationStart,
     SystemStop,
+    Transmission,
 )
 from madns_runtime.protocol.states import AgentState, HostState
 
@@ -84,7 +85,7 @@ def test_what_waits_for_set_up_is_bounded_and_the_rest_counted():
     w.host.setup_finished({"agent-1": {}}, w.now_s)
     w.run_for(2)
 
-    got = [e.payload for e in w.agent_events["agent-1"] if isinstance(e, a.DataReceived)]
+    got = [e.payload for e in w.agent_events["agent-1"] if isinstance(e, a.HostDataReceived)]
     assert got == list(range(HELD_MAX))
     assert w.agents["agent-1"].held_dropped_count == 5
 
@@ -100,7 +101,7 @@ def test_newcomer_at_the_end_of_a_run_is_sent_away():
 
     w.run_for(1.0)
 
-    told = w.agent_saw("agent-2", a.EmergencyDeclared)
+    told = w.agent_saw("agent-2", a.EmergencyOrdered)
     assert told.who == "host"
     assert "already ending" in told.reason or told.reason == "interrupted"
 
@@ -171,8 +172,8 @@ def test_second_emergency_has_no_effect_on_either_side():
 
     declared = [e for e in w.host_events if isinstance(e, h.EmergencyDeclared)]
     assert declared == [h.EmergencyDeclared("operator", "first")]
-    seen = [e for e in w.agent_events["agent-1"] if isinstance(e, a.EmergencyDeclared)]
-    assert seen == [a.EmergencyDeclared("operator", "first")]
+    seen = [e for e in w.agent_events["agent-1"] if isinstance(e, a.EmergencyOrdered)]
+    assert seen == [a.EmergencyOrdered("operator", "first")]
 
 
 def test_agent_without_a_host_says_what_to_look_at_and_ends():
@@ -182,7 +183,7 @@ def test_agent_without_a_host_says_what_to_look_at_and_ends():
 
     w.run_for(8)
 
-    told = w.agent_saw("agent-1", a.EmergencyDeclared)
+    told = w.agent_saw("agent-1", a.EmergencyOrdered)
     assert "no answer to HELLO in 5 s" in told.reason
     assert "UDP port" in told.reason
     assert w.agents["agent-1"].state is AgentState.EXIT
@@ -198,7 +199,7 @@ def test_agent_that_is_never_told_to_go_on_ends_by_its_deadline():
 
     w.run_for(12)
 
-    told = w.agent_saw("agent-1", a.EmergencyDeclared)
+    told = w.agent_saw("agent-1", a.EmergencyOrdered)
     assert "no order to go on from AGENT_SIMULATION_READY" in told.reason
 
 
@@ -348,3 +349,21 @@ def test_process_that_another_replaced_does_not_come_back():
     assert w.host.refused["old_incarnation"] > 0
     assert w.host.peers["agent-1"].phase is Phase.RUNNING
     assert len(w.host.peers["agent-1"].retired_counters) == 1
+
+
+@pytest.mark.parametrize("sent_s", [float("nan"), float("inf"), float("-inf")])
+def test_transmission_of_no_time_reaches_no_medium_and_is_counted(sent_s):
+    w = world(count=2)
+    w.run_for(1.5)
+
+    for number in range(3):
+        w.agents["agent-1"].transmit(Transmission("agent-2", number, sent_s, {}), w.now_s)
+    good = Transmission("agent-2", 3, 0.5, {})
+    w.agents["agent-1"].transmit(good, w.now_s)
+    w.run_for(0.3)
+
+    assert w.host.malformed_count == 3
+    heard = [event for event in w.host_events if isinstance(event, h.AgentDataReceived)]
+    assert heard == [h.AgentDataReceived("agent-1", good)]
+    assert w.host.next_event() is None
+    assert w.host.peers["agent-1"].phase is Phase.RUNNING

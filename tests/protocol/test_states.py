@@ -124,6 +124,7 @@ def test_no_table_lists_an_event_twice_for_one_state():
         assert len(keys) == len(set(keys))
 
 
+@pytest.mark.process
 def test_generated_documentation_is_current():
     script = Path(__file__).parents[2] / "docs" / "generate.py"
 

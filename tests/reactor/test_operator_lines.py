@@ -7,8 +7,8 @@ import threading
 import pytest
 
 from madns_runtime.errors import ConfigurationError
-from madns_runtime.reactor import lines
-from madns_runtime.reactor.lines import OperatorLink, read_launch
+from madns_runtime.reactor import operator_link
+from madns_runtime.reactor.operator_link import OperatorLink, read_launch
 from madns_runtime.reactor.reactor import Reactor
 
 pytestmark = pytest.mark.process
@@ -64,7 +64,7 @@ def test_broken_launch_document_is_refused(pipes, written, expected):
 
 
 def test_launch_document_that_never_comes_has_a_deadline(pipes, monkeypatch):
-    monkeypatch.setattr(lines, "LAUNCH_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(operator_link, "LAUNCH_TIMEOUT_S", 0.05)
 
     with pytest.raises(ConfigurationError, match="no launch document"):
         read_launch(pipes[0])
@@ -93,7 +93,7 @@ def test_events_are_lines_of_json(reactor, pipes):
 def test_operator_who_does_not_read_costs_the_oldest_events_and_they_are_counted(
     reactor, pipes, monkeypatch
 ):
-    monkeypatch.setattr(lines, "OUT_BYTES_MAX", 200_000)
+    monkeypatch.setattr(operator_link, "OUT_BYTES_MAX", 200_000)
     made = link(reactor, pipes, [], [])
     for number in range(400):
         made.emit({"event": "log", "number": number, "text": "x" * 1000})
@@ -139,8 +139,23 @@ def test_pings_are_answered_and_are_no_commands(reactor, pipes):
     assert gone == []
 
 
+def test_what_is_no_command_is_told_and_the_rest_is_heard(reactor, pipes):
+    commands, gone = [], []
+    link(reactor, pipes, commands, gone)
+    os.write(pipes[1], b'{"comm\n[1]\n\n{"command": "stop"}\n')
+    reactor.call_at(reactor.now_s() + 0.05, reactor.stop)
+
+    reactor.run()
+
+    assert [(event["level"], event["text"]) for event in read_events(pipes[2])] == [
+        ("warning", """no command here: b'{"comm'"""),
+        ("warning", "no command here: [1]"),
+    ]
+    assert commands == [{"command": "stop"}]
+
+
 def test_operator_whose_pings_cease_is_gone(reactor, pipes, monkeypatch):
-    monkeypatch.setattr(lines, "PING_SILENCE_S", 0.1)
+    monkeypatch.setattr(operator_link, "PING_SILENCE_S", 0.1)
     commands, gone = [], []
     line = link(reactor, pipes, commands, gone)
     os.write(pipes[1], b'{"command": "ping", "n": 1}\n')
@@ -152,7 +167,7 @@ def test_operator_whose_pings_cease_is_gone(reactor, pipes, monkeypatch):
 
 
 def test_operator_that_never_pinged_is_not_gone_for_its_silence(reactor, pipes, monkeypatch):
-    monkeypatch.setattr(lines, "PING_SILENCE_S", 0.05)
+    monkeypatch.setattr(operator_link, "PING_SILENCE_S", 0.05)
     commands, gone = [], []
     link(reactor, pipes, commands, gone)
     reactor.call_at(reactor.now_s() + 0.2, reactor.stop)
@@ -164,7 +179,7 @@ def test_operator_that_never_pinged_is_not_gone_for_its_silence(reactor, pipes, 
 
 @pytest.mark.parametrize("leaves", ["closes", "falls silent"])
 def test_detached_process_stays_when_its_operator(reactor, pipes, monkeypatch, leaves):
-    monkeypatch.setattr(lines, "PING_SILENCE_S", 0.05)
+    monkeypatch.setattr(operator_link, "PING_SILENCE_S", 0.05)
     commands, gone = [], []
     line = OperatorLink(
         reactor,
@@ -197,12 +212,12 @@ def test_events_that_nobody_takes_are_counted(reactor, pipes):
 
 
 def test_operator_is_late_when_its_pings_are(reactor, pipes, monkeypatch):
-    monkeypatch.setattr(lines, "PING_LATE_S", 0.1)
+    monkeypatch.setattr(operator_link, "PING_LATE_S", 0.1)
     line = link(reactor, pipes, [], [])
-    seen = [line.is_late]
+    seen = [line.is_silent]
     os.write(pipes[1], b'{"command": "ping", "n": 1}\n')
-    reactor.call_at(reactor.now_s() + 0.05, lambda: seen.append(line.is_late))
-    reactor.call_at(reactor.now_s() + 0.5, lambda: (seen.append(line.is_late), reactor.stop()))
+    reactor.call_at(reactor.now_s() + 0.05, lambda: seen.append(line.is_silent))
+    reactor.call_at(reactor.now_s() + 0.5, lambda: (seen.append(line.is_silent), reactor.stop()))
 
     reactor.run()
 

@@ -10,8 +10,9 @@ from madns_runtime.config import Recording
 from madns_runtime.errors import MachineError
 from madns_runtime.recording import reader
 from madns_runtime.recording.reader import read_columns, read_stream
+from madns_runtime.recording.record_files import RecordFiles
+from madns_runtime.recording.recorder import Recorder
 from madns_runtime.recording.records import EVENTS, TICKS, Field, StreamSchema
-from madns_runtime.recording.writer import Recorder
 
 MIXED = StreamSchema(
     "mixed",
@@ -27,7 +28,7 @@ MIXED = StreamSchema(
 
 def record(directory, schema, rows, *, t0_utc=None):
     settings = Recording(buffer_bytes=1 << 24)
-    recorder = Recorder(directory, run="0001-test", source="a", settings=settings)
+    recorder = Recorder(RecordFiles(directory, run="0001-test", source="a"), settings)
     recorder.open_stream(schema)
     if t0_utc:
         recorder.set_t0(t0_utc)
@@ -89,7 +90,7 @@ def test_stream_of_many_blocks_is_the_same(tmp_path, small_blocks):
 
 
 def test_counts_of_the_end_line_are_told(tmp_path):
-    recorder = Recorder(tmp_path, run="r", source="a", settings=Recording(buffer_bytes=65_536))
+    recorder = Recorder(RecordFiles(tmp_path, run="r", source="a"), Recording(buffer_bytes=65_536))
     recorder.open_stream(TICKS)
     for row in make_ticks(2000):
         recorder.record("ticks", row)
@@ -296,6 +297,7 @@ def _refuse(text):
     raise ValueError(text)
 
 
+@pytest.mark.slow
 @settings(
     max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )

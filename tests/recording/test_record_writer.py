@@ -4,26 +4,41 @@ import os
 import random
 import threading
 import time
+from array import array
+from collections import ChainMap, UserDict, UserList, deque
+from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 import pytest
+from harness.waiting import wait_until
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cosmos_cli.onboard import log_tail
 from madns_runtime.config import Recording
 from madns_runtime.errors import MachineError, PluginError
-from madns_runtime.recording import stream_file
+from madns_runtime.recording import run_journal, stream_file
 from madns_runtime.recording.reader import read_stream
-from madns_runtime.recording.records import EVENTS, LOG, TICKS, Field, StreamSchema
-from madns_runtime.recording.writer import Recorder
+from madns_runtime.recording.record_files import RecordFiles
+from madns_runtime.recording.recorder import Recorder
+from madns_runtime.recording.records import EVENTS, TICKS, Field, StreamSchema
+from madns_runtime.recording.run_journal import RunJournal
 
 PAIR = StreamSchema("pair", (Field("number", "", "int"), Field("value_m", "m")))
 
 
 def make_recorder(directory, *, life=1, **values):
     chosen = Recording(**{"flush_interval_s": 0.05, **values})
-    return Recorder(directory, run="0001-test", source="a", settings=chosen, life=life)
+    files = RecordFiles(directory, run="0001-test", source="a", life=life)
+    return Recorder(files, chosen)
+
+
+def make_journal(directory, *, verbosity=3):
+    return RunJournal(make_recorder(directory), verbosity, t_s=lambda: None)
 
 
 def read_lines(path):
@@ -265,6 +280,97 @@ def test_values_that_are_not_finite_are_null_and_counted(tmp_path):
     assert read_lines(tmp_path / "s.jsonl")[1] == [None, [1.0, None, None]]
 
 
+NAN = float("nan")
+
+
+@dataclass
+class Attitude:
+    rate_rad_s: float
+    _kept: float = NAN
+    named: float = 1.0
+
+
+@dataclass(slots=True)
+class Slotted:
+    rate_rad_s: float
+    _kept: float = NAN
+
+
+@dataclass
+class Heir(Slotted):
+    more: float = NAN
+
+
+class Level(Enum):
+    NONE = NAN
+
+
+class Row(NamedTuple):
+    value_m: float
+
+
+class Lines(list):
+    """A list with a name."""
+
+
+ROWS = np.array([(NAN, 1), (2.0, 3)], dtype="f8,i4")
+MASKED = np.ma.masked_array([NAN, 1.0, NAN], [False, False, True])
+NOT_FINITE = {
+    "float": (NAN, 1),
+    "infinity": (float("-inf"), 1),
+    "half": (np.float16("nan"), 1),
+    "single": (np.float32("inf"), 1),
+    "double": (np.float64("nan"), 1),
+    "list": ([NAN, 1.0, [float("inf")]], 2),
+    "list with a name": (Lines([NAN]), 1),
+    "tuple": ((NAN, None), 1),
+    "named tuple": (Row(NAN), 1),
+    "mapping": ({"a": NAN, "b": "null"}, 1),
+    "mapping proxy": (MappingProxyType({"a": [NAN]}), 1),
+    "chained mappings": (ChainMap({"a": NAN}, {"b": NAN}), 2),
+    "user mapping": (UserDict(a=NAN), 1),
+    "user list": (UserList([NAN]), 1),
+    "deque": (deque([NAN, NAN]), 2),
+    "machine array": (array("d", [NAN, 1.0]), 1),
+    "dataclass": (Attitude(NAN), 1),
+    "dataclass with slots": (Slotted(NAN), 1),
+    "dataclass that inherits slots": (Heir(NAN), 1),
+    "dataclasses in a list": ([Attitude(NAN), {"a": Slotted(NAN)}], 2),
+    "enumeration": (Level.NONE, 1),
+    "array": (np.array([[NAN, 1.0], [np.inf, NAN]]), 3),
+    "array of one number": (np.array(NAN), 1),
+    "array of halves": (np.array([NAN], np.float16), 1),
+    "array with strides": (np.full(4, NAN)[::2], 2),
+    "array of objects": (np.array([NAN, None, [np.inf], "a"], object), 2),
+    "array of rows": (ROWS, 1),
+    "row": (ROWS[0], 1),
+    "array with a mask": (MASKED, 1),
+    "finite": ([1.0, None, "null", range(2), np.float32(1), True, Slotted(1.0)], 0),
+}
+
+
+@pytest.mark.parametrize("kind", list(NOT_FINITE))
+def test_every_kind_of_value_that_is_written_is_looked_into_for_nan(tmp_path, kind):
+    value, count = NOT_FINITE[kind]
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(StreamSchema("s", (Field("a"), Field("b", "", "json"))))
+    recorder.record("s", (None, value))
+    counts = recorder.close(30)
+
+    assert counts.written == 1
+    assert counts.not_finite == count
+
+
+def test_what_has_no_json_form_is_refused_and_not_counted(tmp_path):
+    recorder = make_recorder(tmp_path)
+    recorder.open_stream(StreamSchema("s", (Field("a", "", "json"),)))
+    for value in ({NAN}, np.longdouble("nan"), np.complex128(NAN), b"null", iter([NAN])):
+        with pytest.raises(PluginError, match="stream s: value"):
+            recorder.record("s", ([None, value],))
+
+    assert recorder.close(30).not_finite == 0
+
+
 def test_what_does_not_fit_the_buffer_is_counted(tmp_path):
     recorder = make_recorder(tmp_path, buffer_bytes=65_536)
     recorder.open_stream(PAIR)
@@ -336,11 +442,10 @@ def test_counts_are_a_plain_mapping(tmp_path):
     ],
 )
 def test_verbosity_decides_what_is_logged(tmp_path, verbosity, expected):
-    recorder = make_recorder(tmp_path, verbosity=verbosity)
-    recorder.open_stream(LOG)
+    journal = make_journal(tmp_path, verbosity=verbosity)
     for level in ("critical", "error", "warning", "info", "debug"):
-        recorder.log(level, f"a {level}", 1.5)
-    recorder.close(30)
+        journal.log(level, f"a {level}", 1.5)
+    journal.close(30)
 
     records = read_lines(tmp_path / "log.jsonl")[1:-1]
     assert [record["level"] for record in records] == expected
@@ -349,14 +454,13 @@ def test_verbosity_decides_what_is_logged(tmp_path, verbosity, expected):
 
 def test_unknown_level_is_refused(tmp_path):
     with pytest.raises(PluginError, match="unknown log level 'warn'; expected one of critical"):
-        make_recorder(tmp_path).log("warn", "x", None)
+        make_journal(tmp_path).log("warn", "x", None)
 
 
 def test_log_takes_text_that_is_no_unicode(tmp_path):
-    recorder = make_recorder(tmp_path)
-    recorder.open_stream(LOG)
-    recorder.log("error", "no such file: \udcff", None)
-    recorder.close(30)
+    journal = make_journal(tmp_path)
+    journal.log("error", "no such file: \udcff", None)
+    journal.close(30)
 
     assert read_lines(tmp_path / "log.jsonl")[1]["text"] == "no such file: \\udcff"
 
@@ -455,13 +559,6 @@ def test_partial_writes_neither_cut_nor_repeat_a_line(tmp_path_factory, seed, re
     assert file.bytes_written == len(text)
 
 
-def wait_until(condition, deadline_s=60.0):
-    end_s = time.monotonic() + deadline_s
-    while not condition():
-        assert time.monotonic() < end_s, "condition not met in time"
-        time.sleep(0.005)
-
-
 def test_records_are_brought_to_the_disk_at_the_interval_and_only_when_there_are_new_ones(
     tmp_path, monkeypatch
 ):
@@ -498,3 +595,15 @@ def test_records_are_left_to_the_kernel_where_no_interval_is_given(
     recorder.close(30)
 
     assert synced == []
+
+
+def test_text_of_any_length_is_cut_to_what_readers_take_and_says_so(tmp_path):
+    journal = make_journal(tmp_path)
+    journal.log("error", "x" * (run_journal.LOG_CHARACTERS_MAX + 7))
+    journal.log("error", "\x01" * run_journal.LOG_CHARACTERS_MAX)
+    journal.close(30)
+
+    _, first, second, _ = (tmp_path / "log.jsonl").read_bytes().splitlines()
+    text = json.loads(first)["text"]
+    assert text == "x" * run_journal.LOG_CHARACTERS_MAX + "... (7 more characters)"
+    assert len(second) < log_tail.RECORD_BYTES_MAX

@@ -9,21 +9,24 @@ import time
 from contextlib import contextmanager
 
 import pytest
+from harness.waiting import wait_until
 
 from madns_runtime.config import Recording
 from madns_runtime.recording.reader import read_stream
+from madns_runtime.recording.record_files import RecordFiles
+from madns_runtime.recording.recorder import Recorder
 from madns_runtime.recording.records import TICKS
-from madns_runtime.recording.writer import Recorder
 
 RECORDING_CHILD = """
 import json, sys, time
 from pathlib import Path
 from madns_runtime.config import Recording
 from madns_runtime.recording.records import EVENTS, TICKS
-from madns_runtime.recording.writer import Recorder
+from madns_runtime.recording.record_files import RecordFiles
+from madns_runtime.recording.recorder import Recorder
 
 settings = Recording(flush_interval_s=float(sys.argv[2]))
-recorder = Recorder(Path(sys.argv[1]), run="r", source="a", settings=settings)
+recorder = Recorder(RecordFiles(Path(sys.argv[1]), run="r", source="a"), settings)
 recorder.open_stream(TICKS)
 recorder.open_stream(EVENTS)
 recorder.start()
@@ -109,7 +112,9 @@ def fill(path):
 @needs_mount
 def test_records_wait_until_a_full_disk_has_room_again(tmp_path):
     with small_disk(tmp_path / "disk", 1 << 20) as disk:
-        recorder = Recorder(disk, run="r", source="a", settings=Recording(flush_interval_s=0.05))
+        recorder = Recorder(
+            RecordFiles(disk, run="r", source="a"), Recording(flush_interval_s=0.05)
+        )
         recorder.open_stream(TICKS)
         recorder.start()
         recorder.record("ticks", (0, 50, 9000, 0))
@@ -138,7 +143,7 @@ def test_records_wait_until_a_full_disk_has_room_again(tmp_path):
 def test_disk_that_stays_full_costs_counted_records_and_no_broken_line(tmp_path):
     with small_disk(tmp_path / "disk", 65_536) as disk:
         settings = Recording(flush_interval_s=0.05, buffer_bytes=65_536)
-        recorder = Recorder(disk, run="r", source="a", settings=settings)
+        recorder = Recorder(RecordFiles(disk, run="r", source="a"), settings)
         recorder.open_stream(TICKS)
         recorder.start()
         recorded = 0
@@ -176,7 +181,7 @@ def test_writer_leaves_the_real_time_policy_of_its_starter(tmp_path):
         except OSError:
             return
         recorder = Recorder(
-            tmp_path, run="r", source="a", settings=Recording(flush_interval_s=0.05)
+            RecordFiles(tmp_path, run="r", source="a"), Recording(flush_interval_s=0.05)
         )
         recorder.open_stream(TICKS)
         recorder.start()
@@ -197,10 +202,3 @@ def test_writer_leaves_the_real_time_policy_of_its_starter(tmp_path):
 
 def _size(path):
     return path.stat().st_size if path.exists() else 0
-
-
-def wait_until(condition, deadline_s=60.0):
-    end_s = time.monotonic() + deadline_s
-    while not condition():
-        assert time.monotonic() < end_s, "condition not met in time"
-        time.sleep(0.01)

@@ -1,42 +1,20 @@
 """The shipped scenarios of control as whole runs in lockstep, shortened: what truth says became of the wishes."""
 
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
+from harness.cosmos_command import CosmosCommand
 
 pytestmark = pytest.mark.process
 
-SCENARIOS = Path(__file__).parents[2] / "scenarios"
-
-
-def cosmos(folder, *arguments):
-    environment = {
-        **os.environ,
-        "COSMOS_STATE_DIR": str(folder / "state"),
-        "COSMOS_RUNS": str(folder / "runs"),
-    }
-    done = subprocess.run(
-        [sys.executable, "-m", "cosmos_cli.start", *map(str, arguments), "--json", "--quiet"],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=200,
-        check=False,
-    )
-    assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
-    return json.loads(done.stdout)
-
 
 def run(folder, scenario, *settings):
-    chosen = [part for setting in settings for part in ("--set", setting)]
-    cosmos(
-        folder, "run", SCENARIOS / scenario, "--set", "time.mode=lockstep", *chosen, "--no-report"
-    )
-    return cosmos(folder, "report", "last")
+    cosmos = CosmosCommand(folder)
+    code, result = cosmos.run(scenario, "time.mode=lockstep", *settings)
+    assert code == 0, result["verdict"]
+    done = cosmos("report", "last", "--json", "--quiet")
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
 
 
 def flights(document):
@@ -64,6 +42,7 @@ def test_half_of_ten_leave_and_the_others_stay(tmp_path):
     assert sorted(flight is None for flight in flights(document)) == [False] * 5 + [True] * 5
 
 
+@pytest.mark.nightly
 def test_ring_of_93_finds_its_slots_over_crosslinks(tmp_path):
     # A quarter of the day, hastened: coarse ticks, and a shorter time constant at the price of delta-v.
     settings = ("agents.tick_hz=0.05", "parameters.flight.settings.time_constant_h=1.5")

@@ -1,67 +1,30 @@
 """Whole runs in lockstep by the real command: what the verdict says, that they repeat, and how they end."""
 
 import json
-import os
 import signal
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import pytest
+from harness.cosmos_command import SCENARIOS, CosmosCommand
 
-from cosmos_cli.rundir import RunDirectory
+from cosmos_cli.evidence.run_directory import RunDirectory
 from madns_runtime.processes import list_processes
 
 pytestmark = pytest.mark.process
 
-SCENARIOS = Path(__file__).parents[2] / "scenarios"
 LOCKSTEP = ("--set", "time.mode=lockstep")
 
 
-class Cosmos:
-    """The command in folders of its own."""
+class LockstepCommand(CosmosCommand):
+    """The command, every run of which is in lockstep."""
 
-    def __init__(self, folder):
-        self.runs = folder / "runs"
-        self.environment = {
-            **os.environ,
-            "COSMOS_STATE_DIR": str(folder / "state"),
-            "COSMOS_RUNS": str(self.runs),
-            "NO_COLOR": "1",
-        }
-
-    def command(self, *arguments):
-        return [sys.executable, "-m", "cosmos_cli.start", *map(str, arguments)]
-
-    def __call__(self, *arguments):
-        return subprocess.run(
-            self.command(*arguments),
-            env=self.environment,
-            capture_output=True,
-            text=True,
-            timeout=120,
-            check=False,
-        )
-
-    def start(self, *arguments):
-        return subprocess.Popen(
-            self.command(*arguments),
-            env=self.environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-
-    def run(self, scenario, *settings, options=("--no-report",)):
-        chosen = [part for setting in settings for part in ("--set", setting)]
-        done = self("run", SCENARIOS / scenario, *LOCKSTEP, *chosen, *options, "--json", "--quiet")
-        return done.returncode, json.loads(done.stdout)
+    def run(self, scenario, *settings, **more):
+        return super().run(scenario, "time.mode=lockstep", *settings, **more)
 
 
 @pytest.fixture
 def cosmos(tmp_path):
-    return Cosmos(tmp_path)
+    return LockstepCommand(tmp_path)
 
 
 CONSTELLATION = ("agents.tick_hz=1", "time.duration_s=300", "seed=3")

@@ -1,40 +1,22 @@
 """Whole runs on loopback agents: what they count, record and show, not how fast the machine was."""
 
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import orjson
 import pyarrow.parquet as pq
 import pytest
+from harness.cosmos_command import LOOSE, CosmosCommand
 
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
 
 pytestmark = pytest.mark.process
 
-SCENARIOS = Path(__file__).parents[2] / "scenarios"
-LOOSE = ("deadline.max_miss_ratio=1", "time.rtf_tolerance=1")
-"""A shared machine may miss ticks: these tests judge counts."""
-
 
 def run(tmp_path, scenario, *settings):
-    command = [sys.executable, "-m", "cosmos_cli.app", "run", str(scenario), "--json", "--quiet"]
-    command += ["--no-report", "--runs", str(tmp_path / "runs")]
-    for setting in (*LOOSE, *settings):
-        command += ["--set", setting]
-    done = subprocess.run(
-        command,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=240,
-        env={**os.environ, "COSMOS_STATE_DIR": str(tmp_path / "state")},
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    result = json.loads(done.stdout)
-    return result, tmp_path / "runs" / result["run"]
+    cosmos = CosmosCommand(tmp_path)
+    code, result = cosmos.run(scenario, *LOOSE, *settings)
+    assert code == 0, result["verdict"]
+    return result, cosmos.directory(result)
 
 
 def records(path):
@@ -43,7 +25,7 @@ def records(path):
 
 
 def test_ten_iridium_satellites_lose_nothing_and_record_little(tmp_path):
-    result, evidence = run(tmp_path, SCENARIOS / "iridium10.yaml", "time.duration_s=25")
+    result, evidence = run(tmp_path, "iridium10.yaml", "time.duration_s=25")
 
     messages = result["messages"]
     assert messages["reliable"]["lost"] == messages["sync"]["lost"] == 0
@@ -58,7 +40,7 @@ def test_ten_iridium_satellites_lose_nothing_and_record_little(tmp_path):
 
 
 def test_recorded_states_follow_the_recorded_energy(tmp_path):
-    result, evidence = run(tmp_path, SCENARIOS / "iridium10.yaml", "time.duration_s=2")
+    result, evidence = run(tmp_path, "iridium10.yaml", "time.duration_s=2")
 
     mu = GRAVITY_MODELS["EGM-96"].mu_m3_s2
     table = pq.read_table(evidence / "tables" / "state.parquet").to_pydict()
@@ -73,7 +55,7 @@ def test_recorded_states_follow_the_recorded_energy(tmp_path):
 
 def test_sgp4_truth_serves_any_tick_rate(tmp_path):
     settings = ("parameters.propagator={kind: sgp4}", "agents.tick_hz=33", "time.duration_s=3")
-    result, _ = run(tmp_path, SCENARIOS / "iridium10.yaml", *settings)
+    result, _ = run(tmp_path, "iridium10.yaml", *settings)
 
     assert result["simulation"]["host"]["propagator"] == "sgp4"
     served = sum(a["ticks_served"] for a in result["simulation"]["agents"].values())
@@ -88,7 +70,7 @@ def test_counter_loses_nothing_in_any_class_of_service(tmp_path, service):
         f"parameters.service={service}",
         "agents.per_process=6",
     )
-    result, _ = run(tmp_path, SCENARIOS / "counter24.yaml", *settings)
+    result, _ = run(tmp_path, "counter24.yaml", *settings)
 
     agents = result["simulation"]["agents"]
     assert len(agents) == 24
@@ -113,7 +95,7 @@ def test_stress_and_health_run_beside_the_agents(tmp_path):
         "health.stress_workers=1",
         "health.period_s=0.5",
     )
-    _, evidence = run(tmp_path, SCENARIOS / "counter24.yaml", *settings)
+    _, evidence = run(tmp_path, "counter24.yaml", *settings)
 
     health = records(next(evidence.glob("machines/*/health.jsonl")))
     assert len(health) >= 3
@@ -123,13 +105,11 @@ def test_stress_and_health_run_beside_the_agents(tmp_path):
 
 
 def test_two_runs_at_once_do_not_meet(tmp_path):
-    command = [sys.executable, "-m", "cosmos_cli.app", "run", str(SCENARIOS / "counter24.yaml")]
-    command += ["--json", "--quiet", "--no-report", "--runs", str(tmp_path / "runs")]
-    for setting in (*LOOSE, "agents.count=2", "time.duration_s=2"):
-        command += ["--set", setting]
-    both = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    cosmos = CosmosCommand(tmp_path)
+    settings = (*LOOSE, "agents.count=2", "time.duration_s=2")
+    both = [cosmos.start_run("counter24.yaml", *settings) for _ in range(2)]
 
     results = [json.loads(one.communicate(timeout=120)[0]) for one in both]
 
     assert [r["exit_code"] for r in results] == [0, 0]
-    assert {r["run"] for r in results} == {"0001-counter24", "0002-counter24"}
+    assert len({r["run"].partition("-")[0] for r in results}) == 2

@@ -1,13 +1,10 @@
 """A whole run with maneuvers on loopback agents: what is counted and recorded, not how fast the machine was."""
 
-import json
 import math
-import os
-import subprocess
-import sys
 
 import orjson
 import pytest
+from harness.cosmos_command import LOOSE, CosmosCommand
 
 pytestmark = pytest.mark.process
 
@@ -56,20 +53,9 @@ class Burn(FlightSoftware):
 def run(tmp_path, mode, *settings):
     (tmp_path / "burns.yaml").write_text(SCENARIO.replace("MODE", mode))
     (tmp_path / "burn.py").write_text(FLIGHT)
-    command = [sys.executable, "-m", "cosmos_cli.app", "run", str(tmp_path / "burns.yaml")]
-    command += ["--json", "--quiet", "--no-report", "--runs", str(tmp_path / "runs")]
-    for setting in ("time.rtf_tolerance=1", *settings):
-        command += ["--set", setting]
-    done = subprocess.run(
-        command,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-        env={**os.environ, "COSMOS_STATE_DIR": str(tmp_path / "state")},
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    result = json.loads(done.stdout)
+    cosmos = CosmosCommand(tmp_path)
+    code, result = cosmos.run(tmp_path / "burns.yaml", *LOOSE, *settings)
+    assert code == 0, result["verdict"]
     return result, tmp_path / "runs" / result["run"]
 
 

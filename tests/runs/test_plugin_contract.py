@@ -1,16 +1,19 @@
 """What a plug-in may not do: the verdict names the call, whatever it returns or however it ends."""
 
 import json
-import os
-import subprocess
-import sys
+import re
 
 import pytest
+from harness.cosmos_command import CosmosCommand
+
+from madns_runtime.plugin.host_calls import FOLDER, PREFIX
 
 pytestmark = pytest.mark.process
 
 PLUGIN = """
 import os
+import signal
+import time
 from dataclasses import dataclass
 from madns_runtime.plugin.api import HOST, AgentSimulation, HostSimulation, Simulation
 from madns_runtime.protocol.messages import Service
@@ -37,6 +40,18 @@ class H(HostSimulation):
             return None
         if self.evil == "timer":
             return float("nan")
+        if self.evil == "timer_again" and t_s >= 0.3:
+            return t_s
+        if self.evil == "timer_exit" and t_s >= 0.3:
+            os._exit(3)
+        if self.evil in ("timer_again", "timer_exit"):
+            return 0.3
+        if self.evil == "nominal":
+            return self.note(t_s)
+        if self.evil == "slow":
+            time.sleep(0.3 if hasattr(self, "is_second") else 0)
+            self.is_second = True
+            return 0.3 if t_s < 0.3 else None
         if self.evil == "best_deadline" and t_s >= 0:
             self.context.send("agent-01", 1, Service.BEST, deadline_s=t_s + 1.0)
         if self.evil in ("deadline", "best_deadline"):
@@ -45,7 +60,16 @@ class H(HostSimulation):
             return t_s + 0.2
         return None
 
+    def note(self, t_s):
+        self.times_s = [*getattr(self, "times_s", []), t_s]
+        self.late_s = max(getattr(self, "late_s", 0.0), self.context.timer_lateness_s)
+        if len(self.times_s) == 3:
+            time.sleep(0.12)
+        return t_s + 0.05
+
     def finish(self):
+        if self.evil == "nominal":
+            return {"times_s": self.times_s, "late_s": self.late_s}
         if self.evil == "wake":
             return {"woken": self.woken}
         return None if self.evil == "host_finish" else {}
@@ -57,6 +81,8 @@ class A(AgentSimulation):
     def step(self, tick):
         if self.evil == "exit" and self.context.name == "agent-01" and tick.index == 3:
             os._exit(0)
+        if self.evil == "crash" and self.context.name == "agent-01" and tick.index == 3:
+            os.kill(os.getpid(), signal.SIGSEGV)
         if self.evil == "text" and tick.index == 3:
             raise ValueError("\\udcff" + "x" * 100_000)
         if self.evil == "wake" and self.context.name == "agent-01" and tick.index == 3:
@@ -81,6 +107,7 @@ deadline: {max_miss_ratio: 1}
 FAULTS = [
     ("initial_data", "host", "H.initial_data returned a set: expected a mapping"),
     ("timer", "host", "H.timer returned nan: expected a simulated time"),
+    ("timer_again", "host", "H.timer returned 0.3, called for t = 0.3 s: expected a later time"),
     ("host_finish", "host", "H.finish returned None: expected a mapping; is a return"),
     ("agent_finish", "agent-0", "A.finish returned a summary without a JSON form"),
     ("text", "agent-0", "A.step raised ValueError: \\udcffxxx"),
@@ -89,8 +116,15 @@ FAULTS = [
 ]
 
 
-@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
-@pytest.mark.parametrize(("evil", "who", "expected"), FAULTS, ids=[fault[0] for fault in FAULTS])
+def in_both_modes(faults):
+    """Yield each fault in each mode: in one of them, by turns, every night alone."""
+    for number, fault in enumerate(faults):
+        for place, mode in enumerate(("realtime", "lockstep")):
+            marks = (pytest.mark.nightly,) if number % 2 == place else ()
+            yield pytest.param(*fault, mode, id=f"{fault[0]}-{mode}", marks=marks)
+
+
+@pytest.mark.parametrize(("evil", "who", "expected", "mode"), list(in_both_modes(FAULTS)))
 def test_the_verdict_names_the_call_in_both_modes(tmp_path, evil, who, expected, mode):
     result = run(tmp_path, evil, f"time.mode={mode}")
 
@@ -104,7 +138,60 @@ def test_an_agent_that_ends_its_process_is_named(tmp_path):
     result = run(tmp_path, "exit")
 
     assert (result["exit_code"], result["who"]) == (1, "agent-01")
-    assert "its process ended by itself, exit code 0" in result["reason"]
+    reason = "its process ended by itself, exit code 0 in the step of agent-01 at t = 0.15 s"
+    assert reason in result["reason"]
+
+
+def test_an_agent_that_is_killed_in_a_call_is_told_with_the_call(tmp_path):
+    result = run(tmp_path, "crash", "agents.per_process=2")
+
+    assert result["exit_code"] == 1
+    assert "killed by SIGSEGV in the step of agent-01 at t = 0.15 s" in result["reason"]
+
+
+@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+def test_a_host_that_ends_without_a_word_is_told_with_the_call(tmp_path, mode):
+    result = run(tmp_path, "timer_exit", f"time.mode={mode}")
+
+    assert (result["exit_code"], result["who"]) == (1, "host")
+    told = r"exited with code 3 in H\.timer at t = 0\.3\d* s before the run was over"
+    assert re.search(told, result["reason"])
+
+
+def test_a_call_that_holds_the_host_is_told_with_its_time(tmp_path):
+    result = run(tmp_path, "slow")
+
+    told = result["host_calls"]["methods"]["H.timer"]
+    assert told["longest_s"] >= 0.3
+    assert told["longest_t_s"] == pytest.approx(0.3, abs=0.2)
+    assert any("the longest H.timer for 0.3" in remark for remark in result["remarks"])
+
+
+def test_no_page_of_a_host_is_left(tmp_path):
+    before = set(FOLDER.glob(f"{PREFIX}*"))
+    run(tmp_path, "timer_exit")
+    run(tmp_path, "none")
+
+    assert [
+        path for path in set(FOLDER.glob(f"{PREFIX}*")) - before if is_own(path, tmp_path)
+    ] == []
+
+
+def is_own(path, tmp_path):
+    """Tell whether a page is of a run of this test: others may run meanwhile."""
+    plans = [json.loads(plan.read_text()) for plan in tmp_path.glob("runs/*/plan.json")]
+    return any(path.name.endswith(plan["session"]) for plan in plans)
+
+
+@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+def test_the_timer_is_given_the_times_it_asked_for_however_late_it_is(tmp_path, mode):
+    result = run(tmp_path, "nominal", f"time.mode={mode}")
+    told = result["simulation"]["host"]
+    start_s, *times_s = told["times_s"]
+
+    assert start_s == -0.5
+    assert times_s[:20] == pytest.approx([-0.45 + 0.05 * number for number in range(20)])
+    assert (told["late_s"] > 0.0) == (mode == "realtime")
 
 
 def test_broken_sync_deadline_breaks_its_check(tmp_path):
@@ -127,18 +214,6 @@ def test_a_half_that_hears_something_can_ask_for_its_timer(tmp_path, mode):
 def run(tmp_path, evil, *settings):
     (tmp_path / "evil.py").write_text(PLUGIN, "utf-8")
     (tmp_path / "evil.yaml").write_text(SCENARIO, "utf-8")
-    command = [sys.executable, "-m", "cosmos_cli.app", "run", str(tmp_path / "evil.yaml")]
-    command += ["--json", "--quiet", "--no-report", "--runs", str(tmp_path / "runs")]
-    for setting in (f"parameters.evil={evil}", *settings):
-        command += ["--set", setting]
-    done = subprocess.run(
-        command,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-        env={**os.environ, "COSMOS_STATE_DIR": str(tmp_path / "state")},
-    )
-    result = json.loads(done.stdout)
-    assert done.returncode == result["exit_code"], done.stderr
+    scenario = tmp_path / "evil.yaml"
+    _, result = CosmosCommand(tmp_path).run(scenario, f"parameters.evil={evil}", *settings)
     return result

@@ -79,6 +79,7 @@ class Watch:
         self.inside += self.error_s <= self.estimate.uncertainty_s(now_s)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drift", [-600e-6, -50e-6, 0.0, 150e-6])
 @pytest.mark.parametrize(
     ("there_s", "back_s"), [(1e-4, 1e-4), (5e-5, 4e-4), (1e-3, 5e-5), (2e-5, 2e-5)]

@@ -11,12 +11,13 @@ from madns_runtime.timing.rate import (
     Pacer,
     RealTimeFactor,
     TickTiming,
+    count_ticks,
     stagger,
 )
 
 
-def make_pacer(tick_hz=10.0, phase_s=0.0, duration_s=1.0, tolerance_s=0.005):
-    return Pacer(tick_hz=tick_hz, phase_s=phase_s, duration_s=duration_s, tolerance_s=tolerance_s)
+def make_pacer(tick_hz=10.0, phase_s=0.0, duration_s=1.0, overrun_s=0.005):
+    return Pacer(tick_hz=tick_hz, phase_s=phase_s, duration_s=duration_s, overrun_s=overrun_s)
 
 
 def run_tick(pacer, begin_s, end_s):
@@ -39,9 +40,16 @@ def run_tick(pacer, begin_s, end_s):
         (1.0, 1e-12, 1),
         (100.0, 86_400.0, 8_640_000),
         (1e-3, 4000.0, 4),
+        (100.0, 1e7, 1_000_000_000),
+        (10_000.0, 315_576_000.0, 3_155_760_000_000),  # the fastest rate for the longest run
+        (33.3, 0.3, 10),  # 9.99
+        (0.3, 10.0, 3),
+        (10.0, 0.7 + 1e-7, 8),  # a tick of its own
+        (10.0, 0.7 + 1e-12, 7),
     ],
 )
 def test_tick_count_is_robust_to_rounding(tick_hz, duration_s, expected):
+    assert count_ticks(duration_s, tick_hz) == expected
     assert make_pacer(tick_hz=tick_hz, duration_s=duration_s).tick_count == expected
 
 
@@ -65,7 +73,7 @@ def test_duration_of_whole_ticks_holds_exactly_that_many(rate, count):
         {"tick_hz": math.nan},
         {"duration_s": 0.0},
         {"duration_s": math.inf},
-        {"tolerance_s": -1e-9},
+        {"overrun_s": -1e-9},
         {"phase_s": -0.01},
         {"phase_s": 0.1},
     ],
@@ -197,7 +205,7 @@ def test_last_tick_is_run_while_its_period_lasts():
     ],
 )
 def test_overrun_is_a_warning_up_to_the_tolerance_and_an_error_beyond(end_s, warnings, errors):
-    pacer = make_pacer(tick_hz=4.0, tolerance_s=0.0078125)
+    pacer = make_pacer(tick_hz=4.0, overrun_s=0.0078125)
 
     _, margin_s = run_tick(pacer, 0.0, end_s)
 

@@ -147,6 +147,14 @@ class Board:
         return False
 
     @property
+    def cpu_s(self) -> float | None:
+        """Processor time, s, that its programs have used since it was switched on; None while it is off."""
+        with contextlib.suppress(OSError, ValueError):
+            text = (self.surroundings.cgroup / "cpu.stat").read_text()
+            return int(text.split("usage_usec ", 1)[1].split()[0]) / 1e6
+        return None
+
+    @property
     def is_listening(self) -> bool:
         """Whether its sshd takes connections."""
         with contextlib.suppress(OSError):
@@ -259,6 +267,7 @@ class Board:
             "init": self.init,
             "is_link_up": self.condition.is_link_up,
             "is_frozen": self.is_frozen,
+            "cpu_s": self.cpu_s,
             "loss_percent": self.condition.loss_percent,
             "has_disk_failed": self.disk.has_failed,
             "trouble": self.condition.trouble,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,9 @@ AUTHORIZED = f"/home/{USER}/.ssh/authorized_keys"
 HOST_KEY = "/etc/ssh/ssh_host_ed25519_key"
 OWN_KEY = f"{HOST_KEY}.own"
 NO_SSHD = "/run/tower/no-sshd"
+CUTS = "/run/tower/cuts"
+"""Grows by one line each time that connections were cut."""
+CUT_PATIENCE_S = 20.0
 READ_ONLY = kernel.MS_REMOUNT | kernel.MS_BIND | kernel.MS_RDONLY
 WRITABLE = kernel.MS_REMOUNT | kernel.MS_BIND
 
@@ -202,6 +206,25 @@ def _set_sshd(scene: Scene, is_running: bool) -> None:
         scene.board.signal(signal.SIGHUP)
 
 
+def _cut_connections(scene: Scene) -> None:
+    """Break them, and return when that is done: the board's first process may have to wait for a processor."""
+
+    def count() -> int:
+        return scene.board.run_inside(lambda: len(read_lines(CUTS)))  # type: ignore[no-any-return]
+
+    before, until_s = count(), time.monotonic() + CUT_PATIENCE_S
+    scene.board.signal(signal.SIGUSR1)
+    while count() == before:
+        if time.monotonic() > until_s:
+            raise BoardError(f"{scene.board.name}: not cut in {CUT_PATIENCE_S:g} s; is it frozen?")
+        time.sleep(0.02)
+
+
+def read_lines(path: str) -> list[str]:
+    """Return the lines of a file; none if it is not there."""
+    return Path(path).read_text().splitlines() if Path(path).exists() else []
+
+
 def _write(scene: Scene, path: str, text: str) -> None:
     def act() -> None:
         Path(path).write_text(text)
@@ -261,9 +284,7 @@ FAULTS: dict[str, Fault] = {
     "own-host-key": Fault(act=lambda s: _set_host_key(s, True), text="change it back"),
     "stop-sshd": Fault(act=lambda s: _set_sshd(s, False), text="refuse new connections"),
     "start-sshd": Fault(act=lambda s: _set_sshd(s, True), text="accept them again"),
-    "cut": Fault(
-        act=lambda s: s.board.signal(signal.SIGUSR1), text="break every ssh connection it has"
-    ),
+    "cut": Fault(act=_cut_connections, text="break every ssh connection it has"),
     "throttle": Fault(
         act=lambda s: _write(s, "/run/tower/throttled", f"{s.argument or '0x0'}\n"),
         text="let vcgencmd get_throttled say so",

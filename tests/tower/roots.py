@@ -122,7 +122,7 @@ def _build(arch: str, cache: Path) -> None:
     names = ",".join((*PACKAGES, *PACKAGES_MORE.get(arch, ())))
     command = [*ALONE, "mmdebstrap", f"--arch={arch}", "--variant=minbase", f"--include={names}"]
     command += [f"--dpkgopt={option}" for option in DPKG_OPTIONS]
-    command += [SUITE, str(folder / "root"), *_sources()]
+    command += [SUITE, str(folder / "root"), *debian_sources()]
     try:
         with open(log, "w") as out:
             run = subprocess.run(
@@ -155,7 +155,7 @@ def _enter_workshop(builder: int, arch: str) -> None:
     register_emulators([arch])
 
 
-def _sources() -> list[str]:
+def debian_sources() -> list[str]:
     """Return this computer's own sources of the suite, as sources.list lines."""
     form = "deb $(REPO_URI) $(CODENAME) $(COMPONENT)"
     command = ["apt-get", "indextargets", "--format", form, "Created-By: Packages"]

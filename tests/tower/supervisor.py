@@ -30,7 +30,7 @@ from .specification import TowerSpec
 POLL_S = 0.02
 """How often booting boards are looked at; nothing is polled while all are up."""
 REQUEST_BYTES_MAX = 65_536
-REQUEST_PATIENCE_S = 5.0
+REQUEST_PATIENCE_S = 30.0
 START_PATIENCE_S = 120.0
 EXPECTED_ERRORS = (BoardError, DiskError, NetworkError, OSError)
 

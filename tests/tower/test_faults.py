@@ -27,6 +27,10 @@ while True:
 """
 
 
+TRIES = 20
+PAUSE_S = 0.1
+
+
 def connects(tower: Tower, name: str) -> bool:
     """Whether a board answers as an SSH server within SHORT_S."""
     try:
@@ -35,6 +39,15 @@ def connects(tower: Tower, name: str) -> bool:
             return connection.recv(4) == b"SSH-"
     except OSError:
         return False
+
+
+def answers(tower: Tower, name: str) -> bool:
+    """Whether a board answers within some tries: on a busy computer one alone may take longer than SHORT_S."""
+    for _ in range(TRIES):
+        if connects(tower, name):
+            return True
+        time.sleep(PAUSE_S)
+    return False
 
 
 def start(tower: Tower, name: str, command: str) -> subprocess.Popen[str]:
@@ -56,10 +69,10 @@ def is_refused(tower: Tower, name: str, command: str = "true") -> str:
 def test_cable_is_pulled_and_plugged(tower8):
     tower8.fault("pi01", "down")
     assert not connects(tower8, "pi01")
-    assert connects(tower8, "pi02")
+    assert answers(tower8, "pi02")
 
     tower8.fault("pi01", "up")
-    assert connects(tower8, "pi01")
+    assert answers(tower8, "pi01")
 
 
 def test_pulled_cable_stays_pulled_through_a_reboot(tower8):
@@ -76,7 +89,7 @@ def test_frozen_board_says_nothing_and_goes_on_after_thaw(tower8):
     assert not connects(tower8, "pi02")
 
     tower8.fault("pi02", "thaw")
-    assert connects(tower8, "pi02")
+    assert answers(tower8, "pi02")
 
 
 def test_share_of_packets_is_lost_each_way_and_none_after(tower8):
@@ -154,7 +167,7 @@ def test_power_stays_off_until_it_is_on(tower8):
 
     tower8.fault("pi06", "poweron")
     tower8.wait_until_on("pi06")
-    assert connects(tower8, "pi06")
+    assert answers(tower8, "pi06")
 
 
 def test_full_disk_refuses_to_write_and_has_room_again(tower8):
@@ -183,7 +196,7 @@ def test_disk_fails_under_open_files_until_the_next_boot(tower8):
     assert writer.stdout is not None and writer.stdout.readline() == "here\n"
 
     tower8.fault("pi08", "ro")
-    out, err = writer.communicate("text\n", timeout=30)
+    out, err = writer.communicate("text\n", timeout=120)
 
     assert "Read-only file system" in err
     assert out == "kept\n"  # it can still be read
@@ -217,11 +230,11 @@ def test_users_key_is_a_strangers(tower8):
 
 def test_host_key_changes_and_changes_back(tower8):
     tower8.fault("pi03", "new-host-key")
-    tower8.wait_until(lambda _: connects(tower8, "pi03"), "pi03", "listening")
+    tower8.wait_until(lambda _: answers(tower8, "pi03"), "pi03", "listening")
     assert "REMOTE HOST IDENTIFICATION HAS CHANGED" in is_refused(tower8, "pi03")
 
     tower8.fault("pi03", "own-host-key")
-    tower8.wait_until(lambda _: connects(tower8, "pi03"), "pi03", "listening")
+    tower8.wait_until(lambda _: answers(tower8, "pi03"), "pi03", "listening")
     tower8.run("pi03", "true")
 
 
@@ -231,7 +244,7 @@ def test_sshd_stops_and_starts(tower8):
     assert "refused" in is_refused(tower8, "pi04")
 
     tower8.fault("pi04", "start-sshd")
-    tower8.wait_until(lambda _: connects(tower8, "pi04"), "pi04", "open")
+    tower8.wait_until(lambda _: answers(tower8, "pi04"), "pi04", "open")
 
 
 def test_connections_are_cut_and_new_ones_taken(tower8):
@@ -240,8 +253,10 @@ def test_connections_are_cut_and_new_ones_taken(tower8):
 
     tower8.fault("pi05", "cut")
 
-    session.communicate(timeout=30)
-    assert session.returncode == 255
+    assert (
+        session.wait(timeout=120) == 255
+    )  # its input stays open: the end of that would end it, too
+    session.communicate()
     tower8.run("pi05", "true")
 
 

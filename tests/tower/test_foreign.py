@@ -12,7 +12,8 @@ from .roots import EMULATORS, REGISTRY, cache_folder, ensure_root, why_unavailab
 from .specification import BoardSpec
 from .tower import Tower
 
-pytestmark = [pytest.mark.root, pytest.mark.timeout(1200)]  # the first use builds the systems
+# The first use builds the systems.
+pytestmark = [pytest.mark.root, pytest.mark.nightly, pytest.mark.timeout(1200)]
 
 MACHINES = {"arm64": "aarch64", "armhf": "armv7l"}
 

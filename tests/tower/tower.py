@@ -175,7 +175,7 @@ class Tower:
             time.sleep(POLL_S)
 
     def run(
-        self, name: str, command: str, *, timeout_s: float = 30.0, check: bool = True
+        self, name: str, command: str, *, timeout_s: float = 120.0, check: bool = True
     ) -> subprocess.CompletedProcess[str]:
         """Run a command on a board as its user, by OpenSSH's own client."""
         return subprocess.run(

@@ -10,11 +10,11 @@ from cosmos_cli.models.inventory.load import (
     load_machines,
     read_inventory,
 )
-from cosmos_cli.models.inventory.machine import Machine
+from cosmos_cli.models.inventory.machine import LOOPBACK, Machine, Variables
 from cosmos_cli.models.inventory.names import MACHINES_MAX, expand
-from cosmos_cli.models.inventory.variables import Variables
 
 __all__ = [
+    "LOOPBACK",
     "MACHINES_MAX",
     "Inventory",
     "Machine",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 ALL = "all"
@@ -17,7 +18,7 @@ GROUPS_MAX = 2000
 
 
 @dataclass(slots=True)
-class Group:
+class InventoryGroup:
     """One group while the inventory is read."""
 
     name: str
@@ -26,6 +27,10 @@ class Group:
     """Of the inventory itself."""
     file_variables: dict[str, Any] = field(default_factory=dict)
     """Of group_vars, which win over those of every group in the inventory itself."""
+    folders: dict[bool, Path] = field(default_factory=dict)
+    """Folder from which the files of its steps are found: for `variables` under False, `file_variables` under True."""
+    device_folders: dict[bool, Path] = field(default_factory=dict)
+    """The same of the files of its devices."""
     children: dict[str, None] = field(default_factory=dict)
     parents: dict[str, None] = field(default_factory=dict)
     machines: dict[str, None] = field(default_factory=dict)
@@ -36,13 +41,13 @@ class GroupTree:
     """All groups; `all` and `ungrouped` are always there."""
 
     def __init__(self) -> None:
-        self.groups: dict[str, Group] = {}
+        self.groups: dict[str, InventoryGroup] = {}
         self._depths: Mapping[str, int] = {}
         for name in (ALL, UNGROUPED):
             self.add(name)
         self.link(ALL, UNGROUPED)
 
-    def add(self, name: str) -> Group:
+    def add(self, name: str) -> InventoryGroup:
         """
         Return the group, made if it is new.
 
@@ -52,7 +57,7 @@ class GroupTree:
         if name not in self.groups:
             if len(self.groups) >= GROUPS_MAX:
                 raise ValueError(f"expected at most {GROUPS_MAX} groups")
-            self.groups[name] = Group(name)
+            self.groups[name] = InventoryGroup(name)
         return self.groups[name]
 
     def link(self, parent: str, child: str) -> None:
@@ -114,18 +119,19 @@ class GroupTree:
                     waiting.append(child)
         return depths
 
-    def memberships(self) -> dict[str, list[Group]]:
+    def memberships(self) -> dict[str, list[InventoryGroup]]:
         """Return the groups of each machine, the weakest first."""
         direct: dict[str, list[str]] = {}
         for group in self.groups.values():
             for machine in group.machines:
                 direct.setdefault(machine, []).append(group.name)
-        found: dict[tuple[str, ...], list[Group]] = {}
-        for names in {tuple(names) for names in direct.values()}:
-            found[names] = sorted(
+        found = {
+            names: sorted(
                 (self.groups[name] for name in self.above([*names, ALL])),
                 key=lambda group: (self._depths[group.name], group.priority, group.name),
             )
+            for names in {tuple(names) for names in direct.values()}
+        }
         return {machine: found[tuple(names)] for machine, names in direct.items()}
 
     def machines_of(self, name: str) -> list[str]:

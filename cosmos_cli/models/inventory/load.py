@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cosmos_cli.errors import Fault, InputError
-from cosmos_cli.models.inventory.groups import Group
-from cosmos_cli.models.inventory.machine import Machine
-from cosmos_cli.models.inventory.reader import Entry, Reader
-from cosmos_cli.models.inventory.sources import read_inventory_document, read_variables_document
-from cosmos_cli.models.inventory.variable_files import inventory_files, variable_files
-from cosmos_cli.models.inventory.variables import without_secrets
+from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault, InputError
+from cosmos_cli.models.inventory.groups import InventoryGroup
+from cosmos_cli.models.inventory.machine import (
+    PROVISION,
+    UNITED_NAMES,
+    Machine,
+    Variables,
+    without_secret,
+)
+from cosmos_cli.models.inventory.reader import MachineEntry, Reader
+from cosmos_cli.models.inventory.sources import (
+    inventory_files,
+    read_inventory_document,
+    read_variables_document,
+    variable_files,
+)
+from cosmos_cli.models.inventory_arguments import (
+    SOURCES_MAX,
+    Given,
+    folder_of,
+    is_machine_list,
+    sources_of,
+)
 from cosmos_cli.models.limit import select_machines
-from cosmos_cli.models.provision_steps import ProvisionStep
-
-LOCAL_CONNECTIONS = ("local", "ansible.builtin.local")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,41 +54,65 @@ class Inventory:
         return select_machines(self.machines, pattern, groups=self.groups)
 
 
-def load_machines(path: Path, limit: str | None = None) -> tuple[Machine, ...]:
+def load_machines(given: Given, limit: str | None = None) -> tuple[Machine, ...]:
     """
     Read an inventory and return the machines that --limit leaves of it.
 
     Raises:
         InputError: With every fault found; or the pattern names what there is not, or means no machine.
     """
-    return read_inventory(path).select(limit)
+    return read_inventory(given).select(limit)
 
 
-def read_inventory(path: Path) -> Inventory:
+def read_inventory(given: Given) -> Inventory:
     """
-    Read an inventory: a file, or a folder of files, with the group_vars and host_vars beside it.
+    Read an inventory: files, folders of files with the group_vars and host_vars beside each, lists of machines.
+
+    Of several sources the groups and machines are united and the variables merged; what comes later wins.
 
     Raises:
-        InputError: With every fault found, in the order of the file.
+        InputError: With every fault found, in the order of the sources.
     """
-    folder = path if path.is_dir() else path.parent
-    reader = Reader(folder)
-    for file in inventory_files(path):
-        with reader.gathering():
-            reader.read(read_inventory_document(file))
+    sources = sources_of(given)
+    reader = Reader()
+    if not sources or len(sources) > SOURCES_MAX:
+        raise InputError(f"-i: expected 1 to {SOURCES_MAX} inventories, got {len(sources)}")
+    for source in sources:
+        _read_source(reader, source)
     if not reader.machines and not reader.all_faults():
-        text = "expected at least one machine under hosts"
-        reader.faults.append(Fault(text=text, file=str(path), line=1, column=1))
+        is_one = len(sources) == 1
+        text = "expected at least one machine under hosts" + ("" if is_one else " in any of these")
+        place = 1 if is_one else None
+        reader.faults.append(Fault(text=text, file=", ".join(sources), line=place, column=place))
     reader.finish()
-    _read_variable_files(reader, folder)
+    for source in sources:
+        if not is_machine_list(source):
+            _read_variable_files(reader, folder_of(source))
     faults = reader.all_faults()
     if faults:
-        raise InputError(faults=without_secrets(faults))
+        first = [without_secret(fault) for fault in faults[:FAULTS_SHOWN_MAX]]
+        omitted = len(faults) - len(first) + reader.omitted
+        raise InputError(faults=first, omitted=omitted)
     return Inventory(machines=tuple(_machines(reader)), groups=tuple(reader.tree.groups))
 
 
+def _read_source(reader: Reader, source: str) -> None:
+    """Take over one source; its faults are gathered, so that those of the others are told, too."""
+    with reader.gathering():
+        if not source.strip():
+            raise InputError(faults=[Fault(text="expected a file, a folder or a list", file="-i")])
+        if is_machine_list(source):
+            reader.read_list(source)
+            return
+        reader.folder = folder_of(source)
+        for file in inventory_files(Path(source)):
+            with reader.gathering():
+                reader.read(read_inventory_document(file))
+
+
 def _read_variable_files(reader: Reader, folder: Path) -> None:
-    targets: tuple[tuple[str, Mapping[str, Group] | Mapping[str, Entry]], ...] = (
+    reader.folder = folder
+    targets: tuple[tuple[str, Mapping[str, InventoryGroup] | Mapping[str, MachineEntry]], ...] = (
         ("group_vars", reader.tree.groups),
         ("host_vars", reader.machines),
     )
@@ -88,29 +124,18 @@ def _read_variable_files(reader: Reader, folder: Path) -> None:
                 with reader.gathering():
                     document = read_variables_document(path)
                     if document is not None:
-                        reader.read_variables(document, entities[entity].file_variables)
+                        reader.read_variables(document, entities[entity])
 
 
-@dataclass(frozen=True, slots=True)
-class _Wants:
-    """What one group or machine asks for itself, beside what others ask for."""
-
-    packages: tuple[str, ...]
-    requirements: tuple[str, ...]
-    provision: tuple[ProvisionStep, ...]
-
-    @classmethod
-    def of(cls, entity: Group | Entry, folder: Path) -> _Wants:
-        values = entity.variables | entity.file_variables
-        steps = [
-            ProvisionStep.model_validate_json(json.dumps(step), strict=True)
-            for step in values.get("cosmos_provision") or ()
-        ]
-        return cls(
-            tuple(values.get("cosmos_packages") or ()),
-            tuple(values.get("cosmos_requirements") or ()),
-            tuple(step.with_source_in(folder) for step in steps),
-        )
+def _said_by(entity: InventoryGroup | MachineEntry) -> Variables:
+    """Return what one group or machine says of the lists that add up; steps find their files from its folder."""
+    values = entity.variables | entity.file_variables
+    said = Variables.of({name: values[name] for name in UNITED_NAMES if name in values})
+    if not said.cosmos_provision:
+        return said
+    folder = entity.folders.get(PROVISION in entity.file_variables, Path())
+    steps = tuple(step.with_source_in(folder) for step in said.cosmos_provision)
+    return said.model_copy(update={PROVISION: steps})
 
 
 def _machines(reader: Reader) -> Iterator[Machine]:
@@ -120,32 +145,43 @@ def _machines(reader: Reader) -> Iterator[Machine]:
     for group in groups:
         for index, machine in enumerate(reader.tree.machines_of(group)):
             positions[machine][group] = index
-    wants = {name: _Wants.of(group, reader.folder) for name, group in groups.items()}
+    said = {name: _said_by(group) for name, group in groups.items()}
     for name, entry in reader.machines.items():
-        own = [wants[group.name] for group in memberships[name]]
-        own.append(_Wants.of(entry, reader.folder))
-        variables: dict[str, Any] = {}
+        layers = [*(said[group.name] for group in memberships[name]), _said_by(entry)]
+        raw: dict[str, Any] = {}
         for layer in _layers(entry, memberships[name]):
-            variables |= layer
-        is_local = variables.get("ansible_connection") in LOCAL_CONNECTIONS
+            raw |= layer
+        united = {key: _union(layers, key) for key in UNITED_NAMES}
+        variables = Variables.of(raw).model_copy(update=united)
         yield Machine(
+            devices_folder=_devices_folder(entry, memberships[name]),
             name=name,
-            address=variables.get("ansible_ssh_host") or variables.get("ansible_host") or name,
-            connection="local" if is_local else "ssh",
+            address=variables.address or name,
+            connection=variables.connection,
             groups=tuple(group.name for group in memberships[name]),
             variables=variables,
-            packages=_union(want.packages for want in own),
-            requirements=_union(want.requirements for want in own),
-            provision=tuple(step for want in own for step in want.provision),
+            raw_variables=raw,
             positions=positions[name],
         )
 
 
-def _union(lists: Iterable[tuple[str, ...]]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(item for items in lists for item in items))
+def _union(layers: Iterable[Variables], name: str) -> tuple[Any, ...]:
+    """Return the entries of a list that adds up; of a name that several give, the first."""
+    entries = [entry for layer in layers for entry in getattr(layer, name) or ()]
+    is_text = all(isinstance(entry, str) for entry in entries)
+    return tuple(dict.fromkeys(entries) if is_text else entries)
 
 
-def _layers(entry: Entry, groups: list[Group]) -> Iterator[Mapping[str, Any]]:
+def _devices_folder(entry: MachineEntry, groups: list[InventoryGroup]) -> Path:
+    """Return the folder of the list of devices that wins, in the order of `_layers`."""
+    found = [group.device_folders.get(False) for group in groups]
+    found += [group.device_folders.get(True) for group in groups]
+    found += [entry.device_folders.get(False), entry.device_folders.get(True)]
+    folder = next((folder for folder in reversed(found) if folder is not None), None)
+    return Path() if folder is None else folder.absolute()  # a working folder may be gone
+
+
+def _layers(entry: MachineEntry, groups: list[InventoryGroup]) -> Iterator[Mapping[str, Any]]:
     """Yield variables in Ansible's order: files of variables win over every group in the inventory itself."""
     yield from (group.variables for group in groups)
     yield from (group.file_variables for group in groups)

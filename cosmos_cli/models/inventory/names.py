@@ -8,6 +8,7 @@ They mean what they mean to Ansible; a range that Ansible reads in a way that no
 from __future__ import annotations
 
 import itertools
+import math
 import re
 import string
 from collections.abc import Sequence
@@ -57,15 +58,38 @@ def expand(pattern: str) -> list[str]:
         pieces += [[pattern[position : match.start()]], _range(match.group(1))]
         position = match.end()
     pieces.append([pattern[position:]])
-    count = 1
-    for piece in pieces:
-        count *= len(piece)
+    count = math.prod(map(len, pieces))
     if count > MACHINES_MAX:
         raise ValueError(f"expected at most {MACHINES_MAX} machines, got {count}")
     names = ["".join(parts) for parts in itertools.product(*pieces)]
     for name in names:
         _check_name(name, pattern)
     return names
+
+
+def listed_machine(text: str) -> tuple[str, int | None]:
+    """
+    Return the name and the port of one machine of a list such as `pi01,pi02:2222,`.
+
+    Raises:
+        ValueError: It is no name of a machine, or a file or a range, which Ansible would take for a name.
+    """
+    if "/" in text or text.endswith((".yml", ".yaml", ".json")):
+        raise ValueError(
+            f"expected names of machines in a list, got {text!r}: give each file with an -i of its own"
+        )
+    if "[" in text:
+        raise ValueError(
+            f"Ansible knows no ranges in a list of machines: write each of {text!r}, or a file"
+        )
+    if "@" in text:
+        raise ValueError(
+            f"expected the name of a machine, got {text!r}: who logs in is said by ansible_user in a"
+            " file, or by User in ~/.ssh/config"
+        )
+    name, port = split_port(text)
+    _check_name(name, text)
+    return name, port
 
 
 def _check_name(name: str, pattern: str) -> None:

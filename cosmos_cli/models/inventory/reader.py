@@ -9,17 +9,29 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from cosmos_cli.errors import Fault, InputError
+from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault, InputError
 from cosmos_cli.models.document import Document, did_you_mean, kind_of
 from cosmos_cli.models.document import Path as ValuePath
-from cosmos_cli.models.inventory.groups import GroupTree
-from cosmos_cli.models.inventory.names import GROUP_NAME, MACHINES_MAX, expand, split_port
-from cosmos_cli.models.inventory.variables import GROUP_KEYS, PRIORITY, variable_faults
+from cosmos_cli.models.inventory.devices import DEVICES
+from cosmos_cli.models.inventory.groups import UNGROUPED, GroupTree, InventoryGroup
+from cosmos_cli.models.inventory.machine import (
+    GROUP_KEYS,
+    PRIORITY,
+    PROVISION,
+    variable_faults,
+)
+from cosmos_cli.models.inventory.names import (
+    GROUP_NAME,
+    MACHINES_MAX,
+    expand,
+    listed_machine,
+    split_port,
+)
 
 
 @dataclass(slots=True)
-class Entry:
-    """What was said about one machine while the inventory is read."""
+class MachineEntry:
+    """Variables and groups of one machine while the inventory is read."""
 
     first: Fault
     """An empty fault at the place where it is named first."""
@@ -27,18 +39,24 @@ class Entry:
     """Of the inventory itself."""
     file_variables: dict[str, Any] = field(default_factory=dict)
     """Of host_vars, which win."""
+    folders: dict[bool, Path] = field(default_factory=dict)
+    """Folders, as of a group."""
+    device_folders: dict[bool, Path] = field(default_factory=dict)
+    """Folders, as of a group."""
 
 
 @dataclass(slots=True)
 class Reader:
     """Collects groups and machines from one document after the other."""
 
-    folder: Path
-    """The inventory's, from which the files that steps name are found."""
+    folder: Path = Path()
+    """Of the source that is being read, from which the files that its steps name are found."""
     tree: GroupTree = field(default_factory=GroupTree)
-    machines: dict[str, Entry] = field(default_factory=dict)
+    machines: dict[str, MachineEntry] = field(default_factory=dict)
     """In the order of the file."""
     faults: list[Fault] = field(default_factory=list)
+    omitted: int = 0
+    """Number of further faults of files that could not be read at all."""
     scalar_faults: list[Fault] = field(default_factory=list)
     """Of single scalars: other faults at their places follow from them."""
 
@@ -49,6 +67,7 @@ class Reader:
             yield
         except InputError as error:
             self.faults += error.faults
+            self.omitted += error.omitted
 
     def read(self, document: Document) -> None:
         """Take over the groups of a document."""
@@ -60,11 +79,24 @@ class Reader:
             else:
                 self._group(document, name, value, (name,))
 
-    def read_variables(self, document: Document, variables: dict[str, Any]) -> None:
+    def read_list(self, source: str) -> None:
+        """Take over a list of machines, `pi01,pi02:2222,`; as in Ansible, one that is known already stays as it is."""
+        for text in filter(None, map(str.strip, source.split(","))):
+            first = Fault(text="", file=f"-i {source}")
+            try:
+                name, port = listed_machine(text)
+                if name in self.machines:
+                    _expect_port(self.machines[name], port)
+                else:
+                    self._enlist(UNGROUPED, first, ([name], port, {}))
+            except ValueError as error:
+                self.faults.append(dataclasses.replace(first, text=str(error)))
+
+    def read_variables(self, document: Document, entity: InventoryGroup | MachineEntry) -> None:
         """Take over the variables of a file of group_vars or host_vars."""
         self.scalar_faults += document.faults
         self.faults += variable_faults(document, (), document.value, self.folder)
-        variables |= document.value
+        self._keep(entity, document.value, is_file=True)
 
     def all_faults(self) -> list[Fault]:
         """Return every fault once, file by file in the order they were read, and from top to bottom."""
@@ -109,7 +141,8 @@ class Reader:
             elif key == "hosts":
                 self._hosts(document, name, content, (*path, key))
             else:
-                hint = did_you_mean(key, GROUP_KEYS)
+                is_shown = len(self.faults) < 2 * FAULTS_SHOWN_MAX
+                hint = did_you_mean(key, GROUP_KEYS) if is_shown else ""
                 self.faults.append(document.fault((*path, key), f"unknown key{hint}", at_key=True))
 
     def _variables(self, document: Document, group: str, value: Any, path: ValuePath) -> None:
@@ -122,9 +155,9 @@ class Reader:
                 self.tree.groups[group].priority = priority
             else:
                 text = f"expected a whole number, got {kind_of(priority)}"
-                self._fault(document, (*path, PRIORITY), text)
+                self.faults.append(document.fault((*path, PRIORITY), text))
         self.faults += variable_faults(document, path, variables, self.folder)
-        self.tree.groups[group].variables |= variables
+        self._keep(self.tree.groups[group], variables)
 
     def _children(self, document: Document, group: str, value: Any, path: ValuePath) -> None:
         children = {value: None} if isinstance(value, str) else value
@@ -145,16 +178,13 @@ class Reader:
                 self.faults += variable_faults(document, inner, variables, self.folder)
             try:
                 names, port = split_port(pattern)
-                self._enlist(document, group, inner, (expand(names), port, variables))
+                first = document.fault(inner, "", at_key=True)
+                self._enlist(group, first, (expand(names), port, variables))
             except ValueError as error:
                 self.faults.append(document.fault(inner, str(error), at_key=True))
 
     def _enlist(
-        self,
-        document: Document,
-        group: str,
-        path: ValuePath,
-        said: tuple[list[str], int | None, Mapping[str, Any]],
+        self, group: str, first: Fault, said: tuple[list[str], int | None, Mapping[str, Any]]
     ) -> None:
         """Put machines into a group; a port counts where a machine is named first, and nowhere else."""
         names, port, variables = said
@@ -162,17 +192,29 @@ class Reader:
             is_new = name not in self.machines
             if is_new and len(self.machines) >= MACHINES_MAX:
                 text = f"expected at most {MACHINES_MAX} machines"
-                raise InputError(faults=[document.fault(path, text, at_key=True)])
-            entry = self.machines.setdefault(name, Entry(document.fault(path, "", at_key=True)))
+                raise InputError(faults=[dataclasses.replace(first, text=text)])
+            entry = self.machines.setdefault(name, MachineEntry(first))
             if port is not None and is_new:
                 entry.variables["ansible_port"] = port
-            elif port is not None and entry.variables.get("ansible_port") != port:
-                first = f"{entry.first.file}:{entry.first.line}"
-                raise ValueError(
-                    f"Ansible ignores the port here: write it in {first}, which is first"
-                )
-            entry.variables |= variables
+            else:
+                _expect_port(entry, port)
+            self._keep(entry, variables)
             self.tree.groups[group].machines[name] = None
+
+    def _keep(
+        self,
+        entity: InventoryGroup | MachineEntry,
+        variables: Mapping[str, Any],
+        *,
+        is_file: bool = False,
+    ) -> None:
+        """Add variables to those of a group or a machine, and remember where the files of its steps are."""
+        kept = entity.file_variables if is_file else entity.variables
+        kept.update(variables)
+        if PROVISION in variables:
+            entity.folders[is_file] = self.folder
+        if DEVICES in variables:
+            entity.device_folders[is_file] = self.folder
 
     def _is_mapping(
         self, value: Any, document: Document, path: ValuePath
@@ -181,11 +223,24 @@ class Reader:
             text = f"expected a mapping, got {kind_of(value)}"
             if isinstance(value, list):
                 text += ": write `name:` instead of `- name`"
-            self._fault(document, path, text)
+            self.faults.append(document.fault(path, text))
         return isinstance(value, dict)
 
-    def _fault(self, document: Document, path: ValuePath, text: str) -> None:
-        self.faults.append(document.fault(path, text))
+
+def _expect_port(entry: MachineEntry, port: int | None) -> None:
+    """
+    Refuse a port at a machine that was named before.
+
+    Raises:
+        ValueError: It is another than what is known.
+    """
+    if port is not None and entry.variables.get("ansible_port") != port:
+        first = (
+            entry.first.file
+            if entry.first.line is None
+            else f"{entry.first.file}:{entry.first.line}"
+        )
+        raise ValueError(f"Ansible ignores the port here: write it in {first}, which is first")
 
 
 def _place(fault: Fault) -> tuple[str, int, int]:

@@ -13,6 +13,7 @@ world would: the host tells a rover what its sensor measures, and the rover comm
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
@@ -22,6 +23,7 @@ from madns_runtime.plugin.api import (
     HOST,
     AgentSimulation,
     Check,
+    DeclaredStream,
     HostSimulation,
     Simulation,
     Tick,
@@ -49,6 +51,21 @@ class RoverParameters:
 
 
 # --------------------------------------------------------------------------------------------------
+# All that is recorded: each stream's fields, with their units. A run remarks on what it records beside this.
+
+TRUTH = (Field("t_s", "s"), Field("agent", "", "str"), Field("position_m", "m"))
+DRIVE = (Field("tick", "", "int"), Field("measured_m", "m"), Field("speed_m_s", "m/s"))
+
+
+def declared_streams(parameters: RoverParameters, agents: tuple[str, ...]) -> list[DeclaredStream]:
+    """Return every stream that either half opens."""
+    return [
+        DeclaredStream(role="host", name="truth", fields=TRUTH),
+        DeclaredStream(role="agent", name="drive", fields=DRIVE),
+    ]
+
+
+# --------------------------------------------------------------------------------------------------
 # The host's half. It must never keep its caller waiting: a call may take a millisecond. Hand longer
 # work to `context.submit(function, *arguments)`; its value comes back through `result`.
 
@@ -64,19 +81,18 @@ class RoverHost(HostSimulation):
         self.t_s = 0.0
         self.position_m = dict.fromkeys(context.agents, 0.0)
         self.speed_m_s = dict.fromkeys(context.agents, 0.0)
+        self.refused = dict.fromkeys(context.agents, 0)
         first_m = context.parameters.distance_m
         self.mark_m = {name: first_m + index for index, name in enumerate(context.agents)}
         # One stream is one file of records: host/truth.jsonl in the run's directory.
-        context.open_stream(
-            "truth", (Field("t_s", "s"), Field("agent", "", "str"), Field("position_m", "m"))
-        )
+        context.open_stream("truth", TRUTH)
 
     def initial_data(self, agent: str) -> dict[str, Any]:
         # What one agent is told before the run starts: the argument `initial` of its setup.
         return {"mark_m": self.mark_m[agent]}
 
     def timer(self, t_s: float) -> float:
-        # Called when the run starts, and then at the simulated time that was returned last.
+        # Called when the run starts, and then for the simulated time that was returned last.
         step_s = max(0.0, t_s - self.t_s)
         self.t_s = t_s
         for name in self.position_m:
@@ -90,14 +106,24 @@ class RoverHost(HostSimulation):
 
     def receive(self, agent: str, message: Any) -> None:
         # A command of an agent. The world has limits, whatever the software asks for.
+        wanted_m_s = message["speed_m_s"]
+        if not math.isfinite(wanted_m_s):
+            # Every comparison with NaN is false: min and max would let it pass as full speed.
+            self.refused[agent] += 1
+            return
         limit_m_s = self.context.parameters.speed_max_m_s
-        self.speed_m_s[agent] = max(-limit_m_s, min(limit_m_s, message["speed_m_s"]))
+        self.speed_m_s[agent] = max(-limit_m_s, min(limit_m_s, wanted_m_s))
 
     def finish(self) -> dict[str, Any]:
         # The run's summary. Every line under "checks" is judged: one that has not passed makes
         # `cosmos run` end with exit code 4.
         limit_m = self.context.parameters.error_max_m
-        checks = []
+        worst = max(self.refused, key=lambda name: self.refused[name])
+        refused = sum(self.refused.values())
+        # worst names the agent whose value it is, where one check stands for all.
+        checks = [
+            Check(name="commands_refused", limit=0, got=refused, passed=refused == 0, worst=worst)
+        ]
         for name, position_m in self.position_m.items():
             error_m = abs(position_m - self.mark_m[name])
             passed = error_m <= limit_m
@@ -121,9 +147,7 @@ class RoverAgent(AgentSimulation):
         self.context = context
         self.mark_m = initial["mark_m"]
         self.measured_m: float | None = None
-        context.open_stream(
-            "drive", (Field("tick", "", "int"), Field("measured_m", "m"), Field("speed_m_s", "m/s"))
-        )
+        context.open_stream("drive", DRIVE)
 
     def receive(self, message: Any) -> None:
         # Called between ticks. Keep it short: remember what came, and act on it in step.
@@ -153,4 +177,7 @@ simulation = Simulation(
     parameters=RoverParameters,
     host=":RoverHost",
     agent=":RoverAgent",
+    streams=":declared_streams",
+    # What the view of a run shows of every agent while it goes on.
+    columns=("drive.measured_m", "drive.speed_m_s"),
 )

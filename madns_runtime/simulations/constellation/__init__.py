@@ -19,4 +19,13 @@ simulation = Simulation(
     agent=f"{_HERE}.agent:ConstellationAgent",
     demand=f"{_HERE}.demand:estimate_demand",
     check=f"{_HERE}.check:find_faults",
+    streams=f"{_HERE}.streams:declared_streams",
+    labels=f"{_HERE}.check:name_satellites",
+    label_column="satellite",
+    columns=("elements.a_m", "elements.e", "elements.mean_anomaly_deg"),
+    medium=f"{_HERE}.host:radio_of",
+    tabulate=f"{_HERE}.tabulation:tabulate_truth",
+    figures=f"{_HERE}.analysis.chapters:figures",
+    document=f"{_HERE}.analysis.slots:document",
+    compare=f"{_HERE}.analysis.chapters:compare",
 )

@@ -1,35 +1,37 @@
 """
 Faults of a constellation scenario that bounds cannot tell, found before anything is launched.
 
-Imports neither scipy nor sgp4: `cosmos validate` answers at once.
+Element sets have faults that their syntax does not show: SGP4 itself is asked, at the scenario's start and end.
+Imports neither scipy nor numpy: `cosmos validate` answers at once.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import math
+from datetime import datetime, timedelta
 from pathlib import Path
 
-from madns_runtime.errors import ConfigurationError
-from madns_runtime.simulations.constellation.check_board import board_faults
-from madns_runtime.simulations.constellation.check_code import code_faults
+from madns_runtime.errors import ConfigurationError, MissingExtraError
+from madns_runtime.simulations.constellation.check_vehicles import board_faults, code_faults
 from madns_runtime.simulations.constellation.parameters import (
     KNOTS_MAX,
-    BasiliskPropagator,
     ConstellationParameters,
     CustomPropagator,
     ElementSetSatellites,
     Sgp4Propagator,
 )
-from madns_runtime.simulations.constellation.truth.choice import choose
+from madns_runtime.simulations.constellation.truth.element_set import ElementSet
+from madns_runtime.simulations.constellation.truth.satellite_selection import (
+    SatelliteSelection,
+    choose,
+)
 
-LIBRARIES = {
-    "scipy": ("scipy", "host"),
-    "sgp4": ("sgp4", "host"),
-    "numba": ("numba", "fast"),
-    "basilisk": ("Basilisk", "basilisk"),
-}
-"""By the kind of propagator: the module that it needs, and the extra that brings it."""
+FIELD = "parameters.satellites.elements"
+AGE_DAYS_MAX = 366.0
+"""Between a set's epoch and the scenario's start. SGP4 is off by kilometres a day, after months by its whole orbit."""
+FAULTS_MAX = 20
+"""Satellites that are named."""
 
 
 def find_faults(
@@ -37,6 +39,7 @@ def find_faults(
     agents: int,
     base_directory: Path,
     names: tuple[str, ...] = (),
+    duration_s: float = 0.0,
 ) -> list[str]:
     """
     Return every fault as a line that starts with the dotted parameter name and a colon.
@@ -46,13 +49,15 @@ def find_faults(
         agents: Number of agents, each of which needs a satellite.
         base_directory: Folder of the scenario.
         names: The agents' names; globs are not judged without them.
+        duration_s: Of the run: SGP4 is asked for its end, too.
     """
     faults: list[str] = []
     folder = Path(base_directory)
     pairs: list[tuple[str, str]] = []
     try:
-        satellites = choose(parameters, agents, folder).names
-        pairs = list(zip(names, satellites, strict=False))
+        chosen = choose(parameters, agents, folder)
+        pairs = list(zip(names, chosen.names, strict=False))
+        faults += set_faults(parameters, chosen, duration_s)
     except ConfigurationError as error:
         faults += str(error).splitlines()
     faults += _propagator_faults(parameters, folder)
@@ -63,12 +68,25 @@ def find_faults(
     return faults
 
 
+def name_satellites(
+    parameters: ConstellationParameters, agents: tuple[str, ...], base_directory: Path
+) -> dict[str, str]:
+    """
+    Return the name of each agent's satellite; see `plugin.api.Simulation`.
+
+    Raises:
+        ConfigurationError: The satellites cannot be chosen, for the reasons that `find_faults` tells.
+    """
+    chosen = choose(parameters, len(agents), Path(base_directory))
+    return dict(zip(agents, chosen.names, strict=True))
+
+
 def _propagator_faults(parameters: ConstellationParameters, base_directory: Path) -> list[str]:
     propagator = parameters.propagator
     if isinstance(propagator, CustomPropagator):
         field = "parameters.propagator.implementation"
         return code_faults(field, propagator.implementation, base_directory)
-    if not isinstance(propagator, Sgp4Propagator):
+    if not propagator.PROPERTIES.needs_element_sets:
         faults = []
         if "two_body" not in propagator.forces:
             faults.append("parameters.propagator.forces: expected two_body among them")
@@ -78,7 +96,7 @@ def _propagator_faults(parameters: ConstellationParameters, base_directory: Path
     if isinstance(parameters.satellites, ElementSetSatellites):
         return []
     return [
-        "parameters.propagator.kind: sgp4 needs element sets, give satellites.elements; "
+        f"parameters.propagator.kind: {propagator.kind} needs element sets, give satellites.elements; "
         "patterns and Keplerian elements need kind: scipy"
     ]
 
@@ -99,14 +117,15 @@ def _segment_faults(parameters: ConstellationParameters) -> list[str]:
 def _attitude_faults(parameters: ConstellationParameters) -> list[str]:
     """Return rigid bodies that the propagator cannot do, or that turn too fast for the knots."""
     faults = []
-    by_basilisk = isinstance(parameters.propagator, BasiliskPropagator)
+    propagator = parameters.propagator
+    by_engine = propagator.PROPERTIES.turns_bodies
     for number, vehicle in enumerate(parameters.vehicles):
         attitude, field = vehicle.attitude, f"parameters.vehicles[{number}].attitude"
         if attitude is None:
             continue
-        if by_basilisk and attitude.wheels is not None:
+        if by_engine and attitude.wheels is not None:
             faults.append(
-                f"{field}.wheels: basilisk does rigid bodies without wheels only; drop them, which "
+                f"{field}.wheels: {propagator.kind} does rigid bodies without wheels only; drop them, which "
                 "makes torques exact and without limit, or take kind: scipy or numba"
             )
         turn_deg = math.hypot(*attitude.rates_deg_s) * parameters.segments.knot_s
@@ -119,13 +138,88 @@ def _attitude_faults(parameters: ConstellationParameters) -> list[str]:
 
 
 def _missing_libraries(parameters: ConstellationParameters) -> list[str]:
-    wanted = {parameters.propagator.kind: "parameters.propagator.kind"}
+    wanted = {parameters.propagator.PROPERTIES: "parameters.propagator.kind"}
     if isinstance(parameters.satellites, ElementSetSatellites):
-        wanted["sgp4"] = "parameters.satellites.elements"
+        wanted[Sgp4Propagator.PROPERTIES] = "parameters.satellites.elements"
     faults = []
-    for kind, field in wanted.items():
-        module, extra = LIBRARIES.get(kind, (None, None))
+    for properties, field in wanted.items():
+        module = properties.library
         if module is not None and importlib.util.find_spec(module) is None:
-            install = f"pip install 'cosmos-madns[{extra}]'"
+            install = f"pip install 'cosmos-madns[{properties.extra}]'"
             faults.append(f"{field}: {module} is not installed here; install it with: {install}")
     return faults
+
+
+def set_faults(
+    parameters: ConstellationParameters, chosen: SatelliteSelection, duration_s: float
+) -> list[str]:
+    """
+    Return the faults of the element sets that fly, each with file and line.
+
+    Args:
+        parameters: Of the scenario.
+        chosen: Who flies, and from when on.
+        duration_s: Of the run, simulated.
+    """
+    faults = _twice(chosen.element_sets)
+    for element_set in chosen.element_sets:
+        fault = _age_fault(element_set, chosen.epoch_utc) or _perigee_fault(element_set)
+        fault = fault or _sgp4_fault(element_set, parameters, chosen.epoch_utc, duration_s)
+        if fault:
+            faults.append(f"{element_set.place}: {element_set.name}: {fault}")
+    more = len(faults) - FAULTS_MAX
+    return [
+        *(f"{FIELD}: {fault}" for fault in faults[:FAULTS_MAX]),
+        *([f"{FIELD}: and {more} more"] if more > 0 else []),
+    ]
+
+
+def _twice(element_sets: tuple[ElementSet, ...]) -> list[str]:
+    """Return satellites of which two sets would fly: both in one place, or one out of date."""
+    first: dict[str, ElementSet] = {}
+    faults = []
+    for element_set in element_sets:
+        number = element_set.catalogue_number
+        # Fragments of one body share a name; a set without a number has no other.
+        what = f"catalogue number {number}" if number else f"name {element_set.name}"
+        before = first.setdefault(what, element_set)
+        if before is not element_set:
+            faults.append(
+                f"{element_set.place}: {element_set.name}: expected every satellite once, got {what} "
+                f"as in {before.place}; choose by satellites.names"
+            )
+    return faults
+
+
+def _age_fault(element_set: ElementSet, epoch_utc: datetime) -> str | None:
+    if abs((epoch_utc - element_set.epoch_utc) / timedelta(days=1)) <= AGE_DAYS_MAX:
+        return None
+    return (
+        f"expected an epoch within {AGE_DAYS_MAX:g} days of the start {epoch_utc:%Y-%m-%d}, got "
+        f"{element_set.epoch_utc:%Y-%m-%d}; take sets of that time, or give parameters.epoch_utc"
+    )
+
+
+def _perigee_fault(element_set: ElementSet) -> str | None:
+    perigee_km = element_set.perigee_km
+    if perigee_km >= 0.0:
+        return None
+    return f"expected a perigee above the ground, got {perigee_km:.0f} km by its mean motion and eccentricity"
+
+
+def _sgp4_fault(
+    element_set: ElementSet,
+    parameters: ConstellationParameters,
+    epoch_utc: datetime,
+    duration_s: float,
+) -> str | None:
+    try:
+        # sgp4 may be missing, or not asked for.
+        from madns_runtime.simulations.constellation.truth.propagators.sgp4_records import why_not
+    except MissingExtraError:
+        return None  # told by itself, with the command that installs it
+    fault = why_not(element_set, epoch_utc, 0.0)
+    if fault is None and parameters.propagator.PROPERTIES.needs_element_sets:
+        # Who falls meanwhile is lost at that time, as on_agent_loss says.
+        fault = why_not(element_set, epoch_utc, duration_s, may_fall=True)
+    return fault

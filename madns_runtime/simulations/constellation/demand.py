@@ -1,4 +1,4 @@
-"""What a constellation asks of host and network, for the inequalities 2.7-2.10: encoded and timed, not guessed."""
+"""Demands of a constellation on host and network, for the inequalities 2.7-2.10: encoded and timed, not guessed."""
 
 from __future__ import annotations
 
@@ -17,14 +17,16 @@ from madns_runtime.protocol.codec import pack
 from madns_runtime.simulations.constellation.messages import Command, Segment
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters, Maneuvers
-from madns_runtime.simulations.constellation.truth.effects import Effect
-from madns_runtime.simulations.constellation.truth.fleet import load_fleet
-from madns_runtime.simulations.constellation.truth.jobs import VehicleRequest, propagate_vehicle
+from madns_runtime.simulations.constellation.truth.initial_states import load_fleet
+from madns_runtime.simulations.constellation.truth.maneuvers.effects import Effect
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
     StretchRequest,
-    can_maneuver,
     propagate_stretch,
+)
+from madns_runtime.simulations.constellation.truth.vehicle_propagation import (
+    VehicleRequest,
+    propagate_vehicle,
 )
 
 TIMINGS = 5
@@ -73,7 +75,7 @@ def estimate_demand(
         lead_s=math.inf,
         measured=True,
     )
-    if parameters.flight is None or not can_maneuver(parameters.propagator):
+    if parameters.flight is None or not parameters.propagator.can_maneuver:
         return demand
     sync_bytes, sync_s = _maneuver(fleet.states[0], knot_s, 3 * intervals, propagation)
     return replace(

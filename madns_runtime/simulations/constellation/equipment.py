@@ -1,5 +1,5 @@
 """
-What a vehicle carries and is, as a person writes it in a scenario: thruster, wheels, body, sensors.
+Equipment and body of a vehicle, as a person writes them in a scenario: thruster, wheels, body, sensors.
 
 As in `parameters`: frozen dataclasses with bounds, the standard library and annotated_types alone.
 """
@@ -11,14 +11,10 @@ from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 
-from madns_runtime.config import FORBID_EXTRA
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Thruster:
-    """What turns a commanded delta-v into a real one."""
-
-    __pydantic_config__ = FORBID_EXTRA
+    """Errors and limits that turn a commanded delta-v into a real one."""
 
     isp_s: Annotated[float, Gt(0), Le(100_000)]
     """Specific impulse, s."""
@@ -36,9 +32,7 @@ class Thruster:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReactionWheels:
-    """What turns a commanded torque into a real one."""
-
-    __pydantic_config__ = FORBID_EXTRA
+    """Errors and limits that turn a commanded torque into a real one."""
 
     torque_n_m_max: Annotated[float, Gt(0)]
     """Largest torque about each body axis, N m."""
@@ -51,8 +45,6 @@ class ReactionWheels:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Attitude:
     """A rigid body: quaternion (scalar last, inertial to body) and body rates are propagated as well."""
-
-    __pydantic_config__ = FORBID_EXTRA
 
     inertia_kg_m2: tuple[Annotated[float, Gt(0)], Annotated[float, Gt(0)], Annotated[float, Gt(0)]]
     """Principal moments of inertia about body x, y, z, kg m^2."""
@@ -69,12 +61,10 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorNoise:
-    """What every sensor may have. Units of the noise are those of the sensor's values."""
-
-    __pydantic_config__ = FORBID_EXTRA
+    """Errors that every sensor may have. Units of the noise are those of the sensor's values."""
 
     rate_hz: Annotated[float, Gt(0)] = 1.0
-    """Measurements a second; at most one a tick."""
+    """Measurements per second; at most one per tick."""
     noise: Annotated[float, Ge(0)] = 0.0
     """Standard deviation of white noise on each value."""
     bias: Annotated[float, Ge(0)] = 0.0
@@ -91,8 +81,6 @@ class SensorNoise:
 class Gnss(SensorNoise):
     """Position (m) and velocity (m/s) in the run's frame; `noise` and biases are those of position."""
 
-    __pydantic_config__ = FORBID_EXTRA
-
     velocity_noise_m_s: Annotated[float, Ge(0)] = 0.0
     """Standard deviation of white noise on each component of velocity, m/s."""
 
@@ -101,17 +89,13 @@ class Gnss(SensorNoise):
 class Magnetometer(SensorNoise):
     """Magnetic field in body axes, T; in the run's frame for a vehicle without attitude."""
 
-    __pydantic_config__ = FORBID_EXTRA
-
     field: Literal["dipole", "igrf"] = "dipole"
     """dipole: tilted dipole; igrf: the extra `igrf`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sensors:
-    """What a vehicle measures; absent sensors measure nothing."""
-
-    __pydantic_config__ = FORBID_EXTRA
+    """Sensors of a vehicle; absent ones measure nothing."""
 
     gnss: Gnss | None = None
     """Position and velocity."""
@@ -135,9 +119,7 @@ BallisticCoefficient = Annotated[float, Ge(0), Le(100)]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vehicle:
-    """What some of the vehicles are like."""
-
-    __pydantic_config__ = FORBID_EXTRA
+    """Description of some of the vehicles."""
 
     agents: Annotated[tuple[str, ...], MinLen(1)] = ("*",)
     """Globs of agents' or satellites' names; a vehicle is described by the first entry that fits."""
@@ -152,4 +134,4 @@ class Vehicle:
     attitude: Attitude | None = None
     """None: a point mass."""
     sensors: Sensors = field(default_factory=Sensors)
-    """What it measures."""
+    """Sensors on board."""

@@ -1,14 +1,13 @@
 """
 The host's half of the constellation: has truth computed ahead of time, hands it out, and lets commands change it.
 
-This file puts the parts together and passes on what happens; the parts lie in `hosting`, what they
+This file puts the parts together and passes on what happens; the parts lie in `host_side`, what they
 compute in `truth`. Agent number i of the run flies satellite number i.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,39 +15,37 @@ import numpy as np
 from madns_runtime.errors import PluginError
 from madns_runtime.plugin.api import HostContext, HostSimulation
 from madns_runtime.simulations.constellation.equipment import Vehicle
-from madns_runtime.simulations.constellation.hosting.conservation import Conservation
-from madns_runtime.simulations.constellation.hosting.maneuvering import Maneuvering
-from madns_runtime.simulations.constellation.hosting.refills import Refills
-from madns_runtime.simulations.constellation.hosting.supply import TruthSupply
-from madns_runtime.simulations.constellation.hosting.traffic import Traffic
+from madns_runtime.simulations.constellation.host_side.maneuver_execution import Maneuvering
+from madns_runtime.simulations.constellation.host_side.model_health import (
+    AttitudeSpacing,
+    Conservation,
+)
+from madns_runtime.simulations.constellation.host_side.radio import RadioMedium
+from madns_runtime.simulations.constellation.host_side.truth_distribution import Refills
+from madns_runtime.simulations.constellation.host_side.truth_propagation import TruthSupply
 from madns_runtime.simulations.constellation.messages import (
     Command,
     Initial,
-    Transmission,
 )
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
-from madns_runtime.simulations.constellation.truth.fleet import Fleet, load_fleet
-from madns_runtime.simulations.constellation.truth.maneuvers import ManeuverDesk, Rules
+from madns_runtime.simulations.constellation.truth.initial_states import InitialStates, load_fleet
+from madns_runtime.simulations.constellation.truth.maneuvers.effects import Timeline
+from madns_runtime.simulations.constellation.truth.maneuvers.rules import (
+    ManeuverDesk,
+    Rules,
+)
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
-    can_maneuver,
     conserved_by,
 )
+from madns_runtime.simulations.constellation.truth.propagators.rigid_body import initial_attitude
 from madns_runtime.simulations.constellation.truth.segments import TruthStore
 from madns_runtime.simulations.constellation.vehicles import vehicle_of
 
 WINDOWS_FIRST = 3
 """Windows computed before the start: two for the first buffer and the one after it."""
 SEED_MAX = 2**63
-
-
-@dataclass(slots=True)
-class _Lateness:
-    """Truth that came after its first sending was due."""
-
-    count: int = 0
-    s_max: float = 0.0
 
 
 class ConstellationHost(HostSimulation):
@@ -78,21 +75,38 @@ class ConstellationHost(HostSimulation):
         )
         pairs = zip(context.agents, fleet.names, strict=True)
         vehicles = [vehicle_of(parameters, agent, satellite) for agent, satellite in pairs]
-        knot_s = parameters.segments.knot_s
+        knot_s, has_drag = parameters.segments.knot_s, "drag" in self._propagation.forces
         self._store = store = TruthStore(
             len(context.agents),
             knots_per_window=max(1, round(parameters.segments.buffer_s / 2.0 / knot_s)),
             knot_s=knot_s,
             rigid=[n for n, vehicle in enumerate(vehicles) if vehicle.attitude is not None],
+            timelines=[
+                Timeline(
+                    v.ballistic_m2_kg, is_felt=has_drag and v.sensors.accelerometer is not None
+                )
+                for v in vehicles
+            ],
         )
         self._supply = TruthSupply(context, store, self._propagation, vehicles)
         # An exact propagation keeps what the epoch's states have.
         reference = conserved_by(fleet.states, self._propagation)
-        self._conservation = Conservation(context, self._supply, reference)
-        self._refills = Refills(context, self._supply, self._conservation)
+        self._conservation = Conservation(context, store, reference)
+        limit_rad = parameters.record.attitude_error_rad_max
+        self._spacing = None
+        if self._supply.has_rigid_bodies:
+            self._spacing = AttitudeSpacing(context, limit_rad=limit_rad, knot_s=knot_s)
+        self._refills = Refills(
+            context,
+            self._supply,
+            conservation=self._conservation,
+            spacing=self._spacing,
+            is_recorded=parameters.record.truth,
+        )
         self._maneuvering = self._make_maneuvering(vehicles)
-        self._traffic = self._make_traffic()
-        self._late = _Lateness()
+        self.radio = self._make_radio()
+        # Truth that came after its first sending was due.
+        self._late_count, self._late_s_max = 0, 0.0
         windows = min(WINDOWS_FIRST, self._refills.windows)
         self._supply.submit(windows, fleet.states, _attitude_at_epoch(fleet, vehicles))
 
@@ -111,20 +125,15 @@ class ConstellationHost(HostSimulation):
 
     def receive(self, agent: str, message: Any) -> None:
         """
-        Take a command, or what a vehicle says by radio.
+        Take a command.
 
         Raises:
-            PluginError: It is neither, or the scenario has no flight software.
+            PluginError: It is none, or the scenario has no flight software.
         """
         kind = message.get("kind") if isinstance(message, Mapping) else None
-        if kind == Command.KIND and self._maneuvering is not None:
-            self._maneuvering.receive(self._index[agent], Command.from_message(message))
-        elif kind == Transmission.KIND and self._traffic is not None:
-            self._traffic.receive(self._index[agent], Transmission.from_message(message))
-        else:
-            raise PluginError(
-                f"constellation: {agent}: expected a command or a transmission, got {message!r:.200}"
-            )
+        if kind != Command.KIND or self._maneuvering is None:
+            raise PluginError(f"constellation: {agent}: expected a command, got {message!r:.200}")
+        self._maneuvering.receive(self._index[agent], Command.from_message(message))
 
     def timer(self, t_s: float) -> float | None:
         """Do what is due and return when to come back."""
@@ -133,19 +142,17 @@ class ConstellationHost(HostSimulation):
             # Before truth is forgotten that a maneuver, late by however much, begins from.
             times_s.append(self._maneuvering.timer(t_s))
         times_s.append(self._refills.timer(t_s))
-        if self._traffic is not None:
-            times_s.append(self._traffic.timer(t_s))
+        if self.radio is not None:
+            times_s.append(self.radio.timer(t_s))
         return min((time_s for time_s in times_s if time_s is not None), default=None)
 
     def result(self, job: int, value: Any) -> None:
         """Take a part of truth or a change of it; truth that comes after its first sending was due is counted."""
-        if self._maneuvering is not None and self._maneuvering.result(job, value):
-            return
         window, now_s = self._store.end, self._context.now_s()
-        if not self._supply.result(job, value):
-            return
-        self._enter_late(window, now_s, "came")
-        self._refills.submit_if_due(now_s)
+        self._supply.jobs.take(job, value)
+        if self._store.end > window:
+            self._enter_late(window, now_s, "came")
+            self._refills.submit_if_due(now_s)
 
     def agent_lost(self, agent: str, reason: str) -> None:
         """Send it no more; its truth goes on."""
@@ -165,7 +172,8 @@ class ConstellationHost(HostSimulation):
         # SGP4 averages and drags: its energy moves by design and is recorded, not judged.
         if self._propagation.conserves_energy and not self._supply.has_drag:
             got = conservation.energy_drift
-            checks.append(_check("constellation.energy_drift", limit, got, got <= limit))
+            worst = conservation.energy_drift_agent or None
+            checks.append(_check("constellation.energy_drift", limit, got, worst))
         summary: dict[str, Any] = {
             "propagator": self._parameters.propagator.kind,
             "frame": self._parameters.frame,
@@ -174,19 +182,23 @@ class ConstellationHost(HostSimulation):
             "satellites": dict(zip(self._index, self._fleet.names, strict=True)),
             "segments_sent": self._refills.segments_sent,
             "propagations": self._supply.propagations,
-            "truth_late": self._late.count,
-            "truth_late_s_max": self._late.s_max,
+            "truth_late": self._late_count,
+            "truth_late_s_max": self._late_s_max,
             "energy_drift_max": conservation.energy_drift,
             "energy_drift_agent": conservation.energy_drift_agent,
             "momentum_z_drift_max": conservation.momentum_z_drift,
         }
+        if self._spacing is not None:
+            values, judged = self._spacing.finish()
+            summary |= values
+            checks += judged
         if self._maneuvering is not None:
             summary["maneuvers"] = maneuvers = self._maneuvering.finish()
             broken = maneuvers["inequality_broken"]
             name = "constellation.maneuver_deadlines_broken"
-            checks.append(_check(name, 0, broken, broken == 0))
-        if self._traffic is not None:
-            summary |= self._traffic.finish()
+            checks.append(_check(name, 0, broken, maneuvers["inequality_broken_agent"]))
+        if self.radio is not None:
+            summary |= self.radio.finish()
         return summary | {"checks": checks}
 
     def _enter_late(self, window: int, now_s: float, what: str) -> None:
@@ -194,8 +206,8 @@ class ConstellationHost(HostSimulation):
         late_s = self._refills.lateness_s(window, now_s)
         if window < WINDOWS_FIRST or late_s <= 0.0:
             return
-        self._late.count += 1
-        self._late.s_max = max(self._late.s_max, late_s)
+        self._late_count += 1
+        self._late_s_max = max(self._late_s_max, late_s)
         self._context.log(
             "warning",
             f"truth from {window * self._store.window_s:g} s on {what} {late_s:.3f} s too late; "
@@ -209,45 +221,45 @@ class ConstellationHost(HostSimulation):
             return None
         rules = Rules(
             settings=parameters.maneuvers,
-            can_maneuver=can_maneuver(parameters.propagator),
+            can_maneuver=parameters.propagator.can_maneuver,
             duration_s=context.duration_s,
             tick_hz=context.tick_hz,
             knot_s=self._store.knot_s,
             seed=int(context.random.integers(SEED_MAX)),
         )
-        desk = ManeuverDesk(rules, context.agents, vehicles, self._supply.timelines)
+        desk = ManeuverDesk(rules, context.agents, vehicles, self._store.timelines)
         if rules.can_maneuver:
             self._supply.warm_up(self._fleet.states)
         return Maneuvering(context, self._supply, self._refills, desk)
 
-    def _make_traffic(self) -> Traffic | None:
+    def _make_radio(self) -> RadioMedium | None:
         """Return who carries messages; nobody without flight software and radio."""
         parameters = self._parameters
         if parameters.crosslinks is None and not parameters.stations:
             return None
         names, epoch_utc = self._fleet.names, self._fleet.epoch_utc
-        return Traffic(self._context, parameters, names, epoch_utc, self._store)
+        return RadioMedium(self._context, parameters, names, epoch_utc, self._store)
 
     def _epoch_text(self) -> str:
         return self._fleet.epoch_utc.isoformat().replace("+00:00", "Z")
 
 
+def radio_of(host: ConstellationHost, context: HostContext) -> RadioMedium | None:
+    """Return the medium of a run's messages between vehicles; see `plugin.api.Simulation.medium`."""
+    return host.radio
+
+
 def _attitude_at_epoch(
-    fleet: Fleet, vehicles: list[Vehicle]
+    fleet: InitialStates, vehicles: list[Vehicle]
 ) -> np.ndarray[Any, np.dtype[np.float64]] | None:
     """Return quaternions and rates of the rigid bodies, shape (M, 7); None without any."""
-    if all(vehicle.attitude is None for vehicle in vehicles):
-        return None
-    # Imported here: it needs scipy, which point masses may do without.
-    from madns_runtime.simulations.constellation.truth.attitude import initial_attitude
-
     rows = [
         initial_attitude(vehicle.attitude, state[:3], state[3:])
         for vehicle, state in zip(vehicles, fleet.states.tolist(), strict=True)
         if vehicle.attitude is not None
     ]
-    return np.array(rows)
+    return np.array(rows) if rows else None
 
 
-def _check(name: str, limit: float, got: float, passed: bool) -> dict[str, Any]:
-    return {"name": name, "limit": limit, "got": got, "passed": passed}
+def _check(name: str, limit: float, got: float, worst: str | None) -> dict[str, Any]:
+    return {"name": name, "limit": limit, "got": got, "passed": got <= limit, "worst": worst}

@@ -1,10 +1,12 @@
 """
-What the two halves of the constellation say to each other, as dataclasses that become mappings.
+Messages between the two halves of the constellation, as dataclasses that become mappings.
 
 Pure. A mapping has the fields and "kind", the kind of message; a command's own kind is under "command".
 
-    agent -> host    Command (SYNC, deadline: its time), Transmission
-    host -> agent    Initial, Segment, CommandResult, Delivery, Refusal
+    agent -> host    Command (SYNC, deadline: its time)
+    host -> agent    Initial, Segment, CommandResult
+
+What vehicles say to each other and to the ground travels as the framework's messages between agents do.
 """
 
 from __future__ import annotations
@@ -18,11 +20,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from madns_runtime.errors import PluginError
+from madns_runtime.protocol.messages import Delivery, TransmissionRefusal
 from madns_runtime.simulations.constellation.parameters import KNOTS_MAX
 from madns_runtime.simulations.constellation.thrust import Thrust, Vector
 
-EVERYBODY = "*"
-"""Receiver of a broadcast."""
+__all__ = [
+    "GROUND",
+    "Command",
+    "CommandFrame",
+    "CommandKind",
+    "CommandResult",
+    "CommandStatus",
+    "Delivery",
+    "Initial",
+    "Message",
+    "Segment",
+    "TransmissionRefusal",
+    "is_for_ground",
+]
+
 GROUND = "ground"
 """Receiver of what is for any ground station; ground:NAME for one of them."""
 
@@ -32,7 +48,7 @@ CommandStatus = Literal["accepted", "executed", "postponed", "refused"]
 
 
 class Message:
-    """What travels between the halves: a dataclass that becomes a mapping and is read back by its fields' types."""
+    """Base of all messages between the halves: a dataclass that becomes a mapping and is read back by its fields' types."""
 
     __slots__ = ()
     KIND: ClassVar[str]
@@ -107,7 +123,7 @@ class Segment(Message):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Initial(Message):
-    """What an agent sets itself up from, at the start or when it rejoins."""
+    """First message to an agent, at the start or when it rejoins."""
 
     KIND = "initial_data"
 
@@ -118,12 +134,12 @@ class Initial(Message):
     segment: Segment | None
     """Truth from now on; None if the host itself has none yet."""
     more: tuple[Segment, ...] = ()
-    """What follows it, where maneuvers have cut truth into pieces."""
+    """Further segments, where maneuvers have cut truth into pieces."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Command(Message):
-    """What flight software wants done to its own vehicle."""
+    """Wish of flight software to change its own vehicle."""
 
     KIND = "command"
 
@@ -146,7 +162,7 @@ class Command(Message):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CommandResult(Message):
-    """What became of a command."""
+    """Result of a command."""
 
     KIND = "command_result"
 
@@ -155,59 +171,14 @@ class CommandResult(Message):
     """accepted: truth holds it; postponed: the same, at a later time than wanted; executed: its time is over
     and nothing can take it back; refused: not executed, see reason."""
     at_s: float
-    """When it is, or would have been, executed."""
+    """Time at which it is, or would have been, executed, s."""
     revision: int
     """Of the truth that holds it; the one before if it was refused."""
     reason: str = ""
     delta_v_m_s: float = 0.0
     """Magnitude really given."""
     propellant_kg: float = 0.0
-    """Left afterwards."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Transmission(Message):
-    """A message that a vehicle hands to its radio."""
-
-    KIND = "transmission"
-
-    to: str
-    """An agent's or satellite's name, * for all in view, ground or ground:NAME."""
-    sent_s: float
-    """Simulated time of the tick that sent it."""
-    number: int
-    """The agent's own, from 0 on."""
-    payload: Any
-    """As any message between the halves."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Delivery(Message):
-    """A message that a vehicle's radio hears."""
-
-    KIND = "delivery"
-
-    sender: str
-    """An agent's name, or ground:NAME."""
-    sent_s: float
-    arrives_s: float
-    """Simulated time at which it is heard: flight software gets it in the first tick at or after it."""
-    payload: Any
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Refusal(Message):
-    """A message that a vehicle handed to its radio and that never left it, or met nobody."""
-
-    KIND = "refusal"
-
-    number: int
-    """The message's."""
-    to: str
-    """As it was sent."""
-    sent_s: float
-    reason: str
-    """no_radio or too_long, found on board; or what the host found, see `truth.medium.REFUSED`."""
+    """Propellant left after the command, kg."""
 
 
 def is_for_ground(to: str) -> bool:
@@ -231,11 +202,15 @@ _FIELDS: dict[type[Message], tuple[_Field, ...]] = {}
 def _fields(cls: type[Message]) -> tuple[_Field, ...]:
     """Return how each field of a message travels."""
     if cls not in _FIELDS:
-        found = []
-        for field in fields(cast("Any", cls)):
-            key = cls.KIND if field.name == "kind" else field.name
-            found.append(_Field(field.name, key, str(field.type), *_WAYS[str(field.type)]))
-        _FIELDS[cls] = tuple(found)
+        _FIELDS[cls] = tuple(
+            _Field(
+                field.name,
+                cls.KIND if field.name == "kind" else field.name,
+                str(field.type),
+                *_WAYS[str(field.type)],
+            )
+            for field in fields(cast("Any", cls))
+        )
     return _FIELDS[cls]
 
 

@@ -1,5 +1,5 @@
 """
-What a person may set in a scenario of the constellation.
+Parameters of the constellation, as a person sets them in a scenario.
 
 Frozen dataclasses with bounds: the operator's side validates them, agents read them back with
 `madns_runtime.config.from_mapping`, which tries the members of a union in order; each member
@@ -10,11 +10,10 @@ are imported here.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 
-from madns_runtime.config import FORBID_EXTRA
 from madns_runtime.simulations.constellation.equipment import Vehicle
 
 Force = Literal["two_body", "j2", "j3", "j4", "drag"]
@@ -28,8 +27,6 @@ KNOTS_MAX = 100_000
 class ElementSetSatellites:
     """Satellites from a file of element sets."""
 
-    __pydantic_config__ = FORBID_EXTRA
-
     elements: Annotated[str, MinLen(1)]
     """File of TLE, or of OMM as CSV, JSON or XML; found from the scenario's folder."""
     names: tuple[str, ...] = ()
@@ -39,8 +36,6 @@ class ElementSetSatellites:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WalkerSatellites:
     """Satellites in a Walker pattern of circular orbits."""
-
-    __pydantic_config__ = FORBID_EXTRA
 
     walker: Annotated[str, MinLen(7)]
     """Inclination: satellites/planes/phasing, such as "86.4:66/6/2" (degrees for the first)."""
@@ -54,8 +49,6 @@ class WalkerSatellites:
 class KeplerianOrbit:
     """One satellite's osculating elements at the epoch; give a_km or altitude_km."""
 
-    __pydantic_config__ = FORBID_EXTRA
-
     name: Annotated[str, MinLen(1)]
     """Name of the satellite."""
     a_km: Annotated[float, Gt(6400), Le(1_000_000)] | None = None
@@ -66,11 +59,11 @@ class KeplerianOrbit:
     """Eccentricity."""
     i_deg: Annotated[float, Ge(0), Le(180)] = 0.0
     """Inclination, deg."""
-    raan_deg: float = 0.0
+    raan_deg: Annotated[float, Ge(-360), Le(360)] = 0.0
     """Right ascension of the ascending node, deg."""
-    argp_deg: float = 0.0
+    argp_deg: Annotated[float, Ge(-360), Le(360)] = 0.0
     """Argument of perigee, deg."""
-    mean_anomaly_deg: float = 0.0
+    mean_anomaly_deg: Annotated[float, Ge(-360), Le(360)] = 0.0
     """Mean anomaly, deg."""
 
 
@@ -78,17 +71,38 @@ class KeplerianOrbit:
 class KeplerianSatellites:
     """Satellites from osculating elements written in the scenario."""
 
-    __pydantic_config__ = FORBID_EXTRA
-
     keplerian: Annotated[tuple[KeplerianOrbit, ...], MinLen(1)]
     """One entry a satellite."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PropagatorProperties:
+    """Properties of a propagator whatever its settings, known without its library."""
+
+    engine: str
+    """module:Class below `truth.propagators`; see `truth.propagation.Propagator`."""
+    library: str | None = None
+    """Module that it needs."""
+    extra: str = "host"
+    """Extra of the distribution that brings the library."""
+    is_independent: bool = False
+    """Whether a vehicle's neighbours in a call change none of its digits."""
+    conserves_energy: bool = False
+    """Whether it integrates known forces, so that without drag and thrust energy stays."""
+    needs_element_sets: bool = False
+    """Whether it starts from element sets, not from states."""
+    turns_bodies: bool = False
+    """Whether it integrates attitude itself, of bodies without wheels: `truth.propagators.attitude` does else."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScipyPropagator:
     """Numerical integration: DOP853 of scipy over all vehicles at once."""
 
-    __pydantic_config__ = FORBID_EXTRA
+    PROPERTIES: ClassVar = PropagatorProperties(
+        engine="scipy_propagator:ScipyDop853", library="scipy", conserves_energy=True
+    )
+    can_maneuver: ClassVar[bool] = True
 
     kind: Literal["scipy"]
     """scipy"""
@@ -106,7 +120,14 @@ class ScipyPropagator:
 class NumbaPropagator:
     """Numerical integration compiled to machine code, each vehicle at its own steps: extra `fast`."""
 
-    __pydantic_config__ = FORBID_EXTRA
+    PROPERTIES: ClassVar = PropagatorProperties(
+        engine="numba_propagator:NumbaDop853",
+        library="numba",
+        extra="fast",
+        is_independent=True,
+        conserves_energy=True,
+    )
+    can_maneuver: ClassVar[bool] = True
 
     kind: Literal["numba"]
     """numba"""
@@ -126,7 +147,12 @@ class NumbaPropagator:
 class Sgp4Propagator:
     """SGP4 from the element sets themselves (WGS-72, as the sets were fitted)."""
 
-    __pydantic_config__ = FORBID_EXTRA
+    PROPERTIES: ClassVar = PropagatorProperties(
+        engine="sgp4_propagator:Sgp4", library="sgp4", is_independent=True, needs_element_sets=True
+    )
+    can_maneuver: ClassVar[bool] = False
+    forces: ClassVar[tuple[Force, ...]] = ("two_body", "j2")
+    """Forces that it is judged by."""
 
     kind: Literal["sgp4"]
     """sgp4"""
@@ -136,7 +162,15 @@ class Sgp4Propagator:
 class BasiliskPropagator:
     """The Basilisk framework's spacecraft dynamics at a fixed step: extra `basilisk`."""
 
-    __pydantic_config__ = FORBID_EXTRA
+    PROPERTIES: ClassVar = PropagatorProperties(
+        engine="basilisk_propagator:Basilisk",
+        library="Basilisk",
+        extra="basilisk",
+        is_independent=True,
+        conserves_energy=True,
+        turns_bodies=True,
+    )
+    can_maneuver: ClassVar[bool] = True
 
     kind: Literal["basilisk"]
     """basilisk"""
@@ -152,7 +186,9 @@ class BasiliskPropagator:
 class CustomPropagator:
     """A propagator of one's own: a class with `propagate`, see `truth.propagation.Propagator`."""
 
-    __pydantic_config__ = FORBID_EXTRA
+    PROPERTIES: ClassVar = PropagatorProperties(engine="custom_propagator:Custom")
+    forces: ClassVar[tuple[Force, ...]] = ("two_body", "j2")
+    """Forces that it is judged by."""
 
     kind: Literal["custom"]
     """custom"""
@@ -167,16 +203,15 @@ class CustomPropagator:
 AnyPropagator = (
     ScipyPropagator | NumbaPropagator | Sgp4Propagator | BasiliskPropagator | CustomPropagator
 )
+"""All that there are: another one is a class of settings with its properties, and its engine's module."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Maneuvers:
-    """How commands that change truth are treated."""
-
-    __pydantic_config__ = FORBID_EXTRA
+    """Treatment of commands that change truth."""
 
     late: Literal["postpone", "refuse"] = "postpone"
-    """What becomes of a command that cannot be in truth by its time: executed at the first feasible time,
+    """Fate of a command that cannot be in truth by its time: executed at the first feasible time,
     or not at all."""
     propagation_s: Annotated[float, Gt(0), Le(60)] = 0.02
     """T_p: time allowed for propagating one vehicle anew; more is counted against the inequality."""
@@ -187,8 +222,6 @@ class Maneuvers:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Crosslinks:
     """Radio between vehicles: the host is the medium."""
-
-    __pydantic_config__ = FORBID_EXTRA
 
     range_km_max: Annotated[float, Gt(0)] = 5000.0
     """Longest link, km."""
@@ -207,8 +240,6 @@ class Crosslinks:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GroundStation:
     """A place on the ground that vehicles may speak to while it sees them."""
-
-    __pydantic_config__ = FORBID_EXTRA
 
     name: Annotated[str, MinLen(1)]
     """Messages to it go to ground:NAME, messages to any station to ground."""
@@ -230,28 +261,24 @@ class GroundStation:
 class Uplink:
     """A message that the ground has for a vehicle; it leaves in the first pass from its time on."""
 
-    __pydantic_config__ = FORBID_EXTRA
-
     at_s: Annotated[float, Ge(0)]
     """Simulated time from which it waits, s."""
     to: Annotated[str, MinLen(1)]
     """Agent or satellite."""
     text: str
-    """What flight software receives."""
+    """Text that flight software receives."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FlightSoftware:
+class FlightClass:
     """Flight software in Python: one class in one file."""
-
-    __pydantic_config__ = FORBID_EXTRA
 
     software: Annotated[str, MinLen(3)]
     """guidance.py:Guidance beside the scenario, or module:Class."""
     agents: Annotated[tuple[str, ...], MinLen(1)] = ("*",)
     """Globs of agents' or satellites' names that fly it; the others are not commanded."""
     input: Literal["measurements", "truth"] = "measurements"
-    """What it is given every tick."""
+    """Input at every tick."""
     settings: dict[str, Setting] = field(default_factory=dict)
     """For the class to read: context.settings."""
 
@@ -260,14 +287,12 @@ class FlightSoftware:
 class FlightProcess:
     """Flight software in any language: a program that speaks JSON lines on stdin and stdout."""
 
-    __pydantic_config__ = FORBID_EXTRA
-
     command: Annotated[tuple[str, ...], MinLen(1)]
     """The program and its arguments; a relative path is found from the scenario's folder."""
     agents: Annotated[tuple[str, ...], MinLen(1)] = ("*",)
     """Globs of agents' or satellites' names that fly it."""
     input: Literal["measurements", "truth"] = "measurements"
-    """What it is given every tick."""
+    """Input at every tick."""
     settings: dict[str, Setting] = field(default_factory=dict)
     """In the first line that it reads."""
     answer_s: Annotated[float, Gt(0)] = 1.0
@@ -276,9 +301,7 @@ class FlightProcess:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SegmentSettings:
-    """How truth travels to the agents."""
-
-    __pydantic_config__ = FORBID_EXTRA
+    """Way of truth to the agents."""
 
     knot_s: Annotated[float, Ge(0.01), Le(60)] = 1.0
     """Time between knots, s; cubic Hermite between them errs 2e-8 m in LEO at 1 s, and as its fourth power."""
@@ -288,14 +311,17 @@ class SegmentSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordSettings:
-    """What is recorded and what is judged."""
+    """Selection of what is recorded and judged."""
 
-    __pydantic_config__ = FORBID_EXTRA
+    truth: bool = True
+    """Whether the host records the truth that it sends, to the bit: `cosmos tabulate` makes a table of it."""
 
     state_hz: Annotated[float, Gt(0), Le(10_000)] | None = None
     """Rate at which agents record their state, Hz; none for every tick."""
     elements_hz: Annotated[float, Gt(0), Le(1000)] = 1.0
     """Rate at which agents record their osculating elements, Hz; at most the tick rate."""
+    attitude_error_rad_max: Annotated[float, Gt(0)] = 1e-4
+    """Most by which a rigid body's attitude between knots may be off, rad; a shorter segments.knot_s makes it less."""
     energy_drift_max: Annotated[float, Gt(0)] = 1e-9
     """Largest relative drift of a numerically propagated vehicle's specific orbital energy."""
 
@@ -304,10 +330,8 @@ class RecordSettings:
 class ConstellationParameters:
     """The parameters section of a constellation scenario."""
 
-    __pydantic_config__ = FORBID_EXTRA
-
     satellites: ElementSetSatellites | WalkerSatellites | KeplerianSatellites
-    """Which satellites fly; the first agent flies the first, and so on."""
+    """Satellites that fly; the first agent flies the first, and so on."""
     epoch_utc: str | None = None
     """UTC of simulated time zero, such as 2017-03-07T12:00:00Z; none for the latest epoch of the sets flown."""
     frame: Literal["TEME"] = "TEME"
@@ -315,20 +339,20 @@ class ConstellationParameters:
     gravity: Literal["EGM-96", "WGS-84", "WGS-72"] = "EGM-96"
     """Gravity constants of numerical propagation and of the recorded elements."""
     propagator: AnyPropagator = field(default_factory=lambda: ScipyPropagator(kind="scipy"))
-    """Who computes truth."""
+    """Propagator of truth."""
     vehicles: tuple[Vehicle, ...] = (Vehicle(),)
-    """What the vehicles are like; the first entry that fits a vehicle describes it."""
+    """Descriptions of the vehicles; the first entry that fits a vehicle describes it."""
     maneuvers: Maneuvers = field(default_factory=Maneuvers)
-    """How commands that change truth are treated."""
-    flight: str | FlightSoftware | FlightProcess | None = None
+    """Treatment of commands that change truth."""
+    flight: str | FlightClass | FlightProcess | None = None
     """Flight software of the agents: file.py:Class, or with settings; none for vehicles that only coast."""
     crosslinks: Crosslinks | None = None
     """Radio between vehicles; none for no radio."""
     stations: tuple[GroundStation, ...] = ()
     """Ground stations."""
     uplinks: tuple[Uplink, ...] = ()
-    """What the ground has to say."""
+    """Messages from the ground."""
     segments: SegmentSettings = field(default_factory=SegmentSettings)
-    """How truth travels."""
+    """Way of truth to the agents."""
     record: RecordSettings = field(default_factory=RecordSettings)
-    """What is recorded."""
+    """Selection of what is recorded."""

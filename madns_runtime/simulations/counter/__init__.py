@@ -11,4 +11,7 @@ simulation = Simulation(
     host="madns_runtime.simulations.counter.host:CounterHost",
     agent="madns_runtime.simulations.counter.agent:CounterAgent",
     demand="madns_runtime.simulations.counter.demand:demand",
+    streams="madns_runtime.simulations.counter.parameters:declared_streams",
+    columns=("round_trips.round_trip_us",),
+    figures="madns_runtime.simulations.counter.analysis:figures",
 )

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from madns_runtime.plugin.api import HOST, AgentContext, AgentSimulation, Tick
+from madns_runtime.plugin.api import HOST, AgentContext, AgentSimulation, DeviceView, Tick
 from madns_runtime.protocol.messages import Service
-from madns_runtime.recording.records import Field
+from madns_runtime.simulations.counter.parameters import ROUND_TRIPS
 from madns_runtime.simulations.counter.round_trips import RoundTrips
 
 IN_FLIGHT_MAX = 10_000
@@ -32,14 +32,10 @@ class CounterAgent(AgentSimulation):
         self._returned_count = 0
         self._round_trips = RoundTrips()
         self._count_round_trip = self._round_trips.add
-        context.open_stream(
-            "round_trips",
-            (
-                Field("packet", "", "int"),
-                Field("value", "", "int"),
-                Field("round_trip_us", "us", "int"),
-            ),
-        )
+        context.open_stream("round_trips", ROUND_TRIPS)
+        name = context.parameters.send_device
+        self._device = context.hardware[name] if name and name in context.hardware else None
+        self._numbers: dict[str, int] = {}
 
     def step(self, tick: Tick) -> None:
         """Increment and send."""
@@ -50,6 +46,20 @@ class CounterAgent(AgentSimulation):
         self._in_flight[packet] = (self._context.now_s(), self._value)
         self._sent_count += 1
         self._context.send(HOST, [packet, self._value, self._payload], self._service)
+        if self._device is not None:
+            self._send_samples(self._device)
+
+    def _send_samples(self, device: DeviceView) -> None:
+        """Send [device, [[channel, number, time at which it was taken, value], ...]] of all that is new."""
+        samples = []
+        for channel in device.inputs:
+            reading = device[channel]
+            if reading.number > self._numbers.get(channel, 0):
+                self._numbers[channel] = reading.number
+                taken_s = self._context.now_s() - reading.age_s
+                samples.append([channel, reading.number, taken_s, reading.value])
+        if samples:
+            self._context.send(HOST, [device.name, samples], Service.BEST)
 
     def receive(self, message: Any) -> None:
         """Time a packet that came back."""

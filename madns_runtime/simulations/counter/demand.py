@@ -1,4 +1,4 @@
-"""What the counting benchmark asks of host and network."""
+"""Demands of the counting benchmark on host and network."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from madns_runtime.plugin.api import Demand, Flow
 from madns_runtime.protocol.codec import encode_message
 from madns_runtime.protocol.messages import SimulationData
-from madns_runtime.simulations.counter.parameters import CounterParameters
+from madns_runtime.simulations.counter.parameters import SAMPLE_BYTES, CounterParameters
 
 
 def demand(
@@ -20,11 +20,14 @@ def demand(
     """
     packet = [2**31, 2**32, bytes(parameters.payload_bytes)]
     size_bytes = len(encode_message(SimulationData(packet)))
+    flows = [
+        Flow(name="count up", message_bytes=size_bytes, rate_hz=tick_hz),
+        Flow(name="count back", message_bytes=size_bytes, rate_hz=tick_hz),
+    ]
+    if parameters.send_device:
+        flows.append(Flow(name="device samples", message_bytes=SAMPLE_BYTES, rate_hz=tick_hz))
     return Demand(
-        flows=(
-            Flow(name="count up", message_bytes=size_bytes, rate_hz=tick_hz),
-            Flow(name="count back", message_bytes=size_bytes, rate_hz=tick_hz),
-        ),
+        flows=tuple(flows),
         buffer_s=float("inf"),
         batch_bytes=0,
         batch_compute_s=0.0,

@@ -7,6 +7,8 @@ import pytest
 
 from cosmos_cli import app
 
+pytestmark = pytest.mark.process
+
 PLUGIN = """\
 from dataclasses import dataclass
 from madns_runtime.plugin.api import AgentSimulation, Simulation
@@ -25,7 +27,7 @@ SCENARIO = "name: a\nsimulation: ./p.py:simulation\nagents: {count: 3}\n"
 
 
 @pytest.fixture
-def cosmos(tmp_path, monkeypatch, capsys):
+def cosmos(tmp_path, monkeypatch, capfd):
     """Return a function that writes the plug-in, and runs a command on its scenario."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("COSMOS_DEBUG", raising=False)
@@ -34,7 +36,7 @@ def cosmos(tmp_path, monkeypatch, capsys):
     def run(plugin, verb, *arguments):
         (tmp_path / "p.py").write_text(plugin)
         code = app.run([verb, "a.yaml", *arguments])
-        captured = capsys.readouterr()
+        captured = capfd.readouterr()
         return code, captured.out, captured.err
 
     yield run

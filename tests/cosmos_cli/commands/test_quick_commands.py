@@ -1,6 +1,8 @@
 """The commands that start nothing: init, validate, schema, plan, inventory; and how errors leave."""
 
+import errno
 import json
+import math
 import os
 import subprocess
 import sys
@@ -11,11 +13,14 @@ import pytest
 from cosmos_cli import app
 from cosmos_cli.commands.init import render
 from cosmos_cli.errors import ExitCode, RunFailedError
+from cosmos_cli.launch.feasibility import Resources, judge
+from cosmos_cli.launch.plan_view import verdict_words
 from madns_runtime.errors import MachineError, PluginError
+from madns_runtime.plugin.api import Demand
 
 ROOT = Path(__file__).parents[3]
 SCENARIO = "name: a\nsimulation: counter\nagents: {count: 3}\n"
-TEMPLATES = ("benchmark", "constellation", "plugin")
+TEMPLATES = ("benchmark", "constellation", "plugin", "device")
 
 
 @pytest.fixture
@@ -62,7 +67,41 @@ def test_validate_json_holds_the_whole_scenario(cosmos):
     result = json.loads(out)
     assert (code, err, result["valid"]) == (0, "", True)
     assert result["scenarios"][0]["scenario"]["seed"] == 7
-    assert result["scenarios"][0]["scenario"]["deadline"]["tolerance_ms"] == 5.0
+    assert result["scenarios"][0]["scenario"]["deadline"]["overrun_ms"] == 5.0
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("plan", "b.yaml"),
+        ("run", "b.yaml", "--no-report"),
+        ("run", "b.yaml", "--check"),
+        ("diff", "--run", "b.yaml", "a.yaml"),
+        ("doctor", "b.yaml"),
+        ("up", "b.yaml", "--check", "-i", "i.yaml"),
+    ],
+    ids=" ".join,
+)
+def test_each_command_that_reads_a_scenario_tells_an_old_name_once(cosmos, monkeypatch, command):
+    lockstep = "time: {mode: lockstep, duration_s: 0.2}\n"
+    Path("a.yaml").write_text(SCENARIO + lockstep)
+    Path("b.yaml").write_text(SCENARIO + lockstep + "deadline: {tolerance_ms: 5}\n")
+    Path("i.yaml").write_text("all: {hosts: {here: {ansible_connection: local}}}\n")
+
+    _, _, err = cosmos(*command)
+
+    assert err.count("deadline.tolerance_ms: is an old name: write deadline.overrun_ms") == 1
+
+
+def test_validate_tells_old_names_on_stderr_and_is_content(cosmos):
+    Path("b.yaml").write_text(SCENARIO + "deadline: {tolerance_ms: 5}\n")
+
+    code, out, err = cosmos("validate", "b.yaml")
+
+    assert code == ExitCode.OK
+    assert out.startswith("b.yaml: ok")
+    assert "b.yaml:4:12: deadline.tolerance_ms: is an old name: write deadline.overrun_ms" in err
 
 
 def test_faults_are_json_on_stdout_too(cosmos):
@@ -84,6 +123,7 @@ def test_faults_are_json_on_stdout_too(cosmos):
     assert err == "--set seed: expected a whole number, got 'x'\n"
 
 
+@pytest.mark.slow
 def test_schema_is_printed_written_and_checked(cosmos):
     _, out, _ = cosmos("schema")
     assert cosmos("schema", "-o", "s.json")[0] == 0
@@ -136,6 +176,25 @@ def test_plan_of_an_impossible_run_ends_with_4(cosmos):
 
     assert code == ExitCode.BUDGET_BROKEN
     assert out.splitlines()[-1] == "3 agents cannot keep real time: inequality 2.10 is broken"
+
+
+def test_plan_names_several_broken_inequalities_in_the_plural():
+    demand = Demand(
+        flows=(),
+        buffer_s=math.inf,
+        batch_bytes=0,
+        batch_compute_s=0,
+        sync_bytes=1,
+        sync_compute_s=1.0,
+        sync_rate_hz=1.0,
+        lead_s=0.01,
+        measured=False,
+    )
+    resources = Resources(workers=1, bandwidth_bytes_s=1e9, latency_s=0.0)
+
+    words = verdict_words(judge(demand, resources, agents=2, tick_hz=10))
+
+    assert words == "2 agents cannot keep real time: inequalities 2.8 and 2.9 are broken"
 
 
 def test_plan_over_an_inventory_as_json(cosmos):
@@ -198,6 +257,7 @@ def test_plan_without_a_latency_measures_loopback(cosmos):
     assert 0 < resources["latency_s"] < 0.05
 
 
+@pytest.mark.process
 def test_plan_of_a_simulation_that_does_not_tell_its_demand(cosmos):
     cosmos("init", "rover", "--template", "plugin")
 
@@ -236,6 +296,7 @@ def test_limit_to_nothing_is_bad_input(cosmos):
     assert err == "error: --limit twer: no machine or group is named twer, did you mean tower?\n"
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("template", TEMPLATES)
 def test_templates_validate_as_they_are(cosmos, template):
     code, out, err = cosmos("init", "my-sim", "--template", template, "-d", "new")
@@ -246,11 +307,30 @@ def test_templates_validate_as_they_are(cosmos, template):
     assert cosmos("validate", "new/my-sim.yaml")[0] == 0
 
 
-@pytest.mark.parametrize("template", TEMPLATES)
+@pytest.mark.parametrize("template", (*TEMPLATES, "package"))
 def test_templates_leave_no_placeholder(template):
     files = render(template, "my-sim")
 
-    assert all("@NAME@" not in text and "@NAME@" not in str(path) for path, text in files.items())
+    assert files
+    for path, text in files.items():
+        assert not [word for word in ("@NAME@", "@MODULE@") if word in text or word in str(path)]
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("4cars", "Python can import"),
+        ("class", "Python can import"),
+        ("json", "is taken"),
+        ("counter", "is taken"),
+    ],
+)
+def test_package_has_a_name_that_can_be_imported_and_is_free(cosmos, name, text):
+    code, _, err = cosmos("init", name, "--template", "package")
+
+    assert code == ExitCode.BAD_INPUT
+    assert text in err
+    assert os.listdir() == ["a.yaml"]
 
 
 def test_init_overwrites_nothing(cosmos):
@@ -338,6 +418,29 @@ def test_unexpected_error_names_the_file_with_its_traceback(cosmos, monkeypatch)
     saved.unlink()
 
 
+@pytest.mark.parametrize("option", ["--workers", "--maneuvers-at-once"])
+def test_plan_refuses_counts_beyond_all_measure(cosmos, option):
+    code, _, err = cosmos("plan", "a.yaml", option, "1" + "0" * 400)
+
+    assert code == 2
+    assert option in err
+    assert "unexpected" not in err
+
+
+@pytest.mark.parametrize("error", [errno.ENOSPC, errno.EROFS])
+def test_unexpected_error_is_told_where_no_file_takes_its_traceback(cosmos, monkeypatch, error):
+    def refuse(**_):
+        raise OSError(error, os.strerror(error))
+
+    monkeypatch.setattr("tempfile.mkstemp", refuse)
+    fail_with(monkeypatch, ZeroDivisionError("by nought"))
+    code, _, err = cosmos("validate", "a.yaml")
+
+    assert code == 1
+    assert err.startswith("error: unexpected ZeroDivisionError: by nought\n")
+    assert f"COSMOS_DEBUG=1 shows; it could not be kept in a file: {os.strerror(error)}" in err
+
+
 def test_unexpected_error_shows_its_traceback_when_asked(cosmos, monkeypatch):
     fail_with(monkeypatch, ZeroDivisionError("by nought"))
     monkeypatch.setenv("COSMOS_DEBUG", "1")
@@ -412,3 +515,17 @@ def test_interrupt_ends_with_130_and_no_traceback(cosmos, monkeypatch):
     fail_with(monkeypatch, KeyboardInterrupt())
 
     assert cosmos("validate", "a.yaml") == (ExitCode.INTERRUPTED, "", "interrupted\n")
+
+
+@pytest.mark.process
+def test_plugin_of_the_template_records_what_it_declares_and_shows_it(cosmos):
+    cosmos("init", "rover", "--template", "plugin")
+    settings = ("--set", "time.mode=lockstep", "--no-report", "--json", "--quiet")
+
+    code, out, _ = cosmos("run", "rover.yaml", *settings)
+
+    document = json.loads(out)
+    assert code == 0
+    assert [text for text in document["remarks"] if "declared" in text] == []
+    own = document["columns"]["agent-01"]
+    assert own["drive.measured_m"] == pytest.approx(5.0, abs=0.1)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from cosmos_cli.doctor.finding import HERE, Finding, Level, Remark, grouped
+from cosmos_cli.doctor.finding import HERE, CheckRemark, Finding, Severity, grouped
 
 
 def finding(machine: str, check: str = "governor", **remark: object) -> Finding:
-    values = {"level": Level.WARNING, "found": "slow", "cure": "faster"} | remark
-    return Finding(machine=machine, check=check, remark=Remark(**values))  # type: ignore[arg-type]
+    values = {"level": Severity.WARNING, "found": "slow", "cure": "faster"} | remark
+    return Finding(machine=machine, check=check, remark=CheckRemark(**values))  # type: ignore[arg-type]
 
 
 def test_same_finding_of_many_machines_is_one_group() -> None:
@@ -55,7 +55,7 @@ def test_many_details_are_cut() -> None:
 
 
 def test_details_of_what_is_well_are_left_out() -> None:
-    (group,) = grouped([finding(n, level=Level.OK, detail=n) for n in "ab"])
+    (group,) = grouped([finding(n, level=Severity.OK, detail=n) for n in "ab"])
 
     assert group.found == "slow"
 
@@ -63,11 +63,11 @@ def test_details_of_what_is_well_are_left_out() -> None:
 def test_worst_comes_first() -> None:
     groups = grouped(
         [
-            finding("a", "one", level=Level.OK),
-            finding("a", "two", level=Level.ERROR),
-            finding("a", "three", level=Level.NOTE),
-            finding("a", "four", level=Level.WARNING),
-            finding("a", "five", level=Level.ERROR),
+            finding("a", "one", level=Severity.OK),
+            finding("a", "two", level=Severity.ERROR),
+            finding("a", "three", level=Severity.NOTE),
+            finding("a", "four", level=Severity.WARNING),
+            finding("a", "five", level=Severity.ERROR),
         ]
     )
 

@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 
 from cosmos_cli.doctor.case import Case, Wants
-from cosmos_cli.doctor.finding import HERE, Finding, Level
+from cosmos_cli.doctor.finding import HERE, Finding, Severity
 from cosmos_cli.doctor.judge import CHECKS, judge
+from cosmos_cli.models.scenario import Scenario
 
 FOLDER = Path(__file__).parent
 HEALTHY: dict[str, Any] = json.loads((FOLDER / "healthy.json").read_text())
@@ -38,7 +39,7 @@ def judged(case: dict[str, Any]) -> list[Finding]:
     is_here = bool(case.get("here"))
     told = told_with(case.get("change", {}), is_here=is_here)
     machine = HERE if is_here else "pi04"
-    return judge(Case.of(machine, told, Wants(**case.get("wants", {})), is_here=is_here))
+    return judge(Case.of(machine, told, Wants(**case.get("wants", {}))))
 
 
 def named(case: dict[str, Any]) -> str:
@@ -63,11 +64,21 @@ def test_check_finds(case: dict[str, Any]) -> None:
     assert bool(fitting["cure"]) == (fitting["level"] != "ok")
 
 
+@pytest.mark.parametrize(
+    ("deadline", "expected"),
+    [({"overrun_ms": 2}, 2.0), ({"overrun_ms": 2, "lateness_ms": 0.5}, 0.5), ({}, 5.0)],
+)
+def test_wake_ups_are_held_against_the_lateness_that_the_scenario_allows(deadline, expected):
+    scenario = Scenario(name="a", simulation="counter", agents={"count": 1}, deadline=deadline)
+
+    assert Wants.of(scenario, {}, machines=0).lateness_ms == expected
+
+
 @pytest.mark.parametrize("check", CHECKS)
 def test_every_check_is_tried_red_and_green(check: str) -> None:
     mine = [case for case in CASES if case["check"] == check]
     healthy = [f for f in judged({}) + judged({"here": True}) if f.check == check]
-    is_green = [f for f in healthy if f.level == Level.OK] or [
+    is_green = [f for f in healthy if f.level == Severity.OK] or [
         case for case in mine if case["expect"] is None or case["expect"]["level"] == "ok"
     ]
 
@@ -77,7 +88,7 @@ def test_every_check_is_tried_red_and_green(check: str) -> None:
 
 
 def test_healthy_machine_has_nothing_to_cure() -> None:
-    assert [f for f in judged({}) if f.level != Level.OK] == []
+    assert [f for f in judged({}) if f.level != Severity.OK] == []
 
 
 def test_machine_that_tells_little_is_judged_by_that() -> None:
@@ -89,6 +100,6 @@ def test_machine_that_tells_little_is_judged_by_that() -> None:
     told["kernel"] = {}
     told["receive_drops"] = {"total": None, "before": None}
 
-    findings = judge(Case.of("laptop", told, Wants(), is_here=False))
+    findings = judge(Case.of("laptop", told, Wants()))
 
-    assert {f.check for f in findings if f.level != Level.OK} == {"clock"}
+    assert {f.check for f in findings if f.level != Severity.OK} == {"clock"}

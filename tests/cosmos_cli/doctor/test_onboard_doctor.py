@@ -10,16 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from cosmos_cli.doctor.case import Wants
+from cosmos_cli.doctor.case import Case, Wants
 from cosmos_cli.doctor.finding import HERE
 from cosmos_cli.doctor.judge import judge
-from cosmos_cli.doctor.probe import ask, case_of
-from cosmos_cli.doctor.responder import Responder
+from cosmos_cli.doctor.probe import Responder, ask
 from cosmos_cli.fleet.local import LocalConnection, LocalStream
-from cosmos_cli.fleet.onboard import busy, doctor, interfaces, round_trips, wakeups
-from cosmos_cli.fleet.onboard.busy import Moment, Task
-from cosmos_cli.fleet.onboard.round_trips import ANSWER, ASK, SILENCE_COUNT_MAX, Datagram
 from cosmos_cli.fleet.target import Target
+from cosmos_cli.onboard import cpu_load, doctor, interfaces, timer_latency, udp_probe
+from cosmos_cli.onboard.cpu_load import Moment, Task
+from cosmos_cli.onboard.udp_probe import ANSWER, ASK, SILENCE_COUNT_MAX, Datagram
 
 NOBODY = 65534
 
@@ -36,7 +35,7 @@ def write(path: Path, text: str) -> None:
 def test_wake_ups_are_measured_in_another_process() -> None:
     before = os.sched_getscheduler(0)
 
-    told = wakeups.wake_ups(count=5, rate_hz=500.0, policy="auto", priority=1)
+    told = timer_latency.wake_ups(count=5, rate_hz=500.0, policy="auto", priority=1)
 
     assert 0 <= told["p50_ms"] <= told["p99_ms"] <= told["max_ms"]
     assert (told["policy"] == "fifo") == (told["refusal"] is None)
@@ -45,7 +44,7 @@ def test_wake_ups_are_measured_in_another_process() -> None:
 
 @pytest.mark.process
 def test_normal_scheduling_is_not_refused_but_not_asked_for() -> None:
-    told = wakeups.wake_ups(count=2, rate_hz=1000.0, policy="normal", priority=1)
+    told = timer_latency.wake_ups(count=2, rate_hz=1000.0, policy="normal", priority=1)
 
     assert (told["policy"], told["refusal"]) == ("normal", "not asked for")
 
@@ -64,10 +63,10 @@ def moment(at_s: float, ticks: dict[int, int], **more: int) -> Moment:
 
 
 def test_share_of_others_is_told_without_our_own() -> None:
-    second = busy.TICKS_A_SECOND
+    second = cpu_load.TICKS_A_SECOND
     after = moment(2.0, {os.getpid(): second, 50: second, 60: second, 70: second, 80: 2 * second})
 
-    told = busy.compare(moment(0.0, {}), after)
+    told = cpu_load.compare(moment(0.0, {}), after)
 
     assert told["processors"] == pytest.approx(1.5)
     assert [(item["pid"], item["processors"]) for item in told["top"]] == [(80, 1.0), (70, 0.5)]
@@ -77,11 +76,11 @@ def test_process_that_took_a_dead_ones_number_is_left_out() -> None:
     before, after = moment(0.0, {70: 0}), moment(1.0, {70: 500})
     after.tasks[70] = Task(name="other", parent=1, start=6, ticks=500)
 
-    assert busy.compare(before, after)["processors"] == 0
+    assert cpu_load.compare(before, after)["processors"] == 0
 
 
 def test_steal_is_a_share_of_all_time() -> None:
-    told = busy.compare(moment(0.0, {}), moment(1.0, {}, idle=150, steal=50))
+    told = cpu_load.compare(moment(0.0, {}), moment(1.0, {}, idle=150, steal=50))
 
     assert told["steal_share"] == 0.25
 
@@ -92,7 +91,7 @@ def test_counters_are_read_from_proc(tmp_path: Path) -> None:
     write(tmp_path / "stat", "cpu  1 2 3 4 5 6 7 8 9\ncpu0 1\n")
     write(tmp_path / "vmstat", "pswpin 3\npswpout 4\nother 9\n")
 
-    found = busy.look(str(tmp_path))
+    found = cpu_load.look(str(tmp_path))
 
     assert found.tasks == {7: Task(name="a (b) c", parent=1, start=999, ticks=42)}
     assert found.cpu_ticks["steal"] == 8
@@ -168,7 +167,7 @@ NONCE = b"n" * 16
 @pytest.mark.process
 def test_round_trips_are_measured_both_ways() -> None:
     with Responder() as responder:
-        told = round_trips.round_trips("127.0.0.1", responder.port, responder.nonce, 10)
+        told = udp_probe.round_trips("127.0.0.1", responder.port, responder.nonce, 10)
 
     assert (told["sent"], told["answered"], told["unasked"]) == (10, 10, 5)
     assert 0 < told["min_ms"] <= told["p50_ms"] <= told["max_ms"]
@@ -178,7 +177,7 @@ def test_round_trips_are_measured_both_ways() -> None:
 @pytest.mark.process
 def test_nobody_answers_a_stranger() -> None:
     with Responder() as responder:
-        told = round_trips.round_trips("127.0.0.1", responder.port, NONCE, 50)
+        told = udp_probe.round_trips("127.0.0.1", responder.port, NONCE, 50)
 
         assert responder.ignored == SILENCE_COUNT_MAX
     assert (told["sent"], told["answered"], told["p50_ms"]) == (SILENCE_COUNT_MAX, 0, None)
@@ -211,13 +210,13 @@ def deaf_every_fifth_time() -> Iterator[int]:
 
 @pytest.mark.process
 def test_losses_are_counted(deaf_every_fifth_time: int) -> None:
-    told = round_trips.round_trips("127.0.0.1", deaf_every_fifth_time, NONCE, 10)
+    told = udp_probe.round_trips("127.0.0.1", deaf_every_fifth_time, NONCE, 10)
 
     assert (told["sent"], told["answered"]) == (10, 8)
 
 
 def test_address_that_cannot_be_sent_to_is_an_error() -> None:
-    told = round_trips.round_trips("no.such.name.invalid", 9, NONCE, 3)
+    told = udp_probe.round_trips("no.such.name.invalid", 9, NONCE, 3)
 
     assert told["error"]
     assert told["sent"] == 0
@@ -274,7 +273,7 @@ def test_this_computer_can_be_probed_and_is_left_as_it_was(tmp_path: Path) -> No
     target = Target(name="pi01", address="127.0.0.1", connection="local", root=str(tmp_path))
 
     told = probed(LocalConnection(target))
-    findings = judge(case_of("pi01", told, Wants()))
+    findings = judge(Case.of("pi01", told, Wants()))
 
     assert {"system", "udp", "wake_up", "disk_write", "living"} <= {f.check for f in findings}
     assert list(tmp_path.iterdir()) == []
@@ -294,7 +293,7 @@ def test_ordinary_user_without_a_home_can_be_probed() -> None:
     )
 
     told = probed(OrdinaryConnection(target))
-    findings = {f.check: f for f in judge(case_of("pi01", told, Wants()))}
+    findings = {f.check: f for f in judge(Case.of("pi01", told, Wants()))}
 
     assert told["facts"]["user"]["id"] == NOBODY  # type: ignore[index]
     assert findings["environments"].remark.found.startswith("not set up yet")
@@ -318,4 +317,4 @@ def test_left_runs_and_half_made_environments_are_told(tmp_path: Path) -> None:
         ("half", False),
         ("whole", True),
     ]
-    assert case_of(HERE, told, Wants()).is_here
+    assert Case.of(HERE, told, Wants()).is_here

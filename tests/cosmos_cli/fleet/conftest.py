@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
-from sshd import SSHD, Sshd
-
-from cosmos_cli.fleet.target import Target
+from ssh_harness import needs_sshd, write_configuration
+from sshd import Sshd
 
 
 @pytest.fixture(autouse=True)
@@ -31,16 +29,6 @@ def known_hosts(home) -> Path:
     return home / ".ssh" / "known_hosts"
 
 
-def write_configuration(file: Path, *lines: str) -> None:
-    """Write an ssh configuration; the lines come before what all tests need."""
-    common = (
-        "Host *",
-        f"  UserKnownHostsFile {file.parent / 'known_hosts'}",
-        "  GlobalKnownHostsFile none",
-    )
-    file.write_text("\n".join((*lines, *common)) + "\n", encoding="utf-8")
-
-
 @pytest.fixture(scope="module")
 def sshd(tmp_path_factory):
     """One real server for a module's tests, with a key of each kind."""
@@ -57,24 +45,8 @@ def own_sshd(tmp_path):
         yield server
 
 
-def needs_sshd() -> None:
-    if SSHD is None or shutil.which("ssh-keygen") is None:
-        pytest.skip("needs OpenSSH's sshd and ssh-keygen")
-
-
 @pytest.fixture
 def known(sshd, known_hosts):
     """The module's server, its key known."""
     known_hosts.write_text(sshd.known_hosts_line(), encoding="utf-8")
     return sshd
-
-
-def target_of(server: Sshd, **changed) -> Target:
-    values = {
-        "name": "pi",
-        "address": server.address,
-        "port": server.port,
-        "user": server.user,
-        "key_file": str(server.user_key),
-    }
-    return Target(**(values | changed))

@@ -20,6 +20,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 SSHD = shutil.which("sshd", path=os.environ.get("PATH", "") + ":/usr/sbin:/sbin")
 START_TIMEOUT_S = 10.0
@@ -91,6 +92,16 @@ class Sshd:
         """What stands for it in known_hosts."""
         return f"[{self.address}]:{self.port}"
 
+    @property
+    def variables(self) -> dict[str, Any]:
+        """What an inventory says of a machine behind it."""
+        return {
+            "ansible_host": self.address,
+            "ansible_port": self.port,
+            "ansible_user": self.user,
+            "ansible_ssh_private_key_file": str(self.user_key),
+        }
+
     def known_hosts_line(self, kind: str = "ed25519") -> str:
         """The line that makes its key known."""
         return f"{self.name} {' '.join(public(self.host_keys[kind]).split()[:2])}\n"
@@ -139,6 +150,34 @@ class Sshd:
         ):  # who is stopped starts nobody that would be missed
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
+
+    def break_connections(self) -> int:
+        """Kill the server's own processes of all open connections, not what runs in them; return how many those were."""
+        broken = 0
+        for pid in self.sessions():
+            with contextlib.suppress(OSError):
+                if Path(f"/proc/{pid}/comm").read_text().startswith("sshd"):
+                    os.kill(pid, signal.SIGKILL)
+                    broken += 1
+        return broken
+
+    def freeze_logins(self) -> None:
+        """Let nobody else in: the server is stopped, open connections go on."""
+        os.kill(self.pid, signal.SIGSTOP)
+
+    def thaw_logins(self) -> None:
+        """Let in who waits."""
+        os.kill(self.pid, signal.SIGCONT)
+
+    def left(self, words: str) -> list[int]:
+        """Return what lives with *words* in its arguments of all that was ever started through this server."""
+        assert self._keeper is not None
+        found = []
+        for pid in descendants(self._keeper.pid):
+            with contextlib.suppress(OSError):
+                if words in Path(f"/proc/{pid}/cmdline").read_text():
+                    found.append(pid)
+        return found
 
     def freeze(self) -> None:
         """Stop the server and its sessions, as a hung machine would be."""

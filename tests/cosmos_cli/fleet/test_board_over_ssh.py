@@ -6,11 +6,11 @@ import subprocess
 import time
 
 import pytest
-from conftest import target_of
+from ssh_harness import target_of
 
-from cosmos_cli.fleet.board import Board
-from cosmos_cli.fleet.connect import connect
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.helper import Helper
+from cosmos_cli.fleet.open_connection import connect
 
 pytestmark = pytest.mark.process
 
@@ -23,7 +23,7 @@ def connection(known):
 
 
 def test_it_greets_with_what_it_is(connection, known):
-    with Board.start(connection) as board:
+    with Helper.start(connection) as board:
         greeting = board.greeting
 
     assert greeting["uid"] == os.geteuid()
@@ -33,7 +33,7 @@ def test_it_greets_with_what_it_is(connection, known):
 
 def test_lock_is_held_by_one_until_it_ends(connection, tmp_path):
     path = str(tmp_path / "state" / "lock")
-    with Board.start(connection) as first, Board.start(connection) as second:
+    with Helper.start(connection) as first, Helper.start(connection) as second:
         first.call("lock", {"path": path, "holder": "first"})
         with pytest.raises(MachineFailure) as caught:
             second.call("lock", {"path": path, "holder": "second"})
@@ -52,7 +52,7 @@ def test_lock_is_held_by_one_until_it_ends(connection, tmp_path):
 
 
 def test_unknown_verb_is_refused_and_the_next_question_answered(connection, tmp_path):
-    with Board.start(connection) as board:
+    with Helper.start(connection) as board:
         with pytest.raises(MachineFailure) as caught:
             board.call("no such verb")
         assert caught.value.kind is FailureKind.DEFECT
@@ -60,7 +60,7 @@ def test_unknown_verb_is_refused_and_the_next_question_answered(connection, tmp_
 
 
 def test_root_answers_where_sudo_works_and_is_refused_elsewhere(connection, tmp_path):
-    with Board.start(connection) as board:
+    with Helper.start(connection) as board:
         if os.geteuid() == 0 or _may_sudo():
             board.call("lock", {"path": str(tmp_path / "lock")}, as_root=True)
             return
@@ -80,7 +80,7 @@ def test_machine_without_the_python_that_is_named_says_so(known, python):
     connection = connect(target_of(known, python=python))
     try:
         with pytest.raises(MachineFailure) as caught:
-            Board.start(connection, timeout_s=20.0)
+            Helper.start(connection, timeout_s=20.0)
     finally:
         connection.close()
 
@@ -95,7 +95,7 @@ def test_start_up_file_that_talks_is_told(own_sshd, known_hosts):
     connection = connect(target_of(own_sshd, python=str(talking)))
     try:
         with pytest.raises(MachineFailure) as caught:
-            Board.start(connection)
+            Helper.start(connection)
     finally:
         connection.close()
 
@@ -107,7 +107,7 @@ def test_machine_that_dies_in_the_midst_of_an_answer_is_lost(own_sshd, known_hos
     known_hosts.write_text(own_sshd.known_hosts_line())
     connection = connect(target_of(own_sshd))
     try:
-        with Board.start(connection) as board:
+        with Helper.start(connection) as board:
             own_sshd.cut()
             with pytest.raises(MachineFailure) as caught:
                 board.call("lock", {"path": str(tmp_path / "lock")})

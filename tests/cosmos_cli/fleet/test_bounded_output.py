@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosmos_cli.fleet.output import BoundedOutput
+from cosmos_cli.fleet.transfer_limits import BoundedOutput
 
 
 def test_what_fits_is_whole():

@@ -2,13 +2,20 @@
 
 import _thread
 import threading
+from typing import get_args
 
 import pytest
 
 from cosmos_cli.fleet import fleet as module
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.fleet import Fleet, fleet_of
+from cosmos_cli.fleet.open_connection import OPENERS
 from cosmos_cli.fleet.target import Target
+from cosmos_cli.models.connection_kind import (
+    CONNECTION_OF_WORD,
+    AnsibleConnection,
+    ConnectionKind,
+)
 
 WAIT_S = 20.0
 TARGETS = tuple(Target(name=f"pi{n}", address=f"10.0.0.{n}") for n in range(3))
@@ -69,6 +76,13 @@ def test_task_is_given_what_the_inventory_says_of_its_machine(connections, tmp_p
     inventory = tmp_path / "tower.yaml"
     inventory.write_text("all:\n  hosts:\n    pi0: {cosmos_devices: [sense_hat]}\n    pi1:\n")
 
-    outcomes = fleet_of(inventory, forks=2).each(lambda _, machine: machine.devices)
+    outcomes = fleet_of(inventory, forks=2).each(
+        lambda _, machine: machine.variables.cosmos_devices
+    )
 
-    assert [outcome.value for outcome in outcomes] == [("sense_hat",), ()]
+    assert [outcome.value for outcome in outcomes] == [("sense_hat",), None]
+
+
+def test_every_kind_of_connection_has_its_way_to_be_opened_and_every_word_of_ansible_a_kind():
+    assert set(OPENERS) == set(get_args(ConnectionKind)) == set(CONNECTION_OF_WORD.values())
+    assert set(CONNECTION_OF_WORD) == set(get_args(AnsibleConnection))

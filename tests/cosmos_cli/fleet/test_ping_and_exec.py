@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -11,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import needs_sshd
+from ssh_harness import needs_sshd
 from sshd import Sshd, free_port, silent_server
 
 from cosmos_cli.app import run
@@ -49,19 +50,14 @@ def inventory(servers, tmp_path, known_hosts):
 
 
 def entry(server, **changed):
-    return {
-        "ansible_host": server.address,
-        "ansible_port": server.port,
-        "ansible_user": server.user,
-        "ansible_ssh_private_key_file": str(server.user_key),
-    } | changed
+    return server.variables | changed
 
 
 def test_ping_says_a_line_a_machine_and_a_verdict(inventory, capsys):
     assert run(["ping", "-i", inventory()]) == 0
 
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[:3] for line in lines[:3]] == [
+    assert sorted(line.split()[:3] for line in lines[:3]) == [
         [f"pi{n}", f"127.0.0.{n}", "ok"] for n in (1, 2, 3)
     ]
     assert lines[3] == "3 machines: all answered"
@@ -78,9 +74,10 @@ def test_ping_of_machines_that_fail_says_why_and_hides_nobody(inventory, capsys,
     assert run(["ping", "-i", file]) == 3
 
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines[:-1]] == ["pi1", "pi2", "pi3", "bad1", "bad2", "here"]
-    assert "connection refused" in lines[3]
-    assert "no login as nobody-of-this-name" in lines[4]
+    told = {line.split()[0]: line for line in lines[:-1]}
+    assert set(told) == {"pi1", "pi2", "pi3", "bad1", "bad2", "here"}
+    assert "connection refused" in told["bad1"]
+    assert "no login as nobody-of-this-name" in told["bad2"]
     assert lines[-1] == "6 machines: 4 answered, 2 failed"
 
 
@@ -106,7 +103,8 @@ def test_frozen_machine_delays_nobody_else(inventory, capsys, monkeypatch, home)
         assert run(["ping", "-i", file]) == 3
 
     lines = capsys.readouterr().out.splitlines()
-    assert "nothing was said in 1 s" in lines[3]
+    told = next(line for line in lines if "frozen" in line)
+    assert re.search(r"nothing was said in (1|0\.\d+) s", told)  # what opening has left of 1 s
     assert lines[-1] == "4 machines: 3 answered, 1 failed"
 
 

@@ -2,15 +2,14 @@
 
 import os
 import time
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 from cosmos_cli.errors import InputError
-from cosmos_cli.fleet import fleet, remembered
+from cosmos_cli.fleet import fleet, target_cache
 from cosmos_cli.fleet.fleet import fleet_of
-from cosmos_cli.fleet.remembered import key_of, recall, remember
 from cosmos_cli.fleet.target import Target
+from cosmos_cli.fleet.target_cache import key_of, recall, remember
 
 INVENTORY = "all:\n  hosts:\n    pi1: {ansible_host: 10.0.0.1}\n    pi2:\n"
 
@@ -90,15 +89,21 @@ def test_missing_inventory_is_told(tmp_path):
         fleet_of(tmp_path / "none.yaml")
 
 
-def test_inventory_that_comes_through_a_pipe_is_left_to_who_reads_it(inventory, tmp_path):
-    """As of `-i <(command)`: what is read of a pipe is gone."""
+def test_a_pipe_for_an_inventory_is_refused_and_nobody_waits_for_it(tmp_path):
+    """Nobody writes to it: to open it as a file is opened would take for ever."""
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
-    with ThreadPoolExecutor(1) as pool:
-        pool.submit(pipe.write_text, inventory.read_text())
 
-        assert key_of(pipe, None) is None
-        assert addresses(pipe) == ["10.0.0.1", "pi2"]
+    assert key_of(pipe, None) is None
+    with pytest.raises(InputError, match="expected a file, got a pipe"):
+        fleet_of(pipe)
+
+
+def test_a_file_of_terabytes_is_not_remembered(inventory, tmp_path):
+    with inventory.open("ab") as file:
+        file.truncate(2**40)
+
+    assert key_of(inventory, None) is None
 
 
 def test_nothing_is_remembered_of_an_inventory_that_changes_while_it_is_read(
@@ -137,7 +142,7 @@ def test_where_one_stands_counts_since_key_files_may_be_relative(inventory, tmp_
 
 
 def test_inventory_that_is_too_large_is_not_remembered(inventory, monkeypatch):
-    monkeypatch.setattr(remembered, "BYTES_MAX", 10)
+    monkeypatch.setattr(target_cache, "BYTES_MAX", 10)
 
     assert key_of(inventory, None) is None
     remember(None, [])
@@ -162,7 +167,7 @@ def test_cache_that_cannot_be_written_is_no_failure(inventory, tmp_path, monkeyp
 
 def test_oldest_is_forgotten(tmp_path, monkeypatch):
     monkeypatch.setenv("COSMOS_CACHE", str(tmp_path))
-    monkeypatch.setattr(remembered, "KEPT_MAX", 2)
+    monkeypatch.setattr(target_cache, "KEPT_MAX", 2)
     now_ns = time.time_ns()
     for age, key in enumerate("abc"):
         remember(key, [Target(name="pi", address="x")])

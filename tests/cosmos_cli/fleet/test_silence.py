@@ -1,11 +1,13 @@
 """A machine that is silent is waited for while it gives signs of life, and given up when it does not."""
 
+import contextlib
+
 import pytest
 
-from cosmos_cli.fleet import silence
+from cosmos_cli.fleet import liveness
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.liveness import BlockingStream, SilenceWatch, SilentMachine
 from cosmos_cli.fleet.local import LocalConnection
-from cosmos_cli.fleet.silence import WatchedConnection
 from cosmos_cli.fleet.target import Target
 
 pytestmark = pytest.mark.process
@@ -23,15 +25,21 @@ class Watchable(LocalConnection):
 
 @pytest.fixture(autouse=True)
 def short_silence(monkeypatch):
-    monkeypatch.setattr(silence, "SILENCE_S", 0.05)
+    monkeypatch.setattr(liveness, "SILENCE_S", 0.05)
+
+
+@contextlib.contextmanager
+def watched(connection, command, **how):
+    stream = connection.open(command)
+    try:
+        yield stream, BlockingStream(stream, SilenceWatch(connection, **how))
+    finally:
+        stream.close()
 
 
 def read(connection, command, timeout_s):
-    stream = WatchedConnection(connection).open(command)
-    try:
-        return stream.read_some(100, timeout_s=timeout_s)
-    finally:
-        stream.close()
+    with watched(connection, command) as (_, link):
+        return link.read_some(100, timeout_s=timeout_s)
 
 
 def test_slow_machine_is_waited_for():
@@ -43,9 +51,30 @@ def test_slow_machine_is_waited_for():
 
 def test_dead_machine_is_given_up_long_before_the_deadline():
     with pytest.raises(MachineFailure, match="stopped answering") as failure:
-        read(Watchable(alive=[True, False]), "cat", 60.0)
+        read(Watchable(alive=[True, False, False]), "cat", 60.0)
 
     assert failure.value.kind is FailureKind.LOST
+
+
+def test_silence_is_named_long_before_the_machine_is_given_up():
+    told, asked = [], []
+    connection = Watchable(alive=[])
+
+    def is_alive(*, timeout_s):
+        asked.append(timeout_s)
+        return False
+
+    connection.is_alive = is_alive
+
+    def tell(silent_s):
+        told.append((silent_s, len(asked)))
+
+    with watched(connection, "cat", on_silence=tell) as (_, link), pytest.raises(SilentMachine):
+        link.read_some(100, timeout_s=60.0)
+
+    # After a second without a byte and one without a sign: as in a run, where it is 2.5 s.
+    assert told == [(2.0, 1)]
+    assert asked == pytest.approx([1.95, 6.05])
 
 
 def test_deadline_holds_for_a_machine_that_lives():
@@ -64,19 +93,17 @@ def test_end_of_a_program_is_its_end():
 
 
 def test_machine_that_takes_no_more_input_is_asked_for_a_sign_of_life():
-    stream = WatchedConnection(Watchable(alive=[True, False])).open("sleep 60")
-    try:
-        with pytest.raises(MachineFailure, match="stopped answering"):
-            stream.write_all(bytes(10_000_000), timeout_s=60.0)
-    finally:
-        stream.close()
+    connection = Watchable(alive=[True, False, False])
+
+    with (
+        watched(connection, "sleep 60") as (_, link),
+        pytest.raises(MachineFailure, match="stopped answering"),
+    ):
+        link.write_all(bytes(10_000_000), timeout_s=60.0)
 
 
 def test_all_of_a_large_input_is_taken():
-    stream = WatchedConnection(Watchable(alive=[True] * 1000)).open("wc -c")
-    try:
-        stream.write_all(bytes(10_000_000), timeout_s=60.0)
+    with watched(Watchable(alive=[True] * 1000), "wc -c") as (stream, link):
+        link.write_all(bytes(10_000_000), timeout_s=60.0)
         stream.close_writing()
-        assert stream.read_some(100, timeout_s=60.0).strip() == b"10000000"
-    finally:
-        stream.close()
+        assert link.read_some(100, timeout_s=60.0).strip() == b"10000000"

@@ -7,7 +7,7 @@ import subprocess
 import pytest
 
 from cosmos_cli.errors import InputError
-from cosmos_cli.fleet.ssh_config import matches, read_config
+from cosmos_cli.fleet.ssh.config import matches, read_config
 
 
 @pytest.fixture
@@ -77,6 +77,7 @@ def test_match_localuser_is_who_runs_the_command(config):
     assert lookup(file, "pi") == {"port": "3"}
 
 
+@pytest.mark.process
 def test_match_exec_asks_a_command_with_tokens_filled_in(config):
     text = 'Match exec "test %h = pi1"\n  User yes\n'
 

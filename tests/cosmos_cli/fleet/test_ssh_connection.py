@@ -6,16 +6,18 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from conftest import target_of, write_configuration
+from ssh_harness import needs_sshd, target_of, write_configuration
 from sshd import Sshd, free_port, make_key, public, silent_server
 
-from cosmos_cli.fleet.connect import ConnectOptions, connect
+from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.open_connection import connect
 from cosmos_cli.fleet.target import Target
 
 pytestmark = pytest.mark.process
@@ -37,7 +39,7 @@ def failing(kind):
 def says(target, command="echo hello", options=DEFAULT):
     connection = connect(target, options)
     try:
-        return connection.run(command, timeout_s=10.0).stdout
+        return connection.run(command, timeout_s=60.0).stdout
     finally:
         connection.close()
 
@@ -190,6 +192,7 @@ def test_no_more_than_three_keys_are_tried(own_sshd, home, known_hosts, tmp_path
 
 
 def test_password_is_never_tried(tmp_path, known_hosts):
+    needs_sshd()
     with Sshd(tmp_path / "s", extra="PubkeyAuthentication no", has_passwords=True) as server:
         known_hosts.write_text(server.known_hosts_line())
 
@@ -201,6 +204,7 @@ def test_password_is_never_tried(tmp_path, known_hosts):
 
 
 def test_key_alone_that_is_not_enough_is_told(tmp_path, known_hosts):
+    needs_sshd()
     extra = "AuthenticationMethods publickey,password"
     with Sshd(tmp_path / "s", extra=extra, has_passwords=True) as server:
         known_hosts.write_text(server.known_hosts_line())
@@ -252,7 +256,7 @@ def test_key_with_a_passphrase_is_used_through_the_agent(known, agent, tmp_path,
     asks.chmod(0o755)
     environment = {**os.environ, "SSH_ASKPASS": str(asks), "SSH_ASKPASS_REQUIRE": "force"}
     agent(key, env=environment)
-    from cosmos_cli.fleet import ssh_keys
+    from cosmos_cli.fleet.ssh import keys as ssh_keys
 
     ssh_keys._agent_keys.cache_clear()  # a process asks its agent once; here the agent has learnt since
 
@@ -289,6 +293,7 @@ def test_port_without_a_server_is_refused(known):
 
 
 def test_server_that_starts_meanwhile_is_reached_in_a_further_attempt(tmp_path, known_hosts):
+    needs_sshd()
     server = Sshd(tmp_path / "late")
     known_hosts.write_text(server.known_hosts_line())
     starter = threading.Timer(0.4, server.__enter__)
@@ -363,6 +368,71 @@ def test_server_that_closes_in_the_midst_of_it_is_told(known):
         connect(target_of(known, port=port), BRIEF)
 
 
+def test_server_of_another_protocol_is_told(known):
+    answer = b"HTTP/1.0 400 no such thing\r\n" * 200
+    with speaking_server(answer) as port, failing(FailureKind.LOST) as caught:
+        connect(target_of(known, port=port), BRIEF)
+
+    assert "Indecipherable protocol version" in caught.value.text
+
+
+def test_server_that_names_itself_and_says_nothing_more_is_frozen(known):
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        sends = threading.Thread(target=lambda: accepted.append(greet(listener)), daemon=True)
+        accepted = []
+        sends.start()
+
+        with failing(FailureKind.FROZEN):
+            connect(target_of(known, port=listener.getsockname()[1]), BRIEF)
+
+        sends.join()
+        accepted[0].close()
+
+
+def greet(listener):
+    accepted, _ = listener.accept()
+    accepted.sendall(b"SSH-2.0-silent\r\n")
+    return accepted
+
+
+SPOKEN_TO = """
+import socket, sys, threading
+from cosmos_cli.fleet.failure import MachineFailure
+from cosmos_cli.fleet.connection import ConnectOptions
+from cosmos_cli.fleet.open_connection import connect
+from cosmos_cli.fleet.target import Target
+
+heard = threading.Event()
+listener = socket.create_server(("127.0.0.1", 0))
+
+def hear():
+    accepted = listener.accept()[0]
+    if accepted.recv(8) == b"SSH-2.0-":
+        heard.set()
+
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == "fabric":
+            print("spoken to" if heard.wait(20.0) else "left waiting", flush=True)
+
+assert not {"fabric", "paramiko"} & sys.modules.keys()
+sys.meta_path.insert(0, Finder())
+threading.Thread(target=hear).start()
+try:
+    connect(Target(name="pi", address="127.0.0.1", port=listener.getsockname()[1]), ConnectOptions(timeout_s=1.0))
+except MachineFailure as failure:
+    print(failure.kind)
+"""
+
+
+def test_machine_is_spoken_to_while_fabric_is_imported(known):
+    done = subprocess.run(
+        [sys.executable, "-c", SPOKEN_TO], capture_output=True, text=True, timeout=60.0
+    )
+
+    assert done.stdout.split("\n")[0] == "spoken to", done.stderr
+
+
 # The operator's configuration.
 
 
@@ -410,7 +480,7 @@ def test_proxy_jump_leads_through_other_machines(sshd, own_sshd, home, known_hos
     known_hosts.write_text(sshd.known_hosts_line() + own_sshd.known_hosts_line())
     connection = connect(target_of(sshd, address="last"))
     try:
-        said = connection.run("echo $SSH_CONNECTION", timeout_s=10.0).stdout.split()
+        said = connection.run("echo $SSH_CONNECTION", timeout_s=60.0).stdout.split()
     finally:
         connection.close()
 

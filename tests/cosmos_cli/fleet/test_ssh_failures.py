@@ -11,18 +11,20 @@ from paramiko.ssh_exception import (
 )
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
-from cosmos_cli.fleet.known_hosts import Entry, HostKey, Standing, Verdict
-from cosmos_cli.fleet.ssh_failures import (
+from cosmos_cli.fleet.ssh.failures import (
     host_key_failure,
     jump_failure,
     login_failure,
     lost,
     opening_failure,
 )
+from cosmos_cli.fleet.ssh.known_hosts import HostKey, KeyVerdict, KnownHost, Standing
 
 WHERE = "10.0.0.3 port 22"
 KEY = HostKey(kind="ssh-ed25519", blob=b"key")
-LINE = Entry(patterns="pi", key=HostKey(kind="ssh-rsa", blob=b"old"), file="known_hosts", line=7)
+LINE = KnownHost(
+    patterns="pi", key=HostKey(kind="ssh-rsa", blob=b"old"), file="known_hosts", line=7
+)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +122,7 @@ def test_failure_in_words_already_stays_as_it_is():
 
 
 def test_unknown_host_key_is_shown_with_both_ways_to_accept_it():
-    failure = host_key_failure(Verdict(standing=Standing.UNKNOWN), KEY, ("pi",), WHERE)
+    failure = host_key_failure(KeyVerdict(standing=Standing.UNKNOWN), KEY, ("pi",), WHERE)
 
     assert FailureKind.HOST_KEY_UNKNOWN is failure.kind
     assert f"ssh-ed25519 {KEY.fingerprint}" in failure.text
@@ -129,7 +131,7 @@ def test_unknown_host_key_is_shown_with_both_ways_to_accept_it():
 
 
 def test_changed_host_key_names_both_keys_the_line_and_the_danger():
-    verdict = Verdict(standing=Standing.CHANGED, against=LINE)
+    verdict = KeyVerdict(standing=Standing.CHANGED, against=LINE)
 
     failure = host_key_failure(verdict, KEY, ("[pi]:2222", "pi"), WHERE)
 
@@ -142,7 +144,7 @@ def test_changed_host_key_names_both_keys_the_line_and_the_danger():
 
 
 def test_revoked_host_key_is_no_matter_of_accepting():
-    verdict = Verdict(standing=Standing.REVOKED, against=LINE)
+    verdict = KeyVerdict(standing=Standing.REVOKED, against=LINE)
 
     failure = host_key_failure(verdict, KEY, ("pi",), WHERE)
 

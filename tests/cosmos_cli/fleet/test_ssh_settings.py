@@ -4,10 +4,10 @@ import getpass
 from pathlib import Path
 
 import pytest
-from conftest import write_configuration
+from ssh_harness import write_configuration
 
 from cosmos_cli.errors import InputError
-from cosmos_cli.fleet.ssh_settings import settings_of
+from cosmos_cli.fleet.ssh.settings import settings_of
 from cosmos_cli.fleet.target import Target
 
 
@@ -120,7 +120,7 @@ def test_agent_may_be_another_or_none(configure, monkeypatch):
 
 def settings_again():
     """Read the configuration once more, which a process does not: it runs one command."""
-    from cosmos_cli.fleet import ssh_settings
+    from cosmos_cli.fleet.ssh import settings as ssh_settings
 
     ssh_settings._read.cache_clear()
     return settings()

@@ -8,11 +8,12 @@ import threading
 import time
 
 import pytest
-from conftest import target_of
+from ssh_harness import target_of
 
-from cosmos_cli.fleet.connect import connect
 from cosmos_cli.fleet.connection import OUTPUT_BYTES_MAX
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.liveness import BlockingStream
+from cosmos_cli.fleet.open_connection import connect
 
 pytestmark = pytest.mark.process
 
@@ -38,7 +39,7 @@ def fragile(own_sshd, known_hosts):
 
 def read_all(stream):
     data = bytearray()
-    while more := stream.read_some(65536, timeout_s=WAIT_S):
+    while more := BlockingStream(stream).read_some(65536, timeout_s=WAIT_S):
         data += more
     return bytes(data)
 
@@ -47,16 +48,16 @@ def test_output_ends_with_empty_bytes_and_a_status(connection):
     stream = connection.open("echo one; exit 7")
 
     assert read_all(stream) == b"one\n"
-    assert stream.read_some(10, timeout_s=WAIT_S) == b""
+    assert BlockingStream(stream).read_some(10, timeout_s=WAIT_S) == b""
     assert stream.read(10) == b""
-    assert stream.exit_status() == 7
+    assert stream.ending(timeout_s=WAIT_S).exit_status == 7
     stream.close()
 
 
 def test_status_is_unknown_while_it_runs(connection):
     stream = connection.open("cat")
 
-    assert stream.exit_status() is None
+    assert stream.ending().exit_status is None
     stream.close()
 
 
@@ -77,7 +78,7 @@ def test_waiting_has_a_deadline(connection):
     stream = connection.open("cat")
 
     with pytest.raises(MachineFailure) as caught:
-        stream.read_some(10, timeout_s=0.1)
+        BlockingStream(stream).read_some(10, timeout_s=0.1)
 
     assert caught.value.kind is FailureKind.TIMEOUT
     stream.close()
@@ -126,7 +127,7 @@ def test_loop_sees_every_byte_beside_a_flood_of_errors(connection):
             data += more
 
     assert bytes(data).split(b"\n")[:-1] == [b"out %d" % n for n in range(300)]
-    assert len(stream.errors()) <= 16384
+    assert len(stream.ending().errors) <= 16384
     stream.close()
 
 
@@ -164,14 +165,14 @@ def test_last_errors_are_kept(connection):
     )
     read_all(stream)
 
-    assert stream.errors().endswith("last\n")
-    assert "first" not in stream.errors()
+    assert stream.ending().errors.endswith("last\n")
+    assert "first" not in stream.ending().errors
     stream.close()
 
 
 def test_end_of_input_is_seen_and_may_be_said_twice(connection):
     stream = connection.open("cat; echo end")
-    stream.write_all(b"abc\n", timeout_s=WAIT_S)
+    BlockingStream(stream).write_all(b"abc\n", timeout_s=WAIT_S)
     stream.close_writing()
     stream.close_writing()
 
@@ -188,7 +189,7 @@ def test_writing_after_the_end_says_that_it_has_ended(connection):
         stream.write(b"x")
     assert caught.value.kind is FailureKind.LOST
     with pytest.raises(MachineFailure):
-        stream.write_all(b"x", timeout_s=WAIT_S)
+        BlockingStream(stream).write_all(b"x", timeout_s=WAIT_S)
     stream.close()
 
 
@@ -199,7 +200,7 @@ def test_program_that_reads_nothing_fills_the_window_and_no_more(connection):
         while written < 256 * 1024 * 1024:
             written += stream.write(b"x" * 65536)
     with pytest.raises(MachineFailure) as caught:
-        stream.write_all(b"x" * 64 * 1024 * 1024, timeout_s=0.2)
+        BlockingStream(stream).write_all(b"x" * 64 * 1024 * 1024, timeout_s=0.2)
 
     assert caught.value.kind is FailureKind.TIMEOUT
     stream.close()
@@ -230,7 +231,7 @@ def test_bytes_written_in_one_thread_are_read_in_another(connection):
     stream = connection.open("cat")
 
     def write():
-        stream.write_all(data, timeout_s=WAIT_S)
+        BlockingStream(stream).write_all(data, timeout_s=WAIT_S)
         stream.close_writing()
 
     writer = threading.Thread(target=write)
@@ -272,11 +273,11 @@ def test_input_that_nobody_reads_does_not_keep_a_command(connection):
 def test_many_programs_run_over_one_connection(connection):
     streams = [connection.open(f"cat; exit {n}") for n in range(5)]
     for n, stream in enumerate(streams):
-        stream.write_all(b"%d" % n, timeout_s=WAIT_S)
+        BlockingStream(stream).write_all(b"%d" % n, timeout_s=WAIT_S)
         stream.close_writing()
 
     assert [read_all(stream) for stream in streams] == [b"%d" % n for n in range(5)]
-    assert [stream.exit_status() for stream in streams] == list(range(5))
+    assert [stream.ending(timeout_s=WAIT_S).exit_status for stream in streams] == list(range(5))
     for stream in streams:
         stream.close()
 
@@ -299,15 +300,15 @@ def test_connection_that_breaks_wakes_who_waits_and_is_told(fragile, own_sshd, h
     start_s = time.monotonic()
     try:
         with pytest.raises(MachineFailure) as caught:
-            stream.read_some(10, timeout_s=WAIT_S)
+            BlockingStream(stream).read_some(10, timeout_s=WAIT_S)
     finally:
         breaker.join()
 
     assert caught.value.kind is FailureKind.LOST
     assert time.monotonic() - start_s < WAIT_S
-    assert stream.exit_status() is None
+    assert stream.ending().exit_status is None
     with pytest.raises(MachineFailure) as caught:
-        stream.write_all(b"x" * 10_000_000, timeout_s=WAIT_S)
+        BlockingStream(stream).write_all(b"x" * 10_000_000, timeout_s=WAIT_S)
     assert caught.value.kind is FailureKind.LOST
     stream.close()
 
@@ -319,7 +320,7 @@ def test_upload_to_a_machine_that_dies_is_lost_and_does_not_hang(fragile, own_ss
     try:
         with pytest.raises(MachineFailure) as caught:
             while True:
-                stream.write_all(b"x" * 1_000_000, timeout_s=WAIT_S)
+                BlockingStream(stream).write_all(b"x" * 1_000_000, timeout_s=WAIT_S)
     finally:
         breaker.join()
 
@@ -333,7 +334,7 @@ def test_upload_to_a_frozen_machine_ends_by_its_deadline(fragile, own_sshd):
     try:
         with pytest.raises(MachineFailure) as caught:
             for _ in range(100):
-                stream.write_all(b"x" * 1_000_000, timeout_s=0.5)
+                BlockingStream(stream).write_all(b"x" * 1_000_000, timeout_s=0.5)
     finally:
         own_sshd.thaw()
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from conftest import needs_sshd
+from ssh_harness import needs_sshd
 
 pytestmark = pytest.mark.process
 

@@ -9,9 +9,10 @@ import pytest
 
 from cosmos_cli.fleet.connection import OUTPUT_BYTES_MAX
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.liveness import BlockingStream
 from cosmos_cli.fleet.local import LocalConnection
+from cosmos_cli.fleet.shell import NO_SUDO_MARK, as_root, watched
 from cosmos_cli.fleet.target import Target
-from cosmos_cli.fleet.watched import NO_SUDO_MARK, as_root, watched
 
 pytestmark = pytest.mark.process
 
@@ -80,7 +81,7 @@ def living(group):
 )
 def test_end_of_standard_input_ends_it_and_its_children(here, command):
     stream = here.open(f"echo $$; {watched(command)}")
-    group = int(stream.read_some(100, timeout_s=WAIT_S))
+    group = int(BlockingStream(stream).read_some(100, timeout_s=WAIT_S))
     assert living(group)
     stream.close_writing()
 
@@ -91,7 +92,7 @@ def test_end_of_standard_input_ends_it_and_its_children(here, command):
 def test_command_is_asked_to_end_before_it_is_made_to(here, tmp_path):
     command = f"trap 'echo asked > {tmp_path}/asked; exit' TERM; echo ready; sleep 60 & wait"
     stream = here.open(watched(command))
-    assert stream.read_some(100, timeout_s=WAIT_S) == b"ready\n"
+    assert BlockingStream(stream).read_some(100, timeout_s=WAIT_S) == b"ready\n"
     stream.close_writing()
 
     until_s = time.monotonic() + WAIT_S

@@ -36,15 +36,12 @@ def test_shipped_tower_has_24_boards_one_with_a_sense_hat_and_this_computer():
     assert all(machine.connection == "ssh" for machine in boards)
     assert boards[0].groups == ("all", "tower")
     assert boards[21].groups == ("all", "hwil", "tower")
-    assert [machine.name for machine in boards if machine.devices] == ["pi22"]
-    assert (boards[0].user, boards[0].root, boards[0].cpu_affinity) == (
-        "pi",
-        "/home/pi/cosmos",
-        (3,),
-    )
-    assert (boards[0].wifi, boards[0].receive_buffer_bytes) == (False, 4194304)
-    assert [step.kind for step in boards[21].provision] == ["line", "command"]
-    assert (here.name, here.connection, here.agents_max) == ("here", "local", 0)
+    assert [machine.name for machine in boards if machine.variables.cosmos_devices] == ["pi22"]
+    known = boards[0].variables
+    assert (known.user, known.root, known.cosmos_cpu_affinity) == ("pi", "/home/pi/cosmos", (3,))
+    assert (known.cosmos_wifi, known.cosmos_receive_buffer_bytes) == (False, 4194304)
+    assert [step.kind for step in boards[21].variables.cosmos_provision] == ["line", "command"]
+    assert (here.name, here.connection, here.variables.cosmos_agents) == ("here", "local", 0)
 
 
 def test_shipped_loopback_is_this_computer():
@@ -66,7 +63,9 @@ def test_inner_group_wins_over_outer_and_own_variables_over_both(read):
         "          hosts: {m1: , m2: {x: 4}}\n"
     )
 
-    assert [(m.variables["x"], m.variables["y"], m.variables["z"]) for m in machines] == [
+    assert [
+        (m.raw_variables["x"], m.raw_variables["y"], m.raw_variables["z"]) for m in machines
+    ] == [
         (3, 2, 1),
         (4, 2, 1),
     ]
@@ -76,7 +75,7 @@ def test_inner_group_wins_over_outer_and_own_variables_over_both(read):
 def test_groups_may_stand_at_the_top_level_beside_all(read):
     (machine,) = read("all: {vars: {x: 1}}\ntower: {hosts: {m1: {ansible_host: 10.0.0.1}}}\n")
 
-    assert (machine.address, machine.groups, machine.variables["x"]) == (
+    assert (machine.address, machine.groups, machine.raw_variables["x"]) == (
         "10.0.0.1",
         ("all", "tower"),
         1,
@@ -86,7 +85,7 @@ def test_groups_may_stand_at_the_top_level_beside_all(read):
 def test_other_tools_variables_pass_through(read):
     (machine,) = read("all: {hosts: {m1: {ansible_python_interpreter: /usr/bin/python3}}}\n")
 
-    assert machine.variables["ansible_python_interpreter"] == "/usr/bin/python3"
+    assert machine.raw_variables["ansible_python_interpreter"] == "/usr/bin/python3"
 
 
 @pytest.mark.parametrize(
@@ -235,7 +234,7 @@ def test_scalars_that_mean_the_same_in_both_readings_or_are_quoted_are_taken(rea
         "all: {hosts: {m: {x: ['no', \"0644\", !!str 0644, 1.5, true, 0x10, off-line]}}}\n"
     )
 
-    assert machine.variables["x"] == ["no", "0644", "0644", 1.5, True, 16, "off-line"]
+    assert machine.raw_variables["x"] == ["no", "0644", "0644", 1.5, True, 16, "off-line"]
 
 
 def test_what_pyyaml_refuses_is_refused(read):
@@ -383,28 +382,42 @@ def test_machine_knows_what_was_said_about_it(read):
         "  cosmos_cpu_governor: performance, cosmos_bluetooth: true}}}\n"
     )
 
-    assert (machine.address, machine.connection, machine.user, machine.port) == (
+    known = machine.variables
+    assert (machine.address, machine.connection, known.user, known.port) == (
         "10.0.0.1",
         "ssh",
         "pi",
         2222,
     )
-    assert (machine.key_file, machine.python) == (Path("/k"), "/usr/bin/python3")
-    assert (machine.may_become_root, machine.root) == (False, "/opt/cosmos")
-    assert (machine.host_address, machine.agents_max) == ("10.0.0.9", 3)
-    assert (machine.devices, machine.cpu_affinity) == (("sense_hat",), (2, 3))
-    assert (machine.receive_buffer_bytes, machine.realtime_priority) == (4194304, 80)
-    assert (machine.cpu_governor, machine.wifi, machine.bluetooth) == ("performance", False, True)
+    assert (known.key_file, known.python) == (Path("/k"), "/usr/bin/python3")
+    assert (known.may_become_root, known.root) == (False, "/opt/cosmos")
+    assert (known.cosmos_host_address, known.cosmos_agents) == ("10.0.0.9", 3)
+    assert (known.cosmos_devices, known.cosmos_cpu_affinity) == (("sense_hat",), (2, 3))
+    assert (known.cosmos_receive_buffer_bytes, known.cosmos_realtime_priority) == (4194304, 80)
+    assert (known.cosmos_cpu_governor, known.cosmos_wifi, known.cosmos_bluetooth) == (
+        "performance",
+        False,
+        True,
+    )
 
 
 def test_machine_of_which_nothing_was_said_leaves_it_to_others(read):
     (machine,) = read("all: {hosts: {m: {ansible_python_interpreter: auto}}}\n")
 
+    known = machine.variables
     assert (machine.address, machine.connection) == ("m", "ssh")
-    assert (machine.user, machine.port, machine.key_file, machine.python) == (None,) * 4
-    assert (machine.may_become_root, machine.root, machine.agents_max) == (True, "~/cosmos", None)
-    assert (machine.devices, machine.cpu_affinity, machine.provision) == ((), (), ())
-    assert (machine.wifi, machine.bluetooth, machine.cpu_governor) == (None, None, None)
+    assert (known.user, known.port, known.key_file, known.python) == (None,) * 4
+    assert (known.may_become_root, known.root, known.cosmos_agents) == (True, "~/cosmos", None)
+    assert (known.cosmos_devices, known.cosmos_cpu_affinity, known.cosmos_provision) == (
+        None,
+        None,
+        (),
+    )
+    assert (known.cosmos_wifi, known.cosmos_bluetooth, known.cosmos_cpu_governor) == (
+        None,
+        None,
+        None,
+    )
 
 
 def test_priority_of_a_machine_is_refused(read):
@@ -418,7 +431,10 @@ def test_null_takes_back_what_a_group_says(read):
         "all: {vars: {cosmos_cpu_affinity: [3], cosmos_root: /opt/c}, hosts: {m: {cosmos_cpu_affinity: null, cosmos_root: }}}\n"
     )
 
-    assert (machines[0].cpu_affinity, machines[0].root) == ((), "~/cosmos")
+    assert (machines[0].variables.cosmos_cpu_affinity, machines[0].variables.root) == (
+        None,
+        "~/cosmos",
+    )
 
 
 def test_machines_stand_in_the_order_of_the_file(read):
@@ -447,13 +463,13 @@ def test_what_groups_want_adds_up_though_variables_replace_each_other(read):
         "          cosmos_provision: [{packages: [own]}]\n"
     )
 
-    assert machine.packages == ("a1", "b1", "c1")
-    assert machine.requirements == ("numpy", "scipy")
-    assert [step.packages for step in machine.provision] == [
+    assert machine.variables.cosmos_packages == ("a1", "b1", "c1")
+    assert machine.variables.cosmos_requirements == ("numpy", "scipy")
+    assert [step.packages for step in machine.variables.cosmos_provision] == [
         ("outer",), ("inner",), ("inner2",), ("own",),
     ]  # fmt: skip
-    assert machine.variables["cosmos_provision"] == [{"packages": ["own"]}]
-    assert machine.variables["cosmos_packages"] == ["b1", "c1"]
+    assert machine.raw_variables["cosmos_provision"] == [{"packages": ["own"]}]
+    assert machine.raw_variables["cosmos_packages"] == ["b1", "c1"]
 
 
 def test_inventory_without_machines_is_refused(read):

@@ -13,10 +13,13 @@ from cosmos_cli import app
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.inventory import load_machines, read_inventory
 
-pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("ansible") is None,
-    reason="ansible-core is not installed; it comes with `pip install -e .[dev]`",
-)
+pytestmark = [
+    pytest.mark.process,
+    pytest.mark.skipif(
+        importlib.util.find_spec("ansible") is None,
+        reason="ansible-core is not installed; it comes with `pip install -e .[dev]`",
+    ),
+]
 ROOT = Path(__file__).parents[3]
 FOLDER = Path(__file__).parent / "inventories"
 FILES = sorted(
@@ -31,8 +34,8 @@ FILES = sorted(
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.name}")
-def test_machines_groups_and_variables_are_those_of_ansible(path, tmp_path, capsys):
-    expected = ansible_reading.list_inventory(path, tmp_path)
+def test_machines_groups_and_variables_are_those_of_ansible(path, ansible, tmp_path, capsys):
+    expected = ansible.list_inventory(path, tmp_path)
 
     code = app.run(["inventory", "-i", str(path), "--json"])
 
@@ -93,7 +96,8 @@ def test_random_webs_of_groups_resolve_as_in_ansible(tmp_path):
         machines = load_machines(Path(request["file"]))
 
         assert {
-            machine.name: [sorted(machine.groups), dict(machine.variables)] for machine in machines
+            machine.name: [sorted(machine.groups), dict(machine.raw_variables)]
+            for machine in machines
         } == answer["machines"], Path(request["file"]).read_text()
 
 
@@ -159,8 +163,8 @@ def test_limit_without_a_machine_is_none_for_ansible_too(pattern, limits):
 
 
 @pytest.mark.parametrize("pattern", ["tower[1:3],lab1", "tower:&hwil", "all:!chiefs"])
-def test_limit_lists_the_machines_of_the_ansible_command(pattern, tmp_path):
-    expected = ansible_reading.list_hosts(FOLDER / "limits.yaml", pattern, tmp_path)
+def test_limit_lists_the_machines_of_the_ansible_command(pattern, ansible, tmp_path):
+    expected = ansible.list_hosts(FOLDER / "limits.yaml", pattern, tmp_path)
 
     selected = read_inventory(FOLDER / "limits.yaml").select(pattern)
 

@@ -80,7 +80,7 @@ def test_group_without_machines_is_known_where_it_is_told():
         ("tower:!all", "means no machine; there are pi01"),
         ("pi01:&pi02", "means no machine"),
         ("tower[0", "a bracket is never closed, or was never opened"),
-        ("@names.txt", "files of names (@FILE) are not understood"),
+        ("@names.txt", "@names.txt: no such file"),
         ("", "expected a machine, a group or a pattern, got nothing"),
         (" : ", "got nothing"),
         ("tower:!", "expected a name after '!'"),

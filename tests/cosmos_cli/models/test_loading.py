@@ -7,7 +7,7 @@ import pytest
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.loading import load_scenario
-from madns_runtime.config import RunConfig, from_mapping, to_mapping
+from madns_runtime.config import Deadline, RunConfig, from_mapping, to_mapping
 
 MINIMAL = "name: a\nsimulation: counter\nagents: {count: 3}\n"
 
@@ -75,6 +75,7 @@ def golden(text):
     return textwrap.dedent(text).strip("\n")
 
 
+@pytest.mark.process
 def test_every_fault_of_a_file_is_shown_at_once_in_order(see):
     shown = see(
         """\
@@ -83,7 +84,7 @@ def test_every_fault_of_a_file_is_shown_at_once_in_order(see):
         agents: {count: 10.5, tick_hz: 10, tickhz: 3}
         time: {mode: lokstep, duration_s: no}
         deadline:
-          tolerance_ms: -1
+          overrun_ms: -1
         executor: {kind: proces}
         sed: 3
         """
@@ -109,9 +110,9 @@ def test_every_fault_of_a_file_is_shown_at_once_in_order(see):
         a.yaml:4:35: time.duration_s: expected a number, got 'no'
             time: {mode: lokstep, duration_s: no}
                                               ^
-        a.yaml:6:17: deadline.tolerance_ms: expected >= 0, got -1
-              tolerance_ms: -1
-                            ^
+        a.yaml:6:15: deadline.overrun_ms: expected >= 0, got -1
+              overrun_ms: -1
+                          ^
         a.yaml:7:18: executor.kind: expected process, thread, dask or module:callable, got 'proces'
             executor: {kind: proces}
                              ^
@@ -206,7 +207,8 @@ def test_missing_keys_are_placed_at_what_lacks_them(see):
         ),
         (
             "agents: {count: 3}\nseed: 9223372036854775808",
-            "a.yaml:4:7: seed: expected <= 9223372036854775807, got 9223372036854775808",
+            "a.yaml:4:7: seed: expected a whole number from -2^63 to 2^63 - 1, got 9223372036854775808:"
+            " write one that need not be whole such as 1e20, and a text in quotes",
         ),
         (
             "agents: {count: 3}\ntime: {duration_s: 4e8}",
@@ -253,6 +255,7 @@ def test_sections_without_faults_are_checked_against_each_other_even_if_another_
 PLUGGED = "name: a\nsimulation: ./p.py:simulation\nagents: {count: 3}\n"
 
 
+@pytest.mark.process
 def test_faults_of_parameters_have_their_place(see):
     shown = see(
         PLUGGED
@@ -284,6 +287,7 @@ def test_faults_of_parameters_have_their_place(see):
     )
 
 
+@pytest.mark.process
 def test_missing_parameters_are_placed_at_the_section_or_the_file(see):
     assert see(PLUGGED).startswith("a.yaml:1:1: parameters.mass_kg: missing; expected a number\n")
     assert see(PLUGGED + "parameters: {spare: 2}\n").startswith(
@@ -291,6 +295,7 @@ def test_missing_parameters_are_placed_at_the_section_or_the_file(see):
     )
 
 
+@pytest.mark.process
 def test_faults_that_the_simulation_finds_have_their_place(see):
     shown = see(PLUGGED + "parameters:\n  mass_kg: 9\n  files: [p.py, no.tle]\n  spare: 0\n")
 
@@ -309,18 +314,21 @@ def test_faults_that_the_simulation_finds_have_their_place(see):
     )
 
 
+@pytest.mark.process
 def test_fault_of_the_simulation_without_a_name_stands_at_parameters(see):
     shown = see(PLUGGED + "parameters: {mass_kg: 1, spare: 1}\n")
 
     assert shown.startswith("a.yaml:4:1: parameters: spare and mass_kg do not fit together\n")
 
 
+@pytest.mark.process
 def test_simulation_that_can_be_no_file_is_a_fault_of_its_place(see):
     shown = see(f"name: a\nsimulation: {'a' * 300}\nagents: {{count: 3}}\n")
 
     assert shown.startswith("a.yaml:2:13: simulation: not to be found: File name too long\n")
 
 
+@pytest.mark.process
 def test_fault_in_the_plugin_file_is_shown_with_both_places(see):
     Path("broken.py").write_text("x = 1\nx.nothing\n")
 
@@ -359,20 +367,60 @@ def test_long_lines_are_shown_around_the_caret(see):
     assert source[caret.index("^")] == "/"
 
 
-def load(tmp_path, text, *overrides):
+def load(tmp_path, text, *overrides, **how):
     path = tmp_path / "a.yaml"
     path.write_text(text)
-    return load_scenario(path, overrides)
+    return load_scenario(path, overrides, **how)
 
 
 def test_right_scenario_is_read_with_overrides_and_defaults(tmp_path):
     found = load(tmp_path, MINIMAL, "agents.tick_hz=100", "parameters.service=reliable")
 
     assert found.scenario.agents.tick_hz == 100.0
-    assert found.scenario.deadline.tolerance_ms == 5.0
-    assert found.parameters.service == "reliable"
+    assert found.scenario.deadline.overrun_ms == 5.0
+    assert found.parameters["service"] == "reliable"
     assert found.base_directory == tmp_path
     assert found.text == MINIMAL
+
+
+def test_old_name_of_a_key_is_read_with_a_remark_that_tells_the_new_one(tmp_path):
+    told = []
+
+    found = load(tmp_path, MINIMAL + "deadline: {tolerance_ms: 3}\n", warn=told.append)
+
+    assert found.scenario.deadline == Deadline(overrun_ms=3.0)
+    (remark,) = told
+    line = MINIMAL.count("\n") + 1
+    assert (
+        f"a.yaml:{line}:12: deadline.tolerance_ms: is an old name: write deadline.overrun_ms"
+        in (remark)
+    )
+    load(tmp_path, MINIMAL + "deadline: {overrun_ms: 3}\n", warn=told.append)
+    assert told == [remark]
+
+
+def test_old_name_beside_the_new_one_is_a_fault_with_its_place(see):
+    old = "--set deadline.tolerance_ms: is the old name of deadline.overrun_ms, which is given as"
+    written = "a.yaml:4:27: deadline.tolerance_ms: is the old name of deadline.overrun_ms"
+
+    assert written in see(MINIMAL + "deadline: {overrun_ms: 1, tolerance_ms: 2}\n")
+    shown = see(MINIMAL + "deadline: {overrun_ms: 1}\n", "deadline.tolerance_ms=2")
+    assert shown == f"{old} well: leave it out"
+
+
+def test_fault_of_a_value_under_an_old_name_stands_at_its_place(see):
+    shown = see(MINIMAL + "deadline: {tolerance_ms: [1]}\n")
+
+    assert "a.yaml:4:26: deadline.overrun_ms: expected a number, got a list" in shown
+    assert "deadline: expected a mapping, got a list" in see(MINIMAL + "deadline: [1]\n")
+
+
+def test_configuration_with_an_old_name_is_read(tmp_path):
+    config = load(tmp_path, MINIMAL, "deadline.overrun_ms=3").run_config("0001-a")
+    mapping = to_mapping(config)
+    old = {**mapping, "deadline": {"tolerance_ms": 3.0, "max_miss_ratio": 1e-3}}
+
+    assert from_mapping(RunConfig, old) == config
 
 
 def test_run_config_holds_everything_and_survives_the_journey(tmp_path):
@@ -381,7 +429,7 @@ def test_run_config_holds_everything_and_survives_the_journey(tmp_path):
     config = found.run_config("0001-a")
 
     assert (config.run, config.scenario, config.simulation) == ("0001-a", "a", "counter")
-    assert config.parameters == {"service": "best", "payload_bytes": 0}
+    assert config.parameters == {"service": "best", "payload_bytes": 0, "send_device": ""}
     assert from_mapping(RunConfig, to_mapping(config)) == config
 
 
@@ -416,6 +464,7 @@ def test_of_a_union_no_member_of_another_type_speaks_for_a_mapping(see):
     assert "expected a text" not in shown
 
 
+@pytest.mark.process
 def test_choice_that_no_member_of_a_union_knows_lists_those_of_all(see):
     shown = see(PLUGGED + "parameters: {mass_kg: 1, method: {kind: quik, steps: 2, x: 1}}\n")
 

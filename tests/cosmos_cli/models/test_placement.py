@@ -3,6 +3,7 @@ import json
 import pytest
 
 from cosmos_cli.errors import InputError
+from cosmos_cli.models.agent_labels import AgentLabels
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.models.placement import PlacementRule, claim_agents
 
@@ -73,8 +74,8 @@ def test_rule_that_cannot_be_meant_is_told_with_its_place(read, rules, expected)
     assert faults_of(read, f"placement: {rules}\n") == expected
 
 
-def test_requirement_that_is_an_option_or_a_path_is_refused(read):
-    faults = faults_of(read, "requirements: [numpy, --pre, ../x, 'a b', '']\n")
+def test_requirement_that_is_an_option_or_a_path_from_the_root_is_refused(read):
+    faults = faults_of(read, "requirements: [numpy, --pre, /x/y, 'a b', '']\n")
 
     assert [column for _, column, *_ in faults] == [23, 30, 36, 43]
     assert all("expected a Python requirement" in text for *_, text in faults)
@@ -110,3 +111,54 @@ def test_claims_leave_what_no_rule_takes():
     claims = claim_agents(["a", "b", "c"], [PlacementRule(agents=("b",)), PlacementRule(count=1)])
 
     assert (claims.taken, claims.left, claims.faults) == ((("b",), ("a",)), ("c",), ())
+
+
+def test_rules_find_agents_by_their_second_names():
+    labels = AgentLabels(column="satellite", names={"a": "IRIDIUM 7", "b": "IRIDIUM 8", "c": "X"})
+    rules = [PlacementRule(agents=("X",)), PlacementRule(agents=("IRIDIUM*",))]
+
+    claims = claim_agents(["a", "b", "c", "d"], rules, labels)
+
+    assert (claims.taken, claims.left, claims.faults) == ((("c",), ("a", "b")), ("d",), ())
+    (fault,) = claim_agents(["a", "b", "c"], [PlacementRule(agents=("IRIDIUM 77",))], labels).faults
+    assert fault[1] == "no agent is named IRIDIUM 77, did you mean IRIDIUM 7?"
+
+
+CONSTELLATION = """
+name: a
+simulation: constellation
+agents: {count: 2}
+parameters: {satellites: {walker: "56:2/1/0", altitude_km: 780}}
+placement: [{agents: ["GLOB"]}]
+"""
+
+
+@pytest.fixture
+def load_placed(tmp_path):
+    """Load a constellation whose placement names an agent, with changes of its text."""
+
+    def load(glob, old="", new=""):
+        path = tmp_path / "a.yaml"
+        path.write_text(CONSTELLATION.replace("GLOB", glob).replace(old, new))
+        return load_scenario(path)
+
+    return load
+
+
+def test_simulation_tells_placement_what_it_calls_its_agents(load_placed):
+    labels = load_placed("*").labels
+    first = labels.names["agent-01"]
+
+    assert (labels.column, len(labels.names)) == ("satellite", 2)
+    assert first != "agent-01"
+    assert load_placed(first).scenario.placement[0].agents == (first,)
+    with pytest.raises(InputError, match="no agent is named nobody"):
+        load_placed("nobody")
+
+
+def test_second_names_that_a_fault_elsewhere_hides_are_no_faults_of_their_own(load_placed):
+    with pytest.raises(InputError) as caught:
+        load_placed("SAT*", "780", "high")
+
+    (fault,) = caught.value.faults
+    assert fault.path == "parameters.satellites.altitude_km"

@@ -4,7 +4,7 @@ import pytest
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.inventory import load_machines
-from cosmos_cli.models.provision_steps import Command, FileContent, LineInFile, Service
+from cosmos_cli.models.provision_steps import FileContent, LineInFile, ShellCommand, SystemdService
 
 HEAD = "all:\n  hosts: {m: }\n  vars:\n    cosmos_provision:\n"
 
@@ -14,7 +14,7 @@ def read(tmp_path):
     def read_steps(*steps):
         path = tmp_path / "i.yaml"
         path.write_text(HEAD + "".join(f"      - {step}\n" for step in steps))
-        return load_machines(path)[0].provision
+        return load_machines(path)[0].variables.cosmos_provision
 
     return read_steps
 
@@ -53,18 +53,11 @@ def test_steps_of_every_kind_are_typed(read, tmp_path):
         FileContent(src=str(tmp_path / "motd"), dest="/etc/motd", mode="0644", owner="root"),
         FileContent(content="x", dest="~/.profile"),
         LineInFile(path="/boot/config.txt", line="dtoverlay=rpi-sense", create=True),
-        Service(name="hciuart", enabled=False, state="stopped"),
-        Command(run="usermod -aG i2c pi", unless="id -nG pi | grep -q i2c"),
+        SystemdService(name="hciuart", enabled=False, state="stopped"),
+        ShellCommand(run="usermod -aG i2c pi", unless="id -nG pi | grep -q i2c"),
     ]
     assert [step.become for step in steps] == [True, True, True, True, True, False]
-    assert [step.label for step in steps] == [
-        "packages i2c-tools python3-numpy",
-        "greet",
-        "file ~/.profile",
-        "line in /boot/config.txt",
-        "service hciuart",
-        "command usermod -aG i2c pi",
-    ]
+    assert [step.name for step in steps] == [None, "greet", None, None, None, None]
 
 
 def test_source_is_found_from_the_inventorys_folder(read, tmp_path, monkeypatch):
@@ -137,7 +130,7 @@ def test_missing_source_and_folder_are_refused_with_where_they_were_looked_for(r
 
     assert [told for *_, told in faults] == [
         f"no such file: {tmp_path}/nope; it is looked for from the inventory's folder",
-        f"expected a file, got the folder {tmp_path}/folder",
+        f"{tmp_path}/folder: expected a file, got a folder",
     ]
 
 

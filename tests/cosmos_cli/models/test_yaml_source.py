@@ -1,4 +1,5 @@
 import math
+import os
 
 import pytest
 from hypothesis import given
@@ -6,7 +7,13 @@ from hypothesis import strategies as st
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.document import read_document
-from cosmos_cli.models.yaml_source import DEPTH_MAX, Source, compose, read_source, resolve_scalar
+from cosmos_cli.models.yaml_source import (
+    DEPTH_MAX,
+    YamlSource,
+    compose,
+    read_source,
+    resolve_scalar,
+)
 
 
 @pytest.mark.parametrize(
@@ -59,9 +66,38 @@ def test_numbers_that_are_not_finite_or_too_long_are_refused(text):
         resolve_scalar(text)
 
 
-@given(st.integers(-(10**30), 10**30))
+@given(st.integers(-(2**63), 2**63 - 1))
 def test_whole_numbers_come_back_as_they_were_written(number):
     assert resolve_scalar(str(number)) == number
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        str(2**63),
+        str(-(2**63) - 1),
+        "0xffffffffffffffff",
+        f"0o{2**63:o}",
+        "9" * 300,
+        f"0x{'f' * 298}",
+    ],
+)
+def test_whole_numbers_beyond_64_bits_are_refused(text):
+    with pytest.raises(ValueError, match=r"from -2\^63 to 2\^63 - 1, got .* such as 1e20"):
+        resolve_scalar(text)
+
+
+def test_whole_number_beyond_64_bits_is_told_at_its_place():
+    document = read_document(YamlSource.of("a.yaml", "a:\n  b: [1, 99999999999999999999]\n"))
+
+    assert [(fault.path, fault.line, fault.column) for fault in document.faults] == [
+        ("a.b[1]", 2, 10)
+    ]
+
+
+@pytest.mark.parametrize("text", ["1e20", "100000000000000000000.0", "-3.5e300", "0." + "1" * 400])
+def test_numbers_of_many_digits_that_are_not_whole_are_read(text):
+    assert resolve_scalar(text) == float(text)
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False))
@@ -71,7 +107,7 @@ def test_numbers_come_back_as_they_were_written(number):
 
 def fault_of(text):
     with pytest.raises(InputError) as caught:
-        compose(Source.of("a.yaml", text))
+        compose(YamlSource.of("a.yaml", text))
     (fault,) = caught.value.faults
     return fault
 
@@ -111,20 +147,20 @@ def test_deep_nesting_is_refused_and_does_not_end_the_process(text):
 
 
 def test_explicit_tags_of_the_core_schema_are_understood():
-    node = compose(Source.of("a", "[!!str 3, !!int 3, !!float 3, ! 3]"))
+    node = compose(YamlSource.of("a", "[!!str 3, !!int 3, !!float 3, ! 3]"))
 
     assert [item.value for item in node.value] == ["3", 3, 3.0, "3"]
     assert isinstance(node.value[2].value, float)
 
 
 def test_empty_text_has_no_document():
-    assert compose(Source.of("a", "# nothing\n")) is None
+    assert compose(YamlSource.of("a", "# nothing\n")) is None
 
 
 @given(st.text(max_size=200))
 def test_any_text_is_read_or_refused_with_a_place(text):
     try:
-        compose(Source.of("a.yaml", text))
+        compose(YamlSource.of("a.yaml", text))
     except InputError as error:
         assert all(fault.file == "a.yaml" for fault in error.faults)
 
@@ -156,7 +192,7 @@ def test_folder_is_refused(tmp_path):
 def test_unreadable_file_says_why(tmp_path, monkeypatch):
     path = tmp_path / "a.yaml"
     path.write_text("a: 1\n")
-    monkeypatch.setattr(type(path), "open", _deny)
+    monkeypatch.setattr(os, "open", _deny)
 
     assert whole_fault(path) == f"{path}: cannot be read: Permission denied"
 
@@ -194,7 +230,7 @@ def test_huge_file_is_refused(tmp_path):
 
 
 def test_scalar_without_a_value_does_not_stop_the_reading_of_the_rest():
-    document = read_document(Source.of("x", "a: &n .inf\nb: *n\nc: 3\n"))
+    document = read_document(YamlSource.of("x", "a: &n .inf\nb: *n\nc: 3\n"))
 
     assert document.value == {"a": None, "b": None, "c": 3}
     assert [(f.line, f.column, f.path, f.text) for f in document.faults] == [

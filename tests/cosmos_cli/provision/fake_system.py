@@ -3,15 +3,17 @@
 import hashlib
 from pathlib import Path
 
-from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.helper import Helper
+from cosmos_cli.fleet.liveness import SilenceWatch
 from cosmos_cli.fleet.local import LocalConnection
-from cosmos_cli.fleet.silence import WatchedConnection
 from cosmos_cli.fleet.target import Target
-from cosmos_cli.provision.bring_up import Site, bring_up
-from cosmos_cli.provision.brought import Brought, UpOptions
-from cosmos_cli.provision.parts import HELPER_PARTS
-from cosmos_cli.provision.wanted import Content, Paths
+from cosmos_cli.models.device_needs import NO_NEEDS
+from cosmos_cli.models.machine_facts import SystemPaths
+from cosmos_cli.provision import HELPER_PARTS
+from cosmos_cli.provision.inventory_steps import Content
+from cosmos_cli.provision.up import MachineUp, UpOptions
+from cosmos_cli.provision.up_table import MachineResult
 
 FILES = {
     "etc/os-release": 'PRETTY_NAME="Debian GNU/Linux 12 (bookworm)"\nID=debian\nVERSION_ID="12"\n',
@@ -44,7 +46,9 @@ def make_system(folder):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-    return Paths(etc=str(folder / "etc"), sys=str(folder / "sys"), proc=str(folder / "proc"))
+    return SystemPaths(
+        **{name: str(folder / name) for name in ("etc", "sys", "proc", "boot")},
+    )
 
 
 def connection_to(folder):
@@ -55,9 +59,16 @@ def connection_to(folder):
 class FakeKit:
     """Neither wheels nor an echo: what is tested is the way between."""
 
-    def __init__(self, paths=None, trees=()):
-        self.paths = paths or Paths()
-        self.trees = tuple(trees)
+    def __init__(self, paths=None, trees=(), needs=NO_NEEDS):
+        self.paths = paths or SystemPaths()
+        self._trees = tuple(trees)
+        self._needs = needs
+
+    def trees(self, machine):
+        return self._trees
+
+    def needs(self, machine):
+        return self._needs
 
     def environments(self, machine, greeting, teller):
         return ()
@@ -94,11 +105,18 @@ class Listener:
 def up(connection, machine, kit=None, listener=None, **options):
     """Return what became of a machine, as the command line does it."""
     try:
-        with Board.start(WatchedConnection(connection), HELPER_PARTS) as board:
-            site = Site(connection=connection, board=board, machine=machine)
-            return bring_up(site, kit or FakeKit(), UpOptions(**options), listener or Listener())
+        with Helper.start(connection, HELPER_PARTS, watch=SilenceWatch(connection)) as board:
+            return MachineUp(
+                connection=connection,
+                board=board,
+                machine=machine,
+                resources=kit or FakeKit(),
+                options=UpOptions(**options),
+                teller=listener or Listener(),
+                result=MachineResult(machine=machine.name),
+            ).run()
     except MachineFailure as failure:
-        return Brought(failure=failure)
+        return MachineResult(machine=machine.name, failure=failure)
 
 
 def contents(folder):
@@ -118,15 +136,19 @@ class CutStream:
     def __init__(self, stream, counter):
         self._stream = stream
         self._counter = counter
+        self._left_bytes = 0  # of the request that is being handed over
 
     def __getattr__(self, name):
         return getattr(self._stream, name)
 
-    def write_all(self, data, *, timeout_s):
-        self._counter["left"] -= 1
+    def write(self, data, *, timeout_s=0.0):
+        self._counter["left"] -= not self._left_bytes
         if self._counter["left"] < 0:
             raise MachineFailure(FailureKind.LOST, "the connection broke")
-        self._stream.write_all(data, timeout_s=timeout_s)
+        self._left_bytes = len(data)
+        count = self._stream.write(data, timeout_s=timeout_s)
+        self._left_bytes -= count
+        return count
 
 
 class CutConnection:
@@ -135,6 +157,10 @@ class CutConnection:
     def __init__(self, connection, requests):
         self._connection = connection
         self._counter = {"left": requests}
+
+    @property
+    def is_cut(self):
+        return self._counter["left"] < 0
 
     def __getattr__(self, name):
         return getattr(self._connection, name)

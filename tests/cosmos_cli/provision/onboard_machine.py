@@ -7,12 +7,13 @@ import signal
 from contextlib import contextmanager
 from pathlib import Path
 
-from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
+from cosmos_cli.fleet.liveness import BlockingStream
 from cosmos_cli.fleet.local import LocalConnection
 from cosmos_cli.fleet.target import Target
-from cosmos_cli.provision.environment import PARTS
+from cosmos_cli.provision import STORE_PARTS
 
 
 class CutStream:
@@ -21,21 +22,25 @@ class CutStream:
     def __init__(self, stream, connection):
         self._stream = stream
         self._connection = connection
+        self._left_bytes = 0  # of the frame that is being handed over
 
     def __getattr__(self, name):
         return getattr(self._stream, name)
 
-    def write_all(self, data, *, timeout_s):
-        if self._connection.is_over():
+    def write(self, data, *, timeout_s=0.0):
+        if not self._left_bytes and self._connection.is_over():
             # Half of it may have come through.
-            self._stream.write_all(data[: len(data) // 2], timeout_s=timeout_s)
+            BlockingStream(self._stream).write_all(data[: len(data) // 2], timeout_s=timeout_s)
             self._cut()
-        self._stream.write_all(data, timeout_s=timeout_s)
+        self._left_bytes = len(data)
+        count = self._stream.write(data, timeout_s=timeout_s)
+        self._left_bytes -= count
+        return count
 
-    def read_some(self, count, *, timeout_s):
+    def read(self, count, *, timeout_s=0.0):
         if self._connection.is_over():
             self._cut()
-        return self._stream.read_some(count, timeout_s=timeout_s)
+        return self._stream.read(count, timeout_s=timeout_s)
 
     def _cut(self):
         self._stream.close()
@@ -66,7 +71,7 @@ class OwnMachine:
     @contextmanager
     def board(self, *, cut_after=None):
         """Start a helper; *cut_after* counts steps from its greeting on."""
-        with Board.start(self, PARTS) as board:
+        with Helper.start(self, STORE_PARTS) as board:
             self.steps_left = cut_after
             self._count(board)
             try:

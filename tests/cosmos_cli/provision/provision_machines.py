@@ -5,10 +5,10 @@ import hashlib
 import json
 from pathlib import Path
 
-from cosmos_cli.models.inventory import Machine
-from cosmos_cli.models.provision_steps import ProvisionStep
-from cosmos_cli.provision.facts import Facts
-from cosmos_cli.provision.wanted import Content, wanted_of
+from cosmos_cli.models.inventory import Machine, Variables
+from cosmos_cli.models.machine_facts import MachineFacts
+from cosmos_cli.provision.desired import desired_state
+from cosmos_cli.provision.inventory_steps import Content
 
 CASES = Path(__file__).parent / "cases"
 BOARD = json.loads((CASES / "board.json").read_text())
@@ -33,18 +33,13 @@ def told(**changes):
 
 def facts_of(**changes):
     prunable = tuple(changes.pop("prunable", ()))
-    facts = Facts.from_mapping(told(**changes), asked_utc_s=1000.0, answered_utc_s=1001.0)
+    facts = MachineFacts.from_mapping(told(**changes), asked_utc_s=1000.0, answered_utc_s=1001.0)
     return dataclasses.replace(facts, prunable=prunable)
 
 
 def machine_of(*, variables=None, packages=(), provision=()):
-    return Machine(
-        name="pi01",
-        address="pi01",
-        variables=variables or {},
-        packages=tuple(packages),
-        provision=tuple(ProvisionStep.model_validate(step) for step in provision),
-    )
+    given = {**(variables or {}), "cosmos_packages": [*packages], "cosmos_provision": [*provision]}
+    return Machine(name="pi01", address="pi01", variables=Variables.of(given))
 
 
 def read_file(path):
@@ -52,8 +47,8 @@ def read_file(path):
 
 
 def wanted(home=HOME, environments=(), trees=(), **entries):
-    return wanted_of(
-        machine_of(**entries),
+    return desired_state(
+        machine_of(**entries).variables,
         home=home,
         read_file=read_file,
         environments=environments,

@@ -6,10 +6,10 @@ import threading
 
 import pytest
 
-from cosmos_cli.fleet.onboard import installed
-from cosmos_cli.fleet.onboard.core import Refusal
-from cosmos_cli.provision import echo as module
-from cosmos_cli.provision.echo import Echo
+from cosmos_cli.onboard import installed
+from cosmos_cli.onboard.request_loop import HelperRefusal
+from cosmos_cli.provision import udp_echo as module
+from cosmos_cli.provision.udp_echo import Echo
 
 
 @pytest.fixture
@@ -89,7 +89,7 @@ def test_silence_names_the_address_and_what_to_do(monkeypatch, link):
     link.bind(("127.0.0.1", 0))
     port = link.getsockname()[1]
 
-    with pytest.raises(Refusal) as caught:
+    with pytest.raises(HelperRefusal) as caught:
         installed.round_trip_ms({"address": "127.0.0.1", "port": port, "nonce_hex": "00" * 16})
 
     assert caught.value.text == f"no UDP from here to 127.0.0.1:{port}"
@@ -99,7 +99,7 @@ def test_silence_names_the_address_and_what_to_do(monkeypatch, link):
 def test_address_that_is_none_is_told(monkeypatch):
     monkeypatch.setattr(installed, "ECHO_WAIT_S", 0.02)
 
-    with pytest.raises(Refusal, match=r"no UDP from here to no\.such\.host\.invalid:9 \("):
+    with pytest.raises(HelperRefusal, match=r"no UDP from here to no\.such\.host\.invalid:9 \("):
         installed.round_trip_ms(
             {"address": "no.such.host.invalid", "port": 9, "nonce_hex": "00" * 16}
         )
@@ -120,7 +120,7 @@ def test_foreign_answers_are_not_taken_for_ours(monkeypatch):
         thread = threading.Thread(target=answer)
         thread.start()
         question = {"address": "127.0.0.1", "port": other.getsockname()[1], "nonce_hex": "00" * 16}
-        with pytest.raises(Refusal, match="no UDP"):
+        with pytest.raises(HelperRefusal, match="no UDP"):
             installed.round_trip_ms(question)
         thread.join(5)
 

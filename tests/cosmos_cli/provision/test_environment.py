@@ -17,8 +17,8 @@ from made_wheels import make_runtime_wheels, make_wheel, only_index
 from onboard_machine import OwnMachine, snapshot
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
-from cosmos_cli.fleet.onboard.core import Request
-from cosmos_cli.fleet.onboard.environment import environment as build
+from cosmos_cli.onboard.environment import environment as build
+from cosmos_cli.onboard.request_loop import VerbRequest
 from cosmos_cli.provision import environment as module
 from cosmos_cli.provision.environment import (
     RuntimeCheck,
@@ -33,6 +33,8 @@ from cosmos_cli.provision.lock import Distributed, Lock, Locked
 from cosmos_cli.provision.platform import greeted_platform
 from cosmos_cli.provision.trees import runtime_tree, send_tree
 from cosmos_cli.provision.wheelhouse import Environment, prepare
+
+pytestmark = pytest.mark.process
 
 REAL_PACKAGES = ("msgpack", "numpy", "orjson", "psutil")
 
@@ -280,7 +282,7 @@ def test_damaged_environment_of_a_living_run_is_left_alone(machine, house, navli
         before = snapshot(top_of(machine, environment))
         with pytest.raises(MachineFailure, match="a run uses it") as caught:
             install(machine, environment)
-        process.communicate(b"\n", timeout=20)
+        process.communicate(b"\n", timeout=120)
 
     assert caught.value.kind is FailureKind.BUSY
     assert "cosmos down" in caught.value.advice
@@ -429,7 +431,7 @@ def test_disk_without_links_gets_copies(machine, house, navlib, monkeypatch):
     given = next(given for verb, given, _ in machine.calls if verb == "environment")
     shutil.rmtree(top_of(machine, environment))
 
-    build(Request(arguments=given, body=b""))
+    build(VerbRequest(arguments=given, body=b""))
 
     assert calls
     assert is_whole(machine, environment)
@@ -454,7 +456,7 @@ def test_prune_spares_the_wanted_the_newest_and_the_used(machine, house, tmp_pat
             foretold = ask_installed(board, request).prunable
             removed = board.call("prune_installed", request).value
             left = ask_installed(board, request)
-        process.communicate(b"\n", timeout=20)
+        process.communicate(b"\n", timeout=120)
 
     gone = {environments[2].key, environments[3].key}
     assert set(removed["environments"]) == set(foretold["environments"]) == gone
@@ -498,7 +500,6 @@ def test_full_disk_leaves_no_half_built_environment(machine, house, navlib, tmp_
     assert install(machine, environment)
 
 
-@pytest.mark.process
 def test_runtime_runs_from_its_environment_and_tree_alone(machine, tmp_path, monkeypatch):
     """What an agent imports is imported from what was sent, and from nowhere else."""
     monkeypatch.setenv("COSMOS_CACHE", str(tmp_path / "cache"))

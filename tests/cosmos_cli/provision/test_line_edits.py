@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosmos_cli.fleet.onboard.files import edited
+from cosmos_cli.onboard.files import edited
 
 
 @pytest.mark.parametrize(

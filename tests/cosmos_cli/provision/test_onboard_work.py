@@ -4,37 +4,83 @@ import errno
 import io
 import os
 import stat
-import time
 from pathlib import Path
 
 import pytest
 from fake_system import connection_to
+from harness.waiting import is_alive, wait_until
 
-from cosmos_cli.fleet.board import Board
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
-from cosmos_cli.fleet.onboard import core, files, system
-from cosmos_cli.fleet.onboard.core import Refusal, Request
-from cosmos_cli.fleet.onboard.files import replace_file
-from cosmos_cli.provision.parts import HELPER_PARTS
+from cosmos_cli.fleet.helper import Helper
+from cosmos_cli.models.provision_steps import FILE_BYTES_MAX
+from cosmos_cli.onboard import facts, files, request_loop, system, wheels
+from cosmos_cli.onboard.files import replace_file
+from cosmos_cli.onboard.request_loop import HelperRefusal, VerbRequest
+from cosmos_cli.provision import HELPER_PARTS
 
 PATIENCE_S = 30.0
 
 
-def wait_until(condition):
-    until_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < until_s, "waited in vain"
-        time.sleep(0.02)
-
-
 def test_lock_is_given_up_within_a_minute_unless_something_else_is_said(tmp_path, monkeypatch):
-    monkeypatch.setattr(core.PatientInput, "patience_s", None)
+    monkeypatch.setattr(request_loop.PatientInput, "patience_s", None)
 
-    core.lock(Request(arguments={"path": str(tmp_path / "lock")}, body=b""))
+    request_loop.lock(VerbRequest(arguments={"path": str(tmp_path / "lock")}, body=b""))
 
-    assert core.PatientInput.patience_s == 60.0
+    assert request_loop.PatientInput.patience_s == 60.0
 
 
+@pytest.mark.parametrize("kind", ["link", "dangling", "pipe", "folder"])
+def test_lock_empties_no_file_that_a_link_leads_to_and_waits_for_no_pipe(tmp_path, kind):
+    path, victim = tmp_path / "lock", tmp_path / "victim"
+    victim.write_text("precious")
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to(victim if kind == "link" else tmp_path / "nowhere")
+
+    with pytest.raises(HelperRefusal, match="lock: expected a file") as caught:
+        request_loop.lock(VerbRequest(arguments={"path": str(path)}, body=b""))
+
+    assert caught.value.advice == "delete it there"
+    assert victim.read_text() == "precious"
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_piece_of_a_wheel_is_not_appended_to_what_a_link_leads_to(tmp_path):
+    victim = tmp_path / "victim"
+    victim.touch()
+    sha256 = "0" * 64
+    Path(wheels.partial_path(str(tmp_path), sha256)).symlink_to(victim)
+    asked = {"folder": str(tmp_path), "sha256": sha256, "offset": 0, "size": 9, "filename": "x.whl"}
+
+    with pytest.raises(OSError, match="symbolic links"):
+        wheels.wheel(VerbRequest(arguments=asked, body=b"abc"))
+
+    assert victim.read_bytes() == b""
+
+
+@pytest.mark.timeout(30)
+def test_file_longer_than_any_that_is_written_differs_without_being_read(tmp_path):
+    assert files.CONTENT_BYTES_MAX == FILE_BYTES_MAX
+    path = tmp_path / "sparse"
+    path.touch()
+    os.truncate(path, 9 * 10**12)
+
+    asked = {"files": {str(path): "hash"}}
+    told = facts.look(VerbRequest(arguments=asked))["files"][str(path)]
+
+    assert told["size_bytes"] == 9 * 10**12
+    assert "sha256" not in told
+    edit = {"path": str(path), "line": "x", "is_present": True}
+    with pytest.raises(HelperRefusal, match="expected at most 67108864 B to edit"):
+        files.edit_line(VerbRequest(arguments=edit, body=b""))
+    assert replace_file(str(path), b"x", {}) is True
+    assert path.read_bytes() == b"x"
+
+
+@pytest.mark.process
 def test_what_worked_as_root_and_was_killed_is_lost_and_not_the_operator(tmp_path, monkeypatch):
     """A broken pipe to it must not look as if nobody listened any more."""
     sudo = tmp_path / "sudo"
@@ -42,11 +88,11 @@ def test_what_worked_as_root_and_was_killed_is_lost_and_not_the_operator(tmp_pat
     sudo.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     greets_and_dies = 'echo \'{"ok": true, "body": 0}\''
-    rooted = core.Rooted(["/bin/sh", "-c", greets_and_dies], b"package")
-    out = core.FrameWriter(io.BytesIO())
+    rooted = request_loop.Rooted(["/bin/sh", "-c", greets_and_dies], b"package")
+    out = io.BytesIO()
 
     for _ in range(2):
-        with pytest.raises(Refusal, match="ended without an answer") as caught:
+        with pytest.raises(HelperRefusal, match="ended without an answer") as caught:
             rooted.relay({"verb": "facts"}, b"", out)
         rooted._process.wait()
 
@@ -110,10 +156,10 @@ def test_nobody_sees_a_half_written_file(tmp_path, monkeypatch):
 
 
 def test_unknown_owner_and_special_files_are_refused(tmp_path):
-    with pytest.raises(Refusal, match="there is no user 'nobody-here'"):
+    with pytest.raises(HelperRefusal, match="there is no user 'nobody-here'"):
         replace_file(str(tmp_path / "a"), b"", {"owner": "nobody-here"})
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(Refusal, match="expected a file"):
+    with pytest.raises(HelperRefusal, match="expected a file"):
         replace_file(str(tmp_path / "pipe"), b"", {})
 
     assert os.listdir(tmp_path) == ["pipe"]
@@ -121,7 +167,7 @@ def test_unknown_owner_and_special_files_are_refused(tmp_path):
 
 @pytest.mark.process
 def test_long_command_gives_signs_of_life(tmp_path, monkeypatch):
-    with Board.start(connection_to(tmp_path), HELPER_PARTS) as board:
+    with Helper.start(connection_to(tmp_path), HELPER_PARTS) as board:
         asked = {"run": f"sleep 2.5; touch {tmp_path}/a", "creates": f"{tmp_path}/a"}
         parts = [p.value for p in board.parts("command", {**asked, "timeout_s": PATIENCE_S})]
 
@@ -133,22 +179,13 @@ def test_long_command_gives_signs_of_life(tmp_path, monkeypatch):
 @pytest.mark.process
 def test_command_that_takes_too_long_is_ended_with_its_children(tmp_path):
     asked = {"run": f"sleep 1000 & echo $! > {tmp_path}/pid; wait", "creates": f"{tmp_path}/a"}
-    with Board.start(connection_to(tmp_path), HELPER_PARTS) as board:
+    with Helper.start(connection_to(tmp_path), HELPER_PARTS) as board:
         with pytest.raises(MachineFailure, match="not done in 0.1 s") as failure:
             list(board.parts("command", {**asked, "timeout_s": 0.1}))
         pid = int((tmp_path / "pid").read_text())
 
         assert failure.value.kind is FailureKind.TIMEOUT
         wait_until(lambda: not is_alive(pid))
-
-
-def is_alive(pid):
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    with open(f"/proc/{pid}/stat") as file:
-        return file.read().rpartition(")")[2].split()[0] != "Z"
 
 
 @pytest.mark.process
@@ -159,7 +196,7 @@ def test_command_whose_operator_is_gone_is_seen_through(tmp_path):
         "creates": str(done),
         "timeout_s": PATIENCE_S,
     }
-    board = Board.start(connection_to(tmp_path), HELPER_PARTS)
+    board = Helper.start(connection_to(tmp_path), HELPER_PARTS)
     parts = board.parts("command", asked)
     assert next(parts).value == {"is_running": True}
 
@@ -171,6 +208,7 @@ def test_command_whose_operator_is_gone_is_seen_through(tmp_path):
     board.close()
 
 
+@pytest.mark.process
 def test_output_is_kept_to_its_end(monkeypatch):
     (*_, last) = system.running(["/bin/sh", "-c", "seq 20; exit 3"], timeout_s=PATIENCE_S)
 

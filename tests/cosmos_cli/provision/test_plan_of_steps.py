@@ -8,9 +8,10 @@ import pytest
 from provision_machines import CASES, HOME, facts_of, told, wanted
 
 from cosmos_cli.fleet.failure import MachineFailure
-from cosmos_cli.provision.facts import Facts
-from cosmos_cli.provision.notes import notes_of
-from cosmos_cli.provision.steps import RESERVE_BYTES, check_possible, plan_steps
+from cosmos_cli.models.machine_facts import MachineFacts
+from cosmos_cli.provision.steps import RESERVE_BYTES, check_possible, notes_of, plan_steps
+from cosmos_cli.provision.up import MachineUp, UpOptions
+from cosmos_cli.provision.up_table import MachineResult
 
 PLANS = json.loads((CASES / "plans.json").read_text())
 
@@ -149,7 +150,7 @@ def test_facts_tell_the_clock_and_leave_out_what_only_the_plan_needed():
 def test_slow_answer_makes_no_clock_wrong():
     """Conditions of commands may take a minute, and the clock is read before them."""
     answer = told(clock={"utc_s": 1000.1})
-    facts = Facts.from_mapping(answer, asked_utc_s=1000.0, answered_utc_s=1060.0)
+    facts = MachineFacts.from_mapping(answer, asked_utc_s=1000.0, answered_utc_s=1060.0)
 
     assert facts.clock_offset_s == 0.0
     assert notes_of(facts, wanted()) == ()
@@ -166,6 +167,8 @@ def test_slow_answer_makes_no_clock_wrong():
         ({"throttled": 0x50005}, {}, ("its supply voltage is too low and it is throttled",)),
         ({"throttled": 0x50000}, {}, ()),
         ({}, {"cosmos_realtime_priority": 50}, ("is granted real-time priority 0, not 50",)),
+        ({"uses_pam": False}, {"cosmos_realtime_priority": 50}, ("set `UsePAM yes` in",)),
+        ({"uses_pam": True}, {"cosmos_realtime_priority": 50}, ("perhaps pam_limits is missing",)),
         ({"realtime_priority_max": 50}, {"cosmos_realtime_priority": 50}, ()),
         ({"realtime_priority_max": None}, {"cosmos_realtime_priority": 50}, ()),
         ({"user": {"id": 0}}, {"cosmos_realtime_priority": 50}, ()),
@@ -176,3 +179,17 @@ def test_notes(changes, variables, words):
 
     assert len(notes) == len(words)
     assert all(word in note for word, note in zip(words, notes, strict=True))
+
+
+@pytest.mark.parametrize(("is_planned", "count"), [(True, 0), (False, 1)])
+def test_check_blames_no_server_for_a_limit_that_is_still_to_be_set(is_planned, count):
+    wants = wanted(variables={"cosmos_realtime_priority": 50})
+    facts = facts_of(uses_pam=True)
+    steps = plan_steps(facts, wants) if is_planned else ()
+    result = MachineResult(machine="pi01", facts=facts, planned=steps)
+    others = dict.fromkeys(("connection", "board", "machine", "resources", "teller"))
+    options = UpOptions(is_check=True, has_texts=False, host=None)
+
+    MachineUp(**others, options=options, result=result)._note(wants)
+
+    assert len(result.notes) == count

@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,12 +10,14 @@ from made_wheels import make_runtime_wheels, make_wheel, only_index
 from onboard_machine import OwnMachine
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
-from cosmos_cli.models.inventory import Machine
+from cosmos_cli.models.inventory import Machine, Variables
 from cosmos_cli.models.loading import load_scenario
+from cosmos_cli.provision.before_run import Cargo, cargo_of, make_ready
 from cosmos_cli.provision.environment import install_environment
 from cosmos_cli.provision.platform import greeted_platform
-from cosmos_cli.provision.ready import cargo_of, make_ready
 from cosmos_cli.provision.wheelhouse import prepare
+
+pytestmark = pytest.mark.process
 
 SCENARIO = """
 name: small
@@ -69,7 +70,8 @@ def installed(machine, *requirements, **how):
 
 def ready(machine, scenario, /, **how):
     with machine.board() as board:
-        return make_ready(machine, board, how.pop("target", machine.target), scenario, **how)
+        cargo = scenario if isinstance(scenario, Cargo) else cargo_of(scenario)
+        return make_ready(board, how.pop("target", machine.target), cargo, **how)
 
 
 def test_programs_are_told_where_everything_is(machine, index, scenario):
@@ -111,9 +113,8 @@ def test_damaged_environment_is_not_run_in(machine, index, scenario):
 
 
 def test_machines_own_requirements_and_packages_count(machine, index, scenario):
-    entry = Machine(
-        name="own", address="own", requirements=("maplib",), packages=("python3-rtimulib",)
-    )
+    given = {"cosmos_requirements": ["maplib"], "cosmos_packages": ["python3-rtimulib"]}
+    entry = Machine(name="own", address="own", variables=Variables.of(given))
     environment = installed(machine, "maplib", "navlib", sees_system=True)
 
     assert environment.key in ready(machine, scenario, machine=entry).python
@@ -169,16 +170,6 @@ def test_tilde_is_the_home_of_who_logs_in(machine, index, scenario, monkeypatch,
 
     assert made.python.startswith(f"{home}/cosmos/environments/")
     assert Path(made.base_directory).is_dir()
-
-
-def test_this_computer_runs_what_it_runs(machine, scenario):
-    local = replace(machine.target, connection="local")
-
-    made = ready(machine, scenario, target=local)
-
-    assert (made.python, made.python_path) == (sys.executable, "")
-    assert made.base_directory == str(scenario.base_directory)
-    assert machine.calls == []
 
 
 def test_interpreter_runs_with_these_variables(machine, index, scenario):

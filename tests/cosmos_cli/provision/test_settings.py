@@ -8,9 +8,9 @@ import pytest
 from provision_machines import facts_of, wanted
 
 from cosmos_cli.fleet.failure import MachineFailure
-from cosmos_cli.provision.facts import FileFact, Radio
-from cosmos_cli.provision.settings import setting_files, setting_steps
-from cosmos_cli.provision.wanted import Paths
+from cosmos_cli.models.inventory.settings import SETTINGS
+from cosmos_cli.models.machine_facts import FileFact, Radio, SystemPaths
+from cosmos_cli.provision.settings import setting_steps
 
 BUFFER = "/proc/sys/net/core/rmem_max"
 GOVERNOR = "/sys/devices/system/cpu/cpu{}/cpufreq/scaling_governor"
@@ -47,9 +47,6 @@ class Machine:
         facts = facts_of()
         return dataclasses.replace(
             facts,
-            network=dataclasses.replace(
-                facts.network, receive_buffer_bytes_max=int(self.values[BUFFER])
-            ),
             governors={f"cpu{i}": self.values[GOVERNOR.format(i)] for i in (0, 1)},
             radios=tuple(
                 Radio(
@@ -59,7 +56,10 @@ class Machine:
                 )
                 for name, kind in (("rfkill0", "bluetooth"), ("rfkill1", "wlan"))
             ),
-            files={path: FileFact(kind="file", text=text) for path, text in self.files.items()},
+            files={
+                path: FileFact(kind="file", text=text)
+                for path, text in {**self.files, BUFFER: f"{self.values[BUFFER]}\n"}.items()
+            },
         )
 
     def plan(self, **variables):
@@ -224,7 +224,7 @@ def test_folder_where_a_settings_file_belongs_is_told():
 
 
 def test_every_setting_has_a_file_of_its_own():
-    files = setting_files(Paths())
+    files = [setting.file(SystemPaths()) for setting in SETTINGS]
 
     assert len(set(files)) == len(files) == 5
     assert all(path.startswith("/etc/") and "90-cosmos" in path for path in files)

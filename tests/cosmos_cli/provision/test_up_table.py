@@ -8,15 +8,13 @@ import sys
 import pytest
 from provision_machines import facts_of, wanted
 
-from cosmos_cli.console import Console
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.provision import up_table, up_view
-from cosmos_cli.provision.apply import Done
-from cosmos_cli.provision.brought import Brought
-from cosmos_cli.provision.step import Change, Kind, Step
+from cosmos_cli.provision.step import Change, Done, Kind, Step
 from cosmos_cli.provision.steps import plan_steps
 from cosmos_cli.provision.up_table import MachineResult
 from cosmos_cli.provision.up_view import UpView
+from cosmos_cli.ui.console import Console
 
 FACTS = facts_of()
 STEPS = plan_steps(
@@ -30,14 +28,15 @@ FAILURE = MachineFailure(FailureKind.STEP, "package htop: install:\nno\nsuch", "
 
 
 def result(machine, *, steps=(), failure=None, **changes):
-    brought = Brought(
+    return MachineResult(
+        machine=machine,
+        duration_s=0.5,
         facts=None if failure and not steps else FACTS,
         planned=tuple(steps),
         done=[Done(step=step, changed=True) for step in steps],
         failure=failure,
         **changes,
     )
-    return MachineResult(machine=machine, brought=brought, duration_s=0.5)
 
 
 def words(one, **options):
@@ -140,17 +139,47 @@ class Clock:
         return self.now_s
 
 
-def test_progress_is_a_plain_line_a_step_where_nobody_looks(monkeypatch):
+def test_progress_is_one_plain_line_for_each_machine_when_it_is_done_where_nobody_looks(
+    monkeypatch,
+):
     stream = io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
-    with UpView(Console(), ["a"]) as view:
-        teller = view.teller("a")
-        teller.detail("looking")
-        teller.step("package htop: install")
-        teller.detail("50%")
-        view.done("a")
+    said = []
+    with UpView(Console(), ["a", "b"]) as view:
+        for step in range(20):
+            for name in ("a", "b"):
+                view.teller(name).step(f"package {step}: install")
+                view.teller(name).detail("50%")
+        said.append(stream.getvalue())
+        view.done("b", "failed after 3 changes: no room")
+        said.append(stream.getvalue())
+        view.teller("a").step("checking")
+        view.done("a", "changed (20)")
+        said.append(stream.getvalue())
 
-    assert stream.getvalue() == "a: package htop: install\n"
+    failed = "b: failed after 3 changes: no room\n"
+    assert said == ["", failed, f"{failed}a: changed (20)\n"]
+
+
+def test_who_is_still_at_work_is_told_now_and_then_machines_at_the_same_together(monkeypatch):
+    stream, clock = io.StringIO(), Clock()
+    monkeypatch.setattr(sys, "stderr", stream)
+    names = [f"pi{number:02}" for number in range(1, 8)]
+    with UpView(Console(), names, now_s=clock) as view:
+        for name in names[:5]:
+            view.teller(name).step("environment: build")
+        view.teller("pi06").step("package htop: install")
+        view.done("pi07", "ok")
+        for second in range(40):
+            clock.now_s = float(second)
+            view.look()
+
+    at_work = "pi[01:05]: environment: build; pi06: package htop: install"
+    assert stream.getvalue().splitlines() == [
+        "pi07: ok",
+        f"after 15 s: {at_work}",
+        f"after 30 s: {at_work}",
+    ]
 
 
 def test_quiet_view_says_nothing(monkeypatch):
@@ -180,9 +209,9 @@ def test_terminal_shows_a_line_a_machine_once_it_takes_long(monkeypatch):
 
 def test_check_step_is_no_change():
     step = Step(kind=Kind.CHECK, title="runtime starts")
-    brought = Brought(facts=FACTS, done=[Done(step=step, changed=False)])
+    done = [Done(step=step, changed=False)]
 
-    assert MachineResult(machine="a", brought=brought).status == "ok"
+    assert MachineResult(machine="a", facts=FACTS, done=done).status == "ok"
 
 
 @pytest.mark.process
@@ -196,7 +225,7 @@ def test_up_imports_only_what_it_needs_before_it_logs_in():
     assert done.stdout == "[]\n"
 
     code = (
-        "import sys, cosmos_cli.provision.fleet_up;"
+        "import sys, cosmos_cli.provision.up;"
         "print([name for name in ('numpy', 'scipy', 'rich', 'pyarrow', 'asyncio',"
         " 'cosmos_cli.models.scenario') if name in sys.modules])"
     )

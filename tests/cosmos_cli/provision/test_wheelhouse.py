@@ -15,7 +15,14 @@ from cosmos_cli.provision import resolver, wheelhouse
 from cosmos_cli.provision.lock import Distributed
 from cosmos_cli.provision.platform import Platform
 from cosmos_cli.provision.resolver import index_lines, pip_environment, uv_environment
-from cosmos_cli.provision.wheelhouse import environment_key, prepare, sees_system_packages
+from cosmos_cli.provision.wheelhouse import (
+    EnvironmentNeed,
+    environment_key,
+    prepare,
+    sees_system_packages,
+)
+
+pytestmark = pytest.mark.process
 
 PI = Platform(python=(3, 11), machine="aarch64", libc_version=(2, 36))
 LAPTOP = Platform(python=(3, 13), machine="x86_64", libc_version=(2, 41))
@@ -141,7 +148,7 @@ def test_cache_forgets_what_was_not_used_for_long_when_something_new_comes(index
     (wheels / ".new-cut-off").mkdir()
     age(wheels / ".new-cut-off", 2)
     (wheels / ".new-of-somebody").mkdir()
-    assert environment_key(LAPTOP, []) == used.key
+    assert environment_key(EnvironmentNeed.of(LAPTOP, [])) == used.key
 
     new = prepare(PI, [])
 
@@ -157,11 +164,11 @@ def test_key_needs_no_wheels(index, no_process):
         first.wheel(wheel).unlink()
     no_process()
 
-    assert environment_key(PI, []) == first.key
+    assert environment_key(EnvironmentNeed.of(PI, [])) == first.key
 
 
 def test_key_of_what_was_never_prepared_is_found_out(index):
-    assert environment_key(PI, []) == prepare(PI, []).key
+    assert environment_key(EnvironmentNeed.of(PI, [])) == prepare(PI, []).key
 
 
 def test_index_that_gives_something_else_than_it_announced_is_found_out(index, monkeypatch):
@@ -357,11 +364,11 @@ def test_no_password_of_what_uv_and_pip_say_is_repeated():
     assert resolver.last_lines(said) == "error: cannot fetch https://***@one.example/simple/x"
 
 
-def test_uv_is_told_the_indexes_that_pip_knows_but_in_no_environment():
+def test_uv_is_told_the_indexes_that_pip_knows_but_in_no_environment(tmp_path):
     settings = {
         "index-url": "https://me:secret@one.example/simple",
         "extra-index-url": "\nhttps://two.example/simple\nfile:///three",
-        "find-links": "/a /b",
+        "find-links": f"{tmp_path} {tmp_path}/gone https://wheels.example",
         "cert": "/etc/own.pem",
         "trusted-host": "one.example two.example",
     }
@@ -370,8 +377,8 @@ def test_uv_is_told_the_indexes_that_pip_knows_but_in_no_environment():
         "--index-url https://me:secret@one.example/simple",
         "--extra-index-url https://two.example/simple",
         "--extra-index-url file:///three",
-        "--find-links /a",
-        "--find-links /b",
+        f"--find-links {tmp_path}",
+        "--find-links https://wheels.example",
     ]
     assert uv_environment(settings, {"HOME": "/home/me"}) == {
         "HOME": "/home/me",
@@ -417,7 +424,6 @@ def test_pips_own_files_are_read(tmp_path, monkeypatch):
     assert settings["cert"] == "/etc/own.pem"
 
 
-@pytest.mark.process
 @pytest.mark.parametrize("platform", [PI, LAPTOP])
 def test_real_index_has_all_that_the_runtime_needs(platform, tmp_path, monkeypatch):
     monkeypatch.setenv("COSMOS_CACHE", str(tmp_path))
@@ -430,7 +436,6 @@ def test_real_index_has_all_that_the_runtime_needs(platform, tmp_path, monkeypat
     assert environment.distribution_packages == ()
 
 
-@pytest.mark.process
 def test_real_index_has_no_wheel_of_some_hardware_packages(tmp_path, monkeypatch):
     monkeypatch.setenv("COSMOS_CACHE", str(tmp_path))
     for requirement in ("RPi.GPIO", "RTIMULib"):

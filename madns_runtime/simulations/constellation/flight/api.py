@@ -20,7 +20,7 @@ from madns_runtime.simulations.constellation.messages import (
     CommandFrame,
     CommandResult,
     Delivery,
-    Refusal,
+    TransmissionRefusal,
 )
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class Reading(NamedTuple):
     """One measurement."""
 
     t_s: float
-    """When it was valid."""
+    """Time at which it was valid, s."""
     values: tuple[float, ...]
     """Units and frame: see the sensor in `equipment.Sensors`."""
 
@@ -47,7 +47,7 @@ Readings = Mapping[str, Reading]
 
 
 class FlightContext(Protocol):
-    """What a vehicle offers to its flight software."""
+    """The vehicle as its flight software sees it."""
 
     name: str
     """The agent's."""
@@ -89,7 +89,7 @@ class FlightContext(Protocol):
     def broadcast(self, payload: Any) -> int:
         """Send a message by radio to every vehicle in view, and return its number."""
 
-    def estimate(self, values: Mapping[str, float]) -> None:
+    def estimate(self, values: Mapping[str, float | None]) -> None:
         """Record what flight software believes now; names with units, such as slot_error_deg."""
 
     def log(self, level: str, text: str) -> None:
@@ -97,7 +97,7 @@ class FlightContext(Protocol):
 
 
 class FlightSoftware(Protocol):
-    """What is under test. Subclass it and override what is needed."""
+    """Flight software under test. Subclass it and override what is needed."""
 
     context: FlightContext
 
@@ -114,7 +114,7 @@ class FlightSoftware(Protocol):
     def command_result(self, result: CommandResult) -> None:
         """Take what became of a command; called right before a tick."""
 
-    def message_refused(self, refusal: Refusal) -> None:
+    def message_refused(self, refusal: TransmissionRefusal) -> None:
         """Take that a message of one's own was refused, and why; called right before a tick."""
 
     def finish(self) -> Mapping[str, Any]:

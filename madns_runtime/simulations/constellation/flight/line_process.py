@@ -12,22 +12,21 @@ import os
 import select
 import signal
 import subprocess
-from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from time import monotonic
 
 from madns_runtime.errors import BlamedError
+from madns_runtime.plugin.context import clean_text
 from madns_runtime.reactor import libc
 from madns_runtime.reactor.scheduling import die_with_parent
 from madns_runtime.simulations.constellation.flight.programs import find_program
+from madns_runtime.timing.granted_clock import GrantedClock
 
 LINE_BYTES_MAX = 262_144
 """Of one line; a longer one is no answer."""
-TALK_LINES_MAX = 1000
-"""Lines of its standard error that are kept; further ones are counted."""
-TALK_LINE_BYTES_MAX = 500
-"""Of one of them; the rest of it is dropped."""
+LAST_LINE_CHARACTERS_MAX = 200
+"""Of the last line of its standard error, in the words about its end."""
 WAITING_BYTES_MAX = 1_048_576
 """Written, but not taken by the program yet."""
 READ_BYTES = 65_536
@@ -45,16 +44,20 @@ class LineProcess:
     Args:
         command: Program and arguments.
         base_directory: Folder of the scenario, and the program's working directory.
+        is_patient: Whether time in which the program waits for a processor does not count at its end.
 
     Raises:
         BlamedError: It cannot be started.
     """
 
     patience_s = PATIENCE_S
-    """What is left of it."""
+    """Rest of the wait, s."""
 
-    def __init__(self, command: Sequence[str], base_directory: Path) -> None:
+    def __init__(
+        self, command: Sequence[str], base_directory: Path, *, is_patient: bool = False
+    ) -> None:
         self.name = command[0]
+        self._is_patient = is_patient
         found = find_program(command, base_directory)
         if found is None:
             raise BlamedError(
@@ -110,15 +113,20 @@ class LineProcess:
             raise BlamedError(f"{self.name}: expected lines of at most {LINE_BYTES_MAX} bytes")
         return self._out.take()
 
-    def talk(self) -> list[bytes]:
-        """Return what is new of the first TALK_LINES_MAX lines of its standard error; never waits."""
+    def talk(self) -> bytes:
+        """Return what is new of its standard error; never waits."""
         self._err.read()
         return self._err.take()
 
     @property
-    def talk_lines(self) -> int:
-        """Lines of its standard error, also of those that nobody kept."""
-        return self._err.lines
+    def talk_counts(self) -> tuple[int, int]:
+        """Lines and bytes of its standard error."""
+        return self._err.lines, self._err.bytes
+
+    @property
+    def last_line(self) -> str:
+        """The last line of its standard error that is not empty, cut; an empty text if there was none."""
+        return clean_text(self._err.last_line.decode("utf-8", "replace"))
 
     def wait(self, timeout_s: float) -> None:
         """Wait until it writes, ends, or talks; or until the time is over."""
@@ -158,7 +166,7 @@ class LineProcess:
         gentle = (self._close_input, process.terminate) if is_patient else ()
         if not any(self._goes_by_itself(stop) for stop in gentle):
             self._kill_all()
-            self._has_gone_by(monotonic() + END_S)
+            self._has_gone_within(END_S)
         self._kill_all()  # what it started and left behind
         for stream in (process.stdout, process.stderr):
             if stream is not None:
@@ -167,15 +175,25 @@ class LineProcess:
 
     def _goes_by_itself(self, stop: Callable[[], object]) -> bool:
         stop()
-        began_s = monotonic()
-        limit_s = max(PATIENCE_S_MIN, min(END_S, LineProcess.patience_s))
-        has_gone = self._has_gone_by(began_s + limit_s)
-        LineProcess.patience_s -= monotonic() - began_s
-        return has_gone
+        return self._has_gone_within(max(PATIENCE_S_MIN, min(END_S, LineProcess.patience_s)))
 
-    def _has_gone_by(self, deadline_s: float) -> bool:
+    def _has_gone_within(self, limit_s: float) -> bool:
+        clock = self.stopwatch()
+        try:
+            return self._is_gone_by(clock, clock() + limit_s)
+        finally:
+            LineProcess.patience_s -= clock()
+
+    def stopwatch(self) -> Callable[[], float]:
+        """Return what tells the time since now, s: of a patient one, but the program's waits for a processor."""
+        if self._is_patient:
+            return GrantedClock(lambda: (self.pid,)).now_s
+        began_s = monotonic()
+        return lambda: monotonic() - began_s
+
+    def _is_gone_by(self, clock: Callable[[], float], deadline_s: float) -> bool:
         while self._process.poll() is None:
-            left_s = deadline_s - monotonic()
+            left_s = deadline_s - clock()
             if left_s <= 0.0:
                 return False
             # It may not be able to end before its words are read.
@@ -208,17 +226,25 @@ class LineProcess:
             del self._waiting[:written]
 
 
-class _Lines:
-    """Lines from a pipe, bounded: more than LINES_MAX that nobody takes are read later."""
-
-    LINES_MAX = 4096
+class _Pipe:
+    """One end of a pipe that is read without waiting."""
 
     def __init__(self, fd: int) -> None:
         os.set_blocking(fd, False)
         self.fd = fd
         self.is_closed = False
         self._rest = b""
-        self._found: deque[bytes] = deque()
+        """Of a line under way."""
+
+
+class _Lines(_Pipe):
+    """Lines from a pipe, bounded: more than LINES_MAX that nobody takes are read later."""
+
+    LINES_MAX = 4096
+
+    def __init__(self, fd: int) -> None:
+        super().__init__(fd)
+        self._found: list[bytes] = []
 
     @property
     def is_overlong(self) -> bool:
@@ -234,34 +260,24 @@ class _Lines:
             return
         if not data:
             self.is_closed = True
-            if self._rest:
-                self._found.append(self._rest)
-                self._rest = b""
-            return
+            data = b"\n" if self._rest else b""
         *lines, self._rest = (self._rest + data).split(b"\n")
-        self._found.extend(lines)
+        self._found += lines
 
     def take(self) -> list[bytes]:
         """Return the lines found and forget them."""
-        if not self._found:
-            return []
-        lines = list(self._found)
-        self._found.clear()
+        lines, self._found = self._found, []
         return lines
 
 
-class _Talk:
-    """Lines of a standard error: the first ones are kept, all are counted, and reading never stops."""
+class _Talk(_Pipe):
+    """A standard error: counted, its last line known, and reading never stops."""
 
     def __init__(self, fd: int) -> None:
-        os.set_blocking(fd, False)
-        self.fd = fd
-        self.is_closed = False
-        self.lines = 0
-        self._kept = 0
-        self._is_in_line = False
-        self._rest = b""
-        self._found: list[bytes] = []
+        super().__init__(fd)
+        self.lines = self.bytes = 0
+        self.last_line = b""
+        self._found = bytearray()
 
     def read(self) -> None:
         """Read what is there, a bounded amount of it."""
@@ -270,21 +286,22 @@ class _Talk:
         data = _read(self.fd)
         if data is None:
             return
+        self._found += data
+        self.bytes += len(data)
         if not data:
             self.is_closed = True
-            data = b"\n" if self._is_in_line else b""
-        self._is_in_line = not data.endswith(b"\n")
+            data = b"\n" if self._rest else b""
         self.lines += data.count(b"\n")
-        if self._kept < TALK_LINES_MAX:
-            *lines, rest = (self._rest + data).split(b"\n", TALK_LINES_MAX - self._kept)
-            self._rest = rest[:TALK_LINE_BYTES_MAX]
-            self._kept += len(lines)
-            self._found += [line[:TALK_LINE_BYTES_MAX] for line in lines]
+        *lines, rest = (self._rest + data).split(b"\n")
+        told = next((line for line in reversed(lines) if line.strip()), None)
+        if told is not None:
+            self.last_line = told[:LAST_LINE_CHARACTERS_MAX]
+        self._rest = rest[:LAST_LINE_CHARACTERS_MAX]
 
-    def take(self) -> list[bytes]:
-        """Return the lines kept since the last call."""
-        lines, self._found = self._found, []
-        return lines
+    def take(self) -> bytes:
+        """Return what has come since the last call."""
+        data, self._found = bytes(self._found), bytearray()
+        return data
 
 
 def _read(fd: int) -> bytes | None:

@@ -8,6 +8,8 @@ an integrator see no jump. Sun and season are left out, which at solar maximum i
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -64,6 +66,14 @@ SCALE_HEIGHTS_M = np.append(
     np.diff(HEIGHTS_M) / -np.diff(np.log(DENSITIES_KG_M3)), TOP_SCALE_HEIGHT_M
 )
 """Scale heights above the bases, shape (28,), m."""
+_BENDS_1_M = np.abs(np.diff(1.0 / SCALE_HEIGHTS_M))
+KINKS_1_M = np.maximum(np.append(0.0, _BENDS_1_M), np.append(_BENDS_1_M, 0.0))
+"""Change of the slope of log density at the base or the top of each layer, the larger one, shape (28,), 1/m."""
+KINK_M_S = 1e-6
+"""Error of velocity that one step over a kink may make at most, m/s: density has no second derivative there, and an
+integrator of eighth order errs by its square of the step, unseen by its own estimate. Measured at a tenth of that."""
+STEP_S_MIN = 0.5
+"""No kink asks for shorter steps."""
 
 
 def drag_m_s2(
@@ -95,6 +105,40 @@ def drag_m_s2(
     density = density_kg_m3(height_m(r, r2, radius_m))
     speed = np.sqrt(np.einsum("in,in->n", wind, wind))
     return np.asarray((-0.5 * ballistic_m2_kg * density * speed) * wind)
+
+
+def kink_step_s(
+    r: NDArray[np.float64],
+    v: NDArray[np.float64],
+    ballistic_m2_kg: float | NDArray[np.float64],
+    radius_m: float,
+    *,
+    step_s_max: float,
+) -> float:
+    """
+    Return the longest step with which nobody's integration feels the kinks of the density, s.
+
+    Args:
+        r: Positions, shape (3, N), m; z along the Earth's axis.
+        v: Velocities, shape (3, N), m/s, inertial.
+        ballistic_m2_kg: B = Cd A / m, one for all or shape (N,), m^2/kg.
+        radius_m: The Earth's equatorial radius, m.
+        step_s_max: What is allowed without drag.
+
+    A kink changes the slope of the drag in time by drag x climb x change of 1/H; integrated twice over a
+    step, that is the velocity which may be missed.
+    """
+    r2 = np.einsum("in,in->n", r, r)
+    climb = np.abs(np.einsum("in,in->n", r, v)) / np.sqrt(r2)
+    # The lowest that a step may reach: whoever descends steeply is in denser air at its end.
+    heights = np.maximum(height_m(r, r2, radius_m) - climb * step_s_max, 0.0)
+    layer = np.searchsorted(HEIGHTS_M, heights, side="right") - 1
+    density = density_kg_m3(heights)
+    drag = 0.5 * ballistic_m2_kg * density * np.einsum("in,in->n", v, v)
+    change_m_s3 = float((drag * climb * KINKS_1_M[layer]).max())
+    if change_m_s3 * step_s_max**2 <= 2.0 * KINK_M_S:
+        return step_s_max
+    return min(step_s_max, max(STEP_S_MIN, math.sqrt(2.0 * KINK_M_S / change_m_s3)))
 
 
 def height_m(

@@ -1,5 +1,5 @@
 """
-What an exact propagation conserves: the health of a propagator in numbers. Pure.
+Invariants of an exact propagation: the health of a propagator in numbers. Pure.
 
 The specific orbital energy contains the whole potential of the forces at work, else it swings with
 them and hides the drift. Under J2 the magnitude of angular momentum swings too; its component along

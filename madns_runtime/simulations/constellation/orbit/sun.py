@@ -1,4 +1,4 @@
-"""Where the Sun stands, and whether the Earth hides it. Pure."""
+"""Direction of the Sun, and whether the Earth hides it. Pure."""
 
 from __future__ import annotations
 
@@ -46,7 +46,8 @@ def is_in_umbra(r_m: Vector, sun_r_m: Vector) -> bool:
     """
     Tell whether the Earth hides the whole Sun: a conical shadow of a sphere without atmosphere.
 
-    The penumbra, about 8 s wide in LEO, counts as lit.
+    The penumbra counts as lit. At 780 km it lasts 9 s where the Sun stands in the orbit's plane, 15 s where it stands
+    45 deg off it, 38 s at 60 deg, and minutes where the orbit only grazes the shadow; 8 s at least in LEO.
 
     Args:
         r_m: Position from the Earth's centre, m.

@@ -1,5 +1,5 @@
 """
-Who sees whom: line of sight past the Earth, light time, elevation over a place. Pure; SI units.
+Visibility: line of sight past the Earth, light time, elevation over a place. Pure; SI units.
 
 The Earth is the WGS-84 ellipsoid, both radii raised by the height of the atmosphere that blocks a link.
 An ellipsoid costs no more than a sphere: scaled along each axis it is one, and lines stay lines.

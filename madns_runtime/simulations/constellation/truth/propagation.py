@@ -1,18 +1,24 @@
 """
 The job that computes truth: one call for all vehicles and a stretch of time, made in the executor.
 
-A new propagator is a class with `propagate` and one line in PROPAGATORS; its settings are one more
-member of the union in parameters.py. Classes are named, not imported, so that neither the host's
-loop nor a test of the table pays for scipy.
+A propagator is an engine, a class with `propagate` in `truth.propagators`, and its settings with its properties,
+a member of the union in parameters.py. Engines are imported when they are first used, so that neither the
+host's loop nor a test of the table pays for scipy.
+
+Several workers compute a stretch at once, the same to the last digit however many: scipy takes one step size for
+all vehicles of a call, so who is in a call shows in the last digits (1e-9 m). Vehicles are therefore propagated
+in blocks that follow from their order alone: the first BLOCK, the next BLOCK, and so on. A part is some blocks in
+a row, and cutting a part into blocks again gives the same ones.
 """
 
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import lru_cache
-from typing import Protocol
+from typing import Protocol, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,27 +29,22 @@ from madns_runtime.simulations.constellation.orbit.constants import (
     GravityModel,
 )
 from madns_runtime.simulations.constellation.orbit.invariants import invariants
-from madns_runtime.simulations.constellation.parameters import (
-    AnyPropagator,
-    CustomPropagator,
-    Sgp4Propagator,
-)
-from madns_runtime.simulations.constellation.truth.element_sets import ElementSet
+from madns_runtime.simulations.constellation.parameters import AnyPropagator
+from madns_runtime.simulations.constellation.truth.element_set import ElementSet
 
-_TRUTH = "madns_runtime.simulations.constellation.truth"
-
-PROPAGATORS = {
-    "scipy": f"{_TRUTH}.scipy_propagator:ScipyDop853",
-    "numba": f"{_TRUTH}.numba_propagator:NumbaDop853",
-    "sgp4": f"{_TRUTH}.sgp4_propagator:Sgp4",
-    "basilisk": f"{_TRUTH}.basilisk_propagator:Basilisk",
-    "custom": f"{_TRUTH}.custom_propagator:Custom",
+PROPAGATORS: dict[str, type[AnyPropagator]] = {
+    get_args(get_type_hints(settings)["kind"])[0]: settings for settings in get_args(AnyPropagator)
 }
-"""The kind in a scenario -> module:class."""
+"""The kind in a scenario -> its settings."""
 FAULTS_MAX = 5
 """Vehicles that one message names."""
 _ANY_ORBIT = (7.0e6, 0.0, 0.0, 0.0, 7.5e3, 0.0)
 """Position and velocity, m and m/s."""
+
+BLOCK = 500
+"""Vehicles that share a call where they see each other: fewer cost more overhead than workers save."""
+INDEPENDENT_BLOCK = 50
+"""Least vehicles in a part where each is computed by itself, and parts may be cut anywhere."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +56,7 @@ class PropagationParameters:
     epoch_utc: datetime
     """UTC of t = 0."""
     element_sets: tuple[ElementSet, ...] = ()
-    """One a vehicle, in the order of the states; empty for others than sgp4."""
+    """One per vehicle, in the order of the states; empty for others than sgp4."""
     ballistic_m2_kg: NDArray[np.float64] | None = None
     """Cd A / m of each vehicle, shape (N,), m^2/kg; None for no drag whatever the forces."""
     thrust_m_s2: NDArray[np.float64] | None = None
@@ -63,7 +64,19 @@ class PropagationParameters:
     base_directory: str = "."
     """Folder of the scenario, which a custom propagator's file is found from."""
     names: tuple[str, ...] = ()
-    """What messages call the vehicles, in the order of the states; empty for their numbers."""
+    """Names of the vehicles in messages, in the order of the states; empty for their numbers."""
+
+    def of(self, vehicles: Sequence[int]) -> PropagationParameters:
+        """Return what some of the vehicles need, in that order."""
+        rows, sets = list(vehicles), self.element_sets
+        ballistic, thrust = self.ballistic_m2_kg, self.thrust_m_s2
+        return replace(
+            self,
+            element_sets=tuple(sets[n] for n in rows) if sets else (),
+            ballistic_m2_kg=None if ballistic is None else ballistic[rows],
+            thrust_m_s2=None if thrust is None else thrust[rows],
+            names=tuple(self.names[n] for n in rows) if self.names else (),
+        )
 
     def name_of(self, vehicle: int) -> str:
         """Return what messages call a vehicle."""
@@ -72,7 +85,7 @@ class PropagationParameters:
     @property
     def forces(self) -> tuple[str, ...]:
         """Accelerations at work; SGP4 and propagators of one's own are judged as if they had J2."""
-        return getattr(self.settings, "forces", ("two_body", "j2"))
+        return self.settings.forces
 
     @property
     def has_j2(self) -> bool:
@@ -80,17 +93,15 @@ class PropagationParameters:
         return "j2" in self.forces
 
     @property
+    def has_drag(self) -> bool:
+        """Whether the atmosphere acts on the vehicles."""
+        return "drag" in self.forces and self.ballistic_m2_kg is not None
+
+    @property
     def conserves_energy(self) -> bool:
         """Whether energy is to stay: numerical propagation of known forces without drag or thrust."""
-        drags = "drag" in self.forces and self.ballistic_m2_kg is not None
-        return hasattr(self.settings, "forces") and not drags and self.thrust_m_s2 is None
-
-
-def can_maneuver(settings: AnyPropagator) -> bool:
-    """Tell whether a propagator starts from any state, as a vehicle after a maneuver needs."""
-    if isinstance(settings, CustomPropagator):
-        return settings.can_maneuver
-    return not isinstance(settings, Sgp4Propagator)
+        is_exact = self.settings.PROPERTIES.conserves_energy
+        return is_exact and not self.has_drag and self.thrust_m_s2 is None
 
 
 class Propagator(Protocol):
@@ -121,7 +132,7 @@ class Propagator(Protocol):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Stretch:
+class TruthStretch:
     """Truth of all vehicles over some time: what a job returns."""
 
     first_knot: int
@@ -134,7 +145,7 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StretchRequest:
-    """Which knots to compute, and from where."""
+    """Knots to compute, and the states to begin from."""
 
     first_knot: int
     """The knot that *states* belong to; it is the first of the result, too."""
@@ -148,13 +159,14 @@ class StretchRequest:
 @lru_cache(maxsize=len(PROPAGATORS))
 def load_propagator(kind: str) -> Propagator:
     """
-    Return the propagator of a kind in PROPAGATORS, one a process: some have much to set up.
+    Return the propagator of a kind in PROPAGATORS, one per process: some have much to set up.
 
     Raises:
         MissingExtraError: The library behind it is not installed.
     """
-    module, _, name = PROPAGATORS[kind].partition(":")
-    propagator: Propagator = getattr(importlib.import_module(module), name)()
+    module, _, name = PROPAGATORS[kind].PROPERTIES.engine.partition(":")
+    package = f"{__package__}.propagators"
+    propagator: Propagator = getattr(importlib.import_module(f"{package}.{module}"), name)()
     return propagator
 
 
@@ -216,14 +228,14 @@ def _held(
     return held
 
 
-def propagate_stretch(request: StretchRequest, parameters: PropagationParameters) -> Stretch:
+def propagate_stretch(request: StretchRequest, parameters: PropagationParameters) -> TruthStretch:
     """Compute a stretch of truth and what it should conserve; runs in the executor."""
     numbers = np.arange(request.first_knot, request.first_knot + request.knots)
     # Times are products, not sums, so that knots stay on the grid however long the run.
     times_s = numbers.astype(np.float64) * request.knot_s
     states = propagate(request.states, float(times_s[0]), times_s, parameters)
     conserved = conserved_by(states, parameters)
-    return Stretch(first_knot=request.first_knot, states=states, invariants=conserved)
+    return TruthStretch(first_knot=request.first_knot, states=states, invariants=conserved)
 
 
 def conserved_by(
@@ -257,7 +269,7 @@ def _check_arguments(
         faults.append(
             f"parameters.propagator.forces: expected two_body among them, got {list(parameters.forces)}"
         )
-    if parameters.thrust_m_s2 is not None and not can_maneuver(parameters.settings):
+    if parameters.thrust_m_s2 is not None and not parameters.settings.can_maneuver:
         kind = parameters.settings.kind
         faults.append(f"parameters.propagator: {kind} cannot follow a thrust, see can_maneuver")
     if not np.isfinite(knots_s).all() or (np.diff(knots_s, prepend=t0_s) < 0.0).any():
@@ -302,3 +314,62 @@ def _check_finite(
         faults.append(f"and {len(vehicles) - FAULTS_MAX} more")
     if faults:  # else their sum alone is too large
         raise ConfigurationError("\n".join(faults))
+
+
+Part = tuple[StretchRequest, PropagationParameters]
+"""Arguments of `propagate_part`."""
+
+
+def split(request: StretchRequest, parameters: PropagationParameters, parts_max: int) -> list[Part]:
+    """
+    Cut a request into at most *parts_max* parts of nearly equal size, in the vehicles' order.
+
+    Args:
+        request: All vehicles.
+        parameters: What is one a vehicle is in the order of the request.
+        parts_max: Parts wanted, at least 1: the workers, N_p.
+    """
+    is_independent = parameters.settings.PROPERTIES.is_independent
+    size = INDEPENDENT_BLOCK if is_independent else BLOCK
+    count = len(request.states)
+    blocks = max(1, -(-count // size))
+    parts = min(max(1, parts_max), blocks)
+    edges = [min(size * (blocks * n // parts), count) for n in range(parts + 1)]
+    return [
+        _cut(request, parameters, slice(first, last))
+        for first, last in zip(edges[:-1], edges[1:], strict=True)
+    ]
+
+
+def propagate_part(request: StretchRequest, parameters: PropagationParameters) -> TruthStretch:
+    """Compute a part, or the whole, block by block; runs in the executor."""
+    count = len(request.states)
+    if count <= BLOCK or parameters.settings.PROPERTIES.is_independent:
+        return propagate_stretch(request, parameters)
+    blocks = [slice(first, first + BLOCK) for first in range(0, count, BLOCK)]
+    return merge([propagate_stretch(*_cut(request, parameters, block)) for block in blocks])
+
+
+def merge(parts: Sequence[TruthStretch]) -> TruthStretch:
+    """
+    Put parts together again, in the order of `split`.
+
+    Raises:
+        ValueError: They are not of the same knots.
+    """
+    knots = {(part.first_knot, part.states.shape[1]) for part in parts}
+    if len(knots) != 1:
+        raise ValueError(f"parts: expected one stretch's, got first knots and lengths {knots}")
+    if len(parts) == 1:
+        return parts[0]
+    return TruthStretch(
+        first_knot=parts[0].first_knot,
+        states=np.concatenate([part.states for part in parts]),
+        invariants=np.concatenate([part.invariants for part in parts]),
+    )
+
+
+def _cut(request: StretchRequest, parameters: PropagationParameters, part: slice) -> Part:
+    """Return the request and the parameters of some of the vehicles."""
+    some = range(*part.indices(len(request.states)))
+    return replace(request, states=request.states[part]), parameters.of(some)

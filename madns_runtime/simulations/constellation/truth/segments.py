@@ -3,7 +3,7 @@ The host's store of truth: stretches cut into windows, windows into each vehicle
 
 Simulated time is divided into windows of equal length, half an agent's buffer. Window w covers the
 knots w n to (w + 1) n, both included, so that every segment can be interpolated by itself. Beside the
-grid of knots, a vehicle that was commanded has pieces with knots of its own (`truth.pieces`); what is
+grid of knots, a vehicle that was commanded has pieces with knots of its own (`truth.maneuvers.effects`); what is
 known of it is one revision, and each change makes a new one.
 """
 
@@ -16,17 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from madns_runtime.simulations.constellation.messages import Segment
-from madns_runtime.simulations.constellation.orbit.hermite import (
+from madns_runtime.simulations.constellation.orbit.interpolation import (
     coefficients,
     evaluate,
     interpolate,
 )
-from madns_runtime.simulations.constellation.truth.pieces import (
+from madns_runtime.simulations.constellation.truth.maneuvers.effects import (
     Piece,
+    Timeline,
     VehicleTruth,
     knot_at_or_after,
 )
-from madns_runtime.simulations.constellation.truth.propagation import Stretch
+from madns_runtime.simulations.constellation.truth.propagation import TruthStretch
 
 Array = NDArray[np.float64]
 
@@ -40,16 +41,25 @@ class TruthStore:
         knots_per_window: Intervals of the grid in a window.
         knot_s: Time between knots.
         rigid: Indices of the rigid bodies, in the order of a stretch's attitude.
+        timelines: What is done to each vehicle; empty where nothing is.
     """
 
     def __init__(
-        self, vehicles: int, *, knots_per_window: int, knot_s: float, rigid: Sequence[int] = ()
+        self,
+        vehicles: int,
+        *,
+        knots_per_window: int,
+        knot_s: float,
+        rigid: Sequence[int] = (),
+        timelines: Sequence[Timeline] = (),
     ) -> None:
         self.knots_per_window = knots_per_window
         self.knot_s = knot_s
         self.window_s = knots_per_window * knot_s
+        self.timelines = timelines or [Timeline() for _ in range(vehicles)]
+        """Timeline of effects on each vehicle, past and to come."""
         self.revisions = [0] * vehicles
-        """One a vehicle, raised whenever its future is replaced."""
+        """One per vehicle, raised whenever its future is replaced."""
         self.oldest = 0
         """The first window kept."""
         self.end = 0
@@ -65,7 +75,7 @@ class TruthStore:
         """Simulated time of the last knot known."""
         return self.end * self.knots_per_window * self.knot_s
 
-    def add(self, stretch: Stretch, attitude: Array | None = None) -> None:
+    def add(self, stretch: TruthStretch, attitude: Array | None = None) -> None:
         """
         Take the windows that follow the last known one.
 
@@ -99,6 +109,7 @@ class TruthStore:
 
     def put(self, vehicle: int, truth: VehicleTruth) -> None:
         """Take a vehicle's truth as it is, pieces and grid, for a time of which nothing was sent."""
+        self.timelines[vehicle].thrusts |= truth.thrusts
         if truth.pieces:
             self._pieces.setdefault(vehicle, []).extend(truth.pieces)
         n = self.knots_per_window
@@ -200,6 +211,8 @@ class TruthStore:
             self._attitude.pop(self.oldest, None)
             self.oldest += 1
         oldest_s = self.oldest * self.window_s
+        for timeline in self.timelines:
+            timeline.forget_before(oldest_s)
         for vehicle in list(self._pieces):
             kept = [piece for piece in self._pieces[vehicle] if piece.end_s > oldest_s]
             if kept:
@@ -216,7 +229,7 @@ class TruthStore:
                 continue
             if piece.t0_s > at_s:
                 result.append(self._run(vehicle, at_s, piece.t0_s))
-            result.append(piece.to_segment(revision))
+            result.append(piece.to_segment(revision, self._felt_ballistic(vehicle, piece.t0_s)))
             at_s = piece.end_s
         if at_s < end_s:
             result.append(self._run(vehicle, at_s, end_s))
@@ -234,7 +247,13 @@ class TruthStore:
             attitude=_gather(self._attitude, self._rigid[vehicle], (first, last), n)
             if vehicle in self._rigid
             else None,
+            ballistic_m2_kg=self._felt_ballistic(vehicle, first * self.knot_s),
         )
+
+    def _felt_ballistic(self, vehicle: int, t_s: float) -> float | None:
+        """Return what drag acts on from a time on, m^2/kg; None where nobody on board feels it."""
+        timeline = self.timelines[vehicle]
+        return timeline.ballistic_at(t_s) if timeline.is_felt else None
 
     def _keep_until(self, vehicle: int, change_s: float) -> None:
         """Let what was known before *change_s* end there, in a piece of its own: its knot may change."""
@@ -279,15 +298,13 @@ class TruthStore:
 
     def _knot(self, vehicle: int, knot: int) -> Array:
         """Return the state at a knot held, 6 numbers or 13."""
-        window, at = self._place(knot)
+        window, at = divmod(knot, self.knots_per_window)
+        if window not in self._states:  # the last knot of all is the end of a window
+            window, at = window - 1, self.knots_per_window
         state: Array = self._states[window][vehicle, at]
         if vehicle in self._rigid:
             return np.concatenate((state, self._attitude[window][self._rigid[vehicle], at]))
         return state.copy()
-
-    def _place(self, knot: int) -> tuple[int, int]:
-        window, at = divmod(knot, self.knots_per_window)
-        return (window, at) if window in self._states else (window - 1, self.knots_per_window)
 
 
 def _gather(windows: dict[int, Array], row: int, knots: tuple[int, int], n: int) -> Array:
@@ -304,7 +321,7 @@ def _gather(windows: dict[int, Array], row: int, knots: tuple[int, int], n: int)
 
 class RefillSchedule:
     """
-    When each vehicle gets each window.
+    Schedule of the windows of each vehicle.
 
     A window is sent to all vehicles, evenly spread, in the quarter of a buffer before half of the
     buffer is left: nobody ever has less, and no instant sees a burst of all vehicles.
@@ -316,8 +333,7 @@ class RefillSchedule:
 
     def send_s(self, window: int, vehicle: int) -> float:
         """Return the simulated time at which *window* is due to *vehicle*."""
-        share = (vehicle + 1) / self.vehicles
-        return (window - 1.5 + 0.5 * share) * self.window_s
+        return (window - 1.5 + 0.5 * ((vehicle + 1) / self.vehicles)) * self.window_s
 
     def wanted_s(self, window: int) -> float:
         """Return when *window* is to be computed: one and a half windows before its first sending."""

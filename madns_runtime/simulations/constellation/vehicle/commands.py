@@ -1,5 +1,5 @@
 """
-Commands of flight software, checked before they leave the vehicle. Pure.
+Commands of flight software, checked, numbered and recorded as they leave the vehicle.
 
 What no vehicle could do is a mistake of the program and raises; what this one cannot do just now, such
 as a delta-v without propellant, is for the host to refuse.
@@ -12,8 +12,12 @@ from collections.abc import Sequence
 from typing import Any, get_args
 
 from madns_runtime.errors import PluginError
+from madns_runtime.plugin.api import HOST, AgentContext
+from madns_runtime.protocol.messages import Service
 from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.messages import Command, CommandFrame, CommandKind
+from madns_runtime.simulations.constellation.streams import COMMANDS
+from madns_runtime.simulations.constellation.thrust import Vector
 
 COMMANDS_PER_TICK_MAX = 16
 """More in one tick is a loop gone wild, not a plan."""
@@ -21,59 +25,71 @@ COMMANDS_PER_TICK_MAX = 16
 
 class CommandDesk:
     """
-    Numbers and checks one vehicle's commands.
+    Takes one vehicle's commands.
 
     Args:
+        context: Through which they leave.
         vehicle: What it is like.
         first_number: Of its first command.
     """
 
-    def __init__(self, vehicle: Vehicle, first_number: int = 0) -> None:
+    def __init__(self, context: AgentContext, vehicle: Vehicle, first_number: int = 0) -> None:
+        self._context = context
         self._vehicle = vehicle
         self._first_number = first_number
-        self._tick_s = -math.inf
+        self._tick: int | None = None
+        self._t_s = -math.inf
+        self._phase_s = 0.0
         self._in_tick = 0
         self.count = 0
         """Commands given."""
+        context.open_stream("commands", COMMANDS)
 
-    def delta_v(self, t_s: float, delta_v_m_s: Any, *, at_s: float, frame: str) -> Command:
+    def begin(self, tick: int, t_s: float, phase_s: float) -> None:
+        """Begin a tick: from now on commands bear its time, and lie *phase_s* behind it as the vehicle's ticks do."""
+        self._tick, self._t_s, self._phase_s = tick, t_s, phase_s
+        self._in_tick = 0
+
+    def delta_v(self, delta_v_m_s: Any, *, at_s: float, frame: str = "rtn") -> int:
         """
-        Return the command for a change of velocity.
+        Command a change of velocity and return the command's number.
 
         Raises:
             PluginError: It is none that a vehicle of this kind could carry out.
         """
+        check_running("delta_v", self._tick)
         if frame not in get_args(CommandFrame):
             expected = ", ".join(get_args(CommandFrame))
             raise PluginError(f"delta_v: expected frame to be one of {expected}, got {frame!r}")
         if frame == "body" and self._vehicle.attitude is None:
             raise PluginError("delta_v: frame body needs a vehicle with vehicles.attitude")
-        return self._command(
-            "delta_v", t_s, at_s=at_s, vector=_vector("delta_v", delta_v_m_s, "m/s"), frame=frame
-        )
+        vector = _vector("delta_v", delta_v_m_s, "m/s")
+        return self._give("delta_v", at_s=at_s, vector=vector, frame=frame)
 
-    def torque(self, t_s: float, torque_n_m: Any, *, at_s: float, duration_s: float) -> Command:
+    def torque(self, torque_n_m: Any, *, at_s: float, duration_s: float) -> int:
         """
-        Return the command for a torque about the body axes.
+        Command a torque about the body axes and return the command's number.
 
         Raises:
             PluginError: It is none that a vehicle of this kind could carry out.
         """
+        check_running("torque", self._tick)
         if self._vehicle.attitude is None:
             raise PluginError("torque: needs a vehicle with vehicles.attitude")
         duration_s = _number("torque", "duration_s", duration_s)
         if duration_s <= 0.0:
             raise PluginError(f"torque: expected duration_s > 0, got {duration_s}")
         vector = _vector("torque", torque_n_m, "N m")
-        return self._command("torque", t_s, at_s=at_s, vector=vector, duration_s=duration_s)
+        return self._give("torque", at_s=at_s, vector=vector, duration_s=duration_s)
 
-    def ballistic(self, t_s: float, ballistic_m2_kg: Any, *, at_s: float) -> Command:
+    def ballistic(self, ballistic_m2_kg: Any, *, at_s: float) -> int:
         """
-        Return the command for another ballistic coefficient.
+        Command another ballistic coefficient and return the command's number.
 
         Raises:
             PluginError: The vehicle cannot have it.
         """
+        check_running("ballistic", self._tick)
         value = _number("ballistic", "ballistic_m2_kg", ballistic_m2_kg)
         limits = self._vehicle.ballistic_m2_kg_range
         if limits is None:
@@ -82,40 +98,56 @@ class CommandDesk:
             raise PluginError(
                 f"ballistic: expected {limits[0]:g} to {limits[1]:g} m^2/kg, got {value:g}"
             )
-        return self._command("ballistic", t_s, at_s=at_s, vector=(value, 0.0, 0.0))
+        return self._give("ballistic", at_s=at_s, vector=(value, 0.0, 0.0))
 
-    def _command(  # noqa: PLR0913 - the fields of a command, all keyword-only
+    def _give(
         self,
         kind: CommandKind,
-        t_s: float,
         *,
         at_s: float,
-        vector: tuple[float, float, float],
+        vector: Vector,
         frame: Any = "body",
         duration_s: float = 0.0,
-    ) -> Command:
+    ) -> int:
         at_s = _number(kind, "at_s", at_s)
-        if t_s != self._tick_s:
-            self._tick_s, self._in_tick = t_s, 0
         if self._in_tick >= COMMANDS_PER_TICK_MAX:
             raise PluginError(
                 f"{kind}: expected at most {COMMANDS_PER_TICK_MAX} commands in one tick; "
-                f"the tick at {t_s:g} s wants more"
+                f"the tick at {self._t_s:g} s wants more"
             )
+        number = self._first_number + self.count
         self._in_tick += 1
         self.count += 1
-        return Command(
-            number=self._first_number + self.count - 1,
+        command = Command(
+            number=number,
             kind=kind,
-            commanded_s=t_s,
+            commanded_s=self._t_s,
+            phase_s=self._phase_s,
             at_s=at_s,
             frame=frame,
             vector=vector,
             duration_s=duration_s,
         )
+        deadline_s = at_s + self._phase_s
+        self._context.send(HOST, command.to_message(), Service.SYNC, deadline_s=deadline_s)
+        self._context.record(
+            "commands", (self._tick, number, kind, at_s, frame, *vector, duration_s)
+        )
+        return number
 
 
-def _vector(kind: str, values: Any, unit: str) -> tuple[float, float, float]:
+def check_running(name: str, tick: int | None) -> None:
+    """
+    Check that flight software calls what it calls in a tick.
+
+    Raises:
+        PluginError: There was none yet.
+    """
+    if tick is None:
+        raise PluginError(f"{name}: there is no time before the first tick; call it in step()")
+
+
+def _vector(kind: str, values: Any, unit: str) -> Vector:
     is_vector = isinstance(values, Sequence) or getattr(values, "ndim", 0) == 1
     if not is_vector or isinstance(values, str) or len(values) != 3:
         raise PluginError(f"{kind}: expected three numbers in {unit}, got {values!r:.80}")
@@ -127,7 +159,7 @@ def _number(kind: str, name: str, value: Any) -> float:
     """Return a finite number, also one of numpy's."""
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if isinstance(value, str | bool) or not math.isfinite(number):
         raise PluginError(f"{kind}: expected a finite number for {name}, got {value!r:.80}")

@@ -13,17 +13,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from madns_runtime.simulations.constellation.messages import Segment
-from madns_runtime.simulations.constellation.orbit.hermite import (
+from madns_runtime.simulations.constellation.orbit.interpolation import (
+    AttitudeCurve,
     Coefficients,
     coefficients,
     evaluate,
-)
-from madns_runtime.simulations.constellation.orbit.quaternions import IDENTITY, Vector
-from madns_runtime.simulations.constellation.orbit.turning import (
-    Turn,
     evaluate_turn,
     turn_between,
 )
+from madns_runtime.simulations.constellation.orbit.quaternions import IDENTITY, Vector
 from madns_runtime.simulations.constellation.thrust import Thrust
 
 SEGMENTS_MAX = 64
@@ -78,7 +76,7 @@ class TruthBuffer:
         self._low_s = self._high_s = math.inf
         self._cubics: Coefficients = ()
         self._knot_s = 1.0
-        self._turn: Turn | None = None
+        self._turn: AttitudeCurve | None = None
         self._quaternion = IDENTITY
         self._given_m_s = [0.0, 0.0, 0.0]
         self._given_until_s: float | None = None
@@ -91,7 +89,9 @@ class TruthBuffer:
     def add(self, segment: Segment) -> bool:
         """Take a segment; False if it was refused or is worthless by now."""
         start_s = segment.t0_s
-        end_s = min(segment.end_s, self._replaced_from_s(segment.revision))
+        # From where a newer revision begins, this one is replaced.
+        newer_s = (at_s for number, at_s in self._starts if number > segment.revision)
+        end_s = min(segment.end_s, min(newer_s, default=math.inf))
         if end_s <= max(start_s, self._now_s):
             self.superseded += 1
             return False
@@ -150,7 +150,7 @@ class TruthBuffer:
 
     @property
     def ballistic_m2_kg(self) -> float | None:
-        """What drag acts on at the last lookup, m^2/kg; None where nobody said, or there is no drag."""
+        """Ballistic coefficient at the last lookup, m^2/kg; None where nobody said, or there is no drag."""
         return self._pieces[0].ballistic_m2_kg if self._pieces else None
 
     def _seek(self, t_s: float) -> bool:
@@ -208,11 +208,6 @@ class TruthBuffer:
         x, y, z, w = second[:4]
         is_same = sum(a * b for a, b in zip(first, second[:4], strict=False)) >= 0.0
         self._quaternion = (x, y, z, w) if is_same else (-x, -y, -z, -w)
-
-    def _replaced_from_s(self, revision: int) -> float:
-        """Return from when on a newer revision has replaced *revision*; infinity for nowhere."""
-        newer = (start_s for number, start_s in self._starts if number > revision)
-        return min(newer, default=math.inf)
 
     def _begin(self, revision: int, start_s: float) -> None:
         """

@@ -1,0 +1,191 @@
+"""
+A table of what the host recorded in a form of its own, made through the simulation's descriptor.
+
+The simulation says how its records are read; here rows become a Parquet file like a run's other tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from cosmos_cli.collect.unread_files import find_unread
+from cosmos_cli.errors import InputError
+from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.streams import RecordFile
+from cosmos_cli.evidence.table_labels import TableLabels
+from cosmos_cli.evidence.tables import TableLayout, TableWriter
+from madns_runtime.config import RunConfig
+from madns_runtime.errors import PluginError
+from madns_runtime.plugin.api import Tabulated
+from madns_runtime.plugin.code_places import place_of
+from madns_runtime.plugin.isolation import call_plugin
+from madns_runtime.plugin.registry import load_function, resolve
+from madns_runtime.recording.records import Field
+
+NAME = "truth"
+TIME = Field("t_s", "s")
+ROWS_OF_AGENT_MAX = 20_000_000
+"""Times at which one agent may be tabulated: 55 hours at 100 Hz."""
+
+Times = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+Layout = Callable[[tuple[Field, ...]], TableLayout]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Written:
+    """Account of a table that was written."""
+
+    path: Path
+    rows: int
+    gaps: dict[str, int]
+    """Agents of which nothing is on record at some of the times, and at how many."""
+
+
+def times_of(config: RunConfig, ran_s: float | None, rate_hz: float) -> Times:
+    """
+    Return the times of a run at a rate, from simulated time zero on.
+
+    Args:
+        config: The run's.
+        ran_s: How long it ran, s; None if that is not known.
+        rate_hz: Times in a second.
+
+    Raises:
+        InputError: They are too many.
+    """
+    duration_s = config.time.duration_s if ran_s is None else min(config.time.duration_s, ran_s)
+    count = int(duration_s * rate_hz + 1e-6) + 1
+    if count > ROWS_OF_AGENT_MAX:
+        raise InputError(
+            f"--rate-hz {rate_hz:g}: {count} times of each agent are more than {ROWS_OF_AGENT_MAX}; "
+            "take a lower rate"
+        )
+    # As a tick's time is made of its number, so that both have the same digits.
+    return np.arange(count) / rate_hz
+
+
+def tabulated(
+    run: RunDirectory, config: RunConfig, agents: tuple[str, ...], times_s: Times
+) -> Iterator[Tabulated]:
+    """
+    Return the rows of *agents*, part by part, for `write_table`.
+
+    Raises:
+        InputError: The simulation records nothing of the kind, or in a file that is not read.
+        MachineError: The record cannot be read; raised, as the next, while parts are taken.
+        PluginError: The simulation's `tabulate` does not keep its contract.
+    """
+    base = Path(config.base_directory)
+    where = resolve(config.simulation, base).tabulate
+    if where is None:
+        raise InputError(f"{config.simulation}: its host records nothing that could be tabulated")
+    for path, why in find_unread(run).items():
+        if path.parent == run.path / "host":
+            raise InputError(f"{path}: {why}")
+    return _parts(load_function(where, base), run.path / "host", agents, times_s)
+
+
+def write_table(
+    parts: Iterator[Tabulated], layout: Layout, path: Path, *, agents: int, progress: Progress
+) -> Written:
+    """
+    Write a table of the rows of so many agents, laid out by *layout*.
+
+    Raises:
+        InputError: It cannot be written.
+    """
+    try:
+        return _write(parts, layout, path, agents=agents, progress=progress)
+    except (OSError, pa.ArrowException) as error:
+        why = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: cannot be written: {why}") from error
+
+
+def _parts(
+    function: Callable[..., Any], folder: Path, agents: tuple[str, ...], times_s: Times
+) -> Iterator[Tabulated]:
+    """Yield what the simulation tabulates, part by part: its faults are told as its own."""
+    parts = call_plugin("tabulate", function, folder, agents, times_s, finish=iter)
+    fields: tuple[Field, ...] | None = None
+    while (part := call_plugin("tabulate", next, parts, None)) is not None:
+        fault = _fault_of(part, fields)
+        if fault:
+            raise PluginError(f"{place_of(function)}: tabulate() {fault}")
+        fields = part.fields
+        yield part
+
+
+def _fault_of(part: object, fields: tuple[Field, ...] | None) -> str | None:
+    if not isinstance(part, Tabulated):
+        return f"must yield madns_runtime.plugin.api.Tabulated, got {part!r:.100}"
+    if fields is not None and part.fields != fields:
+        return f"must yield the same fields for every agent, got others for {part.agent}"
+    names = [field.name for field in part.fields]
+    rows = {len(part.columns[name]) for name in names if name in part.columns}
+    if set(part.columns) != set(names) or rows != {len(part.times_s)}:
+        return f"must yield a value a time of each of {', '.join(names)}, for {part.agent}"
+    return None
+
+
+def _write(
+    parts: Iterator[Tabulated], layout: Layout, path: Path, *, agents: int, progress: Progress
+) -> Written:
+    writer: TableWriter | None = None
+    file: RecordFile | None = None
+    gaps: dict[str, int] = {}
+    done = 0
+    try:
+        for part in parts:
+            if writer is None:
+                writer = TableWriter(path, layout(part.fields))
+            if file is None or file.source != part.agent:
+                done += file is not None
+                progress(f"tabulating {part.agent}", done / agents)
+                if file is not None:
+                    writer.end_file(file)
+                file = _source(part, path)
+            writer.add(file, {TIME.name: part.times_s, **part.columns}, len(part.times_s))
+            absent = int(np.isnan(part.columns[part.fields[0].name]).sum())
+            if absent:
+                gaps[part.agent] = gaps.get(part.agent, 0) + absent
+        if writer is None or file is None:
+            raise InputError("nothing to tabulate: no agent was chosen")
+        writer.end_file(file)
+        writer.close()
+    except BaseException:
+        if writer is not None:
+            writer.abandon()
+        raise
+    return Written(path=path, rows=writer.rows, gaps=gaps)
+
+
+def layout_with(labels: TableLabels) -> Layout:
+    """Return how the fields that a simulation tabulates become columns, with *labels* beside them."""
+    return lambda fields: TableLayout(
+        name=NAME,
+        role="agent",
+        source_column="agent",
+        fields=(TIME, *fields),
+        tick_hz=None,
+        labels=labels,
+    )
+
+
+def _source(part: Tabulated, path: Path) -> RecordFile:
+    """Return an agent's rows as the table's writer knows them: as if the agent had a stream of them."""
+    return RecordFile(
+        path=path,
+        role="agent",
+        source=part.agent,
+        stream=NAME,
+        incarnation=1,
+        fields=(TIME, *part.fields),
+    )

@@ -1,0 +1,159 @@
+"""
+Reads the log of a run where it lies: here, and on every machine whose records are not here yet.
+
+One thread per machine asks and waits; the lines are put together in the caller's thread. A machine that fails is
+named once, asked again while the run is followed, and holds nobody up.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from cosmos_cli.collect.machine_sources import RecordingMachine
+from cosmos_cli.collect.retrieval_state import asked_sources, read_note
+from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.run_log import LogLine, LogReading
+from cosmos_cli.fleet.connection import ConnectOptions
+from cosmos_cli.fleet.failure import MachineFailure
+from cosmos_cli.fleet.helper import Helper
+from cosmos_cli.fleet.liveness import SilenceWatch
+from cosmos_cli.fleet.open_connection import connect
+from madns_runtime.processes import list_processes
+
+PARTS = ("madns_runtime.processes", "processes", "log_tail")
+ASK_INTERVAL_S = 1.0
+LOOK_INTERVAL_S = 0.5
+AGAIN_S = 5.0
+ANSWER_TIMEOUT_S = 60.0
+
+Told = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class _Answered:
+    """A machine's answer, or why there is none."""
+
+    machine: str
+    told: Told | None = None
+    failure: MachineFailure | None = None
+
+
+@dataclass(slots=True, kw_only=True)
+class LogFollower:
+    """
+    Reads one run's log.
+
+    Args:
+        run: The run.
+        sources: The machines that are asked.
+        reading: What is wanted, and how far each file was read.
+        options: How machines are connected to.
+        on_failure: Called once for each machine that cannot be asked.
+        now_s: A monotonic clock.
+    """
+
+    run: RunDirectory
+    sources: Sequence[RecordingMachine]
+    reading: LogReading
+    options: ConnectOptions
+    on_failure: Callable[[str, MachineFailure], None]
+    now_s: Callable[[], float] = time.monotonic
+    failed: set[str] = field(default_factory=set)
+    """Machines whose log is not read, or not all of it."""
+    _living: dict[str, bool] = field(default_factory=dict)
+    _answers: SimpleQueue[_Answered] = field(default_factory=SimpleQueue)
+    _stop: threading.Event = field(default_factory=threading.Event)
+
+    def lines(self, *, is_following: bool) -> Iterator[list[LogLine]]:
+        """Yield what was said, in portions: what is there now, and while *is_following* what comes until the run ends."""
+        self._living = dict.fromkeys((source.machine for source in self.sources), True)
+        for source in self.sources:
+            threading.Thread(target=self._ask, args=(source, is_following), daemon=True).start()
+        try:
+            is_alive = True
+            while is_alive:
+                is_living = is_living_here(self.run)  # both before the last look
+                is_alive = any(self._living.values()) or (is_following and is_living)
+                yield from self.reading.read_here(self.run.path, is_ended=not is_living)
+                yield from self._portions()
+                if is_alive:
+                    self._wait()
+        finally:
+            self._stop.set()
+
+    def _wait(self) -> None:
+        """Wait until a machine answers, or it is time to look here again."""
+        try:
+            answer = self._answers.get(timeout=LOOK_INTERVAL_S)
+        except Empty:
+            return
+        self._answers.put(answer)
+
+    def _portions(self) -> Iterator[list[LogLine]]:
+        while True:
+            try:
+                answer = self._answers.get_nowait()
+            except Empty:
+                return
+            if answer.told is None:
+                self._living[answer.machine] = False
+                if answer.machine not in self.failed and answer.failure is not None:
+                    self.failed.add(answer.machine)
+                    self.on_failure(answer.machine, answer.failure)
+                continue
+            self.failed.discard(answer.machine)
+            self._living[answer.machine] = bool(answer.told["living"] or answer.told["more"])
+            yield self.reading.take(answer.told["files"])
+
+    def _ask(self, source: RecordingMachine, is_following: bool) -> None:
+        """Ask one machine until its part of the run has ended; in a thread of its own."""
+        offsets = dict(self.reading.offsets)
+        while not self._stop.is_set():
+            try:
+                self._ask_connected(source, offsets, is_following=is_following)
+                return
+            except MachineFailure as failure:
+                self._answers.put(_Answered(source.machine, failure=failure))
+            if not is_following:
+                return
+            self._stop.wait(AGAIN_S)
+
+    def _ask_connected(
+        self, source: RecordingMachine, offsets: dict[str, int], *, is_following: bool
+    ) -> None:
+        with (
+            contextlib.closing(connect(source.target, self.options)) as connection,
+            Helper.start(connection, PARTS, watch=SilenceWatch(connection)) as board,
+        ):
+            is_more = True
+            while not self._stop.is_set() and is_more:
+                told = self._asked(board, source, offsets)
+                is_living = is_following and bool(told["living"])
+                self._answers.put(_Answered(source.machine, told={**told, "living": is_living}))
+                is_more = is_living or bool(told["more"])
+                if not told["more"]:
+                    self._stop.wait(ASK_INTERVAL_S if is_more else 0)
+
+    def _asked(self, board: Helper, source: RecordingMachine, offsets: dict[str, int]) -> Told:
+        told: Told = board.call(
+            "tail", {**source.where, "offsets": offsets}, timeout_s=ANSWER_TIMEOUT_S
+        ).value
+        offsets |= {path: int(file["end"]) for path, file in told["files"].items()}
+        return told
+
+
+def is_living_here(run: RunDirectory) -> bool:
+    """Tell whether anything of a run lives on this computer."""
+    return any(entry.run_directory == str(run.path) for entry in list_processes())
+
+
+def sources_elsewhere(run: RunDirectory) -> list[RecordingMachine]:
+    """Return the machines whose records are not here yet, but for those that were forgotten."""
+    notes = ((source, read_note(run, source.machine)) for source in asked_sources(run))
+    return [source for source, note in notes if note is None or not note.is_complete]

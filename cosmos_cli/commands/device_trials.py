@@ -1,0 +1,167 @@
+"""`cosmos devices test` and `record`: devices that are driven without a run, here and on other machines."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.fleet.fleet import Fleet
+from cosmos_cli.fleet.outcome import Outcome, raise_if_failed
+from cosmos_cli.launch.device_sampling import (
+    chosen_devices,
+    launch_of,
+    missing_for,
+    record,
+    sample_here,
+)
+from cosmos_cli.launch.remote_sampling import MachineSampler
+from cosmos_cli.ui.console import Column, Console
+from madns_runtime.config import DeviceLaunch
+
+FIGURES = (
+    Column("device"),
+    Column("channel"),
+    Column("samples", is_number=True),
+    Column("rate Hz", is_number=True),
+    Column("jitter p99 us", is_number=True),
+    Column("age p50 us", is_number=True),
+    Column("age max us", is_number=True),
+    Column("errors", is_number=True),
+)
+LOCAL = "local"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """The devices that are tried: of this computer, and of others."""
+
+    console: Console
+    fleet: Fleet
+    name: str | None
+    """Of the device; None for all."""
+    seconds: float
+    writes: bool = False
+    here: list[DeviceLaunch] = field(default_factory=list)
+    there: dict[str, list[DeviceLaunch]] = field(default_factory=dict)
+    """By machine."""
+
+    def __post_init__(self) -> None:
+        for machine, device in chosen_devices(self.fleet.machines, self.name):
+            launch = launch_of(machine, device, writes=self.writes)
+            if machine.connection == LOCAL:
+                self.here.append(launch)
+                for text in missing_for(machine, device):
+                    self.console.warn(f"{launch.full_name}: {text}")
+            else:
+                self.there.setdefault(machine.name, []).append(launch)
+
+    @property
+    def names(self) -> list[str]:
+        """Full names of all devices."""
+        elsewhere = (each.full_name for launches in self.there.values() for each in launches)
+        return [*(each.full_name for each in self.here), *elsewhere]
+
+    def sample_there(self, records: Path | None = None) -> list[Outcome[dict[str, Any]]]:
+        """Sample the devices of other machines, all at once, and return what each machine told."""
+        if not self.there:
+            return []
+        machines = [machine for machine in self.fleet.machines if machine.name in self.there]
+        sampler = MachineSampler(machines, self.seconds, writes=self.writes, say=self.console.say)
+        targets = tuple(t for t in self.fleet.targets if t.name in self.there)
+        # Each is driven for as long: none waits for another.
+        fleet = Fleet(
+            targets=targets,
+            forks=max(self.fleet.forks, len(targets)),
+            options=self.fleet.options,
+            load=lambda: tuple(machines),
+        )
+        return fleet.each(
+            lambda connection, machine: sampler.sample(
+                connection, machine, self.there[machine.name], records
+            )
+        )
+
+
+def test_devices(trial: Trial) -> int:
+    """Sample devices, and show what each gave; return the exit code."""
+    console = trial.console
+    console.say(f"sampling {', '.join(trial.names)} for {trial.seconds:g} s")
+    outcomes = trial.sample_there()
+    told = _sampled_here(trial) if trial.here else {}
+    for outcome in outcomes:
+        told |= outcome.value or {}
+        if outcome.failure is not None:
+            console.say(f"{outcome.machine}: failed: {outcome.failure}")
+    console.table(FIGURES, [row for name, each in told.items() for row in _rows(name, each)])
+    bad = [name for name, each in told.items() if _is_bad(each)]
+    for name, each in told.items():
+        console.data(f"{name}: {each['status']}, identity {each['identity'] or 'none'}")
+        if name in bad:
+            console.say(f"{name}: {each['error'] or each['why'] or 'no sample of any input'}")
+    failures = {each.machine: each.failure.to_mapping() for each in outcomes if each.failure}
+    missed = [name for name in trial.names if name not in told]
+    code = ExitCode.MACHINES if failures else ExitCode.RUN_FAILED if bad else ExitCode.OK
+    console.print_json(
+        {"devices": told, "not_sampled": missed, "failures": failures, "exit_code": int(code)}
+    )
+    return int(code)
+
+
+def _sampled_here(trial: Trial) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory(prefix="cosmos-devices-") as folder:
+        return sample_here(
+            trial.here, trial.seconds, Path(folder), writes=trial.writes, say=trial.console.say
+        )
+
+
+def record_device(trial: Trial, directory: Path) -> int:
+    """Record one device into a folder, and show what it gave; return the exit code."""
+    console = trial.console
+    if len(trial.names) > 1:
+        raise InputError(f"{trial.name} means {', '.join(trial.names)}: name one")
+    console.say(f"recording {trial.names[0]} for {trial.seconds:g} s")
+
+    def sample(folder: Path) -> dict[str, Any]:
+        if trial.here:
+            return sample_here(trial.here, trial.seconds, folder, say=console.say)
+        (outcome,) = trial.sample_there(folder)
+        raise_if_failed([outcome], "nothing was recorded")
+        return dict(outcome.value or {})
+
+    launch = [*trial.here, *(each for launches in trial.there.values() for each in launches)][0]
+    told = record(launch, trial.seconds, directory, sample)
+    console.table(FIGURES, _rows(launch.full_name, told))
+    console.data(
+        f"{directory}: recorded; kind: playback with parameters: {{directory: ...}} plays it"
+    )
+    code = ExitCode.RUN_FAILED if _is_bad(told) else ExitCode.OK
+    console.print_json({"directory": str(directory), "device": told, "exit_code": int(code)})
+    return int(code)
+
+
+def _is_bad(told: Mapping[str, Any]) -> bool:
+    """Tell whether a device gave errors, was lost, or has inputs and gave none of them."""
+    inputs = [each for each in told["channels"].values() if "samples" in each]
+    is_silent = bool(inputs) and not any(each["samples"] for each in inputs)
+    return bool(told["errors"] or told["lost"] or is_silent or told.get("report") is None)
+
+
+def _rows(full_name: str, told: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    rows: list[tuple[str, ...]] = []
+    figures: tuple[str, ...]
+    for channel, each in told["channels"].items():
+        if "written" in each:
+            figures = (f"{each['written']} written", "", "", _figure(each.get("lateness_us")), "")
+        else:
+            names = ("samples", "rate_hz", "jitter_us", "age_us", "age_us_max")
+            figures = tuple(_figure(each.get(name)) for name in names)
+        rows.append((full_name, channel, *figures, str(told["errors"])))
+    return rows
+
+
+def _figure(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, int | float) else ""

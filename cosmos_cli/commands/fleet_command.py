@@ -1,0 +1,151 @@
+"""What commands on machines have in common: their options, and their end with what failed and how to repeat it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.fleet.fleet import Fleet, fleet_of
+from cosmos_cli.fleet.outcome import Outcome, failed
+from cosmos_cli.fleet.pool import FORKS_DEFAULT
+from cosmos_cli.fleet.retry_file import offer_retry
+from cosmos_cli.models.inventory_arguments import refuse_stray_limit
+from cosmos_cli.ui.console import Console
+
+if TYPE_CHECKING:
+    from cosmos_cli.models.inventory import Machine
+
+__all__ = [
+    "FORKS_DEFAULT",
+    "TIMEOUT_S_MAX",
+    "AcceptHostKeysOption",
+    "Fleet",
+    "ForksOption",
+    "HostOption",
+    "InventoryOption",
+    "LimitOption",
+    "SomeInventoryOption",
+    "failure_teller",
+    "finish",
+    "fleet_of",
+    "some_machines",
+]
+
+TIMEOUT_S_MAX = 1e6
+"""Of any --timeout, eleven days: the kernel's waits end at twenty-four."""
+
+InventoryOption = Annotated[
+    list[str],
+    typer.Option(
+        "--inventory",
+        "-i",
+        metavar="FILE",
+        envvar="COSMOS_INVENTORY",
+        help="Inventory: a file, a folder, or machines as in pi01,pi02, (with a comma). Repeatable; the later wins.",
+    ),
+]
+SomeInventoryOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--inventory",
+        "-i",
+        metavar="FILE",
+        envvar="COSMOS_INVENTORY",
+        help="Inventory (file, folder, or pi01,pi02, with a comma; repeatable):"
+        " the machines to run on; default: this computer alone.",
+    ),
+]
+HostOption = Annotated[
+    str | None,
+    typer.Option(
+        "--host", metavar="MACHINE", help="Machine that runs the host; default: this computer."
+    ),
+]
+LimitOption = Annotated[
+    str | None,
+    typer.Option(
+        "--limit",
+        "-l",
+        metavar="PATTERN",
+        envvar="COSMOS_LIMIT",
+        help="Only these machines: names, groups, globs, as in tower:!chiefs; @FILE: one on each line.",
+    ),
+]
+ForksOption = Annotated[
+    int,
+    typer.Option(
+        "--forks", min=1, max=500, metavar="N", envvar="COSMOS_FORKS", help="Machines at a time."
+    ),
+]
+AcceptHostKeysOption = Annotated[
+    bool,
+    typer.Option(
+        "--accept-new-host-keys",
+        envvar="COSMOS_ACCEPT_NEW_HOST_KEYS",
+        help="Record unknown host keys in known_hosts; a changed one is always refused.",
+    ),
+]
+
+
+def some_machines(
+    inventory: Sequence[str] | None, limit: str | None, host: str | None
+) -> tuple[Machine, ...]:
+    """
+    Return the machines that a run would have: the inventory's, or this computer alone.
+
+    Raises:
+        InputError: Faults of the inventory or the pattern; or a host or a pattern, and no inventory for it.
+    """
+    # Imported late: most commands that have the options above never read an inventory's models.
+    from cosmos_cli.models.inventory import LOOPBACK, load_machines
+
+    if inventory:
+        return load_machines(inventory, limit)
+    refuse_stray_limit(limit)
+    if host is not None:
+        raise InputError(
+            f"--host {host}: there is no machine without an inventory; give one with -i"
+        )
+    return (LOOPBACK,)
+
+
+def failure_teller(console: Console) -> Callable[[Outcome[Any]], None]:
+    """Return what tells each machine's failure when it happens; call it as `on_done`."""
+
+    def tell(outcome: Outcome[Any]) -> None:
+        if outcome.failure is not None:
+            console.say(f"{outcome.machine}: failed: {outcome.failure}")
+
+    return tell
+
+
+def finish(
+    console: Console,
+    fleet: Fleet,
+    *,
+    outcomes: Sequence[Outcome[Any]],
+    verdict: str,
+    document: Mapping[str, Any],
+) -> int:
+    """
+    Print the end of a command, with how to repeat it for the machines that failed.
+
+    Args:
+        console: Where it is printed.
+        fleet: The machines.
+        outcomes: Of all of them.
+        verdict: The last line.
+        document: What --json prints, but for "retry" and "exit_code".
+
+    Returns:
+        The exit code: MACHINES when any machine failed.
+    """
+    names = [outcome.machine for outcome in failed(outcomes)]
+    exit_code = int(ExitCode.MACHINES if names else ExitCode.OK)
+    retry = offer_retry(console, fleet.sources, failed=names, count=len(outcomes))
+    console.data(verdict)
+    console.print_json({**document, "retry": retry, "exit_code": exit_code})
+    return exit_code

@@ -1,0 +1,196 @@
+"""`cosmos logs`: what the host, the agents and their flight software said in a run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+from cosmos_cli.collect.log_follower import LogFollower, sources_elsewhere
+from cosmos_cli.collect.machine_sources import HOST, RecordingMachines
+from cosmos_cli.commands.fleet_command import AcceptHostKeysOption
+from cosmos_cli.commands.runs import RunArgument, RunsOption
+from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
+from cosmos_cli.evidence.run_log import LogLine, LogReading, in_order
+from cosmos_cli.evidence.run_search import find_run
+from cosmos_cli.evidence.table_labels import run_labels
+from cosmos_cli.fleet.connection import ConnectOptions
+from cosmos_cli.models.document import did_you_mean
+from cosmos_cli.ui.console import Console, JsonOption, QuietOption
+from cosmos_cli.ui.plural import counted
+
+LINES_DEFAULT = 10_000
+LINES_MAX = 1_000_000
+NO_TIME = " " * 12
+
+
+class LogLevel(StrEnum):
+    """The least loud that is shown; what stands on standard error always is."""
+
+    DEBUG = "debug"
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+    CRITICAL = "critical"
+
+
+def logs(
+    run: RunArgument = "last",
+    source: Annotated[
+        str | None,
+        typer.Argument(metavar="[AGENT]", help="An agent, host, or a machine; default: all."),
+    ] = None,
+    follow: Annotated[
+        bool, typer.Option("--follow", "-f", help="Go on until the run ends.")
+    ] = False,
+    level: Annotated[
+        LogLevel, typer.Option("--level", help="The least loud that is shown.")
+    ] = LogLevel.DEBUG,
+    lines: Annotated[
+        int | None,
+        typer.Option(
+            *("--lines", "-n"),
+            min=0,
+            max=LINES_MAX,
+            metavar="N",
+            help="The last N lines; default: 10000, with --follow all.",
+        ),
+    ] = None,
+    folder: RunsOption = None,
+    accept_new_host_keys: AcceptHostKeysOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """
+    Show what host, agents and flight software said, with UTC and simulated time: log streams and standard errors.
+
+    Also of a run that lives, here or on its machines. --json prints one object per line. Ends with 3 when a
+    machine cannot be asked.
+    """
+    console = Console(json=as_json, quiet=quiet)
+    found = find_run(runs_root(folder), run)
+    sources = RecordingMachines.read(found)
+    names = _names(sources)
+    source = _by_name(source, found, names)
+    _expect_known(source, found, sources, names)
+    printer = _Printer(console, width=max(map(len, names)))
+    reading = LogReading(source=source, level=level.value)
+    failed: set[str] = set()
+    elsewhere = sources_elsewhere(found)
+
+    def follower() -> LogFollower:
+        return LogFollower(
+            run=found,
+            sources=elsewhere,
+            reading=reading,
+            options=ConnectOptions(accept_new_host_keys=accept_new_host_keys),
+            on_failure=lambda machine, failure: console.say(
+                f"{machine}: its log cannot be read: {failure}"
+            ),
+            failed=failed,
+        )
+
+    if lines is not None or not follow:
+        last = _Last(LINES_DEFAULT if lines is None else lines)
+        for portion in follower().lines(is_following=False):
+            last.add(portion)
+        printer.print(last.lines())
+        if last.left_out and lines is None:
+            console.say(f"{counted(last.left_out, 'earlier line')} left out; --lines shows more")
+    if follow:
+        for portion in follower().lines(is_following=True):
+            printer.print(portion)
+        console.say(f"{found.name} has ended")
+    _tell_rest(console, found, reading, printer.count)
+    return int(ExitCode.MACHINES if failed else ExitCode.OK)
+
+
+def _by_name(source: str | None, run: RunDirectory, names: Sequence[str]) -> str | None:
+    """Return the name of whom *source* means by its label, or itself."""
+    if source is None or source in names:
+        return source
+    by_label = {label: agent for agent, label in run_labels(run).names.items()}
+    return by_label.get(source, source)
+
+
+class _Printer:
+    """Prints lines: time, source, level, text."""
+
+    def __init__(self, console: Console, *, width: int) -> None:
+        self.count = 0
+        self._console = console
+        self._width = width
+
+    def print(self, lines: Sequence[LogLine]) -> None:
+        """Print them in their order; each line of a text stands under its own head."""
+        for line in lines:
+            self.count += 1
+            if self._console.json:
+                self._console.print_json_line(line.to_mapping())
+                continue
+            time = line.utc[11:23].ljust(len(NO_TIME)) if line.utc else NO_TIME
+            simulated = "" if line.t_s is None else f"{line.t_s:.3f}"
+            head = f"{time}  {simulated:>10}  {line.source:<{self._width}}  {line.level:<8}  "
+            self._console.data(
+                "\n".join(head + part.rstrip("\r") for part in line.text.rstrip("\n").split("\n"))
+            )
+
+
+class _Last:
+    """The last lines by time, in bounded memory."""
+
+    def __init__(self, count_max: int) -> None:
+        self.left_out = 0
+        self._count_max = count_max
+        self._lines: list[LogLine] = []
+
+    def add(self, lines: Sequence[LogLine]) -> None:
+        """Take lines."""
+        self._lines += lines
+        if len(self._lines) > 2 * self._count_max + 1000:
+            self.lines()
+
+    def lines(self) -> list[LogLine]:
+        """Return them in order."""
+        ordered = in_order(self._lines)
+        first = max(0, len(ordered) - self._count_max)
+        self.left_out += first
+        self._lines = ordered[first:]
+        return self._lines
+
+
+def _names(sources: RecordingMachines) -> list[str]:
+    return [
+        HOST,
+        *sources.machine_of_agent,
+        *[source.machine for source in sources.remote],
+        *set(sources.machine_of_agent.values()),
+    ]
+
+
+def _expect_known(
+    source: str | None, run: RunDirectory, sources: RecordingMachines, names: Sequence[str]
+) -> None:
+    """
+    Refuse a source that the run has not; of a run without a plan nothing is known.
+
+    Raises:
+        InputError: It is none of the agents, the host or a machine.
+    """
+    if source is None or source in names or not sources.machine_of_agent:
+        return
+    hint = did_you_mean(source, names) if len(names) < 50 else ""
+    hint = hint if hint.endswith("?") else f": host, {', '.join(names[1:4])}, ..."
+    raise InputError(f"{run.name} has no agent, host or machine named {source}{hint}")
+
+
+def _tell_rest(console: Console, run: RunDirectory, reading: LogReading, count: int) -> None:
+    if reading.damaged:
+        console.say(f"{counted(reading.damaged, 'line')} could not be read")
+    if not count:
+        config = run.read_config()
+        loudness = f" at recording.verbosity {config.recording.verbosity}" if config else ""
+        console.say(f"{run.name}: nothing was said{loudness}")

@@ -1,0 +1,68 @@
+"""Recorded values as Arrow arrays, each as its field's kind wants it."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from cosmos_cli.evidence.streams import Kind
+
+ARROW_TYPES: dict[Kind, pa.DataType] = {
+    "float": pa.float64(),
+    "int": pa.int64(),
+    "bool": pa.bool_(),
+    "str": pa.string(),
+    "json": pa.string(),
+    "packed": pa.string(),
+}
+
+
+def to_arrow(values: NDArray[Any], kind: Kind) -> tuple[pa.Array, int]:
+    """Return a column as its field's kind wants it, and how many values did not fit and became null."""
+    if kind == "float" and values.dtype.kind in "fi":
+        return pa.array(values.astype(np.float64, copy=False), from_pandas=True), 0
+    if kind == "int" and values.dtype.kind == "i":
+        return pa.array(values), 0
+    if kind == "bool" and values.dtype.kind == "b":
+        return pa.array(values), 0
+    if kind == "int" and values.dtype.kind == "f":
+        is_null = np.isnan(values)
+        is_unfit = ~is_null & ((values != np.floor(values)) | (np.abs(values) >= 2.0**63))
+        whole = np.where(is_null | is_unfit, 0, values).astype(np.int64)
+        return pa.array(whole, mask=is_null | is_unfit), int(is_unfit.sum())
+    return _convert_each(values.tolist(), kind)
+
+
+def as_floats(values: NDArray[Any]) -> NDArray[np.float64]:
+    """Return a column as floats; what is no number is NaN."""
+    if values.dtype.kind in "fi":
+        return values.astype(np.float64)
+    numbers = [v if _is_number(v) else np.nan for v in values.tolist()]
+    return np.array(numbers, dtype=np.float64)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _convert_each(values: list[Any], kind: Kind) -> tuple[pa.Array, int]:
+    converted = [_convert(value, kind) for value in values]
+    unfit = sum(new is None and old is not None for old, new in zip(values, converted, strict=True))
+    return pa.array(converted, type=ARROW_TYPES[kind]), unfit
+
+
+def _convert(value: Any, kind: Kind) -> Any:
+    if value is None or (isinstance(value, float) and np.isnan(value)):
+        return None
+    if kind == "float":
+        return float(value) if _is_number(value) else None
+    if kind == "int":
+        is_int64 = _is_number(value) and value == int(value) and abs(value) < 2**63
+        return int(value) if is_int64 else None
+    if kind == "bool":
+        return value if isinstance(value, bool) else None
+    return value if isinstance(value, str) else json.dumps(value)

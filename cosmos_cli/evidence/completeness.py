@@ -1,0 +1,175 @@
+"""Records that a run must have, and those of them that are missing, cut or dropped. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import PurePath
+from types import MappingProxyType
+from typing import Any
+
+from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.streams import StreamScan
+from madns_runtime.config import RunConfig
+from madns_runtime.plain_values import mapping_at as mapping_at
+from madns_runtime.recording.records import CLOCK, EVENTS, HEALTH, LOG, PROCESS, TICKS
+
+AGENT_STREAMS = tuple(schema.name for schema in (TICKS, CLOCK, EVENTS, LOG, PROCESS))
+HOST_STREAMS = tuple(schema.name for schema in (EVENTS, LOG, HEALTH))
+MACHINE_STREAMS = (HEALTH.name,)
+LOCKSTEP_STREAMS = (EVENTS.name, LOG.name)
+"""Of host and agents where no time is kept: there are no machines' clocks, lateness or health to record."""
+FAULTS_SHOWN_MAX = 3
+HOST = "host"
+COUNT_MAX = 2**53
+"""Largest count of a file: JSON's readers agree on whole numbers up to here."""
+NOTHING: Mapping[str, str] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExpectedRecords:
+    """Recording roles and their least streams; a simulation's own are in the summaries."""
+
+    agents: tuple[str, ...] = ()
+    machines: tuple[str, ...] = ()
+    devices: tuple[str, ...] = ()
+    """Full names."""
+    agent_streams: tuple[str, ...] = AGENT_STREAMS
+    host_streams: tuple[str, ...] = HOST_STREAMS
+    machine_streams: tuple[str, ...] = MACHINE_STREAMS
+
+    @classmethod
+    def of(cls, config: RunConfig, machines: Iterable[str]) -> ExpectedRecords:
+        """Return what a run of this configuration on these machines must have recorded."""
+        agents = config.agents.resolved_names()
+        if config.time.is_lockstep:
+            streams = LOCKSTEP_STREAMS
+            return cls(agents=agents, agent_streams=streams, host_streams=streams)
+        return cls(agents=agents, machines=tuple(machines))
+
+    @classmethod
+    def read(cls, run: RunDirectory) -> ExpectedRecords:
+        """Return what plan.json promises; of an unreadable plan nothing but the host's own records."""
+        config, plan = run.read_config(), run.read_json(run.plan_json) or {}
+        machines = plan.get("machines")
+        named = machines if isinstance(machines, Mapping) else {}
+        names = tuple(name for name, machine in named.items() if _has_agents(machine))
+        return cls.of(config, names) if config else cls(machines=names)
+
+
+def find_missing(
+    expected: ExpectedRecords,
+    scans: Sequence[StreamScan],
+    result: Mapping[str, Any] | None,
+    unretrieved: Mapping[str, str] = NOTHING,
+) -> list[str]:
+    """
+    Return one line a source whose data are not all there, each starting with its name.
+
+    Args:
+        expected: Who should have recorded what.
+        scans: What is there.
+        result: What the host reported; None if it could not, which is itself a gap.
+        unretrieved: By machine whose records have not all come, and by agent that recorded on it, why.
+            Such a machine has a line in any case: nobody else knows what it recorded beside.
+    """
+    agents = mapping_at(result, "agents")
+    faults: dict[str, list[str]] = {HOST: [] if result is not None else ["no result"]}
+    found: dict[tuple[str, str], list[StreamScan]] = {}
+    for scan in scans:
+        found.setdefault((scan.file.role, scan.file.source), []).append(scan)
+    _check_source(faults, HOST, found.get((HOST, HOST), ()), expected.host_streams, result)
+    for name in expected.agents:
+        own = found.get(("agent", name), ())
+        _check_source(faults, name, own, expected.agent_streams, mapping_at(agents, name))
+    for name in expected.machines:
+        own = found.get(("machine", name), ())
+        _check_source(faults, name, own, expected.machine_streams, None)
+    for name in expected.devices:
+        _check_device(faults, name, found.get(("device", name), ()))
+    _check_uninvited(faults, scans, expected)
+    for name in unretrieved:
+        if name not in (HOST, *expected.agents) and not faults.get(name):
+            faults[name] = ["not all of its records are here"]
+    causes = {**unretrieved, **_reasons(agents)}
+    return [_line(name, texts, causes.get(name)) for name, texts in faults.items() if texts]
+
+
+def _has_agents(machine: object) -> bool:
+    """Tell whether a machine of the plan records: the host's may run no agent."""
+    return not isinstance(machine, Mapping) or machine.get("agents") != []
+
+
+def _check_source(
+    faults: dict[str, list[str]],
+    name: str,
+    scans: Sequence[StreamScan],
+    streams: Sequence[str],
+    summary: Mapping[str, Any] | None,
+) -> None:
+    found = faults.setdefault(name, [])
+    if not scans:
+        found.append("no records")
+        return
+    lives = {scan.file.incarnation for scan in scans}
+    found.extend(f"no records of incarnation {n}" for n in range(1, max(lives)) if n not in lives)
+    have = {scan.file.stream for scan in scans}
+    paths = {scan.file.path.name for scan in scans}
+    reported = mapping_at(summary, "records", "streams")
+    for stream in dict.fromkeys((*streams, *map(str, reported))):
+        counts = mapping_at(reported, stream)
+        file = PurePath(str(counts.get("file", ""))).name
+        if stream not in have or (file and file not in paths):
+            found.append(f"{stream} is missing")
+    errors = _errors_of(mapping_at(summary, "records"))
+    why = f" ({errors[0]})" if errors else ""
+    faulty = [_told(scan) for scan in scans if scan.fault]
+    found.extend([faulty[0] + why, *faulty[1:]] if faulty else [])  # one cause, told once
+    # A sampler is a process of its own: its trouble, such as having been killed, shows in its own report.
+    found.extend(
+        f"{HEALTH.name}: {text}" for text in _errors_of(mapping_at(summary, "records", HEALTH.name))
+    )
+
+
+def _check_device(faults: dict[str, list[str]], name: str, scans: Sequence[StreamScan]) -> None:
+    """Judge the records of a device; one that was killed leaves them cut, which `records.truncated` counts."""
+    found = faults.setdefault(name, [])
+    if not scans:
+        found.append("no records")
+    found.extend(_told(scan) for scan in scans if scan.fault and scan.promised is not None)
+
+
+def _errors_of(report: Mapping[str, Any]) -> list[str]:
+    errors = report.get("errors")
+    return [str(error) for error in errors] if isinstance(errors, list | tuple) else []
+
+
+def _check_uninvited(
+    faults: dict[str, list[str]], scans: Sequence[StreamScan], expected: ExpectedRecords
+) -> None:
+    """Judge also what a source recorded that no plan names: a plan may be lost, its data are not."""
+    known = {HOST, *expected.agents, *expected.machines, *expected.devices}
+    for scan in scans:
+        if scan.file.source not in known and scan.fault:
+            faults.setdefault(scan.file.source, []).append(_told(scan))
+
+
+def _reasons(agents: Mapping[str, Any]) -> dict[str, str]:
+    """Return what became of agents, as far as the host knew."""
+    reasons = {name: mapping_at(agents, name).get("reason") for name in agents}
+    return {name: text for name, text in reasons.items() if isinstance(text, str) and text}
+
+
+def _line(name: str, faults: Sequence[str], cause: str | None) -> str:
+    """Say what is missing of a source, and first what happened to it if that is known."""
+    return f"{name}: {f'{cause}: ' if cause else ''}{_listed(faults)}"
+
+
+def _told(scan: StreamScan) -> str:
+    life = f" of incarnation {scan.file.incarnation}" if scan.file.incarnation > 1 else ""
+    return f"{scan.file.stream}{life} {scan.fault}"
+
+
+def _listed(items: Sequence[str]) -> str:
+    rest = len(items) - FAULTS_SHOWN_MAX
+    return ", ".join(items[:FAULTS_SHOWN_MAX]) + (f" and {rest} more" if rest > 0 else "")

@@ -1,0 +1,166 @@
+"""Devices of a run as evidence: what each came to, by the accounts of its machine or of the host, and their checks."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.run_documents import read_object
+from cosmos_cli.evidence.verdict import CheckResult, at_most, is_number
+from cosmos_cli.ui.foreign_text import clean_line
+from madns_runtime.config import HardwareSettings
+from madns_runtime.plain_values import mapping_at
+
+ACCOUNT_NAME = re.compile(r"devices(?:\.([1-9][0-9]{0,8}))?\.json")
+"""Accounts of a machine's devices, below machines/<machine>/: one per life of its supervisor."""
+NO_REPORT = "unknown"
+"""Status of a device that nobody has given account of."""
+WHY_MISSING = "no account of it: its supervisor did not come to its end"
+_TOLD_APART = frozenset(
+    (
+        "status",
+        "samples",
+        "errors",
+        "stale_ratio",
+        "lost",
+        "restarts",
+        "why",
+        "frozen",
+        "unsafe",
+        "report",
+    )
+)
+
+
+def expected_devices(plan: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the full names of the devices that plan.json promises."""
+    listed = mapping_at(plan, "devices").values()
+    return tuple(str(name) for names in listed if isinstance(names, list) for name in names)
+
+
+def read_devices(
+    run: RunDirectory, plan: Mapping[str, Any], result: Mapping[str, Any] | None
+) -> dict[str, dict[str, Any]]:
+    """Return what became of each device, by its full name; of one without an account, that there is none."""
+    found: dict[str, list[Mapping[str, Any]]] = {}
+    lives: dict[str, int] = {}
+    for machine, names in mapping_at(plan, "devices").items():
+        accounts = _accounts(run.path / "machines" / str(machine))
+        for account in accounts.values():
+            for name, told in account.items():
+                if isinstance(told, Mapping):
+                    found.setdefault(str(name), []).append(told)
+        for name in names if isinstance(names, list) else ():
+            lives[str(name)] = max(accounts, default=0)
+    for agent in mapping_at(result, "agents"):  # in lockstep
+        for name, told in mapping_at(result, "agents", agent, "records", "devices").items():
+            if isinstance(told, Mapping):
+                found.setdefault(f"{agent}/{name}", []).append(told)
+    names = dict.fromkeys((*expected_devices(plan), *found))
+    return {
+        clean_line(name): _joined(found.get(name, ()), lives.get(name, 0)) for name in sorted(names)
+    }
+
+
+def device_checks(
+    devices: Mapping[str, Mapping[str, Any]], limits: HardwareSettings
+) -> list[CheckResult]:
+    """Return the checks of all devices, each with the name of the worst; none in a run without devices."""
+    if not devices:
+        return []
+    return [
+        _check(devices, "hardware.stale_ratio", limits.stale_ratio, key="stale_ratio"),
+        _check(devices, "hardware.lost", limits.lost, key="lost"),
+        _check(devices, "hardware.frozen", limits.frozen, key="frozen"),
+        *([_check(devices, "hardware.unsafe", 0, key="unsafe")] if _is_unsafe(devices) else []),
+    ]
+
+
+def _is_unsafe(devices: Mapping[str, Mapping[str, Any]]) -> bool:
+    """Tell whether the outputs of a device were left as they were: nobody could make them safe."""
+    return any(told.get("unsafe") for told in devices.values())
+
+
+def _check(
+    devices: Mapping[str, Mapping[str, Any]], name: str, limit: float, *, key: str
+) -> CheckResult:
+    """Judge one figure: of a ratio the largest, of a count the sum; what is not measured of one is of none."""
+    values = {device: told.get(key) for device, told in devices.items()}
+    unknown = next((device for device, value in values.items() if not is_number(value)), None)
+    if unknown is not None:
+        return replace(at_most(name, limit, None), worst=unknown)
+    known = {device: float(value) for device, value in values.items() if is_number(value)}
+    worst = max(known, key=lambda device: known[device])
+    got = known[worst] if key == "stale_ratio" else int(sum(known.values()))
+    return replace(at_most(name, limit, got), worst=worst if known[worst] else None)
+
+
+def _accounts(folder: Path) -> dict[int, Mapping[str, Any]]:
+    """Return a machine's accounts by life; one that cannot be read is as good as none."""
+    found: dict[int, Mapping[str, Any]] = {}
+    for path in sorted(folder.glob("devices*.json")):
+        named = ACCOUNT_NAME.fullmatch(path.name)
+        if named is None or path.is_symlink():
+            continue
+        try:
+            found[int(named[1] or 1)] = read_object(path)
+        except (OSError, ValueError):
+            continue
+    return dict(sorted(found.items()))
+
+
+def _joined(told: Sequence[Mapping[str, Any]], lives: int) -> dict[str, Any]:
+    """Return the account of one device over all lives; a life without one counts as a loss."""
+    if not told:
+        missing = dict.fromkeys(
+            ("samples", "errors", "stale_ratio", "lost", "restarts", "frozen"), None
+        )
+        return {"status": NO_REPORT, **missing, "unsafe": 0, "why": WHY_MISSING, "counts": {}}
+    flat = [{**mapping_at(each, "report"), **each} for each in told]
+    lost = _sum(flat, "lost")
+    ratios = [each.get("stale_ratio") for each in flat]
+    numbers = [float(ratio) for ratio in ratios if is_number(ratio)]
+    return {
+        "status": clean_line(str(flat[-1].get("status", NO_REPORT))),
+        "samples": _sum(flat, "samples"),
+        "errors": _sum(flat, "errors"),
+        "stale_ratio": max(numbers) if len(numbers) == len(flat) else None,
+        "lost": None if lost is None else lost + max(lives - len(told), 0),
+        "restarts": _sum(flat, "restarts"),
+        "frozen": _frozen(flat),
+        "unsafe": int(any(each.get("unsafe") for each in flat[-1:])),
+        "why": clean_line(next((str(e["why"]) for e in reversed(flat) if e.get("why")), "")),
+        "counts": _counts(flat),
+    }
+
+
+def _sum(told: Iterable[Mapping[str, Any]], key: str) -> int | None:
+    values = [each.get(key) for each in told]
+    numbers = [int(value) for value in values if is_number(value)]
+    return sum(numbers) if len(numbers) == len(values) else None
+
+
+def _frozen(told: Iterable[Mapping[str, Any]]) -> int | None:
+    """Return how often inputs were frozen; None if a driver's process ended without its report."""
+    total = 0
+    for each in told:
+        frozen = each.get("frozen")
+        if not isinstance(frozen, Mapping):
+            return None
+        total += sum(int(times) for times in frozen.values() if is_number(times))
+    return total
+
+
+def _counts(told: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+    """Return all further counts, such as of samples dropped and orders refused."""
+    found: dict[str, float] = {}
+    for each in told:
+        for key, value in each.items():
+            if key not in _TOLD_APART and is_number(value):
+                name = clean_line(str(key))
+                found[name] = found.get(name, 0) + value
+    return found

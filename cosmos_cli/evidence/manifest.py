@@ -1,0 +1,109 @@
+"""
+All files of a run: the manifest, which tells size, hash and losses of each, and the package, which holds them.
+
+The package is one .tar.zst beside the run's directory, the same bytes for the same files.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tarfile
+from collections.abc import Container, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import zstandard
+
+from cosmos_cli.evidence.run_directory import RESERVE_NAME, SCHEMA, RunDirectory
+from cosmos_cli.evidence.streams import StreamScan
+from madns_runtime.partial_file import partial_file
+from madns_runtime.recording.access import file_mode
+
+MANIFEST_NAME = "manifest.json"
+COMPRESSION_LEVEL = 3
+
+
+def run_files(run: RunDirectory, without: Container[Path] = ()) -> Iterator[Path]:
+    """Yield the files that are evidence, in the order of their names; no reserve, nothing half-written."""
+    for path in sorted(run.path.rglob("*")):
+        is_left_out = path in without or path.name == RESERVE_NAME or path.name.endswith(".part")
+        if path.is_file() and not path.is_symlink() and not is_left_out:
+            yield path
+
+
+def build_manifest(
+    run: RunDirectory,
+    scans: Mapping[Path, StreamScan],
+    was: Mapping[str, Mapping[str, Any]] | None = None,
+    *,
+    without: Container[Path] = (),
+) -> dict[str, Any]:
+    """
+    Return the manifest of all files but itself.
+
+    Args:
+        run: The run.
+        scans: What was found in each stream file; it holds the hash already.
+        was: First entries of files that are no longer what they were, or are gone.
+        without: Files that are not read.
+    """
+    files: dict[str, Any] = {}
+    for path in run_files(run, without):
+        scan = scans.get(path)
+        if path != run.manifest_json:
+            name = path.relative_to(run.path).as_posix()
+            files[name] = _stream_entry(scan) if scan else file_entry(path)
+    for name, entry in (was or {}).items():
+        files[name] = {**files.get(name, {"missing": True}), "was": entry}
+    return {"schema": SCHEMA, "run": run.name, "files": files}
+
+
+def file_entry(path: Path) -> dict[str, Any]:
+    """Return the entry of a file that is no stream: size and hash."""
+    with path.open("rb") as stream:
+        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        return {"bytes": stream.tell(), "sha256": digest}
+
+
+def _stream_entry(scan: StreamScan) -> dict[str, Any]:
+    return {
+        "bytes": scan.size_bytes,
+        "sha256": scan.sha256,
+        "records": scan.records,
+        "lost": scan.lost,
+        "dropped": scan.dropped,
+        "damaged": scan.damaged,
+        "truncated": scan.truncated,
+        "closed": scan.promised is not None,
+    }
+
+
+def pack_run(run: RunDirectory, mtime_s: int, *, without: Container[Path] = ()) -> Path:
+    """
+    Package all evidence of a run; the package appears under its name when it is whole.
+
+    Args:
+        run: The run; nobody else packs it meanwhile (`alone`).
+        mtime_s: Time that every member carries, s since 1970: the run's start, so that packing
+            twice gives the same bytes.
+        without: Files that are left out.
+
+    Raises:
+        OSError: The package cannot be written.
+    """
+    compressor = zstandard.ZstdCompressor(level=COMPRESSION_LEVEL, write_checksum=True)
+    mode = file_mode(run.access)
+    with (
+        partial_file(run.bundle, mode=mode, takes_over=True) as raw,
+        compressor.stream_writer(raw, closefd=False) as packed,
+        tarfile.open(fileobj=packed, mode="w|", format=tarfile.PAX_FORMAT) as archive,
+    ):
+        for path in run_files(run, without):
+            name = f"{run.name}/{path.relative_to(run.path).as_posix()}"
+            member = tarfile.TarInfo(name)
+            member.mtime, member.mode = mtime_s, mode
+            with path.open("rb") as stream:
+                member.size = os.fstat(stream.fileno()).st_size
+                archive.addfile(member, stream)
+    return run.bundle

@@ -1,0 +1,76 @@
+"""
+Calls of a run's simulation after the run: its figures, its numbers, the comparison that it makes.
+
+Code of a simulation that is not shipped runs in a process of its own with a deadline, as it does before a run: it
+may have been changed since, raise, hang or end the process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from cosmos_cli.models.separate_process import SeparateDefect, SeparateFailure, work_separately
+from madns_runtime.analysis.plain import from_plain, to_plain
+from madns_runtime.config import RunConfig
+from madns_runtime.errors import MadnsError, PluginError
+from madns_runtime.plugin.isolation import call_plugin
+from madns_runtime.plugin.registry import is_shipped, load_function, resolve
+
+Tell = Callable[[str], None]
+Part = Literal["figures", "document", "compare"]
+
+
+def call_simulation(config: RunConfig, part: Part, *arguments: Any) -> tuple[str, Any]:
+    """
+    Return a simulation's name, and what a function of its descriptor returns; None if it has none.
+
+    Args:
+        config: Of the run.
+        part: Which function.
+        arguments: For it.
+
+    Raises:
+        PluginError: It cannot be found, raised, ended its process, did not come to an end, or returned what is no
+            value of figures.
+    """
+
+    def work(tell: Tell) -> Mapping[str, Any]:
+        try:
+            return {"value": to_plain(_call(config, part, arguments, tell))}
+        except (MadnsError, TypeError) as error:
+            return {"fault": str(error)}
+
+    try:
+        if is_shipped(config.simulation):
+            return _call(config, part, arguments, lambda stage: None)
+        found = work_separately(work, limit_s=config.timeouts.loading_s)
+    except PluginError:
+        raise
+    except (MadnsError, SeparateFailure) as error:
+        raise PluginError(str(error)) from None
+    except SeparateDefect as defect:
+        raise PluginError(str(defect).strip().rpartition("\n")[2]) from None
+    if "fault" in found:
+        raise PluginError(found["fault"])
+    name, value = from_plain(found["value"])
+    return name, value
+
+
+def _call(config: RunConfig, part: Part, arguments: tuple[Any, ...], tell: Tell) -> tuple[str, Any]:
+    base_directory = Path(config.base_directory)
+    tell(f"importing {config.simulation}")
+    simulation = resolve(config.simulation, base_directory)
+    where = getattr(simulation, part)
+    if where is None:
+        return simulation.name, None
+    function = load_function(where, base_directory)
+    tell(f"{part}() of {config.simulation}")
+    return simulation.name, call_plugin(part, function, *arguments, finish=_unfolded)
+
+
+def _unfolded(found: Any) -> Any:
+    """Return a list of what a generator yields: it does its work only then."""
+    is_plain = isinstance(found, str | Mapping) or not isinstance(found, Iterable)
+    return found if is_plain else list(found)

@@ -1,0 +1,109 @@
+"""
+Columns that tables bear beside what was recorded: UTC of simulated time, and the second names of agents.
+
+Simulated time zero is the `epoch_utc` of the host's summary, or else of the parameters; of a simulation that knows none
+it is the moment at which the run began, as its host recorded it. In lockstep, where records tell no wall time, that is 1970-01-01T00:00:00Z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosmos_cli.evidence.completeness import mapping_at
+from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.models.agent_labels import NO_LABELS as AGENTS_UNLABELLED
+from cosmos_cli.models.agent_labels import AgentLabels
+from madns_runtime.config import RunConfig, from_mapping
+from madns_runtime.errors import ConfigurationError
+
+EPOCH = "epoch_utc"
+LOCKSTEP_ZERO_UTC = "1970-01-01T00:00:00Z"
+US_PER_S = 1e6
+NEVER_US = np.iinfo(np.int64).min
+YEARS_US = 1e17
+"""Simulated times beyond 3000 years have no UTC."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TableLabels:
+    """Labels of one run's tables; without any nothing is added."""
+
+    zero_utc: datetime | None = None
+    """UTC of simulated time zero."""
+    agents: AgentLabels = AGENTS_UNLABELLED
+    """Second names of agents."""
+
+    @classmethod
+    def of(
+        cls,
+        config: RunConfig | None,
+        result: Mapping[str, Any] | None,
+        plan: Mapping[str, Any] | None = None,
+    ) -> TableLabels:
+        """
+        Return the labels of a run.
+
+        Args:
+            config: Its settings.
+            result: What the host reported at its end; None if it could not.
+            plan: Its plan.json.
+        """
+        result, agents = result or {}, agent_labels(plan, result)
+        places = (mapping_at(result, "simulation"), config.parameters if config else {})
+        if epochs := [place[EPOCH] for place in places if EPOCH in place]:
+            zero_utc = next(filter(None, epochs), None)
+        elif config is not None and config.time.is_lockstep:
+            zero_utc = LOCKSTEP_ZERO_UTC
+        else:
+            zero_utc = result.get("t0_utc")
+        return cls(zero_utc=_parse_utc(zero_utc), agents=agents)
+
+    def utc_us(self, t_s: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return microseconds since 1970 UTC at simulated times, shape (N,), s; NEVER_US where there is no time."""
+        assert self.zero_utc is not None
+        zero_us = round(self.zero_utc.timestamp() * US_PER_S)
+        after_us = t_s * US_PER_S
+        is_time = np.abs(after_us) < YEARS_US  # false for NaN
+        whole = np.where(is_time, np.rint(np.where(is_time, after_us, 0.0)), 0.0).astype(np.int64)
+        return np.where(is_time, zero_us + whole, NEVER_US)
+
+
+def agent_labels(plan: Mapping[str, Any] | None, result: Mapping[str, Any] | None) -> AgentLabels:
+    """
+    Return the second names of a run's agents.
+
+    Args:
+        plan: Its plan.json.
+        result: What its host reported: earlier runs, whose plan tells no names, have those of satellites there.
+    """
+    listed = (plan or {}).get("labels")
+    if isinstance(listed, Mapping):
+        try:
+            return from_mapping(AgentLabels, listed)
+        except ConfigurationError:
+            return AGENTS_UNLABELLED
+    told = mapping_at(result, "simulation", "satellites")
+    agents = mapping_at(result, "agents")
+    names = {agent: str(name) for agent, name in told.items() if agent in agents}
+    return AgentLabels(column="satellite", names=names) if names else AGENTS_UNLABELLED
+
+
+def run_labels(run: RunDirectory) -> AgentLabels:
+    """Return the second names of a run's agents, whatever its simulation is now."""
+    return agent_labels(run.read_json(run.plan_json), run.read_json(run.result_json))
+
+
+def _parse_utc(text: object) -> datetime | None:
+    if not isinstance(text, str):
+        return None
+    try:
+        told = datetime.fromisoformat(text)
+    except ValueError:
+        return None
+    return told.replace(tzinfo=UTC) if told.tzinfo is None else told.astimezone(UTC)

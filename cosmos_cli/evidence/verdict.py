@@ -1,0 +1,328 @@
+"""
+The verdict on a run: facts in, checks, status and exit code out. Pure; no file, no clock.
+
+A run is green only when it completed, every machine answered, all data are there and every check
+holds: what could not be measured counts as not held.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeGuard
+
+from cosmos_cli.errors import ExitCode
+
+ORDER = (
+    "interrupted 130, ended by a lost machine 3, failed 1, a machine failed 3, data incomplete 5,"
+    " a check broken 4, not clean 3"
+)
+"""Order of endings: of several that are true the first is told. README and docs/fleet.md hold the same words."""
+WAKE_UP_LATE_S = 0.02
+"""A single wake-up may be late by this much on an idle machine; lateness has checks of its own."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckResult:
+    """One line of the verdict; got is None when it could not be measured."""
+
+    name: str
+    limit: float
+    got: float | None
+    passed: bool
+    worst: str | None = None
+    """Source of this value, where it is one of many: an agent, the host, a stream."""
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the check as run.json holds it."""
+        return {
+            "name": self.name,
+            "limit": self.limit,
+            "got": self.got,
+            "passed": self.passed,
+            "worst": self.worst,
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckLimits:
+    """Limits of the scenario."""
+
+    miss_ratio_max: float = 1e-3
+    rtf_tolerance: float = 1e-3
+    not_finite_max: int = 0
+    duration_s: float | None = None
+    """Simulated time of the run; None if it is not known."""
+
+    @property
+    def rtf_error_max(self) -> float:
+        """Largest deviation of the real-time factor: in a short run, one late wake-up must not decide it."""
+        if not self.duration_s:
+            return self.rtf_tolerance
+        return max(self.rtf_tolerance, WAKE_UP_LATE_S / self.duration_s)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunFacts:
+    """All that a verdict depends on."""
+
+    host_status: str | None
+    """The host's own status; None when it ended without a word."""
+    who: str | None = None
+    reason: str | None = None
+    host_lost: str | None = None
+    """Fate of the machine that ran the host, if it was lost."""
+    interrupted: bool = False
+    lost_agents: tuple[str, ...] = ()
+    machine_problems: tuple[str, ...] = ()
+    """One line per machine that could not be reached or failed, each starting with its name."""
+    is_ended_by_machine: bool = False
+    """Whether the run did not complete because a machine was lost: the host's, or that of the agents it names."""
+    problems: tuple[str, ...] = ()
+    """Further problems, such as a process that had to be killed."""
+    missing: tuple[str, ...] = ()
+    """One line a source whose data are missing, cut or dropped, each starting with its name."""
+    miss_ratio: float | None = None
+    overrun_ratio: float | None = None
+    rtf: float | None = None
+    has_rate: bool = True
+    """Whether there were ticks enough to tell a real-time factor: two."""
+    is_lockstep: bool = False
+    """Whether simulated time waited for everybody: nothing can be late then, whatever the clock shows."""
+    reliable_lost: int | None = None
+    sync_lost: int | None = None
+    sync_deadlines_broken: int | None = None
+    records_dropped: int = 0
+    records_truncated: int = 0
+    records_not_finite: int = 0
+    """Values of all records that were NaN or infinite."""
+    worst: Mapping[str, str] = field(default_factory=dict)
+    """By name of a check: whose value is the worst."""
+    plugin_checks: tuple[CheckResult, ...] = ()
+    remarks: tuple[str, ...] = ()
+    """Remarks that decide nothing, such as on processors that were refused."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """Result of the judgement of a run."""
+
+    status: str
+    exit_code: ExitCode
+    text: str
+    """One line for people: who and why."""
+    who: str | None
+    reason: str | None
+    checks: tuple[CheckResult, ...]
+    remarks: tuple[str, ...] = ()
+    """Remarks on checks that were not judged, and why; on refusals to agents."""
+
+    @property
+    def broken(self) -> tuple[CheckResult, ...]:
+        """The checks that do not hold."""
+        return tuple(check for check in self.checks if not check.passed)
+
+
+def judge(facts: RunFacts, limits: CheckLimits) -> Verdict:
+    """
+    Judge a run; 0 only when there is nothing to say.
+
+    Of several faults the first decides: interrupted 130, ended by a lost machine 3, failed 1, a machine
+    failed 3, data incomplete 5, a check broken 4, not clean 3.
+    """
+    checks = run_checks(facts, limits)
+    status = run_status(facts)
+    who, reason = facts.who, facts.reason
+    if facts.host_status is None:
+        if status == "interrupted":
+            who, reason = who or "operator", reason or "ended at once, without waiting for the host"
+        else:
+            fate = facts.host_lost or _why_no_result(facts.problems)
+            who, reason = who or "host", reason or fate
+    code, text = _conclude(facts, status, checks, _blame(who, reason))
+    return Verdict(
+        status=status,
+        exit_code=code,
+        text=text,
+        who=who,
+        reason=reason,
+        checks=tuple(checks),
+        remarks=(*_unjudged(facts), *facts.remarks),
+    )
+
+
+NO_RATE = "time.rtf: not judged: a single tick has no rate"
+LOCKSTEP = (
+    "time.rtf, deadline.miss_ratio, deadline.overrun_ratio: not judged: in lockstep time waits"
+)
+
+
+def _unjudged(facts: RunFacts) -> tuple[str, ...]:
+    if facts.is_lockstep:
+        return (LOCKSTEP,)
+    return () if _is_rate_judged(facts) else (NO_RATE,)
+
+
+def _is_rate_judged(facts: RunFacts) -> bool:
+    return facts.has_rate or facts.rtf is not None
+
+
+def run_status(facts: RunFacts) -> str:
+    """Return complete, failed, aborted or interrupted."""
+    if facts.interrupted or facts.host_status == "interrupted":
+        return "interrupted"
+    if facts.host_status in ("complete", "failed", "aborted"):
+        return facts.host_status
+    return "failed"
+
+
+def run_checks(facts: RunFacts, limits: CheckLimits) -> list[CheckResult]:
+    """Return every check of the framework, then those of the simulation."""
+    checks = [
+        at_most("agents.lost", 0, len(facts.lost_agents)),
+        *([] if facts.is_lockstep else _real_time_checks(facts, limits)),
+        at_most("messages.reliable.lost", 0, facts.reliable_lost),
+        at_most("messages.sync.lost", 0, facts.sync_lost),
+        at_most("messages.sync.deadlines_broken", 0, facts.sync_deadlines_broken),
+        at_most("records.dropped", 0, facts.records_dropped),
+        at_most("records.truncated", 0, facts.records_truncated),
+        at_most("records.not_finite", limits.not_finite_max, facts.records_not_finite),
+    ]
+    named = [replace(check, worst=facts.worst.get(check.name)) for check in checks]
+    return named + list(facts.plugin_checks)
+
+
+def _real_time_checks(facts: RunFacts, limits: CheckLimits) -> list[CheckResult]:
+    rtf_error = None if facts.rtf is None else abs(facts.rtf - 1.0)
+    return [
+        at_most("deadline.miss_ratio", limits.miss_ratio_max, facts.miss_ratio),
+        at_most("deadline.overrun_ratio", limits.miss_ratio_max, facts.overrun_ratio),
+        *([at_most("time.rtf", limits.rtf_error_max, rtf_error)] if _is_rate_judged(facts) else []),
+    ]
+
+
+def at_most(name: str, limit: float, got: float | None) -> CheckResult:
+    """Return the check that *got* was measured and is not above *limit*."""
+    # The comparison is written so that a NaN does not pass.
+    return CheckResult(name=name, limit=limit, got=got, passed=got is not None and got <= limit)
+
+
+def plugin_checks(summaries: Mapping[str, Mapping[str, Any]]) -> list[CheckResult]:
+    """
+    Return the plug-in's own checks over the host's or all agents' summaries, the worst of each name.
+
+    Worst is a check that did not pass, then the one with the largest excess over its limit; it bears the
+    name of whose it is, unless it holds and is the same for all. A value that is not finite was not
+    measured. What is no list, or in it no proper `Check` mapping, is a broken check named WHO.checks: a
+    verdict must not depend on a typing slip.
+
+    Args:
+        summaries: By who made them.
+    """
+    worst: dict[str, CheckResult] = {}
+    is_alike: dict[str, bool] = {}
+    for who, summary in summaries.items():
+        listed = summary.get("checks", ())
+        # What is no list is taken for one malformed check.
+        for item in listed if isinstance(listed, list | tuple) else (None,):
+            check = _parse_check(item, who)
+            known = worst.get(check.name)
+            if known is not None:
+                same = known.passed and check.passed and known.got == check.got
+                is_alike[check.name] = is_alike.get(check.name, True) and same
+            if known is None or _badness(check) > _badness(known):
+                worst[check.name] = check
+    return [
+        replace(check, worst=None) if is_alike.get(name) else check for name, check in worst.items()
+    ]
+
+
+def _parse_check(item: Any, who: str) -> CheckResult:
+    mapping = item if isinstance(item, Mapping) else {}
+    name, limit, got, passed = (mapping.get(key) for key in ("name", "limit", "got", "passed"))
+    told = mapping.get("worst")
+    if (
+        (isinstance(name, str) and name)
+        and is_number(limit)
+        and isinstance(passed, bool)
+        and (is_number(got) or got is None or isinstance(got, float))
+    ):
+        return CheckResult(
+            name=name,
+            limit=limit,
+            got=got if is_number(got) else None,
+            passed=is_number(got) and passed,
+            worst=told if isinstance(told, str) and told else who,
+        )
+    return CheckResult(name=f"{who}.checks", limit=0, got=None, passed=False, worst=who)
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Tell whether a value from a file is a finite number; JSON knows no other, msgpack does."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _badness(check: CheckResult) -> tuple[bool, float]:
+    excess = float("inf") if check.got is None else abs(check.got - check.limit)
+    return (not check.passed, excess if not check.passed else -excess)
+
+
+def _blame(who: str | None, reason: str | None) -> str:
+    if who and reason:
+        return f"{who}: {first_line(reason)}"
+    return who or first_line(reason or "") or "no reason was given"
+
+
+def first_line(text: str) -> str:
+    """Return the first line of a text that may have several: a verdict is one line, all of it is in the log."""
+    first, *rest = text.strip().splitlines() or [""]
+    return f"{first.rstrip()} ..." if rest else first
+
+
+def _why_no_result(problems: Sequence[str]) -> str:
+    """Return what the operator saw of the host's end, as in: host (pid 7) was killed by SIGKILL."""
+    for problem in problems:
+        name, _, what = problem.partition(") ")
+        if name.startswith("host (pid ") and what:
+            return what
+    return "it ended without a result; was it killed?"
+
+
+def _conclude(
+    facts: RunFacts, status: str, checks: Sequence[CheckResult], blame: str
+) -> tuple[ExitCode, str]:
+    if status == "interrupted":
+        if facts.host_status in ("failed", "aborted"):  # it was ending already, and had a cause
+            return ExitCode.INTERRUPTED, f"INTERRUPTED by the operator, after {blame}"
+        if facts.who not in (
+            None,
+            "operator",
+        ):  # as by `cosmos down`, when there was no operator to ask
+            return ExitCode.INTERRUPTED, f"INTERRUPTED: {blame}"
+        return ExitCode.INTERRUPTED, f"INTERRUPTED by {facts.who or 'the operator'}"
+    if status != "complete":
+        code = ExitCode.MACHINES if facts.is_ended_by_machine else ExitCode.RUN_FAILED
+        return code, f"{status.upper()}: {blame}"
+    if facts.machine_problems:
+        return ExitCode.MACHINES, f"MACHINES FAILED: {_listed(facts.machine_problems)}"
+    if facts.missing:
+        return ExitCode.DATA_INCOMPLETE, f"DATA INCOMPLETE: {_listed(facts.missing)}"
+    broken = [check for check in checks if not check.passed]
+    if broken:
+        return ExitCode.BUDGET_BROKEN, f"CHECK BROKEN: {_listed([_told(c) for c in broken])}"
+    if facts.problems:
+        return ExitCode.MACHINES, f"NOT CLEAN: {_listed(facts.problems)}"
+    return ExitCode.OK, f"PASSED: {len(checks)} checks hold"
+
+
+def _told(check: CheckResult) -> str:
+    got = "not measured" if check.got is None else f"{check.got:g}"
+    whose = f" of {first_line(check.worst)}" if check.worst else ""
+    return f"{check.name} {got}{whose} (limit {check.limit:g})"
+
+
+def _listed(items: Sequence[str], shown_max: int = 3) -> str:
+    rest = len(items) - shown_max
+    more = f"; and {rest} more" if rest > 0 else ""
+    return "; ".join(first_line(item) for item in items[:shown_max]) + more

@@ -1,0 +1,250 @@
+"""
+The four inequalities of a real-time run (thesis 2.5.4, equations 2.7-2.10), with margins and limits. Pure.
+
+Two things differ from the thesis's own figures. Sizes are encoded sizes in bytes, and what travels is
+counted with the datagrams' overhead: its table 2.2 gives S_b as 100 x 6 x 64 bits, which is 4,800
+bytes and not the 38,400 of table 2.3. And inequality 2.8 is taken for several maneuvers that reach
+the host at once, by default one of every agent: as written, for one alone, it has no limit in agents.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from madns_runtime.plugin.api import Demand
+from madns_runtime.protocol.datagram import FRAGMENT_BYTES_MAX, FRAME_BYTES, OVERHEAD_BYTES
+
+DATAGRAM_OVERHEAD_BYTES = OVERHEAD_BYTES + FRAME_BYTES
+"""Header and keyed MAC of a datagram, and the header of the one frame in it."""
+IP_UDP_BYTES = 28
+BITS_PER_BYTE = 8
+COUNT_MAX = 2.0**53
+"""Of agents: above, a number and the next one are the same, and nobody has as many."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Resources:
+    """Resources of host and network."""
+
+    workers: int
+    """N_p: processes that propagate."""
+    bandwidth_bytes_s: float
+    """B_n: of the host's own link, one direction taken for both."""
+    latency_s: float
+    """T_n: one way."""
+    maneuvers_at_once: int | None = None
+    """Maneuvers that reach the host at one instant at worst; None for one of every agent."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inequality:
+    """One inequality at the planned number of agents."""
+
+    number: str
+    """Of the thesis's equation."""
+    name: str
+    formula: str
+    left: float
+    relation: Literal["<=", ">="]
+    right: float
+    unit: str
+    breaks_at: float
+    """The smallest number of agents at which it does not hold; infinity if it always does."""
+    applies: bool = True
+    """Whether the simulation has what it is about, such as maneuvers; else its sides mean nothing."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether it is fulfilled, or does not apply."""
+        return not self.applies or self.margin >= 0
+
+    @property
+    def margin(self) -> float:
+        """Margin, in the unit of both sides; negative if the inequality does not hold."""
+        return self.right - self.left if self.relation == "<=" else self.left - self.right
+
+    @property
+    def load(self) -> float:
+        """The smaller side's share of the larger allowed one: 1 is the limit, 0 no load."""
+        sides = (self.left, self.right)
+        used, allowed = sides if self.relation == "<=" else reversed(sides)
+        if used == 0:
+            return 0.0
+        return used / allowed if allowed > 0 else math.inf
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values; null stands for infinity, and for the sides of one that does not apply."""
+        left, right = (self.left, self.right) if self.applies else (math.inf, math.inf)
+        return {
+            "equation": self.number,
+            "name": self.name,
+            "formula": self.formula,
+            "applies": self.applies,
+            "left": finite(left),
+            "relation": self.relation,
+            "right": finite(right),
+            "unit": self.unit,
+            "margin": finite(self.margin) if self.applies else None,
+            "holds": self.holds,
+            "breaks_at_agents": finite(self.breaks_at) if self.applies else None,
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Feasibility:
+    """All four, for one number of agents."""
+
+    agents: int
+    inequalities: tuple[Inequality, ...]
+    measured: bool
+    """Whether compute times were measured on this machine; else they are declared."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether all are fulfilled."""
+        return all(item.holds for item in self.inequalities)
+
+    @property
+    def binding(self) -> Inequality:
+        """The one that limits the number of agents first; among equals the one with the highest load."""
+        applying = [item for item in self.inequalities if item.applies]
+        return min(applying, key=lambda item: (item.holds, item.breaks_at, -item.load))
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values for --json."""
+        return {
+            "agents": self.agents,
+            "holds": self.holds,
+            "binding": self.binding.number,
+            "compute_times": "measured" if self.measured else "declared",
+            "inequalities": [item.to_mapping() for item in self.inequalities],
+        }
+
+
+def judge(demand: Demand, resources: Resources, *, agents: int, tick_hz: float) -> Feasibility:
+    """
+    Evaluate the four inequalities.
+
+    Args:
+        demand: What the simulation asks for, a single agent's.
+        resources: What host and network offer.
+        agents: N_a.
+        tick_hz: R_a.
+    """
+    return Feasibility(
+        agents=agents,
+        inequalities=(
+            _asynchronous(demand, resources, agents),
+            _synchronous(demand, resources, agents),
+            _lead(demand, tick_hz),
+            _bandwidth(demand, resources, agents),
+        ),
+        measured=demand.measured,
+    )
+
+
+def has_batches(demand: Demand) -> bool:
+    """Tell whether the host computes anything ahead for an agent: without, there is no buffer to outlast."""
+    return demand.batch_bytes != 0 or demand.batch_compute_s != 0
+
+
+def has_maneuvers(demand: Demand) -> bool:
+    """Tell whether an agent may command anything that the host must answer before its time."""
+    return demand.sync_bytes != 0 or demand.sync_compute_s != 0 or demand.sync_rate_hz != 0
+
+
+def _asynchronous(demand: Demand, resources: Resources, agents: int) -> Inequality:
+    per_agent_s = demand.batch_compute_s / resources.workers
+    return Inequality(
+        number="2.7",
+        name="asynchronous: every agent's batch within its buffer",
+        formula="T_p(S_b) N_a / N_p + T_n <= T_bi",
+        left=per_agent_s * agents + resources.latency_s,
+        relation="<=",
+        right=demand.buffer_s,
+        unit="s",
+        breaks_at=_first_beyond(per_agent_s, demand.buffer_s - resources.latency_s),
+        applies=has_batches(demand),
+    )
+
+
+def _synchronous(demand: Demand, resources: Resources, agents: int) -> Inequality:
+    at_once = resources.maneuvers_at_once
+    rounds = math.ceil(min(at_once or agents, agents) / resources.workers)
+    wait_s = demand.lead_s - 2 * resources.latency_s
+    rounds_beyond = _first_beyond(demand.sync_compute_s, wait_s)
+    agents_beyond = (rounds_beyond - 1) * resources.workers + 1
+    if at_once is not None and agents_beyond > at_once:
+        agents_beyond = math.inf
+    return Inequality(
+        number="2.8",
+        name="synchronous: a maneuver's states before it begins",
+        formula="T_p(S_sync) ceil(n / N_p) + 2 T_n <= T_m - T_s",
+        left=demand.sync_compute_s * rounds + 2 * resources.latency_s,
+        relation="<=",
+        right=demand.lead_s,
+        unit="s",
+        breaks_at=agents_beyond,
+        applies=has_maneuvers(demand),
+    )
+
+
+def _lead(demand: Demand, tick_hz: float) -> Inequality:
+    period_s = 1 / tick_hz
+    return Inequality(
+        number="2.9",
+        name="synchronous: a maneuver at least a tick ahead",
+        formula="T_m - T_s >= 1 / R_a",
+        left=demand.lead_s,
+        relation=">=",
+        right=period_s,
+        unit="s",
+        breaks_at=math.inf if demand.lead_s >= period_s else 1,
+        applies=has_maneuvers(demand),
+    )
+
+
+def _bandwidth(demand: Demand, resources: Resources, agents: int) -> Inequality:
+    planned = sum(wire_bytes(flow.message_bytes) * flow.rate_hz for flow in demand.flows)
+    unplanned = wire_bytes(demand.sync_bytes) * demand.sync_rate_hz
+    return Inequality(
+        number="2.10",
+        name="network: all messages within the bandwidth",
+        formula="N_a (sum S_Di R_Di + N_sync S_sync) <= B_n",
+        left=agents * (planned + unplanned),
+        relation="<=",
+        right=resources.bandwidth_bytes_s,
+        unit="B/s",
+        breaks_at=_first_beyond(planned + unplanned, resources.bandwidth_bytes_s),
+    )
+
+
+def wire_bytes(message_bytes: int) -> int:
+    """Return the bytes that a message of so many encoded bytes costs on the wire, all headers included."""
+    if message_bytes <= 0:
+        return 0
+    datagrams = math.ceil(message_bytes / FRAGMENT_BYTES_MAX)
+    return message_bytes + datagrams * (DATAGRAM_OVERHEAD_BYTES + IP_UDP_BYTES)
+
+
+def _first_beyond(each: float, allowed: float) -> float:
+    """Return the smallest whole n >= 1 with n * each > allowed; infinity if there is none below COUNT_MAX."""
+    if allowed < each:
+        return 1
+    if each <= 0 or math.isinf(allowed):
+        return math.inf
+    if allowed / each >= COUNT_MAX:
+        return math.inf
+    count = math.floor(allowed / each)
+    while count * each <= allowed:  # rounding of the division may be one off
+        count += 1
+    while count > 1 and (count - 1) * each > allowed:
+        count -= 1
+    return count
+
+
+def finite(value: float) -> float | None:
+    """Return *value*, or None for infinity, which JSON does not know."""
+    return value if math.isfinite(value) else None

@@ -1,0 +1,377 @@
+"""
+The programs that a run starts on other machines: as those here, through a stream and the machine's helper.
+
+What a machine does not answer at once is asked in the background; what was known last counts until then.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import PurePosixPath
+from typing import Any
+
+import orjson
+
+from cosmos_cli.fleet.connection import EXIT_STATUS_TIMEOUT_S, Stream
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.liveness import BlockingStream
+from cosmos_cli.launch.background import BackgroundTasks
+from cosmos_cli.launch.channel import READ_BYTES
+from cosmos_cli.launch.child import (
+    STDERR_BYTES,
+    STDERR_LINES,
+    RemoteProgram,
+    relay_command,
+    start_command,
+)
+from cosmos_cli.launch.events import ProcessKnown, parse_event
+from cosmos_cli.launch.machines import RemoteMachine
+from cosmos_cli.launch.remote_line import RemoteLine
+from cosmos_cli.launch.run_events import (
+    LineBroke,
+    Reattached,
+    ReattachFailed,
+    RunEvent,
+    SignalUndelivered,
+)
+from cosmos_cli.system.bounded_process import describe_exit
+from madns_runtime.config import RELAY_CONNECTED, RELAY_NOBODY
+from madns_runtime.plugin.host_calls import interrupted_call, page_path
+
+STATUS_TRIES = 10
+STATUS_PAUSE_S = 0.1
+"""A program's exit status comes a moment after the end of its output."""
+KILL_TIMEOUT_S = 4.0
+LAUNCH_TIMEOUT_S = 20.0
+RELAY_TIMEOUT_S = 5.0
+RELAY_TALK_BYTES_MAX = 65_536
+"""A start-up file there may talk before the relay does."""
+NO_STATUS = "ended, and nobody knows how"
+STARTED_ANEW = "it has started anew"
+
+
+class RemoteChild:
+    """
+    A program on another machine.
+
+    Its first line of input is *launch*, which holds the run key and therefore never touches argv,
+    environment or disk, there or here.
+
+    When its line breaks it waits for another one, and `reattach` makes that.
+
+    Args:
+        program: What to start.
+        machine: Where.
+        background: Threads of the operator, for what may wait.
+        launch: Its first line of input.
+        on_line: Called with each line that it says.
+        tell: Called with what becomes of the lines to it.
+    """
+
+    def __init__(  # noqa: PLR0913 - collaborators, by name
+        self,
+        program: RemoteProgram,
+        machine: RemoteMachine,
+        background: BackgroundTasks,
+        *,
+        launch: Mapping[str, Any],
+        on_line: Callable[[bytes], None],
+        tell: Callable[[RunEvent], None],
+    ) -> None:
+        self.name = program.name
+        self._tell = tell
+        self.pid: int | None = None
+        self._program = program
+        self._machine = machine
+        self._background = background
+        self._on_line = on_line
+        self._may_reattach = bool(launch.get("reattach_s"))
+        self._session = str(launch["session_hex"])
+        self._incarnation = int(launch.get("life", 1))
+        self._stream: Stream | None = None
+        self._line = RemoteLine(background.selector, on_line=self._said, on_end=self._output_ended)
+        self._is_relayed = False
+        self._is_closed = False
+        self._has_exited = False
+        self.loss: str | None = None
+        """Why nobody knows how it ended, if its machine was lost."""
+        self._status: int | None = None
+        self._members: list[int] = []
+        self._is_asking = False
+        background.submit(
+            partial(_start, machine, start_command(program, machine.paths), launch), self._opened
+        )
+
+    @property
+    def stderr(self) -> str:
+        """Place of its standard error."""
+        return f"{self._machine.name}:{PurePosixPath(self._program.run_directory, self._program.stderr)}"
+
+    def send(self, command: Mapping[str, Any]) -> None:
+        """Send one object, or keep it until the program is there to take it."""
+        self._line.send(command)
+
+    def push(self) -> bool:
+        """Hand over what could not be sent at once."""
+        return self._line.push()
+
+    def drain(self) -> None:
+        """Listen no more: its output was read to the end before its end was known."""
+        self._line.close()
+
+    def release(self) -> None:
+        """Let go of it without ending it."""
+        self._is_closed = True
+        self._line.close()
+
+    def close(self) -> None:
+        """Let go of its stream; a program that still reads from it ends."""
+        if self._is_closed:
+            return
+        self.release()
+        self._has_exited, self._members = True, []
+        self._close_stream()
+
+    def has_exited(self) -> bool:
+        """Tell whether its leader has ended, or its machine is lost."""
+        return self._has_exited
+
+    def returncode(self) -> int | None:
+        """Return how its leader ended."""
+        return self._status
+
+    def describe_exit(self) -> str:
+        """Return how its leader ended, in words."""
+        if not self._has_exited:
+            return "is still running"
+        if self.loss is not None:
+            return f"was lost: {self.loss}"
+        return NO_STATUS if self._status is None else describe_exit(self._status)
+
+    def members(self) -> list[int]:
+        """Return who of its group lived when that was asked last, and ask again."""
+        if self.pid is not None and not self._is_asking and not self._is_closed:
+            self._is_asking = True
+            self._ask("group", self._group(), self._answered)
+        return list(self._members)
+
+    def terminate(self) -> None:
+        """Close its standard input and send its whole group SIGTERM."""
+        self._line.leave()
+        self._signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """Send its whole group SIGKILL."""
+        self._signal(signal.SIGKILL)
+
+    def _signal(self, number: signal.Signals) -> None:
+        """Send a signal to its whole group, through the helper there."""
+        if self.pid is not None:
+            self._ask("signal_group", {**self._group(), "signal": int(number)}, self._signalled)
+
+    def end_by_force(self) -> list[int]:
+        """Kill its group and wait for the machine's answer."""
+        left: list[int] = []
+        if self.pid is not None and self._members and self.loss is None:
+            arguments = {**self._group(), "signal": int(signal.SIGKILL)}
+            try:
+                self._machine.ask("signal_group", arguments, timeout_s=KILL_TIMEOUT_S)
+            except MachineFailure:
+                left = list(self._members)
+        return left
+
+    def tell_last_words(self, tell: Callable[[list[str]], None]) -> None:
+        """Fetch the last lines of its standard error, and tell them when they come."""
+        path = str(PurePosixPath(self._program.run_directory, self._program.stderr))
+        said = self._stream.ending().errors.splitlines() if self._stream is not None else []
+        if self.loss is None:
+            self._fetch_lines(
+                path, STDERR_LINES, lambda lines: tell([*lines, *said][-STDERR_LINES:])
+            )
+
+    def tell_last_call(self, session_hex: str, tell: Callable[[str], None]) -> None:
+        """Fetch the call in which it has ended, and tell it when it comes; its page goes with the next host there."""
+        if self.loss is None:
+            self._fetch_lines(
+                str(page_path(session_hex)),
+                1,
+                lambda lines: tell(interrupted_call("".join(lines[:1]).encode())),
+            )
+        else:
+            tell("")
+
+    def _fetch_lines(self, path: str, count: int, tell: Callable[[list[str]], None]) -> None:
+        """Fetch the last lines of a file there, and tell them when they come; none if they cannot be had."""
+        arguments = {"path": path, "bytes": STDERR_BYTES, "lines": count}
+        self._ask("last_words", arguments, lambda lines, _: tell(list(map(str, lines or ()))))
+
+    # The line -------------------------------------------------------------------------------------
+
+    def reattach(self) -> None:
+        """Make a new line to it; what comes of it is told."""
+        if not self._may_reattach:
+            self._end(loss="the connection broke")
+        if self._has_exited:
+            return
+        attach = {
+            "command": "attach",
+            "session": self._session,
+            "incarnation": self._incarnation,
+            "seen": self._line.seen,
+        }
+        task = partial(
+            _reattach,
+            self._machine,
+            relay_command(self._program, self._incarnation, self._machine.paths),
+            orjson.dumps(attach) + b"\n",
+        )
+        self._background.submit(task, self._reattached)
+
+    def _opened(self, stream: Stream | None, failure: MachineFailure | None) -> None:
+        if stream is None:
+            self._end(loss=str(failure))
+            return
+        self._stream = stream
+        if self._is_closed:
+            self._background.submit(stream.close)
+        else:
+            self._line.open(stream)
+
+    def _reattached(
+        self, found: tuple[Stream, bytes] | None, failure: MachineFailure | None
+    ) -> None:
+        if self._is_closed or self._has_exited:
+            if found is not None:
+                self._background.submit(found[0].close)
+        elif failure is not None and failure.text == STARTED_ANEW:
+            self._end(loss=STARTED_ANEW)
+        elif failure is not None:
+            self._tell(ReattachFailed(self.name))
+        elif found is None:
+            self._end(loss=None)
+        else:
+            self._close_stream()
+            self._stream, said = found
+            self._is_relayed = True
+            self._tell(Reattached(self.name))
+            self._line.attach(self._stream, said)
+
+    def _close_stream(self) -> None:
+        if self._stream is not None:
+            # A connection that is lost may take its time to close.
+            self._background.submit(self._stream.close)
+
+    def _said(self, line: bytes) -> None:
+        if self.pid is None:
+            event = parse_event(line)
+            if isinstance(event, ProcessKnown):
+                self.pid = event.pid
+                self._members = [event.pid]
+        self._on_line(line)
+
+    def _output_ended(self, failure: MachineFailure | None) -> None:
+        """Find out how it ended: by itself, or because its line broke."""
+        stream = self._stream
+        assert stream is not None
+        if failure is not None:
+            self._broke(failure.text)
+        else:
+            self._background.submit(partial(_fate, stream, self._machine), self._fate_known)
+
+    def _fate_known(self, fate: tuple[int | None, bool] | None, failure: Any) -> None:
+        status, is_alive = fate or (None, False)
+        if self._is_relayed and status == 0:  # the relay's: nobody knows the program's own
+            self._end(loss=None)
+        elif self._is_relayed or (status is None and (self._may_reattach or not is_alive)):
+            self._broke("the connection broke")
+        else:
+            self._status = status
+            self._end(loss=None)
+
+    def _broke(self, why: str) -> None:
+        if self._may_reattach and self.pid is not None:
+            self._tell(LineBroke(self.name, why))
+        else:
+            self._end(loss=why)
+
+    def _end(self, *, loss: str | None) -> None:
+        self._has_exited = True
+        self.loss = loss
+        if loss is not None:
+            self._members = []
+
+    # The helper -----------------------------------------------------------------------------------
+
+    def _ask(
+        self,
+        verb: str,
+        arguments: Mapping[str, Any],
+        on_done: Callable[[Any, MachineFailure | None], None],
+    ) -> None:
+        """Ask the helper in the background."""
+        self._background.submit(partial(self._machine.ask, verb, arguments), on_done)
+
+    def _group(self) -> dict[str, Any]:
+        return {"group": self.pid, "directory": self._program.run_directory}
+
+    def _answered(self, members: Sequence[int] | None, failure: MachineFailure | None) -> None:
+        self._is_asking = False
+        if members is not None:
+            self._members = list(members)
+        elif self._has_exited:
+            self._members = []  # of a machine that does not answer nothing is known
+
+    def _signalled(self, members: Any, failure: MachineFailure | None) -> None:
+        if failure is not None and self.loss is None:
+            self._tell(SignalUndelivered(self._machine.name))
+
+
+def _start(machine: RemoteMachine, command: str, launch: Mapping[str, Any]) -> Stream:
+    """Start a program there and hand over its launch line, which may be long."""
+    stream = machine.connection.open(command)
+    try:
+        BlockingStream(stream).write_all(orjson.dumps(launch) + b"\n", timeout_s=LAUNCH_TIMEOUT_S)
+    except MachineFailure as failure:
+        if failure.kind is not FailureKind.LOST:  # of one that has ended, its output tells why
+            stream.close()
+            raise
+    return stream
+
+
+def _reattach(machine: RemoteMachine, command: str, attach: bytes) -> tuple[Stream, bytes] | None:
+    """Return a new line to a program and what came over it; None if no program waits there."""
+    machine.connect_again()
+    stream = machine.connection.open(command)
+    link = BlockingStream(stream)
+    try:
+        said = b""
+        while RELAY_CONNECTED not in said:
+            data = link.read_some(READ_BYTES, timeout_s=RELAY_TIMEOUT_S)
+            if not data or len(said) > RELAY_TALK_BYTES_MAX:
+                if _fate(stream, machine)[0] == RELAY_NOBODY:
+                    stream.close()
+                    if machine.has_started_anew():
+                        raise MachineFailure(FailureKind.LOST, STARTED_ANEW)
+                    return None
+                raise MachineFailure(FailureKind.LOST, f"no relay: {link.errors()}")
+            said += data
+        link.write_all(attach, timeout_s=RELAY_TIMEOUT_S)
+    except BaseException:
+        stream.close()
+        raise
+    return stream, said.partition(RELAY_CONNECTED)[2]
+
+
+def _fate(stream: Stream, machine: RemoteMachine) -> tuple[int | None, bool]:
+    """Return the exit status of a program whose output has ended, and whether its machine answers."""
+    for _ in range(STATUS_TRIES):
+        status = stream.ending(timeout_s=EXIT_STATUS_TIMEOUT_S).exit_status
+        if status is not None:
+            return status, True
+        if not machine.is_alive():
+            return None, False
+        time.sleep(STATUS_PAUSE_S)
+    return None, True

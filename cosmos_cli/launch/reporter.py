@@ -1,0 +1,61 @@
+"""The operator's reports on a run, and those of them that the verdict will hear."""
+
+from __future__ import annotations
+
+from cosmos_cli.evidence.run_documents import Problem
+from cosmos_cli.launch.events import Logged, Noise, Progress, StateChanged
+from cosmos_cli.launch.request import View
+
+NOISE_LINES_MAX = 20
+"""Lines of a child that are no events are shown this often, then only counted."""
+PROBLEMS_MAX = 200
+
+Shown = StateChanged | Progress | Logged | Noise
+
+
+class Reporter:
+    """
+    Passes sentences on to the view, and keeps the problems among them.
+
+    Args:
+        view: Where talk goes.
+    """
+
+    def __init__(self, view: View) -> None:
+        self._view = view
+        self._problems: list[Problem] = []
+        self._noise: dict[str, int] = {}
+
+    @property
+    def problems(self) -> tuple[Problem, ...]:
+        """Problems of the run, the first PROBLEMS_MAX."""
+        return tuple(self._problems)
+
+    def problem(self, text: str, machine: str | None = None) -> None:
+        """Say what did not go as it should, and keep it."""
+        if len(self._problems) < PROBLEMS_MAX:
+            self._problems.append(Problem(text=text, machine=machine))
+        self._view.say(text, "error")
+
+    def show(self, name: str, event: Shown) -> None:
+        """Pass on what a child said."""
+        if isinstance(event, StateChanged):
+            self._view.state(event.state)
+        elif isinstance(event, Progress):
+            self._view.progress(event)
+        elif isinstance(event, Logged):
+            self._view.say(f"{event.source or name}: {event.text}", event.level)
+        else:
+            self._noise_heard(name, event)
+
+    def noise_in_all(self) -> None:
+        """Say how many lines were too many to show."""
+        for name, count in self._noise.items():
+            if count > NOISE_LINES_MAX:
+                self._view.say(f"{name}: {count} lines in all that are no events", "warning")
+
+    def _noise_heard(self, name: str, event: Noise) -> None:
+        """Show what a plug-in printed, a few times."""
+        self._noise[name] = self._noise.get(name, 0) + 1
+        if self._noise[name] <= NOISE_LINES_MAX:
+            self._view.say(f"{name}: {event.text}", "info")

@@ -1,0 +1,68 @@
+"""Starts, ends and further starts of the agents that supervisors run. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from cosmos_cli.launch.request import LaunchRequest, Life
+
+
+class Restarts:
+    """
+    The processes of the agents that supervisors run.
+
+    Args:
+        request: The run.
+    """
+
+    def __init__(self, request: LaunchRequest) -> None:
+        self._machines: Mapping[str, tuple[str, ...]] = request.machines
+        self._manual = frozenset(request.manual)
+        config = request.config
+        self._restarts_max = config.agents.restarts_max if config.on_agent_loss == "continue" else 0
+        self._incarnations: dict[str, int] = {}
+        self._done: set[str] = set()
+        self._lives: dict[str, int] = {}
+        self.ended: set[str] = set()
+        """Agents whose process has ended, and that were not started again."""
+
+    def supervised_on(self, machine: str) -> tuple[str, ...]:
+        """Return a machine's agents, without those that are started by hand."""
+        return tuple(name for name in self._machines.get(machine, ()) if name not in self._manual)
+
+    def started(self, agent: str, incarnation: int) -> None:
+        """Note a new process of an agent."""
+        self.ended.discard(agent)
+        self._incarnations[agent] = max(incarnation, self._incarnations.get(agent, 0))
+
+    def exited(self, agent: str, *, is_abnormal: bool) -> None:
+        """Note the end of an agent's process."""
+        self.ended.add(agent)
+        if not is_abnormal:
+            self._done.add(agent)
+
+    def left_on(self, machine: str) -> tuple[str, ...]:
+        """Return a machine's agents of whose end nobody has heard."""
+        return tuple(sorted(set(self.supervised_on(machine)) - self.ended))
+
+    def restartable_on(self, machine: str) -> tuple[str, ...]:
+        """Return a machine's agents that were cut off and may be started once more."""
+        if self._lives.get(machine, 1) > self._restarts_max:
+            return ()  # also a machine on which nothing starts any more has an end
+        return tuple(
+            agent
+            for agent in self.supervised_on(machine)
+            if agent not in self._done and self._count(agent) <= self._restarts_max
+        )
+
+    def next_life_on(self, machine: str) -> Life:
+        """Return what a new supervisor of a machine is told of those before it."""
+        number = self._lives.get(machine, 1) + 1
+        self._lives[machine] = number
+        return Life(
+            number=number,
+            incarnations={agent: self._count(agent) + 1 for agent in self.supervised_on(machine)},
+        )
+
+    def _count(self, agent: str) -> int:
+        return self._incarnations.get(agent, 0)

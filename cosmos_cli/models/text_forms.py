@@ -1,0 +1,103 @@
+"""Texts with a form of their own, such as a package's name: what fits, and how it is told when it does not."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field
+
+TEXT_CHARACTERS_MAX = 4096
+NAME_PATTERN = "^[a-z0-9][a-z0-9-]*$"
+"""Of scenarios. It stands here so that inventories are read without importing what scenarios are made of."""
+
+
+def like(pattern: str, expected: str) -> BeforeValidator:
+    """
+    Return a validator of texts that *pattern* fits as a whole; it sees the value before its type is looked at.
+
+    Args:
+        pattern: A regular expression.
+        expected: What a person reads after "expected".
+    """
+    compiled = re.compile(pattern)
+
+    def check(text: Any) -> Any:
+        if not isinstance(text, str):
+            raise ValueError(f"expected {expected}")
+        if len(text) > TEXT_CHARACTERS_MAX:
+            raise ValueError(f"expected at most {TEXT_CHARACTERS_MAX} characters")
+        if not compiled.fullmatch(text):
+            raise ValueError(f"expected {expected}")
+        return text
+
+    return BeforeValidator(check)
+
+
+def _has_items(value: Any) -> Any:
+    if isinstance(value, list | tuple) and not value:
+        raise ValueError("expected at least one item")
+    return (
+        tuple(value) if isinstance(value, list) else value
+    )  # strict validation takes no list here
+
+
+NOT_EMPTY = BeforeValidator(_has_items)
+"""For lists. Pydantic's own bound counts the items that are right, and so tells a second fault beside a wrong one."""
+
+_NAME = r"[A-Za-z0-9](?:[A-Za-z0-9._-]*[A-Za-z0-9])?"
+_EXTRAS = rf"(?:\s*\[\s*{_NAME}(?:\s*,\s*{_NAME})*\s*\])?"
+_VERSION = r"(?:===|~=|==|!=|<=|>=|<|>)\s*[A-Za-z0-9][A-Za-z0-9.*+!_-]*"
+_VERSIONS = rf"(?:\s*{_VERSION}(?:\s*,\s*{_VERSION})*)?"
+_URL = r"\s*@\s*\S+"
+_MARKER = r"(?:\s*;[^\r\n]+)?"
+
+Requirement = Annotated[
+    str,
+    Field(max_length=500),
+    like(
+        rf"{_NAME}{_EXTRAS}(?:{_URL}|{_VERSIONS}){_MARKER}",
+        "a Python requirement such as numpy or pyserial>=3.5,<4",
+    ),
+]
+"""A package of Python, as pip takes it on its command line; never an option or a path."""
+
+_OWN = re.compile(r"\.{1,2}/[^\0\r\n]*[^\0\r\n\s]")
+
+
+def is_own_requirement(text: str) -> bool:
+    """Tell whether a requirement is a path: ./dist/cars-0.1-py3-none-any.whl, ./cars."""
+    return _OWN.fullmatch(text) is not None
+
+
+ScenarioRequirement = Annotated[
+    str,
+    Field(max_length=500),
+    like(
+        rf"{_NAME}{_EXTRAS}(?:{_URL}|{_VERSIONS}){_MARKER}|{_OWN.pattern}",
+        "a Python requirement such as numpy or pyserial>=3.5,<4, or the path of a wheel or of its"
+        " sources such as ./cars",
+    ),
+]
+"""A package of Python, or a distribution of one's own by its path from the scenario's folder."""
+
+SystemPackage = Annotated[
+    str,
+    like(
+        r"[a-z0-9][a-z0-9+.-]*[a-z0-9+.](?::[a-z0-9-]+)?",
+        "the name of a Debian package such as i2c-tools",
+    ),
+]
+"""A package of the distribution. A name that ends in '-' would tell apt to remove it."""
+
+MachinePath = Annotated[
+    str, like(r"(?:/|~/)[^\0\r\n]*[^\0\r\n/]", "an absolute path or one that starts with ~/")
+]
+"""A file or folder on a machine; ~ is the home of who logs in."""
+
+FileMode = Annotated[str, like(r"[0-7]{3,4}", 'an octal mode in quotes such as "0644"')]
+SystemUser = Annotated[str, like(r"[A-Za-z0-9_][A-Za-z0-9_.-]*\$?", "the name of a user or group")]
+DeviceName = Annotated[
+    str, like(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", "the name of a device such as sense_hat")
+]
+NonBlank = Annotated[str, like(r"(?s).*\S.*", "a text that is not blank")]

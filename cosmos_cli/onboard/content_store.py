@@ -1,0 +1,86 @@
+"""
+Content known by its hash on a machine: trees, wheels, environments. Only looks, for speed.
+
+Whatever has a name of its own there is whole: it was made beside or under its name, reached the disk, and
+got its name or its mark last (`cosmos_cli.onboard.content_changes`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping
+
+from cosmos_cli.onboard.request_loop import PlainValue
+
+MARK = ".complete"
+HIDDEN = "."
+"""First character of things half made, or on their way out; nothing else may have it."""
+
+
+def expand(path: str) -> str:
+    """Return an absolute path; ~ is the home of who works here."""
+    return os.path.abspath(os.path.expanduser(path))
+
+
+def hash_of(path: str) -> str:
+    """Return the SHA-256 of a file."""
+    with open(path, "rb", buffering=0) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def read_mark(folder: str) -> dict[str, PlainValue] | None:
+    """Return what a folder's mark says; None when it is not whole."""
+    try:
+        with open(os.path.join(folder, MARK), "rb") as file:
+            document = json.loads(file.read())
+    except (OSError, ValueError):
+        return None
+    return document if isinstance(document, dict) else None
+
+
+def trace(folder: str, names: Iterable[str]) -> dict[str, list[int]]:
+    """Return size and time of files: what changes when somebody writes to one."""
+    found = {}
+    for name in names:
+        status = os.lstat(f"{folder}/{name}")
+        found[name] = [status.st_size, status.st_mtime_ns]
+    return found
+
+
+def is_untouched(folder: str, files: Mapping[str, list[int]]) -> bool:
+    """Tell whether files still have the size and the time that `trace` found; others do not matter."""
+    try:
+        return trace(folder, files) == files
+    except (OSError, ValueError, TypeError):
+        return False
+
+
+def names_in(folder: str) -> list[str]:
+    """Return the names of all whole things in a folder, or what looks like them."""
+    try:
+        return sorted(name for name in os.listdir(folder) if not name.startswith(HIDDEN))
+    except FileNotFoundError:
+        return []
+
+
+def used(paths: Iterable[str]) -> set[str]:
+    """Return those of these paths that a living process was started with."""
+    wanted = {path: os.fsencode(path) for path in paths}
+    found: set[str] = set()
+    for text in _starts() if wanted else ():
+        found |= {path for path, needle in wanted.items() if needle in text}
+    return found
+
+
+def _starts() -> Iterator[bytes]:
+    """Yield the command line and the environment of every process that lets us see them."""
+    own = str(os.getpid())
+    for name in os.listdir("/proc"):
+        if not name.isdecimal() or name == own:
+            continue
+        for what in ("cmdline", "environ"):
+            with contextlib.suppress(OSError), open(f"/proc/{name}/{what}", "rb") as file:
+                yield file.read()

@@ -1,0 +1,154 @@
+"""
+Requests to the system of a machine: services, and commands of the inventory.
+
+A command may take long: while it runs, a part is sent every second, so that a dead connection is noticed
+soon. A command whose operator is gone goes on to its end, as a package manager must.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+
+from cosmos_cli.onboard.facts import is_done
+from cosmos_cli.onboard.request_loop import (
+    AnswerPart,
+    HelperRefusal,
+    PlainValue,
+    VerbRequest,
+    last_words,
+    verb,
+)
+
+TYPE_CHECKING = False  # as in `request_loop`
+if TYPE_CHECKING:
+    from typing import BinaryIO
+
+SIGN_OF_LIFE_S = 1.0
+END_TIMEOUT_S = 5.0
+OUTPUT_BYTES_MAX = 65_536
+TOOL_FOLDERS = ("/usr/local/sbin", "/usr/sbin", "/sbin")
+"""Not on everybody's path in sessions that are not interactive; dpkg needs what lies there."""
+
+NOT_DONE = "it ran, but its `{}` does not hold yet: the next `cosmos up` runs it again"
+
+
+def running(command: Sequence[str], *, timeout_s: float) -> Iterator[AnswerPart]:
+    """
+    Run a command to its end; the last part holds "exit_status" and "output", the end of what it said.
+
+    Raises:
+        Refusal: TIMEOUT; it was killed.
+    """
+    with tempfile.TemporaryFile() as output:
+        process = start(command, output)
+        end_s = time.monotonic() + timeout_s
+        try:
+            while (status := wait(process, SIGN_OF_LIFE_S)) is None:
+                if time.monotonic() > end_s:
+                    raise HelperRefusal("timeout", f"not done in {timeout_s:g} s")
+                yield AnswerPart(value={"is_running": True})
+        finally:
+            _see_to_end(process, end_s)
+        yield AnswerPart(value={"exit_status": status, "output": last_words(read_end(output))})
+
+
+def start(command: Sequence[str], output: BinaryIO, **variables: str) -> subprocess.Popen[bytes]:
+    """
+    Start a program that goes on without anybody who listens; with *variables* in its environment.
+
+    What it says goes to a file: it must not depend on anybody who reads.
+    """
+    return subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=output,
+        stderr=subprocess.STDOUT,
+        env={**os.environ, "PATH": tool_path(), **variables},
+        start_new_session=True,
+    )
+
+
+def read_end(output: BinaryIO, bytes_max: int = OUTPUT_BYTES_MAX) -> bytes:
+    """Return the end of what a program said; by position, for the writer shares the file's own."""
+    first = max(0, os.fstat(output.fileno()).st_size - bytes_max)
+    return os.pread(output.fileno(), bytes_max, first)
+
+
+def tool_path() -> str:
+    """Return the path on which system programs are found, too."""
+    paths = (*os.environ.get("PATH", "").split(":"), *TOOL_FOLDERS)
+    return ":".join(dict.fromkeys(filter(None, paths)))
+
+
+def wait(process: subprocess.Popen[bytes], timeout_s: float) -> int | None:
+    """Wait for a program's end and return its exit status; None when it still runs."""
+    try:
+        return process.wait(timeout_s)
+    except subprocess.TimeoutExpired:
+        return None
+
+
+def _see_to_end(process: subprocess.Popen[bytes], end_s: float) -> None:
+    """Wait for a command that nobody listens to any more, until its time is over."""
+    if wait(process, max(0.0, end_s - time.monotonic())) is None:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        wait(process, END_TIMEOUT_S)
+
+
+@verb("command")
+def command(request: VerbRequest) -> Iterator[AnswerPart]:
+    """
+    Run a shell command unless it is done already.
+
+    The last part tells whether it "ran", and "notes": that its own condition does not hold even then.
+    """
+    asked = request.arguments
+    if _is_done(asked):
+        yield AnswerPart(value={"ran": False})
+        return
+    yield from _succeeding(["/bin/sh", "-c", asked["run"]], timeout_s=asked["timeout_s"])
+    condition = "creates" if asked.get("creates") else "unless"
+    notes = [] if _is_done(asked) else [NOT_DONE.format(condition)]
+    yield AnswerPart(value={"ran": True, "notes": notes})
+
+
+def _is_done(asked: Mapping[str, PlainValue]) -> bool:
+    if asked.get("creates"):
+        return os.path.lexists(os.path.expanduser(asked["creates"]))
+    return is_done(asked["unless"], as_root=False)
+
+
+def _succeeding(
+    command: Sequence[str], name: str = "", *, timeout_s: float
+) -> Iterator[AnswerPart]:
+    """
+    Run a command with its signs of life.
+
+    Raises:
+        Refusal: It failed; the text says *name*, or else its exit status, and what it said. TIMEOUT as `running`.
+    """
+    for part in running(command, timeout_s=timeout_s):
+        status = part.value.get("exit_status")
+        if status is None:
+            yield part
+        elif status:
+            said = part.value["output"]
+            space = "\n" if "\n" in said else " "
+            raise HelperRefusal("step", f"{name or f'exit status {status}'}:{space}{said}")
+
+
+@verb("service")
+def service(request: VerbRequest) -> Iterator[AnswerPart]:
+    """Have systemd do things with one service: "do" holds enable, disable, start, stop."""
+    asked = request.arguments
+    reload = [["daemon-reload"]] if asked.get("reload") else []
+    for words in [*reload, *([word, asked["name"]] for word in asked.get("do") or ())]:
+        name = f"systemctl {' '.join(words)}"
+        yield from _succeeding(["systemctl", *words], name, timeout_s=asked["timeout_s"])

@@ -1,0 +1,62 @@
+"""The command line that is being carried out, so that a command can say how to repeat it for some of the machines."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+LIMIT = ("--limit", "-l")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Invocation:
+    """A verb and its words."""
+
+    verb: str
+    words: tuple[str, ...] = ()
+    valued: frozenset[str] = frozenset()
+    """Options of the verb that take a value."""
+    has_tail: bool = False
+    """Whether what follows the first plain word is no option of ours, as in `exec`."""
+
+    def with_limit(self, pattern: str) -> str:
+        """Return the command line for a shell, with this --limit in place of its own."""
+        return shlex.join(["cosmos", self.verb, "--limit", pattern, *self._without_limit()])
+
+    def _without_limit(self) -> Iterator[str]:
+        words = iter(self.words)
+        for word in words:
+            if word == "--" or (self.has_tail and not word.startswith("-")):
+                yield word
+                yield from words
+                return
+            name, is_attached = self._option(word)
+            if name in LIMIT:
+                if not is_attached:
+                    next(words, None)
+                continue
+            yield word
+            if name in self.valued and not is_attached:
+                yield from [value for value in [next(words, None)] if value is not None]
+
+    def _option(self, word: str) -> tuple[str, bool]:
+        """Return an option's name, and whether its value is in the same word."""
+        if word.startswith("--"):
+            name, equals, _ = word.partition("=")
+            return name, bool(equals)
+        return word[:2], len(word) > 2
+
+
+_current = Invocation(verb="")
+
+
+def record(verb: str, words: Sequence[str], valued: frozenset[str], *, has_tail: bool) -> None:
+    """Remember the command line that begins."""
+    global _current  # noqa: PLW0603 - a process carries out one command line
+    _current = Invocation(verb=verb, words=tuple(words), valued=valued, has_tail=has_tail)
+
+
+def current() -> Invocation:
+    """Return the command line that is being carried out."""
+    return _current

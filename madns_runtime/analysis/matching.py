@@ -1,0 +1,208 @@
+"""
+Matching of the records of two streams: by tick, or by time. Pure numpy.
+
+Both streams are read side by side, so that neither is ever held whole: what is held is a batch of each
+and the rows between the ends of the two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from madns_runtime.analysis.values import Floats
+
+Indices = NDArray[np.int64]
+Columns = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rows:
+    """Some records of one stream, in the order of recording."""
+
+    keys: Floats
+    """Tick, or time in s; shape (N,)."""
+    who: NDArray[Any]
+    """Subject of each record, as text; records match only where it is the same. Shape (N,)."""
+    columns: Columns
+
+    def __len__(self) -> int:
+        """Return the number of records."""
+        return len(self.keys)
+
+    def take(self, index: NDArray[Any]) -> Rows:
+        """Return the rows at *index*, numbers or a mask."""
+        columns = {name: values[index] for name, values in self.columns.items()}
+        return Rows(keys=self.keys[index], who=self.who[index], columns=columns)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Matched:
+    """Settled part of both streams: pairs, row for row, and records that only one of them has."""
+
+    a: Rows
+    b: Rows
+    only_a: Rows
+    only_b: Rows
+
+
+def match(a: Iterable[Rows], b: Iterable[Rows], *, tolerance: float) -> Iterator[Matched]:
+    """
+    Match two streams whose keys grow.
+
+    Records are pairs if each is the other's nearest and they are no further apart than *tolerance*.
+    Several records of one key and whom are matched in their order. A record that comes after others
+    with keys far beyond its own is not found by its partner, and both count as alone.
+
+    Args:
+        a: Batches of one stream, at least one.
+        b: Batches of the other, at least one.
+        tolerance: Largest distance of a pair's keys.
+    """
+    sides = (_Side(a), _Side(b))
+    first, second = sides
+    while not (first.has_ended and second.has_ended):
+        behind = min((s for s in sides if not s.has_ended), key=lambda side: side.newest)
+        behind.read()
+        settled = _settle(first, second, min(side.frontier for side in sides), tolerance)
+        if any(map(len, (settled.a, settled.only_a, settled.only_b))):
+            yield settled
+
+
+def pair_up(a: Rows, b: Rows, tolerance: float) -> tuple[Indices, Indices]:
+    """Return the places of all pairs in *a* and in *b*, in the order of *a*; a key that is NaN has none."""
+    is_key_a, is_key_b = np.isfinite(a.keys), np.isfinite(b.keys)
+    if not is_key_a.any() or not is_key_b.any():
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    place_a, place_b = np.flatnonzero(is_key_a), np.flatnonzero(is_key_b)
+    line_a, line_b = _on_one_line(
+        (a.keys[place_a], a.who[place_a]), (b.keys[place_b], b.who[place_b]), tolerance
+    )
+    order_a, order_b = np.argsort(line_a, kind="stable"), np.argsort(line_b, kind="stable")
+    sorted_a, sorted_b = line_a[order_a], line_b[order_b]
+    partner = _nearest(sorted_a, sorted_b)
+    is_mutual = _nearest(sorted_b, sorted_a)[partner] == np.arange(len(sorted_a))
+    is_close = np.abs(sorted_b[partner] - sorted_a) <= tolerance
+    found = np.flatnonzero(is_mutual & is_close)
+    index_a, index_b = place_a[order_a[found]], place_b[order_b[partner[found]]]
+    in_order = np.argsort(index_a, kind="stable")
+    return index_a[in_order], index_b[in_order]
+
+
+class _Side:
+    """One stream as far as it is read."""
+
+    def __init__(self, batches: Iterable[Rows]) -> None:
+        self._batches = iter(batches)
+        self._next: Rows | None = next(self._batches)
+        self.held: Rows = self._next.take(np.empty(0, dtype=np.int64))
+        self.newest = -np.inf
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether everything is read."""
+        return self._next is None
+
+    @property
+    def frontier(self) -> float:
+        """No record to come has a key below this one."""
+        return np.inf if self.has_ended else self.newest
+
+    def read(self) -> None:
+        """Take one batch more."""
+        batch = self._next
+        assert batch is not None
+        self.held = batch if not len(self.held) else _join((self.held, batch))
+        if len(batch):
+            self.newest = max(self.newest, float(np.nanmax(batch.keys, initial=-np.inf)))
+        self._next = next(self._batches, None)
+
+
+def _settle(a: _Side, b: _Side, frontier: float, tolerance: float) -> Matched:
+    """Match what is held, and keep what a record to come could still belong to."""
+    rows_a, rows_b = a.held, b.held
+    in_a, in_b = pair_up(rows_a, rows_b, tolerance)
+    # Nearest of all is only sure where whatever comes lies further away.
+    sure = frontier - tolerance
+    is_sure = np.maximum(rows_a.keys[in_a], rows_b.keys[in_b]) <= sure
+    in_a, in_b = in_a[is_sure], in_b[is_sure]
+    alone_a, keep_a = _others(rows_a, in_a, sure)
+    alone_b, keep_b = _others(rows_b, in_b, sure)
+    a.held, b.held = rows_a.take(keep_a), rows_b.take(keep_b)
+    return Matched(
+        a=rows_a.take(in_a),
+        b=rows_b.take(in_b),
+        only_a=rows_a.take(alone_a),
+        only_b=rows_b.take(alone_b),
+    )
+
+
+def _others(rows: Rows, paired: Indices, sure: float) -> tuple[NDArray[np.bool_], Any]:
+    """Return masks of what is surely alone, and of what is kept."""
+    is_left = np.ones(len(rows), dtype=np.bool_)
+    is_left[paired] = False
+    # A key that is not a number will never find a partner.
+    is_over = ~(rows.keys > sure)
+    return is_left & is_over, is_left & ~is_over
+
+
+def _on_one_line(
+    a: tuple[Floats, NDArray[Any]], b: tuple[Floats, NDArray[Any]], tolerance: float
+) -> tuple[Floats, Floats]:
+    """Return keys shifted so far apart for each whom and repetition that one search finds all pairs."""
+    count = len(a[0])
+    keys, who = np.concatenate((a[0], b[0])), np.concatenate((a[1], b[1]))
+    code = np.zeros(len(keys), dtype=np.int64)
+    if len(who) and (who != who[0]).any():
+        code = np.unique(who.astype(str), return_inverse=True)[1].astype(np.int64)
+    low = float(keys.min())
+    span = float(keys.max()) - low + 4.0 * tolerance + 1.0
+    repeated = np.concatenate((_repetition(a[0], code[:count]), _repetition(b[0], code[count:])))
+    code = code * (int(repeated.max(initial=0)) + 1) + repeated
+    line = keys - low + code * span
+    return line[:count], line[count:]
+
+
+def _repetition(keys: Floats, code: Indices) -> Indices:
+    """Return for each row how many before it have its key and whom."""
+    order = np.lexsort((keys, code))
+    is_same = np.zeros(len(keys), dtype=np.bool_)
+    is_same[1:] = (np.diff(keys[order]) == 0.0) & (np.diff(code[order]) == 0)
+    place = np.arange(len(keys))
+    start = np.maximum.accumulate(np.where(is_same, 0, place))
+    result = np.empty(len(keys), dtype=np.int64)
+    result[order] = place - start
+    return result
+
+
+def _nearest(values: Floats, among: Floats) -> Indices:
+    """Return the place of the nearest of *among*, sorted and not empty, for each value."""
+    right = np.clip(np.searchsorted(among, values), 0, len(among) - 1)
+    left = np.maximum(right - 1, 0)
+    is_left = np.abs(values - among[left]) <= np.abs(among[right] - values)
+    return np.where(is_left, left, right)
+
+
+def _join(parts: Sequence[Rows]) -> Rows:
+    names = parts[0].columns
+    return Rows(
+        keys=np.concatenate([part.keys for part in parts]),
+        who=np.concatenate([part.who for part in parts]),
+        columns={name: np.concatenate([p.columns[name] for p in parts]) for name in names},
+    )
+
+
+def joined(batches: Iterable[Rows], rows_min: int) -> Iterator[Rows]:
+    """Give the same rows in batches of at least *rows_min*, the last one apart."""
+    held: list[Rows] = []
+    for batch in batches:
+        held.append(batch)
+        if sum(map(len, held)) >= rows_min:
+            yield _join(held)
+            held = []
+    if held:
+        yield _join(held)

@@ -1,0 +1,167 @@
+"""Thinning samples for drawing, and counting all of them for histograms and root mean squares. Pure numpy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from madns_runtime.analysis.values import Floats, Histogram, Series, Tone
+
+LEVELS = 240
+BUCKETS_MAX = 300
+SAMPLES_PER_BUCKET = 300
+QUANTILES = (0.5, 0.99)
+POINTS_PER_FIGURE = 40_000
+POINTS_PER_SERIES_MAX = 1500
+POINTS_PER_SERIES_MIN = 60
+RMS_BINS = 12
+"""Stretches of time, unless it is said otherwise."""
+Stretch = tuple[float, float, float]
+"""Its end, s; rms and largest value in it."""
+
+
+def as_array(values: NDArray[Any]) -> Floats:
+    """Return a column as floats; what is no number becomes NaN."""
+    if values.dtype.kind in "fiub":
+        return values.astype(np.float64)
+    numbers = [v if isinstance(v, int | float) else np.nan for v in values.tolist()]
+    return np.array(numbers, dtype=np.float64)
+
+
+def points_per_series(count: int) -> int:
+    """Return how many points each of so many series may have, so that a page stays small."""
+    share = POINTS_PER_FIGURE // max(count, 1)
+    return max(min(share, POINTS_PER_SERIES_MAX), POINTS_PER_SERIES_MIN)
+
+
+def thin(x: Floats, y: Floats, points_max: int) -> tuple[Floats, Floats]:
+    """
+    Keep the smallest and the largest sample of each of points_max / 2 buckets, in their order.
+
+    No peak is lost. NaN marks a gap and is kept where a whole bucket is NaN.
+
+    Args:
+        x: Abscissae, shape (N,).
+        y: Ordinates, shape (N,).
+        points_max: Largest number of points returned; at least 2.
+    """
+    if len(y) <= points_max:
+        return x, y
+    edges = np.linspace(0, len(y), max(points_max // 2, 1) + 1).astype(np.int64)
+    starts = edges[:-1]
+    bucket = np.repeat(np.arange(len(starts)), np.diff(edges))
+    # Sorted by bucket, then value; NaN sorts last, so the last finite value is looked up by count.
+    order = np.lexsort((y, bucket))
+    finite = np.add.reduceat(np.isfinite(y), starts)
+    lowest = order[starts]
+    highest = order[starts + np.maximum(finite, 1) - 1]
+    chosen = np.unique(np.concatenate((lowest, highest)))
+    return x[chosen], y[chosen]
+
+
+def evenly(count: int, points_max: int) -> NDArray[np.int64]:
+    """Return indices of at most *points_max* of *count* samples, evenly spread, both ends included."""
+    if count <= points_max:
+        return np.arange(count)
+    return np.unique(np.linspace(0, count - 1, points_max).round().astype(np.int64))
+
+
+class TimeEnvelope:
+    """
+    Median, p99 and largest value by bucket of time, over all samples of all agents.
+
+    The quantiles come from a histogram with bins 4 % wide, the largest value is exact.
+
+    Args:
+        end_s: Largest time that will come, s.
+        low: Smallest value told apart.
+        high: Largest value told apart.
+        samples: How many will come: buckets of time are made so wide that a p99 in them means something.
+    """
+
+    def __init__(self, end_s: float, low: float, high: float, *, samples: int) -> None:
+        buckets = min(max(samples // SAMPLES_PER_BUCKET, 10), BUCKETS_MAX)
+        self._edges_s = np.linspace(0.0, max(end_s, 1e-9), buckets + 1)
+        high = max(high, low * 10)
+        self._levels = np.geomspace(low, high, LEVELS + 1)
+        self._counts = np.zeros((buckets, LEVELS), dtype=np.int64)
+        self._largest = np.full(buckets, -np.inf)
+
+    def add(self, t_s: Floats, values: Floats) -> None:
+        """Count samples, shape (N,) each."""
+        buckets, levels = self._counts.shape
+        row = np.clip(np.searchsorted(self._edges_s, t_s, "right") - 1, 0, buckets - 1)
+        column = np.clip(np.searchsorted(self._levels, values, "right") - 1, 0, levels - 1)
+        flat = np.bincount(row * levels + column, minlength=buckets * levels)
+        self._counts += flat.reshape(buckets, levels)
+        np.maximum.at(self._largest, row, values)
+
+    def curves(self) -> tuple[Floats, dict[str, Floats]]:
+        """Return the buckets' middles, s, and the curves p50, p99 and max; empty buckets are left out."""
+        totals = self._counts.sum(axis=1)
+        has = totals > 0
+        middles = ((self._edges_s[1:] + self._edges_s[:-1]) / 2)[has]
+        cumulated = np.cumsum(self._counts[has], axis=1)
+        curves = {}
+        for quantile in QUANTILES:
+            reached = cumulated >= (quantile * totals[has])[:, None]
+            level = self._levels[reached.argmax(axis=1) + 1]
+            curves[f"p{quantile * 100:g}"] = np.minimum(level, self._largest[has])
+        curves["max"] = self._largest[has]
+        return middles, curves
+
+
+def envelope_series(envelope: TimeEnvelope) -> list[Series]:
+    """Return an envelope's curves, the largest behind, the median in front."""
+    middles, curves = envelope.curves()
+    tones: dict[str, Tone] = {"max": "pale", "p99": "warm", "p50": "main"}
+    return [Series(x=middles, y=curves[n], name=n, tone=tone) for n, tone in tones.items()]
+
+
+class BinCounts:
+    """Counts in fixed bins; what lies outside goes into the outermost ones."""
+
+    def __init__(self, edges: Floats) -> None:
+        self.edges = edges
+        self.counts = np.zeros(len(edges) - 1, dtype=np.int64)
+
+    def add(self, values: NDArray[Any]) -> None:
+        """Count samples, shape (N,)."""
+        bins = np.clip(np.searchsorted(self.edges, values, "right") - 1, 0, len(self.counts) - 1)
+        self.counts += np.bincount(bins, minlength=len(self.counts))
+
+    def mark(self) -> Histogram:
+        """Return the counts as a figure shows them."""
+        return Histogram(edges=self.edges, counts=self.counts.astype(np.float64))
+
+
+class BinnedRms:
+    """
+    Root mean square and largest value of something over time, in stretches of it.
+
+    Args:
+        duration_s: Where the last one ends, s.
+        bins: How many there are.
+    """
+
+    def __init__(self, duration_s: float, bins: int = RMS_BINS) -> None:
+        self._bins = bins
+        self._edges_s = np.linspace(0.0, max(duration_s, 1e-9), bins + 1)
+        self._counts = np.zeros(bins, dtype=np.int64)
+        self._squares = np.zeros(bins)
+        self._largest = np.zeros(bins)
+
+    def add(self, t_s: Floats, values: Floats) -> None:
+        """Take values, shape (N,), at times, s."""
+        bins = np.clip(np.searchsorted(self._edges_s, t_s, "right") - 1, 0, self._bins - 1)
+        self._counts += np.bincount(bins, minlength=self._bins)
+        self._squares += np.bincount(bins, weights=values * values, minlength=self._bins)
+        np.maximum.at(self._largest, bins, np.abs(values))
+
+    def rows(self) -> list[Stretch]:
+        """Return end of the stretch, s, rms and largest value of each that has any."""
+        rms = np.sqrt(self._squares / np.maximum(self._counts, 1))
+        columns = zip(self._edges_s[1:], rms, self._largest, self._counts, strict=True)
+        return [(float(t), float(r), float(m)) for t, r, m, count in columns if count]

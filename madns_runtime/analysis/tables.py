@@ -1,0 +1,171 @@
+"""
+Records of a run as columns: the protocol of its tables, and the run they belong to.
+
+Who reads the files stands elsewhere: nothing here knows their format.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from madns_runtime.analysis.sampling import as_array
+from madns_runtime.analysis.values import SIMULATED_TIME, Axis, Floats
+from madns_runtime.config import RunConfig
+from madns_runtime.plain_values import mapping_at
+from madns_runtime.recording.records import Field
+
+AGENT = "agent"
+Columns = Mapping[str, NDArray[Any]]
+"""By the fields' names, shape (N,) each: numbers as float64 with null as NaN or as int64, the rest as objects."""
+
+
+class RecordedTable(Protocol):
+    """One stream of all who recorded it."""
+
+    @property
+    def name(self) -> str:
+        """The stream's name; of the host host_..., of machines machine_..."""
+
+    @property
+    def role(self) -> str:
+        """Recording role: agent, host or machine."""
+
+    @property
+    def rows(self) -> int:
+        """Number of records of all sources."""
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the agents or machines that have records here, in order."""
+
+    @property
+    def fields(self) -> tuple[Field, ...]:
+        """The recorded fields with their units; t_s, simulated time, first if it was made of a tick."""
+
+    def has(self, *names: str) -> bool:
+        """Tell whether the table has all these columns."""
+
+    def read(self, source: str, names: Iterable[str]) -> Columns:
+        """Return columns of one source in the order of recording."""
+
+    def batches(self, source: str, names: Iterable[str], rows_max: int) -> Iterator[Columns]:
+        """Yield the same, at most *rows_max* records at a time."""
+
+    def each(self, names: Iterable[str]) -> Iterator[tuple[str, Columns]]:
+        """Yield every source with its columns."""
+
+
+class ComparedStream(Protocol):
+    """One stream of one source, from its table or from its lines."""
+
+    @property
+    def table(self) -> str:
+        """Name of the table that it is in."""
+
+    @property
+    def role(self) -> str:
+        """Recording role: agent, host or machine."""
+
+    @property
+    def source(self) -> str:
+        """Name of the agent or machine."""
+
+    @property
+    def fields(self) -> tuple[Field, ...]:
+        """The recorded fields with their units."""
+
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the fields."""
+
+    def batches(self, names: Iterable[str]) -> Iterator[Columns]:
+        """Yield columns of all records in the order of recording, some thousands at a time."""
+
+
+Key = tuple[str, str]
+"""Table and source, such as ("state", "agent-03")."""
+Tables = Mapping[str, RecordedTable]
+"""A run's tables by name."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordedRun:
+    """One run."""
+
+    document: Mapping[str, Any]
+    """run.json."""
+    tables: Tables
+    config: RunConfig | None
+    """Its settings; None where they are lost."""
+
+    @property
+    def tick_hz(self) -> float | None:
+        """Rate of every agent's loop."""
+        return None if self.config is None else self.config.agents.tick_hz
+
+    @property
+    def duration_s(self) -> float:
+        """Simulated time that the run was to have, s; 0 where its settings are lost."""
+        return 0.0 if self.config is None else self.config.time.duration_s
+
+    def agent_summary(self, name: str) -> Mapping[str, Any]:
+        """Return what the agent's half of the simulation summed up; empty for one that died."""
+        return mapping_at(self.document, "simulation", "agents", name)
+
+    def time_of(self, table: RecordedTable, source: str) -> tuple[Floats, Axis]:
+        """
+        Return the abscissae of a source's records and what they are.
+
+        Seconds since T0 where they are known; else the time since the first record; else its number.
+        """
+        if table.has("t_s"):
+            return self.values(table, source, "t_s"), SIMULATED_TIME
+        if table.has("monotonic_s"):
+            clock_s = self.values(table, source, "monotonic_s")
+            first_s = clock_s[0] if len(clock_s) else 0.0
+            return clock_s - first_s, Axis(quantity="time since the first sample", unit="s")
+        first = table.fields[0].name
+        count = len(table.read(source, (first,))[first])
+        return np.arange(count, dtype=np.float64), Axis(quantity="record")
+
+    def series(
+        self, table: RecordedTable, name: str
+    ) -> tuple[dict[str, tuple[Floats, Floats]], Axis]:
+        """
+        Return one field over time, abscissae and ordinates, by whose it is; and what the abscissae are.
+
+        A stream with a text column `agent`, as a host records of all its agents, is one series per agent.
+        """
+        found: dict[str, tuple[Floats, Floats]] = {}
+        axis = Axis()
+        for source in table.sources:
+            x, axis = self.time_of(table, source)
+            y = self.values(table, source, name)
+            if not any(field.name == AGENT and field.kind == "str" for field in table.fields):
+                found[source] = (x, y)
+                continue
+            agents = table.read(source, (AGENT,))[AGENT].astype(str)
+            for agent in dict.fromkeys(agents.tolist()):
+                rows = np.flatnonzero(agents == agent)
+                label = f"{source} · {agent}" if table.role == AGENT else agent
+                found[label] = (x[rows], y[rows])
+        return found, axis
+
+    def values(self, table: RecordedTable, source: str, name: str) -> Floats:
+        """Return one field of a source as floats, null as NaN."""
+        return as_array(table.read(source, (name,))[name])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ComparedRun:
+    """One of two runs that are compared."""
+
+    run: RecordedRun
+    streams: Mapping[Key, ComparedStream]
+    """Those that were chosen for the comparison."""
+    identical: Mapping[Key, int]
+    """Streams that hold the same bytes in both runs, with their number of records: they need not be read."""

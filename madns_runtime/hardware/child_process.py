@@ -1,0 +1,55 @@
+"""Child processes of the manager: forked with a pair to talk over, and waited for until a deadline."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import socket
+import sys
+from collections.abc import Callable
+from time import monotonic
+
+from madns_runtime.errors import MachineError
+from madns_runtime.hardware import messages
+
+
+def fork_with_pair(run: Callable[[socket.socket], None]) -> tuple[int, socket.socket]:
+    """
+    Fork a process that runs *run* with its end of a pair, and return its pid and the other end.
+
+    Raises:
+        MachineError: The machine has no room for another process.
+    """
+    own, other = messages.make_pair()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    try:
+        pid = os.fork()
+    except OSError as error:
+        raise MachineError(f"cannot start a process for a device: {error.strerror}") from error
+    if pid == 0:
+        run(other)
+    other.close()
+    return pid, own
+
+
+def wait_for(pid: int, deadline_s: float) -> bool:
+    """Wait until a child has ended, and return whether it has; 0 is a child that was never there."""
+    if not pid:
+        return True
+    try:
+        fd = os.pidfd_open(pid)
+    except OSError:
+        fd = -1
+    try:
+        if fd >= 0:
+            poll = select.poll()
+            poll.register(fd, select.POLLIN)
+            poll.poll(max(0.0, deadline_s - monotonic()) * 1e3)
+    finally:
+        if fd >= 0:
+            os.close(fd)
+    with contextlib.suppress(ChildProcessError):
+        return os.waitpid(pid, os.WNOHANG)[0] != 0
+    return True

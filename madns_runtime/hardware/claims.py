@@ -1,0 +1,115 @@
+"""
+Claims on a machine's devices: two runs that open the same one would spoil each other's reads and outputs.
+
+A claim is a lock on a file in the machine's state folder. Processes that are forked afterwards hold it, too, so that it
+lasts until the last one that has the device open is gone, however it ended.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any, Final
+
+from madns_runtime.config import DeviceLaunch
+from madns_runtime.errors import MachineError
+from madns_runtime.hardware.contract import DeviceKind
+from madns_runtime.plugin.context import clean_text
+from madns_runtime.processes import state_directory
+
+WAIT_S: Final = 4.0
+"""For the processes of an earlier supervisor of the same machine to make safe, close and end."""
+POLL_S: Final = 0.05
+HOLDER_BYTES_MAX: Final = 4096
+FOLDER: Final = "devices"
+
+
+class DeviceClaims:
+    """
+    Claims of one supervisor.
+
+    Args:
+        run: Its run's name, told to whoever is refused.
+    """
+
+    def __init__(self, run: str) -> None:
+        self._run = run
+        self._descriptors: list[int] = []
+        self.problem = ""
+        """Why claims cannot be kept here, which is no reason to fail; empty where they can."""
+
+    def claim(self, device: DeviceLaunch, kind: DeviceKind) -> None:
+        """
+        Claim a device of the machine; one of a kind that needs no hardware is open to all.
+
+        Raises:
+            MachineError: Another run has it.
+        """
+        if not kind.needs_hardware:
+            return
+        try:
+            descriptor = _open(claim_path(device))
+        except OSError as error:
+            self.problem = f"other runs are not kept from its devices: {error.strerror or error}"
+            return
+        deadline_s = monotonic() + WAIT_S
+        while not _is_locked_now(descriptor):
+            if monotonic() > deadline_s:
+                holder = _holder(descriptor)
+                os.close(descriptor)
+                raise MachineError(
+                    f"device {device.full_name} is in use by {holder}: end it (cosmos ps, cosmos down) or wait for"
+                    " its end"
+                )
+            sleep(POLL_S)
+        told = json.dumps({"run": self._run, "pid": os.getpid()}).encode()
+        with contextlib.suppress(OSError):  # a full disk: the claim holds all the same
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, told, 0)
+        self._descriptors.append(descriptor)
+
+    def tell_problem(self, emit: Callable[[Mapping[str, Any]], None]) -> None:
+        """Tell the operator, by an event, if claims cannot be kept here."""
+        if self.problem:
+            emit({"event": "log", "level": "warning", "text": self.problem})
+
+    def release(self) -> None:
+        """Give up what this process claims; harmless when repeated."""
+        for descriptor in self._descriptors:
+            os.close(descriptor)
+        self._descriptors = []
+
+
+def claim_path(device: DeviceLaunch) -> Path:
+    """Return the file that is locked for a device: of one name, kind, serial and parameters."""
+    key = [device.full_name, device.kind, device.serial, dict(device.parameters)]
+    digest = hashlib.sha256(json.dumps(key, sort_keys=True, default=str).encode()).hexdigest()
+    return state_directory().parent / FOLDER / f"{digest[:32]}.lock"
+
+
+def _open(path: Path) -> int:
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+
+
+def _is_locked_now(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _holder(descriptor: int) -> str:
+    """Return who has a claim, as far as it is told."""
+    try:
+        told = json.loads(os.pread(descriptor, HOLDER_BYTES_MAX, 0))
+        return f"run {clean_text(str(told['run']))[:200]} (pid {int(told['pid'])})"
+    except (OSError, ValueError, KeyError, TypeError):
+        return "another run"

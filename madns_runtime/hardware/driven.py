@@ -1,0 +1,121 @@
+"""A device of a run as its machine's supervisor knows it, its status over the run, and the process that drives it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from madns_runtime.config import DeviceLaunch
+from madns_runtime.hardware import messages, page
+from madns_runtime.hardware.intake import counts_of
+from madns_runtime.hardware.kind_registry import DeviceProgram
+from madns_runtime.hardware.page import DevicePage
+from madns_runtime.hardware.seat import DeviceSeat
+from madns_runtime.hardware.status import StatusAccount, StatusLimits
+
+NOT_MADE_SAFE: Final = "could not be made safe: its driver failed, look at the device"
+
+
+@dataclass(slots=True)
+class DrivenDevice:
+    """One device and what became of it."""
+
+    seat: DeviceSeat
+    limits: StatusLimits
+    ends: Mapping[str, socket.socket]
+    """The agents' ends of their pairs with it."""
+    account: StatusAccount = field(default_factory=StatusAccount)
+    restarts: int = 0
+    faults: dict[str, float | None] = field(default_factory=dict)
+    """Inserted faults in force, by action."""
+    report: Mapping[str, Any] | None = None
+    why: str = ""
+    """Why it is lost, or about to be; empty while all is well."""
+    loss: str = ""
+    """Why it was lost the last time."""
+
+    @classmethod
+    def share(cls, launch: DeviceLaunch, program: DeviceProgram) -> DrivenDevice:
+        """Make what a device and its users share; before anybody is forked."""
+        pairs = {agent: messages.make_pair() for agent in launch.users}
+        seat = DeviceSeat(
+            launch=launch,
+            make=program.make,
+            channels=program.channels,
+            page=DevicePage([c for c in program.channels if c.direction == "in"]),
+            users={agent: pair[1] for agent, pair in pairs.items()},
+        )
+        return cls(
+            seat=seat,
+            limits=StatusLimits.of(1.0 / launch.rate_hz, launch.hang_s),
+            ends={agent: pair[0] for agent, pair in pairs.items()},
+        )
+
+    @property
+    def name(self) -> str:
+        """Full name of the device, such as pi22/imu."""
+        return self.seat.launch.full_name
+
+    def note_fault(self, action: str, value: float | None) -> None:
+        """Take note of an inserted fault in force: a process that is started anew is told it again."""
+        self.faults[action] = value
+        if action == "clear":
+            self.faults.clear()
+
+    def why_silent(self) -> str:
+        """Return why it is lost though its driver has raised nothing, and its process lives."""
+        state = self.seat.page.header[page.STATE]
+        if state == page.OPENING:
+            return f"it has not opened within {self.limits.lost_s:g} s"
+        if state == page.OPEN:
+            return f"no sample for {self.limits.lost_s:g} s"
+        return "it is closed"
+
+    def _counts(self) -> dict[str, Any]:
+        """Return what its processes counted, where the last one ended without its report."""
+        return {**counts_of(self.seat.page), "unreported": 1}
+
+    def summary(self) -> dict[str, Any]:
+        """Return what the run came to."""
+        header, account = self.seat.page.header, self.account
+        return {
+            "status": account.status,
+            "samples": int(header[page.SAMPLES]),
+            "errors": int(header[page.ERRORS]),
+            "stale_ratio": account.stale_ratio(),
+            "lost": account.times_lost,
+            "restarts": self.restarts,
+            "unsafe": int(header[page.MOVED]),
+            "why": NOT_MADE_SAFE if header[page.MOVED] else self.loss or self.why,
+            "report": dict(self.report) if self.report is not None else self._counts(),
+        }
+
+
+@dataclass(slots=True)
+class DeviceProcess:
+    """One process of devices."""
+
+    devices: list[DrivenDevice]
+    pid: int = 0
+    control: socket.socket | None = None
+    failures: int = 0
+    started_s: float = 0.0
+    killed_why: str = ""
+    gave_up_why: str = ""
+    """What it told itself before its end."""
+
+    def is_opening(self) -> bool:
+        """Tell whether it lives and has a device that was neither opened nor has failed."""
+        headers = [driven.seat.page.header for driven in self.devices]
+        if not any(h[page.STATE] == page.OPENING and not h[page.ERRORS] for h in headers):
+            return False
+        return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
+
+
+def exit_text(code: int) -> str:
+    """Return how a process ended, in words."""
+    return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"

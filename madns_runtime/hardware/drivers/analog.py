@@ -1,0 +1,75 @@
+"""Driver of `analog`; see `madns_runtime.hardware.kinds.analog`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+from madns_runtime.hardware.contract import Device, Sample, Value
+from madns_runtime.hardware.drivers.kernel_files import read_number, read_text, write_text
+
+
+class AnalogDevice(Device):
+    """Files of one converter, read as text."""
+
+    def open(self) -> str:
+        """
+        Find scales and offsets.
+
+        Raises:
+            MachineError: A file is missing, or says no number.
+        """
+        p = self.parameters
+        self._folder = Path(p.root) / p.device
+        self._lines = {
+            each.name: (
+                self._folder / each.file,
+                self._number(each.file, "scale", each.scale, 1.0),
+                self._number(each.file, "offset", each.offset, 0.0),
+            )
+            for each in p.inputs
+        }
+        self.read()
+        return read_text(self._folder / "name") if (self._folder / "name").is_file() else p.device
+
+    def read(self) -> Sample | None:
+        """Return all inputs."""
+        taken_s = monotonic()
+        values: dict[str, Value] = {}
+        for each in self.parameters.inputs:
+            if not each.is_output:
+                path, scale, offset = self._lines[each.name]
+                values[each.name] = (read_number(path) + offset) * scale
+        if not values:
+            for path, _, _ in self._lines.values():
+                read_number(path)  # outputs alone: that they are there is all that is measured
+        return Sample(values=values, taken_s=taken_s)
+
+    def write(self, values: Mapping[str, Value], due_s: float) -> None:
+        """Write outputs, by name."""
+        number: Any
+        for name, number in values.items():
+            path, scale, offset = self._lines[name]
+            write_text(path, str(round(number / scale - offset)))
+
+    def make_safe(self) -> None:
+        """Write the safe value of each output that has one."""
+        self.write(
+            {e.name: e.safe for e in self.parameters.inputs if e.is_output and e.safe is not None},
+            0.0,
+        )
+
+    def _number(self, file: str, what: str, given: float | None, default: float) -> float:
+        if given is not None:
+            return given
+        # A channel's own, such as in_voltage0_scale, else that of its type: in_voltage_scale, in_accel_scale of x.
+        own = file.removesuffix("_raw")
+        shared = re.sub(r"\d+", "", own)
+        for name in (own, shared, re.sub(r"_[xyz]$", "", shared)):
+            path = self._folder / f"{name}_{what}"
+            if path.is_file():
+                return read_number(path)
+        return default

@@ -1,0 +1,119 @@
+"""A CAN bus by python-can, of the driver of `can`: any interface that it knows."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from collections import deque
+from typing import Any, Final
+
+import can
+
+from madns_runtime.errors import MachineError
+from madns_runtime.hardware.kinds.can import EXTENDED, CanParameters
+
+WAITING_MAX: Final = 10_000
+"""Frames that may wait to be read; more are lost, and told."""
+LISTEN_S: Final = 0.05
+
+
+class PythonCanBus:
+    """
+    A bus by python-can.
+
+    Args:
+        parameters: Which one.
+
+    Raises:
+        MachineError: It cannot be opened.
+    """
+
+    def __init__(self, parameters: CanParameters) -> None:
+        self._where = parameters.interface
+        self.frames_lost = 0
+        """Always 0: such a loss is an error."""
+        self.frames_left_out = 0
+        options: dict[str, Any] = {"channel": parameters.interface}
+        if parameters.bit_rate is not None:
+            options["bitrate"] = parameters.bit_rate
+        filters = [{"can_id": f.identifier, "can_mask": f.mask} for f in parameters.filters]
+        try:
+            self._bus = can.Bus(
+                interface=parameters.python_can_interface, can_filters=filters or None, **options
+            )
+        except (can.CanError, OSError, ValueError, ImportError) as error:
+            raise MachineError(f"{parameters.interface}: {error}") from None
+
+        self._waiting: deque[Any] = deque(maxlen=WAITING_MAX)
+        self._has_ended = threading.Event()
+        # Some interfaces have no descriptor: a thread listens for all of them alike.
+        self._signal = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._listener = threading.Thread(target=self._listen, name="can", daemon=True)
+        self._listener.start()
+
+    def fileno(self) -> int:
+        """Return a descriptor that is readable while frames wait."""
+        return self._signal
+
+    def receive(self) -> tuple[int, bytes] | None:
+        """
+        Return the next data frame; requests and reports of errors are left out.
+
+        Raises:
+            MachineError: The bus is gone, or frames came faster than they were read.
+        """
+        while True:
+            if not self._waiting:
+                with contextlib.suppress(BlockingIOError):
+                    os.eventfd_read(self._signal)
+                if not self._waiting:
+                    return None
+            message = self._waiting.popleft()
+            if isinstance(message, str):
+                raise MachineError(f"{self._where}: {message}")
+            if message.is_error_frame or message.is_remote_frame:
+                self.frames_left_out += 1
+                continue
+            flag = EXTENDED if message.is_extended_id else 0
+            return message.arbitration_id | flag, bytes(message.data)
+
+    def send(self, identifier: int, data: bytes) -> None:
+        """
+        Send a frame.
+
+        Raises:
+            MachineError: The bus does not take it.
+        """
+        message = can.Message(
+            arbitration_id=identifier & ~EXTENDED,
+            is_extended_id=bool(identifier & EXTENDED),
+            data=data,
+        )
+        try:
+            self._bus.send(message)
+        except (can.CanError, OSError) as error:
+            raise MachineError(f"{self._where}: {error}") from None
+
+    def close(self) -> None:
+        """Close the bus."""
+        self._has_ended.set()
+        self._listener.join(20 * LISTEN_S)
+        self._bus.shutdown()
+        os.close(self._signal)
+
+    def _listen(self) -> None:
+        """Take what comes until the bus is closed or gone."""
+        while not self._has_ended.is_set():
+            try:
+                message = self._bus.recv(LISTEN_S)
+            except (can.CanError, OSError) as error:
+                message = f"is gone: {error}"
+            if message is None:
+                continue
+            if len(self._waiting) >= WAITING_MAX - 1:
+                message = f"more than {WAITING_MAX} frames came before they were read"
+            self._waiting.append(message)
+            os.eventfd_write(self._signal, 1)
+            if isinstance(message, str):
+                return

@@ -1,0 +1,137 @@
+"""
+Faults inserted around a device: what it measures is frozen, biased, noisy, dropped or late, or it is unplugged.
+
+Pure: the same samples, times and seed give the same values. Whatever the device itself does, it knows nothing of it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, Literal, get_args
+
+import numpy as np
+
+from madns_runtime.errors import ConfigurationError
+from madns_runtime.hardware.contract import Sample, Value
+
+FaultAction = Literal["freeze", "bias", "noise", "drop", "delay", "disconnect", "clear"]
+ACTIONS: Final[tuple[str, ...]] = get_args(FaultAction)
+WITH_VALUE: Final = {
+    "bias": "the number that is added to each element",
+    "noise": "the standard deviation of what is added to each element",
+    "drop": "the share of samples that is lost, 0 to 1",
+    "delay": "the time by which samples come late, s",
+}
+HELD_MAX: Final = 10_000
+"""Delayed samples that may wait; the oldest is given up beyond, and counted."""
+
+
+def check_fault(action: str, value: float | None) -> None:
+    """
+    Refuse a fault that is none.
+
+    Raises:
+        ConfigurationError: The action is unknown, or its value is missing, needless or out of range.
+    """
+    if action not in ACTIONS:
+        raise ConfigurationError(f"expected an action of {', '.join(ACTIONS)}; got {action!r}")
+    if action not in WITH_VALUE:
+        if value is not None:
+            raise ConfigurationError(f"{action} takes no value, got {value:g}")
+        return
+    if value is None:
+        raise ConfigurationError(f"{action} needs a value: {WITH_VALUE[action]}")
+    is_good = math.isfinite(value) and (action == "bias" or value >= 0)
+    if not is_good or (action == "drop" and value > 1):
+        raise ConfigurationError(f"{action}: expected {WITH_VALUE[action]}; got {value:g}")
+
+
+class InsertedFaults:
+    """
+    The faults that are in force on one device.
+
+    Args:
+        seed: Of noise and drops.
+    """
+
+    def __init__(self, seed: int | Sequence[int]) -> None:
+        self._random = np.random.default_rng(seed)
+        self._values: dict[str, float] = {}
+        self._frozen: dict[str, Value] = {}
+        self._newest: dict[str, Value] = {}
+        self._held: deque[Sample] = deque()
+        self.dropped = 0
+        """Samples that *drop* lost, and delayed ones that found no room."""
+
+    @property
+    def is_disconnected(self) -> bool:
+        """Whether the device is to be closed and stay so."""
+        return "disconnect" in self._values
+
+    @property
+    def in_force(self) -> Mapping[str, float]:
+        """The actions in force with their values; not a number where they take none."""
+        return self._values
+
+    def insert(self, action: str, value: float | None = None) -> None:
+        """
+        Put a fault in force until `clear`; one of the same action is replaced.
+
+        Raises:
+            ConfigurationError: As `check_fault`.
+        """
+        check_fault(action, value)
+        if action == "clear":
+            self._values.clear()
+            self._frozen.clear()
+            return
+        self._values[action] = math.nan if value is None else value
+        if action == "freeze":
+            self._frozen = dict(self._newest)
+
+    def apply(self, sample: Sample) -> Sample | None:
+        """Return what becomes of a sample: None if it is dropped, or late and asked for by `due`."""
+        self._newest.update(sample.values)
+        if not self._values:
+            return sample
+        if "drop" in self._values and self._random.random() < self._values["drop"]:
+            self.dropped += 1
+            return None
+        sample = dataclasses.replace(
+            sample, values={name: self._alter(name, value) for name, value in sample.values.items()}
+        )
+        if "delay" not in self._values:
+            return sample
+        self._held.append(sample)
+        if len(self._held) > HELD_MAX:
+            self._held.popleft()
+            self.dropped += 1
+        return None
+
+    def due(self, now_s: float) -> list[Sample]:
+        """Return the delayed samples whose time has come by *now_s*."""
+        delay_s = self._values.get("delay", 0.0)
+        found = []
+        while self._held and self._held[0].taken_s + delay_s <= now_s:
+            found.append(self._held.popleft())
+        return found
+
+    def next_due_s(self) -> float:
+        """Return when the next delayed sample is due; infinity if none waits."""
+        if not self._held:
+            return math.inf
+        return self._held[0].taken_s + self._values.get("delay", 0.0)
+
+    def _alter(self, name: str, value: Value) -> Any:
+        if "freeze" in self._values:
+            value = self._frozen.setdefault(name, value)
+        bias, sigma = self._values.get("bias"), self._values.get("noise")
+        if isinstance(value, bytes | str) or (bias is None and sigma is None):
+            return value
+        altered = np.asarray(value, dtype=np.float64) + (bias or 0.0)
+        if sigma:
+            altered = altered + self._random.normal(0.0, sigma, altered.shape)
+        return altered.tolist()

@@ -1,0 +1,119 @@
+"""A device in lockstep: asked in the agent's own process, by simulated time alone, with the same samples each time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+from madns_runtime.config import DeviceLaunch
+from madns_runtime.errors import PluginError
+from madns_runtime.hardware import messages, page
+from madns_runtime.hardware.contract import SimulatedDevice
+from madns_runtime.hardware.intake import Intake
+from madns_runtime.hardware.kind_registry import DeviceProgram
+from madns_runtime.hardware.page import DevicePage
+from madns_runtime.hardware.port import DevicePort
+from madns_runtime.hardware.records import DeviceRecords
+from madns_runtime.hardware.status import StatusAccount, StatusLimits
+
+RECORDS_TIMEOUT_S: Final = 10.0
+SAMPLES_MAX: Final = 1_000_000
+"""In one tick: more means that a driver never lets time go on."""
+
+
+class InlineDevice:
+    """
+    One device of one agent.
+
+    Args:
+        launch: The device.
+        program: Its kind and parameters.
+        records: Its records.
+        now_s: Returns the simulated time, s.
+
+    Raises:
+        PluginError: Its kind does not follow simulated time.
+    """
+
+    def __init__(
+        self,
+        launch: DeviceLaunch,
+        program: DeviceProgram,
+        records: DeviceRecords,
+        *,
+        now_s: Callable[[], float],
+    ) -> None:
+        device = program.make()
+        if not isinstance(device, SimulatedDevice):
+            raise PluginError(
+                f"{launch.full_name}: a {program.kind.name} does not follow simulated time"
+            )
+        self.name = launch.name
+        self._device = device
+        self._records = records
+        self._page = DevicePage([each for each in program.channels if each.direction == "in"])
+        self._limits = StatusLimits.of(1.0 / launch.rate_hz, launch.hang_s)
+        self._account = StatusAccount()
+        self._rate_hz = launch.rate_hz
+        self._count = 0
+        self._own_end, other_end = messages.make_pair()
+        self._intake = Intake(
+            program.channels,
+            self._page,
+            records,
+            seed=[launch.seed, *launch.full_name.encode()],
+            frozen_s=launch.frozen_s,
+            pass_on=self._pass_on,
+        )
+        self.port = DevicePort(
+            launch.name,
+            program.channels,
+            shared=(self._page, other_end),
+            limits=self._limits,
+            now_s=now_s,
+        )
+
+    def open(self) -> None:
+        """Open it at simulated time 0."""
+        identity = self._device.open()
+        header = self._page.header
+        header[page.STATE], header[page.OPENED_S] = page.OPEN, 0.0
+        self._records.time.set(0.0, 0.0, 1.0)
+        self._records.event("opened", 0.0, identity=identity)
+        self._account.begin(0.0)
+
+    def advance(self, t_s: float) -> None:
+        """
+        Take all samples up to simulated time *t_s*; called before the agent's step.
+
+        Raises:
+            PluginError: The driver gave what is no sample.
+        """
+        for _ in range(SAMPLES_MAX):
+            next_s = self._device.next_s()
+            due_s = self._count / self._rate_hz if next_s is None else max(next_s, 0.0)
+            if due_s > t_s:
+                break
+            self._count += 1
+            sample = self._device.sample_at(due_s)
+            if sample is not None:
+                self._intake.take(sample, due_s)
+        self._intake.tell_held(t_s)
+        self._account.observe(self._page.status(self._limits, t_s), t_s)
+
+    def close(self) -> dict[str, Any]:
+        """Close it, and return what the run came to."""
+        self._device.close()
+        account = self._account
+        return {
+            "status": account.status,
+            "stale_ratio": account.stale_ratio(),
+            "lost": account.times_lost,
+            "restarts": 0,
+            "why": "",
+            **self._intake.summary(),
+            "records": self._records.close(RECORDS_TIMEOUT_S),
+        }
+
+    def _pass_on(self, message: list[Any]) -> int:
+        return int(not messages.send(self._own_end, message))

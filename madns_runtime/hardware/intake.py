@@ -1,0 +1,183 @@
+"""The way of a sample: through inserted faults into the page, to the agents' queues, into the records."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+from madns_runtime.errors import PluginError
+from madns_runtime.hardware import messages, page
+from madns_runtime.hardware.clock import DeviceClock
+from madns_runtime.hardware.contract import Channel, Sample
+from madns_runtime.hardware.faults import InsertedFaults
+from madns_runtime.hardware.page import DevicePage
+from madns_runtime.hardware.records import DeviceRecords
+from madns_runtime.hardware.values import are_finite, hold_to_limits, to_frame, to_numbers
+
+FROZEN: Final = "frozen:"
+"""Before an input's name: how often it stood still."""
+EVENTS_MAX: Final = 1000
+"""Of one kind of event, such as refused values; more are counted alone."""
+
+
+class Intake:
+    """
+    Takes what a device measures.
+
+    Args:
+        channels: The device's.
+        device_page: Its page.
+        records: Its records.
+        seed: Of inserted faults.
+        frozen_s: By input: values unchanged for so long are frozen.
+        pass_on: Sends a message to all agents that use it, and returns how many had no room.
+    """
+
+    def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
+        self,
+        channels: Sequence[Channel],
+        device_page: DevicePage,
+        records: DeviceRecords,
+        *,
+        seed: Sequence[int],
+        frozen_s: Mapping[str, float],
+        pass_on: Callable[[list[Any]], int],
+    ) -> None:
+        self._inputs = {each.name: each for each in channels if each.direction == "in"}
+        self._page = device_page
+        self._records = records
+        self._pass_on = pass_on
+        self.faults = InsertedFaults(seed)
+        self.clock = DeviceClock()
+        self._changes = {name: _LastChange(limit_s) for name, limit_s in frozen_s.items()}
+        for name in frozen_s:
+            self.count(f"{FROZEN}{name}", 0)
+        self._frame_numbers: dict[str, int] = {}
+        self._dropped = 0
+        """Samples that inserted faults have dropped, as far as they are counted."""
+
+    def take(self, sample: Sample, now_s: float, *, ahead_s: float = 0.0) -> None:
+        """
+        Hand on what a driver read.
+
+        Args:
+            sample: What it read.
+            now_s: The present, on this machine's monotonic clock, s.
+            ahead_s: How far a sample may lie in the future, s.
+
+        Raises:
+            PluginError: It is no sample of this device's inputs.
+        """
+        if not isinstance(sample, Sample):
+            raise PluginError(f"expected a Sample or None, got {type(sample).__name__}")
+        if not math.isfinite(sample.taken_s) or sample.taken_s > now_s + ahead_s:
+            raise PluginError(
+                f"taken_s: expected a time of time.monotonic(), got {sample.taken_s!r}"
+            )
+        self._page.header[page.ACTIVE_S] = now_s
+        if sample.device_s is not None:
+            self.clock.add(sample.device_s, sample.taken_s)
+        altered = self.faults.apply(sample)
+        if self.faults.dropped != self._dropped:
+            self.count("dropped", self.faults.dropped - self._dropped)
+            self._dropped = self.faults.dropped
+        if altered is not None:
+            self._tell(altered, now_s)
+        self._page.header[page.SAMPLES] += 1
+
+    def tell_held(self, now_s: float) -> None:
+        """Hand on the samples that an inserted fault has delayed until now."""
+        for sample in self.faults.due(now_s):
+            self._tell(sample, now_s)
+
+    def count(self, name: str, number: int = 1) -> None:
+        """Count something by name, in memory that outlives this process."""
+        if number or name.startswith(FROZEN):
+            self._page.counts.add(name, number)
+
+    def event(self, event: str, now_s: float, **values: Any) -> None:
+        """Record that something befell the device, if there was not very much of its kind."""
+        if self._page.counts.add(f"{event}_events") <= EVENTS_MAX:
+            self._records.event(event, now_s, **values)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the counts of a run, those of earlier processes with them."""
+        return counts_of(self._page)
+
+    def _tell(self, sample: Sample, now_s: float) -> None:
+        """Make a sample the newest, pass on its frames, record it."""
+        device_s = math.nan if sample.device_s is None else sample.device_s
+        is_told = not sample.values
+        for name, value in sample.values.items():
+            channel = self._inputs.get(name)
+            if channel is None:
+                raise PluginError(f"a sample holds {name!r}, which is no input of the device")
+            if channel.is_frame:
+                self._tell_frame(channel, to_frame(channel, value), sample.taken_s, now_s)
+                is_told = True
+                continue
+            numbers = to_numbers(channel, value)
+            if not are_finite(numbers):
+                # On record, where the check records.not_finite finds it, and in nobody's hands.
+                self.count(f"{name}_not_finite")
+                last = self._page.read(name).number
+                self._records.sample(name, last, sample.taken_s, numbers, told_s=now_s)
+                continue
+            is_told = True
+            if channel.limits is not None and hold_to_limits(channel, numbers)[1]:
+                self.count(f"{name}_beyond_limits")
+            number = self._page.write(name, sample.taken_s, device_s, numbers)
+            self._records.sample(name, number, sample.taken_s, numbers, told_s=now_s)
+            if channel.passing == "queue":
+                self._send([messages.FRAME, name, number, sample.taken_s, list(numbers)])
+            if name in self._changes and self._changes[name].is_frozen(numbers, now_s):
+                self.count(f"{FROZEN}{name}")
+                self.event("frozen", now_s, channel=name, for_s=self._changes[name].limit_s)
+        if not is_told:
+            return
+        header = self._page.header
+        header[page.NEWEST_S] = max(header[page.NEWEST_S], sample.taken_s)
+        header[page.ARRIVED_S] = now_s
+
+    def _tell_frame(self, channel: Channel, data: bytes, taken_s: float, now_s: float) -> None:
+        number = self._frame_numbers[channel.name] = self._frame_numbers.get(channel.name, 0) + 1
+        told = (len(data), data.hex())
+        self._records.sample(channel.name, number, taken_s, told, told_s=now_s)
+        self._send([messages.FRAME, channel.name, number, taken_s, data])
+
+    def _send(self, message: list[Any]) -> None:
+        self.count("frames_missed", self._pass_on(message))
+
+
+def counts_of(device_page: DevicePage) -> dict[str, Any]:
+    """Return what a device's processes have counted so far, from its page."""
+    counts, header = device_page.counts.read(), device_page.header
+    frozen = {name.removeprefix(FROZEN): n for name, n in counts.items() if name.startswith(FROZEN)}
+    return {
+        "samples": int(header[page.SAMPLES]),
+        "errors": int(header[page.ERRORS]),
+        "dropped": 0,
+        "frozen": frozen,
+        **{name: number for name, number in counts.items() if not name.startswith(FROZEN)},
+    }
+
+
+class _LastChange:
+    """When an input last changed: one that never does although it should is frozen."""
+
+    def __init__(self, limit_s: float) -> None:
+        self.limit_s = limit_s
+        self._values: tuple[float, ...] | None = None
+        self._since_s = 0.0
+        self._is_told = False
+
+    def is_frozen(self, values: tuple[float, ...], now_s: float) -> bool:
+        """Take note of values, and return whether they are now, and were not before, unchanged for too long."""
+        if values != self._values:
+            self._values, self._since_s, self._is_told = values, now_s, False
+            return False
+        if self._is_told or now_s - self._since_s < self.limit_s:
+            return False
+        self._is_told = True
+        return True

@@ -1,0 +1,174 @@
+"""
+Finds kinds of devices, and checks what they declare.
+
+A kind is registered by the entry point `madns.devices`, or named as `module:NAME` or `./file.py:NAME`. NAME is a
+`DeviceKind`, or a `Device` class that bears one as its `kind`.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Final
+
+from madns_runtime.errors import ConfigurationError, MachineError, PluginError
+from madns_runtime.hardware.bounds import bound_faults
+from madns_runtime.hardware.contract import Channel, Device, DeviceKind, Needs, SimulatedDevice
+from madns_runtime.plain_values import from_mapping
+from madns_runtime.plugin.isolation import call_plugin
+from madns_runtime.plugin.registry import load_object
+
+GROUP: Final = "madns.devices"
+CHANNELS_MAX: Final = 64
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeviceProgram:
+    """A kind with its parameters: what drives one device."""
+
+    kind: DeviceKind
+    parameters: Any
+    channels: tuple[Channel, ...]
+    needs: Needs
+    make: Callable[[], Device]
+    """Imports the driver's class and makes it; for the device's process."""
+
+
+def registered_kinds() -> tuple[str, ...]:
+    """Return the names of all installed kinds, sorted."""
+    return tuple(sorted({entry.name for entry in metadata.entry_points(group=GROUP)}))
+
+
+def resolve_kind(spec: str, base_directory: Path) -> DeviceKind:
+    """
+    Find a kind; no library of the device's is imported.
+
+    Args:
+        spec: A registered name, module:NAME, or ./file.py:NAME.
+        base_directory: Folder from which files are found.
+
+    Raises:
+        PluginError: There is no such kind, its file does not load, or its descriptor is faulty.
+        MissingExtraError: It needs an optional dependency that is not installed.
+    """
+    where = spec
+    if ":" not in spec:
+        entries = {entry.name: entry.value for entry in metadata.entry_points(group=GROUP)}
+        if spec not in entries:
+            close = difflib.get_close_matches(spec, entries, n=1)
+            hint = f", did you mean {close[0]}?" if close else ""
+            known = ", ".join(sorted(entries)) or "none"
+            raise PluginError(f"no kind of device named {spec!r}{hint}; installed are {known}")
+        where = entries[spec]
+    module, found = load_object(where, base_directory)
+    kind = getattr(found, "kind", None) if isinstance(found, type) else found
+    if not isinstance(kind, DeviceKind):
+        raise PluginError(
+            f"{where}: expected a madns_runtime.hardware.contract.DeviceKind, or a Device class with one as its"
+            f" `kind`, got {found!r:.80}"
+        )
+    if isinstance(found, type):
+        return replace(kind, device=found)
+    if isinstance(kind.device, str) and kind.device.startswith(":"):
+        return replace(kind, device=f"{module.__name__}{kind.device}")
+    return kind
+
+
+def prepare(spec: str, parameters: Mapping[str, Any], base_directory: Path) -> DeviceProgram:
+    """
+    Return what drives a device of a kind with these parameters.
+
+    Raises:
+        PluginError: There is no such kind, or what it declares is faulty.
+        ConfigurationError: A parameter is unknown, missing, or of another type.
+        MissingExtraError: It needs an optional dependency that is not installed.
+    """
+    kind = resolve_kind(spec, base_directory)
+    if kind.parameters is type(None):
+        if parameters:
+            raise PluginError(f"{kind.name} takes no parameters, got {', '.join(parameters)}")
+        values = None
+    else:
+        values = _with_paths(
+            from_mapping(kind.parameters, parameters, f"{kind.name}.parameters"), base_directory
+        )
+        if beyond := bound_faults(values, f"{kind.name}.parameters"):
+            raise ConfigurationError("; ".join(beyond))
+    channels = kind.channels
+    if callable(channels):
+        channels = tuple(call_plugin(f"{kind.name}.channels", channels, values))
+    needs = kind.needs
+    if callable(needs):
+        needs = call_plugin(f"{kind.name}.needs", needs, values)
+    faults = channel_faults(channels)
+    if faults:
+        raise PluginError(f"{kind.name}: {'; '.join(faults)}")
+    return DeviceProgram(
+        kind=kind,
+        parameters=values,
+        channels=channels,
+        needs=needs,
+        make=partial(_make, replace(kind, needs=needs), values, base_directory),
+    )
+
+
+def channel_faults(channels: tuple[Channel, ...]) -> list[str]:
+    """Return what is wrong with the channels that a kind declares."""
+    if not channels or len(channels) > CHANNELS_MAX:
+        return [f"expected 1 to {CHANNELS_MAX} channels, got {len(channels)}"]
+    faults = [fault for channel in channels for fault in channel.faults()]
+    names = [channel.name for channel in channels]
+    faults += [
+        f"two channels are called {name}" for name in sorted(set(names)) if names.count(name) > 1
+    ]
+    taken = {"events", "log", "device_state", "device_clock"} & set(names)
+    return faults + [f"no channel may be called {name}" for name in sorted(taken)]
+
+
+def _with_paths(parameters: Any, base_directory: Path) -> Any:
+    """Return parameters whose paths are found from *base_directory*."""
+    paths = {
+        field.name: base_directory / value
+        for field in fields(parameters)
+        if isinstance(value := getattr(parameters, field.name), Path)
+    }
+    return replace(parameters, **paths)
+
+
+def _make(kind: DeviceKind, parameters: Any, base_directory: Path) -> Device:
+    """
+    Make the driver.
+
+    Raises:
+        PluginError: Its class cannot be found, or is no `Device`.
+        MachineError: A library that it imports is not installed.
+    """
+    driver: Any = kind.device
+    if isinstance(driver, str):
+        try:
+            _, driver = load_object(driver, base_directory)
+        except PluginError as error:
+            raise _library_missing(kind, error.__cause__) or error from None
+    wanted = SimulatedDevice if kind.follows_simulated_time else Device
+    if not (isinstance(driver, type) and issubclass(driver, wanted)):
+        raise PluginError(f"{kind.name}: {kind.device}: expected a subclass of {wanted.__name__}")
+    return driver(parameters)
+
+
+def _library_missing(kind: DeviceKind, cause: BaseException | None) -> MachineError | None:
+    """Return what to tell if an import failed for want of a library that the kind declares."""
+    needs = kind.needs
+    if not isinstance(cause, ModuleNotFoundError) or not isinstance(needs, Needs):
+        return None
+    if needs.requirements:
+        names = " ".join(map(repr, needs.requirements))
+        cure = f"pip install {names}, or `cosmos up` on the machine that has the device"
+    elif needs.packages:
+        cure = f"sudo apt install {' '.join(needs.packages)}"
+    else:
+        return None
+    return MachineError(f"{kind.name}: the module {cause.name} is not installed here; {cure}")

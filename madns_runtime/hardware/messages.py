@@ -1,0 +1,60 @@
+"""
+Words between an agent's process and a device's, over a socket pair that keeps datagrams apart.
+
+Nobody waits: who finds the other's buffer full keeps the newest for later, or counts what is lost.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from typing import Any, Final
+
+import msgpack
+
+BYTES_MAX: Final = 65_536
+BUFFER_BYTES: Final = 262_144
+DATAGRAMS_MAX: Final = 4096
+"""Of one look: more wait for the next, so that a flood holds nobody."""
+
+WRITE, TIME, FRAME, FAULT, OWNER_GONE, END = "write", "time", "frame", "fault", "owner", "end"
+ERROR, ANSWER = "error", "answer"
+"""First elements of messages: [WRITE, channel, value, due_s]; [TIME]: the page tells the time anew; [FRAME, channel, number, taken_s,
+bytes]; from the manager [FAULT, device, action, value] and to it the same of one that came from an agent;
+from an agent [FAULT, number, action, value] and to it [ANSWER, number, refusal]; [OWNER_GONE]; [END, reason];
+[ERROR, device, what its driver raised]."""
+
+
+def make_pair() -> tuple[socket.socket, socket.socket]:
+    """Return two connected sockets that keep datagrams apart, and never wait."""
+    pair = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    for end in pair:
+        end.setblocking(False)
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
+    return pair
+
+
+def send(end: socket.socket, message: list[Any]) -> bool:
+    """Send a message without waiting; False if there was no room, or nobody."""
+    try:
+        end.send(msgpack.packb(message))
+    except (BlockingIOError, ConnectionError, OSError):
+        return False
+    return True
+
+
+def receive_all(end: socket.socket) -> Iterator[list[Any]]:
+    """Yield the messages that wait, at most DATAGRAMS_MAX; what is none of ours is left out."""
+    for _ in range(DATAGRAMS_MAX):
+        try:
+            data = end.recv(BYTES_MAX)
+        except (BlockingIOError, OSError):
+            return
+        if not data:
+            return
+        try:
+            message = msgpack.unpackb(data)
+        except ValueError:
+            continue
+        if isinstance(message, list) and message:
+            yield message

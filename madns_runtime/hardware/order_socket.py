@@ -1,0 +1,138 @@
+"""
+Door of a living run: commands of the same user hand whoever supervises it orders, one line each, and hear one line back.
+
+A unix socket of this user alone in the run directory.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Final, Protocol
+
+import orjson
+
+from madns_runtime import private_socket
+from madns_runtime.errors import MadnsError
+from madns_runtime.hardware.faults import check_fault
+
+SOCKET_NAME: Final = ".orders.sock"
+LINE_BYTES_MAX: Final = 4096
+VISITORS_MAX: Final = 8
+"""Who knocks beyond them closes the door behind the one that has waited longest."""
+
+Fault = tuple[str, str, float | None]
+"""Target, action and value."""
+
+
+class Readers(Protocol):
+    """A loop that calls back when descriptors are readable."""
+
+    def add_reader(self, fd: int, callback: Callable[[], None], /) -> None:
+        """Call back whenever a descriptor is readable."""
+
+    def remove_reader(self, fd: int, /) -> object:
+        """Call back no more."""
+
+
+class OrderSocket:
+    """
+    The side of who supervises the run: the operator, or the host of a run that goes on without one.
+
+    Args:
+        folder: The run directory.
+        loop: Of the process.
+        on_order: Called with a number and the fault that is ordered; `answer` tells what became of it.
+
+    Raises:
+        OSError: It cannot be made there.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        loop: Readers,
+        on_order: Callable[[int, Fault], None],
+    ) -> None:
+        self._folder = folder
+        self._loop = loop
+        self._on_order = on_order
+        self._visitors: dict[int, socket.socket] = {}
+        self._heard: dict[int, bytes] = {}
+        self._hearing: set[int] = set()
+        self._count = 0
+        self._listener = private_socket.listen(folder, SOCKET_NAME, VISITORS_MAX)
+        loop.add_reader(self._listener.fileno(), self._accept)
+
+    def answer(self, number: int, refusal: str) -> None:
+        """Tell who gave an order what became of it, and let them go."""
+        visitor = self._visitors.get(number)
+        if visitor is not None:
+            with contextlib.suppress(OSError):  # it has gone, or takes nothing
+                visitor.send(orjson.dumps({"refusal": refusal}) + b"\n")
+            self._dismiss(number)
+
+    def close(self) -> None:
+        """Close the door, and all who stand in it."""
+        for number in list(self._visitors):
+            self._dismiss(number)
+        self._loop.remove_reader(self._listener.fileno())
+        self._listener.close()
+        with contextlib.suppress(OSError):
+            (self._folder / SOCKET_NAME).unlink()
+
+    def _accept(self) -> None:
+        visitor = private_socket.accept(self._listener)
+        if visitor is None:
+            return
+        if len(self._visitors) >= VISITORS_MAX:
+            self._dismiss(min(self._visitors))
+        self._count += 1
+        number = self._count
+        self._visitors[number], self._heard[number] = visitor, b""
+        self._hearing.add(number)
+        self._loop.add_reader(visitor.fileno(), partial(self._hear, number))
+
+    def _hear(self, number: int) -> None:
+        try:
+            data = self._visitors[number].recv(LINE_BYTES_MAX)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        heard = self._heard[number] = self._heard[number] + data
+        if not data or len(heard) > LINE_BYTES_MAX:
+            self._dismiss(number)
+        elif heard.endswith(b"\n"):
+            self._stop_hearing(number)
+            self._obey(number, heard)
+
+    def _obey(self, number: int, line: bytes) -> None:
+        try:
+            order = orjson.loads(line)
+            value = order["value"]
+            fault = (str(order["target"]), str(order["action"]), _number(value))
+            check_fault(fault[1], fault[2])
+        except (ValueError, KeyError, TypeError, MadnsError) as error:
+            self.answer(number, f"no order: {error}")
+        else:
+            self._on_order(number, fault)
+
+    def _dismiss(self, number: int) -> None:
+        self._stop_hearing(number)
+        del self._heard[number]
+        self._visitors.pop(number).close()
+
+    def _stop_hearing(self, number: int) -> None:
+        if number in self._hearing:
+            self._hearing.remove(number)
+            self._loop.remove_reader(self._visitors[number].fileno())
+
+
+def _number(value: object) -> float | None:
+    if value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
+        return None if value is None else float(value)
+    raise ValueError(f"expected a number, got {value!r}")

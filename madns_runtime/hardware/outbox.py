@@ -1,0 +1,53 @@
+"""What a device's process sends to the agents that use it: in order, and behind what waits for room."""
+
+from __future__ import annotations
+
+import math
+import socket
+from collections import deque
+from collections.abc import Mapping
+from time import monotonic
+from typing import Any, Final
+
+from madns_runtime.hardware import messages
+from madns_runtime.reactor.reactor import Reactor
+
+WAITING_MAX: Final = 10_000
+"""Messages that may wait for room at one agent; the oldest is given up beyond, and counted."""
+PERIOD_S: Final = 0.02
+"""Between two looks for room."""
+
+
+class UserOutbox:
+    """
+    Sends to all users of a device, and never waits.
+
+    Args:
+        users: The device's ends of its pairs, by agent.
+        reactor: The loop of its process.
+    """
+
+    def __init__(self, users: Mapping[str, socket.socket], reactor: Reactor) -> None:
+        self._users: list[tuple[socket.socket, deque[list[Any]]]] = [
+            (end, deque(maxlen=WAITING_MAX)) for end in users.values()
+        ]
+        self._timer = reactor.call_at(math.inf, self._send_waiting)
+
+    def send(self, message: list[Any]) -> int:
+        """Send a message to all, and return how many of them have to do without one."""
+        lost = 0
+        for end, waiting in self._users:
+            if waiting:
+                lost += len(waiting) == WAITING_MAX
+                waiting.append(message)
+            elif not messages.send(end, message):
+                waiting.append(message)
+                self._timer.reschedule(monotonic() + PERIOD_S)
+        return lost
+
+    def _send_waiting(self) -> None:
+        for end, waiting in self._users:
+            while waiting and messages.send(end, waiting[0]):
+                waiting.popleft()
+        is_empty = not any(waiting for _, waiting in self._users)
+        self._timer.reschedule(math.inf if is_empty else monotonic() + PERIOD_S)

@@ -1,0 +1,245 @@
+"""Devices as an agent sees them: `context.hardware`."""
+
+from __future__ import annotations
+
+import math
+import socket
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from time import monotonic
+from typing import Any, Final
+
+from madns_runtime.errors import PluginError
+from madns_runtime.hardware import messages, page
+from madns_runtime.hardware.contract import Channel, Value
+from madns_runtime.hardware.page import DevicePage
+from madns_runtime.hardware.status import StatusLimits
+from madns_runtime.hardware.values import are_finite, from_numbers, to_frame, to_numbers
+from madns_runtime.plugin.device_view import ChannelFrame, ChannelReading, DeviceStatus
+from madns_runtime.protocol.messages import FaultOrder
+
+FRAMES_MAX: Final = 10_000
+"""Values of a queue that may wait to be taken; the oldest are given up beyond, and counted."""
+ANSWERS_MAX: Final = 8
+"""Orders whose answers are told; who gave an older one has stopped waiting."""
+
+
+class DevicePort:
+    """
+    One device, as one agent sees it: a `madns_runtime.plugin.device_view.DeviceView`. Nothing here waits.
+
+    Args:
+        full_name: The device's among all of the run, such as pi22/imu; the scenario calls it by what stands last.
+        channels: The device's.
+        shared: Its page, and this agent's end of their pair.
+        limits: Ages from which it is stale and lost.
+        now_s: Returns the present on this machine's clock, s; in lockstep simulated time.
+    """
+
+    def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
+        self,
+        full_name: str,
+        channels: tuple[Channel, ...],
+        *,
+        shared: tuple[DevicePage, socket.socket],
+        limits: StatusLimits,
+        now_s: Callable[[], float] = monotonic,
+    ) -> None:
+        self.full_name = full_name
+        self.name = full_name.rpartition("/")[2]
+        self._now_s = now_s
+        self.channels = {channel.name: channel for channel in channels}
+        self.inputs = tuple(
+            each.name for each in channels if each.direction == "in" and not each.is_frame
+        )
+        self._page, self._end = shared
+        self._limits = limits
+        self.local_s: Callable[[float], float] = float
+        """Returns when a simulated time is on that clock, s."""
+        self._frames: dict[str, deque[tuple[int, float, Any]]] = {
+            channel.name: deque(maxlen=FRAMES_MAX)
+            for channel in channels
+            if channel.direction == "in" and (channel.is_frame or channel.passing == "queue")
+        }
+        self._orders: set[int] = set()
+        """Faults that were ordered and not answered."""
+        self._answers: deque[tuple[int, str]] = deque(maxlen=ANSWERS_MAX)
+        self._unsent: dict[str, list[Any]] = {}
+        self.frames_dropped = 0
+        """Values of queues that nobody took in time."""
+        self.writes_lost = 0
+        """Values for an output that the device's process had no room for."""
+
+    @property
+    def status(self) -> DeviceStatus:
+        """Status of the device, now."""
+        return self._page.status(self._limits, self._now_s())
+
+    def __getitem__(self, channel: str) -> ChannelReading:
+        """Return the newest value of an input; see `DeviceView`."""
+        declared = self.channels.get(channel)
+        if declared is None or declared.direction == "out" or declared.is_frame:
+            raise PluginError(f"{self.name} has no input {channel!r} of numbers{self._known()}")
+        number, taken_s, device_s, values = self._page.read(channel)
+        value = from_numbers(declared, values) if number else None
+        now_s = self._now_s()
+        status = self._page.status(self._limits, now_s)
+        return ChannelReading(value, now_s - taken_s, number, status, device_s)
+
+    def frames(self, channel: str) -> list[ChannelFrame]:
+        """Return all that has come through a queue since the last call; see `DeviceView`."""
+        queue = self._frames.get(channel)
+        if queue is None:
+            raise PluginError(f"{self.name} has no queue {channel!r}{self._known()}")
+        self._collect()
+        now_s = self._now_s()
+        found = [ChannelFrame(value, number, now_s - taken_s) for number, taken_s, value in queue]
+        queue.clear()
+        return found
+
+    def write(self, channel: str, value: Value, *, due_s: float | None = None) -> None:
+        """Hand over a value for an output, due at simulated time *due_s*; see `DeviceView`."""
+        declared = self.channels.get(channel)
+        if declared is None or declared.direction != "out":
+            raise PluginError(f"{self.name} has no output {channel!r}{self._known()}")
+        if declared.is_frame:
+            sent: Any = to_frame(declared, value)
+        else:
+            sent = to_numbers(declared, value)
+            if not are_finite(sent):
+                raise PluginError(f"{self.name}.{channel}: expected numbers, got {value!r:.80}")
+            sent = from_numbers(declared, sent)
+        local_s = self._now_s() if due_s is None else self.local_s(due_s)
+        message = [messages.WRITE, channel, sent, local_s]
+        if self._unsent:
+            self.flush()
+        if messages.send(self._end, message):
+            return
+        if declared.passing == "newest":
+            self._unsent[channel] = message
+        else:
+            self.writes_lost += 1
+
+    def flush(self) -> None:
+        """Send what found no room before; the framework calls it in each tick."""
+        for channel, message in list(self._unsent.items()):
+            if not messages.send(self._end, message):
+                return
+            del self._unsent[channel]
+
+    def tell_time(self, local_s: float, t_s: float, rate: float) -> None:
+        """Tell the device's process what simulated time it is; the framework calls it now and then."""
+        self._page.time.write(local_s, t_s, rate)
+        messages.send(self._end, [messages.TIME])
+
+    @property
+    def loss(self) -> str | None:
+        """Why the device was lost since simulated time runs, the last time; None if it was not."""
+        return self._page.loss.read() if self._page.header[page.LOSSES] else None
+
+    def order_fault(self, number: int, action: str, value: float | None) -> None:
+        """Have a fault inserted around the device; `answers` tells what became of it."""
+        self._orders.add(number)
+        if not messages.send(self._end, [messages.FAULT, number, action, value]):
+            self._answered(number, f"{self.full_name}: its process does not listen")
+
+    def answers(self) -> list[tuple[int, str]]:
+        """Return the newest orders' numbers, each with the reason of its refusal, else empty."""
+        if self._orders:
+            self._collect()
+        return list(self._answers)
+
+    def _answered(self, number: int, refusal: str) -> None:
+        self._orders.discard(number)
+        self._answers.append((number, refusal))
+
+    def _collect(self) -> None:
+        for word, *rest in messages.receive_all(self._end):
+            if word == messages.ANSWER:
+                self._answered(rest[0], rest[1])
+            if word != messages.FRAME:
+                continue
+            name, number, taken_s, value = rest
+            queue = self._frames[name]
+            if len(queue) == FRAMES_MAX:
+                self.frames_dropped += 1
+            if not self.channels[name].is_frame:
+                value = from_numbers(self.channels[name], value)
+            queue.append((number, taken_s, value))
+
+    def _known(self) -> str:
+        return f"; it has {', '.join(self.channels) or 'none'}"
+
+
+class Hardware(Mapping[str, DevicePort]):
+    """The devices that one agent uses, by name."""
+
+    def __init__(self, ports: Mapping[str, DevicePort] | None = None) -> None:
+        self._ports = dict(ports or {})
+        self._statuses: dict[str, DeviceStatus] = dict.fromkeys(self._ports, "never")
+
+    def __getitem__(self, name: str) -> DevicePort:
+        """
+        Return a device.
+
+        Raises:
+            PluginError: The scenario gives this agent no device of that name.
+        """
+        try:
+            return self._ports[name]
+        except KeyError:
+            known = ", ".join(self._ports) or "none"
+            raise PluginError(
+                f"this agent uses no device {name!r} (it uses {known}); say so under hardware: use: of the scenario"
+            ) from None
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Return a device, or *default* if this agent uses none of that name."""
+        return self._ports.get(name, default)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._ports
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._ports)
+
+    def __len__(self) -> int:
+        return len(self._ports)
+
+    def use_clock(self, local_s: Callable[[float], float]) -> None:
+        """Let writes that are due at a simulated time find it on this machine's clock by *local_s*."""
+        for port in self._ports.values():
+            port.local_s = local_s
+
+    def changes(self) -> list[tuple[str, DeviceStatus]]:
+        """Return the devices whose status has changed since the last call; the framework calls it in each tick."""
+        found: list[tuple[str, DeviceStatus]] = []
+        for name, port in self._ports.items():
+            port.flush()
+            status = port.status
+            if status != self._statuses[name]:
+                self._statuses[name] = status
+                found.append((name, status))
+        return found
+
+    def order_fault(self, order: FaultOrder) -> None:
+        """Have a fault inserted around a device; `report` tells what became of it."""
+        for port in self._ports.values():
+            if port.full_name == order.device:
+                value = None if math.isnan(order.value) else order.value
+                port.order_fault(order.number, order.action, value)
+
+    def report(self) -> dict[str, Any]:
+        """Return what the host of a run without an operator is told: a device that was lost, and answers to orders."""
+        lost = [(p.full_name, why) for p in self._ports.values() if (why := p.loss) is not None]
+        answers = [answer for port in self._ports.values() for answer in port.answers()]
+        told: dict[str, Any] = {"lost_device": lost[0]} if lost else {}
+        return {**told, "fault_answers": answers} if answers else told
+
+    def tell_time(self, local_s: float, t_s: float, rate: float) -> None:
+        """Tell all devices what simulated time it is."""
+        for port in self._ports.values():
+            port.tell_time(local_s, t_s, rate)
+
+
+NO_HARDWARE: Final = Hardware()

@@ -1,0 +1,137 @@
+"""Records of one device: its channels over time, what was put out, its clock, and what befell it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from time import monotonic
+from typing import Any
+
+from madns_runtime.hardware.contract import Channel
+from madns_runtime.recording.records import Field, StreamSchema
+from madns_runtime.recording.run_journal import RunJournal
+from madns_runtime.timing.clock import utc_at_iso
+
+DEVICE_CLOCK = StreamSchema(
+    "device_clock", (Field("t_s", "s"), Field("offset_us", "us"), Field("drift_ppm", "1e-6"))
+)
+"""The machine's clock minus the device's, and how much faster the device's runs."""
+
+DEVICE_STATE = StreamSchema(
+    "device_state",
+    (
+        Field("t_s", "s"),
+        Field("samples", "", "int"),
+        Field("errors", "", "int"),
+        Field("late_us_max", "us", "int"),
+        Field("details", "", "json"),
+    ),
+)
+"""Once per second: samples and errors so far, the latest start of a read since, and what the driver tells."""
+
+
+class SimulatedTime:
+    """Simulated time on this machine's monotonic clock, as an agent's estimate tells it now and then."""
+
+    def __init__(self) -> None:
+        self._local_s = self._t_s = math.nan
+        self._rate = 1.0
+
+    @property
+    def is_known(self) -> bool:
+        """Whether simulated time has begun."""
+        return not math.isnan(self._t_s)
+
+    def set(self, local_s: float, t_s: float, rate: float) -> None:
+        """Take note that simulated time *t_s* is at *local_s*, and of its seconds per local one."""
+        self._local_s, self._t_s, self._rate = local_s, t_s, rate
+
+    def at(self, local_s: float) -> float:
+        """Return the simulated time at *local_s*, s; NaN before it is known."""
+        return self._t_s + (local_s - self._local_s) * self._rate
+
+    def until(self, t_s: float) -> float:
+        """Return how long from now on simulated time *t_s* is, s."""
+        return (t_s - self._t_s) / self._rate - (monotonic() - self._local_s)
+
+
+class DeviceRecords:
+    """
+    The streams of one device in a folder of its own.
+
+    Args:
+        journal: Its events and log; the other streams go beside.
+        channels: The device's.
+
+    Raises:
+        MachineError: The folder takes no file.
+    """
+
+    def __init__(self, journal: RunJournal, channels: Sequence[Channel]) -> None:
+        self.time = SimulatedTime()
+        self.journal = journal
+        self._recorder = journal.recorder
+        for channel in channels:
+            self._recorder.open_stream(schema_of(channel))
+        self._recorder.open_stream(DEVICE_STATE)
+        self._recorder.open_stream(DEVICE_CLOCK)
+
+    def set_time(self, local_s: float, t_s: float, rate: float) -> None:
+        """Take note of simulated time, see `SimulatedTime.set`."""
+        if not self.time.is_known:
+            self._recorder.set_t0(utc_at_iso(-t_s))
+        self.time.set(local_s, t_s, rate)
+
+    def sample(
+        self, channel: str, number: int, taken_s: float, values: Sequence[Any], *, told_s: float
+    ) -> None:
+        """Record values of an input, taken at *taken_s* and handed on at *told_s*; before simulated time nothing."""
+        if self.time.is_known:
+            t_s = round(self.time.at(taken_s), 6)
+            age_us = round((told_s - taken_s) * 1e6)
+            self._recorder.record(channel, (t_s, number, age_us, *values))
+
+    def written(self, channel: str, due_s: float, done_s: float, values: Sequence[Any]) -> None:
+        """Record values of an output, due at *due_s* and put out at *done_s*."""
+        if self.time.is_known:
+            t_s = round(self.time.at(due_s), 6)
+            self._recorder.record(channel, (t_s, int((done_s - due_s) * 1e6), *values))
+
+    def clock(self, now_s: float, offset_s: float, drift_ppm: float) -> None:
+        """Record an estimate of the device's clock."""
+        if self.time.is_known:
+            values = (round(self.time.at(now_s), 6), round(offset_s * 1e6, 1), round(drift_ppm, 3))
+            self._recorder.record(DEVICE_CLOCK.name, values)
+
+    def state(
+        self, now_s: float, counts: tuple[int, int], late_us_max: int, details: Mapping[str, Any]
+    ) -> None:
+        """Record samples and errors so far, and what the driver tells."""
+        if self.time.is_known:
+            t_s = round(self.time.at(now_s), 6)
+            values = (t_s, *counts, late_us_max, dict(details) or None)
+            self._recorder.record(DEVICE_STATE.name, values)
+
+    def event(self, event: str, now_s: float, **values: Any) -> None:
+        """Record that something befell the device; t_s is null before simulated time."""
+        t_s = round(self.time.at(now_s), 6) if self.time.is_known else None
+        self.journal.event(event, **{**values, "t_s": t_s})
+
+    def close(self, timeout_s: float) -> Mapping[str, Any]:
+        """Close the streams, and return the counts of their records."""
+        return self.journal.close(timeout_s).to_mapping()
+
+
+def schema_of(channel: Channel) -> StreamSchema:
+    """Return the stream of a channel: of an input with number and age, of an output with its lateness."""
+    values: tuple[Field, ...]
+    head: tuple[Field, ...]
+    if channel.is_frame:
+        values = (Field("bytes", "", "int"), Field("data", "", "str"))
+    else:
+        values = tuple(Field(name, channel.unit) for name in channel.column_names())
+    if channel.direction == "in":
+        head = (Field("t_s", "s"), Field("number", "", "int"), Field("age_us", "us", "int"))
+    else:
+        head = (Field("t_s", "s"), Field("lateness_us", "us", "int"))
+    return StreamSchema(channel.name, (*head, *values))

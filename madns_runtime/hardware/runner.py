@@ -1,0 +1,397 @@
+"""One device in its process's loop: opened, read, written, watched, made safe, closed, and opened anew."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+import socket
+from collections.abc import Callable, Mapping
+from functools import partial
+from time import monotonic
+from typing import Any, Final
+
+from madns_runtime.errors import MachineError, MadnsError, PluginError
+from madns_runtime.hardware import messages, page
+from madns_runtime.hardware.contract import Device, SimulatedDevice
+from madns_runtime.hardware.intake import Intake
+from madns_runtime.hardware.outbox import UserOutbox
+from madns_runtime.hardware.pending import PendingWrites
+from madns_runtime.hardware.process_resources import has_descriptors, resident_bytes
+from madns_runtime.hardware.records import DeviceRecords
+from madns_runtime.hardware.seat import DeviceSeat
+from madns_runtime.hardware.status import StatusLimits, back_off_s
+from madns_runtime.hardware.values import from_numbers, to_output
+from madns_runtime.plugin.context import describe_exception
+from madns_runtime.reactor.reactor import Reactor
+
+BURST_MAX: Final = 256
+"""Samples taken in a row from a device that has them ready; then others get their turn."""
+STATE_PERIOD_S: Final = 1.0
+GROWTH_BYTES_MAX: Final = 256 << 20
+"""Memory that a device's process may take beyond what it had when the device was opened first."""
+
+
+class DeviceRunner:
+    """
+    Drives one device.
+
+    Args:
+        seat: The device, and what it shares.
+        records: Its streams.
+        reactor: The loop of its process.
+    """
+
+    def __init__(self, seat: DeviceSeat, records: DeviceRecords, reactor: Reactor) -> None:
+        self._seat = seat
+        self._launch = launch = seat.launch
+        self._header = seat.page.header
+        self._records = records
+        self._reactor = reactor
+        self._channels = {channel.name: channel for channel in seat.channels}
+        self._outputs = any(channel.direction == "out" for channel in seat.channels)
+        self._intake = Intake(
+            seat.channels,
+            seat.page,
+            records,
+            seed=[launch.seed, *launch.full_name.encode()],
+            frozen_s=launch.frozen_s,
+            pass_on=UserOutbox(seat.users, reactor).send,
+        )
+        self.tell_error: Callable[[str], object] = lambda text: None
+        """Told what the driver raised, before the device is closed for it."""
+        self.tell_fault: Callable[[str, float | None], object] = lambda action, value: None
+        """Told of an inserted fault that came from an agent."""
+        self._pending = PendingWrites()
+        self._device: Device | None = None
+        self._fd: int | None = None
+        self._failures = 0
+        self._late_us_max = 0
+        self._is_ending = False
+        self.gave_up = ""
+        """Why its process has to be started anew; empty if it has not."""
+        self._first_bytes = 0
+        """Memory of this process when the device was opened first; 0 before."""
+        self._is_own = False
+        self._period_s = 1.0 / launch.rate_hz
+        self._hang_s = StatusLimits.of(self._period_s, launch.hang_s).hang_s
+        self._due_s = math.inf
+        self._take_time()  # one that is started anew in mid-run
+        # Infinite is never: each timer is made once and moved.
+        self._read_timer = reactor.call_at(math.inf, self._read_due)
+        self._open_timer = reactor.call_at(math.inf, self.open)
+        self._write_timer = reactor.call_at(math.inf, self._write_due)
+        self._held_timer = reactor.call_at(math.inf, self._held_due)
+        self._state_timer = reactor.call_at(monotonic() + STATE_PERIOD_S, self._tell_state)
+        self._alive_timer = reactor.call_at(0.0, self._tell_alive)
+        for agent, end in seat.users.items():
+            reactor.add_reader(end.fileno(), partial(self._hear, agent, end))
+
+    # Opening and closing ------------------------------------------------------------------------
+
+    def open(self) -> None:
+        """Open the device; if that fails, again after a while."""
+        if self._is_ending or self._device is not None or self._intake.faults.is_disconnected:
+            return
+        header = self._header
+        header[page.ACTIVE_S] = monotonic()
+        self._is_own = False
+        try:
+            self._device = device = self._seat.make()
+            device.may_move = self._launch.may_move
+            identity = device.open()
+            self._seat.check_identity(identity)
+            self._is_own = True
+            self._fd = device.fileno()
+        except BaseException as error:  # noqa: BLE001 - a driver may raise anything
+            self._fail("open", error)
+            return
+        now_s = monotonic()
+        header[page.OPENED_S] = header[page.ACTIVE_S] = now_s
+        header[page.STATE] = page.OPEN
+        self._records.event("opened", now_s, identity=identity)
+        self._first_bytes = self._first_bytes or resident_bytes()
+        if header[page.MOVED]:
+            self._make_safe(device)  # what an earlier process, or a failed attempt, has left
+        if self._fd is None:
+            self._due_s = now_s
+            self._read_timer.reschedule(now_s)
+        else:
+            self._reactor.add_reader(self._fd, self._readable)
+
+    def _fail(self, method: str, error: BaseException) -> None:
+        """Note what a driver raised, close the device, and open it anew after a while."""
+        if isinstance(error, KeyboardInterrupt | GeneratorExit):
+            raise error
+        self._failures += 1
+        self._header[page.ERRORS] += 1
+        name = type(self._device).__name__ if self._device is not None else self._launch.kind
+        text = self._blame(name, method, error)
+        self.tell_error(text)
+        self._close_device()
+        if not has_descriptors():
+            self._give_up(f"{name} leaks descriptors: none is left, so it gets a process anew")
+        elif not self._is_ending:
+            self._open_timer.reschedule(monotonic() + back_off_s(self._failures))
+
+    def _give_up(self, why: str) -> None:
+        """End this process, which the driver has used up."""
+        self.gave_up = why
+        self._intake.event("error", monotonic(), why=why)
+        self._reactor.stop()
+
+    def _check_memory(self) -> None:
+        grown_bytes = resident_bytes() - self._first_bytes
+        if self._first_bytes and grown_bytes > GROWTH_BYTES_MAX and not self.gave_up:
+            name, grown = type(self._device).__name__, f"{grown_bytes >> 20} MiB"
+            self._give_up(
+                f"{name} leaks memory: {grown} since it was opened, so it gets a process anew"
+            )
+
+    def _blame(self, driver: str, method: str, error: BaseException) -> str:
+        """Record what a driver's method raised, and return its words."""
+        is_told = isinstance(error, MachineError)
+        text = str(error) if is_told else describe_exception(error, f"{driver}.{method}")
+        self._intake.event("error", monotonic(), why=text)
+        return text
+
+    def _close_device(self) -> None:
+        """Make the device safe and close it; what either raises is recorded."""
+        device, self._device = self._device, None
+        if device is None:
+            return
+        self._read_timer.reschedule(math.inf)
+        if self._fd is not None:
+            self._reactor.remove_reader(self._fd)
+            self._fd = None
+        self._make_safe(device)
+        try:
+            device.close()
+        except BaseException as error:  # noqa: BLE001 - a driver may raise anything
+            self._blame(type(device).__name__, "close", error)
+        self._header[page.STATE] = page.CLOSED
+        self._records.event("closed", monotonic())
+
+    def _make_safe(self, device: Device) -> bool:
+        """Bring outputs into their safe state, where they may move at all; return whether they are."""
+        if not (self._outputs and self._launch.may_move and self._is_own):
+            return True  # nothing has moved, and what is in its place is not to be touched
+        self._pending.clear()
+        self._write_timer.reschedule(math.inf)
+        try:
+            device.make_safe()
+        except BaseException as error:  # noqa: BLE001 - a driver may raise anything
+            self._blame(type(device).__name__, "make_safe", error)
+            return False
+        self._header[page.MOVED] = 0.0
+        self._header[page.SAFE_COUNT] += 1
+        self._records.event("made_safe", monotonic())
+        return True
+
+    def end(self, reason: str, timeout_s: float) -> Mapping[str, Any]:
+        """Make safe, close, and return what the run came to: counts, and the account of records."""
+        self._is_ending = True
+        self._records.event("ending", monotonic(), why=reason)
+        self._close_device()
+        if not self._header[page.MOVED]:  # else the guardian tries what the driver could not
+            self._header[page.STATE] = page.SAFE
+        return {**self._intake.summary(), "records": self._records.close(timeout_s)}
+
+    # Reading ------------------------------------------------------------------------------------
+
+    def _read_due(self) -> None:
+        now_s = monotonic()
+        if self._fd is not None:
+            self._readable()
+            return
+        self._late_us_max = max(self._late_us_max, int((now_s - self._due_s) * 1e6))
+        if not self._read():
+            return
+        if (
+            isinstance(self._device, SimulatedDevice)
+            and (next_s := self._device.next_s()) is not None
+        ):
+            wait_s = (
+                self._records.time.until(next_s) if self._records.time.is_known else self._period_s
+            )
+            self._due_s = monotonic() + min(max(wait_s, 0.0), STATE_PERIOD_S)
+            self._read_timer.reschedule(self._due_s)
+            return
+        # The next whole period, so that a slow read does not shift those after it.
+        passed = math.floor((monotonic() - self._due_s) / self._period_s)
+        self._intake.count("reads_skipped", max(0, passed))
+        self._due_s += (max(0, passed) + 1) * self._period_s
+        self._read_timer.reschedule(self._due_s)
+
+    def _readable(self) -> None:
+        for _ in range(BURST_MAX):
+            before = self._header[page.SAMPLES]
+            if not self._read() or self._header[page.SAMPLES] == before:
+                return
+        self._read_timer.reschedule(monotonic())  # more is ready, and others get their turn first
+
+    def _read(self) -> bool:
+        """Take one sample; return whether the device is still open."""
+        device = self._device
+        if device is None:
+            return False
+        self._header[page.ACTIVE_S] = monotonic()
+        try:
+            if isinstance(device, SimulatedDevice):
+                self._simulate(device)
+            elif (sample := device.read()) is not None:
+                self._take(sample)
+        except BaseException as error:  # noqa: BLE001 - a driver may raise anything
+            self._fail("read", error)
+            return False
+        return True
+
+    def _simulate(self, device: SimulatedDevice) -> None:
+        """Take what a device that follows simulated time gives by now; before that runs, what it gives at 0."""
+        time = self._records.time
+        now_s = monotonic()
+        t_s = time.at(now_s) if time.is_known else 0.0
+        for _ in range(BURST_MAX):
+            sample = device.sample_at(max(t_s, 0.0))
+            if sample is not None:
+                self._take(
+                    dataclasses.replace(sample, taken_s=now_s - (max(t_s, 0.0) - sample.taken_s))
+                )
+            next_s = device.next_s()
+            if next_s is None or next_s > t_s:
+                return
+
+    def _take(self, sample: Any) -> None:
+        self._intake.take(sample, monotonic(), ahead_s=self._period_s)
+        self._failures = 0
+        if (due_s := self._intake.faults.next_due_s()) != math.inf:
+            self._held_timer.reschedule(due_s)
+
+    def _held_due(self) -> None:
+        self._intake.tell_held(monotonic())
+        self._held_timer.reschedule(self._intake.faults.next_due_s())
+
+    # Writing ------------------------------------------------------------------------------------
+
+    def _hear(self, agent: str, end: socket.socket) -> None:
+        for word, *rest in messages.receive_all(end):
+            try:
+                if word == messages.WRITE:
+                    self._take_write(agent, *rest)
+                elif word == messages.TIME:
+                    self._take_time()
+                elif word == messages.FAULT:
+                    self._take_fault(end, *rest)
+            except (PluginError, TypeError, ValueError) as error:
+                self._refuse(f"{agent}: {error}")
+
+    def _take_time(self) -> None:
+        told = self._seat.page.time.read()
+        if told is not None:
+            self._records.set_time(*told)
+
+    def _take_write(self, agent: str, name: str, value: Any, due_s: float) -> None:
+        """
+        Let a value wait until it is due.
+
+        Raises:
+            PluginError: The agent may not, or it is no value of an output.
+        """
+        channel = self._channels.get(name)
+        if channel is None or channel.direction != "out":
+            raise PluginError(f"{name!r} is no output of the device")
+        if agent != self._launch.owner:
+            raise PluginError(f"{name}: its owner is {self._launch.owner or 'nobody'}")
+        if not self._launch.may_move:
+            raise PluginError(f"{name}: outputs may not move here ({self._launch.why_not})")
+        value, was_beyond = to_output(channel, value)
+        self._intake.count(f"{name}_limited", int(was_beyond))
+        replaced = self._pending.replaced
+        if not self._pending.add(channel, value, float(due_s)):
+            raise PluginError(f"{name}: too many values wait for their time")
+        self._intake.count("writes_replaced", self._pending.replaced - replaced)
+        self._write_timer.reschedule(max(self._pending.next_due_s(), 0.0))
+
+    def _write_due(self) -> None:
+        device = self._device
+        if device is None:
+            # What is due while the device is gone is not put out late.
+            self._intake.count("writes_lost", len(self._pending.due(monotonic())))
+        else:
+            for write in self._pending.due(monotonic()):
+                channel = self._channels[write.channel]
+                value = write.value if channel.is_frame else from_numbers(channel, write.value)
+                self._header[page.ACTIVE_S] = monotonic()
+                self._header[page.MOVED] = 1.0
+                try:
+                    device.write({write.channel: value}, write.due_s)
+                except BaseException as error:  # noqa: BLE001 - a driver may raise anything
+                    self._fail("write", error)
+                    return
+                told = (len(value), value.hex()) if channel.is_frame else write.value
+                self._records.written(write.channel, write.due_s, monotonic(), told)
+        self._write_timer.reschedule(self._pending.next_due_s())
+
+    def owner_gone(self) -> None:
+        """Make outputs safe: the agent that moves them has ended, and what it last said is not carried out."""
+        if (end := self._seat.users.get(self._launch.owner)) is not None:
+            late = sum(word == messages.WRITE for word, *_ in messages.receive_all(end))
+            self._intake.count("writes_lost", late)
+        if self._device is not None:
+            self._make_safe(self._device)
+
+    # Faults, state ------------------------------------------------------------------------------
+
+    def _take_fault(
+        self, end: socket.socket, number: int, action: str, value: float | None
+    ) -> None:
+        """Put a fault in force that an agent orders for the host, and answer."""
+        refusal = self.insert_fault(action, value)
+        if not refusal:
+            self.tell_fault(action, value)
+        messages.send(end, [messages.ANSWER, number, refusal])
+
+    def insert_fault(self, action: str, value: float | None) -> str:
+        """Put a fault in force, or clear all, and return why not, else ""; see `InsertedFaults`."""
+        try:
+            self._intake.faults.insert(action, value)
+        except MadnsError as error:
+            self._refuse(str(error))
+            return str(error)
+        self._records.event("fault", monotonic(), action=action, value=value)
+        if self._intake.faults.is_disconnected:
+            self._close_device()
+        elif self._device is None:
+            self._open_timer.reschedule(monotonic())
+        return ""
+
+    def _tell_state(self) -> None:
+        now_s = monotonic()
+        details: Mapping[str, Any] = {}
+        header = self._header
+        silent_s = now_s - max(header[page.ARRIVED_S], header[page.OPENED_S])
+        if self._device is not None and silent_s > self._hang_s:
+            self._fail("read", MachineError(f"no sample within {self._hang_s:g} s"))
+        if self._device is not None:
+            try:
+                details = self._device.health()
+            except BaseException as error:  # noqa: BLE001 - a driver may raise anything
+                self._fail("health", error)
+        counts = int(self._header[page.SAMPLES]), int(self._header[page.ERRORS])
+        with contextlib.suppress(PluginError):  # details that JSON cannot carry
+            self._records.state(now_s, counts, self._late_us_max, details)
+        self._late_us_max = 0
+        self._check_memory()
+        estimate = self._intake.clock.estimate()
+        if estimate is not None:
+            self._records.clock(now_s, estimate.offset_s, estimate.drift_ppm)
+        self._state_timer.reschedule(now_s + STATE_PERIOD_S)
+
+    def _tell_alive(self) -> None:
+        """Note that the loop turns, also while the device is closed: who hangs does not come here."""
+        self._header[page.ACTIVE_S] = now_s = monotonic()
+        self._alive_timer.reschedule(now_s + self._hang_s / 4)
+
+    def _refuse(self, why: str) -> None:
+        self._intake.count("refused", 1)
+        self._intake.event("refused", monotonic(), why=why)

@@ -1,0 +1,100 @@
+"""
+Status of a device as its users see it, and when its process is given up. Pure: times go in, words come out.
+
+*never*: open, no sample yet. *ok*. *stale*: the newest sample is older than 3 periods, and than 0.1 s.
+*lost*: no sample for 10 periods and 1 s, closed, or *never* for that long.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from madns_runtime.plugin.device_view import DeviceStatus
+
+STALE_PERIODS = 3.0
+STALE_S_MIN = 0.1
+LOST_PERIODS = 10.0
+LOST_S_MIN = 1.0
+BACK_OFF_S_MIN = 0.1
+BACK_OFF_S_MAX = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class StatusLimits:
+    """Ages from which a device counts as stale, as lost, and as hung, s."""
+
+    stale_s: float
+    lost_s: float
+    hang_s: float
+
+    @classmethod
+    def of(cls, period_s: float, hang_s: float) -> StatusLimits:
+        """Return the limits of a device that is read every *period_s* seconds."""
+        return cls(
+            stale_s=max(STALE_PERIODS * period_s, STALE_S_MIN),
+            lost_s=max(LOST_PERIODS * period_s, LOST_S_MIN),
+            hang_s=max(hang_s, LOST_PERIODS * period_s),
+        )
+
+    def status(
+        self, age_s: float, *, silent_s: float, waited_s: float, is_open: bool
+    ) -> DeviceStatus:
+        """
+        Return the status.
+
+        Args:
+            age_s: Time since the newest sample was taken; infinite if there is none.
+            silent_s: Time since a sample last arrived: a slow read brings samples that are old already.
+            waited_s: Time since the device was opened, s.
+            is_open: Whether it is open.
+        """
+        if not is_open:
+            return "lost"
+        if math.isinf(age_s):
+            return "never" if waited_s <= self.lost_s else "lost"
+        if age_s <= self.stale_s:
+            return "ok"
+        return "stale" if silent_s <= self.lost_s else "lost"
+
+
+def back_off_s(failures: int) -> float:
+    """Return how long to wait before a device is opened anew, s, after so many failures in a row."""
+    return min(BACK_OFF_S_MAX, BACK_OFF_S_MIN * 2.0 ** max(0, min(failures, 10) - 1))
+
+
+@dataclass(slots=True)
+class StatusAccount:
+    """What a device's statuses came to over a run: what its checks are judged by."""
+
+    status: DeviceStatus = "never"
+    since_s: float = 0.0
+    """Time from which it is so, s."""
+    seconds: dict[DeviceStatus, float] = field(
+        default_factory=lambda: {"never": 0.0, "ok": 0.0, "stale": 0.0, "lost": 0.0}
+    )
+    times_lost: int = 0
+    counted_s: float | None = None
+    """Up to here time has been counted; None before simulated time runs."""
+
+    def observe(self, status: DeviceStatus, now_s: float) -> DeviceStatus | None:
+        """Note the status at *now_s*, and return the one before if it has changed."""
+        if self.counted_s is not None:
+            self.seconds[self.status] += max(0.0, now_s - self.counted_s)
+            self.counted_s = now_s
+        if status == self.status:
+            return None
+        before, self.status, self.since_s = self.status, status, now_s
+        if status == "lost" and self.counted_s is not None:
+            self.times_lost += 1
+        return before
+
+    def begin(self, now_s: float) -> None:
+        """Count from now on: simulated time runs. A device that is lost by now is a loss."""
+        self.counted_s = now_s
+        self.times_lost = int(self.status == "lost")
+
+    def stale_ratio(self) -> float | None:
+        """Return the share of time in which its newest sample was stale, or there was none; None if no time passed."""
+        total_s = sum(self.seconds.values())
+        return (total_s - self.seconds["ok"]) / total_s if total_s > 0 else None

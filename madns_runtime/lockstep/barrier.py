@@ -1,0 +1,271 @@
+"""
+The wait of a lockstep run's host for its workers; the operator is heard meanwhile.
+
+Whatever ends a run before its time, wherever it is noticed, is noted as its ending; whoever waits
+then raises RunEnds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from time import monotonic
+from typing import Any, NoReturn
+
+from madns_runtime.config import HostLaunch
+from madns_runtime.lockstep import frames
+from madns_runtime.lockstep.clock import SimulatedClock
+from madns_runtime.lockstep.frames import encode_frame
+from madns_runtime.lockstep.result import EarlyEnd, RunAccount
+from madns_runtime.lockstep.workers import WorkerProcess, Workers
+from madns_runtime.reactor.operator_link import OPERATOR_GONE, OperatorLink
+from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.timing.granted_clock import GrantedLimit, is_stopped
+
+PROGRESS_INTERVAL_S = 0.5
+"""Between two reports to the operator, and two looks for who is late."""
+SERVE_INTERVAL_S = 0.2
+"""A host that is busy with its own half hears the operator this often."""
+SERVE_WAIT_S = 0.001
+"""So long; a timer that is due at once would stop the loop before it has looked."""
+STACK_HINT = "host/stderr.txt shows where it hung"
+
+
+class RunEnds(Exception):
+    """The run cannot go on; why is noted."""
+
+
+class Meeting:
+    """
+    The workers, the operator, and the loop in which both are heard.
+
+    Args:
+        launch: The run.
+        crew: The workers.
+        account: Where what they say is noted.
+        clock: Simulated time.
+        fds: Where the operator's commands come from and events go to.
+        pending: What had already come behind the launch document.
+    """
+
+    def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
+        self,
+        launch: HostLaunch,
+        crew: Workers,
+        *,
+        account: RunAccount,
+        clock: SimulatedClock,
+        fds: tuple[int, int],
+        pending: bytes,
+    ) -> None:
+        self._timeouts = launch.config.timeouts
+        self._crew = crew
+        self._account = account
+        self._clock = clock
+        self.reactor = Reactor()
+        self.operator = OperatorLink(
+            self.reactor,
+            fds,
+            on_command=self._command,
+            on_gone=lambda: self.end("operator", OPERATOR_GONE, status="aborted"),
+            pending=pending,
+            is_detached=launch.is_detached,
+        )
+        crew.listen(self.reactor, on_frame=self._said, on_lost=self._worker_lost)
+        self.is_open = True
+        """Whether an ending would be news."""
+        self.ending: EarlyEnd | None = None
+        """Why the run ends before its time, if it does."""
+        self._late: tuple[GrantedLimit, Callable[[], EarlyEnd]] | None = None
+        self._served_s = monotonic()
+        self._progress_timer = self.reactor.call_at(0.0, self._progress)
+
+    # Endings --------------------------------------------------------------------------------------
+
+    def end(self, who: str, reason: str, *, status: str = "failed") -> None:
+        """End the run as soon as its script waits; the first cause stands."""
+        self._note(EarlyEnd(who=who, reason=reason, status=status))
+
+    def fail(self, who: str, reason: str) -> NoReturn:
+        """
+        End the run at once.
+
+        Raises:
+            RunEnds: Always.
+        """
+        self.end(who, reason)
+        raise RunEnds
+
+    def _note(self, ending: EarlyEnd) -> None:
+        if self.is_open:
+            self.ending = self.ending or ending
+        self.reactor.stop()
+
+    # Waiting --------------------------------------------------------------------------------------
+
+    def exchange(self, order: tuple[int, ...], boxes: list[list[tuple[int, bytes]]]) -> None:
+        """
+        Give every worker *order* and what waits for its agents, and wait until all have answered.
+
+        Raises:
+            RunEnds: One of them cannot, or something else ends the run.
+        """
+        for worker, box in zip(self._crew.workers, boxes, strict=True):
+            self.order(worker, *order, box)
+            box.clear()
+        self.await_all(self._timeouts.tick_s)
+
+    def order(self, worker: WorkerProcess, *parts: Any) -> None:
+        """
+        Give one worker an order, without waiting for the answer.
+
+        Raises:
+            RunEnds: It does not read.
+        """
+        limit_s = self._timeouts.tick_s
+        try:
+            self._crew.order(worker, encode_frame(*parts), limit_s)
+        except TimeoutError:
+            self._note(self._blame(worker, limit_s, "does not read"))
+            raise RunEnds from None
+
+    def await_all(self, limit_s: float, late: str = "has not answered") -> None:
+        """
+        Wait until every worker has answered; *late* says what one has not done.
+
+        Raises:
+            RunEnds: One of them cannot, or something else ends the run.
+        """
+        self.wait(lambda: self._crew.awaited is None, limit_s, partial(self._blame, late=late))
+        for answer in self._crew.answers():
+            if answer[0] == frames.FAILED:
+                self.fail(self._account.names[answer[1]], answer[2])
+
+    def wait(
+        self, is_done: Callable[[], bool], limit_s: float, late: Callable[..., EarlyEnd]
+    ) -> None:
+        """
+        Wait in the loop.
+
+        Args:
+            is_done: Asked whenever something has happened.
+            limit_s: How long; time spent waiting for a processor does not count.
+            late: Called then with the first worker that is awaited (or None) and *limit_s*.
+
+        Raises:
+            RunEnds: The time is over, or something else ends the run.
+        """
+        self._late = (GrantedLimit(limit_s), lambda: late(self._crew.awaited, limit_s))
+        while self.ending is None and not is_done():
+            self.reactor.run()
+        self._late = None
+        self._served_s = monotonic()
+        if self.ending is not None:
+            raise RunEnds
+
+    def serve(self) -> None:
+        """
+        Hear the operator if that was long ago, and hardly wait.
+
+        Raises:
+            RunEnds: The run is to end.
+        """
+        if monotonic() - self._served_s < SERVE_INTERVAL_S:
+            return
+        self.reactor.call_at(monotonic() + SERVE_WAIT_S, self.reactor.stop)
+        self.reactor.run()
+        self._served_s = monotonic()
+        if self.ending is not None:
+            raise RunEnds
+
+    def messages(self) -> Iterator[tuple[int, int, bytes]]:
+        """Yield what the agents sent: whose it is, its class of service, its body."""
+        for worker in self._crew.workers:
+            if worker.answer is not None:
+                self._account.note_values(worker.agents, worker.answer[2])
+                yield from worker.answer[1]
+
+    def stop_workers(self, reason: str | None) -> tuple[str, ...]:
+        """Have all close their records and end; return the agents of which there is no word that they did."""
+        self.is_open, self.ending = False, None
+        limit_s = self._timeouts.shutdown_s
+        self._crew.stop(reason, limit_s)
+        # Each agent's word gives the next as long again.
+        self._late = (GrantedLimit(limit_s), lambda: EarlyEnd(who="", reason=""))
+        while self._is_in_time() and not self._crew.have_all_ended:
+            self.reactor.run()
+        self._crew.end_left()
+        agents = zip(self._account.names, self._account.agents, strict=True)
+        return tuple(name for name, account in agents if account.state != "stopped")
+
+    def _is_in_time(self) -> bool:
+        return self._late is not None
+
+    # What is heard --------------------------------------------------------------------------------
+
+    def _said(self, worker: WorkerProcess, frame: list[Any]) -> None:
+        kind = frame[0]
+        if kind == frames.CLOSED:
+            account = self._account.agents[frame[1]]
+            account.records, account.state = frame[2], "stopped"
+            if self._late is not None:
+                self._late = (GrantedLimit(self._timeouts.shutdown_s), self._late[1])
+            return
+        if kind == frames.FAILED and worker.answer is not None:  # it was not asked
+            self.end(self._account.names[frame[1]], frame[2])
+        worker.answer = frame
+        if self._crew.awaited is None:
+            self.reactor.stop()
+
+    def _worker_lost(self, worker: WorkerProcess, how: str) -> None:
+        self.reactor.stop()
+        if not self.is_open:
+            return
+        number, method = worker.at
+        where = f" in the agent's {method}" if method else ""
+        reason = f"{self._process(worker)} {how}{where}{self.when()}"
+        self._lose(worker, reason)
+        self.end(self._account.names[number], reason)
+
+    def _command(self, command: Mapping[str, Any]) -> None:
+        if command.get("command") == "stop":
+            reason = str(command.get("reason", "stopped by the operator"))
+            self.end("operator", reason, status=str(command.get("status", "interrupted")))
+        else:
+            self.operator.refuse(command)
+
+    def _progress(self) -> None:
+        now_s = monotonic()
+        self._progress_timer = self.reactor.call_at(now_s + PROGRESS_INTERVAL_S, self._progress)
+        self.operator.emit(self._account.progress(self._clock.t_s, now_s))
+        if self._late is not None and self._late[0].is_over():
+            late, self._late = self._late[1], None
+            self._note(late())
+
+    # Blame ----------------------------------------------------------------------------------------
+
+    def _blame(self, worker: WorkerProcess | None, limit_s: float, late: str) -> EarlyEnd:
+        """Return who of a worker that does not answer is to blame, and end it."""
+        assert worker is not None, "somebody is awaited"
+        number, method = worker.at
+        what = f"the agent's {method} has not returned" if method else ""
+        what = what or f"{self._process(worker)} {late}"
+        stopped = " (it is stopped)" if is_stopped(worker.pid) else ""
+        reason = f"{what} within {limit_s:g} s{self.when()}{stopped}; {STACK_HINT}"
+        self._crew.tell_stack(worker)
+        self._lose(worker, reason)
+        return EarlyEnd(who=self._account.names[number], reason=reason)
+
+    def _lose(self, worker: WorkerProcess, reason: str) -> None:
+        for number in worker.agents:
+            self._account.lost[self._account.names[number]] = reason
+
+    def _process(self, worker: WorkerProcess) -> str:
+        names, agents = self._account.names, worker.agents
+        first, last = names[agents[0]], names[agents[-1]]
+        whose = first if len(agents) == 1 else f"{first} to {last}"
+        return f"the process of {whose} (pid {worker.pid})"
+
+    def when(self) -> str:
+        """Return words for the simulated time, if it has begun."""
+        return "" if self._account.began_s is None else f", at t = {self._clock.t_s:g} s"

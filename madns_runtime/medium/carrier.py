@@ -1,0 +1,165 @@
+"""
+The host's side of messages between agents: keeps what is on its way, and the account. Pure.
+
+    sent = delivered + lost + refused + in_flight + undelivered
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+from madns_runtime.errors import MessageTooLarge, PluginError
+from madns_runtime.medium.outcomes import (
+    DELIVERED,
+    LOST,
+    LinkOutcome,
+    Medium,
+    MessageAccount,
+)
+from madns_runtime.protocol.link_settings import SendQueueFull
+from madns_runtime.protocol.messages import Delivery, Transmission, TransmissionRefusal
+
+LEAD_S: Final = 1.0
+"""Lead of the hand-over before the arrival, s: far more than a network takes."""
+
+
+class Carrier:
+    """
+    Messages between agents, from the host's knowledge of them to their receivers.
+
+    Args:
+        agents: Names of all agents.
+        post: Sends to an agent; returns whether it is there.
+        now_s: Returns the simulated time, s.
+    """
+
+    def __init__(
+        self,
+        agents: Sequence[str],
+        post: Callable[[str, Delivery | TransmissionRefusal], bool],
+        now_s: Callable[[], float],
+    ) -> None:
+        self.medium: Medium | None = None
+        self._agents = frozenset(agents)
+        self._post = post
+        self._now_s = now_s
+        self._accounts: dict[str, MessageAccount] = {}
+        self._serial = 0
+        # Bounded by senders, their queues and the receivers: a message waits at most for its queue.
+        self._heap: list[tuple[float, str, int, int, str, Delivery, MessageAccount]] = []
+
+    def account(self, channel: str = "") -> MessageAccount:
+        """Return what became of the messages of a channel."""
+        return self._accounts.setdefault(channel, MessageAccount())
+
+    def enter(
+        self,
+        sender: str,
+        transmission: Transmission,
+        outcomes: Sequence[LinkOutcome],
+    ) -> None:
+        """
+        See to what becomes of a message, of an agent or of a place such as a ground station.
+
+        Raises:
+            PluginError: There is no outcome, or one is impossible.
+        """
+        if not isinstance(outcomes, (list, tuple)) or not all(
+            isinstance(outcome, LinkOutcome) for outcome in outcomes or (None,)
+        ):
+            raise PluginError(f"{outcomes!r:.200}: expected a list of one or more LinkOutcome")
+        now_s = self._now_s()
+        self.account(outcomes[0].channel).transmissions += 1
+        for outcome in outcomes:
+            account = self.account(outcome.channel)
+            account.enter(_checked(outcome, transmission), now_s)
+            if outcome.arrives_s is not None:
+                self._keep(sender, transmission, outcome, account)
+            elif outcome.outcome != LOST and sender in self._agents:
+                number, to, sent_s = transmission.number, transmission.to, transmission.sent_s
+                self._send(sender, TransmissionRefusal(number, to, sent_s, outcome.outcome))
+
+    def hand_over(self) -> None:
+        """Send on what arrives up to LEAD_S from now on, in order of arrival."""
+        heap, t_s = self._heap, self._now_s()
+        # As `next_s` rounds it: what it promises is there.
+        while heap and heap[0][0] - LEAD_S <= t_s:
+            *_, to, delivery, account = heapq.heappop(heap)
+            account.in_flight -= 1
+            account.handed_over += 1
+            account.undelivered += not self._send(to, delivery)
+
+    def next_s(self) -> float | None:
+        """Return when `hand_over` has something next, which may be over already; None: nothing is on its way."""
+        return self._heap[0][0] - LEAD_S if self._heap else None
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the account of all channels together; without a message, nothing."""
+        accounts = self._accounts.values()
+        outcomes: Counter[str] = sum((account.outcomes for account in accounts), Counter())
+        if not outcomes:
+            return {}
+        delivered, lost = outcomes.pop(DELIVERED, 0), outcomes.pop(LOST, 0)
+        total = {
+            name: sum(getattr(account, name) for account in accounts)
+            for name in ("transmissions", "sent", "in_flight", "undelivered", "heard_late")
+        }
+        return {
+            "transmissions": total["transmissions"],
+            "sent": total["sent"],
+            "delivered": delivered - total["in_flight"] - total["undelivered"],
+            "lost": lost,
+            "refused": sum(outcomes.values()),
+            "refused_because": dict(sorted(outcomes.items())),
+            "in_flight": total["in_flight"],
+            "undelivered": total["undelivered"],
+            "known_late": total["heard_late"],
+        }
+
+    def _keep(
+        self,
+        sender: str,
+        transmission: Transmission,
+        outcome: LinkOutcome,
+        account: MessageAccount,
+    ) -> None:
+        """Keep a message until shortly before it arrives; one for a place that is no agent has arrived there."""
+        if outcome.to not in self._agents or outcome.arrives_s is None:
+            return
+        sent_s, arrives_s = transmission.sent_s, outcome.arrives_s
+        delivery = Delivery(sender, sent_s, arrives_s, transmission.payload)
+        self._serial += 1
+        account.in_flight += 1
+        entry = (
+            arrives_s,
+            sender,
+            transmission.number,
+            self._serial,
+            outcome.to,
+            delivery,
+            account,
+        )
+        heapq.heappush(self._heap, entry)
+
+    def _send(self, to: str, message: Delivery | TransmissionRefusal) -> bool:
+        try:
+            return self._post(to, message)
+        except (SendQueueFull, MessageTooLarge):
+            return False
+
+
+def _checked(outcome: LinkOutcome, transmission: Transmission) -> LinkOutcome:
+    """Return an outcome that is possible: what is delivered arrives, and later than it was sent."""
+    arrives_s = outcome.arrives_s
+    if (outcome.outcome == DELIVERED) != (arrives_s is not None) or not (
+        arrives_s is None or transmission.sent_s < arrives_s < math.inf
+    ):
+        raise PluginError(
+            f"{outcome.outcome!r} with arrives_s {arrives_s!r}: expected a message that is {DELIVERED!r} to"
+            f" arrive later than it was sent, at {transmission.sent_s:g} s, and no other to arrive"
+        )
+    return outcome

@@ -1,0 +1,176 @@
+"""
+Dataclasses as plain mappings, lists and scalars, and back: how what a person wrote travels to host and agents.
+
+What a field may be is written down in `madns_runtime.plugin.parameter_kinds`; docs/plugins.md says it to people.
+"""
+
+from __future__ import annotations
+
+import collections.abc
+import dataclasses
+import functools
+import types
+import typing
+from collections.abc import Mapping
+from enum import Enum
+from pathlib import Path, PurePath
+from typing import Annotated, Any, Literal, TypeVar
+
+from madns_runtime.errors import ConfigurationError
+
+T = TypeVar("T")
+CLASSES_KEPT = 256
+"""Of how many dataclasses the types are kept: to evaluate them takes longer than to build a small object."""
+MAPPINGS = (dict, Mapping, collections.abc.MutableMapping)
+
+
+def to_mapping(value: Any) -> dict[str, Any]:
+    """Return a dataclass, or a mapping of such, as plain mappings, lists and scalars."""
+    return typing.cast("dict[str, Any]", _plain(value))
+
+
+def mapping_at(mapping: Mapping[str, Any] | None, *keys: str) -> Mapping[str, Any]:
+    """Return the mapping under nested keys; an empty one if any is missing or something else."""
+    value: Any = mapping
+    for key in keys:
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return value if isinstance(value, Mapping) else {}
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, Enum):
+        return _plain(value.value)
+    if isinstance(value, PurePath):
+        return str(value)
+    return value
+
+
+def from_mapping(cls: type[T], mapping: Mapping[str, Any], where: str = "") -> T:
+    """
+    Build a dataclass from plain mappings, as the peer's `to_mapping` wrote them.
+
+    Checks names, presence and plain types, not bounds: those were checked where the file was read.
+    A dataclass whose keys were named otherwise tells them in `__old_keys__` (old to new), and is read from either.
+
+    Raises:
+        ConfigurationError: A key is unknown or missing, or a value has another type; the message
+            gives the dotted path.
+    """
+    value = _build(cls, mapping, where or cls.__name__)
+    return typing.cast("T", value)
+
+
+def _build(expected: Any, value: Any, where: str) -> Any:
+    origin = typing.get_origin(expected)
+    if origin is Annotated:
+        return _build(typing.get_args(expected)[0], value, where)
+    if dataclasses.is_dataclass(expected):
+        return _build_dataclass(typing.cast("type", expected), value, where)
+    if origin in (typing.Union, types.UnionType):
+        return _build_union(expected, value, where)
+    if origin is Literal:
+        return _build_literal(typing.get_args(expected), value, where)
+    if (origin or expected) in (tuple, list):
+        return _build_list(expected, value, where)
+    if (origin or expected) in MAPPINGS:
+        return _build_mapping(expected, value, where)
+    if expected is Any:
+        return value
+    return _build_scalar(origin or expected, value, where)
+
+
+def _build_literal(options: tuple[Any, ...], value: Any, where: str) -> Any:
+    for option in options:
+        if type(option) is type(value) and option == value:
+            return option
+    raise ConfigurationError(f"{where}: expected one of {options}, got {value!r}")
+
+
+def _build_list(expected: Any, value: Any, where: str) -> Any:
+    if not isinstance(value, list | tuple):
+        raise ConfigurationError(f"{where}: expected a list, got {value!r}")
+    kind = typing.get_origin(expected) or expected
+    arguments = typing.get_args(expected)
+    if kind is tuple and arguments and arguments[-1] is not ...:  # tuple[float, float, float]
+        if len(value) != len(arguments):
+            raise ConfigurationError(f"{where}: expected {len(arguments)} items, got {len(value)}")
+        items = arguments
+    else:
+        items = (arguments[0] if arguments else Any,) * len(value)
+    pairs = zip(items, value, strict=True)
+    return kind(_build(item, v, f"{where}[{i}]") for i, (item, v) in enumerate(pairs))
+
+
+def _build_mapping(expected: Any, value: Any, where: str) -> Any:
+    if not isinstance(value, Mapping):
+        raise ConfigurationError(f"{where}: expected a mapping, got {value!r}")
+    arguments = typing.get_args(expected)
+    item = arguments[1] if len(arguments) > 1 else Any
+    return {key: _build(item, inner, f"{where}.{key}") for key, inner in value.items()}
+
+
+def _build_scalar(kind: type, value: Any, where: str) -> Any:
+    if issubclass(kind, Enum):
+        for member in kind:
+            if type(member.value) is type(value) and member.value == value:
+                return member
+        known = ", ".join(str(member.value) for member in kind)
+        raise ConfigurationError(f"{where}: expected one of {known}, got {value!r}")
+    if issubclass(kind, PurePath) and isinstance(value, str):
+        return Path(value) if kind is Path else kind(value)
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if not isinstance(value, kind) or (isinstance(value, bool) and kind is int):
+        raise ConfigurationError(f"{where}: expected {kind.__name__}, got {value!r}")
+    return value
+
+
+def _build_union(expected: Any, value: Any, where: str) -> Any:
+    """Build the member that is exactly of the value's type, else the first that can be built."""
+    failures = []
+    options = typing.get_args(expected)
+    if type(value) in options:  # 3 of `float | int` is no 3.0, and "a" of `Path | str` no path
+        options = (type(value), *options)
+    for option in options:
+        if option is type(None):
+            if value is None:
+                return None
+            continue
+        try:
+            return _build(option, value, where)
+        except ConfigurationError as error:
+            failures.append(str(error))
+    raise ConfigurationError("; or ".join(failures) or f"{where}: unexpected {value!r}")
+
+
+@functools.lru_cache(maxsize=CLASSES_KEPT)
+def _hints_of(cls: type) -> dict[str, Any]:
+    return typing.get_type_hints(cls, include_extras=True)
+
+
+def _build_dataclass(cls: type, value: Any, where: str) -> Any:
+    if not isinstance(value, Mapping):
+        raise ConfigurationError(f"{where}: expected a mapping, got {value!r}")
+    old_keys: Mapping[str, str] = getattr(cls, "__old_keys__", {})
+    value = {old_keys.get(key, key): item for key, item in value.items()}
+    hints = _hints_of(cls)
+    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
+    unknown = sorted(set(value) - set(fields))
+    if unknown:
+        raise ConfigurationError(f"{where}: unknown {', '.join(unknown)}")
+    missing = [
+        name
+        for name, f in fields.items()
+        if name not in value
+        and f.default is dataclasses.MISSING
+        and f.default_factory is dataclasses.MISSING
+    ]
+    if missing:
+        raise ConfigurationError(f"{where}: missing {', '.join(missing)}")
+    return cls(**{k: _build(hints[k], v, f"{where}.{k}") for k, v in value.items()})

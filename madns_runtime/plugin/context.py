@@ -1,0 +1,210 @@
+"""Contexts of plug-ins: the implementation of those that `plugin.api` declares."""
+
+from __future__ import annotations
+
+import math
+import traceback
+import zlib
+from collections.abc import Callable, Container, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from madns_runtime.config import RunConfig
+from madns_runtime.errors import (
+    BlamedError,
+    ConfigurationError,
+    MissingExtraError,
+    PluginError,
+)
+from madns_runtime.medium.carrier import Carrier
+from madns_runtime.medium.mailbox import Mailbox
+from madns_runtime.plugin.device_view import DeviceView
+from madns_runtime.protocol.messages import Service
+from madns_runtime.recording.records import FRAMEWORK_STREAMS, Field, StreamSchema
+from madns_runtime.recording.run_journal import RunJournal
+
+TEXT_CHARACTERS_MAX = 2000
+"""Of what a plug-in's exception says; the whole is in the log."""
+
+
+class Sender(Protocol):
+    """Way of a context's `send` to the session."""
+
+    def __call__(
+        self,
+        to: str,
+        message: Any,
+        service: Service = Service.RELIABLE,
+        *,
+        deadline_s: float | None = None,
+    ) -> int | None:
+        """Send *message*; see `plugin.api.Context.send`."""
+
+
+class HalfState(Protocol):
+    """State of the host's half that its context tells."""
+
+    lateness_s: float
+    carrier: Carrier
+
+
+class RunContext:
+    """
+    Either half's view of the run.
+
+    Args:
+        name: host, or the agent's name.
+        config: The run.
+        parameters: The simulation's, parsed.
+        journal: What it logs to; its streams go beside.
+        now_s: Returns the simulated time.
+        send: Takes messages.
+    """
+
+    def __init__(  # noqa: PLR0913 - the collaborators of a seam, all keyword-only
+        self,
+        *,
+        name: str,
+        config: RunConfig,
+        parameters: Any,
+        journal: RunJournal,
+        now_s: Callable[[], float],
+        send: Sender,
+    ) -> None:
+        self.name = name
+        self.is_lockstep = config.time.is_lockstep
+        self.agents = config.agents.resolved_names()
+        self.workers = config.executor.workers
+        self.parameters = parameters
+        self.tick_hz = config.agents.tick_hz
+        self.duration_s = config.time.duration_s
+        self.base_directory = Path(config.base_directory)
+        self.random = np.random.default_rng([config.seed, zlib.crc32(name.encode())])
+        self.now_s = now_s
+        # The framework's own methods, without a layer between: they are called every tick.
+        recorder = journal.recorder
+        self.record = recorder.record
+        self.send = send
+        self.keep_text = recorder.keep_text
+        self._recorder = recorder
+        self._journal = journal
+
+    def open_stream(self, name: str, fields: Sequence[Field]) -> None:
+        """Declare a record stream; see `plugin.api.Context.open_stream`."""
+        if name in FRAMEWORK_STREAMS:
+            raise PluginError(f"stream {name!r} belongs to the framework; choose another name")
+        self._recorder.open_stream(StreamSchema(name, tuple(fields)))
+
+    def log(self, level: str, text: str) -> None:
+        """Log a sentence; see `plugin.api.Context.log`."""
+        self._journal.log(level, text, self.now_s())
+
+
+class PeerContext(RunContext):
+    """An agent's view: it can also send to other agents."""
+
+    def __init__(
+        self, *, mailbox: Mailbox, hardware: Mapping[str, DeviceView], **of_every_half: Any
+    ) -> None:
+        super().__init__(**of_every_half)
+        self.hardware = hardware
+        self.transmit = mailbox.transmit
+        self.message_counts = mailbox.counts
+
+
+class JobContext(RunContext):
+    """The host's view: it can also hand long work to the executor, and knows of messages between agents."""
+
+    def __init__(
+        self,
+        *,
+        half: HalfState,
+        submit: Callable[..., int],
+        wake: Callable[[float], None],
+        **of_every_half: Any,
+    ) -> None:
+        super().__init__(**of_every_half)
+        self._half = half
+        self.submit = submit
+        self.wake = wake
+        self.enter = half.carrier.enter
+        self.account = half.carrier.account
+
+    @property
+    def timer_lateness_s(self) -> float:
+        """Delay of the timer's last call behind the time asked for; see `plugin.api.HostContext`."""
+        return self._half.lateness_s
+
+
+def check_sending(
+    to: str,
+    receivers: Container[str],
+    service: Service,
+    deadline_s: float | None,
+    *,
+    is_running: bool,
+) -> None:
+    """
+    Refuse what cannot be sent, or what nobody could keep account of.
+
+    Args:
+        to: The receiver.
+        receivers: Who there is.
+        service: The class of service.
+        deadline_s: Simulated time by which it must be there, s.
+        is_running: Whether simulated time has begun.
+
+    Raises:
+        PluginError: There is no such receiver or class of service, or the deadline is none.
+    """
+    if to not in receivers:
+        raise PluginError(
+            f"expected a receiver (an agent sends to 'host', the host to an agent's name), got {to!r}"
+        )
+    if not isinstance(service, Service):
+        raise PluginError(f"expected a Service, such as Service.RELIABLE, got {service!r}")
+    if deadline_s is None:
+        return
+    if service is not Service.SYNC:
+        raise PluginError(f"deadline_s goes with Service.SYNC, not with {service!r}")
+    if isinstance(deadline_s, bool) or not math.isfinite(deadline_s):
+        raise PluginError(f"deadline_s: expected a simulated time in seconds, got {deadline_s!r}")
+    if not is_running:
+        raise PluginError("deadline_s is simulated time, which has not begun")
+
+
+def describe_exception(error: BaseException, doing: str) -> str:
+    """
+    Return one line: which call of a plug-in raised what, and in which file and line.
+
+    The place is the innermost line of the plug-in's own folder, not that of a library which it called. Errors
+    that blame the user's file say all by themselves.
+
+    Args:
+        error: What was caught, one call above the plug-in.
+        doing: The call, such as FleetHost.setup.
+    """
+    if isinstance(error, BlamedError | ConfigurationError | MissingExtraError):
+        return clean_text(str(error))
+    frames = traceback.extract_tb(error.__traceback__)
+    place = ""
+    if frames:
+        home = Path(frames[min(1, len(frames) - 1)].filename).parent
+        own = [frame for frame in frames[1:] if _is_below(Path(frame.filename), home)]
+        frame = own[-1] if own else frames[-1]
+        place = f" ({Path(frame.filename).name}:{frame.lineno})"
+    text = f": {clean_text(str(error))}" if str(error) else ""
+    return f"{doing} raised {type(error).__name__}{text}{place}"
+
+
+def clean_text(text: str) -> str:
+    """Return *text* as a message and a record can carry it: no lone surrogates, and bounded."""
+    text = text.encode("utf-8", "backslashreplace").decode("utf-8")
+    return text if len(text) <= TEXT_CHARACTERS_MAX else f"{text[:TEXT_CHARACTERS_MAX]} [cut]"
+
+
+def _is_below(path: Path, home: Path) -> bool:
+    # A virtual environment may lie beside a plug-in.
+    return path.is_relative_to(home) and "site-packages" not in path.relative_to(home).parts

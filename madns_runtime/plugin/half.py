@@ -1,0 +1,318 @@
+"""
+A half of a simulation as the runtime calls it, in real time and in lockstep alike.
+
+What the author of a plug-in sees of a call is settled here: what it may return, how what it raised is
+told, what goes to the log, when the host half's timer is due. When a call is made is its caller's.
+"""
+
+from __future__ import annotations
+
+import math
+import traceback
+from collections.abc import Callable, Mapping
+from concurrent.futures import BrokenExecutor, Future
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from madns_runtime.config import RunConfig
+from madns_runtime.errors import MachineError, PluginError
+from madns_runtime.medium.carrier import Carrier
+from madns_runtime.medium.outcomes import NO_MEDIUM, LinkOutcome
+from madns_runtime.plugin import time_limit, validation
+from madns_runtime.plugin.api import AgentSimulation
+from madns_runtime.plugin.context import clean_text, describe_exception
+from madns_runtime.plugin.executor import WORKER_DIED, JobFailed
+from madns_runtime.plugin.host_calls import HostCalls
+from madns_runtime.plugin.registry import Role, load_function, load_half, parse_parameters, resolve
+from madns_runtime.processes import own_age_s
+from madns_runtime.protocol.messages import Transmission
+
+CHECKS: Final[Mapping[str, Callable[[Any], Any]]] = {
+    "initial_data": validation.initial_data,
+    "medium": validation.medium,
+    "timer": validation.next_time,
+    "finish": validation.summary,
+}
+"""Checks of what methods return, by method; values of other methods are not looked at."""
+REPEATS_MAX: Final = 100_000
+"""Calls of the timer, or jobs, at one simulated time; more means that the half never lets time go on."""
+
+
+READY_SHARE = 0.8
+"""Of timeouts.host_start_s, or timeouts.agents_ready_s, for loading."""
+LEFT_SHARE = 0.1
+"""Of that: a process that needed nearly all its time to start is still given so much to load."""
+
+
+class HalfFailed(PluginError):
+    """A half cannot go on; the text says which of its methods did what, and in which line."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoleProgram:
+    """The class and settings that one role runs, loaded once."""
+
+    make: Callable[[], Any]
+    """The half's class."""
+    parameters: Any
+    medium: Callable[[Any, Any], Any] | None = None
+    """Makes the medium of messages between agents; the host's alone, where there is one."""
+    has_medium: bool = False
+    """Whether the simulation declares one."""
+    columns: tuple[str, ...] = ()
+    """Fields whose newest values are told."""
+    life: int = 1
+    """Number of this process of an agent."""
+
+    @classmethod
+    def load(
+        cls, config: RunConfig, role: Role, tell: Callable[[str], None] = lambda doing: None
+    ) -> RoleProgram:
+        """
+        Import the half of *role* and parse the simulation's parameters.
+
+        Args:
+            config: The run.
+            role: Whose half.
+            tell: Told what is being done, and at last nothing: who hears no more of this process knows why.
+
+        Raises:
+            MadnsError: It cannot be found, does not load, or lacks a method of its contract.
+        """
+        base = Path(config.base_directory)
+        timeouts = config.timeouts
+        # A process that still loads when it is given up could not say what holds it; it was waited for from its start.
+        limit_s = timeouts.host_start_s if role == "host" else timeouts.agents_ready_s
+        limit_s *= READY_SHARE
+        if config.time.is_lockstep:  # where nobody gives up on whom a busy computer keeps waiting
+            time_limit.set_limit(min(timeouts.loading_s, limit_s))
+        else:
+            left_s = max(limit_s - own_age_s(), LEFT_SHARE * limit_s)
+            time_limit.set_limit(timeouts.loading_s, wall_limit_s=left_s)
+        tell(f"importing {config.simulation}")
+        descriptor = resolve(config.simulation, base)
+        tell(f"importing the {role}'s half of {config.simulation}")
+        make = load_half(descriptor, role, base)
+        tell(f"making the parameters of {config.simulation}")
+        parameters = parse_parameters(descriptor, config.parameters)
+        has_medium = descriptor.medium is not None
+        medium = None
+        if descriptor.medium is not None and role == "host":
+            tell(f"importing the medium of {config.simulation}")
+            medium = load_function(descriptor.medium, base)
+        tell("")
+        return cls(
+            make=make,
+            parameters=parameters,
+            medium=medium,
+            has_medium=has_medium,
+            columns=descriptor.columns,
+        )
+
+
+class Half:
+    """
+    One half, made and called.
+
+    Args:
+        make: Its class.
+        log: Takes level and text: the traceback of what a call raised.
+
+    Raises:
+        HalfFailed: It cannot be made.
+    """
+
+    def __init__(self, make: Callable[[], Any], log: Callable[[str, str], None]) -> None:
+        self._log = log
+        self.name: str = getattr(make, "__name__", "the simulation's half")
+        try:
+            self.simulation = make()
+        except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
+            traceback.print_exception(error)  # to stderr.txt: nobody records yet
+            raise HalfFailed(describe_exception(error, f"{self.name}.__init__")) from error
+
+    def call(self, name: str, *arguments: Any) -> Any:
+        """
+        Call a method, and return what it returned.
+
+        Raises:
+            HalfFailed: It raised, or returned something against its contract.
+        """
+        return self.run(name, None, *arguments)
+
+    def run(self, name: str, function: Callable[..., Any] | None, *arguments: Any) -> Any:
+        """
+        Call a function of the plug-in's, or without one the half's method *name*.
+
+        Raises:
+            HalfFailed: It raised, or returned something against its contract.
+        """
+        try:
+            value = (function or self._method(name))(*arguments)
+        except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
+            raise self.failure(name, error) from error
+        check = CHECKS.get(name)
+        if check is None:
+            return value
+        try:
+            return check(value)
+        except PluginError as error:
+            raise HalfFailed(f"{self.name}.{name} returned {clean_text(str(error))}") from error
+
+    def _method(self, name: str) -> Callable[..., Any]:
+        """Return a method; of an agent's half that does not inherit it, and lacks it, the one that it would inherit."""
+        own: Callable[..., Any] | None = getattr(self.simulation, name, None)
+        return own or partial(getattr(AgentSimulation, name), self.simulation)
+
+    def failure(self, name: str, error: BaseException) -> HalfFailed:
+        """Return what to raise, or to tell, of an error that a method raised; its traceback is logged."""
+        if isinstance(error, MachineError):  # a full disk: no fault of the plug-in's
+            return HalfFailed(clean_text(str(error)))
+        self._log("critical", "".join(traceback.format_exception(error)))
+        return HalfFailed(describe_exception(error, f"{self.name}.{name}"))
+
+
+class HostHalf(Half):
+    """
+    The host's half: it also wants to be woken, and gets the values of its jobs.
+
+    Args:
+        program: Its class, and what makes its medium.
+        log: Takes level and text: the traceback of what a call raised.
+        carrier: Messages between agents.
+        calls: Where its calls are noted.
+
+    Raises:
+        HalfFailed: It cannot be made.
+    """
+
+    def __init__(
+        self,
+        program: RoleProgram,
+        log: Callable[[str, str], None],
+        *,
+        carrier: Carrier,
+        calls: HostCalls | None = None,
+    ) -> None:
+        self.carrier = carrier
+        self.next_s: float | None = None
+        """Simulated time at which its timer is to be called; None if it wants none."""
+        self.lateness_s = 0.0
+        """Delay of the timer's last call behind the time asked for, s."""
+        self._calls = calls or HostCalls()
+        self._timer_s = -math.inf
+        self._repeats = 0
+        self._make_medium = program.medium
+        self._calls.name = getattr(program.make, "__name__", "")
+        began_s = self._calls.begin("__init__")
+        super().__init__(program.make, log)
+        self._calls.end("__init__", began_s)
+
+    def set_up(self, context: Any) -> None:
+        """
+        Have it prepare, and make the medium of messages between agents.
+
+        Raises:
+            HalfFailed: As `call`, or what is to be a medium is none.
+        """
+        self.call("setup", context)
+        if self._make_medium is not None:
+            self.carrier.medium = self.run("medium", self._make_medium, self.simulation, context)
+
+    def take(self, agent: str, message: Any) -> None:
+        """
+        Hand in what an agent sent: to the host's half, or (a Transmission) to others, through the medium.
+
+        Raises:
+            HalfFailed: `receive` or the medium raised, or what the medium returned is no outcome.
+        """
+        if not isinstance(message, Transmission):
+            self.call("receive", agent, message)
+            return
+        outcomes: Any = (LinkOutcome(to=message.to, outcome=NO_MEDIUM),)
+        if self.carrier.medium is not None:
+            outcomes = self.run("medium.carry", self.carrier.medium.carry, agent, message)
+        try:
+            self.carrier.enter(agent, message, outcomes)
+        except PluginError as error:
+            raise HalfFailed(f"{self.name}.medium.carry returned {error}") from error
+        self.carrier.hand_over()
+
+    def run(self, name: str, function: Callable[..., Any] | None, *arguments: Any) -> Any:
+        """
+        Call a function of the plug-in's, or without one the half's method *name*; the call is noted.
+
+        Raises:
+            HalfFailed: It raised, or returned something against its contract.
+        """
+        began_s = self._calls.begin(name)
+        try:
+            return super().run(name, function, *arguments)
+        finally:
+            self._calls.end(name, began_s)
+
+    def wake(self, t_s: float) -> None:
+        """
+        Note that the timer is wanted at *t_s*, if not earlier.
+
+        Raises:
+            PluginError: It is no simulated time.
+        """
+        wanted_s = validation.next_time(t_s)
+        if wanted_s is None:
+            raise PluginError("wake(None): expected a simulated time in seconds")
+        if self.next_s is None or wanted_s < self.next_s:
+            self.next_s = wanted_s
+
+    def begin_timer(self, t_s: float) -> None:
+        """Have the timer called for *t_s*, where simulated time starts, and for no earlier time."""
+        self._timer_s = self.next_s = t_s
+
+    def call_timer(self, now_s: float) -> None:
+        """
+        Call the timer for the time it was wanted at, now that the clock shows *now_s*.
+
+        What it returns, or asks `wake` for meanwhile, is due next. The times it is called for never
+        go back: what was asked for too late counts as asked for the time of the call before.
+
+        Raises:
+            HalfFailed: As `call`; it returned no later time, or never lets simulated time go on.
+        """
+        t_s = max(now_s if self.next_s is None else self.next_s, self._timer_s)
+        self._repeats = self._repeats + 1 if t_s == self._timer_s else 0
+        if self._repeats > REPEATS_MAX:
+            raise HalfFailed(
+                f"{self.name}.timer asked {REPEATS_MAX} times in a row for t = {t_s:g} s: simulated"
+                " time stands"
+            )
+        self._timer_s, self.next_s = t_s, None
+        self.lateness_s = max(0.0, now_s - t_s)
+        wanted_s = self.call("timer", t_s)
+        if wanted_s is None:
+            return
+        if wanted_s <= t_s:
+            raise HalfFailed(
+                f"{self.name}.timer returned {wanted_s:g}, called for t = {t_s:g} s: expected a later"
+                " time, or None"
+            )
+        self.wake(wanted_s)
+
+    def take_job(self, job: int, future: Future[Any]) -> None:
+        """
+        Hand in the value of a job that is done.
+
+        Raises:
+            HalfFailed: The job or `result` raised.
+        """
+        error = future.exception()
+        if error is None:
+            self.call("result", job, future.result())
+            return
+        doing = f"{self.name}: job {job}"
+        if isinstance(error, BrokenExecutor):
+            raise HalfFailed(f"{doing}: {WORKER_DIED}")
+        self._log("critical", "".join(traceback.format_exception(error)))
+        is_told = isinstance(error, JobFailed)
+        raise HalfFailed(f"{doing}: {error}" if is_told else describe_exception(error, doing))

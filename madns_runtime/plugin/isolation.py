@@ -1,0 +1,76 @@
+"""
+Runs a plug-in's code that is imported or asked, not driven by the loop: its talk goes to stderr, its faults have a place.
+
+Standard output is data, for scripts; a plug-in's `print` must not spoil it. And a plug-in may end the
+process (`sys.exit`) where it meant to end itself: that is a fault of the plug-in like any other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from madns_runtime.errors import MadnsError, MissingExtraError, PluginError
+from madns_runtime.plugin.code_places import blame
+from madns_runtime.plugin.time_limit import PluginStopped, hold
+
+EXTRA_OF_MODULE = {
+    "pyarrow": "host",
+    "scipy": "host",
+    "sgp4": "host",
+    "zstandard": "host",
+    "sense_hat": "sense-hat",
+}
+
+
+def call_plugin(
+    name: str,
+    function: Callable[..., Any],
+    *arguments: Any,
+    finish: Callable[[Any], Any] | None = None,
+) -> Any:
+    """
+    Call a plug-in's function.
+
+    Args:
+        name: What it is called in the contract, such as check; for the message.
+        function: What to call.
+        arguments: For the function.
+        finish: Takes what it returns and may run more of it: a generator does its work only then.
+
+    Raises:
+        PluginError: It raised, took too long, or wanted to end the process; the message gives file and line.
+        MissingExtraError: It needs an optional dependency that is not installed.
+        MadnsError: What it raised knowingly, as it is.
+    """
+    try:
+        with hold():
+            value = function(*arguments)
+            return finish(value) if finish else value
+    except MadnsError:
+        raise
+    except (Exception, SystemExit, PluginStopped) as error:
+        extra = missing_extra(error)
+        if extra is not None:
+            raise extra from error
+        raise PluginError(f"{blame(error, function)}: {name}(): {said(error)}") from error
+
+
+def missing_extra(error: BaseException) -> MissingExtraError | None:
+    """Return the error that names the command to install what is missing; None if it is something else."""
+    if not isinstance(error, ModuleNotFoundError):
+        return None
+    missing = (error.name or "").partition(".")[0]
+    extra = EXTRA_OF_MODULE.get(missing)
+    return MissingExtraError(missing, extra) if extra else None
+
+
+def said(error: BaseException) -> str:
+    """Return an error's kind and words on one line."""
+    if isinstance(error, SystemExit):
+        return f"it called sys.exit({'' if error.code is None else repr(error.code)})"
+    if isinstance(error, PluginStopped):
+        return str(error)
+    text = str(error.msg) if isinstance(error, SyntaxError) else str(error)
+    text = " ".join(text.split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__

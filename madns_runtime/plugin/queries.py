@@ -1,0 +1,210 @@
+"""
+Queries to a simulation before a run: its faults (`check`) and its demands (`demand`).
+
+What comes back is checked here, so that a slip in a plug-in is told as such and not met later.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import math
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from madns_runtime.errors import PluginError
+from madns_runtime.plugin.api import DeclaredStream, Demand, Flow
+from madns_runtime.plugin.code_places import place_of
+from madns_runtime.plugin.isolation import call_plugin
+from madns_runtime.plugin.registry import load_function
+from madns_runtime.recording.records import FRAMEWORK_STREAMS, Field
+
+NO_FIGURES = ("name", "flows", "measured")
+"""Fields of a Demand or a Flow that are no amounts."""
+ENDLESS = ("buffer_s",)
+"""Figures that may be infinite: of who needs nothing."""
+FIGURE_MAX = 1e18
+"""Of bytes, seconds and hertz; what is beyond is a slip, and its products with agents and rates need no infinity."""
+
+
+def ask_check(  # noqa: PLR0913 - what a scenario is; all but two by name
+    where: str,
+    base_directory: Path,
+    *,
+    parameters: Any,
+    agents: int,
+    names: tuple[str, ...] = (),
+    duration_s: float = 0.0,
+) -> list[str]:
+    """
+    Return the faults that a simulation's `check` finds.
+
+    Args:
+        where: module:function.
+        base_directory: Folder of the scenario.
+        parameters: An instance of the simulation's parameters.
+        agents: How many there are.
+        names: Their names, for a `check` whose fourth parameter is called names.
+        duration_s: Of the run, for one whose fifth is called duration_s.
+
+    Raises:
+        PluginError: It cannot be found, raised, or did not return a list of texts.
+        MissingExtraError: It needs an optional dependency that is not installed.
+    """
+    function = load_function(where, base_directory)
+    arguments = [parameters, agents, base_directory]
+    more = {"names": names, "duration_s": duration_s}
+    arguments += [value for _, value in zip(_more_taken(function), more.values(), strict=False)]
+    found = call_plugin("check", function, *arguments, finish=_unfolded)
+    if not isinstance(found, list) or not all(isinstance(text, str) for text in found):
+        raise PluginError(
+            f"{place_of(function)}: check() must return a list of texts, empty if nothing is wrong;"
+            f" got {_shown(found)}"
+        )
+    return found
+
+
+def ask_demand(
+    where: str, base_directory: Path, *, parameters: Any, agents: int, tick_hz: float
+) -> Demand:
+    """
+    Return what a simulation asks of host and network.
+
+    Args:
+        where: module:function.
+        base_directory: Folder of the scenario.
+        parameters: An instance of the simulation's parameters.
+        agents: How many there are.
+        tick_hz: Rate of every agent's loop.
+
+    Raises:
+        PluginError: It cannot be found, raised, or did not return a proper Demand.
+        MissingExtraError: It needs an optional dependency that is not installed.
+    """
+    function = load_function(where, base_directory)
+    demand = call_plugin("demand", function, parameters, agents, tick_hz, base_directory)
+    fault = _demand_fault(demand)
+    if fault:
+        raise PluginError(f"{place_of(function)}: demand() {fault}")
+    return demand  # type: ignore[no-any-return]
+
+
+def ask_streams(
+    where: str, base_directory: Path, *, parameters: Any, agents: tuple[str, ...]
+) -> tuple[DeclaredStream, ...]:
+    """
+    Return the streams that a simulation declares.
+
+    Args:
+        where: module:function.
+        base_directory: Folder of the scenario.
+        parameters: An instance of the simulation's parameters.
+        agents: Their names.
+
+    Raises:
+        PluginError: It cannot be found, raised, or did not return proper declarations.
+        MissingExtraError: It needs an optional dependency that is not installed.
+    """
+    function = load_function(where, base_directory)
+    found = call_plugin("streams", function, parameters, agents, finish=_unfolded)
+    fault = _streams_fault(found)
+    if fault:
+        raise PluginError(f"{place_of(function)}: streams() {fault}")
+    return tuple(found)
+
+
+def ask_labels(
+    where: str, base_directory: Path, *, parameters: Any, agents: tuple[str, ...]
+) -> dict[str, str]:
+    """
+    Return the second names that a simulation gives to agents.
+
+    Args:
+        where: module:function.
+        base_directory: Folder of the scenario.
+        parameters: An instance of the simulation's parameters.
+        agents: Their names.
+
+    Raises:
+        PluginError: It cannot be found, raised, or did not return a mapping of agents to texts.
+        MissingExtraError: It needs an optional dependency that is not installed.
+    """
+    function = load_function(where, base_directory)
+    found = call_plugin("labels", function, parameters, agents, base_directory)
+    known = set(agents)
+    if not isinstance(found, Mapping) or not all(
+        agent in known and isinstance(label, str) and label for agent, label in found.items()
+    ):
+        raise PluginError(
+            f"{place_of(function)}: labels() must return a mapping of agents' names to texts,"
+            f" got {_shown(found)}"
+        )
+    return dict(found)
+
+
+def _streams_fault(found: Any) -> str | None:
+    if not isinstance(found, list) or not all(isinstance(item, DeclaredStream) for item in found):
+        return f"must return DeclaredStreams of madns_runtime.plugin.api, got {_shown(found)}"
+    seen = set()
+    for item in found:
+        place = (item.role, item.name)
+        if item.role not in ("host", "agent") or not isinstance(item.name, str):
+            return f"must name a stream by a text, of role host or agent, got {_shown(place)}"
+        if item.name in FRAMEWORK_STREAMS or place in seen:
+            whose = "the framework" if item.name in FRAMEWORK_STREAMS else "another of them"
+            return f"declares the {item.role}'s stream {item.name!r}, which belongs to {whose}"
+        seen.add(place)
+        fields: Any = item.fields
+        if not isinstance(fields, tuple | list) or not all(isinstance(f, Field) for f in fields):
+            return f"must give {item.name!r} fields as a tuple of Field, got {_shown(fields)}"
+    return None
+
+
+def _more_taken(function: Callable[..., Any]) -> tuple[str, ...]:
+    """Return which of names and duration_s a `check` takes after its first three arguments, in that order."""
+    try:
+        parameters = tuple(inspect.signature(function).parameters)[3:]
+    except (TypeError, ValueError):  # a function written in C tells no signature
+        return ()
+    if parameters[:2] == ("names", "duration_s"):
+        return ("names", "duration_s")
+    return ("names",) if parameters[:1] == ("names",) else ()
+
+
+def _unfolded(found: Any) -> Any:
+    return list(found) if isinstance(found, Iterable) and not isinstance(found, str) else found
+
+
+def _demand_fault(demand: Any) -> str | None:
+    if not isinstance(demand, Demand):
+        return f"must return a madns_runtime.plugin.api.Demand, got {_shown(demand)}"
+    flows: Any = demand.flows
+    if not isinstance(flows, tuple | list) or not all(isinstance(flow, Flow) for flow in flows):
+        return f"must return flows as a tuple of Flow, got {_shown(flows)}"
+    for flow in flows:
+        if not isinstance(flow.name, str):
+            return f"must name flows by texts, got {_shown(flow.name)}"
+    for owner, label in [(demand, "demand"), *((flow, f"flow {flow.name!r}") for flow in flows)]:
+        for field in dataclasses.fields(owner):
+            value, name = getattr(owner, field.name), field.name
+            if name not in NO_FIGURES and not _is_amount(value, may_be_endless=name in ENDLESS):
+                endless = ", or math.inf" if name in ENDLESS else ""
+                limits = f"of at least 0 and at most {FIGURE_MAX:g}{endless}"
+                return f"must return figures {limits}, got {name} = {_shown(value)} of {label}"
+    return None
+
+
+def _is_amount(value: Any, *, may_be_endless: bool) -> bool:
+    """Tell whether a value is a number, not negative, not NaN and not beyond all measure."""
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    return 0 <= value <= FIGURE_MAX or (may_be_endless and value == math.inf)
+
+
+def _shown(value: Any) -> str:
+    """Return a value for a message; whole numbers of thousands of digits have no text, and a class may refuse one."""
+    try:
+        return f"{value!r:.100}"
+    except Exception:  # noqa: BLE001 - __repr__ of a plug-in's class may raise anything
+        return f"a {type(value).__name__} that cannot be shown"

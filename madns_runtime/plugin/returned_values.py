@@ -1,0 +1,84 @@
+"""What a simulation's functions and halves return, as values: checks, demands, declared streams, tabulated rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from madns_runtime.recording.records import Field
+
+if TYPE_CHECKING:
+    import numpy as np  # 0.2 s of import time that `cosmos validate` has no use for
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Check:
+    """One line of a verdict. In a summary it stands as a plain mapping with these keys."""
+
+    name: str
+    limit: float
+    got: float
+    """A finite number; NaN and None are told as not measured, and break the check."""
+    passed: bool
+    worst: str | None = None
+    """Source of *got*; None for the maker of the check. Of all agents' checks of a name the worst counts."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Flow:
+    """Messages of one kind that every agent exchanges with the host."""
+
+    name: str
+    message_bytes: int
+    """Encoded size of one message, without datagram overhead."""
+    rate_hz: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Demand:
+    """Demands of a simulation on host and network: the terms of the thesis's inequalities 2.7-2.10."""
+
+    flows: tuple[Flow, ...]
+    """S_Di and R_Di of every planned flow, a single agent's."""
+    buffer_s: float
+    """T_bi: how long an agent can go on from what it holds; infinity if it needs nothing."""
+    batch_bytes: int
+    """S_b: encoded size of one asynchronous batch, of one agent."""
+    batch_compute_s: float
+    """T_p(S_b): host time to make one agent's batch."""
+    sync_bytes: int
+    """S_sync: encoded size of one synchronous batch; 0 without maneuvers."""
+    sync_compute_s: float
+    """T_p(S_sync)."""
+    sync_rate_hz: float
+    """N_sync: synchronous exchanges a second, of one agent, at worst."""
+    lead_s: float
+    """T_m - T_s: how far ahead of its execution a maneuver is commanded."""
+    measured: bool
+    """Whether the compute times were measured on this machine (else they are declared)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tabulated:
+    """Rows of one agent, in order of time; an agent's rows may come in several parts, one after the other."""
+
+    agent: str
+    fields: tuple[Field, ...]
+    """Of the columns; times stand for themselves and have none."""
+    times_s: NDArray[np.float64]
+    columns: Mapping[str, NDArray[np.float64]]
+    """By the fields' names; NaN where nothing is on record."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeclaredStream:
+    """A record stream that a simulation may open: what report, comparison and live view can count on."""
+
+    role: Literal["host", "agent"]
+    """Half that opens it."""
+    name: str
+    fields: tuple[Field, ...]
+    is_open: bool = False
+    """Whether further fields may follow these, known only in the run."""

@@ -1,0 +1,97 @@
+"""Validation of what a plug-in's calls return, done where they return: the blame lands on the call."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import orjson
+
+from madns_runtime.errors import PluginError
+from madns_runtime.protocol.codec import pack
+from madns_runtime.protocol.datagram import MESSAGE_BYTES_MAX
+from madns_runtime.recording.encoding import count_not_finite
+
+SUMMARY_BYTES_MAX = 1024 * 1024
+"""A summary is figures; what is longer belongs into a stream of records."""
+NOT_FINITE_CHECK = "summary.not_finite"
+
+
+def initial_data(value: Any) -> Any:
+    """
+    Return an agent's initial data, which a message can carry.
+
+    Raises:
+        PluginError: It is no mapping, too large, or holds what messages do not carry.
+    """
+    if not isinstance(value, Mapping):
+        raise PluginError(f"{_kind(value)}: expected a mapping")
+    size = len(pack(value))
+    if size > MESSAGE_BYTES_MAX - 1024:
+        raise PluginError(f"{size} bytes: expected at most {MESSAGE_BYTES_MAX - 1024}")
+    return value
+
+
+def medium(value: Any) -> Any:
+    """
+    Return what is to carry messages between agents; None for nothing.
+
+    Raises:
+        PluginError: It cannot.
+    """
+    if value is not None and not callable(getattr(value, "carry", None)):
+        raise PluginError(f"{_kind(value)}: expected a medium with a method carry(), or None")
+    return value
+
+
+def next_time(value: Any) -> float | None:
+    """
+    Return the simulated time that `timer` wants, s.
+
+    Raises:
+        PluginError: It is neither None nor a finite number.
+    """
+    if value is None:
+        return None
+    try:
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        time_s = float(value) if is_number else math.nan
+    except OverflowError:  # a whole number beyond what a float holds has no short text either
+        raise PluginError(
+            "a whole number without end: expected a simulated time in seconds"
+        ) from None
+    if not math.isfinite(time_s):
+        raise PluginError(f"{value!r}: expected a simulated time in seconds, or None")
+    return time_s
+
+
+def summary(value: Any) -> dict[str, Any]:
+    """
+    Return a summary as plain mappings, lists and scalars.
+
+    JSON has no number that is not finite: such values are null there, and a broken check tells of them.
+
+    Raises:
+        PluginError: It is no mapping, too large, or has no JSON form.
+    """
+    if not isinstance(value, Mapping):
+        raise PluginError(f"{_kind(value)}: expected a mapping; is a return missing?")
+    try:
+        text = orjson.dumps(dict(value), option=orjson.OPT_SERIALIZE_NUMPY)
+    except TypeError as error:
+        raise PluginError(f"a summary without a JSON form: {error}") from error
+    if len(text) > SUMMARY_BYTES_MAX:
+        raise PluginError(
+            f"a summary of {len(text)} bytes: expected at most {SUMMARY_BYTES_MAX}; record long data"
+        )
+    plain: dict[str, Any] = orjson.loads(text)
+    not_finite = count_not_finite({key: item for key, item in value.items() if key != "checks"})
+    checks = plain.setdefault("checks", []) if not_finite else None
+    if isinstance(checks, list):
+        checks.append({"name": NOT_FINITE_CHECK, "limit": 0, "got": not_finite, "passed": False})
+    return plain
+
+
+def _kind(value: Any) -> str:
+    return "None" if value is None else f"a {type(value).__name__}"

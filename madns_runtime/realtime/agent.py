@@ -1,0 +1,396 @@
+"""One agent inside a loop that others may share: what its session, its pace and its half of the simulation come to."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic
+from typing import Any, assert_never
+
+from madns_runtime.config import AgentLaunch, RunConfig
+from madns_runtime.hardware.port import NO_HARDWARE
+from madns_runtime.plugin.api import Tick
+from madns_runtime.plugin.context import PeerContext
+from madns_runtime.plugin.half import Half, HalfFailed, RoleProgram
+from madns_runtime.protocol import events as told
+from madns_runtime.protocol.codec import NO_DATA
+from madns_runtime.protocol.messages import Delivery, FaultOrder, TransmissionRefusal
+from madns_runtime.protocol.states import AgentState
+from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.reactor.scheduling import freeze_garbage
+from madns_runtime.realtime.agent_calls import (
+    AGENT,
+    IDLE,
+    METHOD,
+    NUMBER_OF,
+    RECEIVE,
+    STEP,
+    T_S,
+    LoopSeat,
+)
+from madns_runtime.realtime.agent_link import AgentPort
+from madns_runtime.realtime.agent_report import AgentReport
+from madns_runtime.realtime.process_records import ProcessRecords
+from madns_runtime.recording.newest_values import NewestValues
+from madns_runtime.recording.record_files import RecordFiles
+from madns_runtime.recording.recorder import Recorder
+from madns_runtime.recording.run_journal import RunJournal
+from madns_runtime.timing.clock import utc_at_iso
+from madns_runtime.timing.rate import Pacer, RealTimeFactor, stagger
+
+DRAIN_S = 0.1
+"""After the last tick's period an agent listens this much longer for what is still under way."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AgentOutcome:
+    """End of an agent: how and why."""
+
+    as_ordered: bool
+    """By the host's order at the end of a run."""
+    reason: str = ""
+    may_restart: bool = False
+    """It failed by itself while the run may go on: another try makes sense."""
+
+
+class AgentRunner:
+    """
+    Runs one agent.
+
+    Args:
+        seat: The agent, and where its calls are noted.
+        launch: The run.
+        program: What it runs.
+        reactor: The loop.
+        on_ended: Called once, with how it ended.
+
+    Raises:
+        MachineError: It cannot record, or there is no socket to be had.
+        HalfFailed: Its half cannot be made.
+    """
+
+    def __init__(
+        self,
+        seat: LoopSeat,
+        launch: AgentLaunch,
+        program: RoleProgram,
+        *,
+        reactor: Reactor,
+        on_ended: Callable[[str, AgentOutcome], None],
+    ) -> None:
+        self.name = name = seat.name
+        self._calls, self._seat = seat.calls.page, seat.number
+        self._config = config = launch.config
+        self._program = program
+        self._reactor = reactor
+        self._on_ended = on_ended
+        self._port = AgentPort(
+            name,
+            launch,
+            program=program,
+            reactor=reactor,
+            on_due=self._session_due,
+            report=lambda: self._report.ping(),
+        )
+        self._session = self._port.session
+        directory = Path(launch.directory) / "agents" / name
+        files = RecordFiles(directory, run=config.run, source=name, life=program.life)
+        self._recorder = recorder = Recorder(files, config.recording)
+        self._journal = RunJournal(recorder, config.recording.verbosity, t_s=self._port.t_s)
+        self._records = ProcessRecords(self._journal)
+        self._hardware = seat.hardware
+        self._hardware.use_clock(self._port.local_s)
+        self._has_devices = bool(seat.hardware)
+        self._half = half = Half(program.make, self._journal.say)
+        # Called every tick: without a layer between.
+        self._step, self._receive = half.simulation.step, half.simulation.receive
+        self._record = recorder.record
+        self._phase_s, self._pacer = _make_pacer(config, name)
+        self._factor = RealTimeFactor()
+        self._report = AgentReport(
+            port=self._port,
+            records=self._records,
+            pacer=self._pacer,
+            factor=self._factor,
+            columns=NewestValues(recorder, program.columns),
+            devices=seat.hardware if launch.is_detached else NO_HARDWARE,
+        )
+        self._period_s = 1.0 / config.agents.tick_hz
+        # Infinite is never: each timer is made once and moved.
+        self._tick_timer = reactor.call_at(math.inf, self._tick)
+        self._end_timer = reactor.call_at(math.inf, self._finish_run)
+        self._usage_timer = reactor.call_at(math.inf, self._record_usage)
+        self._outcome = AgentOutcome(as_ordered=False, reason="did not end")
+        self._is_closed = False
+        self._takes_data = True
+
+    def start(self) -> None:
+        """Begin: says hello at once."""
+        self._recorder.start()
+        self._journal.event("start", pid=os.getpid())
+        if self._port.socket.warning:
+            self._journal.say("warning", self._port.socket.warning)
+        self._reactor.add_reader(self._port.socket.fileno(), self._readable)
+        self._pump()
+
+    def set_scheduling(self, grant: Mapping[str, Any]) -> None:
+        """Take note of what the kernel granted to the loop."""
+        self._report.scheduling = dict(grant)
+        self._journal.event("scheduling", **grant)
+        if grant.get("warning"):
+            self._journal.say("warning", str(grant["warning"]))
+
+    def emergency(self, reason: str) -> None:
+        """End at once, keep the records, tell the host."""
+        self._session.emergency(reason, monotonic())
+        self._pump()
+
+    # The loop's callbacks ----------------------------------------------------------------------
+
+    def _readable(self) -> None:
+        # One datagram, and back to the loop, which looks for more: most often there is one.
+        data = self._port.socket.receive()
+        if data is None:
+            return
+        message = self._session.receive_data(data, monotonic())
+        if message is not NO_DATA and self._takes_data:
+            calls = self._calls
+            calls[AGENT], calls[METHOD] = self._seat, RECEIVE
+            try:
+                self._receive(message)
+            except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
+                self._fail(self._half.failure("receive", error))
+            calls[METHOD] = IDLE
+            if not self._port.must_flush:
+                return
+        self._pump()
+
+    def _session_due(self) -> None:
+        # What waits in the socket is heard before the host is blamed for silence.
+        for data, _ in self._port.socket.receive_all():
+            self._session.receive_datagram(data, monotonic())
+        self._session.handle_timer(monotonic())
+        self._pump()
+
+    def _pump(self) -> None:
+        """Carry out the session's events, send what is due, arm its timer."""
+        session = self._session
+        while (event := session.next_event()) is not None:
+            self._handle(event)
+        while (broken := session.next_broken_deadline()) is not None:
+            self._journal.event("sync_deadline_broken", late_s=broken.late_s)
+        if not self._is_closed:
+            self._port.flush()
+
+    def _handle(self, event: told.AgentSessionEvent) -> None:
+        match event:
+            case told.HostDataReceived(payload):
+                self._take(payload)
+            case told.ClockEstimated():
+                if self._session.state is AgentState.RUN_SIMULATION:
+                    self._records.clock(self._session.clock, monotonic())
+            case told.AgentStateEntered(state):
+                self._journal.event("state", state=state.value)
+            case told.SetupReceived(initial):
+                self._set_up(initial)
+            case told.StartReceived(t0_host_s):
+                self._start_run(t0_host_s)
+            case told.StopReceived():
+                self._outcome = AgentOutcome(as_ordered=True)
+                self._close_records()
+            case told.EmergencyOrdered(who, reason):
+                self._end_early(f"{who}: {reason}", is_own=who == self.name)
+            case told.ExpelledFromRun(reason):
+                self._end_early(f"expelled by the host: {reason}", is_own=True)
+            case told.SessionEnded():
+                self._close()
+            case _:
+                assert_never(event)
+
+    # Carrying out ------------------------------------------------------------------------------
+
+    def _take(self, message: Any) -> None:
+        if isinstance(message, Delivery):
+            self._port.mailbox.add(message)
+        elif isinstance(message, FaultOrder):
+            self._hardware.order_fault(message)
+        elif self._takes_data:
+            is_refusal = isinstance(message, TransmissionRefusal)
+            self._call("refused" if is_refusal else "receive", message)
+
+    def _set_up(self, initial: Any) -> None:
+        context = PeerContext(
+            name=self.name,
+            config=self._config,
+            parameters=self._program.parameters,
+            journal=self._journal,
+            now_s=self._port.now_s,
+            send=self._port.send,
+            mailbox=self._port.mailbox,
+            hardware=self._hardware,
+        )
+        self._call("setup", context, initial)
+        if self._session.state is AgentState.SIMULATION_SETUP:
+            self._session.setup_finished(monotonic())
+
+    def _start_run(self, t0_host_s: float) -> None:
+        self._port.t0_host_s = t0_host_s
+        now_s = self._port.now_s()
+        self._recorder.set_t0(utc_at_iso(-now_s))
+        self._journal.event("phase", phase_s=self._phase_s)
+        if now_s > 0:
+            self._pacer.skip_to(now_s)
+        freeze_garbage()  # what set-up made stays: no collection walks it in mid-run
+        self._arm_tick()
+        self._records.begin_usage()
+        self._tell_time()
+        self._usage_timer.reschedule(monotonic() + self._config.health.period_s)
+
+    def _arm_tick(self) -> None:
+        deadline_s = self._pacer.next_deadline_s()
+        if deadline_s is None:
+            end_s = self._config.time.duration_s + DRAIN_S
+            self._end_timer.reschedule(self._port.local_s(end_s))
+        else:
+            self._tick_timer.reschedule(self._port.local_s(deadline_s))
+
+    def _tick(self) -> None:
+        pacer, port = self._pacer, self._port
+        if self._session.state is not AgentState.RUN_SIMULATION:
+            return
+        began_s = port.now_s()
+        timing = pacer.begin(began_s)
+        if timing is not None:
+            index, t_s, deadline_s, lateness_s, missed = timing
+            self._factor.add(t_s, began_s)
+            calls = self._calls
+            calls[T_S] = t_s
+            if self._program.has_medium and not self._hear(t_s):
+                return
+            if self._has_devices and not self._look_at_devices():
+                return
+            calls[AGENT], calls[METHOD] = self._seat, STEP
+            try:
+                self._step(Tick(index, t_s, self._period_s, lateness_s, missed, deadline_s))
+            except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
+                calls[METHOD] = IDLE
+                self._fail(self._half.failure("step", error))
+                self._pump()
+                return
+            calls[METHOD] = IDLE
+            if port.must_flush:
+                # What the step sent leaves before anything else is done.
+                port.flush()
+            margin_s = pacer.end(port.now_s())
+            values = (index, int(lateness_s * 1e6), int(margin_s * 1e6), missed)
+            self._record("ticks", values)
+        self._arm_tick()
+
+    def _hear(self, t_s: float) -> bool:
+        """Hand in what other agents' messages bring in the tick at *t_s*; return whether the agent goes on."""
+        for delivery in self._port.mailbox.due(t_s):
+            self._call("hear", delivery)
+            if self._session.state is not AgentState.RUN_SIMULATION:
+                self._pump()
+                return False
+        return True
+
+    def _look_at_devices(self) -> bool:
+        """Tell the half whose status has changed; return whether the agent goes on."""
+        for name, status in self._hardware.changes():
+            self._journal.event("device", device=name, status=status)
+            self._call("device_changed", name, status)
+            if self._session.state is not AgentState.RUN_SIMULATION:
+                self._pump()
+                return False
+        return True
+
+    def _tell_time(self) -> None:
+        """Tell the devices' processes how simulated time runs on this machine's clock."""
+        if self._has_devices:
+            t_s = self._port.now_s()
+            rate = 1.0 + self._session.clock.drift_ppm * 1e-6
+            self._hardware.tell_time(self._port.local_s(t_s), t_s, rate)
+
+    def _finish_run(self) -> None:
+        if self._session.state is not AgentState.RUN_SIMULATION:
+            return
+        self._pacer.finish(self._port.now_s())
+        self._takes_data = False  # what comes from now on is too late for the summary
+        summary = self._call("finish")
+        if self._session.state is AgentState.RUN_SIMULATION:
+            self._session.run_finished(self._report.summary(summary), monotonic())
+        self._pump()
+
+    def _end_early(self, reason: str, *, is_own: bool) -> None:
+        self._outcome = AgentOutcome(as_ordered=False, reason=reason, may_restart=is_own)
+        self._takes_data = False
+        self._cancel_timers()
+        self._journal.event("emergency", reason=reason)
+        self._journal.say("critical", f"emergency shutdown: {reason}")
+        self._close_records()
+
+    def _close_records(self) -> None:
+        messages = self._session.link.counters.to_mapping()
+        counts = self._journal.close(self._config.timeouts.shutdown_s)
+        records = {
+            **counts.to_mapping(),
+            "messages": messages,
+            "network": self._port.socket.counters(),
+            "between_agents": self._port.mailbox.counts(),
+            "held_dropped": self._session.held_dropped_count,
+            "malformed": self._session.malformed_count,
+        }
+        self._session.records_closed(records, monotonic())
+
+    def _close(self) -> None:
+        self._is_closed = True
+        self._cancel_timers()
+        self._port.close()
+        self._on_ended(self.name, self._outcome)
+
+    def _cancel_timers(self) -> None:
+        for timer in (self._tick_timer, self._end_timer, self._usage_timer):
+            timer.cancel()
+
+    # Telling -----------------------------------------------------------------------------------
+
+    def _record_usage(self) -> None:
+        if self._session.state is AgentState.RUN_SIMULATION:
+            self._records.usage()
+            self._tell_time()
+            self._usage_timer.reschedule(monotonic() + self._config.health.period_s)
+
+    # Towards the simulation ------------------------------------------------------------------------
+
+    def _call(self, name: str, *arguments: Any) -> Any:
+        """Call the plug-in; what it raises, or returns against its contract, ends this agent by name."""
+        calls = self._calls
+        calls[AGENT], calls[METHOD] = self._seat, NUMBER_OF[name]
+        try:
+            return self._half.call(name, *arguments)
+        except HalfFailed as failure:
+            self._fail(failure)
+            return None
+        finally:
+            calls[METHOD] = IDLE
+
+    def _fail(self, failure: HalfFailed) -> None:
+        self._session.emergency(str(failure), monotonic())
+        self._port.must_flush = True
+
+
+def _make_pacer(config: RunConfig, name: str) -> tuple[float, Pacer]:
+    """Return the agent's share of the period by which its ticks are put off, s, and its pace."""
+    agents = config.agents
+    index = agents.resolved_names().index(name)
+    phase_s = stagger(index, agents.count, agents.tick_hz, phase=agents.phase)
+    return phase_s, Pacer(
+        tick_hz=agents.tick_hz,
+        phase_s=phase_s,
+        duration_s=config.time.duration_s,
+        overrun_s=config.deadline.overrun_ms * 1e-3,
+    )

@@ -1,0 +1,160 @@
+"""An agent's way to the host: its socket, its session, and the simulated time that the session knows."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping
+from time import monotonic
+from typing import Any
+
+from madns_runtime import __version__
+from madns_runtime.config import AgentLaunch
+from madns_runtime.errors import MadnsError
+from madns_runtime.medium.mailbox import Mailbox
+from madns_runtime.plugin.api import HOST
+from madns_runtime.plugin.context import check_sending
+from madns_runtime.plugin.half import RoleProgram
+from madns_runtime.protocol.agent_session import AgentIdentity, AgentSession
+from madns_runtime.protocol.link import LinkLimits
+from madns_runtime.protocol.link_settings import LinkSettings
+from madns_runtime.protocol.messages import Service, Transmission
+from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.reactor.udp import UdpSocket
+
+BEST, SYNC = Service.BEST, Service.SYNC
+
+RECEIVE_BUFFER_BYTES = 1024 * 1024
+
+
+class AgentPort:
+    """
+    The socket and the session of one agent.
+
+    Args:
+        name: The agent's.
+        launch: The run.
+        program: What it runs.
+        reactor: The loop.
+        on_due: Called when the session's timer is due.
+        report: Returns what a ping tells of the agent.
+
+    Raises:
+        MachineError: There is no socket to be had.
+    """
+
+    def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
+        self,
+        name: str,
+        launch: AgentLaunch,
+        *,
+        program: RoleProgram,
+        reactor: Reactor,
+        on_due: Callable[[], None],
+        report: Callable[[], Mapping[str, Any]],
+    ) -> None:
+        config = launch.config
+        self.socket = UdpSocket.connect(
+            launch.host_address, launch.host_port, receive_buffer_bytes=RECEIVE_BUFFER_BYTES
+        )
+        self.session = AgentSession(
+            AgentIdentity(
+                name=name,
+                index=config.agents.resolved_names().index(name) + 1,
+                incarnation=int.from_bytes(os.urandom(4)),
+                runtime_version=__version__,
+                pid=os.getpid(),
+            ),
+            LinkSettings(
+                run_key=bytes.fromhex(launch.run_key_hex),
+                session=bytes.fromhex(launch.session_hex),
+                limits=LinkLimits(receive_window_bytes=self.socket.receive_buffer_bytes // 4),
+            ),
+            timeouts=config.timeouts,
+            report=report,
+            now_s=reactor.now_s(),
+        )
+        self.mailbox = Mailbox(
+            name,
+            config.agents.resolved_names(),
+            has_medium=program.has_medium,
+            post=self._transmit,
+            life=program.life,
+        )
+        self.t0_host_s: float | None = None
+        """Simulated time zero on the host's clock; None before it is known."""
+        self.must_flush = False
+        """Whether something waits to be sent."""
+        self._lead_s = config.timeouts.start_lead_s
+        self._reactor = reactor
+        # Infinite is never: the timer is made once and moved.
+        self._timer = reactor.call_at(math.inf, on_due)
+
+    def flush(self) -> None:
+        """Send what is due, and arm the session's timer."""
+        self.must_flush = False
+        session, send = self.session, self.socket.send
+        for data in session.datagrams_to_send(monotonic()):
+            send(data)
+        due_s = session.get_timer()
+        self._timer.reschedule(math.inf if due_s is None else due_s)
+
+    def close(self) -> None:
+        """Send the last words, and listen no more."""
+        self.flush()
+        self._timer.cancel()
+        self._reactor.remove_reader(self.socket.fileno())
+        self.socket.close()
+
+    # Towards the simulation ------------------------------------------------------------------------
+
+    def now_s(self) -> float:
+        """Return the simulated time, s."""
+        if self.t0_host_s is None:
+            return -self._lead_s
+        return self.session.clock.to_host_s(monotonic()) - self.t0_host_s
+
+    def t_s(self) -> float | None:
+        """Return the simulated time, s; None before it runs."""
+        return None if self.t0_host_s is None else self.now_s()
+
+    def local_s(self, t_s: float) -> float:
+        """
+        Return when simulated time *t_s* is on this machine's monotonic clock, s.
+
+        Raises:
+            MadnsError: Simulated time has not begun.
+        """
+        if self.t0_host_s is None:
+            raise MadnsError("simulated time has not begun")
+        return self.session.clock.to_local_s(self.t0_host_s + t_s)
+
+    def send(
+        self,
+        to: str,
+        message: Any,
+        service: Service = Service.RELIABLE,
+        *,
+        deadline_s: float | None = None,
+    ) -> int | None:
+        """Send to the host's half or to other agents; see `plugin.api.Context.send`."""
+        now_s = monotonic()
+        if service is BEST and to == HOST and deadline_s is None:
+            datagram = self.session.seal_data(message, now_s)
+            if datagram is not None:
+                self.socket.send(datagram)
+                return None
+        if to != HOST:
+            return self.mailbox.send(to, message, service, deadline_s)
+        is_running = self.t0_host_s is not None
+        check_sending(to, (HOST,), service, deadline_s, is_running=is_running)
+        due_s = None if deadline_s is None else self.local_s(deadline_s)
+        self.session.send(message, service, now_s, deadline_s=due_s)
+        self.must_flush = True
+        if service is SYNC:
+            self.flush()
+        return None
+
+    def _transmit(self, transmission: Transmission) -> None:
+        self.session.transmit(transmission, monotonic())
+        self.must_flush = True

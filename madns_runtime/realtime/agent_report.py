@@ -1,0 +1,70 @@
+"""An agent's account of its run in real time: what a ping tells of it on the way, and its summary at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from time import monotonic
+from typing import Any
+
+from madns_runtime.hardware.port import Hardware
+from madns_runtime.realtime.agent_link import AgentPort
+from madns_runtime.realtime.process_records import ProcessRecords
+from madns_runtime.recording.newest_values import NewestValues
+from madns_runtime.timing.rate import Pacer, RealTimeFactor
+
+
+@dataclass(slots=True, kw_only=True)
+class AgentReport:
+    """Reads what others keep; holds nothing of its own but what the kernel granted."""
+
+    port: AgentPort
+    records: ProcessRecords
+    pacer: Pacer
+    factor: RealTimeFactor
+    columns: NewestValues
+    devices: Hardware
+    """Devices that no operator hears of: the host hears of them by pings."""
+    scheduling: Mapping[str, Any] = field(default_factory=dict)
+    """What the kernel granted to the loop."""
+
+    def ping(self) -> Mapping[str, Any]:
+        """Return what a ping tells of the agent."""
+        report = self.records.report()
+        if self.port.t0_host_s is not None:
+            ticks = self.pacer.summary()
+            report.update(
+                ticks=ticks["run"],
+                missed=ticks["missed"],
+                late_p50_us=ticks["lateness_us_p50"],
+                late_p99_us=ticks["lateness_us_p99"],
+                rtf=self._real_time_factor(),
+                lost=self.port.session.link.counters.best.lost,
+                columns=self.columns.read(),
+            )
+            report.update(self.devices.report())
+        return report
+
+    def summary(self, simulation: Any) -> dict[str, Any]:
+        """Return what the host is told at the end; *simulation* is the summary of the agent's half."""
+        clock, now_s = self.port.session.clock, monotonic()
+        return {
+            "ticks": dict(self.pacer.summary()),
+            "rtf": self._real_time_factor(),
+            "clock": {
+                "offset_us": clock.offset_s(now_s) * 1e6,
+                "drift_ppm": clock.drift_ppm,
+                "uncertainty_us": clock.uncertainty_s(now_s) * 1e6,
+                "steps": clock.steps,
+                "rejected": clock.rejected,
+            }
+            if clock.is_valid
+            else None,
+            "scheduling": self.scheduling,
+            "columns": self.columns.read(),
+            "simulation": simulation or {},
+        }
+
+    def _real_time_factor(self) -> float | None:
+        factor = self.factor.value()
+        return None if factor is None else round(factor, 9)

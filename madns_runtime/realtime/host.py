@@ -1,0 +1,400 @@
+"""
+A run in real time, seen from the host: what its session tells, carried out with simulation, executor and records.
+
+Nothing is computed here: what takes long is the executor's, and what is said on the wire the session's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from concurrent.futures import Future
+from functools import partial
+from pathlib import Path
+from time import monotonic
+from typing import Any, assert_never
+
+from madns_runtime.config import HostLaunch
+from madns_runtime.health.sampler import SAMPLER_TIMEOUT_S, start_sampler
+from madns_runtime.plugin.api import HOST
+from madns_runtime.plugin.context import JobContext
+from madns_runtime.plugin.executor import JobRunner, make_executor
+from madns_runtime.plugin.half import HalfFailed, HostHalf, RoleProgram
+from madns_runtime.plugin.host_calls import HostCalls
+from madns_runtime.protocol import events as told
+from madns_runtime.protocol.events import Phase
+from madns_runtime.protocol.states import HOST_LIVE, HostState
+from madns_runtime.reactor.host_signals import heed_signals
+from madns_runtime.reactor.operator_link import (
+    OPERATOR_GONE,
+    OPERATOR_SIDE_GONE,
+    OperatorLink,
+    tell_loading,
+)
+from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.reactor.reattachment import way_back_of
+from madns_runtime.reactor.scheduling import apply as apply_scheduling
+from madns_runtime.reactor.scheduling import freeze_garbage
+from madns_runtime.reactor.watchdog import end_after_hang_up, extend
+from madns_runtime.realtime.host_link import HostPort
+from madns_runtime.realtime.host_result import HostReport
+from madns_runtime.realtime.operator_orders import OperatorOrders
+from madns_runtime.realtime.unwatched_devices import UnwatchedDevices
+from madns_runtime.recording.record_files import RecordFiles
+from madns_runtime.recording.recorder import Recorder
+from madns_runtime.recording.result_file import hand_over
+from madns_runtime.recording.run_journal import RunJournal
+from madns_runtime.timing.clock import utc_at_iso
+
+PROGRESS_INTERVAL_S = 0.5
+HANG_UP_WAIT_S = 0.5
+"""On a busy computer, from the end of a dead operator's line to an agent until the end of that to the host."""
+HANG_GRACE_S = 2.0
+"""Beyond the time for shutdown: a loop that hangs in a plug-in, without an operator, ends by force."""
+
+
+class HostRuntime:
+    """
+    One run in real time.
+
+    Args:
+        launch: What to run.
+        fds: Where the operator's commands come from and events go to.
+        pending: What had already come behind the launch document.
+
+    Raises:
+        MadnsError: The simulation cannot be loaded, the executor not be had, the port is taken.
+    """
+
+    def __init__(self, launch: HostLaunch, fds: tuple[int, int], pending: bytes) -> None:
+        self._config = config = launch.config
+        self._launch, self._line_fd = launch, fds[0]
+        self._directory = Path(launch.directory)
+        program = RoleProgram.load(config, "host", tell=partial(tell_loading, fds[1]))
+        self._calls = calls = HostCalls(launch.session_hex)
+        self._sampler = start_sampler(
+            self._directory,
+            run=config.run,
+            machine=HOST,
+            settings=config.health,
+            recording=config.recording,
+        )
+        executor = make_executor(config.executor)  # both fork: before every thread
+        self._reactor = Reactor()
+        self._jobs = JobRunner(self._reactor, executor, self._job_done)
+        self._operator = OperatorLink(
+            self._reactor,
+            fds,
+            on_command=self._command,
+            on_gone=self._operator_gone,
+            pending=pending,
+            is_detached=launch.is_detached,
+            way_back=way_back_of(launch, self._directory),
+            on_attached=self._watch_line,
+        )
+        self._port = HostPort(launch, reactor=self._reactor, on_due=self._session_due)
+        self._session = self._port.session
+        files = RecordFiles(self._directory, run=config.run, source=HOST)
+        self._recorder = recorder = Recorder(files, config.recording)
+        self._journal = RunJournal(recorder, config.recording.verbosity, t_s=self._port.t_s)
+        self._orders = OperatorOrders(
+            self._session, self._journal, end=self._end, refuse=self._operator.refuse
+        )
+        self._devices = UnwatchedDevices(
+            launch,
+            self._reactor,
+            session=self._session,
+            journal=self._journal,
+            end=self._end,
+            pump=self._pump,
+        )
+        calls.t_s, calls.warn = self._port.t_s, partial(self._log, "warning")
+        self._half = HostHalf(program, self._journal.say, carrier=self._port.carrier, calls=calls)
+        self._context = JobContext(
+            name=HOST,
+            config=config,
+            parameters=program.parameters,
+            journal=self._journal,
+            now_s=self._port.now_s,
+            send=self._port.send,
+            half=self._half,
+            submit=self._jobs.submit,
+            wake=self._wake,
+        )
+        self._report = HostReport(config.time.duration_s, program.columns)
+        # Infinite is never: each timer is made once and moved.
+        self._plugin_timer = self._reactor.call_at(math.inf, self._plugin_due)
+        self._progress_timer = self._reactor.call_at(math.inf, self._progress)
+        self._is_set_up = self._awaits_jobs = False
+        self._takes_data = True
+
+    def run(self) -> int:
+        """Run to the end and return the process's exit code."""
+        if self._launch.is_detached:
+            # Nobody is left who would end a loop that hangs in a plug-in.
+            extend(self._config.longest_s + SAMPLER_TIMEOUT_S + HANG_GRACE_S)
+        else:
+            self._watch_line()
+        terminated = partial(self._end, HOST, "ended by SIGTERM", "interrupted")
+        heed_signals(self._reactor, terminated, is_detached=self._launch.is_detached)
+        self._recorder.start()
+        grant = apply_scheduling(self._config.scheduling, is_host=True)
+        self._report.scheduling = grant.to_mapping()
+        socket = self._port.socket
+        for warning in filter(None, (socket.warning, grant.warning)):
+            self._log("warning", warning)
+        self._reactor.add_reader(socket.fileno(), self._readable)
+        self._operator.emit(self._port.listening())
+        self._operator.emit({"event": "state", "state": self._session.state.value})
+        self._progress_timer.reschedule(monotonic() + PROGRESS_INTERVAL_S)
+        self._pump()
+        self._reactor.run()
+        return self._close()
+
+    # The loop's callbacks ----------------------------------------------------------------------
+
+    def _readable(self) -> None:
+        # One datagram, and back to the loop, which looks for more: most often there is one.
+        received = self._port.socket.receive_from()
+        if received is None:
+            return
+        message = self._session.receive_data(*received, monotonic())
+        if message is not None and self._takes_data:
+            self._call("receive", *message)
+            if not self._port.must_pump:
+                return
+        self._pump()
+
+    def _session_due(self) -> None:
+        # What waits in the socket is heard before anybody is blamed for silence.
+        for data, address in self._port.socket.receive_all():
+            self._session.receive_datagram(data, address, monotonic())
+        self._session.handle_timer(monotonic())
+        self._pump()
+
+    def _pump(self) -> None:
+        """Carry out the session's events, send what is due, arm its timer."""
+        while (event := self._session.next_event()) is not None:
+            self._handle(event)
+        self._port.must_pump = False
+        self._port.flush()
+        if self._port.is_in(HostState.EXIT):
+            self._reactor.stop()
+        else:
+            self._port.arm()
+
+    def _handle(self, event: told.HostSessionEvent) -> None:
+        match event:
+            case told.AgentDataReceived(agent, payload):
+                if self._takes_data:
+                    self._guard(self._half.take, agent, payload)
+            case told.HostStateEntered(state):
+                self._journal.event("state", state=state.value)
+                self._operator.emit({"event": "state", "state": state.value})
+            case told.AgentMoved():
+                self._agent_moved(event)
+            case told.AgentsReady():
+                self._set_up()
+            case told.AgentsSimulationReady():
+                self._start()
+            case told.AgentLost(agent, reason):
+                self._agent_lost(agent, reason)
+            case told.AgentRejoining(agent):
+                self._send_setup(agent)
+            case told.AgentRejoined(agent):
+                self._agent_rejoined(agent)
+            case told.AgentsComplete():
+                self._complete()
+            case told.EmergencyDeclared(who, reason):
+                self._emergency(who, reason)
+            case told.SyncDeadlineBroken(agent, broken):
+                self._journal.event("sync_deadline_broken", agent=agent, late_s=broken.late_s)
+            case told.AgentsStopped(missing):
+                self._agents_stopped(missing)
+            case _:
+                assert_never(event)
+
+    # Carrying out ------------------------------------------------------------------------------
+
+    def _set_up(self) -> None:
+        if not self._port.is_in(HostState.SIMULATION_SETUP):
+            return  # an agent's last words came right behind its hello
+        self._guard(self._half.set_up, self._context)
+        self._is_set_up = True
+        for agent in self._session.agents_in(Phase.LOST):
+            if agent in self._report.lost:  # else the word of it comes just behind
+                self._tell_lost(agent)
+        self._awaits_jobs = True
+        self._continue_setup()
+
+    def _continue_setup(self) -> None:
+        """Once every job that set-up submitted is done, the agents get their initial data."""
+        if not self._awaits_jobs or self._jobs.pending_count:
+            return
+        self._awaits_jobs = False
+        initial = {}
+        for agent in self._session.agents_in(Phase.READY):
+            if not self._port.is_in(HostState.SIMULATION_SETUP):
+                return  # the call before raised
+            initial[agent] = self._call("initial_data", agent)
+        if self._port.is_in(HostState.SIMULATION_SETUP):
+            self._session.setup_finished(initial, monotonic())
+
+    def _send_setup(self, agent: str) -> None:
+        initial = self._call("initial_data", agent)
+        if self._session.state in HOST_LIVE:
+            self._session.send_setup(agent, initial, monotonic())
+
+    def _start(self) -> None:
+        if not self._port.is_in(HostState.HOST_SIMULATION_READY):
+            return  # an agent's last words came right behind its readiness
+        now_s = monotonic()
+        lead_s = self._config.timeouts.start_lead_s
+        freeze_garbage()
+        self._port.t0_s = t0_s = monotonic() + lead_s
+        self._report.t0_utc = utc_at_iso(lead_s)
+        self._recorder.set_t0(self._report.t0_utc)
+        self._session.start(t0_s, self._config.time.duration_s, now_s)
+        self._calls.is_counting = True
+        self._call("start", -lead_s)
+        self._half.begin_timer(-lead_s)
+        self._plugin_due()
+
+    def _plugin_due(self) -> None:
+        if not self._port.is_in(HostState.SIMULATION_START):
+            return
+        self._guard(self._half.call_timer, self._port.now_s())
+        self._arm_plugin_timer()
+        self._pump()
+
+    def _wake(self, t_s: float) -> None:
+        self._half.wake(t_s)
+        self._arm_plugin_timer()
+
+    def _arm_plugin_timer(self) -> None:
+        t0_s, next_s = self._port.t0_s, self._half.next_s
+        # Not before now: what waits in the sockets has its turn between two calls that are late.
+        due_s = math.inf if t0_s is None or next_s is None else max(t0_s + next_s, monotonic())
+        self._plugin_timer.reschedule(due_s)
+
+    def _job_done(self, job: int, future: Future[Any]) -> None:
+        if not self._takes_data:
+            return  # too late for the summary
+        self._guard(self._half.take_job, job, future)
+        self._continue_setup()
+        self._pump()
+
+    def _complete(self) -> None:
+        self._report.completed_s = self._port.now_s()
+        self._takes_data = self._calls.is_counting = False  # what comes now is too late
+        self._report.simulation = self._call("finish") or {}
+        if self._port.is_in(HostState.SIMULATION_COMPLETE):
+            self._session.order_stop(monotonic())
+
+    def _emergency(self, who: str, reason: str) -> None:
+        self._takes_data = False
+        wait_s = HANG_UP_WAIT_S if OPERATOR_SIDE_GONE in reason else 0.0
+        if who in self._session.peers and self._operator.has_hung_up(wait_s):
+            # An agent that ended with its operator may be heard before the operator's own silence.
+            who, reason, self._report.ending_status = "operator", OPERATOR_GONE, "aborted"
+        self._report.fail(who, reason)
+        self._journal.event("emergency", who=who, reason=reason)
+        self._log("critical", f"emergency shutdown: {who}: {reason}")
+
+    def _agents_stopped(self, missing: tuple[str, ...]) -> None:
+        if missing:
+            self._log("error", f"{', '.join(missing)}: no word that records are closed")
+            self._journal.event("not_stopped", agents=list(missing))
+            self._report.not_stopped = missing
+        self._jobs.close()
+        health = self._sampler.wait(SAMPLER_TIMEOUT_S)
+        self._session.cleaned_up()
+        now_s = monotonic()
+        counts = self._journal.close(self._config.timeouts.shutdown_s)
+        self._report.records = {**counts.to_mapping(), "health": health}
+        self._session.records_closed(now_s)
+
+    def _agent_moved(self, event: told.AgentMoved) -> None:
+        peer = self._session.peers[event.agent]
+        moved = {
+            "agent": event.agent,
+            "state": event.phase.value,
+            "reason": event.reason,
+            "incarnation": len(peer.incarnations_seen),
+        }
+        self._journal.event("agent", **moved)
+        self._operator.emit({"event": "agent", **moved})
+
+    def _agent_lost(self, agent: str, reason: str) -> None:
+        self._report.lost[agent] = reason
+        self._log("error", f"{agent} is lost: {reason}")
+        if self._is_set_up:  # else it is told of as soon as it can take it
+            self._tell_lost(agent)
+
+    def _tell_lost(self, agent: str) -> None:
+        if self._takes_data and self._config.on_agent_loss == "continue":
+            self._call("agent_lost", agent, self._report.lost[agent])
+
+    def _agent_rejoined(self, agent: str) -> None:
+        self._log("info", f"{agent} has rejoined at t = {self._port.now_s():.2f} s")
+        self._journal.event("agent_rejoined", agent=agent)
+        if self._takes_data:
+            self._call("agent_rejoined", agent)
+
+    # Towards the operator -----------------------------------------------------------------------
+
+    def _command(self, command: Mapping[str, Any]) -> None:
+        self._orders.obey(command)
+        self._pump()
+
+    def _watch_line(self) -> None:
+        grace_s = self._launch.reattach_s + self._config.timeouts.shutdown_s + HANG_GRACE_S
+        end_after_hang_up(self._line_fd, grace_s)
+
+    def _operator_gone(self) -> None:
+        # Waiting for agents, the sampler's close, the records: each has its own deadline.
+        extend(2 * self._config.timeouts.shutdown_s + SAMPLER_TIMEOUT_S + HANG_GRACE_S)
+        self._end("operator", OPERATOR_GONE, "aborted")
+
+    def _end(self, who: str, reason: str, status: str) -> None:
+        if self._session.state in HOST_LIVE:
+            self._report.ending_status = status
+            self._session.emergency(who, reason, monotonic())
+            self._pump()
+
+    def _progress(self) -> None:
+        self._progress_timer.reschedule(monotonic() + PROGRESS_INTERVAL_S)
+        self._operator.emit(self._report.progress(self._session, self._port.t_s()))
+        self._devices.look()
+        for text in self._report.new_troubles(self._session, self._recorder.problem):
+            self._log("error", text)
+
+    def _log(self, level: str, text: str) -> None:
+        self._journal.say(level, text)
+        self._operator.emit({"event": "log", "level": level, "source": HOST, "text": text})
+
+    def _close(self) -> int:
+        self._devices.close()
+        network = self._port.socket.counters()
+        carried = self._port.carrier.to_mapping()
+        result = self._report.result(self._session, network=network, carried=carried)
+        result["host_calls"] = self._calls.to_mapping()
+        code = hand_over(result, self._directory, self._operator)
+        self._calls.close()
+        self._port.socket.close()
+        self._reactor.close()
+        return code
+
+    # Towards the simulation ------------------------------------------------------------------------
+
+    def _call(self, name: str, *arguments: Any) -> Any:
+        """Call the plug-in; what it raises, or returns against its contract, ends the run by name."""
+        return self._guard(self._half.call, name, *arguments)
+
+    def _guard(self, call: Any, *arguments: Any) -> Any:
+        try:
+            return call(*arguments)
+        except HalfFailed as failure:
+            self._port.must_pump = True
+            self._session.emergency(HOST, str(failure), monotonic())
+            return None

@@ -1,0 +1,229 @@
+"""The host's account of a run: progress on the way, and the result at its end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+from madns_runtime.medium.outcomes import between_agents
+from madns_runtime.protocol.events import Phase
+from madns_runtime.protocol.host_peers import Peer
+from madns_runtime.protocol.host_session import HostSession
+from madns_runtime.recording.newest_values import told_columns
+
+SERVICES = ("best", "reliable", "sync")
+
+
+@dataclass(slots=True)
+class HostReport:
+    """Collects what the result will hold while the run goes on."""
+
+    duration_s: float
+    columns: tuple[str, ...] = ()
+    """Fields of agents' streams whose newest values are told."""
+    t0_utc: str | None = None
+    lost: dict[str, str] = field(default_factory=dict)
+    not_stopped: tuple[str, ...] = ()
+    """Agents that gave no word that their records are closed."""
+    simulation: Mapping[str, Any] = field(default_factory=dict)
+    records: Mapping[str, Any] = field(default_factory=dict)
+    scheduling: Mapping[str, Any] = field(default_factory=dict)
+    ending_status: str | None = None
+    """Status of a run that an order of the operator ends."""
+    _who: str | None = None
+    _reason: str | None = None
+    completed_s: float | None = None
+    """Simulated time of the host at which every agent had run its simulated time, s."""
+    _told: set[str] = field(default_factory=set)
+    """Agents, and "" for the host, whose trouble with their records has been told."""
+
+    def fail(self, who: str, reason: str) -> None:
+        """Keep the first cause."""
+        if self._reason is None:
+            self._who, self._reason = who, reason
+
+    def new_troubles(self, session: HostSession, own: str | None) -> Iterator[str]:
+        """Yield words for who has trouble with its records, the first time; *own* is the host's."""
+        problems = {"": own, **{name: p.report.get("problem") for name, p in session.peers.items()}}
+        for who, problem in problems.items():
+            if problem and who not in self._told:
+                self._told.add(who)
+                yield f"{who}{': ' if who else ''}records are being lost: {problem}"
+
+    def progress(self, session: HostSession, t_s: float | None) -> dict[str, Any]:
+        """Return the progress event: what the agents' newest reports say."""
+        reports = [peer.report for peer in session.peers.values() if peer.report]
+        factors = [r["rtf"] for r in reports if r.get("rtf") is not None]
+        uplink_lost = sum(
+            peer.link.counters.best.lost for peer in session.peers.values() if peer.link
+        )
+        told = [
+            (peer.name, peer.report["columns"])
+            for peer in session.peers.values()
+            if "columns" in peer.report
+        ]
+        ready = (Phase.READY, Phase.SETTING_UP, Phase.SIMULATION_READY)
+        return {
+            "event": "progress",
+            "t_s": None if t_s is None else round(min(t_s, self.duration_s), 3),
+            "rtf": max(factors, key=lambda rtf: abs(rtf - 1.0)) if factors else None,
+            "ready": len(session.agents_in(*ready)),
+            "running": len(session.agents_in(Phase.RUNNING)),
+            "complete": len(session.agents_in(Phase.COMPLETE, Phase.STOPPED)),
+            "lost": len(session.agents_in(Phase.LOST)),
+            "ticks": sum(r.get("ticks", 0) for r in reports),
+            "missed": sum(r.get("missed", 0) for r in reports),
+            "lateness_us_p50": _median([r["late_p50_us"] for r in reports if "late_p50_us" in r]),
+            "lateness_us_p99": max(
+                (r["late_p99_us"] for r in reports if "late_p99_us" in r), default=None
+            ),
+            "lost_messages": uplink_lost + sum(r.get("lost", 0) for r in reports),
+            "records_dropped": sum(r.get("dropped", 0) for r in reports),
+            **told_columns(self.columns, told),
+        }
+
+    def result(
+        self,
+        session: HostSession,
+        *,
+        network: Mapping[str, Any],
+        carried: Mapping[str, Any] = MappingProxyType({}),
+    ) -> dict[str, Any]:
+        """
+        Return the result as the operator's side expects it.
+
+        Args:
+            session: The run's.
+            network: Counts of the host's socket.
+            carried: The host's account of messages between agents.
+        """
+        agents = {
+            name: _agent_result(peer, self.lost.get(name)) for name, peer in session.peers.items()
+        }
+        ended = self.ending_status or "failed"
+        status = "complete" if self._reason is None else ended
+        return {
+            "status": status,
+            "who": self._who,
+            "reason": self._reason,
+            "t0_utc": self.t0_utc,
+            "duration_s": self.duration_s,
+            "completed_s": self.completed_s,
+            "rtf": _worst_rtf(agents.values()),
+            "agents": agents,
+            "lost": sorted(self.lost),
+            "not_stopped": list(self.not_stopped),
+            "network": network,
+            "messages": _totals(agents.values()),
+            "between_agents": between_agents(
+                carried,
+                (peer.records.get("between_agents", {}) for peer in session.peers.values()),
+            ),
+            "refused": dict(session.refused),
+            "malformed_messages": session.malformed_count,
+            "records": self.records,
+            "columns": list(self.columns),
+            "simulation": self.simulation,
+            "scheduling": self.scheduling,
+        }
+
+
+def _agent_result(peer: Peer, loss_reason: str | None) -> dict[str, Any]:
+    summary = dict(peer.summary)
+    simulation = summary.pop("simulation", {})
+    records = dict(peer.records)
+    return {
+        "state": peer.phase.value,
+        "reason": loss_reason,
+        "incarnations": len(peer.incarnations_seen),
+        **summary,
+        "messages": _messages(peer, records.pop("messages", None), records.get("held_dropped", 0)),
+        "records": records,
+        "simulation": simulation,
+    }
+
+
+def _messages(
+    peer: Peer, agent_side: Mapping[str, Any] | None, held_dropped: int
+) -> dict[str, Any]:
+    """
+    Join both ends' counters of an agent's link.
+
+    The agent counts before its last word, the host after it. Without the agent's own count nobody
+    knows what was lost: None, and a check on it does not hold. What came while the agent's half was
+    being set up, and was too much to hold (*held_dropped*), never reached it: lost, of whichever class.
+    """
+    host_side: Mapping[str, Any] = peer.link.counters.to_mapping() if peer.link else {}
+    joined: dict[str, Any] = {
+        service: _joined(service, host_side, agent_side) for service in SERVICES
+    }
+    sides = (host_side, agent_side or {}, *peer.retired_counters)
+    joined["sync"]["deadlines_broken"] = sum(side.get("deadlines_broken", 0) for side in sides)
+    if joined["reliable"]["lost"] is not None:
+        joined["reliable"]["lost"] += held_dropped
+    joined["not_sent"] = peer.not_sent
+    joined["agent"] = dict(agent_side or {})
+    joined["host"] = dict(host_side)
+    if peer.retired_counters:
+        joined["host_earlier"] = list(peer.retired_counters)
+    return joined
+
+
+def _joined(
+    service: str, host_side: Mapping[str, Any], agent_side: Mapping[str, Any] | None
+) -> dict[str, int | None]:
+    up: Mapping[str, Any] = (agent_side or {}).get(service, {})
+    down: Mapping[str, Any] = host_side.get(service, {})
+    # AgentStopped, in SYNC, is sent after the agent has counted.
+    last_word = 1 if service == "sync" and agent_side is not None else 0
+    sent_up, sent_down = up.get("sent", 0) + last_word, down.get("sent", 0)
+    lost: int | None = None
+    if service == "best":
+        # Gaps between what came; one that is pushed out of the sender's queue leaves a gap as well.
+        lost = up.get("lost", 0) + down.get("lost", 0)
+    elif agent_side is not None:
+        lost = max(0, sent_up - down.get("received", 0)) + max(0, sent_down - up.get("received", 0))
+    return {
+        "sent": sent_up + sent_down,
+        "received": up.get("received", 0) + down.get("received", 0),
+        "lost": lost,
+        "resent": up.get("resent", 0) + down.get("resent", 0),
+        "late": up.get("late", 0) + down.get("late", 0),
+    }
+
+
+def _totals(agents: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, int | None]]:
+    """
+    Add up the messages of all agents.
+
+    What was sent to agents that were lost is not judged with the rest, but told: "to_lost_agents".
+    """
+    totals: dict[str, dict[str, int | None]] = {service: {} for service in SERVICES}
+    for agent in agents:
+        is_lost = agent["state"] == Phase.LOST.value
+        for service in SERVICES:
+            total = totals[service]
+            for name, count in agent["messages"][service].items():
+                if is_lost and name == "lost":
+                    total.setdefault("lost", 0)
+                    continue
+                before = total.get(name, 0)
+                total[name] = None if count is None or before is None else before + count
+            down = agent["messages"]["host"].get(service, {})
+            undelivered = down.get("lost", 0) if is_lost and service != "best" else 0
+            earlier = agent["messages"].get("host_earlier", ())
+            undelivered += sum(one[service]["lost"] for one in earlier if service != "best")
+            total["to_lost_agents"] = (total.get("to_lost_agents") or 0) + undelivered
+    return totals
+
+
+def _worst_rtf(agents: Iterable[Mapping[str, Any]]) -> float | None:
+    """Return the real-time factor that is farthest from 1, of the agents that ran to the end."""
+    factors = [agent["rtf"] for agent in agents if agent.get("rtf") is not None]
+    return max(factors, key=lambda rtf: abs(rtf - 1.0)) if factors else None
+
+
+def _median(values: list[float]) -> float | None:
+    return sorted(values)[len(values) // 2] if values else None

@@ -1,0 +1,70 @@
+"""The framework's records of one agent in real time, beside those of the plug-in."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from madns_runtime.health.probe import ProcessUsage
+from madns_runtime.recording.records import CLOCK, PROCESS, TICKS
+from madns_runtime.recording.run_journal import RunJournal
+from madns_runtime.timing.clocksync import ClockEstimate
+
+CLOCK_INTERVAL_S = 1.0
+"""The clock's estimate is recorded this often, though it changes with every exchange."""
+PROBLEM_CHARACTERS_MAX = 200
+"""Of the disk's trouble in a report, which must fit a datagram."""
+
+
+class ProcessRecords:
+    """
+    The streams ticks, clock and process of one agent.
+
+    Args:
+        journal: Of the agent; these streams lie beside its own.
+
+    Raises:
+        MachineError: The directory takes no new file.
+    """
+
+    def __init__(self, journal: RunJournal) -> None:
+        self._recorder = journal.recorder
+        self._t_s = journal.t_s
+        for schema in (TICKS, CLOCK, PROCESS):
+            self._recorder.open_stream(schema)
+        self._clock_recorded_s = 0.0
+        self._usage = ProcessUsage()
+
+    def clock(self, clock: ClockEstimate, now_s: float) -> None:
+        """Record the estimate of the host's clock at local time *now_s*, now and then."""
+        t_s = self._t_s()
+        if t_s is None or now_s - self._clock_recorded_s < CLOCK_INTERVAL_S:
+            return
+        self._clock_recorded_s = now_s
+        self._recorder.record(
+            CLOCK.name,
+            (
+                round(t_s, 3),
+                round(clock.offset_s(now_s) * 1e6, 1),
+                round(clock.drift_ppm, 3),
+                round(clock.uncertainty_s(now_s) * 1e6, 1),
+                round(clock.round_trip_s_min * 1e6, 1),
+            ),
+        )
+
+    def begin_usage(self) -> None:
+        """Count what this process uses from now on."""
+        self._usage = ProcessUsage()
+
+    def usage(self) -> None:
+        """Record what this process has used since the last time."""
+        t_s = self._t_s()
+        self._recorder.record(
+            PROCESS.name, self._usage.read(None if t_s is None else round(t_s, 3))
+        )
+
+    def report(self) -> dict[str, Any]:
+        """Return what a ping tells of the records: how many were dropped, and the disk's trouble."""
+        report: dict[str, Any] = {"dropped": self._recorder.counts().dropped}
+        if (problem := self._recorder.problem) is not None:
+            report["problem"] = problem[:PROBLEM_CHARACTERS_MAX]
+        return report

@@ -1,0 +1,372 @@
+"""
+A machine's agents: forked from one preloaded parent, watched, restarted, and never left behind.
+
+The parent holds the write end of a life line; every child polls its read end and ends when it closes.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import orjson
+
+from madns_runtime.config import AgentLaunch
+from madns_runtime.errors import MachineError, MadnsError
+from madns_runtime.hardware.manager import DeviceManager
+from madns_runtime.health.sampler import SAMPLER_TIMEOUT_S, start_sampler
+from madns_runtime.health.stress import start_stress, stop_stress
+from madns_runtime.partial_file import write_whole
+from madns_runtime.plugin.context import clean_text
+from madns_runtime.plugin.half import RoleProgram
+from madns_runtime.processes import register
+from madns_runtime.reactor.forking import leave_parent
+from madns_runtime.reactor.operator_link import OPERATOR_GONE, OperatorLink, tell_loading
+from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.reactor.reattachment import way_back_of
+from madns_runtime.reactor.scheduling import freeze_garbage, outlive_parent
+from madns_runtime.realtime.agent import AgentOutcome
+from madns_runtime.realtime.agent_calls import AgentCalls, LoopSeat
+from madns_runtime.realtime.agent_process import AgentProcess
+
+RESTART_DELAY_S = 0.2
+KILL_GRACE_S = 3.0
+"""Beyond the time for shutdown: one that cannot even do that is killed."""
+KILL_WAIT_S = 2.0
+FLUSH_TIMEOUT_S = 2.0
+REASON_BYTES_MAX = 2048
+"""A reason is written in one piece, so that those of two children never mix."""
+
+
+@dataclass(slots=True)
+class SupervisedProcess:
+    """One process of agents."""
+
+    agents: tuple[str, ...]
+    pid: int
+    incarnation: int
+    calls: AgentCalls
+    reason: str | None = None
+    may_restart: bool = True
+    """Permission to start it again: granted to a killed one, not to one that ended by order or with the run."""
+    has_ended_well: bool = False
+
+
+class Supervisor:
+    """
+    Runs a machine's agents until they have ended or the operator is gone.
+
+    Args:
+        launch: Which agents, and where the host is.
+        fds: Where the operator's commands come from and events go to.
+        pending: What had already come behind the launch document.
+    """
+
+    def __init__(self, launch: AgentLaunch, fds: tuple[int, int], pending: bytes) -> None:
+        config = launch.config
+        self._launch = launch
+        # Loaded before the forks: the children share the parent's pages.
+        self._program = RoleProgram.load(config, "agent", tell=partial(tell_loading, fds[1]))
+        machine_directory = Path(launch.directory) / "machines" / launch.machine
+        self._sampler = start_sampler(
+            machine_directory,
+            run=config.run,
+            machine=launch.machine,
+            settings=config.health,
+            recording=config.recording,
+            life=launch.life,
+        )
+        self._stress = start_stress(config.health.stress_workers)
+        self._devices = DeviceManager(launch, tell=partial(tell_loading, fds[1]))
+        self._life_read_fd, self._life_write_fd = os.pipe()
+        self._reason_read_fd, self._reason_write_fd = make_reason_pipe()
+        self._children: dict[int, SupervisedProcess] = {}
+        self._is_ending = False
+        self._failed = False
+        freeze_garbage()
+        self._devices.start()
+        agents, size = launch.agents, config.agents.per_process
+        self._to_fork = [agents[i : i + size] for i in range(0, len(agents), size)]
+        started = [
+            self._fork(agents, incarnation=launch.first_incarnation(agents))
+            for agents in self._to_fork
+        ]
+        self._reactor = Reactor()
+        self._operator = OperatorLink(
+            self._reactor,
+            fds,
+            on_command=self._command,
+            on_gone=partial(self._end, OPERATOR_GONE),
+            pending=pending,
+            is_detached=launch.is_detached,
+            way_back=way_back_of(launch, machine_directory, launch.life),
+        )
+        for child in started:
+            self._tell_started(child)
+
+    def run(self) -> int:
+        """Run to the end and return the process's exit code: 0 if every agent ended as ordered."""
+        outlive_parent()
+        if self._launch.is_detached:
+            signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        reactor = self._reactor
+        reactor.on_signal(signal.SIGCHLD, self._reap)
+        reactor.on_signal(signal.SIGTERM, lambda: self._end("SIGTERM"))
+        reactor.on_signal(signal.SIGINT, lambda: None)  # a terminal's Ctrl-C is the operator's
+        reactor.add_reader(self._reason_read_fd, self._read_outcomes)
+        self._devices.watch(reactor, self._operator.emit)
+        self._reap()
+        reactor.run()
+        return self._close()
+
+    # Children --------------------------------------------------------------------------------------
+
+    def _fork(self, agents: tuple[str, ...], *, incarnation: int) -> SupervisedProcess:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        calls = AgentCalls()
+        try:
+            pid = os.fork()
+        except OSError as error:
+            told = f"cannot start the process of {', '.join(agents)}: {error.strerror}"
+            raise MachineError(told) from error
+        if pid == 0:
+            self._run_child(agents, incarnation, calls)
+        child = SupervisedProcess(agents, pid, incarnation, calls)
+        self._children[pid] = child
+        self._devices.agents_started(agents, pid)
+        return child
+
+    def _run_child(self, agents: tuple[str, ...], incarnation: int, calls: AgentCalls) -> None:
+        """Run as a child, and never return."""
+        code = 1
+        try:
+            shared = self._devices.fds_of(agents)
+            leave_parent(keep={self._life_read_fd, self._reason_write_fd, *shared})
+            process = AgentProcess(
+                self._launch,
+                [
+                    LoopSeat(name, number, calls, self._devices.hardware_of(name))
+                    for number, name in enumerate(agents)
+                ],
+                replace(self._program, life=incarnation),
+                life_fd=self._life_read_fd,
+            )
+            with register(
+                self._launch.config.run, "agent", ",".join(agents), self._launch.directory
+            ):
+                outcomes = process.run()
+            code = 0 if all(outcome.as_ordered for outcome in outcomes.values()) else 1
+            self._write_outcomes(outcomes)
+        except MadnsError as error:
+            self._write_failure(agents, str(error))
+        except BaseException as error:  # noqa: BLE001 - the last frame of a process; it is told below
+            self._write_failure(agents, f"{type(error).__name__}: {error}")
+            sys.excepthook(type(error), error, error.__traceback__)
+        finally:
+            sys.stderr.flush()
+            os._exit(code)
+
+    def _write_failure(self, agents: Sequence[str], reason: str) -> None:
+        outcome = AgentOutcome(as_ordered=False, reason=reason, may_restart=True)
+        self._write_outcomes(dict.fromkeys(agents, outcome))
+
+    def _write_outcomes(self, outcomes: Mapping[str, AgentOutcome]) -> None:
+        for agent, outcome in outcomes.items():
+            told = {
+                "pid": os.getpid(),
+                "agent": agent,
+                "as_ordered": outcome.as_ordered,
+                "reason": clean_text(outcome.reason)[: REASON_BYTES_MAX // 4],
+                "may_restart": outcome.may_restart,
+            }
+            os.write(self._reason_write_fd, orjson.dumps(told) + b"\n")
+
+    def _read_outcomes(self) -> None:
+        try:
+            data = os.read(self._reason_read_fd, 65_536)
+        except BlockingIOError:
+            return
+        for line in data.splitlines():
+            told = orjson.loads(line)
+            child = self._children.get(told["pid"])
+            if child is None:
+                continue
+            if told["as_ordered"]:
+                child.has_ended_well = True
+                continue
+            child.may_restart = child.may_restart and bool(told["may_restart"])
+            if child.reason is None:
+                is_alone = len(child.agents) == 1
+                child.reason = told["reason"] if is_alone else f"{told['agent']}: {told['reason']}"
+
+    def _reap(self) -> None:
+        for child in list(self._children.values()):
+            pid, status = os.waitpid(child.pid, os.WNOHANG)
+            if pid:
+                self._child_ended(child, status)
+        self._devices.reap()
+        if not self._children and not self._to_fork:
+            self._reactor.stop()
+
+    def _child_ended(self, child: SupervisedProcess, status: int) -> None:
+        code = os.waitstatus_to_exitcode(status)
+        while select.select([self._reason_read_fd], [], [], 0)[0]:
+            self._read_outcomes()
+        where = child.calls.interrupted(child.agents)
+        if code == 0 and not child.has_ended_well:
+            child.reason = f"its process ended by itself, exit code 0{where}"
+        del self._children[child.pid]
+        self._devices.agents_ended(child.agents)
+        signal_name = signal.Signals(-code).name if code < 0 else None
+        how = _how(code, signal_name, child.reason, where=where)
+        has_failed = code != 0 or not child.has_ended_well
+        will_restart = (
+            has_failed
+            and child.may_restart
+            and not self._is_ending
+            and not self._operator.is_silent  # a cut link: the operator will start them again
+            and self._launch.config.on_agent_loss == "continue"
+            and child.incarnation <= self._launch.config.agents.restarts_max
+        )
+        self._failed = self._failed or has_failed
+        if self._is_ending and code > 0 and child.reason is None:
+            self._tell_killed(
+                child, f"; machines/{self._launch.machine}/stderr.txt shows where it hung"
+            )
+        for agent in child.agents:
+            self._operator.emit(
+                {
+                    "event": "exited",
+                    "agent": agent,
+                    "pid": child.pid,
+                    "code": code if code >= 0 and not (has_failed and code == 0) else None,
+                    "signal": signal_name,
+                    "how": how,
+                    "will_restart": will_restart,
+                }
+            )
+        if will_restart:
+            self._to_fork.append(child.agents)
+            self._restart_soon(child)
+
+    def _restart_soon(self, child: SupervisedProcess) -> None:
+        due_s = self._reactor.now_s() + RESTART_DELAY_S
+        self._reactor.call_at(due_s, partial(self._restart, child))
+
+    def _restart(self, child: SupervisedProcess) -> None:
+        if self._is_ending:
+            self._reap()
+        elif self._operator.is_cut:  # it comes back first, or all is over
+            self._restart_soon(child)
+        else:
+            self._tell_started(self._fork(child.agents, incarnation=child.incarnation + 1))
+
+    def _tell_started(self, child: SupervisedProcess) -> None:
+        if child.agents in self._to_fork:
+            self._to_fork.remove(child.agents)
+        for agent in child.agents:
+            self._operator.emit(
+                {
+                    "event": "started",
+                    "agent": agent,
+                    "pid": child.pid,
+                    "incarnation": child.incarnation,
+                }
+            )
+
+    # The end ---------------------------------------------------------------------------------------
+
+    def _command(self, command: Mapping[str, Any]) -> None:
+        if command.get("command") == "stop":
+            self._end(str(command.get("reason", "stopped by the operator")))
+        elif command.get("command") == "inject":
+            self._inject(command)
+        else:
+            self._operator.refuse(command)
+
+    def _inject(self, command: Mapping[str, Any]) -> None:
+        """Put a fault in force around a device, and say what became of the order."""
+        target, action, value = command.get("target"), command.get("action"), command.get("value")
+        refusal = self._devices.insert_fault(str(target), str(action), value)
+        told = {"event": "injected", "target": target, "action": action, "refusal": refusal}
+        self._operator.emit(told)
+
+    def _end(self, reason: str) -> None:
+        """Close the life line; who does not end by it in time is killed."""
+        if self._is_ending:
+            return
+        self._is_ending = True
+        self._to_fork.clear()
+        self._devices.end(reason)
+        # A byte for each, so that they can tell an order from the death of this process.
+        os.write(self._life_write_fd, bytes(len(self._children)))
+        os.close(self._life_write_fd)
+        grace_s = self._launch.config.timeouts.shutdown_s + KILL_GRACE_S
+        self._reactor.call_at(self._reactor.now_s() + grace_s, self._kill)
+        self._operator.emit({"event": "log", "level": "info", "text": f"ending: {reason}"})
+        if not self._children:
+            self._reactor.stop()
+
+    def _kill(self) -> None:
+        for child in self._children.values():
+            os.kill(child.pid, signal.SIGKILL)
+            self._tell_killed(child)
+        # One that not even this ends hangs in the kernel; it is left to whoever reaps this process.
+        self._reactor.call_at(self._reactor.now_s() + KILL_WAIT_S, self._reactor.stop)
+
+    def _tell_killed(self, child: SupervisedProcess, hint: str = "") -> None:
+        text = f"{', '.join(child.agents)} did not end in time and was killed{hint}"
+        self._operator.emit({"event": "log", "level": "error", "text": text})
+
+    def _close(self) -> int:
+        if not self._is_ending:
+            os.close(self._life_write_fd)
+        stop_stress(self._stress, timeout_s=2.0)
+        devices = self._devices.close()
+        self._record_devices(devices)
+        health = self._sampler.wait(SAMPLER_TIMEOUT_S)
+        self._operator.emit({"event": "finished", "health": health, "devices": devices})
+        self._operator.flush(FLUSH_TIMEOUT_S)
+        self._operator.close()
+        self._reactor.close()
+        return 1 if self._failed else 0
+
+    def _record_devices(self, devices: Mapping[str, Any]) -> None:
+        """Leave the devices' account beside the machine's records: whoever judges the run reads it there."""
+        if not devices:
+            return
+        life = f".{self._launch.life}" if self._launch.life > 1 else ""
+        path = Path(self._launch.directory, "machines", self._launch.machine, f"devices{life}.json")
+        try:
+            write_whole(path, orjson.dumps(devices, option=orjson.OPT_SERIALIZE_NUMPY))
+        except OSError as error:
+            text = f"the account of the devices cannot be written: {path}: {error.strerror}"
+            self._operator.emit({"event": "log", "level": "error", "text": text})
+
+
+def make_reason_pipe() -> tuple[int, int]:
+    """
+    Return the ends of the pipe by which children tell how they ended.
+
+    Reaping empties it, too: the loop's reader, called afterwards in the same turn, finds nothing and does not wait.
+    """
+    read_fd, write_fd = os.pipe()
+    os.set_blocking(read_fd, False)
+    return read_fd, write_fd
+
+
+def _how(code: int, signal_name: str | None, reason: str | None, *, where: str) -> str:
+    """Return how a process ended; one that gave no reason, also in which call of the plug-in."""
+    if signal_name is not None:
+        return f"killed by {signal_name}{where}"
+    if reason is not None:
+        return reason
+    return "ended" if code == 0 else f"exit code {code}{where}"

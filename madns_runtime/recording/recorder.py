@@ -1,0 +1,150 @@
+"""
+Encodes records and puts them into a bounded buffer, from where a writer brings them to the disk.
+
+`record` never waits for a writer thread. What does not fit the buffer is counted, stream by stream. One
+thread, the loop's, may call a recorder, and a recorder does not survive a fork: make one in the child.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import orjson
+
+from madns_runtime.config import Recording
+from madns_runtime.errors import PluginError
+from madns_runtime.recording.encoding import ENCODING, count_not_finite, explain_refusal, to_plain
+from madns_runtime.recording.record_files import RecordCounts, RecordFiles
+from madns_runtime.recording.records import StreamSchema
+from madns_runtime.recording.stream_file import LINE_OVERHEAD_BYTES, StreamFile
+from madns_runtime.recording.text_file import TextFile
+from madns_runtime.recording.writer_thread import RecordWriter, WriterThread
+
+WAKE_BYTES = 65_536
+"""The writer is woken early when this much waits."""
+CLOSE_TIMEOUT_S = 10.0
+
+
+class Recorder:
+    """
+    The record streams of one process (or of one agent of several in a process).
+
+    Args:
+        files: Where records go.
+        settings: Bounds and intervals.
+        writer: What brings them there; None for a thread of its own.
+    """
+
+    def __init__(
+        self, files: RecordFiles, settings: Recording, writer: RecordWriter | None = None
+    ) -> None:
+        self._files = files
+        self._writer = writer or WriterThread(files, settings)
+        self._limit_bytes = settings.buffer_bytes
+        self._queued_bytes = 0
+        self._streams: dict[str, StreamFile] = {}
+        self._texts: dict[str, TextFile] = {}
+        self.start = self._writer.start
+        self.flush = self._writer.flush
+
+    def open_stream(self, schema: StreamSchema) -> None:
+        """
+        Open a stream and create its file, see `RecordFiles.create_stream`.
+
+        Raises:
+            PluginError: The schema is unfit, or a stream of that name is open.
+            MachineError: The directory takes no new file.
+        """
+        if schema.name in self._streams:
+            raise PluginError(f"stream {schema.name}: declared twice")
+        self._streams[schema.name] = self._files.create_stream(schema)
+
+    def set_t0(self, t0_utc: str) -> None:
+        """
+        State when simulated time zero is, in UTC (ISO 8601).
+
+        Streams whose first line is written from now on carry it there; to the others, whose first line
+        is on the disk already, a line {"t0_utc": ...} is added.
+        """
+        self._files.t0_utc = t0_utc
+
+    def record(self, stream: str, values: Sequence[Any] | Mapping[str, Any]) -> None:
+        """
+        Record one value a field; a mapping holds them by name. Never blocks, but where its writer does.
+
+        Object streams take more names than the schema has. NaN and infinity become null and are counted.
+
+        Raises:
+            PluginError: The stream is unknown, the number of values is not the schema's, or a value
+                has no JSON form.
+            MachineError: The writer writes at once, and the disk refuses.
+        """
+        file = self._streams.get(stream)
+        if file is None:
+            raise PluginError(
+                f"unknown stream {stream!r}; declared are: {', '.join(self._streams) or 'none'}"
+            )
+        if type(values) not in file.direct:
+            values = file.arrange(values)
+        elif len(values) != file.width:
+            raise file.width_error(len(values))
+        try:
+            line = orjson.dumps(values, to_plain, ENCODING)
+        except TypeError as error:
+            raise explain_refusal(stream, values, error) from error
+        if b"null" in line:
+            file.not_finite += count_not_finite(values)
+        queued_bytes = self._queued_bytes + len(line) + LINE_OVERHEAD_BYTES
+        waiting_bytes = queued_bytes - self._files.freed_bytes
+        if waiting_bytes > self._limit_bytes:
+            file.overflowed += 1
+            return
+        self._queued_bytes = queued_bytes
+        file.lines.append(line)
+        if waiting_bytes > WAKE_BYTES:
+            self.flush()
+
+    def keep_text(self, name: str, data: bytes) -> None:
+        """
+        Keep what a program wrote in <name>.txt beside the records: its first part and its last. Never blocks.
+
+        Raises:
+            PluginError: The name is no file name.
+        """
+        text = self._texts.get(name)
+        if text is None:
+            text = self._texts[name] = self._files.create_text(name)
+        text.add(data)
+
+    def newest(self, stream: str) -> Mapping[str, Any]:
+        """Return the newest record of a stream by its fields' names; empty where there is none."""
+        file = self._streams.get(stream)
+        if file is None or not (line := file.newest):
+            return {}
+        record = orjson.loads(line)
+        if isinstance(record, dict):
+            return record
+        return {field.name: value for field, value in zip(file.schema.fields, record, strict=True)}
+
+    def counts(self) -> RecordCounts:
+        """Return what was written and dropped until now."""
+        return self._files.counts()
+
+    @property
+    def problem(self) -> str | None:
+        """The first and the latest error of the disk; None if there was none."""
+        return "; ".join(self._files.errors) or None
+
+    def close(self, timeout_s: float = CLOSE_TIMEOUT_S) -> RecordCounts:
+        """
+        Write what waits and the end lines, make it durable, and return the last counts.
+
+        What a full disk still refuses is dropped and counted. What is recorded from now on is dropped.
+
+        Args:
+            timeout_s: How long to wait for the disk; after it an error is in the counts.
+        """
+        self._limit_bytes = -1
+        self._writer.close(timeout_s)
+        return self.counts()

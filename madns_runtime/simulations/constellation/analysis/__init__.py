@@ -1,0 +1,1 @@
+"""What a report and a comparison tell of a constellation."""

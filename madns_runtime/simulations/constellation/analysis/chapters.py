@@ -1,0 +1,74 @@
+"""A constellation's chapters of a report: which of its streams gets which figures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from madns_runtime.analysis.chapters import Chapter, build_sections
+from madns_runtime.analysis.tables import ComparedRun, RecordedRun
+from madns_runtime.analysis.values import Section, SimulationDifference
+from madns_runtime.simulations.constellation.analysis.comparison import compare_runs
+from madns_runtime.simulations.constellation.analysis.comparison_tables import (
+    comparison_blocks,
+    to_document,
+)
+from madns_runtime.simulations.constellation.analysis.links import (
+    contact_blocks,
+    link_blocks,
+    message_blocks,
+    refusal_blocks,
+)
+from madns_runtime.simulations.constellation.analysis.maneuvers import (
+    command_blocks,
+    estimate_blocks,
+    maneuver_blocks,
+    slot_blocks,
+    truth_change_blocks,
+)
+from madns_runtime.simulations.constellation.analysis.measurement_errors import sensor_blocks
+from madns_runtime.simulations.constellation.analysis.orbits import (
+    elements_blocks,
+    invariants_blocks,
+    state_blocks,
+    truth_blocks,
+)
+from madns_runtime.simulations.constellation.analysis.slots import read_control
+
+CONTROL = "Control"
+SENSORS = ("gnss", "gyro", "accelerometer", "magnetometer", "star_tracker", "sun_sensor")
+CHAPTERS = {
+    "state": Chapter("Orbits", state_blocks),
+    "elements": Chapter("Orbits", elements_blocks),
+    "estimates": Chapter(CONTROL, estimate_blocks),
+    "host_maneuvers": Chapter(CONTROL, maneuver_blocks),
+    "commands": Chapter(CONTROL, command_blocks),
+    "command_results": Chapter(CONTROL, command_blocks),
+    "truth_changes": Chapter(CONTROL, truth_change_blocks),
+    "host_links": Chapter("Links", link_blocks),
+    "messages": Chapter("Links", message_blocks),
+    "refusals": Chapter("Links", refusal_blocks),
+    "host_contacts": Chapter("Links", contact_blocks),
+    **{name: Chapter("Sensors", sensor_blocks) for name in SENSORS},
+    "host_truth": Chapter("Truth on record", truth_blocks),
+    "host_invariants": Chapter("Health of the model", invariants_blocks),
+}
+"""By table name, in the order of the report."""
+
+
+def figures(run: RecordedRun) -> list[Section]:
+    """Return the chapters of a run; what became of its slots comes before what flight software believes."""
+    sections = build_sections(CHAPTERS, run)
+    rows = read_control(run.tables, run.config)
+    if not rows:
+        return sections
+    control = next((s for s in sections if s.title == CONTROL), Section(title=CONTROL, blocks=()))
+    with_slots = replace(control, blocks=(*slot_blocks(rows), *control.blocks))
+    if control not in sections:
+        return [*sections, with_slots]
+    return [with_slots if section is control else section for section in sections]
+
+
+def compare(a: ComparedRun, b: ComparedRun) -> SimulationDifference:
+    """Return what differs between two runs."""
+    found = compare_runs(a, b)
+    return SimulationDifference(document=to_document(found), blocks=comparison_blocks(found))

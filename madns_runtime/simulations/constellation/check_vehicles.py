@@ -1,0 +1,228 @@
+"""
+Faults in what a scenario says of vehicles, their sensors and flight software, and of the ground.
+
+Whether code that it names is there is found out without running any of it, for `cosmos validate`: a file is
+parsed, not imported. What it does when it is imported shows on the agent.
+"""
+
+from __future__ import annotations
+
+import ast
+import fnmatch
+import importlib.util
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+from madns_runtime.bounded_files import FileRefused, read_regular_file
+from madns_runtime.plugin.code_places import CODE_BYTES_MAX
+from madns_runtime.plugin.registry import is_file
+from madns_runtime.simulations.constellation.equipment import SensorNoise, Vehicle
+from madns_runtime.simulations.constellation.flight.programs import find_program
+from madns_runtime.simulations.constellation.parameters import (
+    ConstellationParameters,
+    FlightProcess,
+)
+from madns_runtime.simulations.constellation.vehicles import is_glob
+
+_HERE = "madns_runtime.simulations.constellation"
+WALL = tuple(f"{_HERE}.{part}" for part in ("truth", "vehicle", "host_side", "host", "agent"))
+"""Packages that flight software must not import: all that knows truth."""
+PENDING_MAX = 10_000
+"""Measurements that a sensor may have under way: see vehicle.sensors.sensor."""
+
+
+def board_faults(
+    parameters: ConstellationParameters, names: Sequence[tuple[str, str]], base_directory: Path
+) -> list[str]:
+    """
+    Return the faults.
+
+    Args:
+        parameters: Of the scenario, within their bounds.
+        names: Names of each agent and of its satellite; empty if they are not known.
+        base_directory: Folder of the scenario.
+    """
+    faults = []
+    for number, vehicle in enumerate(parameters.vehicles):
+        field = f"parameters.vehicles[{number}]"
+        faults += glob_faults(f"{field}.agents", vehicle.agents, names)
+        faults += _body_faults(field, vehicle)
+        faults += _sensor_faults(field, vehicle)
+    faults += _flight_faults(parameters, names, base_directory)
+    faults += _ground_faults(parameters, names)
+    return faults
+
+
+def glob_faults(field: str, globs: Iterable[str], names: Sequence[tuple[str, str]]) -> list[str]:
+    """Return a fault for each glob that fits nobody."""
+    if not names:
+        return []
+    known = {name for pair in names for name in pair}
+    return [
+        f"{field}: {glob!r} fits no agent and no satellite, such as {names[0][0]} or {names[0][1]}"
+        for glob in globs
+        if glob not in known
+        and not (is_glob(glob) and any(map(re.compile(fnmatch.translate(glob)).match, known)))
+    ]
+
+
+def _body_faults(field: str, vehicle: Vehicle) -> list[str]:
+    faults = []
+    thruster, limits = vehicle.thruster, vehicle.ballistic_m2_kg_range
+    if thruster is not None and thruster.propellant_kg >= vehicle.mass_kg:
+        faults.append(
+            f"{field}.thruster.propellant_kg: expected less than the vehicle's mass_kg, "
+            f"{vehicle.mass_kg:g}, got {thruster.propellant_kg:g}"
+        )
+    if limits is not None and not 0.0 <= limits[0] <= vehicle.ballistic_m2_kg <= limits[1]:
+        faults.append(
+            f"{field}.ballistic_m2_kg_range: expected smallest and largest, and ballistic_m2_kg "
+            f"({vehicle.ballistic_m2_kg:g}) between them, got {limits[0]:g} to {limits[1]:g}"
+        )
+    if vehicle.attitude is not None:
+        a, b, c = sorted(vehicle.attitude.inertia_kg_m2)
+        if a + b < c:
+            faults.append(
+                f"{field}.attitude.inertia_kg_m2: no body has moments of which one exceeds the sum "
+                f"of the others, got {a:g}, {b:g} and {c:g}"
+            )
+    return faults
+
+
+def _sensor_faults(field: str, vehicle: Vehicle) -> list[str]:
+    sensors = vehicle.sensors
+    faults = [
+        f"{field}.sensors.{name}: needs a vehicle with attitude"
+        for name in ("gyro", "star_tracker")
+        if getattr(sensors, name) is not None and vehicle.attitude is None
+    ]
+    for name in type(sensors).__dataclass_fields__:
+        sensor: SensorNoise | None = getattr(sensors, name)
+        if sensor is not None and sensor.latency_s * sensor.rate_hz > PENDING_MAX:
+            faults.append(
+                f"{field}.sensors.{name}.latency_s: expected at most {PENDING_MAX} measurements "
+                f"under way, got {sensor.latency_s * sensor.rate_hz:g}"
+            )
+    magnetometer = sensors.magnetometer
+    wants_igrf = magnetometer is not None and magnetometer.field == "igrf"
+    if wants_igrf and importlib.util.find_spec("ppigrf") is None:
+        faults.append(
+            f"{field}.sensors.magnetometer.field: ppigrf is not installed here; "
+            "install it with: pip install 'cosmos-madns[igrf]'"
+        )
+    return faults
+
+
+def _flight_faults(
+    parameters: ConstellationParameters, names: Sequence[tuple[str, str]], base_directory: Path
+) -> list[str]:
+    flight = parameters.flight
+    if flight is None:
+        return []
+    if isinstance(flight, str):
+        return code_faults("parameters.flight", flight, base_directory, forbidden=WALL)
+    faults = glob_faults("parameters.flight.agents", flight.agents, names)
+    if isinstance(flight, FlightProcess):
+        return faults + _program_faults(flight.command[0], base_directory)
+    field, software = "parameters.flight.software", flight.software
+    return faults + code_faults(field, software, base_directory, forbidden=WALL)
+
+
+def _program_faults(program: str, base_directory: Path) -> list[str]:
+    """Return what is wrong with a program; an absolute path may exist on the boards alone."""
+    if Path(program).is_absolute() or find_program((program,), base_directory) is not None:
+        return []
+    path = base_directory / program
+    if path.is_file():
+        return [f"parameters.flight.command: {path} is not executable; chmod +x makes it so"]
+    where = base_directory if "/" in program else f"{base_directory} or on PATH"
+    return [f"parameters.flight.command: no program {program!r} in {where}"]
+
+
+def _ground_faults(
+    parameters: ConstellationParameters, names: Sequence[tuple[str, str]]
+) -> list[str]:
+    faults = []
+    known: set[str] = set()
+    for number, station in enumerate(parameters.stations):
+        if station.name in known:
+            field = f"parameters.stations[{number}].name"
+            faults.append(f"{field}: expected every name once, got {station.name!r} again")
+        known.add(station.name)
+    if parameters.uplinks and not parameters.stations:
+        faults.append("parameters.uplinks: need parameters.stations to leave from")
+    receivers = {name for pair in names for name in pair}
+    for number, uplink in enumerate(parameters.uplinks):
+        if receivers and uplink.to not in receivers:
+            field = f"parameters.uplinks[{number}].to"
+            faults.append(f"{field}: no agent and no satellite is called {uplink.to!r}")
+    return faults
+
+
+def code_faults(
+    field: str, spec: str, base_directory: Path, *, forbidden: Sequence[str] = ()
+) -> list[str]:
+    """
+    Return what is wrong with a class that a scenario names.
+
+    Args:
+        field: Dotted name of the parameter.
+        spec: file.py:Class beside the scenario, or module:Class.
+        base_directory: Folder of the scenario.
+        forbidden: Modules that its file must not import, nor what is below them.
+    """
+    place, _, name = spec.rpartition(":")
+    if not place or not name.isidentifier():
+        return [f"{field}: expected file.py:Class or module:Class, got {spec!r}"]
+    if not is_file(spec):
+        top = place.partition(".")[0]
+        if not top.isidentifier() or importlib.util.find_spec(top) is None:
+            return [f"{field}: no module {top!r} here; a file is written {place}.py:{name}"]
+        return []
+    path = base_directory / place
+    try:
+        tree = ast.parse(read_regular_file(path, bytes_max=CODE_BYTES_MAX), str(path))
+    except FileNotFoundError:
+        return [f"{field}: no such file: {path}"]
+    except SyntaxError as error:
+        return [f"{field}: {path}:{error.lineno}: {error.msg}"]
+    except FileRefused as error:
+        return [f"{field}: {error}"]
+    except (OSError, ValueError) as error:
+        return [f"{field}: {path} cannot be read: {error}"]
+    except (RecursionError, MemoryError):
+        return [f"{field}: {path}: its expressions are too deeply nested to be read"]
+    faults = [
+        f"{field}: {path}:{line}: expected no import of {module}: flight software sees what its "
+        "context gives it"
+        for line, module in _imports(tree)
+        if any(f"{module}.".startswith(f"{one}.") for one in forbidden)
+    ]
+    names = set(_names(tree))
+    if name not in names and "*" not in names:
+        classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
+        told = f"; it has {', '.join(classes)}" if classes else ""
+        faults.append(f"{field}: {path} has no class {name!r}{told}")
+    return faults
+
+
+def _imports(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield line and module of every import, wherever it stands; what is taken from a package may be a module."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield from ((node.lineno, f"{node.module}.{alias.name}") for alias in node.names)
+
+
+def _names(tree: ast.Module) -> Iterator[str]:
+    """Yield what a module's own lines bind, wherever below an if or a try they stand."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            yield node.name
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            for alias in node.names:
+                yield (alias.asname or alias.name).partition(".")[0]
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.id

@@ -1,0 +1,237 @@
+"""
+All that a constellation records: what each stream is called, its fields and their units.
+
+Light, so that `cosmos validate` asks for it without numpy, and on neither side of the wall: these are names.
+"""
+
+from __future__ import annotations
+
+from madns_runtime.plugin.api import DeclaredStream
+from madns_runtime.recording.records import Field
+from madns_runtime.simulations.constellation.parameters import ConstellationParameters
+
+STATE = (
+    Field("tick", "", "int"),
+    Field("x_teme_m", "m"),
+    Field("y_teme_m", "m"),
+    Field("z_teme_m", "m"),
+    Field("vx_teme_m_s", "m/s"),
+    Field("vy_teme_m_s", "m/s"),
+    Field("vz_teme_m_s", "m/s"),
+)
+"""Truth at every tick, or as often as the scenario says; a tick without truth has no record."""
+
+ELEMENTS = (
+    Field("tick", "", "int"),
+    Field("a_m", "m"),
+    Field("e", "1"),
+    Field("i_deg", "deg"),
+    Field("raan_deg", "deg"),
+    Field("argp_deg", "deg"),
+    Field("mean_anomaly_deg", "deg"),
+)
+"""Osculating elements of the state, in the scenario's gravity constants; none of a vehicle on an escape orbit."""
+
+TRUTH_CHANGES = (
+    Field("revision", "", "int"),
+    Field("from_s", "s"),
+    Field("heard_s", "s"),
+    Field("left_s", "s"),
+)
+"""Truth that a maneuver changed, when its first segment was here: left_s until this agent's own from_s, T_m or
+the beginning of a burn."""
+
+ATTITUDE = (
+    Field("tick", "", "int"),
+    Field("q1", "1"),
+    Field("q2", "1"),
+    Field("q3", "1"),
+    Field("q4", "1"),
+    Field("wx_body_rad_s", "rad/s"),
+    Field("wy_body_rad_s", "rad/s"),
+    Field("wz_body_rad_s", "rad/s"),
+)
+"""Truth of a rigid body: quaternion, scalar last, inertial to body, and body rates."""
+
+COMMANDS = (
+    Field("tick", "", "int"),
+    Field("number", "", "int"),
+    Field("kind", "", "str"),
+    Field("at_s", "s"),
+    Field("frame", "", "str"),
+    Field("x", "m/s | N m | m^2/kg"),
+    Field("y", "m/s | N m"),
+    Field("z", "m/s | N m"),
+    Field("duration_s", "s"),
+)
+"""Commands of flight software; their results are in command_results."""
+
+COMMAND_RESULTS = (
+    Field("tick", "", "int"),
+    Field("number", "", "int"),
+    Field("status", "", "str"),
+    Field("at_s", "s"),
+    Field("revision", "", "int"),
+    Field("delta_v_m_s", "m/s"),
+    Field("propellant_kg", "kg"),
+    Field("reason", "", "str"),
+)
+"""Results of commands, at the tick that told flight software."""
+
+MESSAGES = (
+    Field("tick", "", "int"),
+    Field("way", "", "str"),
+    Field("peer", "", "str"),
+    Field("sent_s", "s"),
+    Field("arrives_s", "s"),
+    Field("payload_bytes", "B", "int"),
+)
+"""Messages by radio. way: sent or received; a sent one's arrival is the host's to know: its sent_s stands for it."""
+
+REFUSALS = (
+    Field("tick", "", "int"),
+    Field("number", "", "int"),
+    Field("to", "", "str"),
+    Field("sent_s", "s"),
+    Field("reason", "", "str"),
+)
+"""Messages that were refused, at the tick that told flight software of it; there is none before the first."""
+
+TRUTH = (
+    Field("sent_s", "s"),
+    Field("agent", "", "str"),
+    Field("revision", "", "int"),
+    Field("t0_s", "s"),
+    Field("knot_s", "s"),
+    Field("knots", "", "int"),
+    Field("states", "", "packed"),
+    Field("attitude", "", "packed"),
+)
+"""One record a segment: *knots* knots every knot_s from t0_s on. states packs (knots, 6) float64, m and m/s, TEME;
+attitude (knots, 7) of a rigid body, else null; see `truth.segment_records`."""
+
+LINKS = (
+    Field("sent_s", "s"),
+    Field("sender", "", "str"),
+    Field("number", "", "int"),
+    Field("to", "", "str"),
+    Field("outcome", "", "str"),
+    Field("arrives_s", "s"),
+    Field("distance_m", "m"),
+    Field("size_bytes", "B", "int"),
+)
+"""Stream "links": one record a LinkEvent."""
+
+CONTACTS = (
+    Field("event", "", "str"),
+    Field("agent", "", "str"),
+    Field("station", "", "str"),
+    Field("rise_s", "s"),
+    Field("set_s", "s"),
+    Field("elevation_deg_max", "deg"),
+)
+"""Stream "contacts": one record when a pass begins, one when it ends."""
+
+MANEUVERS = (
+    Field("commanded_s", "s"),
+    Field("agent", "", "str"),
+    Field("number", "", "int"),
+    Field("kind", "", "str"),
+    Field("status", "", "str"),
+    Field("heard_s", "s"),
+    Field("at_s", "s"),
+    Field("executed_s", "s"),
+    Field("dv_commanded_m_s", "m/s"),
+    Field("dv_given_m_s", "m/s"),
+    Field("propagation_s", "s"),
+    Field("network_s", "s"),
+    Field("slack_s", "s"),
+    Field("propellant_kg", "kg"),
+    Field("reason", "", "str"),
+)
+"""One record a command: at_s is T_m as commanded, executed_s as it became (none if refused); propagation_s
+is T_p, network_s T_n, slack_s (T_m - T_s) - (T_p + 2 T_n), for a finite burn with its beginning for T_m."""
+
+INVARIANTS = (
+    Field("t_s", "s"),
+    Field("agent", "", "str"),
+    Field("energy_j_kg", "J/kg"),
+    Field("momentum_m2_s", "m^2/s"),
+    Field("momentum_z_m2_s", "m^2/s"),
+    Field("energy_drift", "1"),
+    Field("momentum_z_drift", "1"),
+)
+"""One record a vehicle and window; drifts are relative to simulated time zero or to the end of the last
+maneuver, and missing where there is none in the window to compare with."""
+
+SAMPLE = (Field("tick", "", "int"), Field("t_s", "s"))
+"""The first fields of every instrument: when it measured."""
+
+ESTIMATES = (Field("tick", "", "int"),)
+"""Estimates of flight software follow: it names them in the run."""
+
+UNITS = {
+    "_m": "m",
+    "_km": "km",
+    "_m_s": "m/s",
+    "_km_s": "km/s",
+    "_m_s2": "m/s^2",
+    "_deg": "deg",
+    "_deg_s": "deg/s",
+    "_rad": "rad",
+    "_rad_s": "rad/s",
+    "_s": "s",
+    "_kg": "kg",
+    "_m2_kg": "m^2/kg",
+    "_n": "N",
+    "_n_m": "N m",
+    "_t": "T",
+}
+"""Units that end the name of an estimate."""
+
+OF_HOST = {
+    "truth": TRUTH,
+    "invariants": INVARIANTS,
+    "maneuvers": MANEUVERS,
+    "links": LINKS,
+    "contacts": CONTACTS,
+}
+OF_AGENTS = {
+    "state": STATE,
+    "elements": ELEMENTS,
+    "attitude": ATTITUDE,
+    "truth_changes": TRUTH_CHANGES,
+    "commands": COMMANDS,
+    "command_results": COMMAND_RESULTS,
+    "messages": MESSAGES,
+    "refusals": REFUSALS,
+    "gyro": (*SAMPLE, *ATTITUDE[5:]),
+    "gnss": (*SAMPLE, *STATE[1:]),
+    "accelerometer": (
+        *SAMPLE,
+        Field("ax_m_s2", "m/s^2"),
+        Field("ay_m_s2", "m/s^2"),
+        Field("az_m_s2", "m/s^2"),
+    ),
+    "star_tracker": (*SAMPLE, *ATTITUDE[1:5]),
+    "sun_sensor": (*SAMPLE, Field("sx", "1"), Field("sy", "1"), Field("sz", "1")),
+    "clock_sensor": (*SAMPLE, Field("clock_s", "s")),
+    "magnetometer": (*SAMPLE, Field("bx_t", "T"), Field("by_t", "T"), Field("bz_t", "T")),
+}
+
+
+def declared_streams(
+    parameters: ConstellationParameters, agents: tuple[str, ...]
+) -> tuple[DeclaredStream, ...]:
+    """Return every stream that a host or a vehicle may open, whatever the parameters; see `plugin.api.Simulation`."""
+    return (
+        *(DeclaredStream(role="host", name=name, fields=OF_HOST[name]) for name in OF_HOST),
+        *(DeclaredStream(role="agent", name=name, fields=OF_AGENTS[name]) for name in OF_AGENTS),
+        DeclaredStream(role="agent", name="estimates", fields=ESTIMATES, is_open=True),
+    )
+
+
+def unit_of(name: str) -> str:
+    """Return the unit that ends a name, the longest that fits; empty if there is none."""
+    endings = [ending for ending in UNITS if name.endswith(ending)]
+    return UNITS[max(endings, key=len)] if endings else ""

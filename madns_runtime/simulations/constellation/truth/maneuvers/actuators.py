@@ -1,0 +1,198 @@
+"""
+Actuators of a vehicle: the real change of a command, errors included, or why there is none.
+
+Pure. Chance is drawn for a name, (seed, agent, number of the command), not in turn: what one command gets
+never depends on when, or after which others, the host heard of it.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from madns_runtime.simulations.constellation.equipment import ReactionWheels, Thruster, Vehicle
+from madns_runtime.simulations.constellation.thrust import Vector
+from madns_runtime.simulations.constellation.truth.maneuvers.effects import scaled
+
+STANDARD_GRAVITY_M_S2 = 9.80665
+"""By definition; specific impulse in seconds is exhaust velocity over it."""
+DELTA_V_M_S_MIN = 1e-12
+"""Less does not show in the last digit of an orbit's velocity."""
+TORQUE_N_M_MIN = 1e-15
+"""Less than wheels can give is nothing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActuatorRefusal:
+    """Why an actuator does not carry a command out."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Burn:
+    """Change of velocity that a thruster gives."""
+
+    vector: Vector
+    """Change of velocity in the command's frame, m/s, errors included."""
+    propellant_kg: float
+    """Used for it."""
+    burnt: float
+    """The same as a share of the vehicle's mass before it."""
+    duration_s: float
+    """0 for an impulse."""
+
+    @property
+    def magnitude_m_s(self) -> float:
+        """Magnitude of the change of velocity."""
+        return math.hypot(*self.vector)
+
+
+class Tank:
+    """
+    Mass and propellant of one vehicle.
+
+    Burns are booked as they are accepted. The rocket equation makes the propellant of several depend on
+    the sum of their changes of velocity alone, so that what is left is right in whatever order they burn.
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.mass_kg = vehicle.mass_kg
+        self.propellant_kg = vehicle.thruster.propellant_kg if vehicle.thruster else 0.0
+
+    def book(self, burn: Burn) -> None:
+        """Take a burn's propellant off."""
+        self.mass_kg -= burn.propellant_kg
+        self.propellant_kg = max(0.0, self.propellant_kg - burn.propellant_kg)
+
+
+def chance_of(seed: int, agent: str, number: int) -> np.random.Generator:
+    """Return the chance of one command."""
+    return np.random.default_rng([seed, zlib.crc32(agent.encode()), number])
+
+
+def fire(
+    thruster: Thruster, tank: Tank, delta_v_m_s: Vector, random: np.random.Generator
+) -> Burn | ActuatorRefusal:
+    """
+    Return what a thruster makes of a commanded change of velocity; books nothing.
+
+    Args:
+        thruster: Of the vehicle.
+        tank: What is left.
+        delta_v_m_s: As commanded, in any frame, m/s.
+        random: Three numbers are drawn.
+
+    Source: Tsiolkovsky's equation, dm = m (1 - exp(-dv / (g0 Isp))).
+    """
+    magnitude, along, across = random.standard_normal(3).tolist()
+    commanded = math.hypot(*delta_v_m_s)
+    if commanded < DELTA_V_M_S_MIN:
+        return ActuatorRefusal(reason=f"a change of velocity of {commanded:.4g} m/s")
+    impulse_n_s = tank.mass_kg * commanded
+    if impulse_n_s < thruster.minimum_impulse_n_s:
+        return ActuatorRefusal(
+            reason=f"an impulse of {impulse_n_s:.4g} N s, the least is {thruster.minimum_impulse_n_s:g} N s"
+        )
+    needed_kg = propellant_of(thruster, tank.mass_kg, commanded)
+    if needed_kg > tank.propellant_kg:
+        return ActuatorRefusal(
+            reason=f"needs {needed_kg:.4g} kg of propellant, {tank.propellant_kg:.4g} kg are left"
+        )
+    given = max(0.0, 1.0 + magnitude * thruster.magnitude_error)
+    sigma = math.radians(thruster.direction_error_deg)
+    vector = scaled(_turned(delta_v_m_s, along * sigma, across * sigma), given)
+    used_kg = propellant_of(thruster, tank.mass_kg, commanded * given)
+    if used_kg > tank.propellant_kg:
+        # An error cannot burn what is not there.
+        used_kg = tank.propellant_kg
+        most_m_s = exhaust_m_s(thruster) * -math.log1p(-used_kg / tank.mass_kg)
+        vector = scaled(vector, most_m_s / math.hypot(*vector))
+    duration_s = 0.0
+    if thruster.thrust_n is not None:
+        duration_s = used_kg * exhaust_m_s(thruster) / thruster.thrust_n
+    burnt = used_kg / tank.mass_kg
+    return Burn(vector=vector, propellant_kg=used_kg, burnt=burnt, duration_s=duration_s)
+
+
+def propellant_of(thruster: Thruster, mass_kg: float, delta_v_m_s: float) -> float:
+    """Return the propellant, kg, that a change of velocity costs a vehicle of some mass."""
+    return -mass_kg * math.expm1(-delta_v_m_s / exhaust_m_s(thruster))
+
+
+def exhaust_m_s(thruster: Thruster) -> float:
+    """Return the exhaust velocity."""
+    return thruster.isp_s * STANDARD_GRAVITY_M_S2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WheelTurn:
+    """Change of rates that reaction wheels give."""
+
+    torque_n_m: Vector
+    """Mean torque over the time commanded, body axes, N m."""
+    limits: tuple[str, ...] = ()
+    """Limits that kept it below what was commanded."""
+
+
+def turn(
+    wheels: ReactionWheels | None,
+    momentum_n_m_s: Vector,
+    torque_n_m: Vector,
+    duration_s: float,
+    random: np.random.Generator,
+) -> WheelTurn | ActuatorRefusal:
+    """
+    Return what the wheels make of a commanded torque.
+
+    Args:
+        wheels: Of the vehicle; None for exact torques without limit.
+        momentum_n_m_s: What the wheels hold already, body axes; a torque takes up its opposite.
+        torque_n_m: As commanded, body axes.
+        duration_s: For how long, > 0.
+        random: One number is drawn.
+
+    Wheels that saturate on the way give the mean torque that fills them exactly at the end.
+    """
+    if not any(torque_n_m):
+        return ActuatorRefusal(reason="a torque of 0 N m")
+    if wheels is None:
+        return WheelTurn(torque_n_m=torque_n_m)
+    factor = 1.0 + float(random.standard_normal()) * wheels.torque_error
+    limits: list[str] = []
+    given = [0.0, 0.0, 0.0]
+    for axis, commanded in enumerate(torque_n_m):
+        torque = min(max(commanded, -wheels.torque_n_m_max), wheels.torque_n_m_max)
+        if torque != commanded:
+            limits.append(f"{'xyz'[axis]}: {wheels.torque_n_m_max:g} N m at most")
+        torque *= factor
+        held = momentum_n_m_s[axis]
+        low, high = held - wheels.momentum_n_m_s_max, held + wheels.momentum_n_m_s_max
+        possible = min(max(torque, min(0.0, low / duration_s)), max(0.0, high / duration_s))
+        if possible != torque:
+            limits.append(f"{'xyz'[axis]}: wheels saturate")
+        given[axis] = possible
+    if max(map(abs, given)) < TORQUE_N_M_MIN:
+        return ActuatorRefusal(reason="the wheels are saturated")
+    x, y, z = given
+    return WheelTurn(torque_n_m=(x, y, z), limits=tuple(limits))
+
+
+def _turned(vector: Vector, along_rad: float, across_rad: float) -> Vector:
+    """Return a vector turned by small angles about two axes normal to it and to each other."""
+    if along_rad == 0.0 and across_rad == 0.0:
+        return vector
+    v = np.array(vector)
+    length = float(np.linalg.norm(v))
+    # Any direction that is not the vector's own gives the first normal.
+    helper = np.zeros(3)
+    helper[int(np.argmin(np.abs(v)))] = 1.0
+    first = np.cross(v, helper)
+    first /= np.linalg.norm(first)
+    second = np.cross(v / length, first)
+    turned = v / length + math.tan(along_rad) * first + math.tan(across_rad) * second
+    x, y, z = (turned * (length / np.linalg.norm(turned))).tolist()
+    return x, y, z

@@ -1,0 +1,252 @@
+"""
+Effects of commands on truth: changes of velocity, arcs of thrust and torque, and of the ballistic coefficient. Pure.
+
+An effect is what an actuator really gives, errors included; its frame is resolved when truth is propagated,
+since the directions at that time depend on what was done before.
+
+Truth of a vehicle is kept at the knots of a grid common to all. Where an effect begins or ends between two
+knots, or changes the velocity at one, pieces with knots of their own cover the intervals in question, so
+that interpolation never spans a jump.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from madns_runtime.simulations.constellation.messages import CommandFrame, Segment
+from madns_runtime.simulations.constellation.thrust import Thrust, Vector
+
+EffectKind = Literal["impulse", "thrust", "torque", "ballistic"]
+
+SNAP_S = 1e-7
+"""A time this near to a knot is the knot's: 0.2 mm at 2 km/s."""
+SHORT = 0.1
+"""Part of a knot's time: a shorter piece is drawn out over the next interval, whose position would else lose
+digits when its small steps are divided by a small time."""
+ARC_INTERVALS_MIN = 4
+"""Knots in an arc of thrust or torque are at least this dense."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Effect:
+    """One change of a vehicle's truth."""
+
+    number: int
+    """Place among the effects of its vehicle in the order in which they were taken."""
+    kind: EffectKind
+    at_s: float
+    """T_m: when its frame is resolved; the middle of a thrust arc."""
+    start_s: float
+    """From when truth is another one."""
+    end_s: float
+    """Until when it acts; start_s for an impulse and for a ballistic coefficient."""
+    vector: Vector
+    """impulse and thrust: change of velocity, m/s; torque: N m, body; ballistic: m^2/kg and two zeros."""
+    frame: CommandFrame = "inertial"
+    burnt: float = 0.0
+    """Share of the vehicle's mass that a thrust arc burns."""
+
+    @property
+    def is_arc(self) -> bool:
+        """Whether it takes time."""
+        return self.end_s > self.start_s
+
+
+class Timeline:
+    """The effects of one vehicle that truth may still depend on, in order."""
+
+    def __init__(self, ballistic_m2_kg: float = 0.0, *, is_felt: bool = False) -> None:
+        self.ballistic_m2_kg = ballistic_m2_kg
+        """Ballistic coefficient before the first effect held."""
+        self.is_felt = is_felt
+        """Whether an accelerometer on board feels the drag that acts on it."""
+        self.wheels_n_m_s: Vector = (0.0, 0.0, 0.0)
+        """Momentum that wheels had taken up before the first effect held, body axes, N m s."""
+        self.effects: tuple[Effect, ...] = ()
+        self.thrusts: dict[int, Thrust] = {}
+        """Of the thrust arcs that truth already holds, by the effect's number."""
+
+    def add(self, effect: Effect) -> None:
+        """Put an effect where its time belongs; those of one time stay as they were taken."""
+        effects = (*self.effects, effect)
+        self.effects = tuple(sorted(effects, key=lambda e: (e.start_s, e.number)))
+
+    def from_time(self, t_s: float) -> tuple[Effect, ...]:
+        """Return those that act at *t_s* or begin after it; what acts once at *t_s* is in its state already."""
+        return tuple(e for e in self.effects if e.start_s > t_s or e.end_s > t_s)
+
+    def between(self, t0_s: float, t1_s: float) -> tuple[Effect, ...]:
+        """Return those that act within (t0_s, t1_s]."""
+        return tuple(e for e in self.from_time(t0_s) if e.start_s <= t1_s)
+
+    def ballistic_at(self, t_s: float) -> float:
+        """Return the ballistic coefficient from *t_s* on, m^2/kg."""
+        value = self.ballistic_m2_kg
+        for effect in self.effects:
+            if effect.kind == "ballistic" and effect.start_s <= t_s:
+                value = effect.vector[0]
+        return value
+
+    def wheels_at(self, t_s: float) -> Vector:
+        """Return the momentum that wheels have taken up until *t_s*, body axes, N m s."""
+        taken = [self.wheels_n_m_s]
+        for effect in self.effects:
+            if effect.kind == "torque" and effect.start_s < t_s:
+                taken.append(scaled(effect.vector, effect.start_s - min(t_s, effect.end_s)))
+        return total(taken)
+
+    def forget_before(self, t_s: float) -> None:
+        """Drop what is over before *t_s*."""
+        if not self.effects or self.effects[0].start_s >= t_s:
+            return
+        over = tuple(e for e in self.effects if e.end_s < t_s)
+        kept = tuple(e for e in self.effects if e.end_s >= t_s)
+        self.effects = over
+        self.ballistic_m2_kg, self.wheels_n_m_s = self.ballistic_at(t_s), self.wheels_at(t_s)
+        self.effects = kept
+        held = {e.number for e in self.effects}
+        self.thrusts = {n: thrust for n, thrust in self.thrusts.items() if n in held}
+
+
+def total(vectors: Iterable[Vector]) -> Vector:
+    """Return the sum of vectors; zero for none."""
+    x = y = z = 0.0
+    for a, b, c in vectors:
+        x, y, z = x + a, y + b, z + c
+    return x, y, z
+
+
+def scaled(vector: Vector, factor: float) -> Vector:
+    """Return *factor* times a vector."""
+    return vector[0] * factor, vector[1] * factor, vector[2] * factor
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Piece:
+    """Truth of one vehicle over some time, with equally spaced knots of its own."""
+
+    t0_s: float
+    knot_s: float
+    states: NDArray[np.float64]
+    """Shape (K, 6), m and m/s, K >= 2."""
+    end_s: float
+    """Until when it holds: the last knot's time, or sooner if a maneuver has cut it short."""
+    attitude: NDArray[np.float64] | None = None
+    """Shape (K, 7) for a rigid body."""
+    thrust: Thrust | None = None
+
+    def cut_at(self, t_s: float) -> Piece:
+        """Return it with truth up to *t_s* only."""
+        return replace(self, end_s=min(self.end_s, t_s))
+
+    def knot_before(self, t_s: float) -> int:
+        """Return the number of its last knot before *t_s*, which lies within it."""
+        return max(0, math.ceil((t_s - self.t0_s) / self.knot_s - 1e-9) - 1)
+
+    def to_segment(self, revision: int, ballistic_m2_kg: float | None = None) -> Segment:
+        """Return the piece as it travels; a later segment cuts off what does not hold any more."""
+        return Segment(
+            revision=revision,
+            t0_s=self.t0_s,
+            knot_s=self.knot_s,
+            states=self.states,
+            attitude=self.attitude,
+            thrust=self.thrust,
+            ballistic_m2_kg=ballistic_m2_kg,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleTruth:
+    """One vehicle's truth from some time on, as `truth.vehicle_propagation.propagate_vehicle` returns it."""
+
+    change_s: float
+    """From when it holds."""
+    pieces: tuple[Piece, ...]
+    """In order of time; between them the grid holds."""
+    first_knot: int
+    """The first knot of the grid at or after change_s."""
+    states: NDArray[np.float64]
+    """At the knots of the grid from first_knot on, shape (G, 6); G may be 0."""
+    attitude: NDArray[np.float64] | None
+    """The same, shape (G, 7)."""
+    invariants: NDArray[np.float64]
+    """The same, shape (G, 3), see `orbit.invariants`."""
+    thrusts: dict[int, Thrust]
+    """Of the thrust arcs that began by its end, by the effect's number."""
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Knots of a piece to be: count >= 2 of them, evenly from start_s to end_s."""
+
+    start_s: float
+    end_s: float
+    count: int
+
+    @property
+    def knot_s(self) -> float:
+        """Time between knots."""
+        return (self.end_s - self.start_s) / (self.count - 1)
+
+    def times_s(self) -> list[float]:
+        """Return the knots' times; the ends exactly."""
+        return [*(self.start_s + i * self.knot_s for i in range(self.count - 1)), self.end_s]
+
+
+def spin_rad_s_max(knot_s: float) -> float:
+    """Return the rate at which a body turns half a turn a knot: attitude between knots has no meaning then."""
+    return math.pi / knot_s
+
+
+def snap(t_s: float, knot_s: float) -> float:
+    """Return *t_s*, or the grid knot that it means."""
+    knot = round(t_s / knot_s) * knot_s
+    return knot if abs(knot - t_s) <= SNAP_S else t_s
+
+
+def knot_at_or_after(t_s: float, knot_s: float) -> int:
+    """Return the number of the first grid knot that is not before a snapped time."""
+    return math.ceil(t_s / knot_s - 1e-9)
+
+
+def lay_out(
+    start_s: float, end_s: float, knot_s: float, *, jumps: bool, is_arc: bool
+) -> list[Span]:
+    """
+    Return the pieces that an interval needs besides the grid.
+
+    Args:
+        start_s: Its beginning, snapped.
+        end_s: Its end, snapped, after start_s.
+        knot_s: Time between knots of the grid.
+        jumps: Whether the velocity changes at end_s, which the grid knot there will not show, or what
+            drag acts on does.
+        is_arc: Whether all of it is one piece, with dense knots.
+    """
+    if is_arc:
+        return [_span(start_s, end_s, knot_s, ARC_INTERVALS_MIN)]
+    first, last = knot_at_or_after(start_s, knot_s), math.floor(end_s / knot_s + 1e-9)
+    head_end, tail = first, last
+    if first * knot_s > start_s:
+        head_end += first * knot_s - start_s < SHORT * knot_s
+    if last * knot_s < end_s:
+        tail -= end_s - last * knot_s < SHORT * knot_s
+    elif jumps:
+        tail -= 1
+    has_head, has_tail = first * knot_s > start_s, tail * knot_s < end_s
+    if (has_head or has_tail) and (head_end > tail or tail < first):
+        return [_span(start_s, end_s, knot_s, 1)]
+    spans = [_span(start_s, head_end * knot_s, knot_s, 1)] if has_head else []
+    return spans + ([_span(tail * knot_s, end_s, knot_s, 1)] if has_tail else [])
+
+
+def _span(start_s: float, end_s: float, knot_s: float, intervals_min: int) -> Span:
+    intervals = max(intervals_min, math.ceil((end_s - start_s) / knot_s - 1e-9))
+    return Span(start_s, end_s, intervals + 1)

@@ -1,0 +1,371 @@
+"""
+The desk that commands come to: decides what becomes of each, and keeps the account. Pure.
+
+A command is accepted if truth that holds it can be with its agent before it is executed; one that comes
+too late for that is postponed to the first feasible time or refused, as the scenario says. Times of an
+agent are judged by its own ticks: they lie `phase_s` behind their nominal time, and so do its T_s and T_m.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from madns_runtime.simulations.constellation.equipment import Vehicle
+from madns_runtime.simulations.constellation.messages import Command, CommandResult, CommandStatus
+from madns_runtime.simulations.constellation.parameters import Maneuvers
+from madns_runtime.simulations.constellation.thrust import Vector
+from madns_runtime.simulations.constellation.truth.maneuvers.actuators import (
+    ActuatorRefusal,
+    Burn,
+    Tank,
+    WheelTurn,
+    chance_of,
+    fire,
+    propellant_of,
+    turn,
+)
+from madns_runtime.simulations.constellation.truth.maneuvers.effects import (
+    Effect,
+    EffectKind,
+    Timeline,
+    snap,
+    spin_rad_s_max,
+)
+
+WAITING_MAX = 64
+"""Commands of one vehicle whose time is not over."""
+ARC_S_MIN = 0.01
+"""A burn that is over sooner is an impulse; a torque is not given for less, s."""
+COMMANDS_MAX = 2**31
+"""Numbers of commands are below it."""
+ACTUATORS = {"impulse": "thruster", "thrust": "thruster", "torque": "wheels"}
+"""Actuator of each effect; it does one thing at a time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Taken:
+    """A command that truth will hold, or the reason why not."""
+
+    vehicle: int
+    command: Command
+    heard_s: float
+    status: CommandStatus
+    """accepted, postponed or refused."""
+    at_s: float
+    reason: str = ""
+    effect: Effect | None = None
+    """None if it is refused."""
+    delta_v_m_s: float = 0.0
+    """Magnitude that is really given."""
+    used_kg: float = 0.0
+    """Propellant that is really burnt."""
+    propellant_kg: float = 0.0
+    """Propellant left after the command, kg."""
+    expected_m_s: float = 0.0
+    """Magnitude without error."""
+    expected_kg: float = 0.0
+    """Propellant left after the command without error, kg."""
+    begins_s: float = 0.0
+    """Begin as commanded, s: T_m, of a finite burn half its length before."""
+    is_late: bool = False
+    """Whether it could not be in truth by its time."""
+
+    def result(self, revision: int, *, is_over: bool = False) -> CommandResult:
+        """Return what the vehicle is told: now what is expected, for errors show when its time is over."""
+        return CommandResult(
+            number=self.command.number,
+            status="executed" if is_over else self.status,
+            at_s=self.at_s,
+            revision=revision,
+            reason=self.reason,
+            delta_v_m_s=self.delta_v_m_s if is_over else self.expected_m_s,
+            propellant_kg=self.propellant_kg if is_over else self.expected_kg,
+        )
+
+
+@dataclass(slots=True)
+class ManeuverAccount:
+    """Account of all commands, for the summary."""
+
+    commanded: int = 0
+    executed: int = 0
+    postponed: int = 0
+    refused: int = 0
+    inequality_broken: int = 0
+    """Commands for which it does not hold, and those that came too late by what the scenario allows."""
+    inequality_broken_by: Counter[int] = field(default_factory=Counter)
+    """The same by vehicle."""
+    slack_s_min: float = math.inf
+    propagation_s_max: float = 0.0
+    network_s_max: float = 0.0
+    delta_v_m_s: float = 0.0
+    """Sum of the magnitudes given by burns that are over."""
+    propellant_kg: float = 0.0
+    """Burnt by them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Times:
+    """The synchronous inequality of one command, T_p + 2 T_n <= T_m - T_s."""
+
+    propagation_s: float | None
+    """T_p, measured: from hearing the command to handing out the truth that holds it; None if there is none."""
+    network_s: float
+    """T_n, measured: from the tick that commanded to hearing of it."""
+    slack_s: float
+    """(T_m - T_s) - (T_p + 2 T_n); T_m as commanded, of a burn its beginning; T_p as allowed if none was measured."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rules:
+    """Rules that all vehicles' commands are judged by."""
+
+    settings: Maneuvers
+    can_maneuver: bool
+    """Whether the propagator starts from any state."""
+    duration_s: float
+    tick_hz: float
+    knot_s: float
+    seed: int
+
+
+class ManeuverDesk:
+    """
+    Decides about commands, one after the other.
+
+    Args:
+        rules: For all.
+        agents: Names.
+        vehicles: What each agent's vehicle is like.
+        timelines: What is done to each; the desk adds to them.
+    """
+
+    def __init__(
+        self,
+        rules: Rules,
+        agents: Sequence[str],
+        vehicles: Sequence[Vehicle],
+        timelines: Sequence[Timeline],
+    ) -> None:
+        self.account = ManeuverAccount()
+        self._rules = rules
+        self._agents = agents
+        self._vehicles = vehicles
+        self._timelines = timelines
+        self._tanks = [Tank(vehicle) for vehicle in vehicles]
+        self._taken = [0] * len(agents)
+        self._waiting = [0] * len(agents)
+
+    @property
+    def waiting(self) -> int:
+        """Commands that truth holds, or will, and whose time is not over."""
+        return sum(self._waiting)
+
+    def decide(self, vehicle: int, command: Command, heard_s: float) -> Taken:
+        """Return what becomes of a command that is heard of now; an effect is in its vehicle's timeline then."""
+        self.account.commanded += 1
+        taken = self._judge(vehicle, command, heard_s)
+        if taken.effect is None:
+            self.account.refused += 1
+            return taken
+        self._timelines[vehicle].add(taken.effect)
+        self._taken[vehicle] += 1
+        self._waiting[vehicle] += 1
+        self.account.postponed += taken.status == "postponed"
+        return taken
+
+    def measure(self, taken: Taken, sent_s: float | None) -> Times:
+        """Enter the synchronous inequality of a command whose truth was handed out at *sent_s*; None for a refused one."""
+        command, account = taken.command, self.account
+        network_s = max(0.0, taken.heard_s - (command.commanded_s + command.phase_s))
+        propagation_s = None if sent_s is None else sent_s - taken.heard_s
+        account.network_s_max = max(account.network_s_max, network_s)
+        account.propagation_s_max = max(account.propagation_s_max, propagation_s or 0.0)
+        allowed_s = self._rules.settings.propagation_s
+        needed_s = (allowed_s if propagation_s is None else propagation_s) + 2.0 * network_s
+        slack_s = taken.begins_s - command.commanded_s - needed_s
+        if slack_s < 0.0 or taken.is_late:
+            account.inequality_broken += 1
+            account.inequality_broken_by[taken.vehicle] += 1
+        account.slack_s_min = min(account.slack_s_min, slack_s)
+        return Times(propagation_s=propagation_s, network_s=network_s, slack_s=slack_s)
+
+    def execute(self, taken: Taken) -> None:
+        """Enter that a command's time is over."""
+        self._waiting[taken.vehicle] -= 1
+        self.account.executed += 1
+        self.account.delta_v_m_s += taken.delta_v_m_s
+        self.account.propellant_kg += taken.used_kg
+
+    def _judge(self, vehicle: int, command: Command, heard_s: float) -> Taken:
+        refused = Taken(
+            vehicle=vehicle,
+            command=command,
+            heard_s=heard_s,
+            status="refused",
+            at_s=command.at_s,
+            propellant_kg=self._tanks[vehicle].propellant_kg,
+            expected_kg=self._tanks[vehicle].propellant_kg,
+        )
+        fault = self._fault(vehicle, command)
+        if fault:
+            return replace(refused, reason=fault)
+        given = self._given(vehicle, command)
+        if isinstance(given, WheelTurn):
+            given = self._bearable(vehicle, command, given)
+        if isinstance(given, ActuatorRefusal):
+            return replace(refused, reason=given.reason)
+        return self._in_time(refused, given)
+
+    def _fault(self, vehicle: int, command: Command) -> str:
+        """Return why a command cannot be carried out at any time; empty if it can."""
+        times_s = (command.commanded_s, command.phase_s, command.at_s, command.duration_s)
+        numbers = (*times_s, *command.vector)
+        described = self._vehicles[vehicle]
+        attitude, is_torque = described.attitude, command.kind == "torque"
+        is_burn, is_ballistic = command.kind == "delta_v", command.kind == "ballistic"
+        allowed, value = described.ballistic_m2_kg_range, command.vector[0]
+        low, high = allowed or (-math.inf, math.inf)
+        faults = (
+            (not all(map(math.isfinite, numbers)), f"expected finite numbers, got {numbers}"),
+            (
+                not 0 <= command.number < COMMANDS_MAX,
+                f"expected a number from 0 on, got {command.number}",
+            ),
+            (
+                not self._rules.can_maneuver,
+                "the scenario's propagator starts from no other states than its own",
+            ),
+            (
+                self._waiting[vehicle] >= WAITING_MAX,
+                f"{WAITING_MAX} commands are waiting already",
+            ),
+            (is_burn and described.thruster is None, "the vehicle has no thruster"),
+            (
+                is_burn and command.frame == "body" and attitude is None,
+                "body axes of a vehicle without attitude",
+            ),
+            (is_torque and attitude is None, "a torque on a vehicle without attitude"),
+            (
+                is_torque and command.duration_s < ARC_S_MIN,
+                f"expected a duration of at least {ARC_S_MIN} s, got {command.duration_s:g} s",
+            ),
+            (
+                is_ballistic and allowed is None,
+                "the vehicle's ballistic coefficient cannot be changed",
+            ),
+            (
+                is_ballistic and not low <= value <= high,
+                f"expected {low:g} to {high:g} m^2/kg, got {value:g}",
+            ),
+        )
+        return next((text for is_so, text in faults if is_so), "")
+
+    def _given(self, vehicle: int, command: Command) -> Burn | WheelTurn | ActuatorRefusal | None:
+        """Return what the actuator makes of it; None if it needs none."""
+        described = self._vehicles[vehicle]
+        random = chance_of(self._rules.seed, self._agents[vehicle], command.number)
+        if command.kind == "delta_v" and described.thruster is not None:
+            return fire(described.thruster, self._tanks[vehicle], command.vector, random)
+        if command.kind == "torque" and described.attitude is not None:
+            momentum = self._timelines[vehicle].wheels_at(math.inf)
+            wheels = described.attitude.wheels
+            return turn(wheels, momentum, command.vector, command.duration_s, random)
+        return None
+
+    def _bearable(
+        self, vehicle: int, command: Command, given: WheelTurn
+    ) -> WheelTurn | ActuatorRefusal:
+        """Return a turn, or a refusal if it alone would spin the body faster than knots can tell."""
+        described = self._vehicles[vehicle].attitude
+        assert described is not None
+        acting_s = min(command.duration_s, self._rules.duration_s)
+        pairs = zip(given.torque_n_m, described.inertia_kg_m2, strict=True)
+        gained_rad_s = max(abs(torque) / inertia for torque, inertia in pairs) * acting_s
+        limit_rad_s = spin_rad_s_max(self._rules.knot_s)
+        if gained_rad_s < limit_rad_s:
+            return given
+        return ActuatorRefusal(
+            reason=f"it would spin the body up by {gained_rad_s:.4g} rad/s; "
+            f"less than {limit_rad_s:.4g} rad/s, half a turn a knot, can be told"
+        )
+
+    def _in_time(self, refused: Taken, given: Burn | WheelTurn | None) -> Taken:
+        """Return the command at its time, or at the first feasible one, or refused."""
+        command, rules = refused.command, self._rules
+        burn_s = given.duration_s if isinstance(given, Burn) else 0.0
+        burn_s = burn_s if burn_s >= ARC_S_MIN else 0.0
+        arc_s = command.duration_s if isinstance(given, WheelTurn) else burn_s
+        start_s = begins_s = snap(command.at_s - burn_s / 2.0, rules.knot_s)
+        ready_s = refused.heard_s + rules.settings.propagation_s + rules.settings.network_s
+        status: CommandStatus = "accepted"
+        is_late = start_s + command.phase_s < ready_s
+        refused = replace(refused, begins_s=begins_s, is_late=is_late)
+        reasons = given.limits if isinstance(given, WheelTurn) else ()
+        if is_late:
+            late = f"{ready_s - command.phase_s - start_s:.4g} s too late"
+            if rules.settings.late == "refuse":
+                return replace(refused, reason=late)
+            reasons = (late, *reasons)
+            # A whole tick: the first time that flight software could have named itself.
+            tick = math.ceil((ready_s - command.phase_s) * rules.tick_hz - 1e-9)
+            start_s, status = snap(tick / rules.tick_hz, rules.knot_s), "postponed"
+        end_s = snap(start_s + arc_s, rules.knot_s) if arc_s > 0.0 else start_s
+        at_s = start_s + (end_s - start_s) / 2.0 if burn_s > 0.0 else start_s
+        if at_s > rules.duration_s:
+            over = f"{at_s:g} s is beyond the run's {rules.duration_s:g} s"
+            return replace(refused, at_s=at_s, reason=over)
+        effect = Effect(
+            number=self._taken[refused.vehicle],
+            kind=_kind(command, arc_s),
+            at_s=at_s,
+            start_s=start_s,
+            end_s=end_s,
+            vector=_vector(command, given),
+            frame="body" if isinstance(given, WheelTurn) else command.frame,
+            burnt=given.burnt if isinstance(given, Burn) else 0.0,
+        )
+        if busy := self._busy(refused.vehicle, effect):
+            return replace(refused, at_s=at_s, reason=busy)
+        taken = replace(refused, status=status, at_s=at_s, reason="; ".join(reasons), effect=effect)
+        return self._booked(taken, given)
+
+    def _busy(self, vehicle: int, effect: Effect) -> str:
+        """Return why an effect cannot be made: its actuator is at work; empty if it can."""
+        actuator = ACTUATORS.get(effect.kind, "")
+        for other in self._timelines[vehicle].effects:
+            overlaps = other.start_s < effect.end_s and effect.start_s < other.end_s
+            if overlaps and ACTUATORS.get(other.kind) == actuator:
+                return f"{actuator} busy from {other.start_s:.3f} s to {other.end_s:.3f} s"
+        return ""
+
+    def _booked(self, taken: Taken, given: Burn | WheelTurn | None) -> Taken:
+        thruster = self._vehicles[taken.vehicle].thruster
+        if not isinstance(given, Burn) or thruster is None:
+            return taken
+        tank, commanded_m_s = self._tanks[taken.vehicle], math.hypot(*taken.command.vector)
+        expected_kg = tank.propellant_kg - propellant_of(thruster, tank.mass_kg, commanded_m_s)
+        tank.book(given)
+        return replace(
+            taken,
+            delta_v_m_s=given.magnitude_m_s,
+            used_kg=given.propellant_kg,
+            propellant_kg=tank.propellant_kg,
+            expected_m_s=commanded_m_s,
+            expected_kg=expected_kg,
+        )
+
+
+def _kind(command: Command, arc_s: float) -> EffectKind:
+    if command.kind == "delta_v":
+        return "thrust" if arc_s > 0.0 else "impulse"
+    return command.kind
+
+
+def _vector(command: Command, given: Burn | WheelTurn | None) -> Vector:
+    if isinstance(given, Burn):
+        return given.vector
+    return given.torque_n_m if isinstance(given, WheelTurn) else command.vector

@@ -1,0 +1,244 @@
+"""
+The board under flight software: the context that it sees, and what leaves the vehicle through it.
+
+Everything is stamped with the time of the tick in progress, not with a clock's: flight software that is
+given the same readings commands the same things, whatever computer it runs on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from madns_runtime.errors import MadnsError, PluginError
+from madns_runtime.plugin.api import EVERYBODY, AgentContext
+from madns_runtime.protocol.codec import pack
+from madns_runtime.recording.records import Field
+from madns_runtime.simulations.constellation import streams
+from madns_runtime.simulations.constellation.equipment import Vehicle
+from madns_runtime.simulations.constellation.messages import (
+    CommandResult,
+    Delivery,
+    Initial,
+    TransmissionRefusal,
+    is_for_ground,
+)
+from madns_runtime.simulations.constellation.parameters import ConstellationParameters
+from madns_runtime.simulations.constellation.vehicle.commands import (
+    COMMANDS_PER_TICK_MAX,
+    CommandDesk,
+    check_running,
+)
+
+PAYLOAD_BYTES_MAX = 16_384
+"""Of one message by radio, encoded."""
+MESSAGES_PER_TICK_MAX = 64
+REFUSALS_MAX = 1024
+"""Number of refusals that wait for the next tick to be told; older ones are dropped, but counted as all others."""
+MISTAKES = {
+    "no_radio": "the scenario has no crosslinks, or for the ground no stations",
+    "too_long": f"a payload has at most {PAYLOAD_BYTES_MAX} bytes",
+    "unknown_receiver": "there is no other vehicle and no station of that name",
+}
+"""Refusals that no waiting cures: the first of each is told in the log."""
+ESTIMATES_MAX = 64
+"""Names in an estimate."""
+LOG_CHARACTERS_MAX = 2000
+
+
+class VehicleContext:
+    """
+    A vehicle's FlightContext; see `flight.api.FlightContext` for what is not described here.
+
+    Args:
+        context: The framework's.
+        initial: The host's initial data.
+        vehicle: What the vehicle is like.
+        settings: Of its flight software.
+        random: For its flight software.
+    """
+
+    def __init__(
+        self,
+        context: AgentContext,
+        initial: Initial,
+        *,
+        vehicle: Vehicle,
+        settings: Mapping[str, Any],
+        random: np.random.Generator,
+    ) -> None:
+        parameters = context.parameters
+        assert isinstance(parameters, ConstellationParameters)
+        self.name = context.name
+        self.satellite = initial.satellite
+        self.agents = context.agents
+        self.index = context.agents.index(context.name)
+        self.tick_hz = context.tick_hz
+        self.duration_s = context.duration_s
+        self.epoch_utc = initial.epoch_utc
+        self.frame = initial.frame
+        self.settings = settings
+        self.random = random
+        self._context = context
+        self._has_crosslinks = parameters.crosslinks is not None
+        self._has_stations = bool(parameters.stations)
+        # One that rejoins goes on behind all numbers that it can have given before.
+        rejoined_tick = max(0, math.ceil(context.now_s() * context.tick_hz))
+        self.first_number = rejoined_tick * COMMANDS_PER_TICK_MAX
+        """Of its first command: 0, or more in a vehicle that rejoined the run."""
+        self._first_message = rejoined_tick * MESSAGES_PER_TICK_MAX
+        self.desk = desk = CommandDesk(context, vehicle, self.first_number)
+        """Of its commands."""
+        self.delta_v, self.torque, self.ballistic = desk.delta_v, desk.torque, desk.ballistic
+        self._tick: int | None = None
+        self._t_s = -math.inf
+        self._messages = 0
+        self._messages_in_tick = 0
+        self.messages_sent = 0
+        """Messages handed to the radio."""
+        self._refusals: deque[TransmissionRefusal] = deque(maxlen=REFUSALS_MAX)
+        self.refused: Counter[str] = Counter()
+        """Messages refused, by reason: on board, where they never reach the radio, or by the host."""
+        self._has_refusals_stream = False
+        self._estimate_names: tuple[str, ...] = ()
+        context.open_stream("command_results", streams.COMMAND_RESULTS)
+        if self._has_crosslinks or self._has_stations:
+            context.open_stream("messages", streams.MESSAGES)
+
+    def begin(self, tick: int, t_s: float, phase_s: float) -> None:
+        """Begin a tick: from now on everything bears its time."""
+        self.desk.begin(tick, t_s, phase_s)
+        self._tick, self._t_s = tick, t_s
+        self._messages_in_tick = 0
+
+    # What flight software calls --------------------------------------------------------------
+
+    def send(self, to: str, payload: Any) -> int:
+        """Send a message by radio."""
+        check_running("send", self._tick)
+        if not isinstance(to, str):
+            raise PluginError(f"send: expected a receiver's name, got {to!r:.80}")
+        if self._messages_in_tick >= MESSAGES_PER_TICK_MAX:
+            raise PluginError(
+                f"send: expected at most {MESSAGES_PER_TICK_MAX} messages in one tick; "
+                f"the tick at {self._t_s:g} s wants more"
+            )
+        size = _payload_bytes(payload)
+        number = self._first_message + self._messages
+        self._messages += 1
+        self._messages_in_tick += 1
+        reason = self._why_refused(to, size)
+        if reason is not None:
+            self.refuse(TransmissionRefusal(number, to, self._t_s, reason))
+            return number
+        self.messages_sent += 1
+        self._context.transmit(to, payload, number=number)
+        self._context.record("messages", (self._tick, "sent", to, self._t_s, self._t_s, size))
+        return number
+
+    def broadcast(self, payload: Any) -> int:
+        """Send a message to every vehicle in view."""
+        return self.send(EVERYBODY, payload)
+
+    def estimate(self, values: Mapping[str, float | None]) -> None:
+        """Record what flight software believes; the first call fixes the names."""
+        check_running("estimate", self._tick)
+        names = self._estimate_names
+        if not names:
+            names = self._open_estimates(values)
+        try:
+            believed = [values[name] for name in names]
+            row = [None if value is None else float(value) for value in believed]
+        except (KeyError, TypeError, ValueError, OverflowError):
+            row = []
+        if len(row) != len(names) or len(values) != len(names):
+            raise PluginError(
+                f"estimate: expected numbers for {', '.join(names)}, as in the first call, "
+                f"got {values!r:.200}"
+            )
+        self._context.record("estimates", (self._tick, *row))
+
+    def log(self, level: str, text: str) -> None:
+        """Log a sentence."""
+        self._context.log(level, str(text)[:LOG_CHARACTERS_MAX])
+
+    # What the vehicle itself calls -------------------------------------------------------------
+
+    def record_result(self, tick: int, result: CommandResult) -> None:
+        """Record what flight software is about to be told of a command."""
+        self._context.record(
+            "command_results",
+            (
+                tick,
+                result.number,
+                result.status,
+                result.at_s,
+                result.revision,
+                result.delta_v_m_s,
+                result.propellant_kg,
+                result.reason,
+            ),
+        )
+
+    def refuse(self, refusal: TransmissionRefusal) -> None:
+        """Take that a message was refused, to be told in the next tick."""
+        reason = refusal.reason
+        self.refused[reason] += 1
+        self._refusals.append(refusal)
+        if reason in MISTAKES and self.refused[reason] == 1:
+            words = f"{reason.replace('_', ' ')}: {MISTAKES[reason]}"
+            self._context.log(
+                "warning",
+                f"the message to {refusal.to!r:.80} of {refusal.sent_s:g} s was refused, {words}; "
+                "others like it are counted in sends_refused",
+            )
+
+    def take_refusals(self, tick: int) -> list[TransmissionRefusal]:
+        """Record and return what flight software is about to be told of its messages."""
+        taken = list(self._refusals)
+        self._refusals.clear()
+        if taken and not self._has_refusals_stream:
+            self._context.open_stream("refusals", streams.REFUSALS)
+            self._has_refusals_stream = True
+        for one in taken:
+            self._context.record("refusals", (tick, one.number, one.to, one.sent_s, one.reason))
+        return taken
+
+    def record_received(self, tick: int, message: Delivery) -> None:
+        """Record a message that flight software is about to hear."""
+        size = len(pack(message.payload))
+        row = (tick, "received", message.sender, message.sent_s, message.arrives_s, size)
+        self._context.record("messages", row)
+
+    def _why_refused(self, to: str, payload_bytes: int) -> str | None:
+        """Return why a message cannot leave the vehicle; None if it can."""
+        if not (self._has_stations if is_for_ground(to) else self._has_crosslinks):
+            return "no_radio"
+        return "too_long" if payload_bytes > PAYLOAD_BYTES_MAX else None
+
+    def _open_estimates(self, values: Any) -> tuple[str, ...]:
+        if not isinstance(values, Mapping) or not 1 <= len(values) <= ESTIMATES_MAX:
+            raise PluginError(
+                f"estimate: expected a mapping of 1 to {ESTIMATES_MAX} names, got {values!r:.200}"
+            )
+        names = tuple(values)
+        for name in names:
+            if not isinstance(name, str) or not name.isprintable() or not name:
+                raise PluginError(
+                    f"estimate: expected names such as slot_error_deg, got {name!r:.80}"
+                )
+        fields = [Field(name, streams.unit_of(name)) for name in names]
+        self._context.open_stream("estimates", (*streams.ESTIMATES, *fields))
+        self._estimate_names = names
+        return names
+
+
+def _payload_bytes(payload: Any) -> int:
+    try:
+        return len(pack(payload))
+    except MadnsError as error:
+        raise PluginError(f"send: {error}") from error

@@ -1,0 +1,229 @@
+"""
+A vehicle fitted out with sensors and flight software, and one tick on board, in its order: measure, hear, be told, think.
+
+    truth -> sensors -> readings -.
+    host -> messages, results ----+-> flight software -> commands, messages, estimates
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import dataclasses
+from collections import deque
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from madns_runtime.errors import BlamedError, PluginError
+from madns_runtime.plugin import validation
+from madns_runtime.plugin.api import AgentContext
+from madns_runtime.plugin.context import describe_exception
+from madns_runtime.simulations.constellation.equipment import Vehicle
+from madns_runtime.simulations.constellation.flight.api import (
+    MASS,
+    TRUTH,
+    Reading,
+    Readings,
+)
+from madns_runtime.simulations.constellation.flight.loading import load_flight_class
+from madns_runtime.simulations.constellation.flight.process import ExternalFlight
+from madns_runtime.simulations.constellation.messages import (
+    CommandResult,
+    Delivery,
+    Initial,
+    TransmissionRefusal,
+)
+from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
+from madns_runtime.simulations.constellation.parameters import FlightClass, FlightProcess
+from madns_runtime.simulations.constellation.vehicle.flight_context import VehicleContext
+from madns_runtime.simulations.constellation.vehicle.sensors.environment import Scene
+from madns_runtime.simulations.constellation.vehicle.sensors.sensor import SensorSuite, generator_of
+from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBuffer
+from madns_runtime.simulations.constellation.vehicles import flight_of
+
+RESULTS_MAX = 1024
+"""Results of commands that wait for the next tick; older ones are dropped and counted."""
+
+CHANCE_BYTES = 32
+"""Of the run's chance for one vehicle."""
+
+
+class Cockpit:
+    """
+    Flight software in its vehicle: what it lacks is skipped, and what it raises is blamed on its own line.
+
+    Args:
+        make: Returns an object that has some of the contract's methods: a class.
+        board: Its context.
+        vehicle: What the vehicle is like.
+        is_truth_fed: Whether it is given truth instead of measurements.
+
+    Raises:
+        BlamedError: It raised.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[], Any],
+        board: VehicleContext,
+        *,
+        vehicle: Vehicle,
+        is_truth_fed: bool,
+    ) -> None:
+        self._name = getattr(make, "__name__", "flight software")
+        self._software = software = self._call("__init__", make)
+        self._step: Callable[[float, Readings], object] = getattr(software, "step", _do_nothing)
+        self._board = board
+        self._vehicle = vehicle
+        self._is_truth_fed = is_truth_fed
+        self._messages: list[Delivery] = []
+        self._results: deque[CommandResult] = deque(maxlen=RESULTS_MAX)
+        self._results_dropped = 0
+        self.phase_s = 0.0
+        """By how much the vehicle's ticks lie behind their nominal times, s."""
+        self.refuse = board.refuse
+        """Take that the host refused a message, to be told in the next tick."""
+        if hasattr(software, "setup"):
+            self._call("setup", software.setup, board)
+        else:  # it finds its context all the same
+            with contextlib.suppress(AttributeError):  # a class with slots does without
+                software.context = board
+
+    def step(
+        self,
+        tick: int,
+        t_s: float,
+        state: tuple[float, ...] | None,
+        measured: Mapping[str, Reading],
+    ) -> None:
+        """
+        Do one tick; a tick without truth has no readings, but flight software runs all the same.
+
+        Args:
+            tick: Its number.
+            t_s: Its time.
+            state: Truth, or None.
+            measured: What sensors have to say since the tick before.
+
+        Raises:
+            BlamedError: Flight software raised.
+        """
+        board = self._board
+        board.begin(tick, t_s, self.phase_s)
+        readings = dict(measured) if not self._is_truth_fed else {}
+        if self._is_truth_fed and state is not None:
+            readings[TRUTH] = Reading(t_s, state)
+        messages, self._messages = self._messages, []
+        for message in messages:
+            board.record_received(tick, message)
+            self._tell("receive", message)
+        while self._results:
+            result = self._results.popleft()
+            board.record_result(tick, result)
+            self._read_gauge(t_s, result, readings)
+            self._tell("command_result", result)
+        for refusal in board.take_refusals(tick):
+            self._tell("message_refused", refusal)
+        self._call("step", self._step, t_s, readings)
+
+    def deliver(self, message: Delivery) -> None:
+        """Take a message by radio, to be told in the tick that begins."""
+        self._messages.append(message)
+
+    def tell(self, result: CommandResult) -> None:
+        """Take what became of a command, to be told in the next tick."""
+        self._results_dropped += len(self._results) == RESULTS_MAX
+        self._results.append(result)
+
+    def finish(self) -> dict[str, Any]:
+        """
+        Return the summary of what went in and out, and flight software's own under flight.
+
+        Raises:
+            BlamedError: Flight software raised, or returned what is no summary.
+        """
+        summary = self._call("finish", getattr(self._software, "finish", dict))
+        try:
+            told = validation.summary(summary)
+        except PluginError as error:
+            raise BlamedError(f"{self._name}.finish returned {error}") from error
+        return {
+            "commands": self._board.desk.count,
+            "command_results_dropped": self._results_dropped,
+            "messages_sent": self._board.messages_sent,
+            "sends_refused": dict(self._board.refused),
+            "flight": told,
+        }
+
+    def _read_gauge(self, t_s: float, result: CommandResult, readings: dict[str, Reading]) -> None:
+        """Give mass and propellant with what changed them, and not before it has."""
+        thruster = self._vehicle.thruster
+        if thruster is None or result.status != "executed":
+            return
+        left_kg = result.propellant_kg
+        mass_kg = self._vehicle.mass_kg - (thruster.propellant_kg - left_kg)
+        readings[MASS] = Reading(t_s, (mass_kg, left_kg))
+
+    def _tell(self, method: str, news: CommandResult | Delivery | TransmissionRefusal) -> None:
+        """Hand news to `receive`, `command_result` or `message_refused`, if it has that method."""
+        self._call(method, getattr(self._software, method, _do_nothing), news)
+
+    def _call(self, name: str, method: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return method(*arguments)
+        except BlamedError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise BlamedError(describe_exception(error, f"{self._name}.{name}")) from error
+
+
+def _do_nothing(*_arguments: object) -> None:
+    """Stand in for a method that flight software does not have."""
+
+
+def fit_out(
+    context: AgentContext, initial: Initial, *, vehicle: Vehicle, buffer: TruthBuffer
+) -> tuple[SensorSuite | None, Cockpit | None]:
+    """
+    Mount sensors and flight software, and let the latter prepare; None for what the vehicle has not.
+
+    Raises:
+        BlamedError: Flight software does not load, or raised.
+        MissingExtraError: A sensor, or flight software, needs what is not installed.
+    """
+    flight = flight_of(context.parameters, context.name, initial.satellite)
+    wanted = vehicle.sensors
+    has_sensors = any(getattr(wanted, field.name) for field in dataclasses.fields(wanted))
+    if flight is None and not has_sensors:
+        return None, None
+    # All that is left to chance on board hangs on these bytes and on a name, not on an order.
+    chance = context.random.bytes(CHANCE_BYTES)
+    suite = cockpit = None
+    if has_sensors:
+        gravity = GRAVITY_MODELS[context.parameters.gravity]
+        scene = Scene(initial.epoch_utc, buffer, gravity.radius_m)
+        suite = SensorSuite(wanted, scene, context=context, chance=chance)
+    if flight is not None:
+        board = VehicleContext(
+            context,
+            initial,
+            vehicle=vehicle,
+            settings=copy.deepcopy(flight.settings),  # its own: vehicles may share a process
+            random=generator_of(chance, "flight"),
+        )
+        software, is_truth_fed = _software(flight, context), flight.input == "truth"
+        cockpit = Cockpit(software, board, vehicle=vehicle, is_truth_fed=is_truth_fed)
+    return suite, cockpit
+
+
+def _software(flight: FlightClass | FlightProcess, context: AgentContext) -> Callable[[], Any]:
+    if isinstance(flight, FlightClass):
+        return load_flight_class(flight.software, context.base_directory)
+    return partial(
+        ExternalFlight,
+        flight,
+        context.base_directory,
+        is_lockstep=context.is_lockstep,
+        keep_text=context.keep_text,
+    )

@@ -1,0 +1,200 @@
+"""Instruments of a vehicle: what each measures of its surroundings, errors added. Their records: see `streams`."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from madns_runtime.bounded_files import read_regular_file
+from madns_runtime.errors import MissingExtraError, PluginError
+from madns_runtime.simulations.constellation.equipment import Magnetometer
+from madns_runtime.simulations.constellation.orbit.magnetic import (
+    NT,
+    Coefficients,
+    Harmonics,
+    decimal_year,
+    dipole_at,
+    dipole_field_t,
+)
+from madns_runtime.simulations.constellation.orbit.quaternions import from_rotation, multiply
+from madns_runtime.simulations.constellation.vehicle.sensors.environment import Scene
+
+Measured = tuple[float, ...]
+Row = list[float]
+"""Errors of one measurement."""
+
+FILE_BYTES_MAX = 16 * 1024 * 1024
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Instrument:
+    """Properties of one kind of sensor."""
+
+    name: str
+    """Of the reading, and of the stream of records unless that says otherwise."""
+    measure: Callable[[Scene, Row], Measured | None]
+    """Returns the measured values, or None if there is nothing to measure, such as no Sun."""
+    digits: int
+    """Decimals of the recorded values: beyond them lies nothing but noise of the sensor."""
+    channels: int = 3
+    """Errors that a measurement needs."""
+    stream: str = ""
+
+
+def gnss(scene: Scene, error: Row) -> Measured:
+    """Return position, m, and velocity, m/s: at any height, the antenna at the centre of mass."""
+    return tuple(true + wrong for true, wrong in zip(scene.state, error, strict=False))
+
+
+def gyro(scene: Scene, error: Row) -> Measured:
+    """Return the body rates of a rigid body, rad/s."""
+    return tuple(true + wrong for true, wrong in zip(scene.state[10:13], error, strict=True))
+
+
+def star_tracker(scene: Scene, error: Row) -> Measured:
+    """Return the quaternion of a rigid body, turned on by the errors about its axes, rad; nothing blinds it."""
+    return multiply(scene.state[6:10], from_rotation(error))
+
+
+def sun_sensor(scene: Scene, error: Row) -> Measured | None:
+    """
+    Return the unit vector to the Sun, turned by the errors, rad; None in the Earth's umbra.
+
+    It sees all around; its axes are the body's, or the frame's without attitude.
+    """
+    direction = scene.sun_direction()
+    if direction is None:
+        return None
+    x, y, z = scene.to_body(direction)
+    a, b, c = error
+    x, y, z = x + b * z - c * y, y + c * x - a * z, z + a * y - b * x
+    length = math.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
+
+
+def clock(scene: Scene, error: Row) -> Measured:
+    """
+    Return the time since the epoch that the vehicle believes it is, s.
+
+    Its bias is an offset; the walk of it is the random walk of an oscillator's phase.
+    """
+    return (scene.t_s + error[0],)
+
+
+class Accelerometer:
+    """
+    Specific force, that is acceleration other than gravity: thrust, impulses and drag, at the centre of mass.
+
+    It integrates, as real ones do: what it says is the mean since the measurement before. So a burn between two
+    measurements is not lost, and their products with the time between them add up to the change of velocity. An
+    impulse, which has no duration, is spread over the measurement that it falls in. Its axes are the body's, or
+    the frame's without attitude.
+    """
+
+    def __init__(self) -> None:
+        self._sum_m_s = [0.0, 0.0, 0.0]
+        self._since_s: float | None = None
+        self._t_s = 0.0
+        self._given_m_s = self._drag_m_s2 = (0.0, 0.0, 0.0)
+
+    def feel(self, scene: Scene) -> None:
+        """Take what acted since the tick before, turned as the body is now; called every tick."""
+        given, step_s = scene.given_m_s(), scene.t_s - self._t_s
+        if self._since_s is None:
+            self._since_s = scene.t_s
+        else:
+            change = zip(given, self._given_m_s, self._drag_m_s2, strict=True)
+            x, y, z = (now - before + drag * step_s for now, before, drag in change)
+            for axis, gained in enumerate(scene.to_body((x, y, z))):
+                self._sum_m_s[axis] += gained
+        self._t_s, self._given_m_s, self._drag_m_s2 = scene.t_s, given, scene.drag_m_s2()
+
+    def measure(self, scene: Scene, error: Row) -> Measured | None:
+        """Return the mean specific force since the measurement before, m/s^2; None for the first, which has none."""
+        if self._since_s is None or scene.t_s <= self._since_s:
+            return None
+        share = 1.0 / (scene.t_s - self._since_s)
+        x, y, z = (gained * share for gained in self._sum_m_s)
+        self._sum_m_s, self._since_s = [0.0, 0.0, 0.0], scene.t_s
+        a, b, c = error
+        return x + a, y + b, z + c
+
+
+class FluxGate:
+    """
+    Three axes along the body's; along the frame's without attitude.
+
+    Args:
+        settings: Which field.
+        scene: Where: the model is taken at the run's epoch, since it changes by 1e-3 in a year.
+
+    Raises:
+        MissingExtraError: The IGRF is wanted and its coefficients are not installed.
+    """
+
+    def __init__(self, settings: Magnetometer, scene: Scene) -> None:
+        year = decimal_year(scene.days)
+        self._field_t: Callable[[Vector], Vector]
+        if settings.field == "igrf":
+            self._field_t = Harmonics(igrf_coefficients(year)).field_t
+        else:
+            dipole = dipole_at(year)
+            self._field_t = lambda r_m: dipole_field_t(dipole, r_m)
+
+    def measure(self, scene: Scene, error: list[float]) -> tuple[float, ...]:
+        """Return the field, T."""
+        x, y, z = scene.state[:3]
+        gmst = scene.gmst_rad
+        cosine, sine = math.cos(gmst), math.sin(gmst)
+        fx, fy, fz = self._field_t((cosine * x + sine * y, cosine * y - sine * x, z))
+        bx, by, bz = scene.to_body((cosine * fx - sine * fy, sine * fx + cosine * fy, fz))
+        a, b, c = error
+        return bx + a, by + b, bz + c
+
+
+def igrf_coefficients(year: float) -> Coefficients:
+    """
+    Return the newest IGRF's coefficients at a decimal year, linear between its epochs.
+
+    Only the data file of ppigrf is read: its code takes 15 ms for a point, and pandas to import.
+
+    Raises:
+        MissingExtraError: ppigrf is not installed.
+        PluginError: Its data are not where, or what, they were.
+    """
+    found = importlib.util.find_spec("ppigrf")
+    if found is None or not found.submodule_search_locations:
+        raise MissingExtraError("ppigrf", "igrf")
+    folder = Path(found.submodule_search_locations[0])
+    files = sorted(folder.glob("IGRF*.shc"))
+    if not files:
+        raise PluginError(f"{folder}: expected a file IGRF*.shc of the package ppigrf >= 2.1")
+    return read_coefficients(files[-1], year)
+
+
+def read_coefficients(path: Path, year: float) -> Coefficients:
+    """
+    Return the coefficients of an SHC file at a decimal year, T; of its nearest epoch outside of them.
+
+    Raises:
+        PluginError: It is no SHC file.
+    """
+    text = read_regular_file(path, bytes_max=FILE_BYTES_MAX).decode()
+    lines = [line.split() for line in text.splitlines()]
+    rows = [line for line in lines if line and not line[0].startswith("#")][1:]
+    try:
+        years = [float(number) for number in rows[0]]
+        year = min(max(year, years[0]), years[-1])
+        at = next(number for number, until in enumerate(years[1:]) if year <= until)
+        part = (year - years[at]) / (years[at + 1] - years[at])
+        table = {(int(row[0]), int(row[1])): [float(n) for n in row[2:]] for row in rows[1:]}
+        return {
+            key: NT * (values[at] + part * (values[at + 1] - values[at]))
+            for key, values in table.items()
+        }
+    except (IndexError, ValueError, StopIteration) as error:
+        raise PluginError(f"{path}: expected spherical harmonics as SHC text") from error

@@ -1,0 +1,176 @@
+import json
+import os
+
+import pytest
+from harness.synthetic_run import SyntheticRun
+
+from cosmos_cli import app
+from cosmos_cli.collect.finish import finish_run
+
+
+@pytest.fixture(autouse=True)
+def own_register(tmp_path, monkeypatch):
+    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
+    monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
+
+
+@pytest.fixture
+def made(tmp_path):
+    return SyntheticRun(tmp_path / "runs").write()
+
+
+def finish(made):
+    return finish_run(made.run, made.result(), made.expected)
+
+
+def test_collect_prints_the_verdict_as_run_does_and_tells_the_package(made, capsys):
+    finish(made)
+
+    code = app.run(["collect", "1"])
+
+    out, err = capsys.readouterr()
+    assert code == 0
+    assert out == f"PASSED: 11 checks hold | {made.run.path}\n"
+    assert f"packed: {made.run.bundle}\n" in err
+
+
+def test_collect_of_a_cut_off_run_ends_with_5_and_names_what_is_missing(made, capsys):
+    made.kill("agent-01")
+
+    code = app.run(["collect", "last"])
+
+    err = capsys.readouterr().err
+    assert code == 5
+    assert "host: no result" in err
+    assert "agent-01: " in err
+    assert made.run.bundle.exists()
+
+
+def test_collect_as_json_prints_run_json_alone(made, capsys):
+    finish(made)
+
+    assert app.run(["collect", "--json", "--quiet"]) == 0
+
+    out, err = capsys.readouterr()
+    assert json.loads(out) == made.run.read_json(made.run.run_json)
+    assert err == ""
+
+
+def test_runs_lists_what_was_run(made, capsys):
+    finish(made)
+    SyntheticRun(made.run.path.parent)
+
+    assert app.run(["runs", "--json"]) == 0
+
+    first, second = json.loads(capsys.readouterr().out)
+    assert (first["run"], first["status"], first["exit_code"]) == ("0001-synthetic", "complete", 0)
+    assert (second["run"], second["status"]) == ("0002-synthetic", "cut off")
+
+
+def test_runs_of_an_empty_folder_says_how_to_make_one(capsys):
+    assert app.run(["runs"]) == 0
+
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "cosmos run SCENARIO" in err
+
+
+def test_report_shows_verdict_checks_and_tables(made, capsys):
+    finish(made)
+
+    assert app.run(["report"]) == 0
+
+    out = capsys.readouterr().out
+    assert out.startswith("0001-synthetic: PASSED")
+    for text in (
+        "deadline.miss_ratio",
+        "Round trips by agent, ms",
+        "agent-02",
+        "p99.9",
+        "lateness",
+    ):
+        assert text in out
+    assert "no temperature sensor" in out
+
+
+@pytest.mark.slow
+def test_report_writes_html_where_it_is_told_to(made, tmp_path, capsys):
+    finish(made)
+    target = tmp_path / "here.html"
+
+    assert app.run(["report", "1", "--html", str(target)]) == 0
+
+    assert "PASSED" in target.read_text()
+    assert capsys.readouterr().out == ""
+
+
+def test_report_to_an_impossible_path_is_bad_input(made, tmp_path, capsys):
+    finish(made)
+
+    assert app.run(["report", "1", "--html", str(tmp_path / "no/such/here.html")]) == 2
+
+    assert "no/such/here.html: cannot be written" in capsys.readouterr().err
+
+
+def test_report_of_a_run_that_is_not_collected_says_what_to_do(made, capsys):
+    assert app.run(["report", "1"]) == 2
+
+    assert "cosmos collect 1" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(60)
+def test_pipe_among_the_tables_is_named_and_not_waited_for(made, capsys):
+    finish(made)
+    os.mkfifo(made.run.tables / "pipe.parquet")
+
+    assert app.run(["report", "1"]) == 0
+    assert "tables/pipe.parquet cannot be read" in " ".join(capsys.readouterr().out.split())
+    assert app.run(["diff", "1", "1"]) == 0
+    assert "links or no files: tables/pipe.parquet" in capsys.readouterr().out
+    assert app.run(["collect", "1"]) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(60)
+def test_stream_of_terabytes_is_read_by_no_command(made, capsys):
+    finish(made)
+    os.truncate(made.run.path / "agents/agent-01/ticks.jsonl", 9 * 10**12)
+
+    assert app.run(["diff", "1", "1"]) == 0
+    assert "agents/agent-01/ticks.jsonl: not read: it is 9.0 TB" in capsys.readouterr().out
+    assert app.run(["collect", "1", "--no-retrieve", "--size-max", "2GB"]) == 5
+    assert "can have recorded at most 2.0 GB" in capsys.readouterr().err
+    assert app.run(["report", "1"]) == 0
+
+
+@pytest.mark.parametrize("command", ["runs", "report", "collect", "logs", "tabulate", "diff"])
+def test_file_in_place_of_the_folder_of_runs_is_bad_input(tmp_path, capsys, command):
+    (tmp_path / "file").touch()
+    which = [] if command == "runs" else ["1", "2"] if command == "diff" else ["1"]
+
+    assert app.run([command, *which, "--runs", str(tmp_path / "file")]) == 2
+
+    assert "file: expected the folder of all runs: Not a directory" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_linked_run_is_neither_collected_nor_written_into(made, tmp_path, capsys):
+    finish(made)
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    (victim / "run.json").write_text("precious")
+    (made.run.path.parent / "0099-evil").symlink_to(victim)
+
+    assert app.run(["collect", "last"]) == 0
+    assert app.run(["collect", "99"]) == 2
+
+    assert "0099-evil: a link, which is not followed" in capsys.readouterr().err
+    assert [path.name for path in victim.iterdir()] == ["run.json"]
+    assert (victim / "run.json").read_text() == "precious"
+
+
+def test_unknown_run_is_bad_input(made, capsys):
+    assert app.run(["collect", "9"]) == 2
+
+    assert "0001-synthetic" in capsys.readouterr().err

@@ -1,0 +1,316 @@
+"""`cosmos logs` shows what a run's processes said, in order, and follows a run that lives until it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from harness.waiting import wait_until
+
+from cosmos_cli.app import run as cosmos
+from cosmos_cli.evidence import run_log
+from cosmos_cli.evidence.run_log import LogReading
+from cosmos_cli.onboard import log_tail
+from cosmos_cli.onboard.request_loop import VerbRequest
+
+HARNESS = Path(__file__).parents[2] / "harness"
+PATIENCE_S = 90
+SCHEMA = '{"schema":1,"stream":"log","shape":"object","fields":[]}\n'
+SCENARIO = """
+name: talk
+simulation: ./talkative.py:simulation
+agents: {count: 2, tick_hz: 10}
+time: {duration_s: 3, rtf_tolerance: 1}
+deadline: {max_miss_ratio: 1}
+"""
+
+
+def record(second, level, text, t_s=None):
+    utc = f"2026-01-01T00:00:{second:02d}.000000Z"
+    return json.dumps({"t_s": t_s, "utc": utc, "level": level, "text": text}) + "\n"
+
+
+@pytest.fixture
+def made(tmp_path, monkeypatch):
+    """A run directory with logs of a host and two agents, and no plan."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("COSMOS_RUNS", raising=False)
+    run = tmp_path / "runs" / "0001-x"
+    for folder in ("host", "agents/a1", "agents/a2", "machines/here"):
+        (run / folder).mkdir(parents=True)
+    (run / "host/log.jsonl").write_text(SCHEMA + record(5, "error", "host 5", 1.5))
+    (run / "agents/a1/log.jsonl").write_text(
+        SCHEMA + record(1, "info", "a1 1") + record(9, "warning", "a1 9") + '{"end":{}}\n'
+    )
+    (run / "agents/a1/log.2.jsonl").write_text(SCHEMA + record(7, "debug", "a1 again"))
+    (run / "agents/a2/log.jsonl").write_text(SCHEMA + record(3, "info", "a2 3"))
+    (run / "machines/here/stderr.txt").write_text("Traceback\nValueError\n")
+    return run
+
+
+def texts(capsys, *arguments):
+    code = cosmos(["logs", *arguments, "--json"])
+    told = capsys.readouterr()
+    assert code == 0, told.err
+    return [json.loads(line)["text"] for line in told.out.splitlines()]
+
+
+def test_lines_come_in_order_of_time_and_those_without_one_at_the_end(made, capsys):
+    assert texts(capsys) == [
+        *("a1 1", "a2 3", "host 5", "a1 again", "a1 9", "Traceback", "ValueError"),
+    ]
+
+
+def test_text_kept_beside_an_agents_records_is_told_as_that_agents(made, capsys):
+    (made / "agents/a2/flight_stderr.txt").write_text("of a program\n")
+
+    assert texts(capsys, "1", "a2") == ["a2 3", "of a program"]
+
+
+def test_each_line_says_who_and_when_and_how_loud(made, capsys):
+    assert cosmos(["logs", "1", "host"]) == 0
+
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.split() == ["00:00:05.000", "1.500", "host", "error", "host", "5"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["1", "a1"], ["a1 1", "a1 again", "a1 9"]),
+        (["1", "here"], ["Traceback", "ValueError"]),
+        (["--level", "warning"], ["host 5", "a1 9", "Traceback", "ValueError"]),
+        (["--lines", "3"], ["a1 9", "Traceback", "ValueError"]),
+        (["1", "a1", "-n", "1"], ["a1 9"]),
+        (["-f"], ["a1 1", "a2 3", "host 5", "a1 again", "a1 9", "Traceback", "ValueError"]),
+    ],
+)
+def test_part_of_a_log_can_be_had(made, capsys, arguments, expected):
+    assert texts(capsys, *arguments) == expected
+
+
+def test_text_of_others_cannot_steer_a_terminal_nor_speak_for_another(made, capsys):
+    (made / "agents/a1/log.jsonl").write_text(
+        SCHEMA + record(1, "info", "\x1b[2Jgone\n00:00:05.000  host  error  forged")
+    )
+    assert cosmos(["logs", "1", "a1", "-n", "9"]) == 0
+
+    first, second, *_ = capsys.readouterr().out.splitlines()
+    assert first.endswith(r"\x1b[2Jgone")
+    assert second.startswith("00:00:01.000") and " a1 " in second
+
+
+def test_what_is_no_record_is_counted(made, capsys):
+    with (made / "agents/a1/log.jsonl").open("ab") as file:
+        file.write(
+            b'{"half\n[1, 2]\n\xff\xfe\n{"t_s": NaN, "text": "odd", "level": {}, "utc": 7}\n'
+        )
+
+    assert "odd" in texts(capsys, "1", "a1")
+    cosmos(["logs", "1", "a1"])
+    assert "3 lines could not be read" in capsys.readouterr().err
+
+
+def test_long_text_is_cut_and_says_so(made, capsys, monkeypatch):
+    monkeypatch.setattr(run_log, "TEXT_CHARACTERS_MAX", 10)
+    (made / "agents/a1/log.jsonl").write_text(SCHEMA + record(1, "info", "x" * 25))
+
+    assert "x" * 10 + "... (15 more characters)" in texts(capsys)
+
+
+def test_lines_left_out_are_counted(made, capsys, monkeypatch):
+    monkeypatch.setattr("cosmos_cli.commands.logs.LINES_DEFAULT", 2)
+
+    assert cosmos(["logs"]) == 0
+    assert "5 earlier lines left out" in capsys.readouterr().err
+
+
+def test_run_that_said_nothing_says_so(made, capsys):
+    for path in made.rglob("*.*"):
+        path.unlink()
+
+    assert cosmos(["logs"]) == 0
+    assert "0001-x: nothing was said" in capsys.readouterr().err
+
+
+def test_only_whole_lines_are_told_and_each_once(made):
+    path = made / "host/log.jsonl"
+    reading = LogReading()
+    path.write_text(SCHEMA + record(1, "info", "one") + record(2, "info", "two")[:20])
+    first = [line.text for portion in reading.read_here(made) for line in portion]
+    path.write_text(SCHEMA + record(1, "info", "one") + record(2, "info", "two"))
+    second = [line.text for portion in reading.read_here(made) for line in portion]
+
+    assert "one" in first and "two" not in first
+    assert second == ["two"]
+
+
+@pytest.mark.parametrize("arguments", [(), ("-f",)])
+def test_last_line_of_a_text_needs_no_end_once_nothing_lives(made, capsys, arguments):
+    path = made / "machines/here/stderr.txt"
+    path.write_text("one line\nfatal: no newline")
+    (made / "agents/a2/flight_stderr.txt").write_text("the line before a crash")
+
+    told = texts(capsys, "1", *arguments)
+
+    assert {"one line", "fatal: no newline", "the line before a crash"} <= set(told)
+
+
+def test_machine_on_which_nothing_lives_tells_the_last_line_of_a_text(made, tmp_path):
+    (made / "machines/here/stderr.txt").write_text("fatal: no newline")
+    arguments = {"directory": str(made), "state": str(tmp_path / "state"), "offsets": {}}
+
+    told = log_tail.tail(VerbRequest(arguments=arguments, body=b""))
+
+    assert told["files"]["machines/here/stderr.txt"]["text"] == "fatal: no newline"
+
+
+def test_last_line_of_a_text_waits_for_its_end_while_the_run_lives(made):
+    path = made / "machines/here/stderr.txt"
+    path.write_text("half a li")
+    reading = LogReading(source="here")
+    first = [line.text for portion in reading.read_here(made) for line in portion]
+    path.write_text("half a line\nthe la")
+    second = [line.text for portion in reading.read_here(made) for line in portion]
+    third = [line.text for portion in reading.read_here(made, is_ended=True) for line in portion]
+
+    assert (first, second, third) == ([], ["half a line"], ["the la"])
+
+
+def test_record_of_any_length_a_recorder_writes_is_told(made, capsys):
+    long = "é" * 100_000
+    (made / "agents/a1/log.jsonl").write_text(
+        SCHEMA + record(1, "info", long) + record(2, "info", "behind it")
+    )
+
+    assert cosmos(["logs", "1", "a1", "--json"]) == 0
+
+    captured = capsys.readouterr()
+    told = [json.loads(line)["text"] for line in captured.out.splitlines()]
+    assert told[0].startswith("éé") and told[0].endswith("(96000 more characters)")
+    assert "behind it" in told
+    assert captured.err == ""
+
+
+def test_answer_with_long_records_is_bounded(made):
+    for folder in ("agents/a1", "agents/a2", "host"):
+        (made / folder / "log.jsonl").write_text(record(1, "info", "x" * 1_000_000))
+
+    portions = [log_tail.read_tails(str(made), {})]
+    reading = LogReading()
+    told = [line.text[0] for portion in reading.read_here(made) for line in portion]
+
+    assert sum(len(f["text"]) for f in portions[0]["files"].values()) <= log_tail.ANSWER_BYTES_MAX
+    assert portions[0]["more"]
+    assert told.count("x") == 3
+
+
+def test_file_of_any_size_is_told_in_bounded_portions(made, monkeypatch):
+    monkeypatch.setattr(log_tail, "FILE_BYTES_MAX", 300)
+    monkeypatch.setattr(log_tail, "ANSWER_BYTES_MAX", 500)
+    lines = [record(second, "info", f"line {second}") for second in range(50)]
+    (made / "agents/a1/log.jsonl").write_text(SCHEMA + "".join(lines))
+    (made / "agents/a2/log.jsonl").write_text(SCHEMA + "".join(lines))
+    reading = LogReading()
+
+    portions = list(reading.read_here(made))
+
+    told = [line for portion in portions for line in portion if line.source == "a1"]
+    said = [line.text for line in told if line.text.startswith("line")]
+    assert said == [f"line {second}" for second in range(50)]
+    assert max(sum(len(line.text) for line in portion) for portion in portions) < 500
+    assert reading.damaged == 0
+
+
+def test_links_and_pipes_in_the_place_of_a_log_are_not_read(made, capsys, tmp_path):
+    secret = tmp_path / "secret"
+    secret.write_text("secret\n")
+    (made / "host/stderr.txt").symlink_to(secret)
+    (made / "machines/other").mkdir()
+    os.mkfifo(made / "machines/other/stderr.txt")
+
+    assert "secret" not in texts(capsys)
+
+
+def test_what_a_machine_tells_again_is_taken_once(made):
+    """While records are fetched, a file is told by the machine and by its copy here."""
+    reading = LogReading()
+    list(reading.read_here(made))
+    again = {"host/log.jsonl": {"start": 0, "end": 99, "text": record(1, "info", "again")}}
+
+    assert reading.take(again) == []
+
+
+@pytest.fixture
+def talking(tmp_path, monkeypatch):
+    """A scenario whose host and agents talk."""
+    shutil.copy(HARNESS / "talkative.py", tmp_path)
+    (tmp_path / "talk.yaml").write_text(SCENARIO)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("COSMOS_RUNS", raising=False)
+    return tmp_path
+
+
+def start(*words):
+    return subprocess.Popen(
+        [sys.executable, "-m", "cosmos_cli.app", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        stdin=subprocess.DEVNULL,
+        text=True,
+    )
+
+
+def wait_for_a_log(folder):
+    wait_until(lambda: list(folder.glob("runs/*/agents/*/log.jsonl")), "log")
+
+
+@pytest.mark.process
+def test_run_that_lives_is_followed_until_it_ends(talking, capsys):
+    run = start("run", "talk.yaml", "--no-report", "--quiet")
+    try:
+        wait_for_a_log(talking)
+        follower = start("logs", "-f", "--json")
+        out, err = follower.communicate(timeout=PATIENCE_S)
+        assert run.wait(PATIENCE_S) == 0
+    finally:
+        run.kill()
+
+    followed = [json.loads(line) for line in out.splitlines()]
+    assert follower.returncode == 0
+    assert "0001-talk has ended" in err
+    assert cosmos(["logs", "--json"]) == 0
+    whole = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert sorted(map(str, followed)) == sorted(map(str, whole))
+    assert {"the host begins", "wrong 20", "a word on stderr"} <= {line["text"] for line in whole}
+    assert {line["source"] for line in whole} == {"host", "agent-01", "agent-02", "loopback"}
+
+
+@pytest.mark.process
+def test_follower_ends_on_ctrl_c_and_the_run_goes_on(talking):
+    run = start("run", "talk.yaml", "--no-report", "--quiet", "--duration", "60")
+    try:
+        wait_for_a_log(talking)
+        follower = start("logs", "-f")
+        assert follower.stdout.readline()
+        follower.send_signal(signal.SIGINT)
+        follower.communicate(timeout=PATIENCE_S)
+        assert follower.returncode == 130
+        assert run.poll() is None
+    finally:
+        run.send_signal(signal.SIGINT)
+        run.communicate(timeout=PATIENCE_S)
+
+
+@pytest.mark.process
+def test_agent_that_the_run_has_not_is_bad_input(talking, capsys):
+    assert start("run", "talk.yaml", "--no-report", "--quiet").wait(PATIENCE_S) == 0
+
+    assert cosmos(["logs", "last", "agent-3"]) == 2
+    assert "no agent, host or machine named agent-3, did you mean" in capsys.readouterr().err

@@ -1,0 +1,256 @@
+import json
+import shutil
+
+import pytest
+from harness.synthetic_run import SyntheticRun, make_config
+
+from cosmos_cli import app
+from cosmos_cli.collect.finish import finish_run
+from cosmos_cli.diff import recorded
+
+AGENTS, TICKS = 3, 300
+
+
+@pytest.fixture(autouse=True)
+def own_places(tmp_path, monkeypatch):
+    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
+    monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
+
+
+@pytest.fixture
+def make(tmp_path):
+    def make_run(change=None, *, agents=AGENTS, ticks=TICKS, **more):
+        config = make_config(agents, ticks=ticks, **more)
+        made = SyntheticRun(tmp_path / "runs", config).write(with_states=True)
+        if change is not None:
+            change(made)
+        finish_run(made.run, made.result(), made.expected, has_report=False)
+        return made
+
+    return make_run
+
+
+def change_record(made, *, agent="agent-02", stream="state", tick=123, field=2, by=5.0):
+    """Change one value of one record; line 1 is the schema, line 2 may tell time zero."""
+    path = made.stream(agent, stream)
+    lines = path.read_text().split("\n")
+    index = next(i for i, line in enumerate(lines) if line.startswith(f"[{tick},"))
+    values = json.loads(lines[index])
+    values[field] += by
+    lines[index] = json.dumps(values)
+    path.write_text("\n".join(lines))
+
+
+def diff(capsys, *arguments):
+    code = app.run(["diff", *arguments, "--json", "--quiet"])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def streams_of(document):
+    return {stream["table"]: stream for stream in document["streams"]}
+
+
+def test_same_run_twice_is_identical(make, capsys):
+    make(), make()
+
+    code, document = diff(capsys, "1", "2", "--expect-same")
+
+    assert code == 0
+    assert (document["schema"], document["same"], document["identical"]) == (1, True, True)
+    assert document["runs"] == {"a": "0001-synthetic", "b": "0002-synthetic"}
+    state = streams_of(document)["state"]
+    assert state["matched"] == AGENTS * TICKS
+    assert set(state["sources"]) == {"agent-01", "agent-02", "agent-03"}
+
+
+def test_one_value_changed_in_one_record_is_found_and_located(make, capsys):
+    make(), make(change_record)
+
+    code, document = diff(capsys, "1", "2")
+
+    streams = streams_of(document)
+    y_m = streams["state"]["fields"]["y_m"]
+    assert code == 0
+    assert not document["same"]
+    assert (y_m["different"], y_m["at"]) == (1, {"key": 123.0, "who": "agent-02"})
+    assert y_m["max"] == pytest.approx(5.0)
+    assert y_m["rms"] == pytest.approx(5.0 / TICKS**0.5)  # of the one agent that is not identical
+    assert streams["state"]["fields"]["x_m"]["different"] == 0
+    assert streams["state"]["sources"]["agent-01"]["identical"]
+    assert streams["round_trips"]["identical"]
+
+
+@pytest.mark.slow
+def test_differences_end_with_1_only_where_none_are_expected(make, capsys):
+    make(), make(change_record)
+
+    assert diff(capsys, "1", "2")[0] == 0
+    assert diff(capsys, "1", "2", "--expect-same")[0] == 1
+    assert diff(capsys, "1", "2", "--expect-same", "--agents", "agent-01")[0] == 0
+    assert diff(capsys, "1", "2", "--expect-same", "--streams", "round_*")[0] == 0
+
+
+def test_lines_tell_the_same_as_tables(make, capsys):
+    first, second = make(), make(change_record)
+    _, of_tables = diff(capsys, "1", "2")
+    for made in (first, second):
+        shutil.rmtree(made.run.tables)
+
+    _, of_lines = diff(capsys, "1", "2")
+
+    assert of_lines == of_tables
+
+
+def test_a_table_older_than_its_lines_is_not_believed(make, capsys):
+    make(), change_record(make())
+
+    _, document = diff(capsys, "1", "2")
+
+    assert streams_of(document)["state"]["fields"]["y_m"]["different"] == 1
+
+
+def test_missing_agent_is_named(make, capsys):
+    make(), make(agents=AGENTS - 1)
+
+    code, document = diff(capsys, "1", "2", "--expect-same")
+
+    assert code == 1
+    assert ["state", "agent-03"] in document["streams_only_a"]
+    assert document["streams_only_b"] == []
+    assert {"key": "agents.count", "a": 3, "b": 2} in document["settings"]
+
+
+def test_different_tick_rates_are_matched_by_time_and_said(make, capsys):
+    make(), make(ticks=TICKS // 2, tick_hz=5.0)
+
+    _, document = diff(capsys, "1", "2")
+
+    state = streams_of(document)["state"]
+    assert any("matched by time" in remark for remark in document["remarks"])
+    assert (state["by"], state["rows"]) == ("time", [AGENTS * TICKS, AGENTS * TICKS // 2])
+    assert state["matched"] == AGENTS * TICKS // 2
+    assert state["only_a"]["count"] == AGENTS * TICKS // 2
+    assert state["only_a"]["first"] == {"key": 0.1, "who": "agent-01"}
+    assert state["fields"]["x_m"]["max"] < 1e-6  # the same orbit at the same instants
+
+
+def test_different_simulations_are_refused(make, capsys):
+    def rename(made):
+        plan = json.loads(made.run.plan_json.read_text())
+        plan["config"]["simulation"] = "counter"
+        made.run.plan_json.write_text(json.dumps(plan))
+
+    make(), make(rename)
+
+    code = app.run(["diff", "1", "2"])
+
+    assert code == 2
+    err = capsys.readouterr().err
+    assert "0001-synthetic of constellation" in err
+    assert "0002-synthetic of counter" in err
+
+
+def test_cut_data_are_named_and_never_the_same(make, capsys):
+    make(), make(lambda made: made.kill("agent-03"))
+
+    code, document = diff(capsys, "1", "2", "--expect-same")
+
+    assert code == 1
+    assert any("0002-synthetic: agent-03" in line for line in document["missing"])
+    alone = streams_of(document)["state"]["only_a"]
+    assert alone["count"] > 0
+    assert alone["last"] == {"key": TICKS - 1.0, "who": "agent-03"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("has_tables", [True, False])
+@pytest.mark.parametrize(
+    ("harm", "words"),
+    [
+        (lambda path: path.unlink(), "missing; it was there"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-200]), "changed since"),
+        (lambda path: path.write_bytes(b""), "changed since"),
+    ],
+)
+def test_data_that_went_after_the_collection_are_named_and_never_the_same(
+    make, capsys, harm, words, has_tables
+):
+    make()
+    harmed = make()
+    harm(harmed.stream("agent-03", "state"))
+    if not has_tables:
+        shutil.rmtree(harmed.run.tables)
+
+    code, document = diff(capsys, "1", "2", "--expect-same")
+
+    assert (code, document["same"]) == (1, False)
+    (line,) = document["missing"]
+    assert line.startswith("0002-synthetic: agents/agent-03/state.jsonl: ")
+    assert words in line
+
+
+def test_what_the_framework_recorded_is_compared_when_it_is_named(make, capsys):
+    make(), make(lambda made: change_record(made, stream="ticks", field=1))
+
+    assert diff(capsys, "1", "2", "--expect-same")[0] == 0
+    code, document = diff(capsys, "1", "2", "--expect-same", "--streams", "ticks")
+
+    assert code == 1
+    assert streams_of(document)["ticks"]["fields"]["lateness_us"]["at"]["key"] == 123
+
+
+def test_nothing_chosen_is_never_the_same(make, capsys):
+    make(), make()
+
+    code, document = diff(capsys, "1", "2", "--expect-same", "--agents", "nobody")
+
+    assert code == 1
+    assert document["streams"] == []
+
+
+def test_streams_are_read_a_bounded_number_of_rows_at_a_time(make, capsys, monkeypatch):
+    make(), make(change_record)
+    read = []
+    original = recorded.Recorded.batches
+
+    def watched(self, names):
+        for columns in original(self, names):
+            read.append(len(columns["tick"]))
+            yield columns
+
+    monkeypatch.setattr(recorded, "ROWS_READ_MAX", 50)
+    monkeypatch.setattr(recorded.Recorded, "batches", watched)
+
+    diff(capsys, "1", "2", "--streams", "state", "--agents", "agent-02")
+
+    assert max(read) <= 50
+    # Once for the records, once for what the simulation itself makes of them.
+    assert sum(read) == 2 * 2 * TICKS
+
+
+def test_terminal_tells_where_and_how_much(make, capsys):
+    make(), make(change_record)
+
+    app.run(["diff", "1", "2"])
+
+    out, err = capsys.readouterr()
+    assert "agent-02 tick 123 (12.3 s)" in out
+    assert out.endswith("DIFFERENT: records differ in state\n")
+    assert "comparing agent-02/state" in err
+
+
+def test_run_that_is_not_collected_is_bad_input_with_advice(make, tmp_path, capsys):
+    make()
+    SyntheticRun(tmp_path / "runs")
+
+    assert app.run(["diff", "1", "2"]) == 2
+
+    assert "cosmos collect 2" in capsys.readouterr().err
+
+
+def test_settings_of_scenarios_need_scenarios(make, capsys):
+    make()
+
+    assert app.run(["diff", "1", "1", "--set", "seed=3"]) == 2
+
+    assert "--run" in capsys.readouterr().err

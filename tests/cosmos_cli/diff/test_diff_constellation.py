@@ -1,0 +1,196 @@
+"""Truth, measurements, estimates and control of two runs of a constellation, apart."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from harness.synthetic_run import SyntheticRun, make_config
+
+from cosmos_cli import app
+from cosmos_cli.collect.finish import finish_run
+from madns_runtime.recording.records import Field, StreamSchema
+from madns_runtime.simulations.constellation.analysis.measurement_errors import QUATERNION, Quantity
+
+TICKS, TICK_HZ = 200, 1.0
+STATE = StreamSchema(
+    "state",
+    (
+        Field("tick", "", "int"),
+        *(Field(f"{axis}_teme_m", "m") for axis in "xyz"),
+        *(Field(f"v{axis}_teme_m_s", "m/s") for axis in "xyz"),
+    ),
+)
+GNSS = StreamSchema("gnss", (Field("tick", "", "int"), Field("t_s", "s"), *STATE.fields[1:]))
+ESTIMATES = StreamSchema("estimates", (Field("tick", "", "int"), Field("slot_error_deg", "deg")))
+COMMANDS = StreamSchema(
+    "commands",
+    (
+        Field("tick", "", "int"),
+        Field("number", "", "int"),
+        Field("kind", "", "str"),
+        *(Field(axis, "m/s") for axis in "xyz"),
+    ),
+    shape="object",
+)
+MANEUVERS = StreamSchema(
+    "maneuvers",
+    (
+        Field("agent", "", "str"),
+        Field("number", "", "int"),
+        Field("commanded_s", "s"),
+        Field("dv_given_m_s", "m/s"),
+    ),
+    shape="object",
+)
+RADIUS_M, SPEED_M_S, RATE = 7e6, 7500.0, 7500.0 / 7e6
+
+
+def state(tick, along_m=0.0):
+    """A circle in the x-y plane, *along_m* ahead."""
+    angle = RATE * tick / TICK_HZ + along_m / RADIUS_M
+    c, s = np.cos(angle), np.sin(angle)
+    return (RADIUS_M * c, RADIUS_M * s, 0.0, -SPEED_M_S * s, SPEED_M_S * c, 0.0)
+
+
+class Flown(SyntheticRun):
+    """A run of satellites whose truth, measurements, estimates and commands are made up."""
+
+    def fly(self, *, along_m, noise_m, slot_error_deg, delta_v_m_s):
+        host = self.recorder("host", "host", MANEUVERS)
+        for number, name in enumerate(self.names):
+            recorder = self.recorder(f"agents/{name}", name, STATE, GNSS, ESTIMATES, COMMANDS)
+            for tick in range(self.ticks):
+                truth = state(tick, along_m * (number + 1))
+                recorder.record("state", (tick, *truth))
+                if tick >= 2:  # measured two ticks ago
+                    x, *rest = state(tick - 2, along_m * (number + 1))
+                    recorder.record("gnss", (tick, (tick - 2) / TICK_HZ, x + noise_m, *rest))
+                recorder.record("estimates", (tick, slot_error_deg))
+            command = {"tick": 10, "number": 0, "kind": "delta_v", "x": 0.0, "y": delta_v_m_s}
+            recorder.record("commands", command | {"z": 0.0})
+            given = {"agent": name, "number": 0, "commanded_s": 10.0}
+            host.record("maneuvers", given | {"dv_given_m_s": delta_v_m_s * 0.9})
+            recorder.close()
+        host.close()
+
+
+@pytest.fixture
+def fly(tmp_path, monkeypatch):
+    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
+    monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
+
+    def fly_run(*, frame="TEME", epoch="2017-03-07T12:00:00Z", **what):
+        config = make_config(2, ticks=TICKS, tick_hz=TICK_HZ)
+        made = Flown(tmp_path / "runs", dataclasses.replace(config, simulation="constellation"))
+        flown = {"along_m": 0.0, "noise_m": 0.0, "slot_error_deg": 0.1, "delta_v_m_s": 0.5}
+        made.fly(**flown | what)
+        made.write()
+        summary = {"frame": frame, "epoch_utc": epoch}
+        finish_run(made.run, made.result(simulation=summary), made.expected, has_report=False)
+
+    return fly_run
+
+
+def compared(capsys, *more):
+    assert app.run(["diff", "1", "2", "--json", "--quiet", *more]) == 0
+    return json.loads(capsys.readouterr().out)["constellation"]
+
+
+def test_difference_in_position_is_told_by_agent_over_all_and_over_time(fly, capsys):
+    fly(), fly(along_m=30.0)
+
+    truth = compared(capsys)["truth"]
+
+    first, second = truth["agents"]["agent-01"], truth["agents"]["agent-02"]
+    assert first["rms_m"] == pytest.approx(30.0, rel=1e-6)
+    assert second["max_m"] == pytest.approx(60.0, rel=1e-6)
+    assert second["along_rms_m"] == pytest.approx(60.0, rel=1e-6)
+    assert second["normal_rms_m"] == 0.0
+    assert truth["all"]["rms_m"] == pytest.approx(np.sqrt((30.0**2 + 60.0**2) / 2), rel=1e-6)
+    assert truth["all"]["count"] == 2 * TICKS
+    assert truth["over_time"][-1]["t_s"] == TICKS / TICK_HZ
+    assert truth["over_time"][-1]["max_m"] == pytest.approx(60.0, rel=1e-6)
+
+
+def test_same_truth_is_no_distance_apart(fly, capsys):
+    fly(), fly(slot_error_deg=0.2)
+
+    truth = compared(capsys)["truth"]
+
+    assert (truth["all"]["rms_m"], truth["all"]["max_m"], truth["all"]["count"]) == (
+        0,
+        0,
+        2 * TICKS,
+    )
+
+
+def test_measurements_are_held_against_the_truth_of_their_own_time(fly, capsys):
+    fly(), fly(noise_m=4.0)
+
+    found = compared(capsys)["measurements"]
+
+    errors = {one["quantity"]: one["errors"] for one in found if one["sensor"] == "gnss"}
+    assert [e["rms"] for e in errors["position"]] == pytest.approx([0.0, 4.0], abs=1e-6)
+    assert errors["position"][1]["count"] == 2 * (TICKS - 2)
+    assert errors["velocity"][1]["max"] == 0.0
+
+
+def test_delta_v_commanded_and_given_stand_side_by_side(fly, capsys):
+    fly(), fly(delta_v_m_s=-0.75)
+
+    control = compared(capsys)["control"]
+
+    assert [one["commanded_m_s"] for one in control["all"]] == [1.0, 1.5]
+    assert [one["commands"] for one in control["agents"]["agent-01"]] == [1, 1]
+
+
+def test_slot_error_is_told_as_flight_software_believed_it(fly, capsys):
+    fly(), fly(slot_error_deg=-0.02)
+
+    estimates = compared(capsys)["estimates"]
+
+    assert [one["rms_deg"] for one in estimates["all"]] == pytest.approx([0.1, 0.02])
+    assert [one["last_deg"] for one in estimates["agents"]["agent-02"]] == [0.1, -0.02]
+    assert [rows[-1]["rms_deg"] for rows in estimates["over_time"]] == pytest.approx([0.1, 0.02])
+
+
+def test_different_epochs_are_said(fly, capsys):
+    fly(), fly(epoch="2018-01-01T00:00:00Z")
+
+    assert "epochs differ" in compared(capsys)["remarks"][0]
+
+
+def test_terminal_tells_truth_measurements_control_and_estimates_apart(fly, capsys):
+    fly(), fly(along_m=30.0, noise_m=4.0)
+
+    app.run(["diff", "1", "2", "--quiet"])
+
+    out = capsys.readouterr().out
+    places = [out.index(f"\n{word}:") for word in ("Truth", "Measurements", "Control", "Estimates")]
+    assert places == sorted(places)
+
+
+def test_attitude_and_its_negative_quaternion_are_one():
+    quantity = Quantity(truth="attitude", names=QUATERNION, unit="deg")
+    half = np.radians(0.5)
+    measured = {"q1": [0.0, np.sin(half)], "q2": [0, 0], "q3": [0, 0], "q4": [-1.0, np.cos(half)]}
+    truth = {"q1": [0.0, 0.0], "q2": [0, 0], "q3": [0, 0], "q4": [1.0, 1.0]}
+
+    sizes = quantity.sizes(
+        {n: np.array(v, dtype=float) for n, v in measured.items()},
+        {n: np.array(v, dtype=float) for n, v in truth.items()},
+    )
+
+    assert sizes == pytest.approx([0.0, 1.0])
+
+
+def test_terminal_tells_nothing_one_by_one_of_satellites_in_the_same_places(fly, capsys):
+    fly(), fly(slot_error_deg=0.2)
+
+    app.run(["diff", "1", "2", "--quiet"])
+
+    out = capsys.readouterr().out
+    truth = out[out.index("\nTruth:") : out.index("\nMeasurements:")]
+    assert "all" in truth
+    assert "agent-01" not in truth

@@ -1,0 +1,199 @@
+import numpy as np
+import pytest
+
+from cosmos_cli.diff.compare import differing_keys
+from cosmos_cli.diff.fields import FieldDifference
+from cosmos_cli.diff.stream import choose_pairing
+from madns_runtime.analysis.matching import Rows, match, pair_up
+from madns_runtime.recording.records import Field
+
+TICK = Field("tick", "", "int")
+TIME = Field("t_s", "s")
+AGENT = Field("agent", "", "str")
+
+
+def rows(keys, who=None, **columns):
+    keys = np.array(keys, dtype=np.float64)
+    who = np.zeros(len(keys), np.int8) if who is None else np.array(who, dtype=object)
+    return Rows(keys=keys, who=who, columns={n: np.array(v) for n, v in columns.items()})
+
+
+def batches(keys, size):
+    keys = list(keys)
+    for start in range(0, len(keys), size):
+        part = keys[start : start + size]
+        yield rows(part, value=part)
+
+
+def settled(pieces):
+    pieces = list(pieces)
+    joined = {}
+    for name in ("a", "b", "only_a", "only_b"):
+        joined[name] = np.concatenate([getattr(piece, name).keys for piece in pieces]).tolist()
+    return joined
+
+
+def test_records_of_one_tick_are_pairs_and_the_others_are_alone():
+    found = settled(match([rows([0, 1, 2, 4])], [rows([1, 2, 3, 4])], tolerance=0.25))
+
+    assert found == {"a": [1, 2, 4], "b": [1, 2, 4], "only_a": [0], "only_b": [3]}
+
+
+def test_nearest_in_time_are_pairs_within_the_tolerance():
+    found = settled(match([rows([0.0, 1.0, 2.0])], [rows([0.04, 0.96, 1.01, 2.2])], tolerance=0.05))
+
+    assert (found["a"], found["b"]) == ([0.0, 1.0], [0.04, 1.01])
+    assert (found["only_a"], found["only_b"]) == ([2.0], [0.96, 2.2])
+
+
+def test_records_about_others_are_never_pairs():
+    a, b = rows([5, 5], who=["x", "y"]), rows([5, 5, 5], who=["z", "y", "x"])
+
+    assert [index.tolist() for index in pair_up(a, b, 0.25)] == [[0, 1], [2, 1]]
+
+
+def test_several_records_of_one_tick_are_paired_in_their_order():
+    assert [i.tolist() for i in pair_up(rows([7, 7, 7]), rows([7, 7]), 0.25)] == [[0, 1], [0, 1]]
+
+
+def test_key_that_is_no_number_has_no_partner():
+    found = settled(match([rows([0, np.nan, 2])], [rows([0, np.nan, 2])], tolerance=0.25))
+
+    assert found["a"] == [0, 2]
+    assert len(found["only_a"]) == len(found["only_b"]) == 1
+
+
+@pytest.mark.parametrize(("size_a", "size_b"), [(7, 7), (1, 50), (50, 3), (1000, 1000)])
+def test_how_records_come_in_batches_changes_nothing(size_a, size_b):
+    random = np.random.default_rng(3)
+    a = np.flatnonzero(random.random(600) < 0.8)
+    b = np.flatnonzero(random.random(600) < 0.8) + random.uniform(-0.1, 0.1)
+
+    found = settled(match(batches(a, size_a), batches(b, size_b), tolerance=0.25))
+
+    common = sorted(set(a) & set(np.round(b).astype(int)))
+    assert found["a"] == common
+    assert sorted(found["only_a"]) == sorted(set(a) - set(common))
+    assert len(found["b"]) + len(found["only_b"]) == len(b)
+
+
+def test_a_nearer_record_of_a_later_batch_is_waited_for():
+    a = [rows([1.0]), rows([2.0])]
+    b = [rows([0.6]), rows([1.1]), rows([2.0])]
+
+    found = settled(match(a, b, tolerance=0.5))
+
+    assert (found["a"], found["b"], found["only_b"]) == ([1.0, 2.0], [1.1, 2.0], [0.6])
+
+
+def test_huge_streams_are_held_in_small_part():
+    count, size, read, done, held = 200_000, 1000, 0, 0, []
+
+    def counted(keys):
+        nonlocal read
+        for batch in batches(keys, size):
+            read += len(batch)
+            yield batch
+
+    # Twice as many in the second: it must wait for the first, not run ahead of it.
+    for piece in match(counted(range(0, 2 * count, 2)), counted(range(2 * count)), tolerance=0.25):
+        done += sum(map(len, (piece.a, piece.b, piece.only_a, piece.only_b)))
+        held.append(read - done)
+
+    assert done == read == 3 * count
+    assert max(held) <= 6 * size
+
+
+def test_a_stream_that_starts_late_does_not_pile_up_the_other():
+    read, done, held = 0, 0, []
+
+    def counted(keys):
+        nonlocal read
+        for batch in batches(keys, 100):
+            read += len(batch)
+            yield batch
+
+    for piece in match(counted(range(20_000)), counted(range(19_900, 20_000)), tolerance=0.25):
+        done += sum(map(len, (piece.a, piece.b, piece.only_a, piece.only_b)))
+        held.append(read - done)
+
+    assert done == 20_100
+    assert max(held) <= 400
+
+
+def test_angles_differ_by_the_shorter_way_round():
+    found = FieldDifference(Field("raan_deg", "deg"))
+
+    found.add(rows([0, 1], raan_deg=[359.9, 10.0]), rows([0, 1], raan_deg=[0.1, 10.0]))
+
+    assert found.max == pytest.approx(0.2)
+    assert found.rms == pytest.approx(0.2 / np.sqrt(2))
+    assert found.different == 1
+
+
+def test_a_value_that_one_lacks_is_a_difference_without_a_size():
+    found = FieldDifference(Field("x_m", "m"))
+
+    found.add(rows([0, 1, 2], x_m=[1.0, np.nan, np.nan]), rows([0, 1, 2], x_m=[1.0, 5.0, np.nan]))
+
+    assert (found.different, found.null_in_one, found.max, found.compared) == (1, 1, 0.0, 1)
+    assert found.first.key == 1
+
+
+def test_json_of_a_table_and_of_a_line_is_the_same():
+    found = FieldDifference(Field("details", "", "json"))
+    line, table = np.empty(2, dtype=object), np.empty(2, dtype=object)
+    line[:] = [{"a": [1, 2]}, {"a": 1}]
+    table[:] = ['{"a": [1, 2]}', '{"a": 2}']
+
+    found.add(
+        Rows(keys=np.arange(2.0), who=np.zeros(2), columns={"details": line}),
+        Rows(keys=np.arange(2.0), who=np.zeros(2), columns={"details": table}),
+    )
+
+    assert found.different == 1
+    assert found.at.key == 1
+
+
+def test_records_are_paired_by_tick_by_time_or_by_their_order():
+    same, other = (10.0, 10.0), (10.0, 5.0)
+
+    by_tick = choose_pairing([TICK, TIME], [TICK, TIME], same)
+    by_instant = choose_pairing([TICK], [TICK], other)
+    by_time = choose_pairing([TIME, AGENT], [TIME, AGENT], same)
+    by_order = choose_pairing([Field("value")], [Field("value")], same)
+
+    assert (by_tick.by, by_tick.column) == ("tick", "tick")
+    assert (by_instant.by, by_instant.scales) == ("time", (0.1, 0.2))
+    assert (by_time.by, by_time.tolerance, by_time.identity) == ("time", 0.05, ("agent",))
+    assert by_order.by == "order"
+
+
+def test_settings_differ_by_dotted_key():
+    a = {"seed": 1, "run": "x", "agents": {"count": 2}, "stations": [{"name": "S", "h": 1}]}
+    b = {"seed": 1, "run": "y", "agents": {"count": 3}, "stations": [{"name": "S", "h": 2}], "n": 0}
+
+    found = [(one.key, one.a, one.b) for one in differing_keys(a, b, without=("run",))]
+
+    assert found == [("agents.count", 2, 3), ("stations[0].h", 1, 2), ("n", None, 0)]
+
+
+def test_a_mapping_against_null_is_told_by_its_keys_alone():
+    a, b = {"thruster": {"isp_s": 220.0, "thrust_n": None}}, {"thruster": None}
+
+    assert [(one.key, one.a, one.b) for one in differing_keys(a, b)] == [
+        ("thruster.isp_s", 220.0, None)
+    ]
+
+
+def test_first_different_text_is_kept_with_its_place():
+    found = FieldDifference(Field("outcome", "", "str"))
+
+    for start in (0, 2):
+        keys = [start, start + 1]
+        found.add(
+            rows(keys, outcome=["delivered", "delivered"]),
+            rows(keys, outcome=["delivered", "lost"]),
+        )
+
+    assert (found.different, found.values, found.at.key) == (2, ("delivered", "lost"), 1.0)

@@ -1,0 +1,130 @@
+"""Accounts of devices: what they are joined to, and how they are judged."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cosmos_cli.collect.machine_sources import RecordingMachines
+from cosmos_cli.evidence.devices import NO_REPORT, device_checks, read_devices
+from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.streams import find_streams
+from madns_runtime.config import HardwareSettings
+
+PLAN = {"devices": {"pi22": ["pi22/imu", "pi22/gps"]}}
+SOUND = {
+    "status": "ok",
+    "samples": 100,
+    "errors": 0,
+    "stale_ratio": 0.0,
+    "lost": 0,
+    "restarts": 0,
+    "why": "",
+    "report": {"frozen": {"gyro": 0}, "dropped": 3, "refused": 1, "samples": 7},
+}
+
+
+def write(folder: Path, name: str, **devices: Any) -> None:
+    there = folder / "machines" / "pi22"
+    there.mkdir(parents=True, exist_ok=True)
+    told = {key.replace("_", "/"): value for key, value in devices.items()}
+    (there / name).write_text(json.dumps(told))
+
+
+def judged(devices: Any) -> dict[str, tuple[float | None, bool, str | None]]:
+    return {c.name: (c.got, c.passed, c.worst) for c in device_checks(devices, HardwareSettings())}
+
+
+def test_accounts_of_sound_devices_hold_every_check(tmp_path: Path) -> None:
+    write(tmp_path, "devices.json", pi22_imu=SOUND, pi22_gps=SOUND)
+
+    devices = read_devices(RunDirectory(tmp_path), PLAN, None)
+
+    assert set(devices) == {"pi22/imu", "pi22/gps"}
+    assert devices["pi22/imu"]["samples"] == 100
+    assert devices["pi22/imu"]["counts"] == {"dropped": 3, "refused": 1}
+    assert all(passed and worst is None for _, passed, worst in judged(devices).values())
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "check", "got"),
+    [
+        ("stale_ratio", 0.5, "hardware.stale_ratio", 0.5),
+        ("lost", 2, "hardware.lost", 2),
+        ("report", {"frozen": {"gyro": 1}}, "hardware.frozen", 1),
+        ("report", None, "hardware.frozen", None),
+        ("stale_ratio", None, "hardware.stale_ratio", None),
+        ("lost", "\x1b[2J", "hardware.lost", None),
+    ],
+)
+def test_a_check_that_a_device_breaks_bears_its_name(
+    tmp_path: Path, key: str, value: object, check: str, got: float | None
+) -> None:
+    write(tmp_path, "devices.json", pi22_imu={**SOUND, key: value}, pi22_gps=SOUND)
+
+    found = judged(read_devices(RunDirectory(tmp_path), PLAN, None))
+
+    assert found.pop(check) == (got, False, "pi22/imu")
+    assert all(passed for _, passed, _ in found.values())
+
+
+@pytest.mark.parametrize("content", [None, "[]", "{", '{"pi22/gps": 3}'])
+def test_a_device_without_an_account_is_not_taken_for_sound(
+    tmp_path: Path, content: str | None
+) -> None:
+    (tmp_path / "machines" / "pi22").mkdir(parents=True)
+    if content is not None:
+        (tmp_path / "machines" / "pi22" / "devices.json").write_text(content)
+
+    devices = read_devices(RunDirectory(tmp_path), PLAN, None)
+
+    assert devices["pi22/imu"]["status"] == NO_REPORT
+    assert not any(passed for _, passed, _ in judged(devices).values())
+
+
+def test_a_life_of_a_supervisor_without_account_is_a_loss(tmp_path: Path) -> None:
+    write(tmp_path, "devices.2.json", pi22_imu=SOUND, pi22_gps=SOUND)
+
+    devices = read_devices(RunDirectory(tmp_path), PLAN, None)
+
+    assert judged(devices)["hardware.lost"] == (2, False, "pi22/gps")
+
+
+def test_in_lockstep_the_host_tells_of_the_agents_devices() -> None:
+    told = {"status": "ok", "stale_ratio": 0.0, "lost": 0, "restarts": 0, "frozen": {}}
+    result = {"agents": {"agent-01": {"records": {"devices": {"gps": {**told, "samples": 5}}}}}}
+    plan = {"devices": {"loopback": ["agent-01/gps"]}}
+
+    devices = read_devices(RunDirectory(Path("/nowhere")), plan, result)
+
+    assert devices["agent-01/gps"]["samples"] == 5
+    assert devices["agent-01/gps"]["lost"] == 0
+
+
+def test_a_run_without_devices_has_no_checks_of_them() -> None:
+    assert device_checks({}, HardwareSettings()) == []
+
+
+def test_records_of_devices_are_found_by_their_full_name_and_never_through_links(
+    tmp_path: Path,
+) -> None:
+    there = tmp_path / "devices" / "pi22" / "imu"
+    there.mkdir(parents=True)
+    (there / "gyro.jsonl").write_text("")
+    (tmp_path / "devices" / "linked").symlink_to(tmp_path / "devices" / "pi22")
+
+    (file,) = find_streams(tmp_path)
+
+    assert (file.role, file.source, file.stream) == ("device", "pi22/imu", "gyro")
+    assert file.table == "device_imu.gyro"
+    assert file.label == "pi22/imu/gyro"
+
+
+def test_records_of_devices_are_of_their_machine_or_of_their_agents() -> None:
+    sources = RecordingMachines(machine_of_agent={"agent-07": "pi23"})
+
+    assert sources.owner_of("devices/pi22/imu/gyro.jsonl") == "pi22"
+    assert sources.owner_of("devices/agent-07/gps/fix.jsonl") == "pi23"

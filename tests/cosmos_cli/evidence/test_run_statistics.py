@@ -1,0 +1,77 @@
+import numpy as np
+import pytest
+
+from cosmos_cli.evidence.statistics import AgentTicks, TickTotals, tick_totals
+from madns_runtime.analysis.distribution import Distribution, summarise
+
+
+def agent(run, missed=0):
+    return AgentTicks(run=run, missed=missed, lateness_ms={}, margin_ms={})
+
+
+@pytest.mark.parametrize("parts", [1, 7])
+def test_distribution_tells_what_numpy_tells_of_all_samples(parts):
+    samples = np.random.default_rng(5).gamma(2.0, 60.0, 10_001).astype(np.int64)
+    distribution = Distribution()
+
+    for part in np.array_split(samples, parts):
+        distribution.add(Distribution.of(part))
+    summary = distribution.summary(1e-3)
+
+    expected = np.percentile(samples, (50, 99, 99.9, 1, 0.1)) / 1000
+    got = [summary.p50, summary.p99, summary.p999, summary.p01, summary.p001]
+    np.testing.assert_allclose(got, expected, rtol=1e-12)
+    np.testing.assert_allclose(summary.mean, samples.mean() / 1000, rtol=1e-12)
+    np.testing.assert_allclose(summary.sd, samples.std() / 1000, rtol=1e-12)
+    assert (summary.count, summary.min, summary.max) == (
+        10_001,
+        samples.min() * 1e-3,
+        samples.max() * 1e-3,
+    )
+
+
+def test_what_is_not_finite_is_no_sample():
+    summary = summarise(np.array([1.0, np.nan, 3.0, np.inf]))
+
+    assert (summary.count, summary.mean) == (2, 2.0)
+    assert summarise(np.array([np.nan])) is None
+    assert summarise(np.array([])) is None
+
+
+def test_single_sample_is_every_quantile():
+    summary = summarise(np.array([4.0]))
+
+    assert {summary.p50, summary.p999, summary.p001, summary.min, summary.max} == {4.0}
+    assert (summary.sd, summary.range) == (0.0, 0.0)
+
+
+def test_agent_that_died_has_missed_what_was_due_of_it():
+    totals = tick_totals({"a": agent(100), "b": agent(40)}, {}, agents=("a", "b"), due_each=100)
+
+    assert (totals.due, totals.run, totals.missed) == (200, 140, 60)
+
+
+def test_ticks_that_never_ran_count_as_missed_although_no_record_shows_them():
+    counters = {"a": {"due": 100, "run": 90, "overrun_errors": 3}}
+
+    totals = tick_totals({"a": agent(90)}, counters, agents=("a",), due_each=None)
+
+    assert (totals.miss_ratio, totals.overrun_ratio) == (0.1, 0.03)
+
+
+def test_records_that_were_dropped_are_no_missed_ticks():
+    counters = {"a": {"due": 100, "run": 100}}
+
+    assert tick_totals({"a": agent(70)}, counters, agents=("a",), due_each=100).missed == 0
+
+
+def test_rejoined_agent_has_missed_the_time_between():
+    counters = {"a": {"due": 50, "run": 50}}
+
+    totals = tick_totals({"a": agent(80)}, counters, agents=("a",), due_each=100)
+
+    assert totals.missed == 20
+
+
+def test_ratio_of_nothing_is_not_measured():
+    assert TickTotals(due=0, run=0, overrun_errors=0).miss_ratio is None

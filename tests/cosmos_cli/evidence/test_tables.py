@@ -1,0 +1,479 @@
+import dataclasses
+import datetime
+import errno
+import hashlib
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from harness.synthetic_run import MACHINE, SyntheticRun, make_config
+
+from cosmos_cli.collect.finish import finish_run
+from cosmos_cli.evidence.run_directory import write_json
+from cosmos_cli.evidence.streams import find_streams, open_stream_file, scan_stream
+from cosmos_cli.evidence.table_labels import NEVER_US, TableLabels
+from cosmos_cli.evidence.tables import TableReader, TableWriter, no_tables, open_tables, plan_table
+from cosmos_cli.evidence.tabulate import gather
+from madns_runtime.errors import MachineError
+from madns_runtime.recording import reader
+from madns_runtime.recording.records import Field, StreamSchema
+
+MIXED = StreamSchema(
+    "mixed",
+    (
+        Field("t_s", "s"),
+        Field("count", "", "int"),
+        Field("level", "m"),
+        Field("name", "", "str"),
+        Field("is_on", "", "bool"),
+        Field("extra", "", "json"),
+    ),
+)
+
+
+def quiet(_what, _share):
+    pass
+
+
+def record(made, agent, schema, rows):
+    recorder = made.recorder(f"agents/{agent}", agent, schema)
+    for row in rows:
+        recorder.record(schema.name, row)
+    recorder.close()
+
+
+def gathered_table(made, name, tick_hz=10.0):
+    gather(made.run, tick_hz, quiet)
+    return TableReader(made.run.tables / f"{name}.parquet")
+
+
+@pytest.mark.parametrize("name", [".mixed.parquet.part", "mixed.parquet"])
+def test_table_is_not_written_through_a_link(tmp_path, name):
+    made = SyntheticRun(tmp_path)
+    record(made, "agent-01", MIXED, [(0.0, 1, 1, "a", True, {})])
+    victim = tmp_path / "victim"
+    victim.write_bytes(b"precious")
+    made.run.tables.mkdir()
+    (made.run.tables / name).symlink_to(victim)
+
+    gathered = gather(made.run, 10.0, quiet)
+
+    assert gathered.faults == ()
+    assert victim.read_bytes() == b"precious"
+    assert open_tables(made.run.tables)["mixed"].sources == ("agent-01",)
+
+
+def test_tables_are_not_written_into_a_folder_that_is_a_link(tmp_path):
+    made = SyntheticRun(tmp_path)
+    record(made, "agent-01", MIXED, [(0.0, 1, 1, "a", True, {})])
+    (tmp_path / "victim").mkdir()
+    made.run.tables.symlink_to(tmp_path / "victim")
+
+    gathered = gather(made.run, 10.0, quiet)
+
+    assert gathered.faults == (
+        "tables/mixed.parquet: not written: the folder tables is a link; delete it",
+    )
+    assert list((tmp_path / "victim").iterdir()) == []
+
+
+def test_what_is_no_file_is_no_table_and_is_not_waited_for(tmp_path):
+    made = SyntheticRun(tmp_path)
+    record(made, "agent-01", MIXED, [(0.0, 1, 1, "a", True, {})])
+    gather(made.run, 10.0, quiet)
+    os.mkfifo(made.run.tables / "pipe.parquet")
+    (made.run.tables / "link.parquet").symlink_to(made.run.tables / "mixed.parquet")
+
+    assert list(open_tables(made.run.tables)) == ["mixed"]
+    assert no_tables(made.run.tables) == ("link.parquet", "pipe.parquet")
+
+
+def test_values_keep_their_kinds_and_nulls(tmp_path):
+    made = SyntheticRun(tmp_path)
+    rows = [
+        (0.0, 1, 1, "a", True, {"k": [1, 2]}),
+        (1, None, None, None, None, None),
+        (2.5, 2**53 + 1, 2.5, "ü", False, "text"),
+    ]
+    record(made, "agent-01", MIXED, rows)
+
+    gather(made.run, 10.0, quiet)
+
+    table = pq.read_table(made.run.tables / "mixed.parquet").to_pydict()
+    assert table["t_s"] == [0.0, 1.0, 2.5]
+    assert table["level"] == [1.0, None, 2.5]
+    assert table["count"][:2] == [1, None]
+    assert table["name"] == ["a", None, "ü"]
+    assert table["is_on"] == [True, None, False]
+    assert table["extra"] == ['{"k": [1, 2]}', None, "text"]
+    assert table["agent"] == ["agent-01"] * 3
+
+
+def test_large_integers_without_null_are_exact(tmp_path):
+    made = SyntheticRun(tmp_path)
+    schema = StreamSchema("big", (Field("n", "", "int"),))
+    values = [2**53 + 1, -(2**62) - 1, 0]
+    record(made, "agent-01", schema, [(v,) for v in values])
+
+    assert gathered_table(made, "big").read("agent-01", ("n",))["n"].tolist() == values
+
+
+def test_value_that_is_not_of_its_kind_is_null_and_reported(tmp_path):
+    made = SyntheticRun(tmp_path)
+    schema = StreamSchema("odd", (Field("n", "", "int"), Field("x", "m")))
+    record(made, "agent-01", schema, [(1, 1.0), (2.5, "wide"), (3, True)])
+
+    found = gather(made.run, 10.0, quiet)
+
+    table = pq.read_table(made.run.tables / "odd.parquet").to_pydict()
+    assert table["n"] == [1, None, 3]
+    assert table["x"][:2] == [1.0, None]
+    assert found.faults[0].startswith("tables/odd.parquet: 3 recorded values")
+
+
+def test_ticks_get_their_simulated_time(tmp_path):
+    made = SyntheticRun(tmp_path, make_config(2, ticks=30, tick_hz=10.0)).write()
+
+    table = gathered_table(made, "ticks")
+
+    times = table.read("agent-02", ("tick", "t_s"))
+    np.testing.assert_allclose(times["t_s"], times["tick"] / 10.0)
+    assert [f.unit for f in table.fields if f.name in ("t_s", "lateness_us")] == ["s", "us"]
+
+
+def test_columns_are_encoded_small(tmp_path):
+    made = SyntheticRun(tmp_path).write(with_states=True)
+    gather(made.run, 10.0, quiet)
+
+    group = pq.ParquetFile(made.run.tables / "state.parquet").metadata.row_group(0)
+    by_name = {group.column(i).path_in_schema: group.column(i) for i in range(group.num_columns)}
+
+    assert "DELTA_BINARY_PACKED" in by_name["tick"].encodings
+    assert "BYTE_STREAM_SPLIT" in by_name["x_m"].encodings
+    assert "RLE_DICTIONARY" in by_name["agent"].encodings
+    assert by_name["x_m"].compression == "ZSTD"
+
+
+def test_host_agents_and_machines_have_tables_of_their_own(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+
+    gather(made.run, 10.0, quiet)
+
+    tables = open_tables(made.run.tables)
+    assert {"events", "host_events", "machine_health", "ticks"} <= set(tables)
+    assert tables["machine_health"].sources == (MACHINE,)
+    assert tables["ticks"].sources == ("agent-01", "agent-02")
+    assert tables["host_events"].sources == ("host",)
+
+
+def test_details_of_events_are_kept(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+
+    table = gathered_table(made, "host_events")
+
+    details = table.read("host", ("event", "details"))
+    assert details["event"].tolist() == ["SIMULATION_START"]
+    assert details["details"].tolist() == ['{"why":"all"}']
+
+
+def test_stream_without_records_becomes_an_empty_table(tmp_path):
+    made = SyntheticRun(tmp_path)
+    record(made, "agent-01", MIXED, [])
+
+    table = gathered_table(made, "mixed")
+
+    assert table.rows == 0
+    assert table.sources == ()
+    assert len(table.read("agent-01", ("t_s",))["t_s"]) == 0
+
+
+def test_incarnations_with_other_fields_share_a_table(tmp_path):
+    made = SyntheticRun(tmp_path)
+    record(made, "agent-01", StreamSchema("s", (Field("n", "", "int"), Field("a"))), [(1, 2.0)])
+    record(made, "agent-01", StreamSchema("s", (Field("n"), Field("b", "", "str"))), [(1.5, "x")])
+
+    gather(made.run, 10.0, quiet)
+
+    table = pq.read_table(made.run.tables / "s.parquet").to_pydict()
+    assert table["n"] == [1.0, 1.5]
+    assert table["a"] == [2.0, None]
+    assert table["b"] == [None, "x"]
+    assert table["incarnation"] == [1, 2]
+
+
+def test_field_named_as_our_own_column_is_kept_beside_it(tmp_path):
+    made = SyntheticRun(tmp_path)
+    schema = StreamSchema("links", (Field("agent", "", "str"), Field("range_m", "m")))
+    record(made, "agent-01", schema, [("agent-02", 1.0)])
+
+    table = gathered_table(made, "links")
+
+    assert table.sources == ("agent-01",)
+    assert table.read("agent-01", ("agent",))["agent"].tolist() == ["agent-02"]
+
+
+def test_stream_whose_schema_line_is_damaged_is_counted_and_not_guessed(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    path = made.stream("agent-01", "ticks")
+    path.write_bytes(b"X" + path.read_bytes())
+
+    (file,) = [f for f in find_streams(made.run.path) if f.path == path]
+    scan = scan_stream(file)
+
+    assert scan.fault == "the schema line is missing or damaged"
+    assert scan.truncated
+    assert gathered_table(made, "ticks").sources == ("agent-02",)
+
+
+HEADER = (
+    b'{"schema":1,"stream":"s","shape":"array","fields":[{"name":"n","unit":"","kind":"int"},'
+    b'{"name":"x_m","unit":"m","kind":"float"}]}\n'
+)
+END = b'{"end":{"records":2,"dropped":0,"not_finite":0}}\n'
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        HEADER,
+        HEADER + b"[1,2.5]\n[2,3.5]\n" + END,
+        HEADER + b"[1,2.5]\n[2,3.",
+        HEADER + b"[1,2.5]\nnonsense\n[2,3.5]\n" + END,
+        HEADER + b"".join(b"[%d,0.5]\n" % n for n in range(100_000)),
+        HEADER + b"[1," + b" " * 2_000 + b"2.5]\n" + END,
+        b"no header\n[1,2.5]\n",
+    ],
+)
+def test_stream_is_read_once_and_its_hash_is_that_of_all_its_bytes(tmp_path, monkeypatch, content):
+    path = tmp_path / "agents" / "a" / "s.jsonl"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(content)
+    file = open_stream_file(path, "agent")
+    monkeypatch.setattr(reader, "LINE_BYTES_MAX", 1_000)
+    monkeypatch.setattr(reader, "BLOCK_BYTES", 512)
+    blocks = []
+    whole_lines = reader._whole_lines
+    monkeypatch.setattr(
+        reader, "_whole_lines", lambda *given: blocks.append(1) or whole_lines(*given)
+    )
+
+    scan = scan_stream(file)
+
+    assert (scan.sha256, scan.size_bytes) == (hashlib.sha256(content).hexdigest(), len(content))
+    assert len(blocks) == 1
+
+
+def test_stream_that_breaks_off_while_it_is_read_is_told_with_its_name(tmp_path, monkeypatch):
+    made = SyntheticRun(tmp_path).write()
+    file = open_stream_file(made.stream("agent-01", "ticks"), "agent")
+
+    def broken(*given):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+        yield
+
+    monkeypatch.setattr(reader, "_whole_lines", broken)
+
+    with pytest.raises(MachineError, match=r"ticks\.jsonl: cannot be read: Input/output error"):
+        scan_stream(file)
+
+
+def test_empty_file_is_a_fault(tmp_path):
+    path = tmp_path / "agents" / "a" / "ticks.jsonl"
+    path.parent.mkdir(parents=True)
+    path.touch()
+
+    assert scan_stream(open_stream_file(path, "agent")).fault.startswith("empty file")
+
+
+def test_names_of_later_incarnations_are_read(tmp_path):
+    path = tmp_path / "agents" / "a" / "my_stream.12.jsonl"
+    path.parent.mkdir(parents=True)
+    path.touch()
+
+    file = open_stream_file(path, "agent")
+
+    assert (file.source, file.stream, file.incarnation) == ("a", "my_stream", 12)
+
+
+def test_table_that_fails_leaves_nothing_behind(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    files = [f for f in find_streams(made.run.path) if f.table == "ticks"]
+    writer = TableWriter(made.run.tables / "ticks.parquet", plan_table(files, 10.0))
+
+    writer.abandon()
+
+    assert list(made.run.tables.iterdir()) == []
+
+
+ROWS = 1_000_000
+MEMORY_BYTES_MAX = 250 * 1024 * 1024
+"""Imports alone take about 120 MB; all rows as Python objects would take more than 300 MB on top."""
+
+
+@pytest.mark.process
+def test_table_of_a_million_rows_is_written_in_little_memory(tmp_path):
+    path = tmp_path / "agents" / "agent-01" / "ticks.jsonl"
+    path.parent.mkdir(parents=True)
+    header = (
+        b'{"schema":1,"stream":"ticks","shape":"array","fields":[{"name":"tick","unit":"","kind":"int"},'
+        b'{"name":"lateness_us","unit":"us","kind":"int"},{"name":"margin_us","unit":"us","kind":"float"}]}\n'
+    )
+    with path.open("wb") as file:
+        file.write(header)
+        for start in range(0, ROWS, 10_000):
+            lines = (
+                b"[%d,%d,%d.25]" % (i, i % 977, i % 9973) for i in range(start, start + 10_000)
+            )
+            file.write(b"\n".join(lines) + b"\n")
+        file.write(b'{"end":{"records":%d,"dropped":0,"not_finite":0}}\n' % ROWS)
+    code = (
+        "import sys; from pathlib import Path; from cosmos_cli.evidence.tabulate import gather\n"
+        "from cosmos_cli.evidence.run_directory import RunDirectory\n"
+        "found = gather(RunDirectory(Path(sys.argv[1])), 100.0, lambda what, share: None)\n"
+        "assert found.scans[0].records == 1_000_000 and found.scans[0].fault is None\n"
+        # Not ru_maxrss, which a child inherits from the process that started it.
+        "status = Path('/proc/self/status').read_text()\n"
+        "print(status.split('VmHWM:')[1].split()[0])\n"
+    )
+
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, timeout=120
+    )
+
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) * 1024 < MEMORY_BYTES_MAX
+    table = TableReader(tmp_path / "tables" / "ticks.parquet")
+    assert table.rows == ROWS
+    values = table.read("agent-01", ("tick", "margin_us"))
+    assert values["tick"].tolist() == list(range(ROWS))
+    assert values["margin_us"][-1] == (ROWS - 1) % 9973 + 0.25
+
+
+NAMES = {"agent-01": "IRIDIUM 8", "agent-02": "IRIDIUM 7"}
+EPOCH = "2017-03-07T13:32:57Z"
+
+
+def labelled(tmp_path, **host):
+    """Return the tables of a constellation of two, as any reader of Parquet sees them."""
+    made = SyntheticRun(tmp_path).write(with_states=True)
+    truth = StreamSchema("truth", (Field("t_s", "s"), Field("agent", "", "str"), Field("x_m", "m")))
+    recorder = made.recorder("host", "host", truth)
+    for row in ((0.25, "agent-02", 1.0), (None, "agent-01", 2.0), (1.5, "nobody", 3.0)):
+        recorder.record("truth", row)
+    recorder.close()
+    finish_run(made.run, made.result(simulation=host), made.expected, has_report=False)
+    return {path.stem: pq.read_table(path) for path in made.run.tables.glob("*.parquet")}
+
+
+def test_tables_of_a_constellation_bear_utc_since_its_epoch_and_names_of_satellites(tmp_path):
+    tables = labelled(tmp_path, satellites=NAMES, epoch_utc=EPOCH)
+
+    state = tables["state"].to_pylist()
+    zero = datetime.datetime(2017, 3, 7, 13, 32, 57, tzinfo=datetime.UTC)
+    assert str(tables["state"].schema.field("simulated_utc").type) == "timestamp[us, tz=UTC]"
+    for row in state:
+        assert row["simulated_utc"] == zero + datetime.timedelta(seconds=row["t_s"])
+        assert row["satellite"] == NAMES[row["agent"]]
+    truth = tables["host_truth"].to_pylist()
+    assert [row["satellite"] for row in truth] == ["IRIDIUM 7", "IRIDIUM 8", None]
+    assert [row["simulated_utc"] for row in truth] == [
+        zero + datetime.timedelta(seconds=0.25),
+        None,
+        zero + datetime.timedelta(seconds=1.5),
+    ]
+    assert {"simulated_utc", "satellite"}.isdisjoint(tables["machine_health"].column_names)
+
+
+def test_tables_bear_the_second_names_that_the_plan_keeps(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    plan = made.run.read_json(made.run.plan_json)
+    labels = {"column": "car", "names": {"agent-01": "KITT"}}
+    write_json(made.run.plan_json, {**plan, "labels": labels})
+    finish_run(made.run, made.result(), made.expected, has_report=False)
+
+    rows = pq.read_table(made.run.tables / "ticks.parquet").to_pylist()
+
+    assert {(row["agent"], row["car"]) for row in rows} == {
+        ("agent-01", "KITT"),
+        ("agent-02", None),
+    }
+
+
+def test_tables_of_another_simulation_bear_utc_since_the_run_began(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    finish_run(made.run, made.result(), made.expected, has_report=False)
+
+    ticks = pq.read_table(made.run.tables / "ticks.parquet")
+
+    zero = datetime.datetime(2024, 5, 6, 7, 8, 9, tzinfo=datetime.UTC)
+    assert ticks["simulated_utc"][0].as_py() == zero
+    assert ticks["simulated_utc"][10].as_py() == zero + datetime.timedelta(seconds=1)
+    assert "satellite" not in ticks.column_names
+
+
+@pytest.mark.parametrize(
+    ("parameter", "host", "zero"),
+    [(EPOCH, {}, "2017-03-07"), (EPOCH, {"epoch_utc": "2020-02-02"}, "2020-02-02")],
+)
+def test_time_zero_is_the_epoch_of_summary_or_parameters_whatever_the_simulation(
+    tmp_path, parameter, host, zero
+):
+    config = dataclasses.replace(
+        SyntheticRun(tmp_path).config, simulation="rovers", parameters={"epoch_utc": parameter}
+    )
+    result = {"t0_utc": "2024-05-06T07:08:09Z", "simulation": host}
+
+    found = TableLabels.of(config, result).zero_utc
+
+    assert found.date().isoformat() == zero
+    nothing = dataclasses.replace(config, parameters={"epoch_utc": None})
+    assert TableLabels.of(nothing, {**result, "simulation": {}}).zero_utc is None
+
+
+def test_nothing_is_labelled_where_time_zero_is_not_known(tmp_path):
+    made = SyntheticRun(tmp_path).write(with_states=True)
+    finish_run(made.run, None, made.expected, has_report=False)
+
+    state = pq.read_table(made.run.tables / "state.parquet")
+
+    assert {"simulated_utc", "satellite"}.isdisjoint(state.column_names)
+
+
+def test_readers_of_tables_take_labels_for_no_recorded_field(tmp_path):
+    made = SyntheticRun(tmp_path).write(with_states=True)
+    host = {"satellites": NAMES, "epoch_utc": EPOCH}
+    finish_run(made.run, made.result(simulation=host), made.expected, has_report=False)
+
+    table = open_tables(made.run.tables)["state"]
+
+    assert [field.name for field in table.fields][:3] == ["t_s", "tick", "x_m"]
+    assert table.has("satellite", "simulated_utc")
+
+
+def test_times_without_a_utc_are_null(tmp_path):
+    labels = TableLabels.of(None, {"t0_utc": "2024-05-06T07:08:09Z"})
+
+    times = labels.utc_us(np.array([np.nan, np.inf, 1e300, 0.0000004, 0.0000006]))
+
+    zero_us = 1714979289 * 10**6
+    assert times.tolist() == [NEVER_US, NEVER_US, NEVER_US, zero_us, zero_us + 1]
+
+
+@pytest.mark.parametrize("said", [None, 3, "yesterday", "2024-05-06"])
+def test_zero_that_is_no_time_is_none(said):
+    found = TableLabels.of(None, {"t0_utc": said}).zero_utc
+
+    assert found is None or found.tzinfo is not None
+
+
+def test_lockstep_tells_no_wall_time(tmp_path):
+    config = make_config(2)
+    config = dataclasses.replace(config, time=dataclasses.replace(config.time, mode="lockstep"))
+
+    assert TableLabels.of(config, {"t0_utc": "2024-05-06T07:08:09Z"}).zero_utc == (
+        datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
+    )

@@ -1,0 +1,160 @@
+"""What a simulation recorded and did not declare is a remark of run.json."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from harness.synthetic_run import ROUND_TRIPS, SyntheticRun
+
+from cosmos_cli.collect.finish import finish_run
+from cosmos_cli.errors import InputError
+from cosmos_cli.evidence.remarks import (
+    NOT_DECLARED,
+    REMARKS_MAX,
+    declared_streams,
+    undeclared_remarks,
+)
+from cosmos_cli.evidence.run_directory import write_json
+from cosmos_cli.evidence.streams import RecordFile, StreamScan
+from cosmos_cli.models.loading import load_scenario
+from madns_runtime.config import to_mapping
+from madns_runtime.plugin.api import DeclaredStream
+from madns_runtime.recording.records import TICKS, Field
+
+TICK, RANGE = Field("tick", "", "int"), Field("range_m", "m")
+
+
+def scan(stream, *fields, source="agent-01", role="agent"):
+    path = Path(source) / f"{stream}.jsonl"
+    file = RecordFile(
+        path=path, role=role, source=source, stream=stream, incarnation=1, fields=fields
+    )
+    return StreamScan(file=file, size_bytes=1, sha256="")
+
+
+def told(declared, *scans):
+    listed = [to_mapping(stream) for stream in declared]
+    return undeclared_remarks(declared_streams({"streams": listed}), scans)
+
+
+def of_agents(*fields, is_open=False):
+    return [DeclaredStream(role="agent", name="radar", fields=fields, is_open=is_open)]
+
+
+def test_what_is_declared_and_what_the_framework_records_is_no_remark():
+    assert told(of_agents(TICK, RANGE), scan("radar", TICK, RANGE)) == ()
+    assert told([], scan("ticks", *TICKS.fields)) == ()
+    assert told([], scan("health", TICK, role="machine")) == ()
+
+
+def test_undeclared_stream_is_told_once_with_who_recorded_it():
+    scans = [scan("radar", TICK, source=f"agent-0{n}") for n in (1, 2, 3)]
+
+    assert told([], *scans) == (f"agent-01 and 2 more: stream radar is {NOT_DECLARED}",)
+    host = scan("radar", TICK, source="host", role="host")
+    assert told(of_agents(TICK), host) == (f"host: stream radar is {NOT_DECLARED}",)
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        ((TICK, Field("range_m", "km")), "field range_m is float in km where float in m is"),
+        ((TICK, Field("range_m", "m", "int")), "field range_m is int in m where float in m is"),
+        ((TICK, RANGE, Field("x")), f"field x is {NOT_DECLARED}"),
+        ((TICK,), "field range_m is declared and not recorded"),
+    ],
+)
+def test_field_that_differs_is_told(fields, text):
+    (remark,) = told(of_agents(TICK, RANGE), scan("radar", *fields))
+
+    assert remark.startswith(f"agent-01: stream radar: {text}")
+
+
+def test_open_stream_takes_further_fields_and_holds_those_it_declares():
+    assert told(of_agents(TICK, is_open=True), scan("radar", TICK, RANGE)) == ()
+    (remark,) = told(of_agents(TICK, is_open=True), scan("radar", Field("tick"), RANGE))
+    assert "field tick is float where int is declared" in remark
+
+
+def test_remarks_are_bounded_and_the_rest_is_counted():
+    remarks = told([], *(scan(f"s{n}", TICK) for n in range(REMARKS_MAX + 5)))
+
+    assert len(remarks) == REMARKS_MAX + 1
+    assert remarks[-1].startswith("5 more faults")
+
+
+@pytest.mark.parametrize("plan", [None, {}, {"streams": 3}, {"streams": [{"role": "agent"}]}])
+def test_plan_without_a_declaration_judges_nothing(plan):
+    assert undeclared_remarks(declared_streams(plan), [scan("radar", TICK)]) == ()
+
+
+def test_remark_stands_in_run_json_and_changes_no_verdict(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    declared = DeclaredStream(role="agent", name="round_trips", fields=ROUND_TRIPS.fields[:1])
+    plan = json.loads(made.run.plan_json.read_bytes())
+    write_json(made.run.plan_json, {**plan, "streams": [to_mapping(declared)]})
+
+    summary = finish_run(made.run, made.result(), made.expected)
+
+    assert summary.exit_code == 0
+    last = ROUND_TRIPS.fields[-1].name
+    assert any(
+        text == f"agent-01 and 1 more: stream round_trips: field {last} is {NOT_DECLARED}"
+        for text in summary.document["remarks"]
+    )
+
+
+PLUGIN = """
+from dataclasses import dataclass
+from madns_runtime.plugin.api import AgentSimulation, DeclaredStream, Simulation
+from madns_runtime.recording.records import Field
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Parameters:
+    pass
+
+class A(AgentSimulation):
+    def setup(self, context, initial):
+        context.open_stream("declared", [Field("x_m", "m")])
+        context.open_stream("extra", [Field("y_m", "m")])
+
+def streams(parameters, agents):
+    assert agents == ("agent-01", "agent-02")
+    return [DeclaredStream(role="agent", name="declared", fields=(Field("x_m", "m"),))]
+
+simulation = Simulation(name="p", parameters=Parameters, agent=":A", streams=":streams")
+"""
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_run_tells_what_its_simulation_did_not_declare(tmp_path, mode):
+    (tmp_path / "p.py").write_text(PLUGIN)
+    (tmp_path / "a.yaml").write_text(
+        "name: a\nsimulation: ./p.py:simulation\nagents: {count: 2}\n"
+        f"time: {{mode: {mode}, duration_s: 0.5, rtf_tolerance: 1}}\ndeadline: {{max_miss_ratio: 1}}\n"
+    )
+    command = [sys.executable, "-m", "cosmos_cli.app", "run", "a.yaml", "--json", "--no-report"]
+
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100)
+
+    remarks = json.loads(done.stdout)["remarks"]
+    expected = f"agent-01 and 1 more: stream extra is {NOT_DECLARED}"
+    assert [text for text in remarks if "stream" in text] == [expected]
+
+
+@pytest.mark.process
+def test_columns_that_name_no_declared_field_are_a_fault_of_the_scenario(tmp_path):
+    columns = 'columns=("declared.x_m", "declared.y_m")'
+    (tmp_path / "p.py").write_text(PLUGIN.replace('streams=":', f'{columns}, streams=":'))
+    path = tmp_path / "a.yaml"
+    path.write_text("name: a\nsimulation: ./p.py:simulation\nagents: {count: 2}\n")
+
+    with pytest.raises(InputError) as caught:
+        load_scenario(path)
+
+    told = str(caught.value)
+    assert "'declared.y_m' is no field of an agent's stream that streams() declares" in told
+    assert "declared.x_m" not in told

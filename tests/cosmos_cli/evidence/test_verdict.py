@@ -1,0 +1,278 @@
+import dataclasses
+import itertools
+import math
+from pathlib import Path
+
+import pytest
+
+from cosmos_cli.evidence.verdict import (
+    ORDER,
+    CheckLimits,
+    CheckResult,
+    RunFacts,
+    judge,
+    plugin_checks,
+)
+
+TOP = Path(__file__).parents[3]
+
+GOOD = RunFacts(
+    host_status="complete",
+    miss_ratio=0.0,
+    overrun_ratio=0.0,
+    rtf=1.0,
+    reliable_lost=0,
+    sync_lost=0,
+    sync_deadlines_broken=0,
+)
+BROKEN_CHECK = CheckResult(name="counter.lost", limit=0, got=1, passed=False)
+
+
+def judged(**changes):
+    return judge(dataclasses.replace(GOOD, **changes), CheckLimits())
+
+
+def test_nothing_wrong_is_green():
+    verdict = judged()
+
+    assert (verdict.exit_code, verdict.status, verdict.broken) == (0, "complete", ())
+    assert verdict.text.startswith("PASSED")
+
+
+@pytest.mark.parametrize(
+    ("who", "reason", "text"),
+    [
+        ("operator", "interrupted by the operator", "INTERRUPTED by operator"),
+        (None, None, "INTERRUPTED by the operator"),
+        ("host", "ended by SIGTERM", "INTERRUPTED: host: ended by SIGTERM"),
+    ],
+)
+def test_interrupted_run_says_by_whom_or_how(who, reason, text):
+    verdict = judged(host_status="interrupted", who=who, reason=reason)
+
+    assert verdict.text == text
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "status"),
+    [
+        ({"interrupted": True}, 130, "interrupted"),
+        ({"host_status": "interrupted"}, 130, "interrupted"),
+        ({"host_status": "failed"}, 1, "failed"),
+        ({"host_status": "aborted"}, 1, "aborted"),
+        ({"host_status": None}, 1, "failed"),
+        ({"host_status": "who knows"}, 1, "failed"),
+        ({"machine_problems": ("pi07: unreachable",)}, 3, "complete"),
+        ({"missing": ("pi07: no records",)}, 5, "complete"),
+        ({"lost_agents": ("a",)}, 4, "complete"),
+        ({"miss_ratio": 2e-3}, 4, "complete"),
+        ({"miss_ratio": None}, 4, "complete"),
+        ({"overrun_ratio": 2e-3}, 4, "complete"),
+        ({"rtf": 1.002}, 4, "complete"),
+        ({"rtf": 0.998}, 4, "complete"),
+        ({"rtf": None}, 4, "complete"),
+        ({"rtf": math.nan}, 4, "complete"),
+        ({"reliable_lost": 1}, 4, "complete"),
+        ({"reliable_lost": None}, 4, "complete"),
+        ({"sync_lost": 1}, 4, "complete"),
+        ({"sync_deadlines_broken": 1}, 4, "complete"),
+        ({"records_dropped": 1}, 4, "complete"),
+        ({"records_truncated": 1}, 4, "complete"),
+        ({"plugin_checks": (BROKEN_CHECK,)}, 4, "complete"),
+        ({"problems": ("process 77 outlived SIGKILL",)}, 3, "complete"),
+    ],
+)
+def test_single_fault_has_its_exit_code(changes, code, status):
+    verdict = judged(**changes)
+
+    assert (verdict.exit_code, verdict.status) == (code, status)
+
+
+FAULTS = (
+    (130, {"interrupted": True}),
+    (3, {"host_status": "aborted", "is_ended_by_machine": True}),
+    (1, {"host_status": "aborted"}),
+    (3, {"machine_problems": ("pi07: unreachable",)}),
+    (5, {"missing": ("pi07: no records",)}),
+    (4, {"miss_ratio": 0.5}),
+    (3, {"problems": ("process 77 outlived SIGKILL",)}),
+)
+
+
+@pytest.mark.parametrize(
+    "faults", [c for n in (2, 3, 7) for c in itertools.combinations(FAULTS, n)]
+)
+def test_of_several_faults_the_first_in_order_decides(faults):
+    changes = {key: value for _, fault in faults for key, value in fault.items()}
+
+    assert judged(**changes).exit_code == faults[0][0]
+
+
+def test_documents_and_code_tell_one_order():
+    codes = [int(word) for word in ORDER.replace(",", "").split() if word.isdecimal()]
+    texts = [(TOP / name).read_text(encoding="utf-8") for name in ("README.md", "docs/fleet.md")]
+
+    assert codes == [code for code, _ in FAULTS]
+    for text in (*texts, judge.__doc__ or ""):
+        assert ORDER in " ".join(text.split())
+
+
+def test_a_machine_that_is_lost_ends_a_complete_run_no_differently():
+    assert judged(is_ended_by_machine=True).exit_code == 0
+
+
+def test_limits_themselves_still_hold():
+    facts = dataclasses.replace(GOOD, miss_ratio=0.25, overrun_ratio=0.25, rtf=1.5)
+
+    assert judge(facts, CheckLimits(miss_ratio_max=0.25, rtf_tolerance=0.5)).exit_code == 0
+
+
+def test_text_names_who_and_why():
+    verdict = judged(host_status="aborted", who="agent-03", reason="killed by SIGKILL")
+
+    assert verdict.text == "ABORTED: agent-03: killed by SIGKILL"
+
+
+def test_host_that_said_nothing_is_named():
+    verdict = judged(host_status=None)
+
+    assert verdict.who == "host"
+    assert "without a result" in verdict.text
+
+
+def test_every_broken_check_is_told_with_its_limit():
+    verdict = judged(miss_ratio=0.01, rtf=1.5)
+
+    assert "deadline.miss_ratio 0.01 (limit 0.001)" in verdict.text
+    assert "time.rtf 0.5 (limit 0.001)" in verdict.text
+
+
+def test_many_faults_are_cut_short_in_the_text():
+    verdict = judged(missing=tuple(f"pi{i:02d}: no records" for i in range(24)))
+
+    assert verdict.text.endswith("pi02: no records; and 21 more")
+
+
+def test_worst_of_all_agents_counts_for_each_name():
+    summaries = {
+        f"a{got}": {"checks": [{"name": "x", "limit": 5, "got": got, "passed": got <= 5}]}
+        for got in (1, 9, 7, 4)
+    }
+
+    assert plugin_checks(summaries) == [
+        CheckResult(name="x", limit=5, got=9, passed=False, worst="a9")
+    ]
+
+
+def test_worst_of_passing_checks_is_the_one_nearest_its_limit():
+    summaries = {
+        f"a{got}": {"checks": [{"name": "x", "limit": 5, "got": got, "passed": True}]}
+        for got in (1, 4, 2)
+    }
+
+    (check,) = plugin_checks(summaries)
+
+    assert (check.got, check.worst) == (4, "a4")
+
+
+@pytest.mark.parametrize(("passed", "worst"), [(True, None), (False, "a1")])
+def test_nobody_is_the_worst_of_checks_that_hold_alike(passed, worst):
+    checks = {"checks": [{"name": "x", "limit": 5, "got": 3, "passed": passed}]}
+
+    (check,) = plugin_checks({"a1": checks, "a2": checks, "a3": checks})
+
+    assert check.worst == worst
+
+
+def test_check_names_itself_whose_its_value_is():
+    check = {"name": "x", "limit": 5, "got": 9, "passed": False, "worst": "a7"}
+
+    assert plugin_checks({"host": {"checks": [check]}})[0].worst == "a7"
+
+
+@pytest.mark.parametrize("got", [None, math.nan, math.inf])
+def test_value_that_is_not_finite_was_not_measured_whatever_the_plugin_says(got):
+    item = {"name": "x", "limit": 1, "got": got, "passed": True}
+
+    (check,) = plugin_checks({"agent-07": {"checks": [item]}})
+
+    assert check == CheckResult(name="x", limit=1, got=None, passed=False, worst="agent-07")
+    assert "x not measured of agent-07 (limit 1)" in judged(plugin_checks=(check,)).text
+
+
+def test_values_that_are_not_finite_break_a_check_of_their_own():
+    verdict = judged(records_not_finite=60, worst={"records.not_finite": "agent-02/drive"})
+
+    assert (verdict.exit_code, verdict.broken[0].worst) == (4, "agent-02/drive")
+    assert "records.not_finite 60 of agent-02/drive (limit 0)" in verdict.text
+    assert judge(
+        dataclasses.replace(GOOD, records_not_finite=60), CheckLimits(not_finite_max=60)
+    ).text.startswith("PASSED")
+
+
+@pytest.mark.parametrize(
+    "item",
+    [
+        {"name": "x", "limit": math.nan, "got": 0, "passed": True},
+        {"name": "x", "limit": 1, "got": "0", "passed": True},
+        {"name": "x", "limit": 1, "got": 0, "passed": "yes"},
+        {"name": "x", "got": 0, "passed": True},
+        "x",
+        None,
+    ],
+)
+def test_malformed_check_is_a_broken_one_named_after_who_made_it(item):
+    good = {"name": "y", "limit": 1, "got": 0, "passed": True}
+
+    broken, held = plugin_checks({"agent-07": {"checks": [item, good]}})
+
+    name = "agent-07"
+    assert broken == CheckResult(name=f"{name}.checks", limit=0, got=None, passed=False, worst=name)
+    assert (held.name, held.passed) == ("y", True)
+
+
+@pytest.mark.parametrize("listed", [None, 3, "x", {"name": "x"}])
+def test_checks_that_are_no_list_are_a_broken_check(listed):
+    (check,) = plugin_checks({"host": {"checks": listed}})
+
+    assert (check.name, check.passed, check.got) == ("host.checks", False, None)
+
+
+@pytest.mark.parametrize("summary", [{}, {"checks": []}, {"checks": ()}])
+def test_summary_without_checks_has_none(summary):
+    assert plugin_checks({"host": summary}) == []
+
+
+def test_one_late_wake_up_does_not_decide_the_real_time_factor_of_a_short_run():
+    facts = dataclasses.replace(GOOD, rtf=1.009)
+
+    assert judge(facts, CheckLimits(duration_s=2.0)).exit_code == 0
+    assert judge(facts, CheckLimits(duration_s=2.3)).exit_code == 4
+    assert CheckLimits(duration_s=60.0).rtf_error_max == 1e-3
+
+
+def test_real_time_factor_of_a_single_tick_is_not_judged_and_that_is_said():
+    verdict = judged(rtf=None, has_rate=False)
+
+    assert verdict.exit_code == 0
+    assert "time.rtf" not in [check.name for check in verdict.checks]
+    assert verdict.remarks == ("time.rtf: not judged: a single tick has no rate",)
+
+
+def test_reason_of_several_lines_is_one_in_the_verdict():
+    verdict = judged(host_status="aborted", who="agent-03", reason="ValueError: a\n  b\nc")
+
+    assert verdict.text == "ABORTED: agent-03: ValueError: a ..."
+    assert verdict.reason == "ValueError: a\n  b\nc"
+
+
+def test_in_lockstep_nothing_is_late():
+    changes = {"rtf": 500.0, "miss_ratio": None, "overrun_ratio": None}
+    verdict = judged(is_lockstep=True, **changes)
+
+    assert (verdict.exit_code, verdict.broken) == (0, ())
+    assert not any(check.name.startswith(("deadline.", "time.")) for check in verdict.checks)
+    assert verdict.remarks == (
+        "time.rtf, deadline.miss_ratio, deadline.overrun_ratio: not judged: in lockstep time waits",
+    )
+    assert judged(**changes).exit_code == 4

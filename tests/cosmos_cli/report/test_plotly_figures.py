@@ -1,0 +1,171 @@
+"""Values of figures as plotly.js gets them: quantity, unit, limits, and what cannot be drawn."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from test_report_browser import CHROMIUM, INSPECT, WATCH, browse
+
+from cosmos_cli.report.html import render_page
+from cosmos_cli.report.plotly_figures import to_plotly
+from cosmos_cli.report.style import BAD
+from madns_runtime.analysis import values
+from madns_runtime.analysis.plain import from_plain, to_plain
+from madns_runtime.analysis.values import (
+    Axis,
+    Band,
+    Bars,
+    EventBand,
+    Figure,
+    FigureChoice,
+    HeatMap,
+    Histogram,
+    LimitLine,
+    ReportRemark,
+    Section,
+    Series,
+    SpaceFigure,
+    SpacePath,
+    TableBlock,
+    headings,
+)
+
+X = np.arange(5.0)
+
+
+def figure(*marks, **more):
+    return Figure(title="speed", choices=[FigureChoice(marks=marks)], **more)
+
+
+EVERY = (
+    figure(
+        Band(x=X, low=X, high=X + 2.0, name="range"),
+        *(
+            Series(x=X, y=X + 1.0, name=form, form=form)
+            for form in ("line", "dotted", "steps", "points")
+        ),
+        y=Axis(quantity="speed", unit="m/s"),
+        limits=[LimitLine(value=3.5, name="allowed")],
+        events=[EventBand(start=1.0, end=2.0, name="red light")],
+    ),
+    figure(Histogram(edges=X, counts=[1, 2, 3, 4]), x=Axis(quantity="gap", unit="m")),
+    figure(
+        HeatMap(x=X, y=X[:2], values=np.ones((2, 5)), scale=Axis(quantity="density", unit="1/m"))
+    ),
+    figure(
+        Series(x=np.cos(X), y=np.sin(X)),
+        x=Axis(quantity="east", unit="m"),
+        y=Axis(unit="m"),
+        is_to_scale=True,
+    ),
+    figure(
+        Bars(names=["a", "b"], values=[1.0, None]),
+        Bars(names=["a", "b"], values=[3.0, 4.0], panel=1),
+        x=Axis(),
+        panels=[Axis(quantity="mean", unit="m"), Axis(quantity="max", unit="m")],
+    ),
+    SpaceFigure(
+        title="paths in space",
+        unit="m",
+        paths=[SpacePath(points=np.ones((3, 3)) * X[:3, None], name="a")],
+        spots=SpacePath(points=np.zeros((1, 3)), tone="warm"),
+        spot_names=["start"],
+    ),
+)
+
+
+def test_axes_tell_quantity_and_unit():
+    layout = to_plotly(EVERY[1]).layout
+
+    assert layout["xaxis"]["title"]["text"] == "gap, m"
+    assert to_plotly(EVERY[0]).layout["yaxis"]["title"]["text"] == "m/s"
+
+
+def test_what_lies_beyond_a_limit_is_drawn_as_bad_and_the_limit_where_it_is_seen():
+    points = Series(x=X, y=X, form="points")
+    drawn = to_plotly(figure(points, limits=[LimitLine(value=2.5)]))
+    far = to_plotly(figure(points, limits=[LimitLine(value=99.0)]))
+
+    colours = drawn.choices[0][1][0]["marker"]["color"]
+    assert [colour == BAD for colour in colours] == [False, False, False, True, True]
+    assert [shape["y0"] for shape in drawn.layout["shapes"]] == [2.5]
+    assert far.layout["shapes"] == []
+    assert far.choices[0][1][0]["marker"]["color"] != BAD
+
+
+def test_event_stands_behind_the_marks_over_the_whole_height():
+    (event, _limit) = to_plotly(EVERY[0]).layout["shapes"]
+
+    assert (event["x0"], event["x1"], event["yref"], event["layer"]) == (1.0, 2.0, "paper", "below")
+
+
+def test_map_has_one_scale_on_both_axes():
+    assert to_plotly(EVERY[3]).layout["yaxis"]["scaleanchor"] == "x"
+
+
+def test_values_come_through_a_process_of_their_own_as_they_were():
+    section = Section(
+        title="s",
+        blocks=[*EVERY, TableBlock(title="t", headings=headings("a", "b"), rows=[["x", np.inf]])],
+    )
+
+    back = from_plain(to_plain([section]))[0]
+
+    assert to_plain(back) == to_plain(section)
+    np.testing.assert_array_equal(back.blocks[0].choices[0].marks[0].high, X + 2.0)
+    assert back.blocks[-1].rows[0] == ["x", np.inf]
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda: Series(x=[1, 2], y=[1]), "Series: expected one length, got x 2, y 1"),
+        (lambda: Series(x=[[1]], y=[1]), "Series.x: expected 1 dimensions, got 2"),
+        (lambda: Histogram(edges=[1], counts=[1]), "one edge more"),
+        (lambda: HeatMap(x=X, y=X, values=np.ones((2, 5)), scale=Axis()), r"shape \(5, 5\)"),
+        (lambda: Bars(names=["a"], values=[]), "1 names and 0 values"),
+        (lambda: SpacePath(points=np.ones((3, 2))), r"shape \(N, 3\)"),
+        (lambda: figure(), "expected a mark"),
+        (lambda: figure(Series(x=X, y=X, panel=1)), "no panel 1"),
+        (
+            lambda: TableBlock(title="t", headings=headings("a"), rows=[[1, 2]]),
+            "2 cells, the head 1",
+        ),
+    ],
+)
+def test_what_does_not_fit_together_is_refused_where_it_is_made(make, told):
+    with pytest.raises(ValueError, match=told):
+        make()
+
+
+def test_figure_that_cannot_be_drawn_costs_a_remark_and_not_the_page():
+    odd = figure(Series(x=X, y=X, tone="mauve"))
+
+    page = render_page({"run": "r"}, [Section(title="s", blocks=[odd, EVERY[1]])])
+
+    assert "The figure speed could not be drawn: KeyError" in page
+    assert 'id="plot0"' in page
+    assert 'id="plot1"' not in page
+
+
+def test_every_value_of_figures_is_drawn_here():
+    drawn = {type(mark).__name__ for f in EVERY[:-1] for c in f.choices for mark in c.marks}
+
+    assert drawn == {kind.__name__ for kind in values.Mark.__args__}
+    assert all(dataclasses.is_dataclass(kind) for kind in (*values.Block.__args__, ReportRemark))
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
+def test_every_value_of_figures_draws_in_a_browser(tmp_path):
+    page = tmp_path / "report.html"
+    text = render_page({"run": "r"}, [Section(title="s", blocks=EVERY)])
+    inspect = INSPECT.replace(".gl-container canvas", ".gl-container canvas, .heatmaplayer image")
+    text = text.replace("<style>", WATCH + "<style>", 1).replace("</body>", inspect + "</body>", 1)
+    page.write_text(text)
+
+    dom = browse(page, "--dump-dom")
+
+    assert 'data-inspected="yes"' in dom
+    for told in ('data-failed="0"', 'data-errors=""', 'data-empty=""', 'data-violations="0"'):
+        assert told in dom, dom[:500]

@@ -1,0 +1,201 @@
+"""Figures and comparisons of a simulation of one's own: drawn, and done without where its code fails."""
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from harness.synthetic_run import SyntheticRun, make_config
+
+from cosmos_cli import app
+from cosmos_cli.collect.finish import finish_run
+from cosmos_cli.report.build import build_sections, with_simulation
+from madns_runtime.analysis.values import Figure, ReportRemark, TableBlock
+from madns_runtime.config import Timeouts
+from madns_runtime.recording.records import Field, StreamSchema
+
+pytestmark = pytest.mark.process  # code that is not shipped is asked in a fork
+
+DOCS = Path(__file__).parents[3] / "docs/plugins.md"
+PATH = StreamSchema("path", (Field("t_s", "s"), Field("x_m", "m"), Field("y_m", "m")))
+TICKS = 30
+DESCRIPTOR = """
+from dataclasses import dataclass
+
+from madns_runtime.plugin.api import Simulation
+
+
+@dataclass(frozen=True)
+class Parameters:
+    pass
+
+
+simulation = Simulation(
+    name="rover", parameters=Parameters, agent=":Agent", figures="./figures.py:figures", compare="./figures.py:compare",
+    document="./figures.py:document"
+)
+"""
+
+
+def example():
+    """Return the code that the documentation shows."""
+    section = DOCS.read_text(encoding="utf-8").split("## Figures of your own\n")[1]
+    return re.search(r"```python\n(.*?)```", section, re.DOTALL)[1]
+
+
+@pytest.fixture
+def drive(tmp_path, monkeypatch):
+    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
+    monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
+    (tmp_path / "rover.py").write_text(DESCRIPTOR)
+    (tmp_path / "figures.py").write_text(example())
+
+    def run_once(*, north_m=0.0, loading_s=60.0):
+        config = dataclasses.replace(
+            make_config(2, ticks=TICKS),
+            simulation="./rover.py:simulation",
+            base_directory=str(tmp_path),
+            timeouts=Timeouts(loading_s=loading_s),
+        )
+        made = SyntheticRun(tmp_path / "runs", config).write(health_count=0)
+        for number, name in enumerate(made.names):
+            recorder = made.recorder(f"agents/{name}", name, PATH)
+            for tick in range(TICKS):
+                recorder.record("path", (tick / 10, 3.0 * tick, 4.0 * tick * number + north_m))
+            recorder.close()
+        finish_run(made.run, made.result(), made.expected, has_report=False)
+        return made
+
+    return run_once
+
+
+def sections_of(made):
+    document = made.run.read_json(made.run.run_json)
+    return {section.title: section.blocks for section in build_sections(made.run, document)}
+
+
+def test_documented_example_draws_its_own_figures_and_its_stream_is_not_drawn_twice(drive):
+    sections = sections_of(drive())
+
+    figure, table = sections["Paths"]
+    assert "Stream path" not in sections
+    assert isinstance(figure, Figure)
+    assert figure.is_to_scale
+    assert [mark.name for mark in figure.choices[0].marks] == ["agent-01", "agent-02"]
+    np.testing.assert_array_equal(figure.choices[0].marks[1].y, 4.0 * np.arange(TICKS))
+    assert isinstance(table, TableBlock)
+    assert table.rows == [["agent-01", 3.0 * (TICKS - 1)], ["agent-02", 5.0 * (TICKS - 1)]]
+
+
+def test_documented_example_compares_two_runs(drive, capsys):
+    drive(), drive(north_m=7.0)
+
+    assert app.run(["diff", "1", "2", "--json", "--quiet"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    app.run(["diff", "1", "2", "--quiet"])
+    told = capsys.readouterr().out
+
+    assert document["rover"] == {"apart_m": {"agent-01": 7.0, "agent-02": 7.0}}
+    assert "Rovers at the end, distance between A and B\nrover     m\nagent-01  7" in told
+
+
+BROKEN = {
+    "raises": (
+        "def figures(run):\n    raise KeyError('gone')",
+        "figures.py:2: figures(): KeyError",
+    ),
+    "is no module": ("def figures(run:\n", "SyntaxError"),
+    "lacks its function": ("x = 1", "has no 'figures'"),
+    "ends the process": ("import os\nos._exit(0)", "os._exit(0)"),
+    "kills itself": (
+        "import os, signal\ndef figures(run):\n    os.kill(os.getpid(), signal.SIGKILL)",
+        "SIGKILL",
+    ),
+    "hangs": ("def figures(run):\n    while True:\n        pass", "was not done within 0.5 s"),
+    "returns something else": ("def figures(run):\n    return [1]", "must return"),
+    "returns what no page holds": (
+        "from madns_runtime.analysis.values import *\n"
+        "def figures(run):\n"
+        "    table = TableBlock(title='t', headings=headings('a'), rows=[[object()]])\n"
+        "    return [Section(title='s', blocks=[table])]",
+        "figures hold numbers, texts and values of theirs",
+    ),
+    "draws what does not fit together": (
+        "from madns_runtime.analysis.values import *\n"
+        "def figures(run):\n    return [Series(x=[1, 2], y=[1])]",
+        "figures.py:3: figures(): ValueError: Series: expected one length, got x 2, y 1",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_report_of_a_plug_in_that_fails_is_written_with_a_remark(drive, tmp_path, what):
+    made = drive(loading_s=0.5 if what == "hangs" else 60.0)
+    code, told = BROKEN[what]
+    (tmp_path / "figures.py").write_text(code)
+
+    sections = sections_of(made)
+
+    (remark,) = sections["Figures of the simulation"]
+    assert isinstance(remark, ReportRemark)
+    assert told in remark.text
+    assert [block.title for block in sections["Stream path"]] == ["x", "y"]
+    assert "Real time" in sections
+
+
+def test_report_of_a_plug_in_that_is_gone_is_written_with_a_remark(drive, tmp_path):
+    made = drive()
+    (tmp_path / "rover.py").unlink()
+
+    sections = sections_of(made)
+
+    assert "no file" in sections["Figures of the simulation"][0].text
+    assert len(sections["Stream path"]) == 2
+
+
+def test_comparison_of_a_plug_in_that_fails_is_told_and_the_records_are_compared(
+    drive, tmp_path, capsys
+):
+    drive(), drive(north_m=7.0)
+    (tmp_path / "figures.py").write_text("def compare(a, b):\n    return 1 / 0")
+
+    assert app.run(["diff", "1", "2", "--json", "--quiet"]) == 0
+    document = json.loads(capsys.readouterr().out)
+
+    assert any("ZeroDivisionError" in remark for remark in document["remarks"])
+    assert [stream["table"] for stream in document["streams"] if not stream["identical"]] == [
+        "path"
+    ]
+
+
+def test_numbers_of_a_simulation_stand_in_the_json_and_never_over_the_run_s_own(drive, tmp_path):
+    made = drive()
+    (tmp_path / "figures.py").write_text(
+        "def figures(run):\n"
+        "    raise SystemExit('nobody asked for figures')\n"
+        "def document(run):\n"
+        "    return {'driven_m': 5.0, 'verdict': 'fine'}"
+    )
+    document = made.run.read_json(made.run.run_json)
+
+    told = with_simulation(made.run, document, pytest.fail)
+
+    assert told["driven_m"] == 5.0
+    assert told["verdict"] == document["verdict"]
+
+
+@pytest.mark.parametrize(
+    ("body", "fault"),
+    [("1 / 0", "ZeroDivisionError"), ("return [3]", "document() must return a mapping, got list")],
+)
+def test_a_simulation_that_fails_to_tell_its_numbers_is_named(drive, tmp_path, body, fault):
+    made = drive()
+    (tmp_path / "figures.py").write_text(f"def document(run):\n    {body}\n")
+    document = made.run.read_json(made.run.run_json)
+    warnings = []
+
+    assert with_simulation(made.run, document, warnings.append) == document
+    (warning,) = warnings
+    assert fault in warning

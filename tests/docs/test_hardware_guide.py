@@ -1,0 +1,186 @@
+"""The guide to hardware: what it shows runs as it stands, and its tables are complete."""
+
+import dataclasses
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from guides import ROOT, blocks, row_keys
+
+from cosmos_cli.models.inventory.devices import MachineDevice
+from madns_runtime.config import HardwareSettings
+from madns_runtime.hardware import guardian, status
+from madns_runtime.hardware.faults import ACTIONS
+from madns_runtime.hardware.kind_registry import registered_kinds, resolve_kind
+
+GUIDE = (ROOT / "docs" / "hardware.md").read_text("utf-8")
+LOOSE = (
+    "deadline.max_miss_ratio=1",
+    "deadline.overrun_ms=1000",
+    "time.rtf_tolerance=1",
+    "timeouts.silence_s=30",
+    "hardware.stale_ratio=1",
+    "hardware.lost=100",
+    "hardware.on_device_loss=continue",
+)
+"""So that a busy machine breaks nothing of the example."""
+
+
+def written(folder):
+    """Write all that the guide shows into a folder, and return the commands of its two examples."""
+    driver = next(block for block in blocks(GUIDE, "python") if "class Load" in block)
+    (folder / "load.py").write_text(driver)
+    inventory, *scenarios = blocks(GUIDE, "yaml")
+    (folder / "here.yaml").write_text(inventory)
+    for text in scenarios:
+        (folder / f"{text.split()[1]}.yaml").write_text(text)
+    return [block.splitlines() for block in blocks(GUIDE, "sh")]
+
+
+def wait_until(is_so, timeout_s):
+    """Wait until something is so."""
+    end_s = time.monotonic() + timeout_s
+    while not is_so():
+        assert time.monotonic() < end_s
+        time.sleep(0.1)
+
+
+def start(folder, line, *settings):
+    """Start a command in a folder; records go to runs there."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    return subprocess.Popen(
+        [*line.split(), *(part for each in settings for part in ("--set", each))],
+        cwd=folder,
+        env={
+            **os.environ,
+            "PATH": path,
+            "COSMOS_RUNS": str(folder / "runs"),
+            "COSMOS_STATE_DIR": str(folder / "state"),
+        },
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def cosmos(folder, line, *settings):
+    """Run a command to its end, which must be a good one."""
+    with start(folder, f"{line} --no-report", *settings) as process:
+        try:
+            _, err = process.communicate(timeout=300)
+        except BaseException:
+            process.kill()
+            raise
+    assert process.returncode == 0, err
+
+
+def samples(folder, run):
+    """Return the device samples that the host recorded, without who read them and how late they came."""
+    path = folder / "runs" / run / "host" / "device_samples.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    return {line[1]: [] for line in lines if isinstance(line, list)}, lines
+
+
+@pytest.mark.process
+def test_the_driver_of_ones_own_runs_as_it_stands(tmp_path):
+    (command,), _ = written(tmp_path)
+
+    cosmos(tmp_path, command, *LOOSE)
+
+    sources, lines = samples(tmp_path, "0001-watch")
+    assert set(sources) == {"agent-01/load"}
+    assert len(lines) > 5
+    events = tmp_path / "runs" / "0001-watch" / "devices" / "here" / "load" / "events.jsonl"
+    assert '"loadavg"' in events.read_text()
+
+
+@pytest.mark.process
+def test_faults_are_inserted_into_the_example_as_the_guide_says(tmp_path):
+    (command,), _ = written(tmp_path)
+    orders = re.findall(r"^    (cosmos inject .*)$", GUIDE, flags=re.MULTILINE)
+    assert len(orders) == 2
+
+    with start(tmp_path, f"{command} --set time.duration_s=60", *LOOSE) as running:
+        try:
+            events = tmp_path / "runs" / "0001-watch" / "devices" / "here" / "load" / "events.jsonl"
+            wait_until(lambda: events.is_file() and "opened" in events.read_text(), 60)
+            for order in orders:
+                wait_until(lambda order=order: start(tmp_path, order).wait(60) == 0, 60)
+            wait_until(lambda: "clear" in events.read_text(), 60)
+        finally:
+            running.send_signal(signal.SIGINT)
+            running.communicate(timeout=120)
+    faults = [json.loads(line) for line in events.read_text().splitlines() if "bias" in line]
+    assert len(faults) == 1
+
+
+@pytest.mark.process
+def test_devices_are_verified_listed_tried_and_recorded_as_the_guide_says(tmp_path):
+    written(tmp_path)
+    commands = re.findall(
+        r"^    (cosmos devices .*(?:here\.yaml|load\.py).*)$", GUIDE, flags=re.MULTILINE
+    )
+    assert len(commands) == 4
+
+    for command in commands:
+        with start(tmp_path, command) as process:
+            _, err = process.communicate(timeout=240)
+        assert process.returncode == 0, err
+
+    assert '"load"' in (tmp_path / "recorded" / "load" / "load.jsonl").read_text()
+
+
+def test_the_driver_has_thirty_lines():
+    driver = next(block for block in blocks(GUIDE, "python") if "class Load" in block)
+
+    assert len([line for line in driver.splitlines() if line.strip()]) <= 30
+
+
+@pytest.mark.process
+def test_what_was_recorded_in_lockstep_is_played_back_to_all(tmp_path):
+    _, commands = written(tmp_path)
+
+    for command in commands:
+        cosmos(tmp_path, command)
+
+    sources, lines = samples(tmp_path, "0002-again")
+    assert set(sources) == {"agent-01/gyro", "agent-02/gyro"}
+    first = [line for line in samples(tmp_path, "0001-waves")[1] if isinstance(line, list)]
+    told = [line[5] for line in first if line[1] == "agent-01/gyro"]
+    again = [line[5] for line in lines if isinstance(line, list) and line[1] == "agent-02/gyro"]
+    assert len(again) > 50
+    assert set(again) <= set(told)
+
+
+def test_its_tables_name_all_settings_and_kinds():
+    assert set(row_keys(GUIDE, "## Seen on what")) == set(registered_kinds())
+    fields = {field.name for field in dataclasses.fields(HardwareSettings)}
+    who = GUIDE.split("\n## Who uses what\n")[1].split("| status |")[0]
+    assert set(row_keys(f"\n## Who\n{who}", "## Who")) == fields
+    assert {name for name in ACTIONS if f"`{name}`" not in GUIDE} == set()
+    assert all(field.name in GUIDE for field in dataclasses.fields(MachineDevice))
+
+
+@pytest.mark.parametrize("name", registered_kinds())
+def test_each_kind_has_its_parameters_in_the_guide(name):
+    parameters = resolve_kind(name, ROOT).parameters
+
+    section = GUIDE.split(f"\n### {name}\n", 1)[1].split("\n### ", 1)[0]
+    first = section.split("\n\n`")[0]
+    listed = set(row_keys(f"\n## Kind\n{first}", "## Kind"))
+    assert listed == {field.name for field in dataclasses.fields(parameters)}
+
+
+def test_its_limits_are_those_of_the_code():
+    assert (
+        f"older than {status.STALE_PERIODS:g} periods, and than {status.STALE_S_MIN:g} s" in GUIDE
+    )
+    assert f"for {status.LOST_PERIODS:g} periods, and {status.LOST_S_MIN:g} s" in GUIDE
+    assert f"after {status.BACK_OFF_S_MIN:g} s at first and {status.BACK_OFF_S_MAX:g} s" in GUIDE
+    assert f"within {guardian.GRACE_S:g} s of its owner's" in GUIDE

@@ -1,0 +1,3 @@
+"""Tests of `inside/` are for the guest alone."""
+
+collect_ignore = ["inside"]

@@ -1,0 +1,161 @@
+"""`can`: by the kernel's sockets where it has them, a stand-in for them elsewhere, and python-can's virtual bus."""
+
+from __future__ import annotations
+
+import errno
+import socket
+import struct
+import sys
+
+import pytest
+
+from madns_runtime.errors import MachineError, PluginError
+from madns_runtime.hardware.drivers import can as driver
+from madns_runtime.hardware.kind_registry import prepare
+from tests.hardware.driving import frames, opened
+
+ENGINE = 0x123
+LONG = 0x1ABC_DEF0 | 0x8000_0000
+
+
+def frame(identifier: int, data: bytes) -> bytes:
+    return identifier.to_bytes(4, "little") + data
+
+
+def has_can() -> bool:
+    try:
+        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw:
+            raw.bind(("vcan0",))
+    except OSError:
+        return False
+    return True
+
+
+def test_frames_go_through_the_kernel_or_its_want_is_told():
+    if not has_can():
+        with (
+            pytest.raises(MachineError, match="no CAN sockets|there is no such interface"),
+            opened("can", interface="vcan0"),
+        ):
+            pass
+        return
+    with opened("can", interface="vcan0") as one, opened("can", interface="vcan0") as other:
+        one.write({"sent": frame(LONG, b"12345678")}, 0.0)
+        assert frames(other, 1) == [frame(LONG, b"12345678")]
+
+
+@pytest.fixture
+def kernel(monkeypatch):
+    """Ends of a pair that keeps the borders of messages, as a CAN socket does."""
+    own, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    options = []
+    state = {"error": 0, "lost": 0}
+
+    class Raw:
+        def __init__(self, *family):
+            self.__dict__.update(
+                {n: getattr(own, n) for n in ("send", "setblocking", "fileno", "close")}
+            )
+
+        def recvmsg(self, size, ancillary_size):
+            raw, _, flags, address = own.recvmsg(size)
+            content = struct.pack("=I", state["lost"])
+            told = [(socket.SOL_SOCKET, driver.SO_RXQ_OVFL, content)] if state["lost"] else []
+            return raw, told, flags, address
+
+        def getsockopt(self, level, name):
+            assert (level, name) == (socket.SOL_SOCKET, socket.SO_ERROR)
+            return state["error"]
+
+        def setsockopt(self, *option):
+            options.append(option)
+
+        def bind(self, address):
+            if address != ("can0",):
+                raise OSError(19, "No such device")
+
+    class Sockets:
+        socket = Raw
+
+        def __getattr__(self, name):
+            return getattr(socket, name)
+
+    monkeypatch.setattr(driver, "socket", Sockets())
+    yield other, options, state
+    own.close()
+    other.close()
+
+
+def test_frames_on_the_wire_are_the_kernels(kernel):
+    other, options, state = kernel
+    wanted = [{"identifier": 0x100, "mask": 0x700}]
+    with opened("can", filters=wanted, safe_frames_hex=["123#00FF", "1ABCDEF0#"]) as device:
+        assert options[0][2] == struct.pack("=II", 0x100, 0x700)
+        device.write({"sent": frame(ENGINE, b"ab")}, 0.0)
+        assert other.recv(100) == struct.pack("=IB3x8s", ENGINE, 2, b"ab")
+        remote = struct.pack("=IB3x8s", 0x4000_0123, 0, b"")
+        other.send(remote)
+        other.send(struct.pack("=IB3x8s", LONG, 3, b"xyz"))
+        assert frames(device, 1) == [frame(LONG, b"xyz")]
+        assert device.read() is None
+        assert device.health() == {"frames_lost": 0, "frames_left_out": 1}
+        state["lost"] = 7
+        other.send(struct.pack("=IB3x8s", ENGINE, 0, b""))
+        assert frames(device, 1) == [frame(ENGINE, b"")]
+        assert device.health()["frames_lost"] == 7
+        device.make_safe()
+        assert other.recv(100)[:7] == struct.pack("=IB2x", ENGINE, 2)
+        assert other.recv(100)[:4] == struct.pack("=I", LONG)
+        with pytest.raises(PluginError, match="4 bytes of identifier"):
+            device.write({"sent": b"abc"}, 0.0)
+
+
+def test_an_interface_that_is_not_there(kernel):
+    with (
+        pytest.raises(MachineError, match="can7: there is no such interface; see `ip link`"),
+        opened("can", interface="can7"),
+    ):
+        pass
+
+
+def test_an_interface_that_is_down(kernel):
+    kernel[2]["error"] = errno.ENETDOWN
+    with (
+        pytest.raises(MachineError, match="can0: the interface is down; `sudo ip link set can0 up"),
+        opened("can", interface="can0"),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("text", ["123", "xyz#00", "123#0", "FFF#00", "123#" + "00" * 9, "#"])
+def test_a_safe_frame_that_is_none_is_refused_before_the_run(text):
+    with pytest.raises(PluginError, match="safe_frames_hex: expected a frame such as 123#00FF"):
+        prepare("can", {"safe_frames_hex": [text]}, None)
+
+
+def test_python_cans_virtual_bus_wakes_its_reader():
+    pytest.importorskip("can")
+    shared = {"library": "python-can", "python_can_interface": "virtual", "interface": "bus-1"}
+    with opened("can", **shared) as one, opened("can", **shared) as other:
+        for number in range(200):
+            one.write({"sent": frame(number, bytes([number]))}, 0.0)
+        assert frames(other, 200) == [frame(number, bytes([number])) for number in range(200)]
+        assert other.read() is None
+        one.write({"sent": frame(LONG, b"")}, 0.0)
+        assert frames(other, 1) == [frame(LONG, b"")]
+
+
+def test_a_bus_that_python_can_does_not_know_and_a_missing_python_can(monkeypatch):
+    pytest.importorskip("can")
+    with (
+        pytest.raises(MachineError, match="can0: .*nosuch"),
+        opened("can", library="python-can", python_can_interface="nosuch"),
+    ):
+        pass
+    monkeypatch.setitem(sys.modules, "can", None)
+    monkeypatch.delitem(sys.modules, "madns_runtime.hardware.drivers.python_can")
+    with (
+        pytest.raises(MachineError, match="python-can is not installed here; pip install"),
+        opened("can", library="python-can"),
+    ):
+        pass

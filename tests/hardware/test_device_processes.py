@@ -1,0 +1,350 @@
+"""Real processes of real drivers: read, written, killed, hung, unplugged, made safe."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import orjson
+import pytest
+
+from madns_runtime.errors import PluginError
+from madns_runtime.hardware.guardian import ATTEMPTS_MAX
+from tests.hardware.bench import line_bench
+
+pytestmark = pytest.mark.process
+
+
+def records(folder, name: str, device: str = "pi22/line") -> list:
+    lines = (folder / "devices" / device / f"{name}.jsonl").read_bytes().splitlines()
+    return [
+        orjson.loads(line) for line in lines[1:] if not line.startswith((b'{"end"', b'{"t0_utc"'))
+    ]
+
+
+def test_samples_reach_the_agent_and_the_records(tmp_path):
+    with line_bench(tmp_path) as (bench, _):
+        line = bench.hardware["line"]
+        bench.start_time()
+        bench.until(lambda: line["time"].number >= 20)
+        reading = line["time"]
+        assert reading.status == "ok"
+        assert 0 <= reading.age_s < 5.0
+        assert reading.value == pytest.approx(time.monotonic() - reading.age_s, abs=1.0)
+        result = bench.close()["pi22/line"]
+
+    assert bench.statuses("line") == ["ok"]
+    assert result["samples"] >= 20
+    assert result["restarts"] == result["errors"] == result["lost"] == 0
+    numbers = [record[1] for record in records(tmp_path, "time")]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    assert [event["event"] for event in records(tmp_path, "events")][:1] == ["opened"]
+
+
+def test_writes_are_held_to_limits_recorded_and_made_safe_at_the_end(tmp_path):
+    with line_bench(tmp_path) as (bench, terminal):
+        bench.start_time()
+        bench.until(lambda: bench.hardware["line"].status == "ok")
+        bench.hardware["line"].write("valve", 0.25)
+        bench.until(lambda: "VALVE 0.25" in terminal.heard())
+        bench.hardware["line"].write("valve", 7.0)
+        bench.until(lambda: "VALVE 1" in terminal.heard())
+        result = bench.close()["pi22/line"]
+        heard = terminal.heard()
+
+    assert heard == ["OPEN", "VALVE 0.25", "VALVE 1", "SAFE"]
+    assert result["report"]["valve_limited"] == 1
+    assert [record[2] for record in records(tmp_path, "valve")] == [0.25, 1.0]
+
+
+def test_a_write_is_put_out_when_it_is_due_and_a_newer_one_takes_its_place(tmp_path):
+    with line_bench(tmp_path) as (bench, terminal):
+        line = bench.hardware["line"]
+        zero_s = bench.start_time()
+        bench.hardware.use_clock(lambda t_s: zero_s + t_s)
+        bench.until(lambda: line.status == "ok")
+        due_s = time.monotonic() - zero_s + 0.5
+        line.write("valve", 0.1, due_s=due_s + 1000.0)
+        line.write("valve", 0.2, due_s=due_s)
+        bench.run(0.3)
+        assert "VALVE 0.2" not in terminal.heard()
+        bench.until(lambda: "VALVE 0.2" in terminal.heard())
+        result = bench.close()["pi22/line"]
+
+    assert result["report"]["writes_replaced"] == 1
+    assert "VALVE 0.1" not in terminal.heard()
+    t_s, lateness_us, value = records(tmp_path, "valve")[0]
+    assert value == 0.2
+    assert t_s == pytest.approx(due_s, abs=1e-5)
+    assert lateness_us >= 0
+
+
+def test_nothing_moves_where_it_may_not(tmp_path):
+    refused = {"may_move": False, "why_not": "the scenario is not armed"}
+    with line_bench(tmp_path, launch=refused) as (bench, terminal):
+        bench.until(lambda: bench.hardware["line"].status == "ok")
+        bench.hardware["line"].write("valve", 0.5)
+        bench.run(0.3)
+        result = bench.close()["pi22/line"]
+        assert terminal.heard() == ["OPEN"]
+
+    assert result["report"]["refused"] == 1
+    [why] = [event["why"] for event in records(tmp_path, "events") if event["event"] == "refused"]
+    assert "the scenario is not armed" in why
+
+
+@pytest.mark.parametrize(
+    ("channel", "value", "text"),
+    [
+        ("valve", [1.0, 2.0], "expected a number"),
+        ("valve", float("nan"), "expected numbers"),
+        ("time", 1.0, "no output 'time'"),
+        ("valv", 1.0, "no output 'valv'"),
+    ],
+)
+def test_what_is_no_value_of_an_output_is_refused_where_it_is_written(
+    tmp_path, channel, value, text
+):
+    with line_bench(tmp_path) as (bench, _), pytest.raises(PluginError, match=text):
+        bench.hardware["line"].write(channel, value)
+
+
+def test_a_killed_process_is_made_safe_by_the_guardian_and_replaced(tmp_path):
+    with line_bench(tmp_path) as (bench, terminal):
+        bench.start_time()
+        line = bench.hardware["line"]
+        bench.until(lambda: line.status == "ok")
+        line.write("valve", 1.0)
+        bench.until(lambda: "VALVE 1" in terminal.heard() and bench.statuses("line") == ["ok"])
+        before = line["time"].number
+
+        os.kill(bench.pid_of(), signal.SIGKILL)
+        bench.until(lambda: "SAFE" in terminal.heard())
+        bench.until(lambda: line["time"].number > before)
+        bench.until(lambda: bench.statuses("line")[-1] == "ok")
+        result = bench.close()["pi22/line"]
+
+    assert bench.statuses("line") == ["ok", "lost", "ok"]
+    assert result["restarts"] == 1
+    assert result["lost"] == 1
+    assert "SIGKILL" in result["why"]
+
+
+def test_a_driver_that_hangs_for_good_is_given_up_by_name_and_made_safe(tmp_path):
+    hang = tmp_path / "hang"
+    with line_bench(tmp_path, launch={"hang_s": 1.0}, hang_file=str(hang)) as (bench, terminal):
+        bench.start_time()
+        line = bench.hardware["line"]
+        bench.until(lambda: line.status == "ok")
+        pid = bench.pid_of()
+
+        hang.touch()
+        bench.until(lambda: line.status == "lost")
+        bench.until(lambda: bench.pid_of() not in (0, pid))
+        hang.unlink()
+        bench.until(lambda: line.status == "ok")
+        result = bench.close()["pi22/line"]
+        heard = terminal.heard()
+
+    assert "did not return within 1 s" in result["why"]
+    assert heard.count("SAFE") >= 2  # the guardian's, and the end's
+
+
+def test_a_read_of_half_a_second_only_ages_the_sample(tmp_path):
+    with line_bench(tmp_path, rate_hz=100.0, read_s=0.5) as (bench, _):
+        bench.start_time()
+        line = bench.hardware["line"]
+        bench.until(lambda: line["time"].number >= 1)
+        ages = []
+        for _ in range(10):
+            bench.run(0.1)
+            ages.append(line["time"].age_s)
+        result = bench.close()["pi22/line"]
+
+    assert max(ages) >= 0.5
+    assert result["restarts"] == 0
+    assert result["report"]["reads_skipped"] >= 49
+
+
+@pytest.mark.parametrize("method", ["open", "read", "health"])
+def test_a_driver_that_raises_is_told_by_name_and_tried_again(tmp_path, method):
+    with line_bench(tmp_path, raises=method) as (bench, _):
+        bench.start_time()
+        bench.until(lambda: errors(bench) >= 2)
+        result = bench.close()["pi22/line"]
+
+    whys = [event["why"] for event in records(tmp_path, "events") if event["event"] == "error"]
+    assert len(whys) >= 2
+    assert f"Line.{method} raised ValueError: {method} does not work (line.py:" in whys[0]
+    assert result["errors"] >= 2
+    assert result["restarts"] == 0  # its process lives
+
+
+def errors(bench) -> int:
+    from madns_runtime.hardware import page
+
+    [driven] = bench.manager._devices.values()
+    return int(driven.seat.page.header[page.ERRORS])
+
+
+def test_a_driver_that_raises_at_writing_and_making_safe_leaves_the_rest_to_the_guardian(tmp_path):
+    with line_bench(tmp_path, raises="make_safe") as (bench, terminal):
+        bench.until(lambda: bench.hardware["line"].status == "ok")
+        bench.hardware["line"].write("valve", 1.0)
+        bench.until(lambda: "VALVE 1" in terminal.heard())
+        result = bench.close()["pi22/line"]
+        assert terminal.heard().count("SAFE") == 1 + ATTEMPTS_MAX
+    assert result["unsafe"] == 1
+    assert "could not be made safe" in result["why"]
+    assert bench.events[-1]["text"].startswith("pi22/line: could not be made safe")
+
+    whys = [event["why"] for event in records(tmp_path, "events") if event["event"] == "error"]
+    assert any("Line.make_safe raised ValueError" in why for why in whys)
+
+
+def test_another_device_in_its_place_is_a_fault(tmp_path):
+    with line_bench(tmp_path, launch={"serial": "line-2"}) as (bench, terminal):
+        bench.until(lambda: bench.hardware["line"].status == "lost")
+        bench.close()
+        assert set(terminal.heard()) == {"OPEN"}  # nothing is written to it, not even what is safe
+
+    [first, *_] = [
+        event["why"] for event in records(tmp_path, "events") if event["event"] == "error"
+    ]
+    assert first == "expected the device 'line-2', found 'line-1'"
+
+
+def test_inserted_faults_act_on_what_is_read_and_are_recorded(tmp_path):
+    with line_bench(tmp_path) as (bench, _):
+        bench.start_time()
+        line = bench.hardware["line"]
+        bench.until(lambda: line.status == "ok")
+        assert bench.manager.insert_fault("pi22/line", "freeze", None) is None
+        bench.run(0.3)
+        first = line["time"]
+        bench.until(lambda: line["time"].number >= first.number + 5)
+        assert line["time"].value == first.value
+        bench.manager.insert_fault("pi22/line", "clear", None)
+        bench.until(lambda: line["time"].value != first.value)
+
+        bench.manager.insert_fault("pi22/line", "disconnect", None)
+        bench.until(lambda: line.status == "lost")
+        bench.manager.insert_fault("pi22/line", "clear", None)
+        bench.until(lambda: line.status == "ok")
+        assert "no device 'pi22/imu' here" in bench.manager.insert_fault("pi22/imu", "freeze", None)
+        bench.close()
+
+    actions = [
+        event["action"] for event in records(tmp_path, "events") if event["event"] == "fault"
+    ]
+    assert actions == ["freeze", "clear", "disconnect", "clear"]
+
+
+def test_counts_survive_the_process_that_counted(tmp_path):
+    """A frozen input, then a killed process, then one that is killed before it gives its report."""
+    with line_bench(tmp_path, launch={"frozen_s": {"time": 0.2}}) as (bench, _):
+        bench.start_time()
+        line = bench.hardware["line"]
+        bench.until(lambda: line["time"].number > 0)
+        bench.hardware["line"].write("valve", 7.0)
+        bench.manager.insert_fault("pi22/line", "freeze", None)
+        counts = bench.manager.page_of("pi22/line").counts
+        bench.until(lambda: counts.read().get("frozen:time") == 1)
+        bench.manager.insert_fault("pi22/line", "clear", None)
+        frozen = line["time"]
+        bench.until(lambda: line["time"].value != frozen.value)
+        os.kill(bench.pid_of(), signal.SIGKILL)
+        bench.until(lambda: bench.statuses("line")[-2:] == ["lost", "ok"])
+        os.kill(bench.pid_of(), signal.SIGSTOP)
+        result = bench.close()["pi22/line"]
+
+    report = result["report"]
+    assert report["frozen"] == {"time": 1}
+    assert report["valve_limited"] == 1
+    assert report["samples"] == result["samples"] > 0
+    assert report["unreported"] == 1  # its records have no end
+
+
+def test_the_owners_end_makes_outputs_safe_while_the_device_goes_on(tmp_path):
+    with line_bench(tmp_path) as (bench, terminal):
+        bench.start_time()
+        line = bench.hardware["line"]
+        bench.until(lambda: line.status == "ok")
+        owner = os.fork()
+        if owner == 0:
+            time.sleep(60)
+            os._exit(0)
+        bench.manager.agents_started(("agent-01",), owner)
+        line.write("valve", 1.0)
+        bench.until(lambda: "VALVE 1" in terminal.heard())
+
+        os.kill(owner, signal.SIGKILL)
+        os.waitpid(owner, 0)
+        bench.manager.agents_ended(("agent-01",))
+        bench.until(lambda: "SAFE" in terminal.heard())
+        before = line["time"].number
+        bench.until(lambda: line["time"].number > before + 5)
+        assert bench.statuses("line") == ["ok"]
+
+
+def test_what_the_owner_last_said_is_not_carried_out_after_its_end(tmp_path):
+    with line_bench(tmp_path) as (bench, terminal):
+        bench.until(lambda: bench.hardware["line"].status == "ok")
+        bench.hardware["line"].write("valve", 1.0)
+        bench.until(lambda: "VALVE 1" in terminal.heard())
+        os.kill(bench.pid_of(), signal.SIGSTOP)
+        bench.hardware["line"].write("valve", 0.5)  # it waits in the socket
+        bench.manager.agents_ended(("agent-01",))
+        os.kill(bench.pid_of(), signal.SIGCONT)
+        bench.until(lambda: "SAFE" in terminal.heard())
+        bench.run(0.3)
+        result = bench.close()["pi22/line"]
+        heard = terminal.heard()
+
+    # Which of the two it hears first is the kernel's choice: nothing moves after it was made safe.
+    assert [word for word in heard if word.startswith("VALVE")][:1] == ["VALVE 1"]
+    assert heard[-1] == "SAFE"
+    assert heard.index("SAFE") > max(
+        place for place, word in enumerate(heard) if word.startswith("VALVE")
+    )
+    assert result["restarts"] == 0
+
+
+def test_a_healthy_process_is_not_given_up_when_its_owner_ends(tmp_path):
+    """The device is made safe before the guardian looks, and again moved by the owner that was started anew."""
+    with line_bench(tmp_path) as (bench, terminal):
+        line = bench.hardware["line"]
+        bench.until(lambda: line.status == "ok")
+        for _ in range(3):
+            line.write("valve", 1.0)
+            count = terminal.heard().count("VALVE 1")
+            bench.until(lambda count=count: terminal.heard().count("VALVE 1") >= count)
+            owner = os.fork()
+            if owner == 0:
+                os._exit(0)
+            bench.manager.agents_ended(("agent-01",))
+            bench.run(0.05)
+            bench.manager.agents_started(("agent-01",), owner)  # which has ended already
+            os.waitpid(owner, 0)
+            bench.run(0.6)
+        assert bench.close()["pi22/line"]["restarts"] == 0
+
+
+def test_a_disconnected_device_stays_so_for_longer_than_a_hang_and_through_a_new_process(tmp_path):
+    with line_bench(tmp_path, launch={"hang_s": 0.5}) as (bench, _):
+        line = bench.hardware["line"]
+        bench.until(lambda: line.status == "ok")
+        bench.manager.insert_fault("pi22/line", "disconnect", None)
+        bench.until(lambda: line.status == "lost")
+        bench.run(2.5)
+        pid = bench.pid_of()
+        os.kill(pid, signal.SIGKILL)
+        bench.until(lambda: bench.pid_of() not in (0, pid))
+        bench.run(0.5)
+        assert line.status == "lost"
+        bench.manager.insert_fault("pi22/line", "clear", None)
+        bench.until(lambda: line.status == "ok")
+        result = bench.close()["pi22/line"]
+
+    assert result["restarts"] == 1  # by the test's own kill

@@ -1,0 +1,78 @@
+"""What drivers read, before anybody sees it: shapes, numbers that are none, what becomes the newest sample."""
+
+import pytest
+
+from madns_runtime.errors import PluginError
+from madns_runtime.hardware import page
+from madns_runtime.hardware.contract import Channel, Sample
+from madns_runtime.hardware.intake import Intake
+from madns_runtime.hardware.page import DevicePage
+from madns_runtime.hardware.values import to_numbers
+
+NAN = float("nan")
+FIELD = Channel(name="field", unit="T", shape=(3,))
+LEVEL = Channel(name="level", unit="m")
+ITSELF: list = []
+ITSELF.append(ITSELF)
+
+
+class Kept:
+    """Records that are kept."""
+
+    def __init__(self):
+        self.samples = []
+
+    def sample(self, channel, number, taken_s, values, *, told_s):
+        self.samples.append((channel, number, tuple(values)))
+
+
+def make_intake():
+    kept, device_page = Kept(), DevicePage([FIELD, LEVEL])
+    channels = (FIELD, LEVEL)
+    return (
+        Intake(channels, device_page, kept, seed=[1], frozen_s={}, pass_on=lambda message: 0),
+        device_page,
+        kept,
+    )
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["abc", b"abc", {1.0, 2.0, 3.0}, {0: 1.0}, None, 1.0, ["a", 1, 2], (10**400, 0, 0), ITSELF],
+)
+def test_what_is_no_vector_is_refused_by_its_channel(value):
+    with pytest.raises(PluginError, match="field: expected 3 numbers, got "):
+        to_numbers(FIELD, value)
+
+
+def test_nested_rows_become_numbers_row_by_row():
+    matrix = Channel(name="matrix", shape=(2, 2))
+
+    assert to_numbers(matrix, [(1, 2), [3, 4]]) == (1.0, 2.0, 3.0, 4.0)
+
+
+def test_a_sample_that_holds_no_number_is_on_record_and_no_newest_sample():
+    intake, device_page, kept = make_intake()
+    intake.take(Sample(values={"field": (1.0, 2.0, 3.0)}, taken_s=1.0), 1.0)
+    intake.take(Sample(values={"field": (1.0, NAN, 3.0)}, taken_s=2.0), 2.0)
+
+    assert device_page.header[page.NEWEST_S] == 1.0
+    assert device_page.read("field").values == (1.0, 2.0, 3.0)
+    assert [str(values) for _, _, values in kept.samples] == ["(1.0, 2.0, 3.0)", "(1.0, nan, 3.0)"]
+    assert intake.summary()["field_not_finite"] == 1
+
+
+def test_an_input_that_is_no_number_keeps_no_other_from_being_told():
+    intake, device_page, _ = make_intake()
+    intake.take(Sample(values={"field": (NAN,) * 3, "level": 4.0}, taken_s=2.0), 2.0)
+
+    assert device_page.header[page.NEWEST_S] == 2.0
+    assert device_page.read("level").values == (4.0,)
+
+
+def test_a_sample_that_is_refused_is_not_counted_as_one():
+    intake, _, _ = make_intake()
+    with pytest.raises(PluginError, match="'depth', which is no input"):
+        intake.take(Sample(values={"depth": 1.0}, taken_s=1.0), 1.0)
+
+    assert intake.summary()["samples"] == 0

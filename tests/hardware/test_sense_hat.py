@@ -1,0 +1,180 @@
+"""`sense_hat`: through the emulator's own library where it is installed, and a stand-in for the HAT's."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from types import ModuleType, SimpleNamespace
+
+import pytest
+from harness.sense_emulator import emulator_held
+
+from madns_runtime.errors import MachineError
+from madns_runtime.hardware.contract import Sample
+from madns_runtime.hardware.kind_registry import prepare
+from madns_runtime.hardware.values import to_numbers
+from tests.hardware.driving import opened
+
+
+class Stick:
+    def __init__(self):
+        self.events = []
+        self.is_closed = False
+
+    def get_events(self):
+        found, self.events = self.events, []
+        return found
+
+    def close(self):
+        self.is_closed = True
+
+
+class SenseHat:
+    """As sense_hat's: accelerations in g, rates in rad/s, fields in uT."""
+
+    made: list[SenseHat] = []
+
+    def __init__(self):
+        self.stick = Stick()
+        self.asked = []
+        self.pixels = None
+        self.raw = {"x": 0.0, "y": 0.0, "z": 1.0}
+        SenseHat.made.append(self)
+
+    def set_rotation(self, degrees):
+        self.rotation = degrees
+
+    def set_imu_config(self, compass_enabled, gyro_enabled, accel_enabled):
+        self.imu = (compass_enabled, gyro_enabled, accel_enabled)
+
+    def get_gyroscope_raw(self):
+        return {"x": 0.1, "y": -0.2, "z": 0.3}
+
+    def get_accelerometer_raw(self):
+        return self.raw
+
+    def get_compass_raw(self):
+        return {"x": 20.0, "y": 0.0, "z": -40.0}
+
+    def get_temperature(self):
+        self.asked.append("temperature")
+        return 31.5
+
+    def get_pressure(self):
+        return 1013.25
+
+    def get_humidity(self):
+        return 45.0
+
+    def set_pixels(self, pixels):
+        assert len(pixels) == 64
+        assert all(len(pixel) == 3 and all(isinstance(n, int) for n in pixel) for pixel in pixels)
+        self.pixels = pixels
+
+    def clear(self):
+        self.pixels = [[0, 0, 0]] * 64
+
+
+@pytest.fixture
+def hats(monkeypatch):
+    module = ModuleType("sense_hat")
+    module.SenseHat = SenseHat
+    monkeypatch.setitem(sys.modules, "sense_hat", module)
+    SenseHat.made.clear()
+    return SenseHat.made
+
+
+def test_units_are_those_of_the_channels(hats):
+    with opened("sense_hat", rotation=90, magnetometer=True) as device:
+        values = device.read().values
+        assert hats[0].rotation == 90
+    assert values["accelerometer"] == pytest.approx([0.0, 0.0, 9.80665])
+    assert values["gyroscope"] == pytest.approx([0.1, -0.2, 0.3])
+    assert values["magnetometer"] == pytest.approx([20e-6, 0.0, -40e-6])
+    assert (values["temperature"], values["pressure"], values["humidity"]) == (31.5, 1013.25, 45.0)
+    channels = {c.name: c for c in prepare("sense_hat", {}, None).channels}
+    for name, value in values.items():
+        to_numbers(channels[name], value)
+    assert channels["gyroscope"].limits == pytest.approx((-math.radians(2000), math.radians(2000)))
+
+
+def test_what_is_not_asked_for_is_not_read(hats):
+    parameters = {"gyroscope": False, "magnetometer": False, "environment_period_s": 60.0}
+    with opened("sense_hat", **parameters) as device:
+        assert hats[0].imu == (False, False, True)
+        device.read()
+        assert sorted(device.read().values) == ["accelerometer"]
+        assert hats[0].asked == ["temperature"]
+        hats[0].raw = None
+        with pytest.raises(MachineError, match="gives nothing; is the user in the group i2c"):
+            device.read()
+
+
+def test_joystick_events_come_one_by_one(hats):
+    with opened("sense_hat") as device:
+        hats[0].stick.events = [
+            SimpleNamespace(direction="left", action="pressed"),
+            SimpleNamespace(direction="left", action="released"),
+        ]
+        assert device.read().values["joystick"] == (2, 1)
+        assert device.read().values["joystick"] == (2, 0)
+        assert "joystick" not in device.read().values
+    assert hats[0].stick.is_closed
+
+
+def test_a_picture_is_shown_and_switched_off(hats):
+    with opened("sense_hat") as device:
+        device.write({"matrix": tuple(float(n) for n in range(192))}, 0.0)
+        assert hats[0].pixels[0] == [0, 1, 2]
+        assert hats[0].pixels[63] == [189, 190, 191]
+        device.make_safe()
+        assert hats[0].pixels == [[0, 0, 0]] * 64
+
+
+def test_a_missing_library_or_hat_is_told_with_its_cure(hats, monkeypatch):
+    def broken():
+        raise OSError("Cannot detect RPi-Sense FB device")
+
+    sys.modules["sense_hat"].SenseHat = broken
+    with (
+        pytest.raises(MachineError, match="does not answer: Cannot detect.*is it plugged in"),
+        opened("sense_hat"),
+    ):
+        pass
+    monkeypatch.setitem(sys.modules, "sense_hat", None)
+    with (
+        pytest.raises(MachineError, match="sense_hat is not installed; sudo apt install sense-hat"),
+        opened("sense_hat"),
+    ):
+        pass
+    monkeypatch.setitem(sys.modules, "sense_emu", None)
+    with (
+        pytest.raises(MachineError, match="sense_emu is not installed; pip install sense-emu"),
+        opened("sense_hat", emulated=True),
+    ):
+        pass
+
+
+@pytest.fixture
+def emulator():
+    with emulator_held():
+        yield
+    name = f"/dev/shm/rpi-sense-emu-client-{os.getpid()}"
+    if os.path.exists(name):
+        os.unlink(name)
+
+
+def test_the_emulator_gives_samples_of_the_declared_shapes(emulator):
+    channels = {c.name: c for c in prepare("sense_hat", {}, None).channels}
+    with opened("sense_hat", emulated=True, joystick=False) as device:
+        assert device.identity == "emulator"
+        sample = device.read()
+        assert isinstance(sample, Sample)
+        assert {"accelerometer", "gyroscope", "magnetometer", "temperature"} <= set(sample.values)
+        for name, value in sample.values.items():
+            assert all(map(math.isfinite, to_numbers(channels[name], value)))
+        device.write({"matrix": (255.0, 0.0, 0.0) * 64}, 0.0)
+        assert device._hat.get_pixel(3, 3)[0] > 200
+        device.make_safe()
+        assert device._hat.get_pixel(3, 3) == [0, 0, 0]

@@ -1,0 +1,82 @@
+"""The driver of `serial` on a real pseudo-terminal."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+import tty
+
+import pytest
+
+from madns_runtime.errors import MachineError
+from madns_runtime.hardware.drivers import serial as driver
+from madns_runtime.hardware.drivers.serial import SerialDevice
+from madns_runtime.hardware.kinds.serial import SerialParameters
+
+
+@pytest.fixture
+def line():
+    ours, theirs = os.openpty()
+    tty.setraw(theirs)
+    device = SerialDevice(SerialParameters(port=os.ttyname(theirs)))
+    device.open()
+    os.close(theirs)
+    yield device, ours
+    device.close()
+    with contextlib.suppress(OSError):  # a test may have pulled it out
+        os.close(ours)
+
+
+def received(device):
+    sample = device.read()
+    return None if sample is None else sample.values["received"]
+
+
+def wait_for(device):
+    deadline_s = time.monotonic() + 10
+    while (frame := received(device)) is None:
+        assert time.monotonic() < deadline_s
+    return frame
+
+
+def test_an_idle_line_is_not_gone(line):
+    device, ours = line
+    assert [received(device) for _ in range(5)] == [None] * 5
+
+    os.write(ours, b"one\ntwo\n")
+
+    assert wait_for(device) == b"one"
+    assert received(device) == b"two"
+    assert [received(device) for _ in range(5)] == [None] * 5
+
+
+def test_a_wake_costs_one_look_at_the_line(line, monkeypatch):
+    device, ours = line
+    looks = []
+    read = os.read
+    monkeypatch.setattr(driver.os, "read", lambda fd, size: looks.append(fd) or read(fd, size))
+    os.write(ours, b"one\n")
+    assert wait_for(device) == b"one"
+    looks.clear()
+
+    assert received(device) is None  # the loop asks until nothing is left
+
+    assert looks == []
+
+
+def test_half_a_frame_is_kept_until_its_end_comes(line):
+    device, ours = line
+    os.write(ours, b"hal")
+    time.sleep(0.01)
+    assert received(device) is None
+    os.write(ours, b"ves\n")
+    assert wait_for(device) == b"halves"
+
+
+def test_a_line_that_is_pulled_out_is_gone(line):
+    device, ours = line
+    os.close(ours)
+    with pytest.raises(MachineError, match="/dev/pts/.* is gone"):
+        for _ in range(3):
+            device.read()

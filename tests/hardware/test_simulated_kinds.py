@@ -1,0 +1,145 @@
+"""`synthetic`, `playback` and `null`: the same values each time, by simulated time alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from madns_runtime.config import Agents, RunConfig
+from madns_runtime.errors import PluginError
+from madns_runtime.hardware.contract import Sample
+from madns_runtime.hardware.kind_registry import prepare
+from madns_runtime.hardware.records import DeviceRecords, schema_of
+from madns_runtime.recording.reader import read_stream
+from madns_runtime.recording.record_files import RecordFiles
+from madns_runtime.recording.recorder import Recorder
+from madns_runtime.recording.run_journal import RunJournal
+from tests.hardware.driving import opened
+
+CHANNELS = [
+    {"name": "gyro", "unit": "rad/s", "components": ["x", "y", "z"], "elements": [{"noise": 0.1}] * 3},
+    {"name": "level", "elements": [{"shape": "sine", "amplitude": 2.0, "offset": 1.0}]},
+]  # fmt: skip
+CONFIG = RunConfig(
+    run="0001-r", scenario="s", simulation="counter", base_directory="", agents=Agents(count=1)
+)
+
+
+def test_waveforms():
+    shapes = ("constant", "sine", "square", "triangle", "sawtooth", "ramp")
+    channels = [
+        {"name": s, "elements": [{"shape": s, "amplitude": 2.0, "offset": 1.0, "frequency_hz": 0.5}]}
+        for s in shapes
+    ]  # fmt: skip
+    with opened("synthetic", channels=channels) as device:
+        quarter = device.sample_at(0.5).values
+        three = device.sample_at(1.5).values
+    assert [quarter[s] for s in shapes] == pytest.approx([1.0, 3.0, 3.0, 1.0, 0.0, 2.0])
+    assert [three[s] for s in shapes] == pytest.approx([1.0, -1.0, -1.0, 1.0, 2.0, 4.0])
+
+
+def test_noise_is_the_seeds():
+    def values(seed: int) -> np.ndarray:
+        with opened("synthetic", channels=CHANNELS, seed=seed) as device:
+            return np.array([device.sample_at(i / 100).values["gyro"] for i in range(2000)])
+
+    first = values(1)
+    assert np.array_equal(first, values(1))
+    assert not np.array_equal(first, values(2))
+    assert first.std(axis=0) == pytest.approx([0.1] * 3, rel=0.1)
+
+
+def test_null_takes_anything_and_tells_the_time():
+    with opened("null", outputs=["valve"], low=-1.0, high=1.0) as device:
+        device.write({"valve": 1.0}, 0.0)
+        assert device.sample_at(2.5) == Sample(values={"time": 2.5}, taken_s=2.5)
+    program = prepare("null", {"outputs": ["valve"], "low": -1.0, "high": 1.0}, None)
+    assert [channel.limits for channel in program.channels] == [None, (-1.0, 1.0)]
+
+
+def record(folder, ages_s: Mapping[str, float]) -> list:
+    """Record what a synthetic device gives, as its process does, and return (channel, t, age in us, values)."""
+    program = prepare("synthetic", {"channels": CHANNELS, "seed": 3}, None)
+    config = CONFIG
+    recorder = Recorder(RecordFiles(folder, run="0001-r", source="pi22/imu"), config.recording)
+    journal = RunJournal(recorder, config.recording.verbosity, t_s=lambda: None)
+    records = DeviceRecords(journal, program.channels)
+    recorder.start()
+    records.set_time(1000.0, 0.0, 1.0)
+    device = program.make()
+    device.open()
+    told = []
+    for number in range(200):
+        t_s = number / 50
+        sample = device.sample_at(t_s)
+        for channel in program.channels:
+            value = sample.values[channel.name]
+            numbers = tuple(value) if channel.shape else (value,)
+            age_s = ages_s[channel.name] + number * 1e-6
+            records.sample(
+                channel.name, number + 1, 1000.0 + t_s, numbers, told_s=1000.0 + t_s + age_s
+            )
+            told.append((channel.name, round(t_s, 6), round(age_s * 1e6), numbers))
+    records.close(5.0)
+    return told
+
+
+def test_playback_gives_the_recorded_values_at_their_own_times_and_ages(tmp_path):
+    told = record(tmp_path, {"gyro": 0.0015, "level": 0.03})
+    with opened("playback", tmp_path, directory=".") as device:
+        found = []
+        while (next_s := device.next_s()) != math.inf:
+            assert device.sample_at(next_s - 1e-7) is None  # not before it was handed on
+            sample = device.sample_at(next_s)
+            [(name, value)] = sample.values.items()
+            numbers = tuple(value) if isinstance(value, list) else (value,)
+            age_us = round((next_s - sample.taken_s) * 1e6)
+            found.append((name, round(sample.taken_s, 6), age_us, numbers))
+    assert sorted(found) == sorted(told)
+    handed_on = [t_s + age_us * 1e-6 for _, t_s, age_us, _ in found]
+    assert handed_on == sorted(handed_on)
+
+
+def test_a_playback_recorded_anew_is_the_same_to_the_microsecond(tmp_path):
+    record(tmp_path, {"gyro": 0.0015, "level": 0.03})
+    program = prepare("playback", {"directory": "."}, tmp_path)
+    assert [(c.name, c.unit, c.shape, c.components) for c in program.channels] == [
+        ("gyro", "rad/s", (3,), ("x", "y", "z")),
+        ("level", "", (), ()),
+    ]
+    again = tmp_path / "again"
+    config = CONFIG
+    recorder = Recorder(RecordFiles(again, run="0002-r", source="pi22/imu"), config.recording)
+    records = DeviceRecords(
+        RunJournal(recorder, config.recording.verbosity, t_s=lambda: None), program.channels
+    )
+    recorder.start()
+    records.set_time(500.0, 0.0, 1.0)
+    device = program.make()
+    device.open()
+    numbers: dict[str, int] = {}
+    while (next_s := device.next_s()) != math.inf:
+        sample = device.sample_at(next_s)
+        [(name, value)] = sample.values.items()
+        numbers[name] = numbers.get(name, 0) + 1
+        values = value if isinstance(value, list) else (value,)
+        records.sample(name, numbers[name], 500.0 + sample.taken_s, values, told_s=500.0 + next_s)
+    records.close(5.0)
+    for name in ("gyro", "level"):
+        first = list(read_stream(tmp_path / f"{name}.jsonl").records())
+        second = list(read_stream(again / f"{name}.jsonl").records())
+        assert len(first) == 200
+        assert second == first
+    assert schema_of(program.channels[0]).name == "gyro"
+
+
+def test_a_playback_begins_where_it_is_told_and_refuses_an_empty_folder(tmp_path):
+    record(tmp_path, {"gyro": 0.0, "level": 0.0})
+    with opened("playback", tmp_path, directory=".", start_s=2.0) as device:
+        assert device.sample_at(10.0).taken_s == 0.0
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(PluginError, match="expected records of a device's inputs, found none"):
+        prepare("playback", {"directory": "empty"}, tmp_path)

@@ -1,0 +1,81 @@
+"""Statuses by age, and what they come to over a run."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from madns_runtime.hardware.status import StatusAccount, StatusLimits, back_off_s
+
+
+@pytest.mark.parametrize(
+    ("period_s", "stale_s", "lost_s"),
+    [(0.01, 0.1, 1.0), (0.05, 0.15, 1.0), (0.5, 1.5, 5.0)],
+)
+def test_limits_are_periods_but_never_shorter_than_their_least(period_s, stale_s, lost_s):
+    limits = StatusLimits.of(period_s, hang_s=15.0)
+
+    assert limits.stale_s == pytest.approx(stale_s)
+    assert limits.lost_s == pytest.approx(lost_s)
+
+
+def test_a_slow_device_hangs_only_after_ten_periods():
+    assert StatusLimits.of(0.1, hang_s=15.0).hang_s == 15.0
+    assert StatusLimits.of(10.0, hang_s=15.0).hang_s == 100.0
+
+
+@pytest.mark.parametrize(
+    ("age_s", "silent_s", "waited_s", "is_open", "status"),
+    [
+        (math.inf, math.inf, 0.5, True, "never"),
+        (math.inf, math.inf, 1.5, True, "lost"),
+        (0.05, 0.05, 9.0, True, "ok"),
+        (0.1001, 0.1001, 9.0, True, "stale"),
+        (0.999, 0.999, 9.0, True, "stale"),
+        (1.001, 1.001, 9.0, True, "lost"),
+        (0.0, 0.0, 9.0, False, "lost"),
+        (1.001, 0.5, 9.0, True, "stale"),  # a slow read: samples arrive, and are old already
+    ],
+)
+def test_status_by_age(age_s, silent_s, waited_s, is_open, status):
+    limits = StatusLimits.of(0.01, hang_s=15.0)
+
+    assert limits.status(age_s, silent_s=silent_s, waited_s=waited_s, is_open=is_open) == status
+
+
+def test_back_off_grows_from_a_tenth_to_a_second():
+    assert [back_off_s(number) for number in (0, 1, 2, 3, 4, 5, 100)] == [
+        0.1,
+        0.1,
+        0.2,
+        0.4,
+        0.8,
+        1.0,
+        1.0,
+    ]
+
+
+def test_account_counts_losses_and_the_share_of_bad_time_from_simulated_time_zero_on():
+    account = StatusAccount()
+    account.observe("lost", 90.0)  # long before: nobody is judged by it
+    account.observe("ok", 95.0)
+    account.begin(100.0)
+
+    account.observe("ok", 106.0)
+    assert account.observe("stale", 108.0) == "ok"
+    account.observe("stale", 109.0)
+    assert account.observe("lost", 109.5) == "stale"
+    account.observe("ok", 110.0)
+
+    assert account.times_lost == 1
+    assert account.stale_ratio() == pytest.approx(0.2)
+
+
+def test_a_device_that_is_lost_when_the_run_begins_is_a_loss():
+    account = StatusAccount()
+    account.observe("lost", 90.0)
+    account.begin(100.0)
+
+    assert account.times_lost == 1
+    assert account.stale_ratio() is None

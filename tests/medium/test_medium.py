@@ -1,0 +1,287 @@
+"""Messages between agents, piece by piece: mailbox, carrier, and the medium made of four answers."""
+
+import math
+
+import numpy as np
+import pytest
+
+from madns_runtime.errors import MessageTooLarge, PluginError
+from madns_runtime.medium.carrier import LEAD_S, Carrier
+from madns_runtime.medium.links import LinkMedium
+from madns_runtime.medium.mailbox import HELD_MAX, NUMBERS_PER_LIFE, Mailbox
+from madns_runtime.medium.outcomes import EVERYBODY, LinkOutcome, between_agents
+from madns_runtime.protocol.codec import pack
+from madns_runtime.protocol.link_settings import SendQueueFull
+from madns_runtime.protocol.messages import (
+    Delivery,
+    Service,
+    Transmission,
+    TransmissionRefusal,
+)
+
+NAMES = ("car-1", "car-2", "car-3")
+PAYLOAD = {"x_m": 1.0}
+BYTES = len(pack(PAYLOAD))
+
+
+# The sender's and the receiver's side.
+
+
+def mailbox(**rest):
+    sent = []
+    box = Mailbox("car-1", NAMES, post=sent.append, **{"has_medium": True, **rest})
+    return box, sent
+
+
+def delivery(arrives_s, sender="car-2", sent_s=0.0, payload=None):
+    return Delivery(sender, sent_s, arrives_s, payload)
+
+
+def test_messages_bear_the_time_of_the_tick_and_a_number_each():
+    box, sent = mailbox()
+    box.due(0.5)
+
+    numbers = [
+        box.send("car-2", "a"),
+        box.send(EVERYBODY, "b"),
+        box.transmit("kiosk", "c", number=9),
+    ]
+    numbers.append(box.send("car-3", "d"))
+
+    assert numbers == [0, 1, 9, 10]
+    assert sent == [
+        Transmission("car-2", 0, 0.5, "a"),
+        Transmission("*", 1, 0.5, "b"),
+        Transmission("kiosk", 9, 0.5, "c"),
+        Transmission("car-3", 10, 0.5, "d"),
+    ]
+
+
+def test_a_process_started_anew_gives_no_number_twice():
+    box, sent = mailbox(life=2)
+    box.due(0.5)
+
+    assert box.send("car-2", "a") == NUMBERS_PER_LIFE
+
+
+@pytest.mark.parametrize("to", ["car-9", "car-1", "", 3, ["car-2"]])
+def test_an_agent_that_does_not_exist_is_the_senders_fault(to):
+    box, sent = mailbox()
+    box.due(0.0)
+
+    with pytest.raises(PluginError, match="expected a receiver"):
+        box.send(to, PAYLOAD)
+    assert sent == []
+
+
+def test_what_cannot_be_sent_to_agents_is_told():
+    box, sent = mailbox()
+    with pytest.raises(PluginError, match=r"no time before the first tick.* in step\(\)"):
+        box.send("car-2", PAYLOAD)
+    box.due(0.0)
+    with pytest.raises(PluginError, match="RELIABLE and no deadline"):
+        box.send("car-2", PAYLOAD, Service.BEST)
+    with pytest.raises(PluginError, match="RELIABLE and no deadline"):
+        box.send("car-2", PAYLOAD, Service.RELIABLE, 3.0)
+    with pytest.raises(PluginError, match='declares no medium.* medium=":function"'):
+        mailbox(has_medium=False)[0].send("car-2", PAYLOAD)
+    assert sent == []
+
+
+def test_a_message_is_held_until_the_first_tick_at_or_after_its_arrival():
+    box, _ = mailbox()
+    box.due(0.0)
+    for one in (delivery(0.31), delivery(0.2, "car-3"), delivery(0.2, "car-2")):
+        box.add(one)
+
+    heard = {t_s: [one.sender for one in box.due(t_s)] for t_s in (0.1, 0.2, 0.3, 0.4)}
+
+    assert heard == {0.1: [], 0.2: ["car-2", "car-3"], 0.3: [], 0.4: ["car-2"]}
+    assert box.counts() == {"received": 3, "held": 0, "late": 0, "no_room": 0}
+
+
+def test_a_late_message_is_received_in_the_next_tick_and_counted():
+    box, _ = mailbox()
+    box.due(1.0)
+    box.add(delivery(0.95))
+
+    assert len(box.due(1.1)) == 1
+    assert box.counts() == {"received": 1, "held": 0, "late": 1, "no_room": 0}
+
+
+def test_what_finds_no_room_is_counted():
+    box, _ = mailbox()
+    for _ in range(HELD_MAX + 3):
+        box.add(delivery(9.0))
+
+    assert box.counts() == {"received": 0, "held": HELD_MAX, "late": 0, "no_room": 3}
+
+
+# The host's side.
+
+
+class Desk:
+    """A carrier, its clock, and what it posted; *broken* raises for a receiver, or says that it is not there."""
+
+    def __init__(self, broken=None):
+        self.now_s, self.posted, self.broken = 0.0, [], broken or {}
+        self.carrier = Carrier(NAMES, self._post, lambda: self.now_s)
+
+    def _post(self, to, message):
+        error = self.broken.get(to)
+        if isinstance(error, Exception):
+            raise error
+        self.posted.append((to, message))
+        return error is None
+
+    def enter(self, *outcomes, sender="car-1", number=0):
+        transmission = Transmission("*", number, 0.0, PAYLOAD)
+        self.carrier.enter(sender, transmission, outcomes)
+        return self
+
+    def at(self, t_s):
+        self.now_s = t_s
+        self.carrier.hand_over()
+        return self
+
+
+def delivered(to, arrives_s):
+    return LinkOutcome(to=to, outcome="delivered", arrives_s=arrives_s, size_bytes=BYTES)
+
+
+def adds_up(account):
+    return account["sent"] == sum(
+        account[fate] for fate in ("delivered", "lost", "refused", "in_flight", "undelivered")
+    )
+
+
+def test_messages_are_handed_over_ahead_of_their_time_in_the_order_of_arrival():
+    desk = Desk().enter(delivered("car-2", 5.0), delivered("car-3", 3.0))
+
+    assert desk.carrier.next_s() == 3.0 - LEAD_S
+    assert desk.at(1.9).posted == []
+    assert [to for to, _ in desk.at(2.0).posted] == ["car-3"]
+    account = desk.carrier.to_mapping()
+    assert (account["delivered"], account["in_flight"]) == (1, 1)
+    assert [to for to, _ in desk.at(9.0).posted] == ["car-3", "car-2"]
+    assert desk.posted[0][1] == Delivery("car-1", 0.0, 3.0, PAYLOAD)
+    assert desk.carrier.next_s() is None
+
+
+def test_the_sender_is_told_of_a_refusal_and_of_no_loss():
+    desk = Desk().enter(LinkOutcome(to="car-2", outcome="lost"))
+    desk.enter(LinkOutcome(to="car-3", outcome="out_of_range"), number=7)
+
+    assert desk.posted == [("car-1", TransmissionRefusal(7, "*", 0.0, "out_of_range"))]
+    assert desk.carrier.to_mapping()["refused_because"] == {"out_of_range": 1}
+
+
+def test_every_message_is_accounted_whatever_becomes_of_it():
+    desk = Desk(broken={"car-3": SendQueueFull("full"), "car-2": False})
+    desk.enter(delivered("car-2", 1.0), delivered("car-3", 1.0), delivered("car-1", 1.0))
+    desk.enter(delivered("car-1", 99.0), LinkOutcome(to="car-2", outcome="lost"))
+    desk.enter(LinkOutcome(to="*", outcome="too_fast"), sender="kiosk")
+    desk.enter(delivered("kiosk", 2.0)).at(1.5)
+    desk.broken["car-1"] = MessageTooLarge("long")
+    desk.enter(LinkOutcome(to="*", outcome="too_fast"))
+
+    account = desk.carrier.to_mapping()
+    assert account == {
+        "transmissions": 5,
+        "sent": 8,
+        "delivered": 2,  # to car-1, and to the kiosk, which is no agent
+        "lost": 1,
+        "refused": 2,
+        "refused_because": {"too_fast": 2},
+        "in_flight": 1,
+        "undelivered": 2,
+        "known_late": 0,
+    }
+    assert adds_up(account)
+
+
+def test_what_the_host_knows_only_after_its_arrival_is_counted():
+    desk = Desk().at(2.0).enter(delivered("car-2", 1.0), delivered("car-3", 2.5))
+
+    assert desk.carrier.to_mapping()["known_late"] == 1
+
+
+def test_a_runs_account_has_both_sides_and_is_empty_without_messages():
+    counts = [{"received": 2, "late": 1}, {"received": 3}]
+
+    assert between_agents({}, counts) == {}
+    assert between_agents({"sent": 5}, counts)["receivers"] == {"received": 5, "late": 1}
+    assert Desk().carrier.to_mapping() == {}
+
+
+# The medium of four answers.
+
+
+def medium(**rest):
+    answers = {"delay_s": 0.005, **rest}
+    return LinkMedium(NAMES, np.random.default_rng(answers.pop("seed", 1)), **answers)
+
+
+def carried(air, to="car-2", sender="car-1", number=0, sent_s=0.0):
+    return air.carry(sender, Transmission(to, number, sent_s, PAYLOAD))
+
+
+def test_a_message_takes_its_turn_its_length_and_its_delay():
+    air = medium(rate_byte_s=BYTES, delay_s=lambda sender, receiver, t_s: 0.25 + t_s)
+
+    arrivals = [carried(air, number=number)[0].arrives_s for number in range(3)]
+
+    assert arrivals == [1.25, 3.25, 5.25]
+
+
+def test_a_full_transmitter_refuses():
+    air = medium(rate_byte_s=BYTES, queue_max=1)
+
+    outcomes = [carried(air, number=number)[0].outcome for number in range(3)]
+
+    assert outcomes == ["delivered", "delivered", "queue_full"]
+
+
+def test_reach_says_who_receives_and_why_not():
+    def reach(sender, receiver, t_s):
+        return "out_of_range" if receiver == "car-3" else None
+
+    air = medium(reach=reach)
+
+    (refused,) = carried(air, "car-3")
+    (heard,) = carried(air, EVERYBODY, number=1)
+    (nobody,) = carried(medium(reach=lambda *way: "wall"), EVERYBODY)
+
+    assert (refused.to, refused.outcome) == ("car-3", "out_of_range")
+    assert (heard.to, heard.outcome) == ("car-2", "delivered")
+    assert (nobody.to, nobody.outcome) == ("*", "nobody_in_reach")
+
+
+@pytest.mark.parametrize("to", ["car-1", "car-9", "kiosk"])
+def test_oneself_and_the_unknown_are_refused(to):
+    assert carried(medium(), to)[0].outcome == "unknown_receiver"
+
+
+def test_messages_out_of_order_are_refused():
+    air = medium()
+    carried(air, sent_s=2.0, number=7)
+
+    assert carried(air, sent_s=1.0, number=8)[0].outcome == "out_of_order"
+
+
+def test_losses_are_the_share_wanted_and_hang_on_the_seed_alone():
+    def lost(seed, order):
+        air, found = medium(seed=seed, loss=0.3), set()
+        for number in range(1000):
+            for sender in order:
+                (outcome,) = carried(air, "car-3", sender, number=number)
+                if outcome.outcome == "lost":
+                    found.add((sender, number))
+        return found
+
+    first = lost(1, ("car-1", "car-2"))
+
+    # Five standard deviations of a binomial: 5 sqrt(0.21 x 2000) = 102.
+    assert abs(len(first) - 600) < 5 * math.sqrt(0.21 * 2000)
+    assert lost(1, ("car-2", "car-1")) == first
+    assert lost(2, ("car-1", "car-2")) != first

@@ -1,0 +1,71 @@
+"""The distribution that `cosmos init --template package` writes is built, installed, and passes its own test."""
+
+import os
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from cosmos_cli import app
+
+pytestmark = [pytest.mark.process, pytest.mark.timeout(600)]
+
+
+def run(*command, cwd, path):
+    search = os.pathsep.join([str(path), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, *map(str, command)],
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": search, "COSMOS_STATE_DIR": str(cwd / "state")},
+        capture_output=True,
+        text=True,
+        timeout=500,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """A folder with the distribution's sources, and one that it is installed into as a wheel."""
+    folder = tmp_path_factory.mktemp("package")
+    assert app.run(["init", "my-rovers", "--template", "package", "-d", str(folder), "-q"]) == 0
+    wheels = folder / "wheels"
+    source, target = folder / "my-rovers", folder / "site"
+    run("-m", "build", "--wheel", "--outdir", wheels, source, cwd=folder, path=target)
+    (wheel,) = wheels.glob("*.whl")
+    install = ("-m", "pip", "install", "--no-deps", "--no-index", "--quiet", "--target", target)
+    run(*install, wheel, cwd=folder, path=target)
+    shutil.rmtree(source / "my_rovers")  # what is tried is what the wheel holds
+    return source, target
+
+
+def test_its_test_runs_it_in_lockstep_and_finds_nothing_undeclared(installed):
+    source, target = installed
+
+    told = run("-m", "pytest", "-q", "-p", "no:cacheprovider", cwd=source, path=target)
+
+    assert "2 passed" in told
+
+
+def test_test_of_the_package_fails_on_what_is_not_declared(installed):
+    source, target = installed
+    streams = target / "my_rovers" / "streams.py"
+    text = streams.read_text()
+    streams.write_text(
+        text.replace('        DeclaredStream(role="agent", name="drive", fields=DRIVE),', "")
+    )
+    try:
+        with pytest.raises(AssertionError, match="stream drive is not declared"):
+            run("-m", "pytest", "-q", "-k", "declared", cwd=source, path=target)
+    finally:
+        streams.write_text(text)
+
+
+def test_plan_knows_its_demand(installed):
+    source, target = installed
+
+    told = run("-m", "cosmos_cli.app", "plan", "my-rovers.yaml", cwd=source, path=target)
+
+    assert "3 agents keep real time" in told

@@ -1,0 +1,99 @@
+"""How what a plug-in raised is told: which call, what, and the line that its author can mend."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from madns_runtime.config import Agents
+from madns_runtime.plugin.context import describe_exception
+from madns_runtime.plugin.executor import JobFailed, run_job
+
+PLUGIN = """\
+import json
+
+
+def step(text):
+    return parse(text)
+
+
+def parse(text):
+    return json.loads(text)
+
+
+def check(value):
+    if value < 0:
+        raise ValueError
+
+
+def leave():
+    raise SystemExit(3)
+"""
+
+
+@pytest.fixture
+def plugin(tmp_path: Path) -> dict[str, Any]:
+    path = tmp_path / "rover.py"
+    path.write_text(PLUGIN)
+    names: dict[str, Any] = {}
+    exec(compile(PLUGIN, path, "exec"), names)
+    return names
+
+
+def told(method: Any, *arguments: Any) -> str:
+    try:
+        method(*arguments)
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - as the callers do
+        return describe_exception(error, "Rover.step")
+    raise AssertionError("raised nothing")
+
+
+def test_place_is_the_plugins_own_line_not_the_librarys(plugin):
+    with pytest.raises(json.JSONDecodeError) as raised:
+        json.loads("{")
+
+    expected = f"Rover.step raised JSONDecodeError: {raised.value} (rover.py:9)"
+    assert told(plugin["step"], "{") == expected
+
+
+def test_exception_without_a_text_is_told_by_its_kind(plugin):
+    assert told(plugin["check"], -1) == "Rover.step raised ValueError (rover.py:14)"
+
+
+def test_library_in_an_environment_beside_the_plugin_is_not_the_plugin(tmp_path, plugin):
+    folder = tmp_path / ".venv/lib/site-packages"
+    folder.mkdir(parents=True)
+    library: dict[str, Any] = {}
+    exec(compile("def fail():\n    raise KeyError('x')\n", folder / "lib.py", "exec"), library)
+    source = "\n\ndef step():\n    fail()\n"
+    names: dict[str, Any] = {"fail": library["fail"]}
+    exec(compile(source, tmp_path / "rover.py", "exec"), names)
+
+    assert told(names["step"]) == "Rover.step raised KeyError: 'x' (rover.py:4)"
+
+
+def test_failed_job_is_told_where_it_was_raised(plugin):
+    with pytest.raises(JobFailed) as raised:
+        run_job(plugin["step"], "{")
+
+    assert str(raised.value).startswith("step raised JSONDecodeError: ")
+    assert str(raised.value).endswith(" (rover.py:9)")
+
+
+def test_job_that_leaves_has_failed(plugin):
+    with pytest.raises(JobFailed, match=r"leave raised SystemExit: 3 \(rover.py:18\)"):
+        run_job(plugin["leave"])
+
+
+def test_job_that_succeeds_returns_its_value():
+    assert run_job(max, 1, 2) == 2
+
+
+def test_thousands_of_agents_share_one_list_of_all_names():
+    first, second = (Agents(count=5000, tick_hz=hz).resolved_names() for hz in (1.0, 2.0))
+
+    assert first is second
+    assert (first[0], first[-1]) == ("agent-0001", "agent-5000")

@@ -1,0 +1,339 @@
+"""Executors: the same truth from a process pool and from Dask, and an end to every wait for a cluster."""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
+from datetime import UTC, datetime
+
+import numpy as np
+import psutil
+import pytest
+from harness.late_module import LateModule, needs_library
+from harness.waiting import wait_until
+
+from madns_runtime.config import ExecutorSettings
+from madns_runtime.errors import ConfigurationError, MachineError, MissingExtraError
+from madns_runtime.plugin.executor import JobFailed, JobRunner, make_executor, run_job
+from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.simulations.constellation.orbit.constants import EGM_96
+from madns_runtime.simulations.constellation.parameters import ScipyPropagator
+from madns_runtime.simulations.constellation.truth.propagation import (
+    PropagationParameters,
+    StretchRequest,
+    merge,
+    propagate_part,
+    split,
+)
+
+distributed = LateModule("distributed")
+dask_executor = LateModule("madns_runtime.plugin.dask_executor")
+
+pytestmark = [pytest.mark.process, needs_library("distributed", "dask")]
+PATIENCE_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Someone else's cluster: a scheduler and two workers on this machine."""
+    with distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        dashboard_address="127.0.0.1:0",
+        host="127.0.0.1",
+    ) as cluster:
+        yield cluster
+
+
+def connected(cluster):
+    return make_executor(ExecutorSettings(kind="dask", address=cluster.scheduler_address))
+
+
+def request_of(count):
+    angles = np.linspace(0.0, 6.0, count)
+    radius_m = 7e6 + 1e5 * np.cos(3.0 * angles)
+    speed = np.sqrt(EGM_96.mu_m3_s2 / radius_m)
+    zero = np.zeros(count)
+    states = np.stack(
+        (
+            radius_m * np.cos(angles),
+            radius_m * np.sin(angles),
+            zero,
+            -0.5 * speed * np.sin(angles),
+            0.5 * speed * np.cos(angles),
+            math.sqrt(0.75) * speed,
+        ),
+        axis=1,
+    )
+    given = PropagationParameters(
+        settings=ScipyPropagator(kind="scipy"),
+        gravity=EGM_96,
+        epoch_utc=datetime(2026, 1, 1, tzinfo=UTC),
+    )
+    return StretchRequest(first_knot=0, knots=6, knot_s=1.0, states=states), given
+
+
+def through_the_loop(executor, parts):
+    """Return the values of jobs as the host gets them: by callbacks of its loop, in order of submission."""
+    reactor, found = Reactor(), {}
+
+    def done(job, future):
+        found[job] = future.result()
+        if len(found) == len(parts):
+            reactor.stop()
+
+    runner = JobRunner(reactor, executor, done)
+    for part in parts:
+        runner.submit(propagate_part, *part)
+    reactor.call_at(reactor.now_s() + PATIENCE_S, reactor.stop)
+    reactor.run()
+    runner.close()
+    return [found[job] for job in sorted(found)]
+
+
+def test_truth_is_the_same_whoever_computes_it(cluster):
+    request, given = request_of(1200)
+    expected = propagate_part(request, given)
+    for executor in (
+        connected(cluster),
+        make_executor(ExecutorSettings(kind="process", workers=2)),
+        make_executor(ExecutorSettings(kind="thread", workers=1)),
+    ):
+        parts = split(request, given, 2)
+        truth = merge(through_the_loop(executor, parts))
+
+        assert len(parts) == 2
+        assert np.array_equal(truth.states, expected.states)
+        assert np.array_equal(truth.invariants, expected.invariants)
+
+
+def left_since(before):
+    """Return the processes that were begun and live; multiprocessing's tracker of resources ends with this one."""
+    found = []
+    for child in set(psutil.Process().children(recursive=True)) - before:
+        try:
+            command = " ".join(child.cmdline())
+        except psutil.NoSuchProcess:  # it ends at this moment
+            continue
+        if "resource_tracker" not in command:
+            found.append(command)
+    return found
+
+
+def test_a_cluster_of_our_own_starts_works_and_leaves_nothing_behind():
+    before = set(psutil.Process().children(recursive=True))
+    executor = make_executor(ExecutorSettings(kind="dask", workers=1))
+    request, given = request_of(501)
+    workers = executor.submit(len, executor.client.nthreads()).result(PATIENCE_S)
+    stretches = through_the_loop(executor, split(request, given, 2))
+
+    assert workers == 1
+    assert np.array_equal(merge(stretches).states, propagate_part(request, given).states)
+    wait_until(
+        lambda: left_since(before) == [], lambda: f"no end of {left_since(before)}", patience_s=30.0
+    )
+
+
+def test_a_job_that_raises_says_what_and_where(cluster):
+    executor = connected(cluster)
+    with pytest.raises(JobFailed, match="fmod raised ValueError"):
+        executor.submit(run_job, math.fmod, 1.0, 0.0).result(PATIENCE_S)
+    executor.shutdown(wait=False, cancel_futures=True)
+
+
+def test_what_cannot_travel_fails_its_job_instead_of_never_coming_back(cluster):
+    executor = connected(cluster)
+    with pytest.raises(TypeError, match="cannot pickle"):
+        executor.submit(threading.Lock).result(PATIENCE_S)
+    with pytest.raises(TypeError, match="[Cc]ould not serialize|cannot pickle"):
+        executor.submit(id, threading.Lock()).result(PATIENCE_S)
+    executor.shutdown()
+
+
+def test_arguments_reach_the_job_as_they_are(cluster):
+    executor = connected(cluster)
+    argument = {"a": [1, (2, "x")], "b": ("sum", [1, 2]), "c": np.arange(3.0)}
+    found = executor.submit(dict, argument).result(PATIENCE_S)
+    executor.shutdown()
+
+    assert found.pop("c").tolist() == argument.pop("c").tolist()
+    assert found == argument
+
+
+def test_a_cluster_that_somebody_else_started_stays(cluster):
+    connected(cluster).shutdown(wait=False, cancel_futures=True)
+    executor = connected(cluster)
+
+    assert executor.submit(math.sqrt, 4.0).result(PATIENCE_S) == 2.0
+    executor.shutdown()
+    with pytest.raises(RuntimeError):
+        executor.submit(math.sqrt, 4.0)
+
+
+def test_an_address_without_a_scheduler_is_told_in_time(monkeypatch):
+    monkeypatch.setattr(dask_executor.load(), "CONNECT_S", 0.5)
+    settings = ExecutorSettings(kind="dask", address="tcp://127.0.0.1:9")
+    with pytest.raises(ConfigurationError, match=r"scheduler at tcp://127.0.0.1:9, none answered"):
+        make_executor(settings)
+
+    with pytest.raises(ConfigurationError, match="expected a Dask scheduler at nonsense://x"):
+        make_executor(ExecutorSettings(kind="dask", address="nonsense://x"))
+
+
+def test_a_scheduler_without_workers_is_told_in_time(monkeypatch):
+    # The scheduler is there, however long a busy machine takes to connect to it.
+    client = functools.partial(distributed.Client, set_as_default=False)
+    monkeypatch.setattr(dask_executor.load(), "_client", lambda where, _: client(where))
+    monkeypatch.setattr(dask_executor.load(), "CONNECT_S", 0.5)
+    with (
+        distributed.LocalCluster(
+            n_workers=0, dashboard_address="127.0.0.1:0", host="127.0.0.1"
+        ) as empty,
+        pytest.raises(ConfigurationError, match=r"expected 1 worker\(s\) .* dask worker"),
+    ):
+        connected(empty)
+
+
+def test_workers_with_another_version_are_refused(cluster, monkeypatch):
+    monkeypatch.setattr(dask_executor.madns_runtime, "__version__", "9.9")
+    with pytest.raises(ConfigurationError, match=r"expected cosmos-madns 9\.9 .*, got 0\."):
+        connected(cluster)
+
+
+CLUSTER = """\
+import sys
+from distributed import LocalCluster
+local = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "protocol": "tcp"}
+with LocalCluster(n_workers=1, processes=False, threads_per_worker=1, **local) as cluster:
+    print(cluster.scheduler_address, flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_jobs_of_a_lost_scheduler_fail_instead_of_never_coming_back():
+    with subprocess.Popen(
+        [sys.executable, "-c", CLUSTER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as cluster:
+        address = cluster.stdout.readline().strip()
+        executor = make_executor(ExecutorSettings(kind="dask", address=address))
+        # Until Dask gives a lost scheduler up; to connect takes a busy machine longer.
+        executor.client._timeout = 1.0
+        job = executor.submit(time.sleep, PATIENCE_S)
+        cluster.kill()
+
+        with pytest.raises((MachineError, OSError)):
+            job.result(PATIENCE_S)
+        for _ in range(2):  # while Dask looks for its scheduler, and after it has given up
+            with pytest.raises(MachineError, match=r"scheduler at tcp://127.* is gone"):
+                executor.submit(math.sqrt, 4.0).result(PATIENCE_S)
+        executor.shutdown(wait=False, cancel_futures=True)
+
+
+def test_jobs_from_a_file_beside_the_scenario_are_refused_before_they_travel(cluster):
+    def of_a_file():
+        pass
+
+    of_a_file.__module__ = "madns_plugin_rover_1"
+    executor = connected(cluster)
+    with pytest.raises(ConfigurationError, match=r"of_a_file from a file beside the scenario"):
+        executor.submit(run_job, of_a_file)
+    executor.shutdown()
+
+
+def test_workers_of_our_own_cluster_die_with_a_killed_host(tmp_path):
+    script = tmp_path / "host.py"
+    script.write_text(
+        "from madns_runtime.config import ExecutorSettings\n"
+        "from madns_runtime.plugin.executor import make_executor\n"
+        "import os, time\n"
+        "if __name__ == '__main__':\n"
+        "    executor = make_executor(ExecutorSettings(kind='dask', workers=1))\n"
+        "    print(executor.submit(os.getpid).result(), flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    with subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True) as host:
+        worker = psutil.Process(int(host.stdout.readline()))
+        host.send_signal(signal.SIGKILL)
+
+        worker.wait(PATIENCE_S)
+
+
+FACTORIES = """\
+from concurrent.futures import ThreadPoolExecutor
+def good(): return ThreadPoolExecutor(1)
+def bad():
+    raise ValueError("no cluster here")
+def none(): return None
+def needs(a): return a
+thing = 3
+"""
+
+
+@pytest.fixture
+def factories(tmp_path, monkeypatch):
+    (tmp_path / "factories.py").write_text(FACTORIES)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield
+    sys.modules.pop("factories", None)
+
+
+def test_an_executor_of_ones_own_is_used(factories):
+    executor = make_executor(ExecutorSettings(kind="factories:good"))
+
+    assert executor.submit(math.sqrt, 4.0).result(PATIENCE_S) == 2.0
+    executor.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [
+        ("factories:bad", r"factories.py:4: bad\(\): ValueError: no cluster here"),
+        ("factories:none", "factories:none returned NoneType, which is no"),
+        ("factories:needs", r"factories.py:6: needs\(\): TypeError: needs\(\) missing 1"),
+        ("factories:thing", "factories:thing: expected a function, got int"),
+        ("factories:god", "has no 'god', did you mean good?"),
+        ("nowhere:x", "nowhere:x: No module named 'nowhere'"),
+    ],
+)
+def test_what_is_wrong_with_an_executor_of_ones_own_is_named(factories, kind, expected):
+    with pytest.raises(ConfigurationError, match=f"executor.kind: .*{expected}"):
+        make_executor(ExecutorSettings(kind=kind))
+
+
+def test_a_job_for_workers_that_have_died_is_no_fault_of_who_submits_it():
+    executor = make_executor(ExecutorSettings(kind="process", workers=1))
+    runner = JobRunner(Reactor(), executor, lambda job, future: None)
+    with pytest.raises(BrokenExecutor):
+        executor.submit(os.kill, next(iter(executor._processes)), signal.SIGKILL).result(PATIENCE_S)
+
+    with pytest.raises(MachineError, match="a worker of the executor has died"):
+        runner.submit(math.sqrt, 4.0)
+
+
+class Stubborn(ThreadPoolExecutor):
+    """Somebody's executor that cannot be closed in the usual way."""
+
+    def shutdown(self, wait=True):  # no cancel_futures
+        super().shutdown(wait)
+
+
+def test_an_executor_that_cannot_be_closed_costs_no_result(capsys):
+    executor = Stubborn(1)
+    JobRunner(Reactor(), executor, lambda job, future: None).close()
+
+    assert "TypeError" in capsys.readouterr().err
+    executor.shutdown()
+
+
+def test_without_dask_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.delitem(sys.modules, "madns_runtime.plugin.dask_executor", raising=False)
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'cosmos-madns\[dask\]'"):
+        make_executor(ExecutorSettings(kind="dask"))

@@ -1,0 +1,325 @@
+"""A half as both time modes call it: what it may return, how its faults are told, when it is woken."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import enum
+import math
+from concurrent.futures import Future
+from typing import Any
+
+import pytest
+
+from madns_runtime.errors import MachineError, PluginError
+from madns_runtime.medium.carrier import Carrier
+from madns_runtime.medium.outcomes import LinkOutcome
+from madns_runtime.plugin import validation
+from madns_runtime.plugin.api import AgentSimulation, HostSimulation
+from madns_runtime.plugin.executor import JobFailed
+from madns_runtime.plugin.half import Half, HalfFailed, HostHalf, RoleProgram
+from madns_runtime.protocol.messages import Delivery, Transmission, TransmissionRefusal
+
+
+class Rover(AgentSimulation):
+    def setup(self, context: Any, initial: Any) -> None:
+        raise context
+
+    def finish(self) -> Any:
+        return {"x": {1, 2}}
+
+
+class Broken(AgentSimulation):
+    def __init__(self) -> None:
+        raise ValueError("no board")
+
+
+class Base(HostSimulation):
+    """Wants its timer as *wanted* says; wakes itself meanwhile as *own* says."""
+
+    wanted: float | None = None
+    own: float | None = None
+
+    def timer(self, t_s: float) -> float | None:
+        if self.own is not None:
+            self.half.wake(self.own)
+        return self.wanted
+
+    def result(self, job: int, value: Any) -> None:
+        self.got = (job, value)
+
+
+@pytest.fixture
+def logged() -> list[str]:
+    return []
+
+
+def made(kind: type, logged: list[str], half: type = Half, medium: Any = None) -> Any:
+    def log(level: str, text: str) -> None:
+        logged.append(text)
+
+    if half is Half:
+        return Half(kind, log)
+    program = RoleProgram(make=kind, parameters=None, medium=medium)
+    carrier = Carrier(("a", "b"), lambda to, message: True, lambda: 1.0)
+    return HostHalf(program, log, carrier=carrier)
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (ValueError("told to"), "Rover.setup raised ValueError: told to (test_half.py:"),
+        (KeyboardInterrupt(), "Rover.setup raised KeyboardInterrupt (test_half.py:"),
+        (asyncio.CancelledError(), "Rover.setup raised CancelledError (test_half.py:"),
+        (SystemExit(2), "Rover.setup raised SystemExit: 2 (test_half.py:"),
+    ],
+)
+def test_whatever_a_call_raises_is_told_with_its_line_and_logged(logged, error, told):
+    with pytest.raises(HalfFailed) as raised:
+        made(Rover, logged).call("setup", error, {})
+
+    assert str(raised.value).startswith(told)
+    assert len(logged) == 1
+    assert logged[0].startswith("Traceback")
+
+
+def test_a_full_disk_is_no_fault_of_the_plug_in(logged):
+    with pytest.raises(HalfFailed, match=r"^/x: No space left on device$"):
+        made(Rover, logged).call("setup", MachineError("/x: No space left on device"), {})
+
+    assert logged == []
+
+
+def test_what_a_call_returns_against_its_contract_is_refused(logged):
+    with pytest.raises(HalfFailed, match=r"^Rover\.finish returned a summary without a JSON form"):
+        made(Rover, logged).call("finish")
+
+
+def test_a_half_that_cannot_be_made_is_named(logged, capsys):
+    with pytest.raises(HalfFailed, match=r"^Broken\.__init__ raised ValueError: no board \(test_h"):
+        made(Broken, logged)
+
+    assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("wanted", "own", "next_s"),
+    [
+        (None, None, None),
+        (5.0, None, 5.0),
+        (None, 3.0, 3.0),
+        (5.0, 3.0, 3.0),
+        (2, 3.0, 2.0),
+        (5.0, 0.5, 0.5),
+    ],
+)
+def test_the_timer_is_due_at_the_earliest_time_that_was_asked_for(logged, wanted, own, next_s):
+    half = made(Base, logged, HostHalf)
+    half.simulation.half, half.simulation.wanted, half.simulation.own = half, wanted, own
+    half.wake(1.0)
+    half.call_timer(1.0)
+
+    assert half.next_s == next_s
+
+
+@pytest.mark.parametrize("wanted", [1.0, 0.5, -3])
+def test_a_timer_that_asks_for_no_later_time_is_refused(logged, wanted):
+    half = made(Base, logged, HostHalf)
+    half.simulation.wanted = wanted
+    half.wake(1.0)
+
+    with pytest.raises(
+        HalfFailed, match=r"^Base\.timer returned .*, called for t = 1 s: expected a l"
+    ):
+        half.call_timer(1.25)
+
+
+class Clocked(HostSimulation):
+    """Notes what its timer is given."""
+
+    def timer(self, t_s: float) -> float:
+        self.given = t_s
+        return t_s + 1.0
+
+
+def test_the_timer_is_given_the_time_it_asked_for_and_how_late_that_is(logged):
+    half = made(Clocked, logged, HostHalf)
+    half.begin_timer(-0.5)
+    half.call_timer(-0.25)
+
+    assert (half.simulation.given, half.lateness_s, half.next_s) == (-0.5, 0.25, 0.5)
+
+    half.call_timer(0.5)
+
+    assert (half.simulation.given, half.lateness_s) == (0.5, 0.0)
+
+
+def test_the_times_of_the_timer_never_go_back(logged):
+    half = made(Clocked, logged, HostHalf)
+    half.begin_timer(4.0)
+    half.call_timer(4.0)
+    half.wake(2.0)
+    half.call_timer(4.5)
+
+    assert (half.simulation.given, half.lateness_s) == (4.0, 0.5)
+
+
+def test_a_half_that_wakes_itself_for_ever_at_one_time_is_ended(logged, monkeypatch):
+    monkeypatch.setattr("madns_runtime.plugin.half.REPEATS_MAX", 5)
+    half = made(Base, logged, HostHalf)
+    half.simulation.half, half.simulation.own = half, 1.0
+    half.wake(1.0)
+
+    with pytest.raises(HalfFailed, match=r"^Base\.timer asked 5 times in a row for t = 1 s"):
+        for _ in range(7):
+            half.call_timer(1.0)
+
+
+def test_waking_before_the_start_is_kept_until_then(logged):
+    half = made(Base, logged, HostHalf)
+    half.wake(7.0)
+    half.wake(9.0)
+
+    assert half.next_s == 7.0
+
+
+@pytest.mark.parametrize("t_s", [float("nan"), float("inf"), "soon", None, True])
+def test_waking_at_no_time_is_refused(logged, t_s):
+    with pytest.raises(PluginError, match="expected a simulated time"):
+        made(Base, logged, HostHalf).wake(t_s)
+
+
+def future_of(value: Any = None, error: BaseException | None = None) -> Future[Any]:
+    future: Future[Any] = Future()
+    if error is None:
+        future.set_result(value)
+    else:
+        future.set_exception(error)
+    return future
+
+
+def test_the_value_of_a_job_is_handed_in(logged):
+    half = made(Base, logged, HostHalf)
+    half.take_job(4, future_of("truth"))
+
+    assert half.simulation.got == (4, "truth")
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (JobFailed("square raised ValueError (x.py:3)"), "Base: job 4: square raised ValueError"),
+        (OSError("pool"), "Base: job 4 raised OSError: pool"),
+    ],
+)
+def test_a_job_that_failed_is_told_and_logged(logged, error, told):
+    with pytest.raises(HalfFailed) as raised:
+        made(Base, logged, HostHalf).take_job(4, future_of(error=error))
+
+    assert str(raised.value).startswith(told)
+    assert len(logged) == 1
+
+
+@pytest.mark.parametrize(
+    "checks", [None, [{"name": "x", "limit": 1, "got": 0, "passed": True}]], ids=["none", "own"]
+)
+def test_numbers_of_a_summary_that_are_not_finite_break_a_check(checks):
+    own = {} if checks is None else {"checks": checks}
+    told = validation.summary({"a": math.nan, "b": [1.0, {"c": -math.inf}], "d": None, **own})
+
+    assert (told["a"], told["b"]) == (None, [1.0, {"c": None}])
+    assert told["checks"] == [
+        *(checks or []),
+        {"name": "summary.not_finite", "limit": 0, "got": 2, "passed": False},
+    ]
+
+
+@pytest.mark.parametrize(
+    "value",
+    [10**400, -(10**5000), math.nan, math.inf, True, "1"],
+    ids=lambda value: type(value).__name__,
+)
+def test_time_that_no_clock_reaches_is_refused(value):
+    with pytest.raises(PluginError, match="expected a simulated time in seconds"):
+        validation.next_time(value)
+
+
+@dataclasses.dataclass
+class Drift:
+    error_m: float
+
+
+@pytest.mark.parametrize(
+    "value", [Drift(math.nan), [Drift(math.inf)], enum.Enum("Level", {"NONE": math.nan}).NONE]
+)
+def test_numbers_that_are_not_finite_break_a_check_whatever_holds_them(value):
+    told = validation.summary({"a": value})
+
+    assert told["checks"] == [{"name": "summary.not_finite", "limit": 0, "got": 1, "passed": False}]
+
+
+def test_summary_of_finite_numbers_stays_as_it_is():
+    assert validation.summary({"a": 1.0, "b": None}) == {"a": 1.0, "b": None}
+
+
+class Air:
+    """A medium that answers what it was made with."""
+
+    def __init__(self, answer: Any) -> None:
+        self.answer = answer
+
+    def carry(self, sender: str, transmission: Transmission) -> Any:
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (ValueError("no air"), r"Base.medium.carry raised ValueError: no air \(test_half.py:"),
+        (None, "Base.medium.carry returned None: expected a list of one or more LinkOutcome"),
+        ([], "one or more LinkOutcome"),
+        (["delivered"], "one or more LinkOutcome"),
+        ([LinkOutcome(to="b", outcome="delivered")], "to arrive later than it was sent"),
+        ([LinkOutcome(to="b", outcome="delivered", arrives_s=1.0)], "at 1 s"),
+        ([LinkOutcome(to="b", outcome="lost", arrives_s=2.0)], "and no other to arrive"),
+        ([LinkOutcome(to="b", outcome="delivered", arrives_s=math.nan)], "with arrives_s nan"),
+    ],
+)
+def test_what_a_medium_may_not_answer_is_told(logged, answer, words):
+    half = made(Base, logged, HostHalf, lambda host, context: Air(answer))
+    half.set_up(None)
+
+    with pytest.raises(HalfFailed, match=words):
+        half.take("a", Transmission(to="b", number=0, sent_s=1.0, payload=None))
+
+
+@pytest.mark.parametrize("medium", [3, "air", object()])
+def test_what_is_no_medium_is_told(logged, medium):
+    half = made(Base, logged, HostHalf, lambda host, context: medium)
+
+    with pytest.raises(HalfFailed, match=r"Base.medium returned a \w+: expected a medium"):
+        half.set_up(None)
+
+
+def test_a_half_without_a_medium_refuses_messages_between_agents(logged):
+    half = made(Base, logged, HostHalf, lambda host, context: None)
+    half.set_up(None)
+
+    half.take("a", Transmission(to="b", number=0, sent_s=1.0, payload=None))
+
+    assert half.carrier.to_mapping()["refused_because"] == {"no_medium": 1}
+
+
+def test_an_agent_that_cannot_hear_says_who_sent_and_what_it_lacks(logged):
+    class Deaf:
+        """Looks like an agent's half, without inheriting."""
+
+    delivery = Delivery(sender="a", sent_s=0.0, arrives_s=0.1, payload=None)
+    for kind in (Rover, Deaf):
+        with pytest.raises(HalfFailed) as raised:
+            made(kind, logged).call("hear", delivery)
+        assert str(raised.value) == f"a sent a message, and {kind.__name__} has no hear(delivery)"
+        refusal = TransmissionRefusal(number=0, to="b", sent_s=0.0, reason="out_of_range")
+        assert made(kind, logged).call("refused", refusal) is None

@@ -1,0 +1,58 @@
+"""The result of a run in real time: what its links and its agents tell together."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from madns_runtime.protocol.counters import LinkCounters
+from madns_runtime.protocol.events import Phase
+from madns_runtime.protocol.host_peers import Peer
+from madns_runtime.realtime.host_result import HostReport
+
+
+def result_of(**records: Any) -> dict[str, Any]:
+    peer = Peer(name="agent-01", index=1, phase=Phase.STOPPED, records=records)
+    session: Any = SimpleNamespace(peers={"agent-01": peer}, refused={}, malformed_count=0)
+    return HostReport(10.0).result(session, network={})
+
+
+def test_what_an_agent_could_not_hold_during_its_set_up_is_lost():
+    messages = {name: {"sent": 0, "received": 0} for name in ("best", "reliable")}
+    messages["sync"] = {"sent": 0, "received": 0, "deadlines_broken": 0}
+    assert result_of(messages=messages, held_dropped=0)["messages"]["reliable"]["lost"] == 0
+
+    result = result_of(messages=messages, held_dropped=7)
+
+    assert result["messages"]["reliable"]["lost"] == 7
+    assert result["agents"]["agent-01"]["records"]["held_dropped"] == 7
+
+
+def test_without_the_agents_own_count_nobody_knows_what_was_lost():
+    assert result_of()["messages"]["reliable"]["lost"] is None
+
+
+@pytest.mark.parametrize("again", ["disk full", "another"])
+def test_trouble_with_records_is_told_once(again):
+    report = HostReport(10.0)
+
+    def told(of_agent, own=None):
+        peers = {"agent-01": SimpleNamespace(report={"problem": of_agent} if of_agent else {})}
+        return list(report.new_troubles(SimpleNamespace(peers=peers), own))
+
+    assert told(None) == []
+    assert told("disk full") == ["agent-01: records are being lost: disk full"]
+    assert told(again) == []
+    assert told(again, own="no space") == ["records are being lost: no space"]
+
+
+def test_deadlines_that_were_broken_before_an_agent_came_again_stay_counted():
+    earlier = LinkCounters(deadlines_broken=2).to_mapping()
+    peer = Peer(name="agent-01", index=1, phase=Phase.STOPPED, retired_counters=[earlier])
+    session: Any = SimpleNamespace(peers={"agent-01": peer}, refused={}, malformed_count=0)
+
+    result = HostReport(10.0).result(session, network={})
+
+    assert result["messages"]["sync"]["deadlines_broken"] == 2

@@ -1,0 +1,34 @@
+"""A plug-in whose commands and records are NaN: nothing of it is green."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+COSMOS = (sys.executable, "-m", "cosmos_cli.start")
+SPEED = "speed_m_s = GAIN_1_S * (self.mark_m - self.measured_m)"
+
+
+@pytest.mark.process
+def test_commands_and_records_of_nan_break_checks_that_name_the_agent(tmp_path):
+    def cosmos(*arguments):
+        return subprocess.run(
+            [*COSMOS, *arguments], cwd=tmp_path, capture_output=True, text=True, timeout=200
+        )
+
+    assert cosmos("init", "rover", "--template", "plugin", "--directory", ".").returncode == 0
+    plugin = tmp_path / "rover.py"
+    text = plugin.read_text()
+    assert SPEED in text
+    is_second = 'self.context.name == "agent-02"'
+    plugin.write_text(text.replace(SPEED, f'{SPEED} + (float("nan") if {is_second} else 0.0)'))
+
+    done = cosmos("run", "rover.yaml", "--set", "time.mode=lockstep", "-q", "--json")
+
+    assert done.returncode == 4, done.stderr
+    broken = {c["name"]: c for c in json.loads(done.stdout)["checks"] if not c["passed"]}
+    assert broken["records.not_finite"]["worst"] == "agent-02/drive"
+    assert broken["records.not_finite"]["got"] == broken["commands_refused"]["got"] > 0
+    assert broken["commands_refused"]["worst"] == "agent-02"
+    assert "agent-02.error_m" in broken
