@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import pytest
+from harness.ports import free_port
 from harness.waiting import wait_until
 
 from madns_runtime.protocol.datagram import OVERHEAD_BYTES, PREFIX, Role
@@ -17,12 +18,6 @@ pytestmark = pytest.mark.process
 
 EACH = 40
 """Datagrams of each kind: beyond the count that is worth a remark."""
-
-
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def forged(session, *, version=VERSION, role=Role.AGENT, agent=1, size=200):
@@ -70,7 +65,7 @@ def is_running(runs):
 
 
 def test_refused_datagrams_are_told_by_reason_of_host_and_agents(tmp_path):
-    runs, port = tmp_path / "runs", free_port()
+    runs, port = tmp_path / "runs", free_port(kind=socket.SOCK_DGRAM)
     scenario = tmp_path / "small.yaml"
     scenario.write_text(
         "name: small\nsimulation: counter\nagents: {count: 2, tick_hz: 10}\n"

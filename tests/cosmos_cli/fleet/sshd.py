@@ -60,6 +60,8 @@ class Sshd:
         environment: str = "",
         port: int | None = None,
     ) -> None:
+        from harness.ports import free_port  # the keeper, which is this module too, finds none
+
         self.directory = directory
         self.address = address
         self.port = port or free_port(address)
@@ -242,13 +244,6 @@ def make_key(file: Path, kind: str, *, passphrase: str = "") -> Path:
 def public(file: Path) -> str:
     """Return the public half's line."""
     return Path(f"{file}.pub").read_text(encoding="utf-8")
-
-
-def free_port(address: str) -> int:
-    """Return a port that nobody listens on."""
-    with socket.socket() as sock:
-        sock.bind((address, 0))
-        return int(sock.getsockname()[1])
 
 
 @contextlib.contextmanager

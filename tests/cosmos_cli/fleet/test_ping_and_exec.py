@@ -12,8 +12,9 @@ import time
 from pathlib import Path
 
 import pytest
+from harness.ports import free_port
 from ssh_harness import needs_sshd
-from sshd import Sshd, free_port, silent_server
+from sshd import Sshd, silent_server
 
 from cosmos_cli.app import run
 

@@ -12,8 +12,9 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from harness.ports import free_port
 from ssh_harness import needs_sshd, target_of, write_configuration
-from sshd import Sshd, free_port, make_key, public, silent_server
+from sshd import Sshd, make_key, public, silent_server
 
 from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
