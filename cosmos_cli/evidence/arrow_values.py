@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,34 @@ ARROW_TYPES: dict[Kind, pa.DataType] = {
     "json": pa.string(),
     "packed": pa.string(),
 }
+
+
+class _NoPandas:
+    """Finder of modules that finds no pandas."""
+
+    def find_spec(self, name: str, *_: object) -> None:
+        if name == "pandas":
+            raise ModuleNotFoundError(name=name)
+
+
+def _leave_pandas_out() -> None:
+    """
+    Make an array while pandas cannot be imported, unless it is there already.
+
+    pyarrow looks for pandas once, when it makes its first array, and imports it wherever it is installed:
+    0.4 s of CPU per command for what nobody here uses. Who asks pyarrow for pandas gets it still.
+    """
+    if "pandas" in sys.modules:
+        return
+    finder: Any = _NoPandas()
+    sys.meta_path.insert(0, finder)
+    try:
+        pa.array([None])
+    finally:
+        sys.meta_path.remove(finder)
+
+
+_leave_pandas_out()
 
 
 def to_arrow(values: NDArray[Any], kind: Kind) -> tuple[pa.Array, int]:

@@ -104,6 +104,8 @@ class UpTower:
             document = json.loads(out)
         except ValueError:
             raise AssertionError(f"no JSON; it said: {out}{err}") from None
+        if "machines" not in document:
+            raise AssertionError(f"no answer of machines: {out}{err}")
         return Result(code=process.returncode, document=document, talk=err)
 
     def up(self, *arguments: str) -> Result:

@@ -8,7 +8,7 @@ import sys
 from types import ModuleType, SimpleNamespace
 
 import pytest
-from harness.sense_emulator import emulator_held
+from harness.sense_emulator import fed_emulator
 
 from madns_runtime.errors import MachineError
 from madns_runtime.hardware.contract import Sample
@@ -156,9 +156,27 @@ def test_a_missing_library_or_hat_is_told_with_its_cure(hats, monkeypatch):
         pass
 
 
+def test_a_hat_whose_inertial_sensors_do_not_begin_is_told_with_its_cure(hats, monkeypatch):
+    def failing(self, *_):
+        raise OSError("IMU Init Failed")
+
+    monkeypatch.setattr(SenseHat, "set_imu_config", failing)
+    with (
+        pytest.raises(MachineError, match="does not answer: IMU Init Failed; is it plugged in"),
+        opened("sense_hat"),
+    ):
+        pass
+    monkeypatch.setitem(sys.modules, "sense_emu", sys.modules["sense_hat"])
+    with (
+        pytest.raises(MachineError, match="IMU Init Failed; start sense_emu_gui"),
+        opened("sense_hat", emulated=True),
+    ):
+        pass
+
+
 @pytest.fixture
 def emulator():
-    with emulator_held():
+    with fed_emulator():
         yield
     name = f"/dev/shm/rpi-sense-emu-client-{os.getpid()}"
     if os.path.exists(name):

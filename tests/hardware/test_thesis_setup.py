@@ -1,12 +1,10 @@
 """The thesis's set-up: boards that count, one of which reads a Sense HAT and sends its samples to the host."""
 
-import contextlib
-import importlib
 import json
 
 import pytest
 from harness.cosmos_command import LOOSE, SCENARIOS, CosmosCommand
-from harness.sense_emulator import emulator_held
+from harness.sense_emulator import fed_emulator
 
 pytestmark = pytest.mark.process
 
@@ -75,22 +73,6 @@ def test_a_device_that_nobody_uses_breaks_a_check(tmp_path):
     assert code == 4, document["verdict"]
     absent = next(c for c in document["checks"] if c["name"] == "counter.device_absent")
     assert (absent["got"], absent["passed"], absent["worst"]) == (1, False, "camera")
-
-
-@contextlib.contextmanager
-def fed_emulator():
-    """Feed the emulated HAT from this process, as its window would: at rest, at 30 degC."""
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(emulator_held())
-        for name, values in (("humidity", (40.0, 30.0)), ("pressure", (1013.0, 30.0))):
-            server = getattr(importlib.import_module(f"sense_emu.{name}"), f"{name.title()}Server")(
-                simulate_noise=False
-            )
-            stack.callback(server.close)
-            server.set_values(*values)
-        imu = importlib.import_module("sense_emu.imu").IMUServer(simulate_world=False)
-        stack.callback(imu.close)
-        yield
 
 
 def test_an_emulated_hat_is_read_in_the_thesis_s_set_up(tmp_path):

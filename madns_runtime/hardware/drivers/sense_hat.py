@@ -39,12 +39,11 @@ class SenseHatDevice(Device):
             raise MachineError(f"{error.name} is not installed; {cure}") from None
         try:
             self._hat: Any = make()
+            self._hat.set_rotation(p.rotation)
+            self._hat.set_imu_config(p.magnetometer, p.gyroscope, p.accelerometer)
         except OSError as error:
-            raise MachineError(
-                f"the Sense HAT does not answer: {error}; is it plugged in?"
-            ) from None
-        self._hat.set_rotation(p.rotation)
-        self._hat.set_imu_config(p.magnetometer, p.gyroscope, p.accelerometer)
+            cure = "start sense_emu_gui" if p.emulated else "is it plugged in?"
+            raise MachineError(f"the Sense HAT does not answer: {error}; {cure}") from None
         return "emulator" if p.emulated else "sense_hat"
 
     def read(self) -> Sample | None:

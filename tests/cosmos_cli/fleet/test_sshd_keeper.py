@@ -1,5 +1,6 @@
 """The tests' own servers end with the tests, also when nobody can say goodbye."""
 
+import os
 import subprocess
 import sys
 import time
@@ -32,9 +33,11 @@ with Sshd(Path(sys.argv[1])) as server:
 def test_nothing_of_a_server_survives_the_test_process_that_was_killed(tmp_path):
     needs_sshd()
     folder = Path(__file__).parent
+    tests = str(folder.parents[1])
     starter = subprocess.Popen(
         [sys.executable, "-c", STARTER, str(tmp_path / "s")],
         cwd=folder,
+        env={**os.environ, "PYTHONPATH": tests},
         stdout=subprocess.PIPE,
         text=True,
     )
