@@ -13,7 +13,7 @@ from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.launch.order_socket import order_fault
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
 from madns_runtime.errors import ConfigurationError
-from madns_runtime.hardware.faults import check_fault
+from madns_runtime.hardware.fault_actions import check_fault
 
 
 def inject(

@@ -10,43 +10,15 @@ import dataclasses
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final
 
 import numpy as np
 
-from madns_runtime.errors import ConfigurationError
 from madns_runtime.hardware.contract import Sample, Value
+from madns_runtime.hardware.fault_actions import check_fault
 
-FaultAction = Literal["freeze", "bias", "noise", "drop", "delay", "disconnect", "clear"]
-ACTIONS: Final[tuple[str, ...]] = get_args(FaultAction)
-WITH_VALUE: Final = {
-    "bias": "the number that is added to each element",
-    "noise": "the standard deviation of what is added to each element",
-    "drop": "the share of samples that is lost, 0 to 1",
-    "delay": "the time by which samples come late, s",
-}
 HELD_MAX: Final = 10_000
 """Delayed samples that may wait; the oldest is given up beyond, and counted."""
-
-
-def check_fault(action: str, value: float | None) -> None:
-    """
-    Refuse a fault that is none.
-
-    Raises:
-        ConfigurationError: The action is unknown, or its value is missing, needless or out of range.
-    """
-    if action not in ACTIONS:
-        raise ConfigurationError(f"expected an action of {', '.join(ACTIONS)}; got {action!r}")
-    if action not in WITH_VALUE:
-        if value is not None:
-            raise ConfigurationError(f"{action} takes no value, got {value:g}")
-        return
-    if value is None:
-        raise ConfigurationError(f"{action} needs a value: {WITH_VALUE[action]}")
-    is_good = math.isfinite(value) and (action == "bias" or value >= 0)
-    if not is_good or (action == "drop" and value > 1):
-        raise ConfigurationError(f"{action}: expected {WITH_VALUE[action]}; got {value:g}")
 
 
 class InsertedFaults:

@@ -17,7 +17,7 @@ import orjson
 
 from madns_runtime import private_socket
 from madns_runtime.errors import MadnsError
-from madns_runtime.hardware.faults import check_fault
+from madns_runtime.hardware.fault_actions import check_fault
 
 SOCKET_NAME: Final = ".orders.sock"
 LINE_BYTES_MAX: Final = 4096

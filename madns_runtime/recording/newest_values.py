@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from madns_runtime.recording.recorder import Recorder
+if TYPE_CHECKING:
+    # Who only cleans values, as the operator's side does, is spared numpy.
+    from madns_runtime.recording.recorder import Recorder
 
 AGENTS_TOLD_MAX = 64
 """Agents whose values a report on a run's progress tells; the others are counted."""

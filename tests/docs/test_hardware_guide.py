@@ -16,7 +16,7 @@ from guides import ROOT, blocks, row_keys
 from cosmos_cli.models.inventory.devices import MachineDevice
 from madns_runtime.config import HardwareSettings
 from madns_runtime.hardware import guardian, status
-from madns_runtime.hardware.faults import ACTIONS
+from madns_runtime.hardware.fault_actions import ACTIONS
 from madns_runtime.hardware.kind_registry import registered_kinds, resolve_kind
 
 GUIDE = (ROOT / "docs" / "hardware.md").read_text("utf-8")

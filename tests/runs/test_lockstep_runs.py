@@ -67,7 +67,7 @@ def test_messages_over_links_and_passes_repeat_to_the_bit(cosmos):
 def test_neither_records_nor_summaries_tell_how_many_computed_the_truth(cosmos):
     many = ("agents.count=501", "parameters.satellites.walker=56:501/3/1", "agents.tick_hz=1")
     results = [
-        cosmos.run("walker24.yaml", *many, "time.duration_s=3", f"executor.workers={workers}")
+        cosmos.run("walker24.yaml", *many, "time.duration_s=2", f"executor.workers={workers}")
         for workers in (1, 2)
     ]
 

@@ -65,15 +65,15 @@ def test_sgp4_truth_serves_any_tick_rate(tmp_path):
 @pytest.mark.parametrize("service", ["best", "reliable", "sync"])
 def test_counter_loses_nothing_in_any_class_of_service(tmp_path, service):
     settings = (
-        "agents.count=24",
+        "agents.count=8",
         "time.duration_s=3",
         f"parameters.service={service}",
-        "agents.per_process=6",
+        "agents.per_process=4",
     )
     result, _ = run(tmp_path, "counter24.yaml", *settings)
 
     agents = result["simulation"]["agents"]
-    assert len(agents) == 24
+    assert len(agents) == 8
     totals = {
         name: sum(a[name] for a in agents.values())
         for name in ("sent", "returned", "lost", "duplicated", "wrong_values")

@@ -505,6 +505,20 @@ def test_validate_imports_only_what_it_needs(tmp_path):
 
 
 @pytest.mark.process
+def test_a_run_begins_before_what_only_its_evidence_needs_is_imported():
+    code = (
+        "import sys; import cosmos_cli.commands.run;"
+        "print([m for m in ('numpy', 'scipy', 'pyarrow', 'paramiko') if m in sys.modules])"
+    )
+
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+
+    assert result.stdout == "[]\n"
+
+
+@pytest.mark.process
 def test_help_and_version():
     assert command("--version").stdout.startswith("cosmos 0.")
     assert "validate" in command("--help").stdout
