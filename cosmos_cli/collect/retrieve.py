@@ -26,6 +26,7 @@ from cosmos_cli.fleet.liveness import NAMED_S, SilenceWatch, SilentMachine
 from cosmos_cli.fleet.outcome import Outcome
 from cosmos_cli.fleet.pool import FORKS_DEFAULT, for_each
 from cosmos_cli.fleet.target import Target
+from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.ui.plural import counted
 
 PARTS = ("madns_runtime.processes", "processes", "records")
@@ -319,6 +320,7 @@ class _Tally:
 
 def _connect(target: Target, options: ConnectOptions) -> Connection:
     # Imported late: a run on this computer alone needs no SSH.
-    from cosmos_cli.fleet.open_connection import connect
+    with IMPORT_TURN:
+        from cosmos_cli.fleet.open_connection import connect
 
     return connect(target, options)

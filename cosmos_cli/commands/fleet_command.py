@@ -13,6 +13,7 @@ from cosmos_cli.fleet.outcome import Outcome, failed
 from cosmos_cli.fleet.pool import FORKS_DEFAULT
 from cosmos_cli.fleet.retry_file import offer_retry
 from cosmos_cli.models.inventory_arguments import refuse_stray_limit
+from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.ui.console import Console
 
 if TYPE_CHECKING:
@@ -100,7 +101,8 @@ def some_machines(
         InputError: Faults of the inventory or the pattern; or a host or a pattern, and no inventory for it.
     """
     # Imported late: most commands that have the options above never read an inventory's models.
-    from cosmos_cli.models.inventory import LOOPBACK, load_machines
+    with IMPORT_TURN:
+        from cosmos_cli.models.inventory import LOOPBACK, load_machines
 
     if inventory:
         return load_machines(inventory, limit)

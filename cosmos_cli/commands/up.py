@@ -26,6 +26,7 @@ from cosmos_cli.provision import HELPER_PARTS, up_table
 from cosmos_cli.provision.udp_echo import Echo
 from cosmos_cli.provision.up_table import MachineResult, result_of
 from cosmos_cli.provision.up_view import UpView
+from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
 from cosmos_cli.ui.step_times import HERE, timed
 
@@ -70,7 +71,8 @@ def up(
 
     def gather() -> FleetUp:
         # Imported here: while logging in, as what it needs takes as long.
-        from cosmos_cli.provision.up import FleetUp, UpOptions
+        with IMPORT_TURN:
+            from cosmos_cli.provision.up import FleetUp, UpOptions
 
         options = UpOptions(is_check=check, has_texts=diff, host=host)
         with timed(HERE, "read the inventory and the scenarios"):
@@ -106,8 +108,9 @@ def _look_at_devices(
     if not fleet_up.scenarios:
         return
     # Imported here, as above: not needed for the runtime alone.
-    from cosmos_cli.launch.device_plan import look_at_devices
-    from cosmos_cli.models.inventory import load_machines
+    with IMPORT_TURN:
+        from cosmos_cli.launch.device_plan import look_at_devices
+        from cosmos_cli.models.inventory import load_machines
 
     machines = fleet.machines if whole is None else load_machines(whole)
     for scenario in fleet_up.scenarios:

@@ -15,6 +15,7 @@ from typing import Any
 import psutil
 
 from cosmos_cli.evidence.run_directory import list_runs, runs_root
+from cosmos_cli.system.import_turn import IMPORT_TURN
 
 AGENT_TIMEOUT_S = 2.0
 REQUEST_IDENTITIES = struct.pack(">IB", 1, 11)
@@ -80,7 +81,8 @@ def _ssh_problems(folder: Path) -> Iterator[dict[str, str]]:
 
 def _uv() -> str | None:
     try:
-        import uv  # may be missing: that is the answer
+        with IMPORT_TURN:
+            import uv  # may be missing: that is the answer
 
         return str(uv.find_uv_bin())
     except (ImportError, FileNotFoundError):

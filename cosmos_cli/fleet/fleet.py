@@ -16,6 +16,7 @@ from cosmos_cli.fleet.pool import FORKS_DEFAULT, for_each
 from cosmos_cli.fleet.target import Target, target_of
 from cosmos_cli.fleet.target_cache import key_of, recall, remember
 from cosmos_cli.models.inventory_arguments import Given, sources_of
+from cosmos_cli.system.import_turn import IMPORT_TURN
 
 if TYPE_CHECKING:
     from cosmos_cli.models.inventory import Machine
@@ -132,6 +133,7 @@ def fleet_of(
 
 
 def _machines(inventory: Given, limit: str | None) -> tuple[Machine, ...]:
-    from cosmos_cli.models.inventory import load_machines  # takes 0.2 s to import
+    with IMPORT_TURN:
+        from cosmos_cli.models.inventory import load_machines  # takes 0.2 s to import
 
     return load_machines(inventory, limit)

@@ -45,6 +45,7 @@ from cosmos_cli.models.agent_labels import AgentLabels
 from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.inventory.machine import LOOPBACK
 from cosmos_cli.models.loading import ScenarioFile
+from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.ui.plural import counted
 from madns_runtime.config import DeviceLaunch, to_mapping
 from madns_runtime.lockstep.partition import processors_here
@@ -283,8 +284,9 @@ def _finish(
     prepared: _Prepared, outcome: LaunchOutcome, options: RunOptions, *, view: View
 ) -> RunSummary:
     # Imported late: the tables' library is large, and the run need not wait for it.
-    from cosmos_cli.collect.finish import finish_run
-    from cosmos_cli.evidence.completeness import ExpectedRecords
+    with IMPORT_TURN:
+        from cosmos_cli.collect.finish import finish_run
+        from cosmos_cli.evidence.completeness import ExpectedRecords
 
     view.state("COLLECTING")
     is_patient = outcome.interruption != "at once"
@@ -312,7 +314,8 @@ def _retrieve(
         text = f"its records were not fetched; fetch them with: cosmos collect {prepared.run.path}"
         return tuple(Problem(text=text, machine=name, step="collect") for name in prepared.remote)
     # Imported late: agents run meanwhile on the same processors, and a run on this computer needs none of it.
-    from cosmos_cli.collect.retrieve import Retrieval, problems_of
+    with IMPORT_TURN:
+        from cosmos_cli.collect.retrieve import Retrieval, problems_of
 
     retrieval = Retrieval(
         prepared.run,

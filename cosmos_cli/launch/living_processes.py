@@ -22,6 +22,7 @@ from cosmos_cli.fleet.target import Target, target_of
 from cosmos_cli.launch.machines import PARTS
 from cosmos_cli.models.inventory_arguments import refuse_stray_limit
 from cosmos_cli.onboard.processes import RunEnding, run_directory
+from cosmos_cli.system.import_turn import IMPORT_TURN
 from madns_runtime.processes import ProcessEntry, list_processes
 
 ROLE_ORDER = ("operator", "host", "supervisor", "agent")
@@ -88,7 +89,8 @@ class Fleetwide:
         self, targets: Sequence[Target], task: Callable[[Target, Helper], T]
     ) -> list[Outcome[T]]:
         # Imported late: without machines none of it is needed.
-        from cosmos_cli.fleet.open_connection import connect
+        with IMPORT_TURN:
+            from cosmos_cli.fleet.open_connection import connect
 
         def work(target: Target) -> T:
             with (
@@ -125,7 +127,9 @@ def targets_of(inventory: Sequence[str] | None, limit: str | None) -> list[Targe
     if not inventory:
         refuse_stray_limit(limit)
         return []
-    from cosmos_cli.models.inventory import load_machines  # what checks inventories takes its time
+    # Imported here: what checks inventories takes its time.
+    with IMPORT_TURN:
+        from cosmos_cli.models.inventory import load_machines
 
     return [target_of(machine) for machine in load_machines(inventory, limit)]
 

@@ -19,6 +19,7 @@ from cosmos_cli.launch.request import MachineConfig
 from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.loading import ScenarioFile
 from cosmos_cli.provision import STORE_PARTS
+from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.ui.plural import counted
 from madns_runtime.config import RunConfig
 
@@ -48,8 +49,9 @@ def reach(
     if not plan.elsewhere:
         return {}
     # Imported late: a run on this computer alone needs none of it.
-    from cosmos_cli.fleet.open_connection import connect
-    from cosmos_cli.provision.before_run import cargo_of, make_ready
+    with IMPORT_TURN:
+        from cosmos_cli.fleet.open_connection import connect
+        from cosmos_cli.provision.before_run import cargo_of, make_ready
 
     cargo = cargo_of(scenario, plan.elsewhere, say)
     host = plan.host.name if plan.host else None

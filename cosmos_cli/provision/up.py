@@ -44,6 +44,7 @@ from cosmos_cli.provision.steps import check_possible, notes_of, plan_steps
 from cosmos_cli.provision.udp_echo import Echo
 from cosmos_cli.provision.up_table import MachineResult
 from cosmos_cli.provision.up_view import MachineTeller, UpView
+from cosmos_cli.system.import_turn import IMPORT_TURN
 
 if TYPE_CHECKING:
     from cosmos_cli.models.loading import ScenarioFile
@@ -306,7 +307,8 @@ class FleetUp:
 def _load(paths: Sequence[Path], view: UpView) -> list[ScenarioFile]:
     if not paths:
         return []
-    from cosmos_cli.models.loading import load_scenario  # not needed for the runtime alone
+    with IMPORT_TURN:
+        from cosmos_cli.models.loading import load_scenario  # not needed for the runtime alone
 
     def warn(remark: str) -> None:
         view.say(f"warning: {remark}")

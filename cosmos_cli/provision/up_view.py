@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.ui.console import Console, is_terminal
 from cosmos_cli.ui.foreign_text import clean_line
 from cosmos_cli.ui.name_ranges import compact, names_by
@@ -137,7 +138,8 @@ class UpView:
             return
         self._drawn_s = now_s
         if self._live is None:
-            from cosmos_cli.ui.rich_console import LiveRows  # a tenth of a second to import
+            with IMPORT_TURN:
+                from cosmos_cli.ui.rich_console import LiveRows  # a tenth of a second to import
 
             self._live = LiveRows()
         self._live.show(self._lines)

@@ -26,6 +26,7 @@ from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.report.build import build_sections, figures_of
 from cosmos_cli.report.cells import format_cell
 from cosmos_cli.report.plotly_figures import to_plotly
+from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.ui.foreign_text import clean_text
 from cosmos_cli.ui.plural import counted
 from madns_runtime.analysis.values import (
@@ -95,7 +96,8 @@ def render_page(document: Mapping[str, Any], sections: Sequence[Section]) -> str
 
 @functools.cache
 def _environment() -> jinja2.Environment:
-    import jinja2  # 0.04 s that only a page needs, at the end of a run
+    with IMPORT_TURN:
+        import jinja2  # 0.04 s that only a page needs, at the end of a run
 
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("cosmos_cli.report"),

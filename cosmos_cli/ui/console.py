@@ -24,6 +24,7 @@ from typing import Annotated, Any, TextIO
 import typer
 
 from cosmos_cli.errors import InputError
+from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.ui.foreign_text import clean_line, clean_text
 
 JsonOption = Annotated[
@@ -99,7 +100,8 @@ class Console:
         width = shutil.get_terminal_size().columns
         frame = len(columns) + 3  # beside the two spaces between columns
         if max(map(len, lines)) + frame <= width:
-            from cosmos_cli.ui.rich_console import print_table  # a tenth of a second to import
+            with IMPORT_TURN:
+                from cosmos_cli.ui.rich_console import print_table  # a tenth of a second to import
 
             print_table([(column.heading, column.is_number) for column in columns], rows)
         else:

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.ui import step_times
 from cosmos_cli.ui.console import Console, is_terminal
 
@@ -29,7 +30,8 @@ def told_progress(console: Console, title: str) -> Iterator[Callable[[str, float
     elif console.quiet:
         yield lambda _what, _share: None
     elif is_terminal(sys.stderr):
-        from cosmos_cli.ui.rich_console import progress_bar  # a tenth of a second to import
+        with IMPORT_TURN:
+            from cosmos_cli.ui.rich_console import progress_bar  # a tenth of a second to import
 
         yield from progress_bar(title)
     else:

@@ -8,6 +8,7 @@ import time
 from cosmos_cli.launch.events import Progress
 from cosmos_cli.launch.request import View
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
+from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.ui import step_times
 from cosmos_cli.ui.console import is_terminal
 from cosmos_cli.ui.progress import work_words
@@ -25,7 +26,8 @@ def make_view(
     if quiet:
         return _plain_view(duration_s, quiet=True)
     if is_terminal(sys.stderr):
-        from cosmos_cli.view.live import LiveView  # rich costs a tenth of a second to import
+        with IMPORT_TURN:
+            from cosmos_cli.view.live import LiveView  # rich costs a tenth of a second to import
 
         return LiveView(sys.stderr, title, duration_s=duration_s, labels=labels)
     return _plain_view(duration_s, quiet=False)

@@ -182,7 +182,7 @@ def late_imports(file):
     }
     for node in inside:
         first = node.lineno - 1
-        while lines[first - 1].strip().startswith(("import ", "from ")):
+        while lines[first - 1].strip().startswith(("import ", "from ", "with IMPORT_TURN:")):
             first -= 1
         told = lines[first : node.end_lineno]
         has_reason = any("#" in line for line in told) or lines[first - 1].strip().startswith("#")
@@ -198,6 +198,26 @@ def test_imports_inside_functions_are_few_and_say_why():
 
     assert [(file, line) for file, line, has_reason in found if not has_reason] == []
     assert 0 < len(found) <= LATE_IMPORTS_MAX
+
+
+def test_the_operators_imports_inside_functions_take_turns():
+    """Boards' programs import with one thread, and the entry points before there are others."""
+    alone = ("cosmos_cli/onboard/", "cosmos_cli/app.py", "cosmos_cli/start.py")
+    found, in_turn = [], set()
+    for file in FILES:
+        name = str(file.relative_to(ROOT))
+        if not name.startswith("cosmos_cli/") or name.startswith(alone):
+            continue
+        found += [(name, line) for line, _ in late_imports(file)]
+        in_turn |= {
+            (name, inner.lineno)
+            for node in ast.walk(tree_of(file))
+            if isinstance(node, ast.With) and ast.unparse(node.items[0]) == "IMPORT_TURN"
+            for inner in node.body
+        }
+
+    assert len(found) > 10
+    assert [place for place in found if place not in in_turn] == []
 
 
 def test_operators_side_names_no_shipped_simulation():

@@ -24,6 +24,7 @@ from cosmos_cli.fleet.ssh.known_hosts import KnownHosts
 from cosmos_cli.fleet.ssh.settings import JUMPS_MAX, SshSettings, settings_of
 from cosmos_cli.fleet.ssh.socket import SshSocket, connect_tcp, connect_through_command
 from cosmos_cli.fleet.target import Target
+from cosmos_cli.system.import_turn import IMPORT_TURN
 
 if TYPE_CHECKING:
     # As above: the machine answers while this is imported.
@@ -96,12 +97,14 @@ def _logged_in(
     known = KnownHosts(settings.known_hosts)
     start_s = time.monotonic()
     # Imported here, and in this order, for the reason that the module's docstring gives.
-    from cosmos_cli.fleet.ssh.transport import make_transport
+    with IMPORT_TURN:
+        from cosmos_cli.fleet.ssh.transport import make_transport
 
     names = settings.names
     transport = make_transport(wire, known.kinds(names), is_certified=known.has_authority(names))
     transport.begin(timeout_s=max(TIMEOUT_S_MIN, until_s - time.monotonic()))
-    from cosmos_cli.fleet.ssh.connection import SshConnection, log_in  # as above
+    with IMPORT_TURN:
+        from cosmos_cli.fleet.ssh.connection import SshConnection, log_in  # as above
 
     importing_s = time.monotonic() - start_s
     connection = SshConnection(target, log_in(settings, options, transport, until_s))
