@@ -136,7 +136,6 @@ def verify(folder: Path, kind: str, parameters: Mapping[str, Any]) -> dict[str, 
         got_hz, limit_hz = (float(rate[key].partition(" Hz")[0]) for key in ("got", "limit"))
         rate["passed"] = got_hz >= limit_hz / SLOWNESS
     broken = [row for row in rows.values() if row["passed"] is False]
-    broken = [row for row in rows.values() if row["passed"] is False]
     assert not broken, broken
     return rows
 
