@@ -93,6 +93,7 @@ def test_the_propagator_of_ones_own_flies(tmp_path):
     assert found[1].tolist() == [[7e6, 0, 0, 1, 2, 3], [7e6 + 10, 20, 30, 1, 2, 3]]
 
 
+@pytest.mark.nightly
 def test_the_benchmark_races_judges_and_says_who_is_left_out(load, capsys, monkeypatch):
     truth = load("truth")
     monkeypatch.setattr(truth, "BASILISK_COUNT_MAX", 2)

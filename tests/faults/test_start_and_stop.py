@@ -20,7 +20,7 @@ HANG_S = 500.0
 
 
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("times", [8, pytest.param(50, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("times", [4, pytest.param(50, marks=pytest.mark.nightly)])
 def test_runs_in_a_row_leave_nothing_but_their_evidence(laboratory: Laboratory, times: int):
     scenario = laboratory.folder / "brief.yaml"
     brief = {**SCENARIO, "agents": {"count": 2, "tick_hz": 20}}

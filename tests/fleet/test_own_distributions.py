@@ -115,6 +115,7 @@ def seen_by_agents(operator: RunTower) -> str:
 
 
 @pytest.mark.root
+@pytest.mark.nightly
 @pytest.mark.timeout(900)
 def test_boards_run_a_registered_simulation_of_a_folder_and_get_it_again_when_it_has_changed(
     make_tower, tmp_path: Path

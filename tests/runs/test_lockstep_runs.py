@@ -64,6 +64,7 @@ def test_messages_over_links_and_passes_repeat_to_the_bit(cosmos):
     assert results[0][1]["records_sha256"] == results[1][1]["records_sha256"]
 
 
+@pytest.mark.nightly
 def test_neither_records_nor_summaries_tell_how_many_computed_the_truth(cosmos):
     many = ("agents.count=501", "parameters.satellites.walker=56:501/3/1", "agents.tick_hz=1")
     results = [

@@ -86,13 +86,14 @@ def garbled(document, at, wrong):
 
 
 @pytest.mark.slow
-def test_wrong_types_anywhere_end_in_no_traceback(made, monkeypatch, capsys):
+@pytest.mark.parametrize("count", [12, pytest.param(120, marks=pytest.mark.nightly)])
+def test_wrong_types_anywhere_end_in_no_traceback(made, monkeypatch, capsys, count):
     monkeypatch.setattr(finish, "write_report", lambda *_: None)
     documents = {name: json.loads((made.run.path / name).read_bytes()) for name in NAMES}
     cases = [(name, at) for name in NAMES for at in places(documents[name])]
     random_ = random.Random(8)
 
-    for name, at in random_.sample(cases, 40):
+    for name, at in random_.sample(cases, count):
         wrong = random_.choice(WRONG)
         for each in NAMES:
             (made.run.path / each).write_text(json.dumps(documents[each]))

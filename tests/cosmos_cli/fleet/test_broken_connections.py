@@ -116,7 +116,13 @@ def check_whole(boards: BoardsOverSsh) -> None:
     assert document["timing"]["ticks"] == 2 * 200
 
 
-@pytest.mark.parametrize("host", [(), ("--host", "pi02")], ids=["host-here", "host-there"])
+@pytest.mark.parametrize(
+    "host",
+    [
+        pytest.param((), id="host-here"),
+        pytest.param(("--host", "pi02"), id="host-there", marks=pytest.mark.nightly),
+    ],
+)
 def test_run_goes_on_when_all_its_connections_break_again_and_again(
     boards: BoardsOverSsh, host: tuple[str, ...]
 ) -> None:

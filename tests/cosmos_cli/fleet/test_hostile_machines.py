@@ -148,6 +148,7 @@ def test_exec_ends_what_does_not_end_at_its_deadline(inventory):
     assert done.memory_bytes < MEMORY_BYTES_MAX
 
 
+@pytest.mark.nightly
 def test_ps_says_who_could_not_be_asked(inventory):
     done = Command("ps", "-i", inventory)
 
