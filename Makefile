@@ -53,7 +53,7 @@ $(RUNNABLE): pyproject.toml
 
 # What its development needs, beside it.
 $(READY): $(RUNNABLE)
-	$(PIP) --editable '.[dev]'
+	$(PIP) --no-compile --editable '.[dev]'
 	touch $@
 
 clean:
