@@ -15,6 +15,7 @@ from guest_devices import (
     assert_refused,
     device_events,
     driven,
+    errors_told,
     load,
     lose_and_regain,
     status_is,
@@ -127,11 +128,11 @@ def test_a_bus_in_use_stays_and_one_that_comes_late_is_found(bus, tmp_path):
         assert bench.hardware[NAME].status == "ok"
     unload("i2c-stub")
     with driven(tmp_path / "late", "i2c", parameters) as bench:
+        bench.until(lambda: bool(errors_told(bench)), PATIENCE_S)
+        assert f"/dev/i2c-{bus}: there is no such bus" in errors_told(bench)[0]
         bench.until(status_is(bench, "lost"), PATIENCE_S)
         assert load_stub() == bus
         bench.until(status_is(bench, "ok"), PATIENCE_S)
-        told = [event["why"] for event in device_events(bench.folder) if event["event"] == "error"]
-        assert f"/dev/i2c-{bus}: there is no such bus" in told[0]
 
 
 @pytest.fixture
