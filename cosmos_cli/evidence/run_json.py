@@ -160,11 +160,12 @@ class Evidence:
         """Tell whether the host, or one of the agents whose loss ended the run, was on a machine that was lost."""
         if self._host_lost() is not None and self.result is None:
             return True
-        if (self.result or {}).get("who") in self.devices:
+        who = _text((self.result or {}).get("who"))
+        if who in self.devices:
             return True
         lost_machines = {p.machine for p in self.problems if p.machine and p.step == "run"}
         lost_machines.discard(LOOPBACK.name)  # what was killed on this computer is no lost machine
-        blamed = (_text((self.result or {}).get("who")) or "").split(", ")
+        blamed = (who or "").split(", ")
         return any(
             self.machine_of_agent.get(name) in lost_machines
             for name in set(self._lost()).intersection(blamed)

@@ -215,7 +215,8 @@ def figures_of(document: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     reliable = mapping_at(document, "messages", "reliable")
     sync = mapping_at(document, "messages", "sync")
     best = mapping_at(document, "messages", "best")
-    lost = agents.get("lost") or ()
+    told = agents.get("lost")
+    lost = told if isinstance(told, list) else ()
     return [
         ("agents", _number(agents.get("count")), f"{len(lost)} lost"),
         ("real-time factor", _number(document.get("rtf"), ".7g"), "simulated per wall second"),

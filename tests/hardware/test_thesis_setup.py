@@ -68,9 +68,7 @@ def test_samples_of_a_stand_in_reach_the_host_with_their_delay(tmp_path):
 
 
 def test_a_device_that_nobody_uses_breaks_a_check(tmp_path):
-    code, document, _ = run(
-        tmp_path, STAND_IN, "parameters.send_device=camera", "agents.count=22", "time.duration_s=1"
-    )
+    code, document, _ = run(tmp_path, STAND_IN, "parameters.send_device=camera", "agents.count=22")
 
     assert code == 4, document["verdict"]
     absent = next(c for c in document["checks"] if c["name"] == "counter.device_absent")

@@ -22,6 +22,8 @@ from cosmos_cli.launch.living_processes import unfinished_runs
 from cosmos_cli.report.build import build_sections
 
 NAMES = ("run.json", "result.json", "plan.json", "manifest.json")
+FOUND = [("result.json", ("who",), {}), ("run.json", ("agents", "lost"), 10**30)]
+"""What once ended in a traceback: tried each time."""
 WRONG = (
     None,
     [],
@@ -91,10 +93,10 @@ def test_wrong_types_anywhere_end_in_no_traceback(made, monkeypatch, capsys, cou
     monkeypatch.setattr(finish, "write_report", lambda *_: None)
     documents = {name: json.loads((made.run.path / name).read_bytes()) for name in NAMES}
     cases = [(name, at) for name in NAMES for at in places(documents[name])]
-    random_ = random.Random(8)
+    random_ = random.Random(count)
 
-    for name, at in random_.sample(cases, count):
-        wrong = random_.choice(WRONG)
+    drawn = [(name, at, random_.choice(WRONG)) for name, at in random_.sample(cases, count)]
+    for name, at, wrong in [*FOUND, *drawn]:
         for each in NAMES:
             (made.run.path / each).write_text(json.dumps(documents[each]))
         (made.run.path / name).write_text(json.dumps(garbled(documents[name], at, wrong)))
