@@ -35,6 +35,8 @@ class DrivenDevice:
     report: Mapping[str, Any] | None = None
     why: str = ""
     """Why it is lost, or about to be; empty while all is well."""
+    why_samples: float = 0
+    """Samples that had come when that was told."""
     loss: str = ""
     """Why it was lost the last time."""
 
@@ -65,6 +67,15 @@ class DrivenDevice:
         self.faults[action] = value
         if action == "clear":
             self.faults.clear()
+
+    def blame(self, why: str) -> None:
+        """Take note of why it is about to be lost: closing it may take a while, in which its newest sample is still fresh."""
+        self.why, self.why_samples = why, self.seat.page.header[page.SAMPLES]
+
+    def forgive(self) -> None:
+        """Forget that once a sample has come since."""
+        if self.seat.page.header[page.SAMPLES] > self.why_samples:
+            self.why = ""
 
     def why_silent(self) -> str:
         """Return why it is lost though its driver has raised nothing, and its process lives."""

@@ -240,7 +240,7 @@ class DeviceManager:
                 for name, report in rest[0].items():
                     self._devices[name].report = report
             elif word == messages.ERROR:
-                self._devices[rest[0]].why = rest[1]
+                self._devices[rest[0]].blame(rest[1])
             elif word == messages.FAULT:
                 self._devices[rest[0]].note_fault(rest[1], rest[2])
             elif word == GONE:
@@ -290,12 +290,11 @@ class DeviceManager:
             if header[page.STATE] in (page.OPENING, page.OPEN):
                 header[page.STATE] = page.CLOSED
             if not self._is_ending:
-                driven.why = driven.loss = (
-                    process.killed_why or process.gave_up_why or exit_text(code)
-                )
+                driven.blame(process.killed_why or process.gave_up_why or exit_text(code))
+                driven.loss = driven.why
                 self._look_at(process, driven, monotonic())
             elif code:
-                driven.why = exit_text(code)
+                driven.blame(exit_text(code))
         if self._is_ending or self._reactor is None:
             return
         process.failures = 0 if monotonic() - process.started_s > 10.0 else process.failures + 1
@@ -331,7 +330,7 @@ class DeviceManager:
     def _look_at(self, process: DeviceProcess, driven: DrivenDevice, now_s: float) -> None:
         status = driven.seat.page.status(driven.limits, now_s)
         if status == "ok":
-            driven.why = ""
+            driven.forgive()
         elif process.control is not None and select.select([process.control], [], [], 0)[0]:
             self._hear(process)  # why it was closed may wait
         if driven.account.counted_s is None and driven.seat.page.time.read() is not None:

@@ -31,6 +31,8 @@ class Parameters:
     port: str
     read_s: float = 0.0
     hang_file: str = ""
+    gone_file: str = ""
+    close_s: float = 0.0
     raises: str = ""
 
 
@@ -59,6 +61,8 @@ class Line(Device):
             time.sleep(self.parameters.read_s)
         while self.parameters.hang_file and os.path.exists(self.parameters.hang_file):
             time.sleep(0.05)
+        if self.parameters.gone_file and os.path.exists(self.parameters.gone_file):
+            raise OSError("the line is gone")
         return Sample(values={"time": taken_s}, taken_s=taken_s)
 
     def write(self, values, due_s):
@@ -74,6 +78,7 @@ class Line(Device):
         self._raise("make_safe")
 
     def close(self):
+        time.sleep(self.parameters.close_s)
         if hasattr(self, "fd"):
             os.close(self.fd)
         self._raise("close")

@@ -181,6 +181,18 @@ def test_a_driver_that_raises_is_told_by_name_and_tried_again(tmp_path, method):
     assert result["restarts"] == 0  # its process lives
 
 
+def test_a_device_that_takes_its_time_to_close_is_lost_for_what_its_driver_raised(tmp_path):
+    gone = tmp_path / "gone"
+    with line_bench(tmp_path, rate_hz=5.0, gone_file=str(gone), close_s=0.4) as (bench, _):
+        bench.start_time()
+        bench.until(lambda: bench.hardware["line"].status == "ok")
+        gone.touch()
+        bench.until(lambda: "lost" in bench.statuses("line"))
+
+    [lost] = [event for event in bench.events if event.get("status") == "lost"]
+    assert "the line is gone" in lost["why"]
+
+
 def errors(bench) -> int:
     from madns_runtime.hardware import page
 
