@@ -31,15 +31,15 @@ COMPILE = (
 )
 FIRST = """#!/bin/busybox sh
 # The first process: loads what the disks need, and hands over to the system on the first of them.
-/bin/busybox mkdir -p /dev /proc /root
+/bin/busybox mkdir -p /dev /proc /system
 /bin/busybox mount -t devtmpfs dev /dev
 /bin/busybox mount -t proc proc /proc
 for module in $(/bin/busybox cat /modules); do /bin/busybox insmod "$module"; done
-/bin/busybox mount -t ext4 /dev/vda /root
-/bin/busybox mount -t ext4 /dev/vdb /root/cosmos
+/bin/busybox mount -t ext4 /dev/vda /system
+/bin/busybox mount -t ext4 /dev/vdb /system/cosmos
 /bin/busybox umount /proc
-/bin/busybox mount --move /dev /root/dev
-exec /bin/busybox switch_root /root /cosmos/init
+/bin/busybox mount --move /dev /system/dev
+exec /bin/busybox switch_root /system /cosmos/init
 """
 
 
