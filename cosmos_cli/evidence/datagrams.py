@@ -103,8 +103,9 @@ def _host_ends(messages: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 def whole_count(value: object) -> int:
     """Return a count from a file; 0 for what is none."""
-    is_count = isinstance(value, int) and not isinstance(value, bool) and abs(value) <= COUNT_MAX
-    return value if is_count else 0  # type: ignore[return-value]
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) <= COUNT_MAX:
+        return value
+    return 0
 
 
 def datagram_account(result: Mapping[str, Any]) -> dict[str, Any]:
