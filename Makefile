@@ -17,7 +17,7 @@ demo: $(RUNNABLE)  ## Run ten real Iridium satellites on ten loopback agents.
 
 test: $(READY)  ## Lint, types, import contracts and every test but those of `.ci/nightly`.
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint measured unmeasured
-	$(VENV)/bin/python -m pytest --numprocesses 4 --dist loadfile --no-loadscope-reorder --durations=25 $(addprefix --ignore=,$(MEASURED))
+	$(VENV)/bin/python -m pytest --numprocesses 6 --dist loadfile --no-loadscope-reorder --durations=25 $(addprefix --ignore=,$(MEASURED))
 
 lint: $(READY)
 	$(VENV)/bin/ruff check .

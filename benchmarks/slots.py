@@ -34,6 +34,7 @@ from madns_runtime.simulations.constellation.flight.api import TRUTH, FlightCont
 from madns_runtime.simulations.constellation.flight.gossip import Known
 from madns_runtime.simulations.constellation.flight.loading import load_flight_class
 from madns_runtime.simulations.constellation.flight.ring_consensus import RingMember, RingSettings
+from madns_runtime.simulations.constellation.flight_settings import FlightClass
 from madns_runtime.simulations.constellation.messages import CommandResult
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.orbit.frames import rtn_to_inertial
@@ -45,7 +46,7 @@ from madns_runtime.simulations.constellation.parameters import (
 from madns_runtime.simulations.constellation.truth.initial_states import load_fleet
 from madns_runtime.simulations.constellation.truth.propagation import PropagationParameters
 from madns_runtime.simulations.constellation.truth.propagators.scipy_propagator import ScipyDop853
-from madns_runtime.simulations.constellation.vehicles import flight_of, flight_settings
+from madns_runtime.simulations.constellation.vehicles import flight_of, flight_rules
 
 RTOL = 1e-10
 """Of truth in this process: 1 mm a day."""
@@ -219,8 +220,8 @@ def load_start(path: Path, settings: Sequence[str] = ()) -> Start:
         for index, (agent, satellite) in enumerate(zip(agents, fleet.names, strict=False))
         if flight_of(parameters, agent, satellite) is not None
     ]
-    flight = flight_settings(parameters)
-    if flight is None or not hasattr(flight, "software") or flight.settings.get("slots") != "even":
+    flight = next(iter(flight_rules(parameters)), None)
+    if not isinstance(flight, FlightClass) or flight.settings.get("slots") != "even":
         raise SystemExit(f"{path}: expected flight software with slots: even")
     return Start(
         states=fleet.states[keepers],

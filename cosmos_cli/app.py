@@ -61,6 +61,7 @@ COMMANDS = (
     "collect",
     "report",
     "diff",
+    "rerun",
     "tabulate",
 )
 INVENTORY_VARIABLE = "COSMOS_INVENTORY"

@@ -18,7 +18,9 @@ from madns_runtime.protocol.states import (
     HostState,
     mermaid,
 )
-from madns_runtime.simulations.constellation.flight.json_protocol import message_schema
+from madns_runtime.simulations.constellation.flight.interface.c_header import header_text
+from madns_runtime.simulations.constellation.flight.interface.json_lines import message_schema
+from madns_runtime.simulations.constellation.flight.interface.xtce import xtce_text
 
 DOCS = Path(__file__).parent
 STATES = """\
@@ -57,7 +59,12 @@ def flight_messages() -> str:
     return json.dumps(message_schema(), indent=2) + "\n"
 
 
-PAGES = {"states.md": states_page, "flight-messages.schema.json": flight_messages}
+PAGES = {
+    "states.md": states_page,
+    "flight-messages.schema.json": flight_messages,
+    "flight-packets.xtce.xml": xtce_text,
+    "../scenarios/flight/flight_frames.h": header_text,
+}
 
 
 def stale_pages() -> list[str]:

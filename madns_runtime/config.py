@@ -19,7 +19,7 @@ from madns_runtime.plain_values import from_mapping as from_mapping
 from madns_runtime.plain_values import to_mapping as to_mapping
 
 AGENTS_MAX = 5000
-RATE_HZ_MAX = 10_000.0
+RATE_HZ_MAX = 10_000
 SEED_MAX = 2**63 - 1
 """A seed travels in messages as a signed integer of 64 bits."""
 DURATION_S_MAX = 10 * 365.25 * 86_400.0
@@ -246,6 +246,12 @@ class HardwareSettings:
     """Times that devices may be lost."""
     frozen: Annotated[int, Ge(0)] = 0
     """Times that inputs may be frozen (unchanged for their frozen_s)."""
+    stimulus_late_ms: Annotated[float, Ge(0), Le(60_000)] = 10.0
+    """From how far behind its time on a point of a stimulus is late."""
+    stimulus_late: Annotated[float, Ge(0), Le(1)] = 1e-2
+    """Largest share of a stimulus's points that may be late, or not put out at all."""
+    stimulus_underruns: Annotated[int, Ge(0)] = 0
+    """Times that stimuli may run out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -317,6 +323,8 @@ class DeviceLaunch:
     """If they may not: what is missing."""
     hang_s: Annotated[float, Gt(0)] = 15.0
     frozen_s: Mapping[str, float] = field(default_factory=dict)
+    late_s: Annotated[float, Ge(0)] = 0.01
+    """Behind its time, a point of a profile is late."""
     seed: int = 0
 
     @property

@@ -65,12 +65,21 @@ class Trial:
         elsewhere = (each.full_name for launches in self.there.values() for each in launches)
         return [*(each.full_name for each in self.here), *elsewhere]
 
-    def sample_there(self, records: Path | None = None) -> list[Outcome[dict[str, Any]]]:
+    @property
+    def launches(self) -> list[DeviceLaunch]:
+        """What drives all of them."""
+        return [*self.here, *(each for launches in self.there.values() for each in launches)]
+
+    def sample_there(
+        self, records: Path | None = None, *, seconds: float | None = None
+    ) -> list[Outcome[dict[str, Any]]]:
         """Sample the devices of other machines, all at once, and return what each machine told."""
         if not self.there:
             return []
         machines = [machine for machine in self.fleet.machines if machine.name in self.there]
-        sampler = MachineSampler(machines, self.seconds, writes=self.writes, say=self.console.say)
+        sampler = MachineSampler(
+            machines, seconds or self.seconds, writes=self.writes, say=self.console.say
+        )
         targets = tuple(t for t in self.fleet.targets if t.name in self.there)
         # Each is driven for as long: none waits for another.
         fleet = Fleet(
@@ -121,26 +130,43 @@ def _sampled_here(trial: Trial) -> dict[str, Any]:
 def record_device(trial: Trial, directory: Path) -> int:
     """Record one device into a folder, and show what it gave; return the exit code."""
     console = trial.console
-    if len(trial.names) > 1:
-        raise InputError(f"{trial.name} means {', '.join(trial.names)}: name one")
-    console.say(f"recording {trial.names[0]} for {trial.seconds:g} s")
-
-    def sample(folder: Path) -> dict[str, Any]:
-        if trial.here:
-            return sample_here(trial.here, trial.seconds, folder, say=console.say)
-        (outcome,) = trial.sample_there(folder)
-        raise_if_failed([outcome], "nothing was recorded")
-        return dict(outcome.value or {})
-
-    launch = [*trial.here, *(each for launches in trial.there.values() for each in launches)][0]
-    told = record(launch, trial.seconds, directory, sample)
-    console.table(FIGURES, _rows(launch.full_name, told))
+    told = recorded(trial, directory)
+    console.table(FIGURES, _rows(trial.names[0], told))
     console.data(
         f"{directory}: recorded; kind: playback with parameters: {{directory: ...}} plays it"
     )
     code = ExitCode.RUN_FAILED if _is_bad(told) else ExitCode.OK
     console.print_json({"directory": str(directory), "device": told, "exit_code": int(code)})
     return int(code)
+
+
+def recorded(trial: Trial, directory: Path, *, seconds: float | None = None) -> dict[str, Any]:
+    """
+    Record the one device of a trial into a new folder, and return what it gave.
+
+    Args:
+        trial: Of one device.
+        directory: The folder; it is made.
+        seconds: How long; None for as long as the trial says.
+
+    Raises:
+        InputError: The trial has several, or the folder is there already.
+        MachinesError: There was no sample, or its machine failed.
+    """
+    console = trial.console
+    if len(trial.names) > 1:
+        raise InputError(f"{trial.name} means {', '.join(trial.names)}: name one")
+    seconds = seconds or trial.seconds
+    console.say(f"recording {trial.names[0]} for {seconds:g} s")
+
+    def sample(folder: Path) -> dict[str, Any]:
+        if trial.here:
+            return sample_here(trial.here, seconds, folder, say=console.say)
+        (outcome,) = trial.sample_there(folder, seconds=seconds)
+        raise_if_failed([outcome], "nothing was recorded")
+        return dict(outcome.value or {})
+
+    return record(trial.launches[0], seconds, directory, sample)
 
 
 def _is_bad(told: Mapping[str, Any]) -> bool:

@@ -10,6 +10,15 @@ from typing import Annotated
 import typer
 
 from cosmos_cli.commands.device_trials import Trial, record_device, test_devices
+from cosmos_cli.commands.devices_calibrate import (
+    CalibrationWish,
+    ChannelOption,
+    FieldOption,
+    FromOption,
+    PlaceOption,
+    calibrate_device,
+    calibrate_recorded,
+)
 from cosmos_cli.commands.devices_verify import verify_driver
 from cosmos_cli.commands.fleet_command import (
     FORKS_DEFAULT,
@@ -29,7 +38,7 @@ from cosmos_cli.ui.plural import counted
 
 SECONDS = 5.0
 SECONDS_MAX = 3600.0
-ACTIONS = ("test", "record", "verify")
+ACTIONS = ("test", "record", "verify", "calibrate")
 KINDS = (Column("kind"), Column("what it is"), Column("parameters"))
 LISTED = (Column("machine"), Column("device"), Column("kind"), Column("rate Hz", is_number=True))
 
@@ -43,6 +52,8 @@ class _Wish:
     has_inventory: bool
     parameters: Sequence[str]
     write: bool
+    of_calibration: bool
+    """Whether an option was given that calibration alone has."""
 
     def refuse_misfits(self) -> None:
         """
@@ -52,13 +63,19 @@ class _Wish:
             InputError: The first that does.
         """
         if self.action and self.action not in ACTIONS:
-            raise InputError(f"{self.action}: expected test, record, verify, or nothing")
+            raise InputError(f"{self.action}: expected test, record, verify, calibrate, or nothing")
         if self.action == "verify":
             if len(self.names) != 1 or self.has_inventory:
                 raise self._error("expected one KIND or ./file.py:NAME, and no inventory")
             return
+        if self.of_calibration and self.action != "calibrate":
+            raise self._error("--from, --channel, --field-ut and --place are of calibrate alone")
         if self.parameters:
             raise self._error("--parameters is of verify alone")
+        if self.action == "calibrate":
+            if not self.names or self.write:
+                raise self._error("expected DEVICE and no --write")
+            return
         if self.action and not self.has_inventory:
             raise self._error("give the inventory that lists it with -i")
         if self.write and self.action != "test":
@@ -76,10 +93,11 @@ def devices(
     words: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[test [NAME] | record NAME DIRECTORY | verify KIND]",
+            metavar="[test [NAME] | record NAME DIRECTORY | verify KIND | calibrate DEVICE [SENSOR...]]",
             help="test: sample devices and show rate, jitter, age and errors;"
             " record: write what the kind playback plays; verify: put the driver of a kind, or ./file.py:NAME, through"
-            " what befalls it in runs. Else: list kinds, or with -i what hangs where.",
+            " what befalls it in runs; calibrate: find bias and scale of gyro, accelerometer, magnetometer, step by step."
+            " Else: list kinds, or with -i what hangs where.",
         ),
     ] = None,
     inventory: SomeInventoryOption = None,
@@ -104,6 +122,10 @@ def devices(
             help="verify: parameters of the kind; port=pty lets a pseudo-terminal stand in for a line.",
         ),
     ] = None,
+    from_: FromOption = None,
+    channel: ChannelOption = None,
+    field_ut: FieldOption = None,
+    place: PlaceOption = None,
     forks: ForksOption = FORKS_DEFAULT,
     accept_new_host_keys: AcceptHostKeysOption = False,
     json: JsonOption = False,
@@ -113,7 +135,7 @@ def devices(
     List kinds of devices, or with -i what hangs where; try devices, or record one, without a run.
 
     A test ends with 1 when a device gave errors or no sample, with 3 when a machine failed; a verification with 4 when
-    something does not hold.
+    something does not hold; a calibration with 1 when something could not be told.
     """
     console = Console(json=json, quiet=quiet)
     action, *names = words or [""]
@@ -123,9 +145,18 @@ def devices(
         has_inventory=bool(inventory),
         parameters=parameters or (),
         write=write,
+        of_calibration=bool(from_ or channel or place) or field_ut is not None,
     ).refuse_misfits()
     if action == "verify":
         return verify_driver(console, names[0], parameters or (), write=write)
+    if action == "calibrate":
+        wish = CalibrationWish.of(
+            names, recordings=from_ or (), channel=channel, field_ut=field_ut, place=place
+        )
+        if wish.recordings or not inventory:
+            return calibrate_recorded(console, wish)
+        fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
+        return calibrate_device(console, fleet, wish, seconds)
     if not inventory:
         refuse_stray_limit(limit)
         return _list_kinds(console)

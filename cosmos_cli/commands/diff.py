@@ -1,7 +1,8 @@
-"""`cosmos diff`: what differs between two runs, or between two scenarios that are run for it."""
+"""`cosmos diff`: differences of runs from the first, or of scenarios that are run for it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -9,9 +10,9 @@ from typing import Annotated
 import typer
 
 from cosmos_cli.commands.runs import RunsOption
-from cosmos_cli.diff.compare import Selection, compare
-from cosmos_cli.diff.document import to_document
-from cosmos_cli.diff.side import open_side
+from cosmos_cli.diff.compare import Comparison, Selection, compare
+from cosmos_cli.diff.document import several_documents, to_document
+from cosmos_cli.diff.side import check_comparable, open_side
 from cosmos_cli.diff.terminal import print_comparison
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
@@ -23,10 +24,16 @@ from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
 from cosmos_cli.ui.progress import told_progress
 from cosmos_cli.view.factory import make_view
 
+RUNS_MAX = 16
+"""Runs of one comparison."""
+
 
 def diff(
     a: Annotated[str, typer.Argument(metavar="A", help="Number, name or path of a run, or: last.")],
-    b: Annotated[str, typer.Argument(metavar="B", help="The run to compare it with.")],
+    others: Annotated[
+        list[str],
+        typer.Argument(metavar="B...", help="Runs to compare with it, each by itself."),
+    ],
     agents: Annotated[
         list[str] | None,
         typer.Option(metavar="GLOB", help="Only agents of this name. Repeatable."),
@@ -42,42 +49,44 @@ def diff(
         bool, typer.Option("--expect-same", help="End with 1 if the records differ.")
     ] = False,
     run_first: Annotated[
-        bool, typer.Option("--run", help="A and B are scenarios: run one, then the other, first.")
+        bool, typer.Option("--run", help="A, B, ... are scenarios: run one after the other first.")
     ] = False,
     set_: SetOption = None,
     duration_s: Annotated[
         float | None,
-        typer.Option("--duration", metavar="S", help="With --run: simulated time of both, s."),
+        typer.Option("--duration", metavar="S", help="With --run: simulated time of each, s."),
     ] = None,
     folder: RunsOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """
-    Compare two runs: settings, timing, and record by record what their simulation recorded.
+    Compare runs with the first: settings, timing, and record by record what their simulation recorded.
 
     Ends with 0 when they were compared, whatever was found; with --expect-same, 1 when their records differ.
     """
     console = Console(json=as_json, quiet=quiet)
     code = ExitCode.OK
+    names = [a, *others]
+    if len(names) > RUNS_MAX:
+        raise InputError(f"expected at most {RUNS_MAX} runs, got {len(names)}")
     if run_first:
-        found, code = _run_both((a, b), console, folder, overrides=_overrides(set_, duration_s))
+        found, code = _run_all(names, console, folder, overrides=_overrides(set_, duration_s))
     elif set_ or duration_s is not None:
         raise InputError(
             "--set and --duration change scenarios; give them with --run A.yaml B.yaml"
         )
     else:
         root = runs_root(folder)
-        found = (find_run(root, a), find_run(root, b))
-    sides = open_side(found[0], a), open_side(found[1], b)
-    chosen = tuple(agents or ())
-    labelled = (name for run in found for name in run_labels(run).labelled(chosen))
-    selection = Selection(agents=(*chosen, *labelled), streams=tuple(streams or ()))
-    with told_progress(console, "diff") as progress:
-        comparison = compare(*sides, selection, progress)
-    console.print_json(to_document(comparison))
-    print_comparison(console, comparison)
-    if code is ExitCode.OK and expect_same and not comparison.is_same:
+        found = [find_run(root, name) for name in names]
+    comparisons = _compare_each(
+        found, names, tuple(agents or ()), tuple(streams or ()), console=console
+    )
+    documents = [to_document(one) for one in comparisons]
+    console.print_json(documents[0] if len(documents) == 1 else several_documents(documents))
+    for comparison in comparisons:
+        print_comparison(console, comparison)
+    if code is ExitCode.OK and expect_same and not all(one.is_same for one in comparisons):
         code = ExitCode.RUN_FAILED
     raise typer.Exit(int(code))
 
@@ -89,22 +98,46 @@ def _overrides(set_: list[str] | None, duration_s: float | None) -> list[str]:
     return overrides
 
 
-def _run_both(
-    paths: tuple[str, str], console: Console, folder: Path | None, *, overrides: list[str]
-) -> tuple[tuple[RunDirectory, RunDirectory], ExitCode]:
-    """Run two scenarios one after the other; both are checked before the first starts."""
-    first, second = (load_scenario(Path(path), overrides, warn=console.warn) for path in paths)
-    if first.scenario.simulation != second.scenario.simulation:
-        raise InputError(
-            f"expected two scenarios of one simulation, got {paths[0]} of"
-            f" {first.scenario.simulation} and {paths[1]} of {second.scenario.simulation}"
-        )
+def _compare_each(
+    found: Sequence[RunDirectory],
+    names: Sequence[str],
+    agents: tuple[str, ...],
+    streams: tuple[str, ...],
+    *,
+    console: Console,
+) -> list[Comparison]:
+    """Compare all runs but the first with it; that they can be compared is known before the first is read."""
+    labelled = {name: None for run in found for name in run_labels(run).labelled(agents)}
+    selection = Selection(agents=(*agents, *labelled), streams=streams)
+    first, *others = [open_side(run, name) for run, name in zip(found, names, strict=True)]
+    for other in others:
+        check_comparable(first, other)
+    with told_progress(console, "diff") as progress:
+        return [compare(first, other, selection, progress) for other in others]
+
+
+def _run_all(
+    paths: Sequence[str], console: Console, folder: Path | None, *, overrides: list[str]
+) -> tuple[list[RunDirectory], ExitCode]:
+    """Run scenarios one after the other; all are checked before the first starts."""
+    scenarios = [load_scenario(Path(path), overrides, warn=console.warn) for path in paths]
+    first = scenarios[0].scenario.simulation
+    for path, scenario in zip(paths, scenarios, strict=True):
+        if scenario.scenario.simulation != first:
+            raise InputError(
+                f"expected scenarios of one simulation, got {paths[0]} of {first} and {path} of"
+                f" {scenario.scenario.simulation}"
+            )
     root = runs_root(folder)
-    run_a, code_a = _run_one(first, console=console, root=root)
-    if code_a in (ExitCode.RUN_FAILED, ExitCode.MACHINES, ExitCode.INTERRUPTED):
-        raise typer.Exit(int(code_a))
-    run_b, code_b = _run_one(second, console=console, root=root)
-    return (run_a, run_b), code_a if code_a is not ExitCode.OK else code_b
+    runs, code = [], ExitCode.OK
+    for number, scenario in enumerate(scenarios, start=1):
+        run, own = _run_one(scenario, console=console, root=root)
+        failed = own in (ExitCode.RUN_FAILED, ExitCode.MACHINES, ExitCode.INTERRUPTED)
+        if failed and number < len(scenarios):
+            raise typer.Exit(int(own))
+        runs.append(run)
+        code = own if code is ExitCode.OK else code
+    return runs, code
 
 
 def _run_one(

@@ -12,6 +12,8 @@ A comparison as JSON: what `cosmos diff --json` prints, schema 1. Pure.
     the simulation's name            what its `compare` tells; absent without one
     missing, remarks                 lists of sentences
 
+Of more than two runs: schema, first, same, identical, and comparisons, a list of these, each with the first run as a.
+
 A key is a tick where `by` is tick, a time in s where it is time, and the number of the record where it is order.
 Differences are those of the second run from the first; a number that is not finite is null.
 """
@@ -19,7 +21,7 @@ Differences are those of the second run from the first; a number that is not fin
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -60,6 +62,17 @@ def to_document(found: Comparison) -> dict[str, Any]:
     }
     plain: dict[str, Any] = _finite(document)
     return plain
+
+
+def several_documents(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return several comparisons with one run as one mapping: each stands in `comparisons` as it would alone."""
+    return {
+        "schema": SCHEMA,
+        "first": documents[0]["runs"]["a"],
+        "same": all(one["same"] for one in documents),
+        "identical": all(one["identical"] for one in documents),
+        "comparisons": list(documents),
+    }
 
 
 def _stream(found: StreamDifference) -> dict[str, Any]:

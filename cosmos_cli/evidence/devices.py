@@ -13,6 +13,7 @@ from cosmos_cli.evidence.run_documents import read_object
 from cosmos_cli.evidence.verdict import CheckResult, at_most, is_number
 from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.config import HardwareSettings
+from madns_runtime.hardware.profiles import POINT_COUNTS
 from madns_runtime.plain_values import mapping_at
 
 ACCOUNT_NAME = re.compile(r"devices(?:\.([1-9][0-9]{0,8}))?\.json")
@@ -20,6 +21,8 @@ ACCOUNT_NAME = re.compile(r"devices(?:\.([1-9][0-9]{0,8}))?\.json")
 NO_REPORT = "unknown"
 """Status of a device that nobody has given account of."""
 WHY_MISSING = "no account of it: its supervisor did not come to its end"
+NEVER_PLAYED = ("skipped", "lost", "refused")
+"""Counts of a profile's points that were due and never put out."""
 _TOLD_APART = frozenset(
     (
         "status",
@@ -76,7 +79,36 @@ def device_checks(
         _check(devices, "hardware.stale_ratio", limits.stale_ratio, key="stale_ratio"),
         _check(devices, "hardware.lost", limits.lost, key="lost"),
         _check(devices, "hardware.frozen", limits.frozen, key="frozen"),
+        *_stimulus_checks(devices, limits),
         *([_check(devices, "hardware.unsafe", 0, key="unsafe")] if _is_unsafe(devices) else []),
+    ]
+
+
+def _stimulus_checks(
+    devices: Mapping[str, Mapping[str, Any]], limits: HardwareSettings
+) -> list[CheckResult]:
+    """Return the checks of profiles that were played; none where nobody played one."""
+    late: dict[str, float] = {}
+    underruns: dict[str, int] = {}
+    for device, told in devices.items():
+        for channel, counts in mapping_at(told, "stimulus").items():
+            due = sum(counts[name] for name in ("played", *NEVER_PLAYED))
+            wrong = sum(counts[name] for name in ("late", *NEVER_PLAYED))
+            late[f"{device}.{channel}"] = wrong / due if due else 0.0
+            underruns[f"{device}.{channel}"] = counts["underruns"]
+    if not late:
+        return []
+    worst = max(late, key=lambda name: late[name])
+    most = max(underruns, key=lambda name: underruns[name])
+    runs_out = at_most(
+        "hardware.stimulus_underruns", limits.stimulus_underruns, sum(underruns.values())
+    )
+    return [
+        replace(
+            at_most("hardware.stimulus_late", limits.stimulus_late, late[worst]),
+            worst=worst if late[worst] else None,
+        ),
+        replace(runs_out, worst=most if underruns[most] else None),
     ]
 
 
@@ -135,7 +167,26 @@ def _joined(told: Sequence[Mapping[str, Any]], lives: int) -> dict[str, Any]:
         "unsafe": int(any(each.get("unsafe") for each in flat[-1:])),
         "why": clean_line(next((str(e["why"]) for e in reversed(flat) if e.get("why")), "")),
         "counts": _counts(flat),
+        **({"stimulus": stimulus} if (stimulus := _stimulus(flat)) else {}),
     }
+
+
+def _stimulus(told: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return counts of points by output over all lives, and the largest of each life's figures of lateness."""
+    found: dict[str, dict[str, Any]] = {}
+    for each in told:
+        for channel, counts in mapping_at(each, "stimulus").items():
+            zeros: dict[str, Any] = {**dict.fromkeys(POINT_COUNTS, 0), "underruns": 0}
+            joined = found.setdefault(clean_line(str(channel)), zeros)
+            for name in zeros.keys() - {"lateness_us"}:
+                number = mapping_at(counts).get(name)
+                joined[name] += int(number) if is_number(number) else 0
+            lateness = joined.setdefault("lateness_us", {})
+            for name in ("p50", "p99", "max"):
+                value = mapping_at(counts, "lateness_us").get(name)
+                if is_number(value):
+                    lateness[name] = max(lateness.get(name, 0), int(value))
+    return found
 
 
 def _sum(told: Iterable[Mapping[str, Any]], key: str) -> int | None:

@@ -186,6 +186,7 @@ class DevicePlanner:
             why_not=why_not,
             hang_s=device.hang_s,
             frozen_s=device.frozen_s,
+            late_s=self.scenario.hardware.stimulus_late_ms * 1e-3,
             seed=self.scenario.seed,
         )
         self.found.setdefault(machine, {})[launch.full_name] = launch
@@ -250,6 +251,7 @@ class DevicePlanner:
                         why_not="" if self.scenario.hardware.armed else NOT_ARMED,
                         hang_s=device.hang_s,
                         frozen_s=device.frozen_s,
+                        late_s=self.scenario.hardware.stimulus_late_ms * 1e-3,
                         seed=zlib.crc32(agent.encode(), self.scenario.seed & 0xFFFF_FFFF),
                     )
                     self.found.setdefault(machine, {})[launch.full_name] = launch

@@ -10,6 +10,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
@@ -43,18 +44,23 @@ SHIPPED = "madns_runtime."
 
 NEEDS_MAX = 64
 """Of each sort."""
-_NEED_FORMS: Mapping[str, TypeAdapter[str]] = {
-    "packages": TypeAdapter(SystemPackage),
-    "groups": TypeAdapter(SystemUser),
-    "boot_lines": TypeAdapter(Annotated[str, like(r"[^\r\n]*\S[^\r\n]*", "one line of text")]),
-    "files": TypeAdapter(
-        Annotated[str, like(r"/[^\0\r\n]*", "an absolute path, or a pattern of it")]
-    ),
-    "requirements": TypeAdapter(Requirement),
-    "system_modules": TypeAdapter(
-        Annotated[str, like(r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*", "the name of a Python module")]
-    ),
+_NEED_FORMS: Mapping[str, Any] = {
+    "packages": SystemPackage,
+    "groups": SystemUser,
+    "boot_lines": Annotated[str, like(r"[^\r\n]*\S[^\r\n]*", "one line of text")],
+    "files": Annotated[str, like(r"/[^\0\r\n]*", "an absolute path, or a pattern of it")],
+    "requirements": Requirement,
+    "system_modules": Annotated[
+        str, like(r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*", "the name of a Python module")
+    ],
 }
+
+
+@cache
+def _need_form(name: str) -> TypeAdapter[str]:
+    """Return what judges one sort of needs; made when a device is there to ask, for it takes milliseconds."""
+    return TypeAdapter(_NEED_FORMS[name])
+
 
 Tell = Callable[[str], None]
 
@@ -204,7 +210,7 @@ def needs_faults(needs: Needs) -> list[str]:
             continue
         for item in items:
             try:
-                _NEED_FORMS[field.name].validate_python(item)
+                _need_form(field.name).validate_python(item)
             except ValidationError as error:
                 what = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
                 found.append(f"{field.name}: {what}, got {item!r:.80}")

@@ -8,10 +8,12 @@ from pathlib import Path
 from cosmos_cli.errors import Fault
 from cosmos_cli.models.agent_labels import AgentLabels
 from cosmos_cli.models.device_kinds import DeviceQuestion, KindAnswer, ask_kinds
+from cosmos_cli.models.device_uses import use_faults
 from cosmos_cli.models.document import Document, did_you_mean
 from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.scenario import Scenario, SectionFault
 from madns_runtime.config import ScenarioDevice
+from madns_runtime.plugin.api import DeviceUse
 
 NOT_IN_LOCKSTEP = (
     "time.mode: lockstep runs without machines of an inventory, whose devices follow the wall clock: leave out"
@@ -20,7 +22,12 @@ NOT_IN_LOCKSTEP = (
 
 
 def hardware_faults(
-    document: Document, scenario: Scenario, base_directory: Path, labels: AgentLabels | None
+    document: Document,
+    scenario: Scenario,
+    base_directory: Path,
+    *,
+    labels: AgentLabels | None,
+    uses: Sequence[DeviceUse] = (),
 ) -> list[Fault]:
     """
     Return what is wrong with a scenario's section `hardware`.
@@ -30,6 +37,7 @@ def hardware_faults(
         scenario: What it says.
         base_directory: Its folder.
         labels: Second names of agents; None if they are not known, and then agents are not looked for.
+        uses: Channels that the simulation's parameters name.
     """
     devices = scenario.hardware.devices
     paths: list[ValuePath] = [("hardware", "devices", index) for index in range(len(devices))]
@@ -55,6 +63,7 @@ def hardware_faults(
         found.append((("hardware", "use"), NOT_IN_LOCKSTEP))
     if labels is not None:
         found += _agents(scenario, labels)
+        faults += use_faults(document, scenario, labels, answers, uses)
     return faults + [document.fault(path, text) for path, text in found]
 
 

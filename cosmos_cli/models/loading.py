@@ -108,6 +108,22 @@ def load_scenario(
     return checked
 
 
+def check_scenario(text: str, path: Path) -> ScenarioFile:
+    """
+    Check a scenario that lies in no file.
+
+    Args:
+        text: As YAML.
+        path: Where it would lie: relative files are found from there, and faults name it.
+
+    Raises:
+        InputError: With every fault found.
+        MissingExtraError: The simulation needs an optional dependency that is not installed.
+    """
+    document = read_document(YamlSource.of(str(path), text))
+    return _check(document, path, (), list(document.faults))
+
+
 def _rename_old_keys(document: Document) -> tuple[tuple[str, ...], list[Fault]]:
     """Give old keys their new names; return a remark on each, and a fault on each beside its new one."""
     remarks, faults = [], []
@@ -144,7 +160,9 @@ def _check(
     answers = ask_plugin(document, agents, base_directory, duration_s=duration_s)
     faults += answers.faults
     if not broken:
-        faults += hardware_faults(document, scenario, base_directory, answers.labels)
+        faults += hardware_faults(
+            document, scenario, base_directory, labels=answers.labels, uses=answers.device_uses
+        )
     faults += [
         document.fault(where, text)
         for where, text in cross_faults(scenario, skip=broken, labels=answers.labels)

@@ -31,11 +31,17 @@ from cosmos_cli.models.yaml_source import WHOLE_MAX, WHOLE_MIN
 from madns_runtime import errors as runtime_errors
 from madns_runtime.config import Agents, Timeouts, from_mapping, to_mapping
 from madns_runtime.errors import ConfigurationError, MadnsError, MissingExtraError, PluginError
-from madns_runtime.plugin.api import DeclaredStream, Demand, Simulation
+from madns_runtime.plugin.api import DeclaredStream, Demand, DeviceUse, Simulation
 from madns_runtime.plugin.code_places import blame, place_of
 from madns_runtime.plugin.columns import unknown_columns
 from madns_runtime.plugin.isolation import said
-from madns_runtime.plugin.queries import ask_check, ask_demand, ask_labels, ask_streams
+from madns_runtime.plugin.queries import (
+    ask_check,
+    ask_demand,
+    ask_device_uses,
+    ask_labels,
+    ask_streams,
+)
 from madns_runtime.plugin.registry import (
     is_file,
     is_shipped,
@@ -64,6 +70,8 @@ class PluginAnswers:
     """Streams as it declares them; None if it declares none, or nobody could be asked."""
     labels: AgentLabels | None = NO_LABELS
     """Second names of agents; None if the simulation could not be asked for those it gives."""
+    device_uses: tuple[DeviceUse, ...] = ()
+    """Channels of devices that the parameters name; empty if nobody could be asked."""
     omitted: int = 0
     """Number of further faults."""
 
@@ -190,10 +198,12 @@ class _Asking:
         parameters = None if simulation is None else self._parameters(simulation)
         streams: tuple[DeclaredStream, ...] | None = None
         labels: AgentLabels | None = NO_LABELS
+        uses: tuple[DeviceUse, ...] = ()
         if simulation is not None and parameters is not None and self._agents is not None:
             self._check(simulation, parameters, self._agents, duration_s)
             streams = self._streams(simulation, parameters, self._agents)
             labels = self._labels(simulation, parameters, self._agents)
+            uses = self._device_uses(simulation, parameters, self._agents)
         elif simulation is not None and simulation.labels is not None:
             labels = None
         first = self._faults[:FAULTS_SHOWN_MAX]
@@ -204,6 +214,7 @@ class _Asking:
             has_demand=simulation is not None and simulation.demand is not None,
             streams=streams,
             labels=labels,
+            device_uses=uses,
         )
 
     def _blame(self, *texts: str) -> None:
@@ -273,11 +284,13 @@ class _Asking:
                 agents=agents.count,
                 names=agents.resolved_names(),
                 duration_s=duration_s,
+                is_lockstep=_is_lockstep(self._document),
+                tick_hz=agents.tick_hz,
             )
         except PluginError as error:
             self._blame(str(error))
         else:
-            self._faults += [_found_by_check(self._document, text) for text in texts]
+            self._faults += [fault_found_at(self._document, text) for text in texts]
 
     def _streams(
         self, simulation: Simulation, parameters: Any, agents: Agents
@@ -312,6 +325,19 @@ class _Asking:
                 self._blame(str(error))
             return None
         return AgentLabels(column=simulation.label_column, names=found)
+
+    def _device_uses(
+        self, simulation: Simulation, parameters: Any, agents: Agents
+    ) -> tuple[DeviceUse, ...]:
+        where, names = simulation.device_uses, agents.resolved_names()
+        if where is None or self._faults:  # what is faulty names nothing that can be looked for
+            return ()
+        self._tell(f"device_uses() of {simulation.name}")
+        try:
+            return ask_device_uses(where, self._base_directory, parameters=parameters, agents=names)
+        except MadnsError as error:
+            self._blame(str(error))
+            return ()
 
 
 def _place(kind: type) -> str:
@@ -356,8 +382,8 @@ def _changed(made: Mapping[str, Any], found: Mapping[str, Any]) -> str:
     )
 
 
-def _found_by_check(document: Document, text: str) -> Fault:
-    """Find the place of `dotted.name: what is wrong`; the name may leave out `parameters.`."""
+def fault_found_at(document: Document, text: str) -> Fault:
+    """Return a fault at the place of `dotted.name: what is wrong`; the name may leave out `parameters.`."""
     name, colon, message = text.partition(":")
     path: ValuePath = ("parameters",)
     if not colon or " " in name:
@@ -368,3 +394,9 @@ def _found_by_check(document: Document, text: str) -> Fault:
         return document.fault(path, text, at_key=True)
     path = steps if steps[:1] == path else path + steps
     return document.fault(path, message.strip())
+
+
+def _is_lockstep(document: Document) -> bool:
+    """Return whether a scenario without faults of its own runs in lockstep."""
+    time = document.value.get("time")
+    return isinstance(time, Mapping) and time.get("mode") == "lockstep"

@@ -6,6 +6,7 @@ import dataclasses
 import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Annotated, Any, Union
 
 from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault
@@ -62,9 +63,14 @@ class Located:
 
     path: Path
     """Only steps that are in the document, but for a missing key."""
-    branch: Path
-    """Entry into a union, and the label of its member; empty outside of unions."""
+    branches: tuple[Path, ...]
+    """Entries into unions, the outermost first, each with the label of its member; empty outside of unions."""
     error: Mapping[str, Any]
+
+    @property
+    def branch(self) -> Path:
+        """The innermost of them; empty outside of unions."""
+        return self.branches[-1] if self.branches else ()
 
     @property
     def member(self) -> str:
@@ -96,7 +102,7 @@ def _located(document: Document, below: Path, error: Mapping[str, Any]) -> Locat
     """Follow pydantic's location through the values; labels of union members are no keys."""
     value = _value_at(document, below)
     path = below
-    branch: Path = ()
+    branches: list[Path] = []
     steps = list(error["loc"])
     for index, step in enumerate(steps):
         if _holds(value, step):
@@ -104,8 +110,8 @@ def _located(document: Document, below: Path, error: Mapping[str, Any]) -> Locat
         elif error["type"] in _MISSING and index == len(steps) - 1:
             path = (*path, step)
         else:
-            branch = (*path, str(step))
-    return Located(path, branch, error)
+            branches = [each for each in branches if each[:-1] != path] + [(*path, str(step))]
+    return Located(path, tuple(branches), error)
 
 
 def _holds(value: Any, step: str | int) -> bool:
@@ -121,23 +127,33 @@ def _value_at(document: Document, path: Path) -> Any:
     return value
 
 
-def _likeliest(located: Sequence[Located]) -> Iterator[Located]:
+def _likeliest(located: Sequence[Located], depth: int = 0) -> Iterator[Located]:
     """Of a union's members, keep the errors of the one that was probably meant: it got furthest."""
     members: dict[Path, dict[Path, list[Located]]] = {}
     for item in located:
-        if not item.branch:
+        if len(item.branches) <= depth:
             yield item
         else:
-            members.setdefault(item.branch[:-1], {}).setdefault(item.branch, []).append(item)
-    for group in members.values():
-        choice = _common_choice(list(group.values()))
-        yield from [choice] if choice else min(group.values(), key=_distance)
+            branch = item.branches[depth]
+            members.setdefault(branch[:-1], {}).setdefault(branch, []).append(item)
+    for entry, group in members.items():
+        choice = _common_choice(list(group.values()), depth)
+        if choice:
+            yield choice
+        else:
+            meant = min(group.values(), key=partial(_distance, entry))
+            yield from _likeliest(meant, depth + 1)
 
 
-def _common_choice(members: Sequence[Sequence[Located]]) -> Located | None:
+def _common_choice(members: Sequence[Sequence[Located]], depth: int) -> Located | None:
     """Return one error for a key that every member knows and whose value none of them has, such as `kind`."""
     found = [
-        [item for item in member if item.error["type"] == "literal_error"] for member in members
+        [
+            item
+            for item in member
+            if item.error["type"] == "literal_error" and len(item.branches) == depth + 1
+        ]
+        for member in members
     ]
     if len(members) < 2 or not all(found) or len({errors[0].path for errors in found}) > 1:
         return None
@@ -147,21 +163,23 @@ def _common_choice(members: Sequence[Sequence[Located]]) -> Located | None:
     return Located(first.path, (), {**first.error, "ctx": context})
 
 
-def _distance(errors: Sequence[Located]) -> tuple[bool, int, int, int]:
-    """Return how far a member is from what was written: of another type, then by its tag, then by all errors."""
-    is_misfit = any(
-        item.path == item.branch[:-1] and item.error["type"].endswith("_type") for item in errors
-    )
+def _distance(entry: Path, errors: Sequence[Located]) -> tuple[bool, int, int, int]:
+    """
+    Return how far a member is from what was written: of another type, then by its tag, then by all errors.
+
+    Errors in a union further in say nothing here: each of its members has one.
+    """
+    is_misfit = any(item.path == entry and item.error["type"].endswith("_type") for item in errors)
+    own = [item for item in errors if item.branches and item.branch[:-1] == entry]
     decisive = sum(
-        item.error["type"] in ("literal_error", *_UNKNOWN) or item.path == item.branch[:-1]
-        for item in errors
+        item.error["type"] in ("literal_error", *_UNKNOWN) or item.path == entry for item in own
     )
-    return is_misfit, sum(map(_is_tag, errors)), decisive, len(errors)
+    return is_misfit, sum(_is_tag(item, entry) for item in errors), decisive, len(errors)
 
 
-def _is_tag(item: Located) -> bool:
+def _is_tag(item: Located, entry: Path) -> bool:
     """Tell whether a key has another value than the one by which this member is told from others."""
-    if item.error["type"] != "literal_error" or len(item.path) != len(item.branch):
+    if item.error["type"] != "literal_error" or len(item.path) != len(entry) + 1:
         return False
     return " or " not in str(item.error["ctx"]["expected"])
 

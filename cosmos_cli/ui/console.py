@@ -151,6 +151,24 @@ def confirm(question: str, *, is_sure: bool) -> bool:
     return sys.stdin.readline().strip().lower() in AGREEMENTS
 
 
+def wait_for_enter(text: str, *, instead: str) -> None:
+    """
+    Ask on the terminal for something to be done, and wait until Enter is pressed.
+
+    Args:
+        text: What to do.
+        instead: What to do without a terminal.
+
+    Raises:
+        InputError: There is no terminal to ask at, or it has ended.
+    """
+    if not sys.stdin.isatty():
+        raise InputError(f"{text}: there is no terminal to ask at: {instead}")
+    _write(sys.stderr, clean_line(f"{text}, then press Enter"), end=" ")
+    if not sys.stdin.readline():
+        raise InputError(f"{text}: the terminal has ended: {instead}")
+
+
 class OutputLost(OSError):
     """Failure to write output: the disk behind a redirection is full, or stdout is closed."""
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, Literal
 
 from madns_runtime.errors import PluginError
@@ -49,6 +50,8 @@ class Channel:
     """Least and largest value: outputs are held to them, inputs beyond are counted."""
     safe: float | tuple[float, ...] | None = None
     """Value of an output in which it harms nobody; None if only `Device.make_safe` knows it."""
+    underrun: Literal["hold", "safe"] = "hold"
+    """What an output does whose profile has run out: it holds the newest value, or takes the safe one."""
 
     @property
     def size(self) -> int:
@@ -81,7 +84,9 @@ class Channel:
             found.append(f"{self.name}: limits {self.limits} are no range")
         if self.safe is not None and self.direction == "in":
             found.append(f"{self.name}: only an output has a safe value")
-        elif self.safe is not None and self.limits is not None:
+        if self.underrun == "safe" and (self.safe is None or self.is_frame):
+            found.append(f"{self.name}: underrun: safe needs a safe value of numbers")
+        if self.direction == "out" and self.safe is not None and self.limits is not None:
             values = self.safe if isinstance(self.safe, tuple) else (self.safe,)
             if not all(self.limits[0] <= value <= self.limits[1] for value in values):
                 found.append(
@@ -100,6 +105,8 @@ class Sample:
     """Time at which they were true, on this machine's monotonic clock (`time.monotonic`), s."""
     device_s: float | None = None
     """The same on the device's own clock, s; None if it has none."""
+    handed_s: float | None = None
+    """Simulated time at which it was handed on when it was recorded, s: of a recording in lockstep, see `playback`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -131,6 +138,13 @@ class Device:
     kind: DeviceKind
     may_move: bool = True
     """Whether outputs may move in this run; without it `open` leaves them as they are. Set before `open`."""
+    place: str = ""
+    """The machine's name, or that of the agent whose own it is. Set before `open`."""
+
+    inserted_faults: Mapping[str, float] = MappingProxyType({})
+    """Faults that are in force around it, with their values (not a number where they take none). Set before `open`."""
+    carries_out: frozenset[str] = frozenset()
+    """Inserted faults that it carries out itself, in what it emulates: its samples are not altered by them."""
 
     def __init__(self, parameters: Any) -> None:
         self.parameters = parameters

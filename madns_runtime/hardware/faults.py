@@ -10,11 +10,12 @@ import dataclasses
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
 
-from madns_runtime.hardware.contract import Sample, Value
+from madns_runtime.hardware.contract import Device, Sample, Value
 from madns_runtime.hardware.fault_actions import check_fault
 
 HELD_MAX: Final = 10_000
@@ -35,6 +36,8 @@ class InsertedFaults:
         self._frozen: dict[str, Value] = {}
         self._newest: dict[str, Value] = {}
         self._held: deque[Sample] = deque()
+        self._left_to_device: frozenset[str] = frozenset()
+        """Actions that the device carries out itself."""
         self.dropped = 0
         """Samples that *drop* lost, and delayed ones that found no room."""
 
@@ -47,6 +50,11 @@ class InsertedFaults:
     def in_force(self) -> Mapping[str, float]:
         """The actions in force with their values; not a number where they take none."""
         return self._values
+
+    def show_to(self, device: Device) -> None:
+        """Let a device that is about to be opened see the faults in force, and leave to it what it carries out."""
+        device.inserted_faults = MappingProxyType(self._values)
+        self._left_to_device = device.carries_out
 
     def insert(self, action: str, value: float | None = None) -> None:
         """
@@ -69,13 +77,13 @@ class InsertedFaults:
         self._newest.update(sample.values)
         if not self._values:
             return sample
-        if "drop" in self._values and self._random.random() < self._values["drop"]:
+        if self._alters("drop") and self._random.random() < self._values["drop"]:
             self.dropped += 1
             return None
         sample = dataclasses.replace(
             sample, values={name: self._alter(name, value) for name, value in sample.values.items()}
         )
-        if "delay" not in self._values:
+        if not self._alters("delay"):
             return sample
         self._held.append(sample)
         if len(self._held) > HELD_MAX:
@@ -97,10 +105,15 @@ class InsertedFaults:
             return math.inf
         return self._held[0].taken_s + self._values.get("delay", 0.0)
 
+    def _alters(self, action: str) -> bool:
+        """Tell whether samples are altered by an action: it is in force, and nobody else carries it out."""
+        return action in self._values and action not in self._left_to_device
+
     def _alter(self, name: str, value: Value) -> Any:
-        if "freeze" in self._values:
+        if self._alters("freeze"):
             value = self._frozen.setdefault(name, value)
-        bias, sigma = self._values.get("bias"), self._values.get("noise")
+        bias = self._values["bias"] if self._alters("bias") else None
+        sigma = self._values["noise"] if self._alters("noise") else None
         if isinstance(value, bytes | str) or (bias is None and sigma is None):
             return value
         altered = np.asarray(value, dtype=np.float64) + (bias or 0.0)

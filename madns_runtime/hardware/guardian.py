@@ -240,7 +240,7 @@ def _open_and_make_safe(seat: DeviceSeat, go_fd: int) -> None:
             return  # the guardian has ended, and all is safe
         outlive_parent()
         try:
-            device.may_move = True
+            device.may_move, device.place = True, seat.launch.place
             seat.check_identity(device.open())
             # Before it is done: what a process that was started anew moves meanwhile is not taken for safe.
             seat.page.header[page.MOVED] = 0.0

@@ -11,6 +11,7 @@ from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.contract import SimulatedDevice
 from madns_runtime.hardware.intake import Intake
 from madns_runtime.hardware.kind_registry import DeviceProgram
+from madns_runtime.hardware.outputs import DeviceOutputs, DueOutput
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.port import DevicePort
 from madns_runtime.hardware.records import DeviceRecords
@@ -18,7 +19,7 @@ from madns_runtime.hardware.status import StatusAccount, StatusLimits
 
 RECORDS_TIMEOUT_S: Final = 10.0
 SAMPLES_MAX: Final = 1_000_000
-"""In one tick: more means that a driver never lets time go on."""
+"""In one tick, outputs with them: more means that a driver never lets time go on."""
 
 
 class InlineDevice:
@@ -56,6 +57,9 @@ class InlineDevice:
         self._account = StatusAccount()
         self._rate_hz = launch.rate_hz
         self._count = 0
+        self._launch = launch
+        self._handed_s = 0.0
+        """When agents handed over what is heard next, simulated, s."""
         self._own_end, other_end = messages.make_pair()
         self._intake = Intake(
             program.channels,
@@ -65,6 +69,8 @@ class InlineDevice:
             frozen_s=launch.frozen_s,
             pass_on=self._pass_on,
         )
+        self._outputs = DeviceOutputs(launch, program.channels, self._intake.count)
+        self._device.may_move, self._device.place = launch.may_move, launch.place
         self.port = DevicePort(
             launch.name,
             program.channels,
@@ -84,25 +90,68 @@ class InlineDevice:
 
     def advance(self, t_s: float) -> None:
         """
-        Take all samples up to simulated time *t_s*; called before the agent's step.
+        Take all samples up to simulated time *t_s*, and put out what is due by then; called before the agent's step.
+
+        What is put out at the time of a sample comes first.
 
         Raises:
             PluginError: The driver gave what is no sample.
         """
+        self._hear()
         for _ in range(SAMPLES_MAX):
             next_s = self._device.next_s()
             due_s = self._count / self._rate_hz if next_s is None else max(next_s, 0.0)
-            if due_s > t_s:
+            output_s = min(self._outputs.next_write_s(), self._outputs.next_point_s())
+            if min(due_s, output_s) > t_s:
                 break
+            if output_s <= due_s:
+                self._put_out_due(max(output_s, self._handed_s))
+                continue
             self._count += 1
             sample = self._device.sample_at(due_s)
             if sample is not None:
-                self._intake.take(sample, due_s)
+                self._intake.take(sample, due_s if sample.handed_s is None else sample.handed_s)
         self._intake.tell_held(t_s)
         self._account.observe(self._page.status(self._limits, t_s), t_s)
+        self._handed_s = t_s
+
+    def _hear(self) -> None:
+        """Take what the agent has handed over since the last time."""
+        has_heard = True
+        while has_heard:
+            has_heard = False
+            self.port.flush()  # what found no room goes on where this makes some
+            for word, *rest in messages.receive_all(self._own_end):
+                has_heard = True
+                try:
+                    if word == messages.WRITE:
+                        self._outputs.take_write(self._launch.owner, *rest, t_s=rest[-1])
+                    elif word == messages.PLAY:
+                        self._outputs.take_profile(self._launch.owner, *rest, t_s=self._handed_s)
+                except (PluginError, TypeError, ValueError) as error:
+                    self._intake.count("refused")
+                    self._intake.event("refused", self._handed_s, why=str(error))
+
+    def _put_out_due(self, now_s: float) -> None:
+        for output in self._outputs.due(now_s, now_s, float):
+            if output.point is not None and output.point.is_underrun:
+                self._intake.event("underrun", now_s, channel=output.channel.name)
+            if output.value is not None:
+                self._put_out(output, now_s)
+
+    def _put_out(self, output: DueOutput, now_s: float) -> None:
+        self._page.header[page.MOVED] = 1.0
+        self._device.write({output.channel.name: output.value}, output.due_s)
+        self._records.written(output.channel.name, output.due_s, now_s, output.told)
+        if output.point is not None and not output.point.is_underrun:
+            self._outputs.note_played(output.point, now_s - output.due_s)
 
     def close(self) -> dict[str, Any]:
-        """Close it, and return what the run came to."""
+        """Make it safe and close it, and return what the run came to."""
+        self._hear()
+        self._outputs.clear()
+        if self._page.header[page.MOVED]:
+            self._device.make_safe()
         self._device.close()
         account = self._account
         return {
@@ -112,6 +161,7 @@ class InlineDevice:
             "restarts": 0,
             "why": "",
             **self._intake.summary(),
+            **self._outputs.summary(self._page.counts.read()),
             "records": self._records.close(RECORDS_TIMEOUT_S),
         }
 

@@ -12,6 +12,7 @@ from madns_runtime.hardware.clock import DeviceClock
 from madns_runtime.hardware.contract import Channel, Sample
 from madns_runtime.hardware.faults import InsertedFaults
 from madns_runtime.hardware.page import DevicePage
+from madns_runtime.hardware.profiles import PREFIX, counts_by_channel
 from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.values import are_finite, hold_to_limits, to_frame, to_numbers
 
@@ -154,12 +155,14 @@ def counts_of(device_page: DevicePage) -> dict[str, Any]:
     """Return what a device's processes have counted so far, from its page."""
     counts, header = device_page.counts.read(), device_page.header
     frozen = {name.removeprefix(FROZEN): n for name, n in counts.items() if name.startswith(FROZEN)}
+    stimulus = counts_by_channel(counts)
     return {
         "samples": int(header[page.SAMPLES]),
         "errors": int(header[page.ERRORS]),
         "dropped": 0,
         "frozen": frozen,
-        **{name: number for name, number in counts.items() if not name.startswith(FROZEN)},
+        **{name: n for name, n in counts.items() if not name.startswith((FROZEN, PREFIX))},
+        **({"stimulus": stimulus} if stimulus else {}),
     }
 
 

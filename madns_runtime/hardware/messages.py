@@ -18,8 +18,9 @@ DATAGRAMS_MAX: Final = 4096
 """Of one look: more wait for the next, so that a flood holds nobody."""
 
 WRITE, TIME, FRAME, FAULT, OWNER_GONE, END = "write", "time", "frame", "fault", "owner", "end"
-ERROR, ANSWER = "error", "answer"
-"""First elements of messages: [WRITE, channel, value, due_s]; [TIME]: the page tells the time anew; [FRAME, channel, number, taken_s,
+ERROR, ANSWER, PLAY = "error", "answer", "play"
+"""First elements of messages: [WRITE, channel, value, due_s]; [PLAY, channel, from_s, points]: simulated
+times, see `profiles.pack_points`; [TIME]: the page tells the time anew; [FRAME, channel, number, taken_s,
 bytes]; from the manager [FAULT, device, action, value] and to it the same of one that came from an agent;
 from an agent [FAULT, number, action, value] and to it [ANSWER, number, refusal]; [OWNER_GONE]; [END, reason];
 [ERROR, device, what its driver raised]."""

@@ -57,12 +57,9 @@ class PendingWrites:
         heapq.heappush(self._heap, PendingWrite(due_s, next(self._orders), channel.name, value))
         return True
 
-    def due(self, now_s: float) -> list[PendingWrite]:
-        """Take out what is due by now, the earliest first."""
-        found = []
-        while self._heap and self._heap[0].due_s <= now_s:
-            found.append(heapq.heappop(self._heap))
-        return found
+    def pop_due(self, now_s: float) -> PendingWrite | None:
+        """Take out the earliest that is due by now; None if nothing is."""
+        return heapq.heappop(self._heap) if self._heap and self._heap[0].due_s <= now_s else None
 
     def next_due_s(self) -> float:
         """Return when the next is due, s; infinity if nothing waits."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import socket
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from time import monotonic
 from typing import Any, Final
 
@@ -13,13 +13,21 @@ from madns_runtime.errors import PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.contract import Channel, Value
 from madns_runtime.hardware.page import DevicePage
+from madns_runtime.hardware.profiles import pack_points
 from madns_runtime.hardware.status import StatusLimits
 from madns_runtime.hardware.values import are_finite, from_numbers, to_frame, to_numbers
-from madns_runtime.plugin.device_view import ChannelFrame, ChannelReading, DeviceStatus
+from madns_runtime.plugin.device_view import (
+    ChannelForm,
+    ChannelFrame,
+    ChannelReading,
+    DeviceStatus,
+)
 from madns_runtime.protocol.messages import FaultOrder
 
 FRAMES_MAX: Final = 10_000
 """Values of a queue that may wait to be taken; the oldest are given up beyond, and counted."""
+PACKS_MAX: Final = 64
+"""Messages of profiles that may wait for room; the oldest are given up beyond, and their points counted."""
 ANSWERS_MAX: Final = 8
 """Orders whose answers are told; who gave an older one has stopped waiting."""
 
@@ -65,10 +73,14 @@ class DevicePort:
         """Faults that were ordered and not answered."""
         self._answers: deque[tuple[int, str]] = deque(maxlen=ANSWERS_MAX)
         self._unsent: dict[str, list[Any]] = {}
+        self._packs: deque[list[Any]] = deque()
+        """Points of profiles that wait for room."""
         self.frames_dropped = 0
         """Values of queues that nobody took in time."""
         self.writes_lost = 0
         """Values for an output that the device's process had no room for."""
+        self.points_lost = 0
+        """Points of profiles that it had no room for."""
 
     @property
     def status(self) -> DeviceStatus:
@@ -86,6 +98,13 @@ class DevicePort:
         status = self._page.status(self._limits, now_s)
         return ChannelReading(value, now_s - taken_s, number, status, device_s)
 
+    def form_of(self, channel: str) -> ChannelForm:
+        """Return what the values of a channel are; see `DeviceView`."""
+        declared = self.channels.get(channel)
+        if declared is None:
+            raise PluginError(f"{self.name} has no channel {channel!r}{self._known()}")
+        return ChannelForm(declared.unit, 0 if declared.is_frame else declared.size)
+
     def frames(self, channel: str) -> list[ChannelFrame]:
         """Return all that has come through a queue since the last call; see `DeviceView`."""
         queue = self._frames.get(channel)
@@ -99,9 +118,7 @@ class DevicePort:
 
     def write(self, channel: str, value: Value, *, due_s: float | None = None) -> None:
         """Hand over a value for an output, due at simulated time *due_s*; see `DeviceView`."""
-        declared = self.channels.get(channel)
-        if declared is None or declared.direction != "out":
-            raise PluginError(f"{self.name} has no output {channel!r}{self._known()}")
+        declared = self._output(channel)
         if declared.is_frame:
             sent: Any = to_frame(declared, value)
         else:
@@ -111,7 +128,7 @@ class DevicePort:
             sent = from_numbers(declared, sent)
         local_s = self._now_s() if due_s is None else self.local_s(due_s)
         message = [messages.WRITE, channel, sent, local_s]
-        if self._unsent:
+        if self._unsent or self._packs:
             self.flush()
         if messages.send(self._end, message):
             return
@@ -120,8 +137,52 @@ class DevicePort:
         else:
             self.writes_lost += 1
 
+    def play(
+        self,
+        channel: str,
+        points: Iterable[tuple[float, Any]],
+        *,
+        from_s: float | None = None,
+    ) -> None:
+        """Hand over points of an output's profile; see `DeviceView`."""
+        declared = self._output(channel)
+        if declared.is_frame:
+            raise PluginError(
+                f"{self.name}.{channel}: frames have no profile: write them with due_s"
+            )
+        packs = pack_points(declared, points)
+        start_s = packs[0][0] if from_s is None and packs[0] else from_s
+        if start_s is None or (packs[0] and not start_s <= packs[0][0]):
+            raise PluginError(
+                f"{self.name}.{channel}: expected points, none before from_s ({from_s}); got"
+                f" {f'one at {packs[0][0]:g} s' if packs[0] else 'neither'}"
+            )
+        for number, pack in enumerate(packs):
+            first_s = pack[0] if number else start_s
+            self._packs.append([messages.PLAY, channel, first_s, pack.tobytes()])
+        while len(self._packs) > PACKS_MAX:
+            self.points_lost += len(self._packs.popleft()[-1]) // 8 // (declared.size + 1)
+        self.flush()
+
+    def size_of(self, channel: str) -> int:
+        """Return how many numbers an output takes; see `DeviceView`."""
+        declared = self._output(channel)
+        if declared.is_frame:
+            raise PluginError(f"{self.name}.{channel} takes frames, and no numbers")
+        return declared.size
+
+    def _output(self, channel: str) -> Channel:
+        declared = self.channels.get(channel)
+        if declared is None or declared.direction != "out":
+            raise PluginError(f"{self.name} has no output {channel!r}{self._known()}")
+        return declared
+
     def flush(self) -> None:
         """Send what found no room before; the framework calls it in each tick."""
+        while self._packs:
+            if not messages.send(self._end, self._packs[0]):
+                return
+            self._packs.popleft()
         for channel, message in list(self._unsent.items()):
             if not messages.send(self._end, message):
                 return

@@ -50,9 +50,13 @@ class SimulatedTime:
         """Return the simulated time at *local_s*, s; NaN before it is known."""
         return self._t_s + (local_s - self._local_s) * self._rate
 
+    def local_s(self, t_s: float) -> float:
+        """Return when simulated time *t_s* is on this machine's clock, s; NaN before that is known."""
+        return self._local_s + (t_s - self._t_s) / self._rate
+
     def until(self, t_s: float) -> float:
         """Return how long from now on simulated time *t_s* is, s."""
-        return (t_s - self._t_s) / self._rate - (monotonic() - self._local_s)
+        return self.local_s(t_s) - monotonic()
 
 
 class DeviceRecords:

@@ -16,12 +16,11 @@ from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.contract import Device, SimulatedDevice
 from madns_runtime.hardware.intake import Intake
 from madns_runtime.hardware.outbox import UserOutbox
-from madns_runtime.hardware.pending import PendingWrites
+from madns_runtime.hardware.outputs import DeviceOutputs, DueOutput
 from madns_runtime.hardware.process_resources import has_descriptors, resident_bytes
 from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.seat import DeviceSeat
 from madns_runtime.hardware.status import StatusLimits, back_off_s
-from madns_runtime.hardware.values import from_numbers, to_output
 from madns_runtime.plugin.context import describe_exception
 from madns_runtime.reactor.reactor import Reactor
 
@@ -48,8 +47,6 @@ class DeviceRunner:
         self._header = seat.page.header
         self._records = records
         self._reactor = reactor
-        self._channels = {channel.name: channel for channel in seat.channels}
-        self._outputs = any(channel.direction == "out" for channel in seat.channels)
         self._intake = Intake(
             seat.channels,
             seat.page,
@@ -58,11 +55,11 @@ class DeviceRunner:
             frozen_s=launch.frozen_s,
             pass_on=UserOutbox(seat.users, reactor).send,
         )
+        self._outputs = DeviceOutputs(launch, seat.channels, self._intake.count)
         self.tell_error: Callable[[str], object] = lambda text: None
         """Told what the driver raised, before the device is closed for it."""
         self.tell_fault: Callable[[str, float | None], object] = lambda action, value: None
         """Told of an inserted fault that came from an agent."""
-        self._pending = PendingWrites()
         self._device: Device | None = None
         self._fd: int | None = None
         self._failures = 0
@@ -76,7 +73,6 @@ class DeviceRunner:
         self._period_s = 1.0 / launch.rate_hz
         self._hang_s = StatusLimits.of(self._period_s, launch.hang_s).hang_s
         self._due_s = math.inf
-        self._take_time()  # one that is started anew in mid-run
         # Infinite is never: each timer is made once and moved.
         self._read_timer = reactor.call_at(math.inf, self._read_due)
         self._open_timer = reactor.call_at(math.inf, self.open)
@@ -84,6 +80,7 @@ class DeviceRunner:
         self._held_timer = reactor.call_at(math.inf, self._held_due)
         self._state_timer = reactor.call_at(monotonic() + STATE_PERIOD_S, self._tell_state)
         self._alive_timer = reactor.call_at(0.0, self._tell_alive)
+        self._take_time()  # one that is started anew in mid-run
         for agent, end in seat.users.items():
             reactor.add_reader(end.fileno(), partial(self._hear, agent, end))
 
@@ -98,7 +95,8 @@ class DeviceRunner:
         self._is_own = False
         try:
             self._device = device = self._seat.make()
-            device.may_move = self._launch.may_move
+            device.may_move, device.place = self._launch.may_move, self._launch.place
+            self._intake.faults.show_to(device)
             identity = device.open()
             self._seat.check_identity(identity)
             self._is_own = True
@@ -176,8 +174,8 @@ class DeviceRunner:
         """Bring outputs into their safe state, where they may move at all; return whether they are."""
         if not (self._outputs and self._launch.may_move and self._is_own):
             return True  # nothing has moved, and what is in its place is not to be touched
-        self._pending.clear()
-        self._write_timer.reschedule(math.inf)
+        self._outputs.clear_writes()
+        self._schedule_write()
         try:
             device.make_safe()
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything
@@ -192,10 +190,12 @@ class DeviceRunner:
         """Make safe, close, and return what the run came to: counts, and the account of records."""
         self._is_ending = True
         self._records.event("ending", monotonic(), why=reason)
+        self._outputs.clear()
         self._close_device()
         if not self._header[page.MOVED]:  # else the guardian tries what the driver could not
             self._header[page.STATE] = page.SAFE
-        return {**self._intake.summary(), "records": self._records.close(timeout_s)}
+        told = {**self._intake.summary(), **self._outputs.summary(self._seat.page.counts.read())}
+        return {**told, "records": self._records.close(timeout_s)}
 
     # Reading ------------------------------------------------------------------------------------
 
@@ -276,8 +276,8 @@ class DeviceRunner:
     def _hear(self, agent: str, end: socket.socket) -> None:
         for word, *rest in messages.receive_all(end):
             try:
-                if word == messages.WRITE:
-                    self._take_write(agent, *rest)
+                if word in (messages.WRITE, messages.PLAY):
+                    self._take_output(agent, word, *rest)
                 elif word == messages.TIME:
                     self._take_time()
                 elif word == messages.FAULT:
@@ -289,54 +289,57 @@ class DeviceRunner:
         told = self._seat.page.time.read()
         if told is not None:
             self._records.set_time(*told)
+            self._schedule_write()
 
-    def _take_write(self, agent: str, name: str, value: Any, due_s: float) -> None:
-        """
-        Let a value wait until it is due.
+    def _take_output(self, agent: str, word: str, *rest: Any) -> None:
+        """Let a value, or points of a profile, wait until they are due."""
+        time = self._records.time
+        if word == messages.PLAY:
+            self._outputs.take_profile(agent, *rest, t_s=time.at(monotonic()))
+        else:
+            self._outputs.take_write(agent, *rest, t_s=time.at(rest[-1]))
+        self._schedule_write()
 
-        Raises:
-            PluginError: The agent may not, or it is no value of an output.
-        """
-        channel = self._channels.get(name)
-        if channel is None or channel.direction != "out":
-            raise PluginError(f"{name!r} is no output of the device")
-        if agent != self._launch.owner:
-            raise PluginError(f"{name}: its owner is {self._launch.owner or 'nobody'}")
-        if not self._launch.may_move:
-            raise PluginError(f"{name}: outputs may not move here ({self._launch.why_not})")
-        value, was_beyond = to_output(channel, value)
-        self._intake.count(f"{name}_limited", int(was_beyond))
-        replaced = self._pending.replaced
-        if not self._pending.add(channel, value, float(due_s)):
-            raise PluginError(f"{name}: too many values wait for their time")
-        self._intake.count("writes_replaced", self._pending.replaced - replaced)
-        self._write_timer.reschedule(max(self._pending.next_due_s(), 0.0))
+    def _schedule_write(self) -> None:
+        """Have what is due next put out; without the time of the run no point is."""
+        point_s = self._records.time.local_s(self._outputs.next_point_s())
+        due_s = min(self._outputs.next_write_s(), math.inf if math.isnan(point_s) else point_s)
+        self._write_timer.reschedule(max(due_s, 0.0))
 
     def _write_due(self) -> None:
-        device = self._device
-        if device is None:
-            # What is due while the device is gone is not put out late.
-            self._intake.count("writes_lost", len(self._pending.due(monotonic())))
-        else:
-            for write in self._pending.due(monotonic()):
-                channel = self._channels[write.channel]
-                value = write.value if channel.is_frame else from_numbers(channel, write.value)
-                self._header[page.ACTIVE_S] = monotonic()
-                self._header[page.MOVED] = 1.0
-                try:
-                    device.write({write.channel: value}, write.due_s)
-                except BaseException as error:  # noqa: BLE001 - a driver may raise anything
-                    self._fail("write", error)
-                    return
-                told = (len(value), value.hex()) if channel.is_frame else write.value
-                self._records.written(write.channel, write.due_s, monotonic(), told)
-        self._write_timer.reschedule(self._pending.next_due_s())
+        now_s = monotonic()
+        time = self._records.time
+        for output in self._outputs.due(now_s, time.at(now_s), time.local_s):
+            if output.point is not None and output.point.is_underrun:
+                self._intake.event("underrun", monotonic(), channel=output.channel.name)
+            if self._device is None:
+                self._outputs.note_lost(output)  # what is due meanwhile is not put out late
+            elif output.value is not None and not self._put_out(self._device, output):
+                break
+        self._schedule_write()
+
+    def _put_out(self, device: Device, output: DueOutput) -> bool:
+        """Put out one value; return whether the device is still open."""
+        name = output.channel.name
+        self._header[page.ACTIVE_S] = monotonic()
+        self._header[page.MOVED] = 1.0
+        try:
+            device.write({name: output.value}, output.due_s)
+        except BaseException as error:  # noqa: BLE001 - a driver may raise anything
+            self._outputs.note_lost(output)
+            self._fail("write", error)
+            return False
+        done_s = monotonic()
+        self._records.written(name, output.due_s, done_s, output.told)
+        if output.point is not None and not output.point.is_underrun:
+            self._outputs.note_played(output.point, done_s - output.due_s)
+        return True
 
     def owner_gone(self) -> None:
         """Make outputs safe: the agent that moves them has ended, and what it last said is not carried out."""
         if (end := self._seat.users.get(self._launch.owner)) is not None:
-            late = sum(word == messages.WRITE for word, *_ in messages.receive_all(end))
-            self._intake.count("writes_lost", late)
+            self._hear(self._launch.owner, end)
+        self._intake.count("writes_lost", self._outputs.clear())
         if self._device is not None:
             self._make_safe(self._device)
 

@@ -17,7 +17,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 from madns_runtime.errors import BlamedError
 from madns_runtime.medium.outcomes import EVERYBODY, LinkOutcome, Medium, MessageAccount
 from madns_runtime.plugin.device_view import ChannelFrame, ChannelReading, DeviceStatus, DeviceView
-from madns_runtime.plugin.returned_values import Check, DeclaredStream, Demand, Flow, Tabulated
+from madns_runtime.plugin.returned_values import (
+    Check,
+    DeclaredStream,
+    Demand,
+    DeviceUse,
+    Flow,
+    Rerun,
+    Tabulated,
+)
 from madns_runtime.protocol.messages import Delivery, Service, Transmission, TransmissionRefusal
 from madns_runtime.recording.records import Field
 
@@ -34,6 +42,7 @@ __all__ = [
     "DeclaredStream",
     "Delivery",
     "DeviceStatus",
+    "DeviceUse",
     "DeviceView",
     "Demand",
     "Field",
@@ -45,6 +54,7 @@ __all__ = [
     "Medium",
     "MessageAccount",
     "ChannelReading",
+    "Rerun",
     "Service",
     "Simulation",
     "Tabulated",
@@ -301,13 +311,20 @@ class Simulation:
     check: str | None = None
     """module:function of (parameters, agents: int, base_directory: Path) -> list[str]: faults beyond bounds,
     such as a missing file, each starting with the dotted parameter name and a colon. A fourth parameter
-    called names is given the agents' names, a fifth called duration_s the run's simulated duration."""
+    called names is given the agents' names, a fifth called duration_s the run's simulated duration,
+    a sixth called is_lockstep whether simulated time waits for everybody, a seventh called tick_hz the ticks' rate."""
     streams: str | None = None
     """module:function of (parameters, agents: tuple[str, ...]) -> sequence of `DeclaredStream`: all that either
     half may open. What a run recorded otherwise is a remark in its run.json; None if nothing is declared."""
     labels: str | None = None
     """module:function of (parameters, agents: tuple[str, ...], base_directory: Path) -> mapping of agents to second
     names: placement, selections of agents and tables find an agent by either; None if it has but one."""
+    device_uses: str | None = None
+    """module:function of (parameters, agents: tuple[str, ...], base_directory: Path) -> sequence of `DeviceUse`: the
+    channels of devices that the parameters name; `cosmos validate` looks for them. None if they name none."""
+    rerun: str | None = None
+    """module:function of (parameters, agents: tuple[str, ...], run_directory: Path) -> `Rerun`: how a recorded run is
+    flown again in lockstep with its devices played back (`cosmos rerun`). None: with the same parameters."""
     columns: tuple[str, ...] = ()
     """Fields of the agents' declared streams, as "drive.speed_m_s", at most six: whoever watches a run is shown
     their newest values per agent."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, Literal, NamedTuple, Protocol
 
 DeviceStatus = Literal["never", "ok", "stale", "lost"]
@@ -34,6 +35,15 @@ class ChannelFrame(NamedTuple):
     """Time between its being taken and the call that returned it, s."""
 
 
+class ChannelForm(NamedTuple):
+    """What a channel's values are."""
+
+    unit: str
+    """As its kind declares it, such as rad/s; empty if it does not."""
+    size: int
+    """Numbers of a value; 0 of a channel of frames."""
+
+
 class DeviceView(Protocol):
     """One device; nothing here waits."""
 
@@ -55,6 +65,14 @@ class DeviceView(Protocol):
             PluginError: The device has no such input, or it is one of frames.
         """
 
+    def form_of(self, channel: str) -> ChannelForm:
+        """
+        Return what the values of a channel are, an input or an output.
+
+        Raises:
+            PluginError: The device has no such channel.
+        """
+
     def frames(self, channel: str) -> list[ChannelFrame]:
         """
         Return all that has come through a queue since the last call, in order.
@@ -74,4 +92,37 @@ class DeviceView(Protocol):
 
         Raises:
             PluginError: The device has no such output, or the value is none of its shape, or is no number.
+        """
+
+    def play(
+        self,
+        channel: str,
+        points: Iterable[tuple[float, Any]],
+        *,
+        from_s: float | None = None,
+    ) -> None:
+        """
+        Hand over a timed profile of an output, which the device's process puts out point by point.
+
+        Args:
+            channel: The output; its limits are held as of `write`.
+            points: Simulated times, s, rising, each with a float or a sequence of as many as the channel has
+                elements; 10,000 may wait. No points end the profile in good order.
+            from_s: Simulated time from which on all that was handed over before is replaced, s; the first
+                point's if None.
+
+        A profile whose newest point is followed by none in its time has run out: it is counted as an underrun, and
+        the output holds its value or becomes safe, as the kind says.
+
+        Raises:
+            PluginError: The device has no such output, it is one of frames, times do not rise, or a value is none
+                of the output's shape.
+        """
+
+    def size_of(self, channel: str) -> int:
+        """
+        Return how many numbers an output takes.
+
+        Raises:
+            PluginError: The device has no such output, or it is one of frames.
         """

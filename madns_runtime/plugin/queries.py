@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from madns_runtime.errors import PluginError
-from madns_runtime.plugin.api import DeclaredStream, Demand, Flow
+from madns_runtime.plugin.api import DeclaredStream, Demand, DeviceUse, Flow, Rerun
 from madns_runtime.plugin.code_places import place_of
 from madns_runtime.plugin.isolation import call_plugin
 from madns_runtime.plugin.registry import load_function
@@ -24,6 +25,8 @@ NO_FIGURES = ("name", "flows", "measured")
 """Fields of a Demand or a Flow that are no amounts."""
 ENDLESS = ("buffer_s",)
 """Figures that may be infinite: of who needs nothing."""
+CHECK_MORE = ("names", "duration_s", "is_lockstep", "tick_hz")
+"""What a `check` may take beside parameters, count of agents and folder."""
 FIGURE_MAX = 1e18
 """Of bytes, seconds and hertz; what is beyond is a slip, and its products with agents and rates need no infinity."""
 
@@ -36,6 +39,8 @@ def ask_check(  # noqa: PLR0913 - what a scenario is; all but two by name
     agents: int,
     names: tuple[str, ...] = (),
     duration_s: float = 0.0,
+    is_lockstep: bool = False,
+    tick_hz: float = 0.0,
 ) -> list[str]:
     """
     Return the faults that a simulation's `check` finds.
@@ -47,6 +52,8 @@ def ask_check(  # noqa: PLR0913 - what a scenario is; all but two by name
         agents: How many there are.
         names: Their names, for a `check` whose fourth parameter is called names.
         duration_s: Of the run, for one whose fifth is called duration_s.
+        is_lockstep: Whether simulated time waits for everybody, for one whose sixth is called so.
+        tick_hz: Rate of every agent's loop, for one whose seventh is called so.
 
     Raises:
         PluginError: It cannot be found, raised, or did not return a list of texts.
@@ -54,7 +61,7 @@ def ask_check(  # noqa: PLR0913 - what a scenario is; all but two by name
     """
     function = load_function(where, base_directory)
     arguments = [parameters, agents, base_directory]
-    more = {"names": names, "duration_s": duration_s}
+    more = dict(zip(CHECK_MORE, (names, duration_s, is_lockstep, tick_hz), strict=True))
     arguments += [value for _, value in zip(_more_taken(function), more.values(), strict=False)]
     found = call_plugin("check", function, *arguments, finish=_unfolded)
     if not isinstance(found, list) or not all(isinstance(text, str) for text in found):
@@ -143,6 +150,69 @@ def ask_labels(
     return dict(found)
 
 
+def ask_device_uses(
+    where: str, base_directory: Path, *, parameters: Any, agents: tuple[str, ...]
+) -> tuple[DeviceUse, ...]:
+    """
+    Return the channels of devices that a simulation's parameters name.
+
+    Args:
+        where: module:function.
+        base_directory: Folder of the scenario.
+        parameters: An instance of the simulation's parameters.
+        agents: Their names.
+
+    Raises:
+        PluginError: It cannot be found, raised, or did not return uses by agents of the scenario.
+        MissingExtraError: It needs an optional dependency that is not installed.
+    """
+    function = load_function(where, base_directory)
+    found = call_plugin(
+        "device_uses", function, parameters, agents, base_directory, finish=_unfolded
+    )
+    known = set(agents)
+    if not isinstance(found, list) or not all(
+        isinstance(use, DeviceUse) and use.agent in known for use in found
+    ):
+        raise PluginError(
+            f"{place_of(function)}: device_uses() must return DeviceUses of madns_runtime.plugin.api by agents of the"
+            f" scenario, got {_shown(found)}"
+        )
+    return tuple(found)
+
+
+def ask_rerun(
+    where: str, base_directory: Path, *, parameters: Any, agents: tuple[str, ...], run: Path
+) -> Rerun:
+    """
+    Return how a simulation flies a recorded run again.
+
+    Args:
+        where: module:function.
+        base_directory: Folder of the scenario.
+        parameters: An instance of the simulation's parameters.
+        agents: Their names.
+        run: The run directory.
+
+    Raises:
+        PluginError: It cannot be found, raised, or did not return a proper Rerun.
+        MissingExtraError: It needs an optional dependency that is not installed.
+    """
+    function = load_function(where, base_directory)
+    found = call_plugin("rerun", function, parameters, agents, run)
+    is_proper = isinstance(found, Rerun) and _are_texts(found.remarks) and _are_texts(found.unlike)
+    if not is_proper:
+        raise PluginError(
+            f"{place_of(function)}: rerun() must return a Rerun of madns_runtime.plugin.api,"
+            f" got {_shown(found)}"
+        )
+    return found  # type: ignore[no-any-return]
+
+
+def _are_texts(given: Any) -> bool:
+    return isinstance(given, tuple | list) and all(isinstance(text, str) for text in given)
+
+
 def _streams_fault(found: Any) -> str | None:
     if not isinstance(found, list) or not all(isinstance(item, DeclaredStream) for item in found):
         return f"must return DeclaredStreams of madns_runtime.plugin.api, got {_shown(found)}"
@@ -162,14 +232,13 @@ def _streams_fault(found: Any) -> str | None:
 
 
 def _more_taken(function: Callable[..., Any]) -> tuple[str, ...]:
-    """Return which of names and duration_s a `check` takes after its first three arguments, in that order."""
+    """Return which of CHECK_MORE a `check` takes after its first three arguments, in that order."""
     try:
         parameters = tuple(inspect.signature(function).parameters)[3:]
     except (TypeError, ValueError):  # a function written in C tells no signature
         return ()
-    if parameters[:2] == ("names", "duration_s"):
-        return ("names", "duration_s")
-    return ("names",) if parameters[:1] == ("names",) else ()
+    pairs = zip(CHECK_MORE, parameters, strict=False)
+    return tuple(name for name, _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
 def _unfolded(found: Any) -> Any:

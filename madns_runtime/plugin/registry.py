@@ -49,6 +49,8 @@ PARTS = (
     "check",
     "streams",
     "labels",
+    "device_uses",
+    "rerun",
     "medium",
     "tabulate",
     "figures",

@@ -1,10 +1,10 @@
-"""What a simulation's functions and halves return, as values: checks, demands, declared streams, tabulated rows."""
+"""What a simulation's functions and halves return, as values: checks, demands, declared streams, used channels, tabulated rows."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from madns_runtime.recording.records import Field
 
@@ -82,3 +82,32 @@ class DeclaredStream:
     fields: tuple[Field, ...]
     is_open: bool = False
     """Whether further fields may follow these, known only in the run."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeviceUse:
+    """A channel of a device that an agent's half uses by the scenario's parameters: checked before a run."""
+
+    agent: str
+    field: str
+    """Dotted name of the parameter that says so."""
+    device: str
+    channel: str
+    direction: Literal["in", "out"] = "in"
+    size: int | None = None
+    """Numbers that its values must have; None for any."""
+    unit: str | None = None
+    """Unit of `madns_runtime.hardware.units` that the channel's must convert to; None for any."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rerun:
+    """How a simulation flies a recorded run again, in lockstep and with its devices played back."""
+
+    parameters: Any
+    """An instance of the descriptor's parameters class."""
+    remarks: tuple[str, ...] = ()
+    """What is flown otherwise than it was, such as software that cannot be stepped, each a sentence."""
+    unlike: tuple[str, ...] = ()
+    """Streams, their fields as stream.field, or outputs as device.NAME.CHANNEL (globs), that depend on computers and
+    networks: of a run in real time lockstep has them otherwise, or not at all. They are told and not judged."""

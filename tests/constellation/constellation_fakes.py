@@ -47,6 +47,7 @@ class FakeContext:
     wake_s: float = math.inf
     random: np.random.Generator = field(default_factory=lambda: np.random.default_rng(7))
     transmitted: list = field(default_factory=list)
+    hardware: dict = field(default_factory=dict)
 
     def __post_init__(self):
         self.mailbox = Mailbox(self.name, self.agents, has_medium=True, post=self._transmit)

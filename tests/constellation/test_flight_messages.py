@@ -12,7 +12,11 @@ import jsonschema
 import pytest
 
 from madns_runtime.errors import BlamedError
-from madns_runtime.simulations.constellation.flight.json_protocol import carry_out, message_schema
+from madns_runtime.simulations.constellation.flight.interface.answers import carry_out
+from madns_runtime.simulations.constellation.flight.interface.json_lines import (
+    message_schema,
+    read_answer,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 SCHEMA = json.loads((ROOT / "docs/flight-messages.schema.json").read_text("utf-8"))
@@ -151,7 +155,7 @@ class Deaf:
     ],
 )
 def test_what_the_code_takes_the_schema_takes(answer):
-    carry_out(json.dumps(answer).encode(), Deaf(), "x", t_s=1.0)
+    carry_out(read_answer(json.dumps(answer).encode()), Deaf(), "x", t_s=1.0)
 
     assert validator("from_program").is_valid(answer)
 
@@ -174,6 +178,6 @@ def test_what_the_code_takes_the_schema_takes(answer):
 )
 def test_what_the_code_refuses_the_schema_refuses(answer):
     with pytest.raises(BlamedError):
-        carry_out(json.dumps(answer).encode(), Deaf(), "x", t_s=1.0)
+        carry_out(read_answer(json.dumps(answer).encode()), Deaf(), "x", t_s=1.0)
 
     assert not validator("from_program").is_valid(answer)

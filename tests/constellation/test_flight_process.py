@@ -16,7 +16,8 @@ from harness.waiting import is_alive, wait_until
 from madns_runtime.errors import BlamedError
 from madns_runtime.plugin.api import Tick
 from madns_runtime.simulations.constellation.agent import ConstellationAgent
-from madns_runtime.simulations.constellation.flight import line_process, process
+from madns_runtime.simulations.constellation.flight import process
+from madns_runtime.simulations.constellation.flight.interface import program as flight_program
 from madns_runtime.simulations.constellation.flight.process import LATE_CHECK, UNANSWERED_MAX
 from madns_runtime.simulations.constellation.messages import (
     Command,
@@ -45,7 +46,7 @@ ANSWER = "print(json.dumps({}), flush=True)"
 @pytest.fixture(autouse=True)
 def patience(monkeypatch):
     """Other tests' programs ended in this process, too."""
-    monkeypatch.setattr(line_process.LineProcess, "patience_s", line_process.PATIENCE_S)
+    monkeypatch.setattr(flight_program.FlightProgram, "patience_s", flight_program.PATIENCE_S)
 
 
 def program(folder, body, text=ECHO):
@@ -64,6 +65,9 @@ class Ship:
             "answer_s": PATIENCE_S,
             **rest.pop("flight", {}),
         }
+        if flight["command"] is None:  # it runs already
+            del flight["command"]
+        hardware = rest.pop("hardware", {})
         self.context = FakeContext(
             "agent-01",
             ("agent-01", "agent-02"),
@@ -71,6 +75,7 @@ class Ship:
             tick_hz=HZ,
             base_directory=Path(folder),
             is_lockstep=is_lockstep,
+            hardware=hardware,
         )
         states = np.tile(CIRCULAR, (61, 1))
         segment = Segment(revision=0, t0_s=0.0, knot_s=1.0, states=states)
@@ -84,7 +89,7 @@ class Ship:
 
     @property
     def process(self):
-        return self.agent._cockpit._software._process
+        return self.agent._cockpit._software._link.program
 
     def run(self, ticks):
         for _ in range(ticks):
@@ -106,7 +111,7 @@ class Ship:
         software = self.agent._cockpit._software
         self.run(1)
         while software._counts["answers"] < count:
-            self.process.wait(PATIENCE_S)
+            software._link.wait(PATIENCE_S)
             self.run(1)
 
     def __enter__(self):
@@ -371,7 +376,7 @@ print("{}", flush=True)
 
 
 def test_a_program_that_does_not_end_with_its_input_is_stopped(tmp_path, monkeypatch):
-    monkeypatch.setattr(line_process, "END_S", 0.2)
+    monkeypatch.setattr(flight_program, "END_S", 0.2)
     text = """
 import signal, sys, time
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -386,7 +391,7 @@ while True:
         ship.run(1)
 
     assert ship.summary["exit_code"] == -9
-    assert line_process.LineProcess.patience_s <= line_process.PATIENCE_S - 2 * 0.2
+    assert flight_program.FlightProgram.patience_s <= flight_program.PATIENCE_S - 2 * 0.2
     assert [level for level, text in ship.context.logs if "exit code -9" in text] == ["warning"]
 
 
@@ -410,7 +415,7 @@ def test_a_program_dies_with_its_agents_process(tmp_path):
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
-        process = line_process.LineProcess(command, tmp_path)
+        process = flight_program.FlightProgram(command, tmp_path)
         os.write(writer, str(process.pid).encode())
         os._exit(0)
     os.close(writer)

@@ -20,11 +20,11 @@ from madns_runtime.simulations.constellation.orbit.quaternions import rotate, ro
 from madns_runtime.simulations.constellation.orbit.sun import sun_m
 from madns_runtime.simulations.constellation.vehicle.sensors.environment import Scene
 from madns_runtime.simulations.constellation.vehicle.sensors.instruments import star_tracker
-from madns_runtime.simulations.constellation.vehicle.sensors.sensor import (
+from madns_runtime.simulations.constellation.vehicle.sensors.sensor import SensorSuite
+from madns_runtime.simulations.constellation.vehicle.sensors.sensor_errors import (
     BLOCK,
     ErrorModel,
     Errors,
-    SensorSuite,
     key_of,
 )
 

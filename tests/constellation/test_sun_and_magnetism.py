@@ -7,6 +7,10 @@ import numpy as np
 import pytest
 
 from madns_runtime.errors import PluginError
+from madns_runtime.simulations.constellation.geomagnetic_field import (
+    igrf_coefficients,
+    read_coefficients,
+)
 from madns_runtime.simulations.constellation.orbit.earth import days_since_j2000
 from madns_runtime.simulations.constellation.orbit.magnetic import (
     REFERENCE_RADIUS_M,
@@ -19,10 +23,6 @@ from madns_runtime.simulations.constellation.orbit.sun import (
     ASTRONOMICAL_UNIT_M,
     is_in_umbra,
     sun_m,
-)
-from madns_runtime.simulations.constellation.vehicle.sensors.instruments import (
-    igrf_coefficients,
-    read_coefficients,
 )
 
 

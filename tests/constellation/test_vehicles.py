@@ -4,8 +4,8 @@ import pytest
 from constellation_fakes import parameters
 
 from madns_runtime.simulations.constellation.equipment import Vehicle
-from madns_runtime.simulations.constellation.parameters import FlightClass
-from madns_runtime.simulations.constellation.vehicles import flight_of, vehicle_of
+from madns_runtime.simulations.constellation.flight_settings import FlightClass
+from madns_runtime.simulations.constellation.vehicles import flight_of, flight_rules, vehicle_of
 
 VEHICLES = [
     {"agents": ["agent-01", "IRIDIUM 9*"], "mass_kg": 1.0},
@@ -48,3 +48,18 @@ def test_agents_that_no_glob_names_only_coast():
     assert flight_of(params, "agent-01", "X") is None
     assert flight_of(params, "agent-02", "X").command == ("hold",)
     assert flight_of(parameters(), "agent-02", "X") is None
+
+
+def test_the_first_rule_of_flight_software_that_fits_holds():
+    rules = [
+        {"software": "a.py:A", "agents": ["SAT-1"]},
+        {"command": ["b"], "agents": ["agent-0[12]"]},
+        "c.py:C",
+    ]
+    params = parameters(flight=rules)
+
+    assert flight_of(params, "agent-01", "SAT-1").software == "a.py:A"
+    assert flight_of(params, "agent-02", "SAT-2").command == ("b",)
+    assert flight_of(params, "agent-03", "SAT-3").software == "c.py:C"
+    assert flight_of(parameters(flight=rules[:2]), "agent-03", "SAT-3") is None
+    assert flight_rules(parameters(flight=[])) == ()

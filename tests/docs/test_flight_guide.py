@@ -6,16 +6,20 @@ import os
 import shutil
 import subprocess
 import sys
+import typing
 from pathlib import Path
 
 import pytest
 from guides import ROOT, blocks, row_keys, spans
 
 from madns_runtime.recording import text_file
+from madns_runtime.simulations.constellation import interface_settings
 from madns_runtime.simulations.constellation.equipment import SensorNoise, Sensors
 from madns_runtime.simulations.constellation.flight import process
 from madns_runtime.simulations.constellation.flight.api import FlightContext, FlightSoftware
-from madns_runtime.simulations.constellation.flight.json_protocol import KEYS
+from madns_runtime.simulations.constellation.flight.interface.content import BY_NUMBER
+from madns_runtime.simulations.constellation.flight.interface.json_lines import KEYS
+from madns_runtime.simulations.constellation.flight.interface.opening import PROTOCOLS
 from madns_runtime.simulations.constellation.flight.loading import METHODS
 from madns_runtime.simulations.constellation.vehicle import commands, flight_context
 
@@ -78,6 +82,31 @@ def test_the_example_in_c_reaches_its_orbit(tmp_path):
     assert sum(last_estimates(run, 50)) / 50 == pytest.approx(7_160_000, abs=10.0)
 
 
+@pytest.mark.process
+def test_the_three_flight_computers_damp_their_vehicles_rates(tmp_path):
+    if shutil.which("cc") is None or shutil.which("c++") is None:
+        pytest.skip("no C or C++ compiler")
+    shutil.copy(ROOT / "scenarios/flight/flight_frames.h", tmp_path)
+    said = {"yaml": "name: damp", "c": "flight_put", "cpp": "flight_put", "python": "binascii"}
+    for language, words in said.items():
+        ending = {"python": "py"}.get(language, language)
+        (text,) = (block for block in blocks(GUIDE, language) if words in block)
+        (tmp_path / f"damp.{ending}").write_text(text)
+
+    for line in blocks(GUIDE, "sh")[1].splitlines():
+        cosmos(tmp_path, line)
+
+    agents, run = summaries(tmp_path)
+    assert [agent["commands"] for agent in agents] == [20] * 3
+    assert not any(sum(one["flight"]["interface"]["faults"].values()) for one in agents)
+    for path in sorted((run / "agents").iterdir()):
+        rows = [json.loads(line) for line in (path / "attitude.jsonl").read_text().splitlines()]
+        first, *_, last = [row[5:] for row in rows if isinstance(row, list)]
+        assert all(
+            abs(after) < 0.1 * abs(before) for before, after in zip(first, last, strict=True)
+        ), path
+
+
 def test_its_tables_name_all_methods_and_sensors():
     def names(heading):
         return {key.partition("(")[0] for key in row_keys(GUIDE, heading)}
@@ -101,6 +130,18 @@ def test_its_json_lines_are_those_of_the_program():
     assert list(setup) == ["setup"]
     assert list(tick) == ["t_s", "readings", "messages", "results", "refusals"]
     assert set(answer) == KEYS - {"t_s"}
+
+
+def test_its_tables_of_interfaces_are_those_of_the_code():
+    kinds = {
+        typing.get_args(typing.get_type_hints(one)["kind"])[0]
+        for one in typing.get_args(interface_settings.AnyTransport)
+    }
+    keys = set(row_keys(GUIDE, "## Where it really runs"))
+    assert keys - {"file.py:Class"} == kinds | set(interface_settings.PROTOCOLS)
+    assert set(PROTOCOLS) == set(interface_settings.PROTOCOLS)
+    for one in BY_NUMBER.values():
+        assert one.name in spans(GUIDE), one.name
 
 
 def test_its_bounds_are_those_of_the_code():

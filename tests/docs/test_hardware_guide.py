@@ -18,6 +18,7 @@ from madns_runtime.config import HardwareSettings
 from madns_runtime.hardware import guardian, status
 from madns_runtime.hardware.fault_actions import ACTIONS
 from madns_runtime.hardware.kind_registry import registered_kinds, resolve_kind
+from madns_runtime.simulations.constellation.equipment import Sensors
 
 GUIDE = (ROOT / "docs" / "hardware.md").read_text("utf-8")
 LOOSE = (
@@ -51,7 +52,7 @@ def wait_until(is_so, timeout_s):
         time.sleep(0.1)
 
 
-def start(folder, line, *settings):
+def start(folder, line, *settings, stdout=subprocess.DEVNULL):
     """Start a command in a folder; records go to runs there."""
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     return subprocess.Popen(
@@ -63,7 +64,7 @@ def start(folder, line, *settings):
             "COSMOS_RUNS": str(folder / "runs"),
             "COSMOS_STATE_DIR": str(folder / "state"),
         },
-        stdout=subprocess.DEVNULL,
+        stdout=stdout,
         stderr=subprocess.PIPE,
         text=True,
     )
@@ -89,7 +90,7 @@ def samples(folder, run):
 
 @pytest.mark.process
 def test_the_driver_of_ones_own_runs_as_it_stands(tmp_path):
-    (command,), _ = written(tmp_path)
+    (command,), *_ = written(tmp_path)
 
     cosmos(tmp_path, command, *LOOSE)
 
@@ -102,7 +103,7 @@ def test_the_driver_of_ones_own_runs_as_it_stands(tmp_path):
 
 @pytest.mark.process
 def test_faults_are_inserted_into_the_example_as_the_guide_says(tmp_path):
-    (command,), _ = written(tmp_path)
+    (command,), *_ = written(tmp_path)
     orders = re.findall(r"^    (cosmos inject .*)$", GUIDE, flags=re.MULTILINE)
     assert len(orders) == 2
 
@@ -144,7 +145,7 @@ def test_the_driver_has_thirty_lines():
 
 @pytest.mark.process
 def test_what_was_recorded_in_lockstep_is_played_back_to_all(tmp_path):
-    _, commands = written(tmp_path)
+    _, commands, *_ = written(tmp_path)
 
     for command in commands:
         cosmos(tmp_path, command)
@@ -156,6 +157,39 @@ def test_what_was_recorded_in_lockstep_is_played_back_to_all(tmp_path):
     again = [line[5] for line in lines if isinstance(line, list) and line[1] == "agent-02/gyro"]
     assert len(again) > 50
     assert set(again) <= set(told)
+
+
+@pytest.mark.process
+def test_the_vehicle_with_a_gyroscope_on_the_desk_is_flown_and_its_device_calibrated(tmp_path):
+    *_, (run,), (calibrate,) = written(tmp_path)
+
+    cosmos(tmp_path, run)
+    with start(tmp_path, f"{calibrate} --json", stdout=subprocess.PIPE) as process:
+        out, err = process.communicate(timeout=240)
+
+    assert process.returncode == 0, err
+    found = json.loads(out)["sensors"][0]
+    for value, sigma, truth in zip(
+        found["bias"]["values"], found["bias"]["sigmas"], (0.8, -0.3, 0.05), strict=True
+    ):
+        assert abs(value - truth) < 5 * sigma < 0.05
+    folder = tmp_path / "runs" / "0001-measured" / "agents" / "agent-01"
+    for name in ("gyro", "gyro_truth", "gyro_model"):
+        lines = (folder / f"{name}.jsonl").read_text().splitlines()
+        # 10 Hz for 30 s, with a schema before and an end behind them.
+        assert len(lines) == 302, name
+
+
+def test_its_table_of_measurements_names_all_sensors_and_counts():
+    of_sensors, of_counts = (
+        GUIDE.split(f"\n| {head} |")[1].split("\n\n")[0]
+        for head in ("sensor | channel", "count | of")
+    )
+    keys = [
+        re.findall(r"^\| `(\w+)`", table, flags=re.MULTILINE) for table in (of_sensors, of_counts)
+    ]
+    assert set(keys[0]) == {field.name for field in dataclasses.fields(Sensors)}
+    assert keys[1] == ["samples", "skipped", "absent", "refused", "without_truth"]
 
 
 def test_its_tables_name_all_settings_and_kinds():

@@ -60,7 +60,8 @@ def test_every_kind_is_listed_with_its_summary_and_parameters(told: Told) -> Non
     assert code == 0
     assert set(kinds) == set(registered_kinds())
     assert all(each["summary"] and not each["fault"] for each in kinds.values())
-    assert {"directory", "start_s"} == {each["name"] for each in kinds["playback"]["parameters"]}
+    playback = {each["name"] for each in kinds["playback"]["parameters"]}
+    assert {"directory", "start_s", "ticks", "limits"} <= playback
     assert kinds["playback"]["parameters"][0]["required"] is True
 
 
@@ -157,7 +158,7 @@ def test_a_device_without_samples_leaves_no_recording(
     ("words", "message"),
     [
         (("devices", "test"), "with -i"),
-        (("devices", "paint"), "expected test, record, verify, or nothing"),
+        (("devices", "paint"), "expected test, record, verify, calibrate, or nothing"),
         (("devices", "record", "wave", "-i", "X"), "expected NAME and DIRECTORY"),
         (
             ("devices", "test", "imu", "-i", "X"),

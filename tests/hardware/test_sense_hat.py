@@ -7,10 +7,13 @@ import os
 import sys
 from types import ModuleType, SimpleNamespace
 
+import numpy as np
 import pytest
 from harness.sense_emulator import fed_emulator
 
 from madns_runtime.errors import MachineError
+from madns_runtime.hardware.calibration.result import ChannelSamples
+from madns_runtime.hardware.calibration.strength import calibrate_turned
 from madns_runtime.hardware.contract import Sample
 from madns_runtime.hardware.kind_registry import prepare
 from madns_runtime.hardware.values import to_numbers
@@ -176,8 +179,8 @@ def test_a_hat_whose_inertial_sensors_do_not_begin_is_told_with_its_cure(hats, m
 
 @pytest.fixture
 def emulator():
-    with fed_emulator():
-        yield
+    with fed_emulator() as imu:
+        yield imu
     name = f"/dev/shm/rpi-sense-emu-client-{os.getpid()}"
     if os.path.exists(name):
         os.unlink(name)
@@ -196,3 +199,41 @@ def test_the_emulator_gives_samples_of_the_declared_shapes(emulator):
         assert device._hat.get_pixel(3, 3)[0] > 200
         device.make_safe()
         assert device._hat.get_pixel(3, 3) == [0, 0, 0]
+
+
+TURNED = 64
+"""Samples of the emulated compass: each takes 10 ms."""
+
+
+def compass_samples(imu, field, hard_iron=(0.0, 0.0, 0.0)):
+    """Feed the emulator a field that is turned to all sides, and return what the HAT's compass says of it."""
+    heights = np.linspace(-0.98, 0.98, TURNED)
+    angles = 2.4 * np.arange(TURNED)
+    widths = np.sqrt(1.0 - heights**2)
+    ways = np.column_stack([widths * np.cos(angles), widths * np.sin(angles), heights])
+    only = {"gyroscope": False, "accelerometer": False, "joystick": False}
+    found = []
+    with opened("sense_hat", emulated=True, environment_period_s=60.0, **only) as device:
+        for way in ways:
+            imu.set_imu_values((0, 0, 1), (0, 0, 0), field * way + hard_iron, (0, 0, 0))
+            found.append(device.read().values["magnetometer"])
+    return ChannelSamples(
+        name="magnetometer", unit="T", t_s=0.1 * np.arange(TURNED), values=np.array(found)
+    )
+
+
+def test_the_emulated_compass_is_calibrated_against_the_field(emulator):
+    found = calibrate_turned(compass_samples(emulator, 0.48, (0.1, -0.05, 0.2)), 48e-6)
+
+    # It is fed in gauss, and told in uT.
+    assert found.is_usable, found.remarks
+    assert found.scale.values == pytest.approx((1.0, 1.0, 1.0), abs=2e-3)
+    assert found.bias.values == pytest.approx((10e-6, -5e-6, 20e-6), abs=0.2e-6)
+
+
+def test_a_compass_that_was_fed_in_the_wrong_unit_is_found_to_be_clipped(emulator):
+    # 48 uT for gauss: it comes back as the 4 gauss at which the emulator ends.
+    found = calibrate_turned(compass_samples(emulator, 48.0), 48e-6)
+
+    assert not found.is_usable
+    assert all("clipped" in text for text in found.remarks)

@@ -141,5 +141,43 @@ def test_a_playback_begins_where_it_is_told_and_refuses_an_empty_folder(tmp_path
     with opened("playback", tmp_path, directory=".", start_s=2.0) as device:
         assert device.sample_at(10.0).taken_s == 0.0
     (tmp_path / "empty").mkdir()
-    with pytest.raises(PluginError, match="expected records of a device's inputs, found none"):
+    with pytest.raises(PluginError, match="expected records of a device's channels, found none"):
         prepare("playback", {"directory": "empty"}, tmp_path)
+
+
+def test_a_playback_with_ticks_gives_each_sample_in_the_tick_that_could_find_it(tmp_path):
+    told = record(tmp_path, {"gyro": 0.0015, "level": 0.03})
+    (tmp_path / "ticks.jsonl").write_text(
+        '{"schema":1,"stream":"ticks","shape":"array","fields":['
+        '{"name":"tick","unit":"","kind":"int"},{"name":"lateness_us","unit":"us","kind":"int"}]}\n'
+        "[0,100]\n[1,30000]\n[3,0]\n"
+    )
+    settings = {"directory": ".", "ticks": "ticks.jsonl", "tick_hz": 10.0, "phase_s": 0.05}
+    with opened("playback", tmp_path, **settings) as device:
+        found = []
+        while (next_s := device.next_s()) != math.inf:
+            sample = device.sample_at(next_s)
+            found.append((next_s, sample.handed_s))
+
+    woke_s = {0.0: 0.0501, 0.1: 0.18, 0.3: 0.35}
+    assert {next_s for next_s, _ in found} == set(woke_s)
+    assert all(handed_s <= woke_s[next_s] + 2e-6 for next_s, handed_s in found)
+    handed_s = sorted(t_s + age_us * 1e-6 for _, t_s, age_us, _ in told)
+    assert len(found) == sum(each <= 0.35 + 1e-6 for each in handed_s)  # later ones nobody found
+
+
+def test_recorded_outputs_take_what_they_are_given_and_limits_are_told(tmp_path):
+    fields = [("t_s", "s"), ("lateness_us", "us"), ("duty", "1")]
+    told = ",".join(f'{{"name":"{name}","unit":"{unit}","kind":"float"}}' for name, unit in fields)
+    (tmp_path / "duty.jsonl").write_text(
+        f'{{"schema":1,"stream":"duty","shape":"array","fields":[{told}]}}\n[0.5,10,0.25]\n'
+    )
+
+    program = prepare("playback", {"directory": ".", "limits": {"duty": [0.0, 1.0]}}, tmp_path)
+
+    [duty] = program.channels
+    assert (duty.name, duty.direction, duty.unit, duty.limits) == ("duty", "out", "1", (0.0, 1.0))
+    device = program.make()
+    device.open()
+    device.write({"duty": 0.5}, 0.0)
+    assert device.next_s() == math.inf

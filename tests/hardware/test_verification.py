@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +14,7 @@ from madns_runtime.hardware.kind_registry import registered_kinds
 from madns_runtime.hardware.verification.order import STEPS
 from tests.hardware.bench import is_late
 from tests.hardware.test_simulated_kinds import record
+from tests.harness.firmware import build_firmware, needs_emulator
 
 pytestmark = pytest.mark.process
 
@@ -139,6 +141,8 @@ MAP = {
 KINDS = {
     "analog": {"inputs": [{"name": "volts", "file": "in_voltage0_raw"}]},
     "can": {"library": "python-can", "python_can_interface": "virtual"},
+    "emulated_mcu": {"firmware": "report.elf"},
+    "gnss_receiver": {"link": "gps"},
     "gpio": {
         "lines": [{"name": "door", "offset": 1}, {"name": "heater", "offset": 2, "mode": "output"}]
     },
@@ -171,11 +175,19 @@ def test_every_shipped_kind_is_here():
     assert set(KINDS) == set(registered_kinds())
 
 
-@pytest.mark.parametrize("kind", KINDS)
+NIGHTLY = {"emulated_mcu": [pytest.mark.nightly, needs_emulator]}
+"""Kinds of which a hundred starts take half a minute."""
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=NIGHTLY.get(kind, ())) for kind in KINDS]
+)
 def test_shipped_kinds_pass(tmp_path, kind):
     if kind in ("can", "serial"):
         pytest.importorskip(kind)
     prepare_stand_ins(tmp_path)
+    if kind == "emulated_mcu":
+        build_firmware(tmp_path, "report", Path(__file__).parent / "firmware" / "report.c")
     where = {"root": str(tmp_path)} if kind in ("analog", "pwm") else {}
 
     findings = verify(tmp_path, kind, may_write=True, **KINDS[kind], **where)

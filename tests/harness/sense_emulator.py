@@ -8,14 +8,15 @@ import importlib
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 REST = {"humidity": (40.0, 30.0), "pressure": (1013.0, 30.0)}
 """What is fed by sensor: its quantity in % and hPa, and the temperature in degC."""
 
 
 @contextlib.contextmanager
-def fed_emulator() -> Iterator[None]:
-    """Be the program that feeds the emulated HAT, at rest and at 30 degC, once no other test is."""
+def fed_emulator() -> Iterator[Any]:
+    """Be the program that feeds the emulated HAT, at rest and at 30 degC, once no other test is; yield what feeds motion."""
     from sense_emu.lock import EmulatorLock
 
     with contextlib.ExitStack() as stack:
@@ -33,4 +34,4 @@ def fed_emulator() -> Iterator[None]:
             server.set_values(*values)
         imu = importlib.import_module("sense_emu.imu").IMUServer(simulate_world=False)
         stack.callback(imu.close)
-        yield
+        yield imu

@@ -6,11 +6,15 @@ import os
 import signal
 import subprocess
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from harness.waiting import wait_until
+
+EXEC_LOOKS_MAX = 200
+EXEC_POLL_S = 0.005
 
 
 class Marked(NamedTuple):
@@ -95,13 +99,33 @@ def find_marked(*variables: str) -> list[Marked]:
     for folder in Path("/proc").iterdir():
         if folder.name.isdecimal() and int(folder.name) != os.getpid():
             try:
-                is_marked = marks <= set((folder / "environ").read_bytes().split(b"\0"))
+                environment, command = _settled(folder)
                 state = (
                     (folder / "stat").read_text("utf-8", "replace").rpartition(")")[2].split()[0]
                 )
-                command = (folder / "cmdline").read_bytes().replace(b"\0", b" ")
             except OSError:
                 continue
-            if is_marked and state not in "ZX":
-                found.append(Marked(int(folder.name), command.decode(errors="replace").strip()))
+            if marks <= set(environment.split(b"\0")) and state not in "ZX":
+                text = command.replace(b"\0", b" ").decode(errors="replace").strip()
+                found.append(Marked(int(folder.name), text))
     return found
+
+
+def _settled(folder: Path) -> tuple[bytes, bytes]:
+    """Return a process's environment and command; in the midst of an exec it has neither, as a kernel's never has."""
+    for _ in range(EXEC_LOOKS_MAX):
+        environment = (folder / "environ").read_bytes()
+        command = (folder / "cmdline").read_bytes()
+        if environment or command or not _has_program(folder):
+            break
+        time.sleep(EXEC_POLL_S)
+    return environment, command
+
+
+def _has_program(folder: Path) -> bool:
+    """Return whether a process runs a program, as those of the kernel itself and those that have ended do not."""
+    try:
+        (folder / "exe").readlink()
+    except OSError:
+        return False
+    return True

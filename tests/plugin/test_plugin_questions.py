@@ -8,7 +8,13 @@ import pytest
 
 from madns_runtime.errors import PluginError
 from madns_runtime.plugin import code_places, registry
-from madns_runtime.plugin.queries import ask_check, ask_demand, ask_labels, ask_streams
+from madns_runtime.plugin.queries import (
+    ask_check,
+    ask_demand,
+    ask_device_uses,
+    ask_labels,
+    ask_streams,
+)
 
 HEAD = """\
 from dataclasses import dataclass
@@ -154,6 +160,36 @@ def test_labels_that_are_no_second_names_are_told(plugin, value):
 
     with pytest.raises(PluginError, match=re.escape(told)):
         ask_labels(f"{path}:labels", path.parent, parameters=None, agents=("a",))
+
+
+@pytest.mark.parametrize(
+    "value", ["None", "3", "[3]", "[U(agent='b', field='f', device='d', channel='c')]"]
+)
+def test_uses_of_devices_that_are_none_are_told(plugin, value):
+    path = plugin(f"""
+from madns_runtime.plugin.api import DeviceUse as U
+def uses(parameters, agents, base):
+    return {value}
+""")
+    told = (
+        "device_uses() must return DeviceUses of madns_runtime.plugin.api by agents of the scenario"
+    )
+
+    with pytest.raises(PluginError, match=re.escape(told)):
+        ask_device_uses(f"{path}:uses", path.parent, parameters=None, agents=("a",))
+
+
+def test_uses_of_devices_are_those_of_the_agents(plugin):
+    path = plugin("""
+from madns_runtime.plugin.api import DeviceUse
+def uses(parameters, agents, base):
+    for agent in agents:
+        yield DeviceUse(agent=agent, field="parameters.gyro", device="imu", channel="rate")
+""")
+
+    uses = ask_device_uses(f"{path}:uses", path.parent, parameters=None, agents=("a", "b"))
+
+    assert [use.agent for use in uses] == ["a", "b"]
 
 
 @pytest.mark.parametrize("value", ["None", "3", "'gain: odd'", "[3]"])

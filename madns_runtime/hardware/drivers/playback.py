@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Iterator
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from madns_runtime.hardware.contract import Channel, Sample, SimulatedDevice
-from madns_runtime.hardware.kinds.playback import _streams
+from madns_runtime.hardware.contract import Channel, Sample, SimulatedDevice, Value
+from madns_runtime.hardware.kinds.playback import PlaybackParameters, streams_of
 from madns_runtime.recording.reader import read_stream
+
+ROUNDING_S: Final = 1e-6
+"""Of recorded times and ages together."""
 
 
 class PlaybackDevice(SimulatedDevice):
@@ -18,9 +22,14 @@ class PlaybackDevice(SimulatedDevice):
 
     def open(self) -> str:
         """Begin the recording."""
-        streams = _streams(self.parameters.directory)
+        start_s, has_ticks = self.parameters.start_s, self.parameters.tick_hz is not None
+        found_at = _finder(self.parameters)
         self._samples = heapq.merge(
-            *(_samples(channel, path, self.parameters.start_s) for channel, path in streams),
+            *(
+                _samples(channel, path, start_s, found_at, has_ticks=has_ticks)
+                for channel, path in streams_of(self.parameters.directory)
+                if channel.direction == "in"
+            ),
             key=lambda pair: pair[0],
         )
         self._next = next(self._samples, None)
@@ -38,14 +47,53 @@ class PlaybackDevice(SimulatedDevice):
         """Return when the next sample was handed on."""
         return math.inf if self._next is None else self._next[0]
 
+    def write(self, values: Mapping[str, Value], due_s: float) -> None:
+        """Put out nothing: what was given is on record."""
 
-def _samples(channel: Channel, path: Path, start_s: float) -> Iterator[tuple[float, Sample]]:
-    """Yield the samples of one input with the time at which each was handed on, s."""
+
+def _samples(
+    channel: Channel,
+    path: Path,
+    start_s: float,
+    found_at: Callable[[float], float],
+    *,
+    has_ticks: bool,
+) -> Iterator[tuple[float, Sample]]:
+    """Yield the samples of one input with the simulated time at which each is handed on, s."""
     for t_s, _, age_us, *values in read_stream(path).records():
         taken_s = t_s - start_s
-        if taken_s < 0 or None in values:
+        if None in values or (taken_s < 0 and not has_ticks):
             continue
         value: Any = values if channel.shape else values[0]
         if channel.is_frame:
             value = bytes.fromhex(values[1])
-        yield taken_s + age_us * 1e-6, Sample(values={channel.name: value}, taken_s=taken_s)
+        handed_s = taken_s + age_us * 1e-6
+        yield (
+            found_at(handed_s),
+            Sample(
+                values={channel.name: value},
+                taken_s=taken_s,
+                handed_s=handed_s if has_ticks else None,
+            ),
+        )
+
+
+def _finder(parameters: PlaybackParameters) -> Callable[[float], float]:
+    """Return what tells when in simulated time a sample is there that was handed on at a time, s."""
+    tick_hz, start_s = parameters.tick_hz, parameters.start_s
+    if tick_hz is None:
+        return float
+    if parameters.ticks is None:
+        return lambda handed_s: math.ceil((handed_s - ROUNDING_S) * tick_hz) / tick_hz
+    nominal_s: list[float] = []
+    woke_s: list[float] = []
+    for tick, lateness_us, *_ in read_stream(parameters.ticks).records():
+        t_s = tick / tick_hz - start_s
+        nominal_s.append(t_s)
+        woke_s.append(t_s + parameters.phase_s + lateness_us * 1e-6)
+
+    def found_at(handed_s: float) -> float:
+        place = bisect_left(woke_s, handed_s - ROUNDING_S)
+        return nominal_s[place] if place < len(nominal_s) else math.inf
+
+    return found_at

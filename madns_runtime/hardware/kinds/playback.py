@@ -1,26 +1,33 @@
-"""`playback`: the recorded samples of another device, at their own times and with their own ages."""
+"""
+`playback`: the recorded samples of another device, at their own times and with their own ages.
+
+Outputs that were recorded are there as well: they take what they are given, put out nothing, and record it.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
-from annotated_types import Ge
+from annotated_types import Ge, Gt
 
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware.contract import Channel, DeviceKind
 from madns_runtime.recording.reader import read_stream
 
-HEAD = ("t_s", "number", "age_us")
+HEAD: Final = ("t_s", "number", "age_us")
 """First fields of an input's stream."""
 
+OUTPUT_HEAD: Final = ("t_s", "lateness_us")
+"""First fields of an output's stream."""
 
-FRAME = ("bytes", "data")
-"""Its further fields, if its values are frames."""
+FRAME: Final = ("bytes", "data")
+"""Further fields of both, if the values are frames."""
 
 
-CHANNELS_MAX = 64
+CHANNELS_MAX: Final = 64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,38 +38,62 @@ class PlaybackParameters:
     """Folder of a device's records, such as runs/0007-hwil/devices/pi22/imu, or what `cosmos devices record` wrote."""
     start_s: Annotated[float, Ge(0)] = 0.0
     """Time in the recording that is simulated time zero, s."""
+    ticks: Path | None = None
+    """Stream of the ticks of the agent that used the device, such as runs/0007-hwil/agents/agent-01/ticks.jsonl: in
+    lockstep each sample is then there in the tick that could first find it, however late that woke up; without it in
+    the first one at or after the time at which it was handed on."""
+    tick_hz: Annotated[float, Gt(0)] | None = None
+    """Rate of those ticks, Hz; without `ticks` they were lockstep's, on time."""
+    phase_s: float = 0.0
+    """By how much they were due behind their nominal times, s."""
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """By channel, of one number or more: least and largest value, for these are not on record."""
+    queues: tuple[str, ...] = ()
+    """Inputs of which each value arrives once, in order; frames do in any case."""
 
 
 def channels_of(parameters: PlaybackParameters) -> tuple[Channel, ...]:
     """
-    Return the inputs that were recorded.
+    Return the inputs and outputs that were recorded.
 
     Raises:
-        PluginError: The folder holds no stream of an input.
+        PluginError: The folder holds no stream of an input or an output.
     """
-    found = tuple(channel for channel, _ in _streams(parameters.directory))
+    found = tuple(channel for channel, _ in streams_of(parameters.directory))
     if not found:
         raise PluginError(
-            f"{parameters.directory}: expected records of a device's inputs, found none"
+            f"{parameters.directory}: expected records of a device's channels, found none"
         )
-    return found
+    return tuple(
+        replace(
+            each,
+            limits=parameters.limits.get(each.name),
+            passing="queue" if each.name in parameters.queues else each.passing,
+        )
+        for each in found
+    )
 
 
-def _streams(directory: Path) -> list[tuple[Channel, Path]]:
-    """Return the inputs that a folder holds, with their files."""
+def streams_of(directory: Path) -> list[tuple[Channel, Path]]:
+    """Return the channels of which a folder holds streams, with their files."""
     found = []
     for path in sorted(directory.glob("*.jsonl"))[:CHANNELS_MAX]:
         fields = read_stream(path).schema.get("fields", ())
         names = tuple(field["name"] for field in fields)
-        if names[: len(HEAD)] == HEAD and path.stem.isidentifier():
+        if not path.stem.isidentifier():
+            continue
+        if names[: len(HEAD)] == HEAD:
             found.append((_channel(path.stem, fields[len(HEAD) :]), path))
+        elif names[: len(OUTPUT_HEAD)] == OUTPUT_HEAD:
+            channel = _channel(path.stem, fields[len(OUTPUT_HEAD) :])
+            found.append((replace(channel, direction="out"), path))
     return found
 
 
 def _channel(name: str, fields: Any) -> Channel:
     columns = [field["name"] for field in fields]
     if tuple(columns) == FRAME:
-        return Channel(name=name, is_frame=True, frame_bytes_max=8192)
+        return Channel(name=name, is_frame=True, frame_bytes_max=8192, passing="queue")
     if columns == [name]:
         return Channel(name=name, unit=fields[0]["unit"])
     components = tuple(column.removeprefix(f"{name}_") for column in columns)

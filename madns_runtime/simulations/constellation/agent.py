@@ -28,9 +28,14 @@ from madns_runtime.simulations.constellation.orbit.constants import (
 from madns_runtime.simulations.constellation.orbit.elements import elements_from_state
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
 from madns_runtime.simulations.constellation.streams import ATTITUDE, ELEMENTS, STATE, TRUTH_CHANGES
-from madns_runtime.simulations.constellation.vehicle.flight_tick import fit_out
+from madns_runtime.simulations.constellation.vehicle.device_commands import (
+    DEVICE_NUMBER_FIRST,
+    DeviceCommands,
+)
+from madns_runtime.simulations.constellation.vehicle.flight_tick import fit_out, rate_of
+from madns_runtime.simulations.constellation.vehicle.stimuli import Stimuli
 from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBuffer
-from madns_runtime.simulations.constellation.vehicles import vehicle_of
+from madns_runtime.simulations.constellation.vehicles import flight_of, vehicle_of
 
 
 class ConstellationAgent(AgentSimulation):
@@ -73,8 +78,18 @@ class ConstellationAgent(AgentSimulation):
         if vehicle.attitude is not None:
             context.open_stream("attitude", ATTITUDE)
         self._sensors, self._cockpit = fit_out(context, first, vehicle=vehicle, buffer=self._buffer)
-        if self._cockpit is not None:
+        self._rate = rate_of(flight_of(parameters, context.name, first.satellite), context.tick_hz)
+        self._devices = None
+        if vehicle.actuation:
+            has_flight = self._cockpit is not None
+            self._devices = DeviceCommands(context, vehicle, has_flight=has_flight)
+        self._is_commanded = self._cockpit is not None or self._devices is not None
+        self._phase_s = 0.0
+        self._flight_tick = 0
+        self._has_begun = False
+        if self._is_commanded:
             context.open_stream("truth_changes", TRUTH_CHANGES)
+        self._stimuli = Stimuli(vehicle.stimuli, context, first) if vehicle.stimuli else None
 
     def step(self, tick: Tick) -> None:
         """
@@ -83,19 +98,44 @@ class ConstellationAgent(AgentSimulation):
         Raises:
             BlamedError: The vehicle has met the Earth.
         """
+        # Its ticks lie that much behind their nominal times, and so do its maneuvers.
+        self._phase_s = max(0.0, tick.deadline_s - tick.t_s)
+        self._step_early(tick)
         state = self._buffer.lookup(tick.t_s)
         if state is not None:
             x, y, z = state[:3]
             if x * x + y * y + z * z < EARTH_POLAR_RADIUS_M**2:
                 raise BlamedError(f"{self._satellite} has met the Earth at {tick.t_s:g} s")
             self._record_truth(tick, state)
-        readings = None
+        self._measure(tick.index, tick.t_s, state)
+        if self._cockpit is not None and tick.index >= self._flight_tick:
+            # At the first tick at or after each of its times.
+            every = self._rate.ticks_per_step
+            self._flight_tick = tick.index - tick.index % every + every
+            self._cockpit.step(tick.index, tick.t_s, state)
+        if self._devices is not None:
+            self._devices.step(tick.index, tick.t_s, self._phase_s)
+        if self._stimuli is not None:
+            self._stimuli.step(tick.t_s)
+
+    def _step_early(self, tick: Tick) -> None:
+        """Do the steps of flight software since the tick before, but the one at the tick's own time."""
+        cockpit = self._cockpit
+        if cockpit is None:
+            return
+        cockpit.phase_s = self._phase_s
+        has_begun, self._has_begun = self._has_begun, True
+        # Who has just begun, or rejoined, was not there yet.
+        for t_s in self._rate.early_times_s(tick.index) if has_begun else ():
+            state = self._buffer.lookup(t_s)
+            self._measure(tick.index, t_s, state)
+            cockpit.step(tick.index, t_s, state, is_early=True)
+
+    def _measure(self, tick: int, t_s: float, state: tuple[float, ...] | None) -> None:
         if self._sensors is not None:
-            readings = self._sensors.step(tick.index, tick.t_s, state)
-        if self._cockpit is not None:
-            # Its ticks lie that much behind their nominal times, and so do its maneuvers.
-            self._cockpit.phase_s = max(0.0, tick.deadline_s - tick.t_s)
-            self._cockpit.step(tick.index, tick.t_s, state, readings or {})
+            self._sensors.step(tick, t_s, state)
+            if self._cockpit is not None:
+                self._cockpit.take(self._sensors.news())
 
     def _record_truth(self, tick: Tick, state: tuple[float, ...]) -> None:
         self._served += 1
@@ -133,8 +173,8 @@ class ConstellationAgent(AgentSimulation):
         kind = message.get("kind") if isinstance(message, Mapping) else None
         if kind == Segment.KIND:
             self._take_segment(Segment.from_message(message))
-        elif kind == CommandResult.KIND and self._cockpit is not None:
-            self._cockpit.tell(CommandResult.from_message(message))
+        elif kind == CommandResult.KIND and self._is_commanded:
+            self._take_result(CommandResult.from_message(message))
         elif kind != CommandResult.KIND:
             raise PluginError(f"constellation: expected a segment, got {message!r:.200}")
 
@@ -148,14 +188,24 @@ class ConstellationAgent(AgentSimulation):
         if self._cockpit is not None:
             self._cockpit.refuse(refusal)
 
+    def _take_result(self, result: CommandResult) -> None:
+        if self._devices is not None and result.number >= DEVICE_NUMBER_FIRST:
+            self._devices.tell(result)
+            if self._cockpit is not None:
+                self._cockpit.read_gauges(result)
+        elif self._cockpit is not None:
+            self._cockpit.tell(result)
+
     def _take_segment(self, segment: Segment) -> None:
         now_s = self._context.now_s()
         left_s = self._buffer.end_s - now_s
         if self._buffer.add(segment):
             self._left_s_min = min(self._left_s_min, left_s)
-        if segment.revision > self._revision and self._cockpit is not None:
+        if self._stimuli is not None:
+            self._stimuli.take(segment, now_s)
+        if segment.revision > self._revision and self._is_commanded:
             self._revision = segment.revision
-            left_s = segment.t0_s + self._cockpit.phase_s - now_s
+            left_s = segment.t0_s + self._phase_s - now_s
             self._change_left_s_min = min(self._change_left_s_min, left_s)
             self._context.record("truth_changes", (segment.revision, segment.t0_s, now_s, left_s))
 
@@ -184,10 +234,16 @@ class ConstellationAgent(AgentSimulation):
             else None,
             "joint_gap_m_max": buffer.joint_gap_m_max,
             **({} if self._sensors is None else {"sensors": self._sensors.summary()}),
+            **({} if self._devices is None else {"actuation": self._devices.finish()}),
+            **self._stimuli_summary(),
             **flown,
             **self._message_counts(),
             "checks": [underruns, *(checks if isinstance(checks, list) else [checks])],
         }
+
+    def _stimuli_summary(self) -> dict[str, Any]:
+        stimuli = self._stimuli
+        return {} if stimuli is None else {"stimuli": stimuli.finish(self._context.now_s())}
 
     def _message_counts(self) -> dict[str, int]:
         """Return the counts of messages by radio; without flight software nobody heard them."""

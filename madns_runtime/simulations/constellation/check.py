@@ -13,7 +13,10 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 from madns_runtime.errors import ConfigurationError, MissingExtraError
+from madns_runtime.plugin.api import DeviceUse
+from madns_runtime.simulations.constellation.check_flight import flight_faults, rate_faults
 from madns_runtime.simulations.constellation.check_vehicles import board_faults, code_faults
+from madns_runtime.simulations.constellation.device_uses import uses_devices, uses_of
 from madns_runtime.simulations.constellation.parameters import (
     KNOTS_MAX,
     ConstellationParameters,
@@ -34,12 +37,14 @@ FAULTS_MAX = 20
 """Satellites that are named."""
 
 
-def find_faults(
+def find_faults(  # noqa: PLR0913 - what a scenario is; see plugin.api.Simulation.check
     parameters: ConstellationParameters,
     agents: int,
     base_directory: Path,
     names: tuple[str, ...] = (),
     duration_s: float = 0.0,
+    is_lockstep: bool = False,
+    tick_hz: float = 0.0,
 ) -> list[str]:
     """
     Return every fault as a line that starts with the dotted parameter name and a colon.
@@ -50,6 +55,8 @@ def find_faults(
         base_directory: Folder of the scenario.
         names: The agents' names; globs are not judged without them.
         duration_s: Of the run: SGP4 is asked for its end, too.
+        is_lockstep: Whether simulated time waits for everybody.
+        tick_hz: Of the ticks; rates are not judged without it.
     """
     faults: list[str] = []
     folder = Path(base_directory)
@@ -64,7 +71,9 @@ def find_faults(
     faults += _segment_faults(parameters)
     faults += _attitude_faults(parameters)
     faults += _missing_libraries(parameters)
-    faults += board_faults(parameters, pairs, folder)
+    faults += board_faults(parameters, pairs)
+    faults += flight_faults(parameters, pairs, folder, is_lockstep=is_lockstep)
+    faults += rate_faults(parameters, tick_hz)
     return faults
 
 
@@ -79,6 +88,25 @@ def name_satellites(
     """
     chosen = choose(parameters, len(agents), Path(base_directory))
     return dict(zip(agents, chosen.names, strict=True))
+
+
+def device_uses(
+    parameters: ConstellationParameters, agents: tuple[str, ...], base_directory: Path
+) -> list[DeviceUse]:
+    """
+    Return the channels of devices that vehicles use; see `plugin.api.Simulation`.
+
+    Raises:
+        ConfigurationError: The satellites cannot be chosen.
+    """
+    if not uses_devices(parameters):
+        return []
+    satellites = name_satellites(parameters, agents, base_directory)
+    return [
+        use
+        for index, (agent, satellite) in enumerate(satellites.items())
+        for use in uses_of(parameters, agent, index, satellite)
+    ]
 
 
 def _propagator_faults(parameters: ConstellationParameters, base_directory: Path) -> list[str]:
@@ -127,6 +155,11 @@ def _attitude_faults(parameters: ConstellationParameters) -> list[str]:
             faults.append(
                 f"{field}.wheels: {propagator.kind} does rigid bodies without wheels only; drop them, which "
                 "makes torques exact and without limit, or take kind: scipy or numba"
+            )
+        if attitude.magnetorquers is not None and not propagator.PROPERTIES.follows_dipoles:
+            faults.append(
+                f"{field}.magnetorquers: {propagator.kind} follows no magnetic dipole; drop them, or take "
+                "kind: scipy or numba"
             )
         turn_deg = math.hypot(*attitude.rates_deg_s) * parameters.segments.knot_s
         if turn_deg >= 180.0:

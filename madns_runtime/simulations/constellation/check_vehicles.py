@@ -1,5 +1,5 @@
 """
-Faults in what a scenario says of vehicles, their sensors and flight software, and of the ground.
+Faults in what a scenario says of vehicles and their sensors, and of the ground; and in code that it names.
 
 Whether code that it names is there is found out without running any of it, for `cosmos validate`: a file is
 parsed, not imported. What it does when it is imported shows on the agent.
@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import fnmatch
 import importlib.util
+import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -17,12 +18,20 @@ from pathlib import Path
 from madns_runtime.bounded_files import FileRefused, read_regular_file
 from madns_runtime.plugin.code_places import CODE_BYTES_MAX
 from madns_runtime.plugin.registry import is_file
-from madns_runtime.simulations.constellation.equipment import SensorNoise, Vehicle
-from madns_runtime.simulations.constellation.flight.programs import find_program
-from madns_runtime.simulations.constellation.parameters import (
-    ConstellationParameters,
-    FlightProcess,
+from madns_runtime.simulations.constellation.actuation import actuation_faults
+from madns_runtime.simulations.constellation.alignment import alignment_fault
+from madns_runtime.simulations.constellation.equipment import (
+    AnySensorDevice,
+    ClockDevice,
+    MagnetometerDevice,
+    SensorDevice,
+    SensorNoise,
+    StarTrackerDevice,
+    Vehicle,
 )
+from madns_runtime.simulations.constellation.parameters import ConstellationParameters
+from madns_runtime.simulations.constellation.sensor_channels import sensors_from_devices
+from madns_runtime.simulations.constellation.stimulus import stimulus_faults
 from madns_runtime.simulations.constellation.vehicles import is_glob
 
 _HERE = "madns_runtime.simulations.constellation"
@@ -33,7 +42,7 @@ PENDING_MAX = 10_000
 
 
 def board_faults(
-    parameters: ConstellationParameters, names: Sequence[tuple[str, str]], base_directory: Path
+    parameters: ConstellationParameters, names: Sequence[tuple[str, str]]
 ) -> list[str]:
     """
     Return the faults.
@@ -41,7 +50,6 @@ def board_faults(
     Args:
         parameters: Of the scenario, within their bounds.
         names: Names of each agent and of its satellite; empty if they are not known.
-        base_directory: Folder of the scenario.
     """
     faults = []
     for number, vehicle in enumerate(parameters.vehicles):
@@ -49,7 +57,8 @@ def board_faults(
         faults += glob_faults(f"{field}.agents", vehicle.agents, names)
         faults += _body_faults(field, vehicle)
         faults += _sensor_faults(field, vehicle)
-    faults += _flight_faults(parameters, names, base_directory)
+        faults += _actuation_faults(field, vehicle)
+        faults += _stimulus_faults(field, vehicle, parameters.segments.buffer_s / 2.0)
     faults += _ground_faults(parameters, names)
     return faults
 
@@ -98,46 +107,91 @@ def _sensor_faults(field: str, vehicle: Vehicle) -> list[str]:
         if getattr(sensors, name) is not None and vehicle.attitude is None
     ]
     for name in type(sensors).__dataclass_fields__:
-        sensor: SensorNoise | None = getattr(sensors, name)
-        if sensor is not None and sensor.latency_s * sensor.rate_hz > PENDING_MAX:
+        sensor: SensorNoise | AnySensorDevice | None = getattr(sensors, name)
+        if not isinstance(sensor, SensorNoise):
+            continue
+        if sensor.latency_s * sensor.rate_hz > PENDING_MAX:
             faults.append(
                 f"{field}.sensors.{name}.latency_s: expected at most {PENDING_MAX} measurements "
                 f"under way, got {sensor.latency_s * sensor.rate_hz:g}"
             )
-    magnetometer = sensors.magnetometer
-    wants_igrf = magnetometer is not None and magnetometer.field == "igrf"
-    if wants_igrf and importlib.util.find_spec("ppigrf") is None:
-        faults.append(
-            f"{field}.sensors.magnetometer.field: ppigrf is not installed here; "
+    for name, settings in sensors_from_devices(vehicle):
+        faults += _device_faults(f"{field}.sensors.{name}", settings)
+    magnetometer, inner = sensors.magnetometer, ""
+    if isinstance(magnetometer, MagnetometerDevice):
+        magnetometer, inner = magnetometer.model, ".model"
+    torquers = None if vehicle.attitude is None else vehicle.attitude.magnetorquers
+    models = {
+        f"sensors.magnetometer{inner}": magnetometer and magnetometer.field,
+        "attitude.magnetorquers": torquers and torquers.field,
+    }
+    if "igrf" in models.values() and importlib.util.find_spec("ppigrf") is None:
+        faults += [
+            f"{field}.{name}.field: ppigrf is not installed here; "
             "install it with: pip install 'cosmos-madns[igrf]'"
-        )
+            for name, model in models.items()
+            if model == "igrf"
+        ]
     return faults
 
 
-def _flight_faults(
-    parameters: ConstellationParameters, names: Sequence[tuple[str, str]], base_directory: Path
-) -> list[str]:
-    flight = parameters.flight
-    if flight is None:
-        return []
-    if isinstance(flight, str):
-        return code_faults("parameters.flight", flight, base_directory, forbidden=WALL)
-    faults = glob_faults("parameters.flight.agents", flight.agents, names)
-    if isinstance(flight, FlightProcess):
-        return faults + _program_faults(flight.command[0], base_directory)
-    field, software = "parameters.flight.software", flight.software
-    return faults + code_faults(field, software, base_directory, forbidden=WALL)
+def _actuation_faults(field: str, vehicle: Vehicle) -> list[str]:
+    attitude = vehicle.attitude
+    has_torquers = attitude is not None and attitude.magnetorquers is not None
+    return [
+        f"{field}.actuation[{number}].{name}: {text}"
+        for number, actuation in enumerate(vehicle.actuation)
+        for name, text in actuation_faults(
+            actuation, has_attitude=attitude is not None, has_torquers=has_torquers
+        )
+    ]
 
 
-def _program_faults(program: str, base_directory: Path) -> list[str]:
-    """Return what is wrong with a program; an absolute path may exist on the boards alone."""
-    if Path(program).is_absolute() or find_program((program,), base_directory) is not None:
-        return []
-    path = base_directory / program
-    if path.is_file():
-        return [f"parameters.flight.command: {path} is not executable; chmod +x makes it so"]
-    where = base_directory if "/" in program else f"{base_directory} or on PATH"
-    return [f"parameters.flight.command: no program {program!r} in {where}"]
+def _stimulus_faults(field: str, vehicle: Vehicle, lead_s_max: float) -> list[str]:
+    faults = []
+    channels: set[str] = set()
+    for number, stimulus in enumerate(vehicle.stimuli):
+        own = f"{field}.stimuli[{number}]"
+        found = stimulus_faults(
+            stimulus, has_attitude=vehicle.attitude is not None, lead_s_max=lead_s_max
+        )
+        faults += [f"{own}.{name}: {text}" for name, text in found]
+        if stimulus.channel in channels:
+            faults.append(
+                f"{own}.channel: expected every channel once, got {stimulus.channel} again"
+            )
+        channels.add(stimulus.channel)
+        if stimulus.field == "igrf" and importlib.util.find_spec("ppigrf") is None:
+            faults.append(
+                f"{own}.field: ppigrf is not installed here; "
+                "install it with: pip install 'cosmos-madns[igrf]'"
+            )
+    return faults
+
+
+def _device_faults(field: str, settings: AnySensorDevice) -> list[str]:
+    """Return what is wrong with a sensor that is hardware, whatever its device."""
+    faults = []
+    device, _, channel = settings.device.rpartition(".")
+    if not device or not channel.isidentifier():
+        faults.append(
+            f"{field}.device: expected a device and its channel such as imu.gyro, got {settings.device!r:.80}"
+        )
+    if isinstance(settings, SensorDevice | StarTrackerDevice):
+        must_turn = isinstance(settings, StarTrackerDevice)
+        if wrong := alignment_fault(settings.alignment, must_turn=must_turn):
+            faults.append(f"{field}.alignment: {wrong}")
+    if isinstance(settings, SensorDevice | ClockDevice):
+        scale = settings.scale if isinstance(settings.scale, tuple) else (settings.scale,)
+        if not all(number and math.isfinite(number) for number in scale):
+            faults.append(f"{field}.scale: expected factors other than 0, got {settings.scale}")
+    unused = SensorNoise()
+    faults += [
+        f"{field}.model.{name}: the model is asked at the times of the device's samples: leave it out"
+        for name in ("rate_hz", "latency_s", "dropout")
+        if settings.model is not None and getattr(settings.model, name) != getattr(unused, name)
+    ]
+    return faults
 
 
 def _ground_faults(

@@ -28,6 +28,7 @@ from madns_runtime.simulations.constellation.truth.vehicle_propagation import (
     VehicleRequest,
     propagate_vehicle,
 )
+from madns_runtime.simulations.constellation.vehicles import flight_rules
 
 TIMINGS = 5
 """Timed propagations; the median is taken, after one that pays for imports."""
@@ -75,7 +76,9 @@ def estimate_demand(
         lead_s=math.inf,
         measured=True,
     )
-    if parameters.flight is None or not parameters.propagator.can_maneuver:
+    is_commanded = any(vehicle.actuation for vehicle in parameters.vehicles)
+    is_commanded = is_commanded or bool(flight_rules(parameters))
+    if not is_commanded or not parameters.propagator.can_maneuver:
         return demand
     sync_bytes, sync_s = _maneuver(fleet.states[0], knot_s, 3 * intervals, propagation)
     return replace(

@@ -11,6 +11,12 @@ from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 
+from madns_runtime.simulations.constellation.actuation import Actuation
+from madns_runtime.simulations.constellation.stimulus import Stimulus
+
+FieldName = Literal["dipole", "igrf"]
+"""Model of the Earth's magnetic field."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Thruster:
@@ -43,6 +49,19 @@ class ReactionWheels:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Magnetorquers:
+    """Errors and limits that turn a commanded magnetic dipole into a real one; the Earth's field turns the body by it."""
+
+    dipole_a_m2_max: Annotated[float, Gt(0), Le(10_000)]
+    """Largest dipole along each body axis, A m^2."""
+    dipole_error: Annotated[float, Ge(0), Lt(1)] = 0.0
+    """Standard deviation of the dipole, as a share of it."""
+    field: FieldName | None = None
+    """The Earth's field in truth that turns the body. dipole: tilted dipole; igrf: the extra `igrf`, on the host as
+    well; none for that of the vehicle's magnetometer, without one dipole."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Attitude:
     """A rigid body: quaternion (scalar last, inertial to body) and body rates are propagated as well."""
 
@@ -57,6 +76,8 @@ class Attitude:
     """Whether the Earth's gravity turns it."""
     wheels: ReactionWheels | None = None
     """Actuators of commanded torques; none for exact torques without limit."""
+    magnetorquers: Magnetorquers | None = None
+    """Actuators of commanded magnetic dipoles; none for no dipoles."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,27 +110,98 @@ class Gnss(SensorNoise):
 class Magnetometer(SensorNoise):
     """Magnetic field in body axes, T; in the run's frame for a vehicle without attitude."""
 
-    field: Literal["dipole", "igrf"] = "dipole"
+    field: FieldName = "dipole"
     """dipole: tilted dipole; igrf: the extra `igrf`."""
+
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorDevice:
+    """A sensor that is hardware: its readings are alignment (scale raw - bias), in the sensor's unit, of a channel."""
+
+    device: Annotated[str, MinLen(3)]
+    """Device of the run and its channel, such as imu.gyro."""
+    alignment: tuple[Triple, Triple, Triple] | tuple[float, float, float, float] | None = None
+    """From the device's axes to the body's: a matrix by its rows, or a quaternion, scalar last; none where they are one."""
+    scale: float | Triple = 1.0
+    """Factor of the channel's values, or one for each of its axes."""
+    bias: Triple = (0.0, 0.0, 0.0)
+    """What remains of the scaled values where there is nothing to measure, in the channel's unit."""
+    model: SensorNoise | None = None
+    """Model that is recorded beside it, with its errors; none for no more than truth beside it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MagnetometerDevice(SensorDevice):
+    """A magnetometer that is hardware."""
+
+    model: Magnetometer | None = None
+    """Model that is recorded beside it, with its errors; its field is that of the truth beside it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StarTrackerDevice:
+    """A star tracker that is hardware: a channel of quaternions, scalar last, inertial to the device's axes."""
+
+    device: Annotated[str, MinLen(3)]
+    """Device of the run and its channel, such as tracker.attitude."""
+    alignment: tuple[Triple, Triple, Triple] | tuple[float, float, float, float] | None = None
+    """Rotation from the device's axes to the body's; none where they are one."""
+    model: SensorNoise | None = None
+    """Model that is recorded beside it, with its errors."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockDevice:
+    """A clock that is hardware: scale raw - bias is the time since the epoch."""
+
+    device: Annotated[str, MinLen(3)]
+    """Device of the run and its channel, such as gps.time."""
+    scale: float = 1.0
+    """Factor of the channel's values."""
+    bias: float = 0.0
+    """What the scaled value is at the epoch, in the channel's unit."""
+    model: SensorNoise | None = None
+    """Model that is recorded beside it, with its errors."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GnssDevice:
+    """A receiver that is hardware: two channels of one device, taken at one time."""
+
+    device: Annotated[str, MinLen(3)]
+    """Device of the run and its channel of positions, such as gps.position."""
+    velocity: Annotated[str, MinLen(1)]
+    """Channel of velocities of the same device."""
+    frame: Literal["ECEF", "TEME"] = "ECEF"
+    """Frame of the channels: ECEF is turned into the run's frame by sidereal time."""
+    model: Gnss | None = None
+    """Model that is recorded beside it, with its errors."""
+
+
+AnySensorDevice = SensorDevice | StarTrackerDevice | ClockDevice | GnssDevice
+"""Settings of a sensor that is hardware."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sensors:
-    """Sensors of a vehicle; absent ones measure nothing."""
+    """Sensors of a vehicle, models or hardware (those with `device`); absent ones measure nothing."""
 
-    gnss: Gnss | None = None
+    gnss: Gnss | GnssDevice | None = None
     """Position and velocity."""
-    gyro: SensorNoise | None = None
+    gyro: SensorNoise | SensorDevice | None = None
     """Body rates, rad/s."""
-    accelerometer: SensorNoise | None = None
+    accelerometer: SensorNoise | SensorDevice | None = None
     """Specific force, mean since the measurement before, in body axes, m/s^2."""
-    magnetometer: Magnetometer | None = None
+    magnetometer: Magnetometer | MagnetometerDevice | None = None
     """Magnetic field."""
-    star_tracker: SensorNoise | None = None
+    star_tracker: SensorNoise | StarTrackerDevice | None = None
     """Quaternion, scalar last, inertial to body; noise in rad about each body axis."""
-    sun_sensor: SensorNoise | None = None
+    sun_sensor: SensorNoise | SensorDevice | None = None
     """Unit vector to the Sun in body axes; nothing in eclipse; noise in rad."""
-    clock: SensorNoise | None = None
+    clock: SensorNoise | ClockDevice | None = None
     """Time since the epoch, s."""
 
 
@@ -135,3 +227,7 @@ class Vehicle:
     """None: a point mass."""
     sensors: Sensors = field(default_factory=Sensors)
     """Sensors on board."""
+    actuation: tuple[Actuation, ...] = ()
+    """Devices whose values are commands of the vehicle, with or without flight software."""
+    stimuli: tuple[Stimulus, ...] = ()
+    """Truth that devices of the vehicle are given, ahead of its time."""

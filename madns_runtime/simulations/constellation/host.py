@@ -41,7 +41,7 @@ from madns_runtime.simulations.constellation.truth.propagation import (
 )
 from madns_runtime.simulations.constellation.truth.propagators.rigid_body import initial_attitude
 from madns_runtime.simulations.constellation.truth.segments import TruthStore
-from madns_runtime.simulations.constellation.vehicles import vehicle_of
+from madns_runtime.simulations.constellation.vehicles import flight_rules, vehicle_of
 
 WINDOWS_FIRST = 3
 """Windows computed before the start: two for the first buffer and the one after it."""
@@ -215,13 +215,15 @@ class ConstellationHost(HostSimulation):
         )
 
     def _make_maneuvering(self, vehicles: list[Vehicle]) -> Maneuvering | None:
-        """Return who carries commands out; nobody without flight software."""
+        """Return who carries commands out; nobody without flight software or a device that commands."""
         parameters, context = self._parameters, self._context
-        if parameters.flight is None:
+        has_devices = any(vehicle.actuation for vehicle in vehicles)
+        if not has_devices and not flight_rules(parameters):
             return None
         rules = Rules(
             settings=parameters.maneuvers,
             can_maneuver=parameters.propagator.can_maneuver,
+            can_magnetise=parameters.propagator.PROPERTIES.follows_dipoles,
             duration_s=context.duration_s,
             tick_hz=context.tick_hz,
             knot_s=self._store.knot_s,

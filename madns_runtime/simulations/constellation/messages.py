@@ -42,7 +42,7 @@ __all__ = [
 GROUND = "ground"
 """Receiver of what is for any ground station; ground:NAME for one of them."""
 
-CommandKind = Literal["delta_v", "torque", "ballistic"]
+CommandKind = Literal["delta_v", "torque", "ballistic", "dipole"]
 CommandFrame = Literal["inertial", "rtn", "body"]
 CommandStatus = Literal["accepted", "executed", "postponed", "refused"]
 
@@ -146,7 +146,8 @@ class Command(Message):
     number: int
     """The agent's own, from 0 on."""
     kind: CommandKind
-    """delta_v: vector in m/s; torque: vector in N m, body axes; ballistic: its first component is Cd A / m, m^2/kg."""
+    """delta_v: vector in m/s; torque: vector in N m, body axes; ballistic: its first component is Cd A / m, m^2/kg;
+    dipole: vector in A m^2, body axes."""
     commanded_s: float
     """T_s: simulated time of the tick that commanded it."""
     at_s: float
@@ -155,7 +156,7 @@ class Command(Message):
     """rtn: radial, along-track, normal at the time of execution."""
     vector: Vector
     duration_s: float = 0.0
-    """Of a torque, s."""
+    """Of a torque or a dipole, s."""
     phase_s: float = 0.0
     """By how much this agent's ticks lie behind their nominal time, s: its T_m comes that much later, too."""
 
@@ -179,6 +180,8 @@ class CommandResult(Message):
     """Magnitude really given."""
     propellant_kg: float = 0.0
     """Propellant left after the command, kg."""
+    wheels_n_m_s: Vector | None = None
+    """Momentum of the wheels about body x, y, z after a torque that was executed, N m s; None for any other result."""
 
 
 def is_for_ground(to: str) -> bool:
@@ -270,6 +273,7 @@ _WAYS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
     "float | None": (_or_none(_number), _as_it_is),
     "str": (_exactly(str), _as_it_is),
     "Vector": (_vector, list),
+    "Vector | None": (_or_none(_vector), _or_none(list)),
     "CommandKind": (_one_of(CommandKind), _as_it_is),
     "CommandFrame": (_one_of(CommandFrame), _as_it_is),
     "CommandStatus": (_one_of(CommandStatus), _as_it_is),

@@ -15,10 +15,14 @@ from typing import Annotated, ClassVar, Literal
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 
 from madns_runtime.simulations.constellation.equipment import Vehicle
+from madns_runtime.simulations.constellation.flight_settings import (
+    FlightAttached,
+    FlightClass,
+    FlightProcess,
+    Setting,
+)
 
 Force = Literal["two_body", "j2", "j3", "j4", "drag"]
-Setting = bool | int | float | str | list[float] | list[str]
-"""A value of one's own that a scenario hands to code of one's own."""
 KNOTS_MAX = 100_000
 """Knots in one segment: more is a mistake, not a plan."""
 
@@ -93,6 +97,8 @@ class PropagatorProperties:
     """Whether it starts from element sets, not from states."""
     turns_bodies: bool = False
     """Whether it integrates attitude itself, of bodies without wheels: `truth.propagators.attitude` does else."""
+    follows_dipoles: bool = False
+    """Whether bodies turn by their magnetorquers."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,7 +106,10 @@ class ScipyPropagator:
     """Numerical integration: DOP853 of scipy over all vehicles at once."""
 
     PROPERTIES: ClassVar = PropagatorProperties(
-        engine="scipy_propagator:ScipyDop853", library="scipy", conserves_energy=True
+        engine="scipy_propagator:ScipyDop853",
+        library="scipy",
+        conserves_energy=True,
+        follows_dipoles=True,
     )
     can_maneuver: ClassVar[bool] = True
 
@@ -126,6 +135,7 @@ class NumbaPropagator:
         extra="fast",
         is_independent=True,
         conserves_energy=True,
+        follows_dipoles=True,
     )
     can_maneuver: ClassVar[bool] = True
 
@@ -270,36 +280,6 @@ class Uplink:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FlightClass:
-    """Flight software in Python: one class in one file."""
-
-    software: Annotated[str, MinLen(3)]
-    """guidance.py:Guidance beside the scenario, or module:Class."""
-    agents: Annotated[tuple[str, ...], MinLen(1)] = ("*",)
-    """Globs of agents' or satellites' names that fly it; the others are not commanded."""
-    input: Literal["measurements", "truth"] = "measurements"
-    """Input at every tick."""
-    settings: dict[str, Setting] = field(default_factory=dict)
-    """For the class to read: context.settings."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FlightProcess:
-    """Flight software in any language: a program that speaks JSON lines on stdin and stdout."""
-
-    command: Annotated[tuple[str, ...], MinLen(1)]
-    """The program and its arguments; a relative path is found from the scenario's folder."""
-    agents: Annotated[tuple[str, ...], MinLen(1)] = ("*",)
-    """Globs of agents' or satellites' names that fly it."""
-    input: Literal["measurements", "truth"] = "measurements"
-    """Input at every tick."""
-    settings: dict[str, Setting] = field(default_factory=dict)
-    """In the first line that it reads."""
-    answer_s: Annotated[float, Gt(0)] = 1.0
-    """Time for the answer to a tick; in real time a later one is counted as late and taken when it comes."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SegmentSettings:
     """Way of truth to the agents."""
 
@@ -344,8 +324,16 @@ class ConstellationParameters:
     """Descriptions of the vehicles; the first entry that fits a vehicle describes it."""
     maneuvers: Maneuvers = field(default_factory=Maneuvers)
     """Treatment of commands that change truth."""
-    flight: str | FlightClass | FlightProcess | None = None
-    """Flight software of the agents: file.py:Class, or with settings; none for vehicles that only coast."""
+    flight: (
+        str
+        | FlightClass
+        | FlightProcess
+        | FlightAttached
+        | tuple[str | FlightClass | FlightProcess | FlightAttached, ...]
+        | None
+    ) = None
+    """Flight software of the agents: file.py:Class, or with settings, or a list of rules of which the first that
+    fits a vehicle holds; none for vehicles that only coast."""
     crosslinks: Crosslinks | None = None
     """Radio between vehicles; none for no radio."""
     stations: tuple[GroundStation, ...] = ()

@@ -6,6 +6,8 @@ Light, so that `cosmos validate` asks for it without numpy, and on neither side 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from madns_runtime.plugin.api import DeclaredStream
 from madns_runtime.recording.records import Field
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
@@ -64,7 +66,8 @@ COMMANDS = (
     Field("z", "m/s | N m"),
     Field("duration_s", "s"),
 )
-"""Commands of flight software; their results are in command_results."""
+"""Commands of flight software; their results are in command_results. Where a vehicle has magnetorquers the vector may
+also be in A m^2: see `commands_fields`."""
 
 COMMAND_RESULTS = (
     Field("tick", "", "int"),
@@ -96,6 +99,20 @@ REFUSALS = (
     Field("reason", "", "str"),
 )
 """Messages that were refused, at the tick that told flight software of it; there is none before the first."""
+
+FLIGHT_ANSWERS = (
+    Field("tick", "", "int"),
+    Field("t_s", "s"),
+    Field("answer_us", "us"),
+)
+"""Answers of flight software behind an interface: time from sending a tick's report until its answer came."""
+
+FLIGHT_CLOCK = (
+    Field("t_s", "s"),
+    Field("offset_s", "s"),
+    Field("drift_ppm", "1e-6"),
+)
+"""The flight software's own clock: simulated time minus it, and how much faster it runs; once per second."""
 
 TRUTH = (
     Field("sent_s", "s"),
@@ -185,6 +202,8 @@ UNITS = {
     "_m2_kg": "m^2/kg",
     "_n": "N",
     "_n_m": "N m",
+    "_n_m_s": "N m s",
+    "_a_m2": "A m^2",
     "_t": "T",
 }
 """Units that end the name of an estimate."""
@@ -205,6 +224,8 @@ OF_AGENTS = {
     "command_results": COMMAND_RESULTS,
     "messages": MESSAGES,
     "refusals": REFUSALS,
+    "flight_answers": FLIGHT_ANSWERS,
+    "flight_clock": FLIGHT_CLOCK,
     "gyro": (*SAMPLE, *ATTITUDE[5:]),
     "gnss": (*SAMPLE, *STATE[1:]),
     "accelerometer": (
@@ -218,6 +239,20 @@ OF_AGENTS = {
     "clock_sensor": (*SAMPLE, Field("clock_s", "s")),
     "magnetometer": (*SAMPLE, Field("bx_t", "T"), Field("by_t", "T"), Field("bz_t", "T")),
 }
+SENSOR_STREAMS = (
+    "gyro",
+    "gnss",
+    "accelerometer",
+    "star_tracker",
+    "sun_sensor",
+    "clock_sensor",
+    "magnetometer",
+)
+OF_AGENTS |= {
+    f"{name}_{beside}": OF_AGENTS[name] for name in SENSOR_STREAMS for beside in ("truth", "model")
+}
+"""Beside the readings of a sensor that is hardware: what one without errors would have measured at the same time, and
+what the model of it did, if there is one. Their tick is the reading's."""
 
 
 def declared_streams(
@@ -226,8 +261,22 @@ def declared_streams(
     """Return every stream that a host or a vehicle may open, whatever the parameters; see `plugin.api.Simulation`."""
     return (
         *(DeclaredStream(role="host", name=name, fields=OF_HOST[name]) for name in OF_HOST),
-        *(DeclaredStream(role="agent", name=name, fields=OF_AGENTS[name]) for name in OF_AGENTS),
+        *(
+            DeclaredStream(role="agent", name=name, fields=fields)
+            for name, fields in (OF_AGENTS | {"commands": commands_fields(parameters)}).items()
+        ),
         DeclaredStream(role="agent", name="estimates", fields=ESTIMATES, is_open=True),
+    )
+
+
+def commands_fields(parameters: ConstellationParameters) -> tuple[Field, ...]:
+    """Return the fields of the stream commands of a run: the same in all its vehicles, with all units that they may have."""
+    bodies = (vehicle.attitude for vehicle in parameters.vehicles)
+    if not any(body is not None and body.magnetorquers is not None for body in bodies):
+        return COMMANDS
+    return tuple(
+        replace(field, unit=f"{field.unit} | A m^2") if field.name in "xyz" else field
+        for field in COMMANDS
     )
 
 

@@ -11,12 +11,9 @@ import re
 from collections.abc import Iterable
 from functools import lru_cache
 
-from madns_runtime.simulations.constellation.equipment import Vehicle
-from madns_runtime.simulations.constellation.parameters import (
-    ConstellationParameters,
-    FlightClass,
-    FlightProcess,
-)
+from madns_runtime.simulations.constellation.equipment import FieldName, MagnetometerDevice, Vehicle
+from madns_runtime.simulations.constellation.flight_settings import FlightClass, FlightRule
+from madns_runtime.simulations.constellation.parameters import ConstellationParameters
 
 GLOBS_KEPT = 1024
 """Lists of globs that are kept sorted out: each is asked for every agent."""
@@ -32,22 +29,29 @@ def vehicle_of(parameters: ConstellationParameters, agent: str, satellite: str) 
     return DEFAULT
 
 
-def flight_of(
-    parameters: ConstellationParameters, agent: str, satellite: str
-) -> FlightClass | FlightProcess | None:
-    """Return the flight software that an agent flies, or None for a vehicle that only coasts."""
-    flight = flight_settings(parameters)
-    if flight is None or not fits(flight.agents, agent, satellite):
-        return None
-    return flight
+def field_of(vehicle: Vehicle) -> FieldName:
+    """Return the Earth's field by which magnetorquers turn a vehicle: as they say, else as its magnetometer does."""
+    torquers = None if vehicle.attitude is None else vehicle.attitude.magnetorquers
+    magnetometer = vehicle.sensors.magnetometer
+    if isinstance(magnetometer, MagnetometerDevice):
+        magnetometer = magnetometer.model
+    measured: FieldName = "dipole" if magnetometer is None else magnetometer.field
+    return measured if torquers is None or torquers.field is None else torquers.field
 
 
-def flight_settings(
-    parameters: ConstellationParameters,
-) -> FlightClass | FlightProcess | None:
-    """Return the scenario's flight software, with its short form file.py:Class written out."""
+def flight_of(parameters: ConstellationParameters, agent: str, satellite: str) -> FlightRule | None:
+    """Return the first rule of flight software that fits an agent or its satellite; None for a vehicle that only coasts."""
+    for rule in flight_rules(parameters):
+        if fits(rule.agents, agent, satellite):
+            return rule
+    return None
+
+
+def flight_rules(parameters: ConstellationParameters) -> tuple[FlightRule, ...]:
+    """Return the scenario's rules of flight software, with their short form file.py:Class written out."""
     flight = parameters.flight
-    return FlightClass(software=flight) if isinstance(flight, str) else flight
+    rules = flight if isinstance(flight, tuple) else () if flight is None else (flight,)
+    return tuple(FlightClass(software=rule) if isinstance(rule, str) else rule for rule in rules)
 
 
 def fits(globs: Iterable[str], agent: str, satellite: str) -> bool:

@@ -10,6 +10,7 @@ from harness.synthetic_run import SyntheticRun, make_config
 from cosmos_cli import app
 from cosmos_cli.collect.finish import finish_run
 from madns_runtime.recording.records import Field, StreamSchema
+from madns_runtime.simulations.constellation import streams
 from madns_runtime.simulations.constellation.analysis.measurement_errors import QUATERNION, Quantity
 
 TICKS, TICK_HZ = 200, 1.0
@@ -43,6 +44,7 @@ MANEUVERS = StreamSchema(
     ),
     shape="object",
 )
+ATTITUDE = StreamSchema("attitude", streams.ATTITUDE)
 RADIUS_M, SPEED_M_S, RATE = 7e6, 7500.0, 7500.0 / 7e6
 
 
@@ -56,10 +58,17 @@ def state(tick, along_m=0.0):
 class Flown(SyntheticRun):
     """A run of satellites whose truth, measurements, estimates and commands are made up."""
 
-    def fly(self, *, along_m, noise_m, slot_error_deg, delta_v_m_s):
+    def fly(self, *, along_m, noise_m, slot_error_deg, delta_v_m_s, turned_deg=None, rate_rad_s=0):
         host = self.recorder("host", "host", MANEUVERS)
         for number, name in enumerate(self.names):
             recorder = self.recorder(f"agents/{name}", name, STATE, GNSS, ESTIMATES, COMMANDS)
+            if turned_deg is not None:
+                half = np.radians(turned_deg * (number + 1)) / 2
+                body = (0.0, 0.0, np.sin(half), np.cos(half), 0.0, 0.0, rate_rad_s)
+                bodies = self.recorder(f"agents/{name}", name, ATTITUDE)
+                for tick in range(self.ticks):
+                    bodies.record("attitude", (tick, *body))
+                bodies.close()
             for tick in range(self.ticks):
                 truth = state(tick, along_m * (number + 1))
                 recorder.record("state", (tick, *truth))
@@ -194,3 +203,39 @@ def test_terminal_tells_nothing_one_by_one_of_satellites_in_the_same_places(fly,
     truth = out[out.index("\nTruth:") : out.index("\nMeasurements:")]
     assert "all" in truth
     assert "agent-01" not in truth
+
+
+def test_bodies_that_are_turned_against_each_other_are_told_by_angle_and_rates(fly, capsys):
+    fly(turned_deg=10.0), fly(turned_deg=10.5, rate_rad_s=np.radians(2.0))
+
+    found = compared(capsys)["attitude"]
+
+    assert found["agent-01"]["count"] == TICKS
+    assert found["agent-01"]["angle_deg_rms"] == pytest.approx(0.5)
+    assert found["agent-02"]["angle_deg_max"] == pytest.approx(1.0)
+    assert found["agent-02"]["rate_deg_s_rms"] == pytest.approx(2.0)
+    assert found["agent-01"]["rate_deg_s_last_a"] == 0.0
+    assert found["agent-01"]["rate_deg_s_last_b"] == pytest.approx(2.0)
+
+
+def test_either_quaternion_of_one_attitude_is_the_same_body(fly, capsys):
+    fly(turned_deg=10.0), fly(turned_deg=370.0)
+
+    found = compared(capsys)["attitude"]
+
+    assert found["agent-01"]["angle_deg_max"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_several_runs_are_each_compared_with_the_first(fly, capsys):
+    fly(), fly(along_m=30.0), fly()
+
+    assert app.run(["diff", "1", "2", "3", "--json", "--quiet"]) == 0
+    document = json.loads(capsys.readouterr().out)
+
+    far, near = document["comparisons"]
+    assert document["first"] == "0001-synthetic"
+    assert [one["runs"]["b"] for one in (far, near)] == ["0002-synthetic", "0003-synthetic"]
+    assert far["constellation"]["truth"]["agents"]["agent-01"]["rms_m"] == pytest.approx(30.0)
+    assert (far["same"], near["same"], document["same"]) == (False, True, False)
+    assert app.run(["diff", "1", "3", "2", "--expect-same", "--quiet"]) == 1
+    assert capsys.readouterr().out.count("DIFFERENT") == 1

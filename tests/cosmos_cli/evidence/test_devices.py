@@ -128,3 +128,44 @@ def test_records_of_devices_are_of_their_machine_or_of_their_agents() -> None:
 
     assert sources.owner_of("devices/pi22/imu/gyro.jsonl") == "pi22"
     assert sources.owner_of("devices/agent-07/gps/fix.jsonl") == "pi23"
+
+
+PLAYED = {
+    "points": 100,
+    "played": 90,
+    "late": 3,
+    "skipped": 4,
+    "lost": 6,
+    "refused": 0,
+    "underruns": 2,
+    "lateness_us": {"p50": 80, "p99": 900, "max": 12_000},
+}
+
+
+def test_a_stimulus_is_judged_by_its_worst_output_over_all_lives(tmp_path: Path) -> None:
+    stimulus = {"coil": PLAYED, "line": {**PLAYED, "late": 0, "skipped": 0, "lost": 0}}
+    first = {**SOUND, "report": {**SOUND["report"], "stimulus": stimulus}}
+    slower = {**PLAYED, "underruns": 0, "lateness_us": {"p50": 90, "p99": "\x1b", "max": 7}}
+    second = {**SOUND, "report": {**SOUND["report"], "stimulus": {"coil": slower}}}
+    write(tmp_path, "devices.json", pi22_imu=first, pi22_gps=SOUND)
+    write(tmp_path, "devices.2.json", pi22_imu=second, pi22_gps=SOUND)
+
+    devices = read_devices(RunDirectory(tmp_path), PLAN, None)
+
+    told = devices["pi22/imu"]["stimulus"]["coil"]
+    assert (told["points"], told["played"], told["underruns"]) == (200, 180, 2)
+    assert told["lateness_us"] == {"p50": 90, "p99": 900, "max": 12_000}
+    assert "stimulus" not in devices["pi22/gps"]
+    found = judged(devices)
+    assert found["hardware.stimulus_late"] == (26 / 200, False, "pi22/imu.coil")
+    assert found["hardware.stimulus_underruns"] == (4, False, "pi22/imu.coil")
+
+
+def test_without_a_stimulus_there_is_no_check_of_one(tmp_path: Path) -> None:
+    write(tmp_path, "devices.json", pi22_imu=SOUND, pi22_gps=SOUND)
+
+    assert not [
+        name
+        for name in judged(read_devices(RunDirectory(tmp_path), PLAN, None))
+        if "stimulus" in name
+    ]

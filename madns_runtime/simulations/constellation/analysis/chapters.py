@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from madns_runtime.analysis.chapters import Chapter, build_sections
-from madns_runtime.analysis.tables import ComparedRun, RecordedRun
-from madns_runtime.analysis.values import Section, SimulationDifference
+from madns_runtime.analysis.tables import ComparedRun, RecordedRun, RecordedTable
+from madns_runtime.analysis.values import Block, Section, SimulationDifference
 from madns_runtime.simulations.constellation.analysis.comparison import compare_runs
 from madns_runtime.simulations.constellation.analysis.comparison_tables import (
     comparison_blocks,
@@ -18,6 +18,7 @@ from madns_runtime.simulations.constellation.analysis.links import (
     message_blocks,
     refusal_blocks,
 )
+from madns_runtime.simulations.constellation.analysis.loop_latency import loop_blocks
 from madns_runtime.simulations.constellation.analysis.maneuvers import (
     command_blocks,
     estimate_blocks,
@@ -32,10 +33,25 @@ from madns_runtime.simulations.constellation.analysis.orbits import (
     state_blocks,
     truth_blocks,
 )
+from madns_runtime.simulations.constellation.analysis.predictions import prediction_blocks
 from madns_runtime.simulations.constellation.analysis.slots import read_control
 
+
+def _sensor(table: RecordedTable, run: RecordedRun) -> list[Block]:
+    """Return a sensor's errors, and how its model had predicted them."""
+    return [*sensor_blocks(table, run), *prediction_blocks(table, run)]
+
+
 CONTROL = "Control"
-SENSORS = ("gnss", "gyro", "accelerometer", "magnetometer", "star_tracker", "sun_sensor")
+SENSORS = (
+    "gnss",
+    "gyro",
+    "accelerometer",
+    "magnetometer",
+    "star_tracker",
+    "sun_sensor",
+    "clock_sensor",
+)
 CHAPTERS = {
     "state": Chapter("Orbits", state_blocks),
     "elements": Chapter("Orbits", elements_blocks),
@@ -43,12 +59,16 @@ CHAPTERS = {
     "host_maneuvers": Chapter(CONTROL, maneuver_blocks),
     "commands": Chapter(CONTROL, command_blocks),
     "command_results": Chapter(CONTROL, command_blocks),
+    "flight_answers": Chapter(CONTROL, loop_blocks),
     "truth_changes": Chapter(CONTROL, truth_change_blocks),
     "host_links": Chapter("Links", link_blocks),
     "messages": Chapter("Links", message_blocks),
     "refusals": Chapter("Links", refusal_blocks),
     "host_contacts": Chapter("Links", contact_blocks),
-    **{name: Chapter("Sensors", sensor_blocks) for name in SENSORS},
+    **{name: Chapter("Sensors", _sensor) for name in SENSORS},
+    **{f"{name}_model": Chapter("Sensors", sensor_blocks) for name in SENSORS},
+    # Drawn as the errors of what stands beside it.
+    **{f"{name}_truth": Chapter("Sensors", lambda table, run: ()) for name in SENSORS},
     "host_truth": Chapter("Truth on record", truth_blocks),
     "host_invariants": Chapter("Health of the model", invariants_blocks),
 }

@@ -20,6 +20,10 @@ from madns_runtime.analysis.sampling import BinnedRms, Stretch, as_array, evenly
 from madns_runtime.analysis.tables import ComparedRun, ComparedStream, Key
 from madns_runtime.analysis.values import Floats
 from madns_runtime.plain_values import mapping_at
+from madns_runtime.simulations.constellation.analysis.attitudes import (
+    AttitudeDifference,
+    compare_attitudes,
+)
 from madns_runtime.simulations.constellation.analysis.measurement_errors import (
     MeasurementError,
     measurement_errors,
@@ -81,6 +85,7 @@ class ConstellationDifference:
     frame: tuple[Any, Any]
     positions: dict[str, PositionDifference] = field(default_factory=dict)
     over_time: list[Stretch] = field(default_factory=list)
+    attitudes: dict[str, AttitudeDifference] = field(default_factory=dict)
     efforts: tuple[dict[str, Effort], dict[str, Effort]] = ({}, {})
     slot_errors: tuple[dict[str, SlotError], dict[str, SlotError]] = ({}, {})
     slot_over_time: tuple[list[Stretch], list[Stretch]] = ([], [])
@@ -127,6 +132,7 @@ def compare_runs(a: ComparedRun, b: ComparedRun) -> ConstellationDifference:
         frame=(hosts[0].get("frame"), hosts[1].get("frame")),
         positions=positions,
         over_time=over_time,
+        attitudes=compare_attitudes(a, b),
         efforts=(efforts_of(a.streams), efforts_of(b.streams)),
         slot_errors=(estimated[0][0], estimated[1][0]),
         slot_over_time=(estimated[0][1], estimated[1][1]),

@@ -12,6 +12,10 @@ from typing import Any
 
 from madns_runtime.analysis.sampling import evenly
 from madns_runtime.analysis.values import Block, Heading, ReportRemark, TableBlock, headings
+from madns_runtime.simulations.constellation.analysis.attitudes import (
+    AttitudeDifference,
+    total_attitude,
+)
 from madns_runtime.simulations.constellation.analysis.comparison import (
     AXES,
     ConstellationDifference,
@@ -29,6 +33,17 @@ SLOT_COLUMNS = {
     "delta-v mean": "delta_v_m_s_mean",
     "messages": "messages",
 }
+ATTITUDE_HEADINGS = (
+    "records",
+    "rms",
+    "max",
+    "at t, s",
+    "at the end",
+    "rates rms",
+    "max",
+    "end A",
+    "end B",
+)
 ERROR_COLUMNS = {"measurements": "count", "rms": "rms", "max": "max"}
 EFFORT_COLUMNS = {"commands": "commands", "commanded": "commanded_m_s", "given": "given_m_s"}
 ESTIMATE_COLUMNS = {"rms": "rms_deg", "settled rms": "settled_rms_deg", "last": "last_deg"}
@@ -43,6 +58,8 @@ def comparison_blocks(found: ConstellationDifference) -> list[Block]:
     total = found.all_positions()
     if total is not None:
         blocks += _positions(found, total)
+    if any(one.angle_max_rad > 0.0 for one in found.attitudes.values()):
+        blocks.append(_attitudes(found.attitudes))
     if any(found.slots):
         blocks.append(_slots(found))
     if any(found.measurements):
@@ -77,6 +94,20 @@ def _positions(found: ConstellationDifference, total: PositionDifference) -> Ite
 
 def _position(one: PositionDifference, name: str) -> list[object]:
     return [name, *(getattr(one, attribute) for attribute in POSITION_TOLD), *one.axes_m()]
+
+
+def _attitudes(found: Mapping[str, AttitudeDifference]) -> TableBlock:
+    apart = [one for one in found.values() if one.angle_max_rad > 0.0]
+    shown = sorted(apart, key=lambda one: one.angle_deg_rms, reverse=True)[:AGENTS_SHOWN_MAX]
+    return TableBlock(
+        title="Truth: angle between the bodies of A and B, deg; body rates, deg/s",
+        headings=headings("agent", *ATTITUDE_HEADINGS),
+        rows=[
+            *([one.agent, *one.told().values()] for one in shown),
+            ["all", *total_attitude(found).told().values()],
+        ],
+        note=_rest(len(apart) - len(shown)),
+    )
 
 
 def _slots(found: ConstellationDifference) -> TableBlock:
@@ -165,6 +196,7 @@ def to_document(found: ConstellationDifference) -> dict[str, Any]:
     return {
         "frame": list(found.frame),
         "truth": truth,
+        "attitude": {name: one.told() for name, one in found.attitudes.items()},
         "slots": [[dataclasses.asdict(row) for row in rows] for rows in found.slots],
         "measurements": _measurements_told(found),
         "control": _both_told(found.efforts, EFFORT_TOLD, total_effort),

@@ -2,7 +2,8 @@
 Measurement minus truth, where a run recorded both: which fields belong together, and the size of the error.
 
 Every run is judged by itself. A sensor's field is held against the field of the same name among truth ("state",
-"attitude"). Pure numpy.
+"attitude") at the same time; that of a sensor that is hardware against what was recorded beside it in the same tick:
+truth as an instrument without errors would have measured it ("gyro_truth"), and the model ("gyro_model"). Pure numpy.
 """
 
 from __future__ import annotations
@@ -27,7 +28,16 @@ KEYS = ("tick", "t_s")
 QUATERNION = ("q1", "q2", "q3", "q4")
 SAME_INSTANT_S = 1e-6
 """A measurement's time of validity is that of a tick."""
-TITLES = {"m": "position", "m/s": "velocity", "rad/s": "body rates", "deg": "attitude"}
+TITLES = {
+    "m": "position",
+    "m/s": "velocity",
+    "rad/s": "body rates",
+    "deg": "attitude",
+    "m/s^2": "specific force",
+    "T": "field",
+}
+BESIDE_TRUTH, BESIDE_MODEL = "_truth", "_model"
+"""Ends of the names of tables that stand beside a sensor that is hardware."""
 
 ROWS_MATCHED_MIN = 16_384
 """Records of one stream that are matched at a time."""
@@ -45,11 +55,15 @@ class Quantity:
     """Table of the truth."""
     names: tuple[str, ...]
     unit: str
+    by_tick: bool = False
+    """Whether partners share a tick: truth was recorded beside the measurement; else they share a time."""
+    of: str = ""
+    """Addition to the title: what is held against what."""
 
     @property
     def title(self) -> str:
         """Name of the quantity."""
-        return TITLES.get(self.unit, ", ".join(self.names))
+        return TITLES.get(self.unit, ", ".join(self.names)) + self.of
 
     def sizes(self, measured: Mapping[str, Any], truth: Mapping[str, Any]) -> Floats:
         """
@@ -84,20 +98,36 @@ def quantities(
     Args:
         table: Name of the sensor's table.
         fields: Its fields.
-        truths: Fields of the tables of truth that the run recorded.
+        truths: Fields of the tables that the run recorded, those of `truth_tables` among them.
     """
     if table in NO_MEASUREMENTS or "t_s" not in {field.name for field in fields}:
         return []
     found: list[Quantity] = []
-    for truth in TRUTH_TABLES:
+    for truth in truth_tables(table):
         there = {field.name for field in truths.get(truth, ())} - set(KEYS)
         units: dict[str, list[str]] = {}
         for field in fields:
             if field.name in there:
                 unit = "deg" if field.name in QUATERNION else field.unit
                 units.setdefault(unit, []).append(field.name)
-        found += [Quantity(truth=truth, names=tuple(n), unit=unit) for unit, n in units.items()]
+        beside = truth not in TRUTH_TABLES
+        of = ""
+        if beside and not table.endswith(BESIDE_MODEL):
+            of = " of the device" + (" against its model" if truth.endswith(BESIDE_MODEL) else "")
+        found += [
+            Quantity(truth=truth, names=tuple(n), unit=unit, by_tick=beside, of=of)
+            for unit, n in units.items()
+        ]
     return found
+
+
+def truth_tables(table: str) -> tuple[str, ...]:
+    """Return the names of tables that a sensor's can be held against, where a run has them."""
+    if table.endswith(BESIDE_TRUTH):
+        return ()
+    if table.endswith(BESIDE_MODEL):
+        return (table.removesuffix(BESIDE_MODEL) + BESIDE_TRUTH,)
+    return (*TRUTH_TABLES, table + BESIDE_TRUTH, table + BESIDE_MODEL)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -135,7 +165,10 @@ def measurement_errors(
     for (table, agent), recorded in streams.items():
         if recorded.role != "agent":
             continue
-        truths = {name: streams[name, agent] for name in TRUTH_TABLES if (name, agent) in streams}
+        names = truth_tables(table)
+        if (table + BESIDE_TRUTH, agent) in streams:
+            names = tuple(name for name in names if name not in TRUTH_TABLES)
+        truths = {name: streams[name, agent] for name in names if (name, agent) in streams}
         fields = {name: truth.fields for name, truth in truths.items()}
         for quantity in quantities(table, recorded.fields, fields):
             error = MeasurementError(sensor=table, quantity=quantity.title, unit=quantity.unit)
@@ -151,8 +184,10 @@ def _add(
     quantity: Quantity,
     tick_hz: float,
 ) -> None:
+    key = "tick" if quantity.by_tick else "t_s"
+    scale = 1.0 / tick_hz if quantity.by_tick else 1.0
     sides = (
-        rows_over_time(measured, quantity.names, "t_s"),
+        rows_over_time(measured, quantity.names, key, scale),
         rows_over_time(truth, quantity.names, "tick", 1.0 / tick_hz),
     )
     for piece in match(*sides, tolerance=SAME_INSTANT_S):
@@ -180,13 +215,14 @@ def rows_over_time(
 
 def sensor_blocks(table: RecordedTable, run: RecordedRun) -> list[Block]:
     """Return the errors of a sensor over time and a table of them; its values where truth has none."""
-    truths = {name: run.tables[name].fields for name in TRUTH_TABLES if name in run.tables}
+    known = truth_tables(table.name)
+    truths = {name: run.tables[name].fields for name in known if name in run.tables}
     blocks: list[Block] = []
     for quantity in quantities(table.name, table.fields, truths):
         errors = {
             agent: found
             for agent in table.sources
-            if (found := _errors(table, run, agent, quantity)) is not None
+            if (found := error_sizes(table, run, agent, quantity)) is not None
         }
         name = f"{table.name.replace('_', ' ')}, {quantity.title}"
         if errors:
@@ -205,24 +241,31 @@ def sensor_blocks(table: RecordedTable, run: RecordedRun) -> list[Block]:
     return blocks or generic_blocks(table, run)
 
 
-def _errors(
+def error_sizes(
     table: RecordedTable, run: RecordedRun, agent: str, quantity: Quantity
 ) -> tuple[Floats, Floats] | None:
-    truth = run.tables[quantity.truth]
+    """Return the times for which one agent's measurements were valid, s, and their errors; None without truth."""
+    truth, beside = run.tables[quantity.truth], run.tables.get(table.name + BESIDE_TRUTH)
     if agent not in truth.sources:
         return None
+    if not quantity.by_tick and beside is not None and agent in beside.sources:
+        return None  # what was recorded beside it tells more
     measured_s, _ = run.time_of(table, agent)
-    truth_s, _ = run.time_of(truth, agent)
-    if not len(measured_s) or not len(truth_s):
+    if quantity.by_tick:
+        keys = as_array(table.read(agent, ("tick",))["tick"])
+        of_truth_keys = as_array(truth.read(agent, ("tick",))["tick"])
+    else:
+        keys, (of_truth_keys, _) = measured_s, run.time_of(truth, agent)
+    if not len(keys) or not len(of_truth_keys):
         return None
-    order = np.argsort(truth_s, kind="stable")
-    place = np.clip(np.searchsorted(truth_s[order], measured_s), 0, len(order) - 1)
+    order = np.argsort(of_truth_keys, kind="stable")
+    place = np.clip(np.searchsorted(of_truth_keys[order], keys), 0, len(order) - 1)
     before = np.maximum(place - 1, 0)
-    closer = np.abs(truth_s[order][before] - measured_s) < np.abs(
-        truth_s[order][place] - measured_s
+    closer = np.abs(of_truth_keys[order][before] - keys) < np.abs(
+        of_truth_keys[order][place] - keys
     )
     partner = order[np.where(closer, before, place)]
-    is_there = np.abs(truth_s[partner] - measured_s) <= SAME_INSTANT_S
+    is_there = np.abs(of_truth_keys[partner] - keys) <= SAME_INSTANT_S
     if not is_there.any():
         return None
     columns = table.read(agent, quantity.names)

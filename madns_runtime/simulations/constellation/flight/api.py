@@ -31,6 +31,8 @@ TRUTH = "truth"
 vx, vy, vz, m/s; for a rigid body also the quaternion, scalar last, and the body rates, rad/s."""
 MASS = "mass"
 """Name of the reading that a tank gauge gives when a command was executed: mass, kg, and propellant, kg."""
+WHEELS = "wheels"
+"""Name of the reading of the wheels' speeds when a torque was executed: momentum about body x, y, z, N m s."""
 
 
 class Reading(NamedTuple):
@@ -43,7 +45,29 @@ class Reading(NamedTuple):
 
 
 Readings = Mapping[str, Reading]
-"""By the sensor's name, those that became known since the tick before: a sensor without news is not in it."""
+"""By the sensor's name the newest that became known since the step before: a sensor without news is not in it. See
+`StepReadings` for the others."""
+
+
+class StepReadings(dict[str, Reading]):
+    """
+    Readings of one step.
+
+    Args:
+        newest: By the sensor's name.
+        all_new: All that became known since the step before, oldest first, where there are several.
+    """
+
+    def __init__(
+        self, newest: Mapping[str, Reading], all_new: Mapping[str, Sequence[Reading]]
+    ) -> None:
+        super().__init__(newest)
+        self.samples = {name: tuple(news) for name, news in all_new.items() if len(news) > 1}
+        """Of the sensors with more than one."""
+
+    def since(self, name: str) -> tuple[Reading, ...]:
+        """Return all readings of a sensor since the step before, oldest first; none for one without news."""
+        return self.samples.get(name) or ((self[name],) if name in self else ())
 
 
 class FlightContext(Protocol):
@@ -75,6 +99,9 @@ class FlightContext(Protocol):
 
     def torque(self, torque_n_m: Sequence[float], *, at_s: float, duration_s: float) -> int:
         """Command a torque about the body axes and return the command's number."""
+
+    def dipole(self, dipole_a_m2: Sequence[float], *, at_s: float, duration_s: float) -> int:
+        """Command the magnetorquers' dipole along the body axes, A m^2, and return the command's number."""
 
     def ballistic(self, ballistic_m2_kg: float, *, at_s: float) -> int:
         """Command another ballistic coefficient, m^2/kg, from *at_s* on; within the vehicle's range."""

@@ -1,38 +1,46 @@
 """
-Flight software in any language: a program that reads and writes JSON lines.
+Flight software outside the agent's process: a program in any language, or what runs elsewhere already.
 
 To the vehicle it is flight software like any other. In lockstep a tick waits for its answer; in real
 time no tick waits for anything: an answer is taken in the first tick after it has come.
 
-    to the program      {"setup": {...}}
-                        {"t_s": 0.1, "readings": {...}, "messages": [...], "results": [...], "refusals": [...]}
-    from the program    {"commands": [...], "send": [...], "estimate": {...}, "log": [...]}
+    readings, messages, results -> a tick's report -> protocol -> link
+    commands, messages, words   <- answers         <- protocol <- link
 """
 
 from __future__ import annotations
 
-import base64
-import dataclasses
+import contextlib
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from time import monotonic
 from typing import Any
 
-import orjson
-
 from madns_runtime.errors import BlamedError
-from madns_runtime.plugin.context import clean_text
+from madns_runtime.hardware.clock import DeviceClock
+from madns_runtime.plugin.api import AgentContext
 from madns_runtime.simulations.constellation.flight.api import FlightContext, Readings
-from madns_runtime.simulations.constellation.flight.json_protocol import carry_out
-from madns_runtime.simulations.constellation.flight.line_process import LineProcess
+from madns_runtime.simulations.constellation.flight.interface.answers import (
+    TIME_TOLERANCE_S,
+    FlightAnswer,
+    carry_out,
+    shown,
+)
+from madns_runtime.simulations.constellation.flight.interface.link import FlightLink
+from madns_runtime.simulations.constellation.flight.interface.opening import (
+    FlightProtocol,
+    make_protocol,
+)
+from madns_runtime.simulations.constellation.flight.interface.reports import SetupReport, TickReport
+from madns_runtime.simulations.constellation.flight_settings import FlightAttached, FlightProcess
+from madns_runtime.simulations.constellation.interface_settings import is_played_back
 from madns_runtime.simulations.constellation.messages import (
     CommandResult,
     Delivery,
     TransmissionRefusal,
 )
-from madns_runtime.simulations.constellation.parameters import FlightProcess
+from madns_runtime.simulations.constellation.streams import FLIGHT_ANSWERS, FLIGHT_CLOCK
 
 LATE_CHECK = "constellation.flight_answers_late"
 """Ticks that were answered later than answer_s, or never, or not sent to a program that was behind."""
@@ -44,34 +52,34 @@ UNANSWERED_MAX = 64
 """Ticks under way to the program in real time; further ones are not sent and counted."""
 MAIL_MAX = 1024
 """Messages, results, and refusals, that wait for the next tick that is sent; older ones are dropped and counted."""
+CLOCK_S = 1.0
+"""Between two records of its clock, simulated."""
 
 
 class ExternalFlight:
     """
-    A program that flies a vehicle.
+    Software that flies a vehicle from outside.
 
     Args:
         settings: From the scenario.
-        base_directory: Folder of the scenario.
-        is_lockstep: Whether simulated time waits for the answers.
-        keep_text: Keeps what the program writes to its standard error, under a name.
+        agent: The framework as the agent sees it.
     """
 
-    def __init__(
-        self,
-        settings: FlightProcess,
-        base_directory: Path,
-        *,
-        is_lockstep: bool,
-        keep_text: Callable[[str, bytes], None],
-    ) -> None:
-        self._keep_text = keep_text
+    def __init__(self, settings: FlightProcess | FlightAttached, agent: AgentContext) -> None:
         self._settings = settings
-        self._base_directory = base_directory
-        self._is_lockstep = is_lockstep
+        self._agent = agent
+        self._is_lockstep = agent.is_lockstep
+        interface = settings.interface
+        self._has_own_clock = interface is not None and interface.clock == "own"
+        self._is_played_back = is_played_back(interface)
+        """Whether answers come from a recording, at their times: no tick waits for one."""
+        is_simulated = self._is_played_back and agent.is_lockstep
+        self._present_s: Callable[[], float] = agent.now_s if is_simulated else monotonic
+        self._is_recorded = interface is not None and not agent.is_lockstep
+        """Whether what depends on this computer's clock is recorded: nothing is in lockstep."""
         self._asked: deque[tuple[float, float]] = deque()
         """Ticks without an answer: when they were sent, by the computer's clock, and their times."""
-        self._mail: dict[str, deque[dict[str, Any]]] = {
+        self._mail: dict[str, deque[Any]] = {
             name: deque(maxlen=MAIL_MAX) for name in ("messages", "results", "refusals")
         }
         self._answer_s_max = 0.0
@@ -86,138 +94,243 @@ class ExternalFlight:
             "answers_late": 0,
             "mail_dropped": 0,
         }
+        self._ticks_unanswered = 0
+        """Ticks that later ones were answered before."""
+        self._answers_unasked = 0
+        """Answers to no tick that waits for one."""
+        self._clock = DeviceClock()
+        self._clock_s = -math.inf
+        """Time of its last record."""
 
     def setup(self, context: FlightContext) -> None:
         """
-        Start the program and tell it who it is.
+        Start the program, or begin to look for the software, and tell it who it is.
 
         Raises:
-            BlamedError: It cannot be started.
+            BlamedError: It cannot be started, or reached.
         """
         self._context = context
-        self._process = LineProcess(
-            self._settings.command, self._base_directory, is_patient=self._is_lockstep
+        settings, interface = self._settings, self._settings.interface
+        folder = self._agent.base_directory
+        name = interface.protocol if interface else "json_lines"
+        self._protocol: FlightProtocol = make_protocol(name, folder)
+        self._by_time: bool = getattr(self._protocol, "answers_by_time", True)
+        self._link = FlightLink(
+            settings,
+            folder,
+            devices=self._agent.hardware if interface else {},
+            values={
+                "name": context.name,
+                "index": str(context.index),
+                "satellite": context.satellite,
+            },
+            is_lockstep=self._is_lockstep,
         )
-        told = {
-            "name": context.name,
-            "satellite": context.satellite,
-            "agents": context.agents,
-            "index": context.index,
-            "tick_hz": context.tick_hz,
-            "duration_s": context.duration_s,
-            "epoch_utc": context.epoch_utc,
-            "frame": context.frame,
-            "input": self._settings.input,
-            "first_number": context.first_number,
-            "seed": int(context.random.integers(2**31)),
-            "settings": dict(context.settings),
-        }
-        self._process.write(orjson.dumps({"setup": told}))
+        if self._is_recorded:
+            self._agent.open_stream("flight_answers", FLIGHT_ANSWERS)
+            self._agent.open_stream("flight_clock", FLIGHT_CLOCK)
+        if interface and interface.transport.kind == "pty":
+            context.log("info", f"flight software is expected at {self._link.transport.address}")
+        told = SetupReport(
+            name=context.name,
+            satellite=context.satellite,
+            agents=context.agents,
+            index=context.index,
+            tick_hz=context.tick_hz,
+            duration_s=context.duration_s,
+            epoch_utc=context.epoch_utc,
+            frame=context.frame,
+            input=settings.input,
+            first_number=context.first_number,
+            seed=int(context.random.integers(2**31)),
+            settings=dict(context.settings),
+            clock="own" if self._has_own_clock else "stepped",
+        )
+        # One that has ended already is told with its end in the first tick.
+        if not self._link.write(self._protocol.setup(told)) and not self._link.how_it_ended():
+            raise BlamedError(
+                f"{self._link.name}: its transport has no room for its setup: give fewer settings"
+            )
 
     def receive(self, message: Delivery) -> None:
-        """Keep a message for the next line."""
+        """Keep a message for the next tick."""
         self._keep("messages", message)
 
     def command_result(self, result: CommandResult) -> None:
-        """Keep a result for the next line."""
+        """Keep a result for the next tick."""
         self._keep("results", result)
 
     def message_refused(self, refusal: TransmissionRefusal) -> None:
-        """Keep a refusal for the next line."""
+        """Keep a refusal for the next tick."""
         self._keep("refusals", refusal)
 
     def step(self, t_s: float, readings: Readings) -> None:
         """
-        Send a tick's line, and carry out the answers that are there.
+        Send a tick's report, and carry out the answers that are there.
 
         Raises:
-            BlamedError: The program is gone, or wrote what is no answer; in lockstep also: it does
-                not answer in time.
+            BlamedError: The software is gone or was never there, or wrote what is no answer; in lockstep
+                also: it does not answer in time.
         """
         try:
             self._take_answers(t_s)
             self._send(t_s, readings)
-            if self._is_lockstep:
+            if self._is_lockstep and not self._is_played_back:
                 self._await_answer(t_s)
-        except BlamedError:
+        except Exception:
             # At once: other agents may tick in this process.
-            self._process.end(is_patient=False)
+            self._link.end(is_patient=False)
             self._keep_talk()
             raise
 
     def finish(self) -> Mapping[str, Any]:
         """End the program, and return what came of it; in real time what was late is judged."""
+        if self._is_recorded:
+            self._account_for_last()
         overdue = sum(self._is_late(sent_s, self._listened_s) for sent_s, _ in self._asked)
-        code = self._process.end()
+        code = self._link.end()
         self._keep_talk()
-        if code != 0:
-            told = f"{self._process.name} ended with exit code {code}{self._last_words()}"
+        if code:
+            told = f"{self._link.name} ended with exit code {code}{self._last_words()}"
             self._context.log("warning", told)
         counts = self._counts
-        lines, size_bytes = self._process.talk_counts
-        summary: dict[str, Any] = {
-            **counts,
-            "stderr_lines": lines,
-            "stderr_bytes": size_bytes,
-            "unanswered": len(self._asked),
-            "exit_code": code,
-        }
+        summary: dict[str, Any] = dict(counts)
+        if self._link.program is not None:
+            lines, size_bytes = self._link.program.talk_counts
+            summary |= {"stderr_lines": lines, "stderr_bytes": size_bytes}
+        summary["unanswered"] = len(self._asked)
+        if self._link.program is not None:
+            summary["exit_code"] = code
+        if self._settings.interface is not None:
+            summary["interface"] = self._interface_summary()
         if not self._is_lockstep:  # where no summary depends on a clock
             summary["answer_s_max"] = round(self._answer_s_max, 6)
             late = counts["answers_late"] + counts["ticks_skipped"] + overdue
+            late += self._ticks_unanswered
             summary["checks"] = [{"name": LATE_CHECK, "limit": 0, "got": late, "passed": late == 0}]
+        return summary
+
+    def _account_for_last(self) -> None:
+        """Count what has come since the last tick; there is none any more in which it could be carried out."""
+        with contextlib.suppress(BlamedError):
+            for arrival in self._link.arrivals():
+                for answer in self._protocol.feed(arrival.data):
+                    asked = None if self._has_own_clock else self._find_asked(answer, math.inf)
+                    if asked is not None:
+                        self._counts["answers"] += 1
+                        self._record_answer(asked, arrival.came_s)
+
+    def _interface_summary(self) -> dict[str, Any]:
+        transport = self._link.transport
+        summary: dict[str, Any] = {
+            "transport": transport.name,
+            "ticks_unanswered": self._ticks_unanswered,
+            "answers_unasked": self._answers_unasked,
+            "faults": dict(getattr(self._protocol, "faults", {})),
+        }
+        if not self._is_lockstep:
+            summary |= transport.counts
+            estimate = self._clock.estimate()
+            if estimate is not None:
+                summary |= {
+                    "clock_offset_s": round(estimate.offset_s, 9),
+                    "clock_drift_ppm": round(estimate.drift_ppm, 3),
+                }
         return summary
 
     def _keep(self, name: str, item: Delivery | CommandResult | TransmissionRefusal) -> None:
         self._counts["mail_dropped"] += len(self._mail[name]) == MAIL_MAX
-        self._mail[name].append(dataclasses.asdict(item))
+        self._mail[name].append(item)
 
     def _send(self, t_s: float, readings: Readings) -> None:
         counts = self._counts
-        tick = {
-            "t_s": t_s,
-            "readings": {
-                name: {"t_s": reading.t_s, "values": reading.values}
-                for name, reading in readings.items()
-            },
-            **{name: list(waiting) for name, waiting in self._mail.items()},
-        }
-        line = orjson.dumps(tick, _to_plain, orjson.OPT_SERIALIZE_NUMPY)
-        if len(self._asked) >= UNANSWERED_MAX or not self._process.write(line):
+        if len(self._asked) >= UNANSWERED_MAX:
+            counts["ticks_skipped"] += 1
+            return
+        mail = {name: list(waiting) for name, waiting in self._mail.items()}
+        report = TickReport(t_s=t_s, readings=readings, **mail)
+        sent_s = self._present_s()
+        if not self._link.write(self._protocol.tick(report)):
             counts["ticks_skipped"] += 1
             return
         for waiting in self._mail.values():
             waiting.clear()
-        self._asked.append((monotonic(), t_s))
+        if not self._has_own_clock:
+            self._asked.append((sent_s, t_s))
         counts["ticks_sent"] += 1
 
     def _take_answers(self, t_s: float) -> None:
-        process = self._process
-        self._listened_s = monotonic()
-        for line in process.lines():
-            self._take(line, t_s)
+        link = self._link
+        self._listened_s = self._present_s()
+        for arrival in link.arrivals():
+            for answer in self._protocol.feed(arrival.data):
+                came_s = arrival.came_s if self._is_recorded else self._present_s()
+                self._take(answer, came_s, t_s)
         self._keep_talk()
-        if process.has_ended:
-            how = process.how_it_ended()
+        how = link.how_it_ended()
+        if how:
             self._keep_talk()
-            told = f"{process.name} (pid {process.pid}) {how} before {t_s:g} s{self._last_words()}"
-            raise BlamedError(told)
+            raise BlamedError(f"{link.who} {how} before {t_s:g} s{self._last_words()}")
+        if self._is_recorded:
+            self._record_clock(t_s)
 
-    def _take(self, line: bytes, t_s: float) -> None:
-        process, counts = self._process, self._counts
-        if not self._asked:
-            raise BlamedError(
-                f"{process.name}: expected one line for each tick and none for the setup, got another "
-                f"one before {t_s:g} s: {clean_text(repr(line[:200]))}"
-            )
-        sent_s, asked_s = self._asked.popleft()
-        now_s = monotonic()
-        self._answer_s_max = max(self._answer_s_max, now_s - sent_s)
-        if not counts["answers"]:
-            self._begun_s = now_s
+    def _take(self, answer: FlightAnswer, came_s: float, t_s: float) -> None:
+        counts = self._counts
+        asked = None
+        if not self._has_own_clock:
+            asked = self._find_asked(answer, t_s)
+            if asked is None:
+                self._answers_unasked += 1
+                return
+            sent_s = asked[0]
+            self._answer_s_max = max(self._answer_s_max, came_s - sent_s)
+            if not counts["answers"]:
+                self._begun_s = came_s
+            counts["answers_late"] += self._is_late(sent_s, came_s)
+            if self._is_recorded:
+                self._record_answer(asked, came_s)
         counts["answers"] += 1
-        counts["answers_late"] += self._is_late(sent_s, now_s)
-        carry_out(line, self._context, process.name, t_s=asked_s)
+        if answer.board_us and self._is_recorded:
+            self._clock.add(answer.board_us * 1e-6, self._agent.now_s() - (monotonic() - came_s))
+        carry_out(answer, self._context, self._link.name, t_s=asked[1] if asked else None)
+
+    def _find_asked(self, answer: FlightAnswer, t_s: float) -> tuple[float, float] | None:
+        """Return the tick that an answer is for, and forget it and those before; None for one to nothing."""
+        if self._by_time and isinstance(answer.t_s, int | float):
+            places = (
+                place
+                for place, (_, asked_s) in enumerate(self._asked)
+                if abs(asked_s - answer.t_s) <= TIME_TOLERANCE_S
+            )
+            place = next(places, None)
+            if place is None:
+                return None
+            self._ticks_unanswered += place
+            for _ in range(place):
+                self._asked.popleft()
+        elif not self._asked:
+            if answer.fault:  # such as noise without an end
+                raise BlamedError(f"{self._link.name}: {answer.fault}")
+            raise BlamedError(
+                f"{self._link.name}: expected one line for each tick and none for the setup, got another "
+                f"one before {t_s:g} s: {shown(answer.source)}"
+            )
+        return self._asked.popleft()
+
+    def _record_answer(self, asked: tuple[float, float], came_s: float) -> None:
+        sent_s, asked_s = asked
+        tick = round(asked_s * self._context.tick_hz)
+        answer_us = round((came_s - sent_s) * 1e6, 1)
+        self._agent.record("flight_answers", (tick, asked_s, answer_us))
+
+    def _record_clock(self, t_s: float) -> None:
+        if t_s - self._clock_s < CLOCK_S:
+            return
+        estimate = self._clock.estimate()
+        if estimate is not None:
+            self._clock_s = t_s
+            row = (t_s, round(estimate.offset_s, 9), round(estimate.drift_ppm, 3))
+            self._agent.record("flight_clock", row)
 
     def _is_late(self, sent_s: float, now_s: float) -> bool:
         return now_s - max(sent_s, self._begun_s) > self._settings.answer_s
@@ -226,32 +339,27 @@ class ExternalFlight:
         limit_s = self._settings.answer_s
         unmeasured_s, clock = monotonic() + min(UNMEASURED_S, limit_s), None
         while self._asked:
-            if clock is None and monotonic() >= unmeasured_s:
-                clock = self._process.stopwatch()
+            if not self._link.is_ready:  # it has its own time to come
+                unmeasured_s, clock = monotonic() + min(UNMEASURED_S, limit_s), None
+            elif clock is None and monotonic() >= unmeasured_s:
+                clock = self._link.stopwatch()
             elif clock is not None and clock() >= limit_s:
                 raise BlamedError(
-                    f"{self._process.name} (pid {self._process.pid}): expected the answer to the tick "
+                    f"{self._link.who}: expected the answer to the tick "
                     f"at {t_s:g} s within {self._settings.answer_s:g} s (parameters.flight.answer_s)"
                     f"{self._last_words()}"
                 )
-            self._process.wait(min(limit_s, UNMEASURED_S))
+            self._link.wait(min(limit_s, UNMEASURED_S))
             self._take_answers(t_s)
 
     def _keep_talk(self) -> None:
         """Keep what the program says on its standard error; in a file of its own, for no run depends on it."""
-        said = self._process.talk()
+        said = self._link.program.talk() if self._link.program else b""
         if said:
-            self._keep_text(STDERR_TEXT, said)
+            self._agent.keep_text(STDERR_TEXT, said)
 
     def _last_words(self) -> str:
         """Return the last line of its standard error, and where all of it lies; nothing if it said nothing."""
-        line = self._process.last_line
+        line = self._link.program.last_line if self._link.program else ""
         where = f"agents/{self._context.name}/{STDERR_TEXT}.txt"
         return f"; its last words: {line!r} ({where})" if line else ""
-
-
-def _to_plain(value: Any) -> Any:
-    """Return what JSON has no form for in one that it has."""
-    if isinstance(value, bytes):
-        return {"base64": base64.b64encode(value).decode()}
-    raise TypeError(type(value).__name__)

@@ -73,8 +73,7 @@ class Maneuvering:
                 self._carry_out(late, is_urgent=True)
         while self._pending and self._pending[0][0] <= t_s:
             taken = heapq.heappop(self._pending)[2]
-            self._desk.execute(taken)
-            self._tell(taken, is_over=True)
+            self._tell(self._desk.execute(taken), is_over=True)
         return min([heap[0][0] for heap in (self._waiting, self._pending) if heap], default=None)
 
     def finish(self) -> Mapping[str, Any]:

@@ -34,6 +34,8 @@ URGENT_KNOTS_MAX = 20
 """Knots of a change that travel as SYNC: one datagram; the others follow as RELIABLE."""
 STREAM = "truth"
 SENT_S_DIGITS = 6
+SEGMENTS_GIVEN_MAX = 32
+"""Given at once whatever their times; an agent takes twice as many."""
 LOOK_BACK_S = 1.0
 """Truth that is kept beyond a tick's time: messages name times that are over when they are heard."""
 
@@ -86,7 +88,7 @@ class Refills:
         last = max(now + 1, self._turns_passed(vehicle) - 1)
         self._sent_until[vehicle] = min(last + 1, self._store.end)
         self._revisions_given[vehicle] = self._store.revisions[vehicle]
-        return self._store.segments(vehicle, now, last)
+        return self._still_wanted(self._store.segments(vehicle, now, last))
 
     def timer(self, t_s: float) -> float | None:
         """Send what is due, have computed what will be, and return when to come back."""
@@ -176,7 +178,7 @@ class Refills:
         first = self._sent_until[vehicle]
         if not self._active[vehicle] or first > window:
             return
-        segments = self._store.segments(vehicle, first, window)
+        segments = self._still_wanted(self._store.segments(vehicle, first, window))
         if not segments:
             return
         self._sent_until[vehicle] = min(window + 1, self._store.end)
@@ -184,6 +186,13 @@ class Refills:
         for segment in segments:
             self._context.send(agent, segment.to_message(), Service.RELIABLE)
         self.segments_sent += len(segments)
+
+    def _still_wanted(self, segments: list[Segment]) -> list[Segment]:
+        """Return segments without those that are over, if a vehicle that is commanded often has left many."""
+        if len(segments) <= SEGMENTS_GIVEN_MAX:
+            return segments
+        over_s = self._context.now_s() - LOOK_BACK_S
+        return [segment for segment in segments if segment.end_s >= over_s]
 
     def _record_window(self, vehicle: int, window: int) -> None:
         """Record a vehicle's truth up to and including a window, as it is now."""

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from madns_runtime.errors import PluginError
 from madns_runtime.plugin.api import HostContext
 from madns_runtime.simulations.constellation.equipment import Vehicle
-from madns_runtime.simulations.constellation.truth.maneuvers.effects import VehicleTruth
+from madns_runtime.simulations.constellation.truth.maneuvers.effects import Effect, VehicleTruth
+from madns_runtime.simulations.constellation.truth.orbit_curves import OrbitCurve
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
     StretchRequest,
@@ -36,9 +37,16 @@ from madns_runtime.simulations.constellation.truth.vehicle_propagation import (
     propagate_vehicle,
     propagate_vehicles,
 )
+from madns_runtime.simulations.constellation.vehicles import field_of
 
 Array = NDArray[np.float64]
 
+ORBIT_KNOT_S_MAX = 5.0
+"""Knots further apart do not tell the orbit between them well enough for the torques that depend on it."""
+WARMING = Effect(
+    number=0, kind="dipole", at_s=0.0, start_s=0.0, end_s=0.1, vector=(1e-9, 0.0, 0.0), frame="body"
+)
+"""Of no consequence: sets up what the first dipole needs."""
 BODIES_PER_JOB = 50
 """Rigid bodies that share a call: fixed, since one step size for all shows in the last digits."""
 VEHICLES_PER_JOB = 20
@@ -100,6 +108,7 @@ class TruthSupply:
         self._propagation = propagation
         self._vehicles = vehicles
         self._rigid = [n for n, vehicle in enumerate(vehicles) if vehicle.attitude is not None]
+        self._magnetic = [n for n in self._rigid if _has_magnetorquers(vehicles[n])]
         self.has_rigid_bodies = bool(self._rigid)
         """Whether any vehicle has an attitude."""
         self.has_drag = "drag" in propagation.forces
@@ -114,11 +123,14 @@ class TruthSupply:
     def warm_up(self, states: Array) -> None:
         """Propagate one vehicle here, so that no maneuver pays for what the first call sets up."""
         # A rigid body, if there is one, sets up both orbits and attitude.
-        vehicle, state = (self._rigid or [0])[0], states[0]
+        vehicle, state = (self._magnetic or self._rigid or [0])[0], states[0]
         if self._rigid:
             state = np.concatenate((states[vehicle], (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)))
         request = self._request(vehicle, 0.0, state, change_s=0.0, end_knot=1)
         propagate_vehicle(request, self._parameters_of(vehicle))
+        if vehicle in self._magnetic:
+            effects = (WARMING,)
+            propagate_vehicle(replace(request, effects=effects), self._parameters_of(vehicle))
 
     def submit(self, windows: int, states: Array, attitude: Array | None) -> None:
         """
@@ -203,7 +215,11 @@ class TruthSupply:
             raise PluginError(f"constellation: truth of {change_s:g} s is over and forgotten")
         start_s, state = restart
         end_knot = store.end * store.knots_per_window
-        return self._request(vehicle, start_s, state, change_s=change_s, end_knot=end_knot)
+        request = self._request(vehicle, start_s, state, change_s=change_s, end_knot=end_knot)
+        if vehicle not in self._magnetic or store.knot_s > ORBIT_KNOT_S_MAX:
+            return request
+        known = store.orbit_from(vehicle, start_s)
+        return request if known is None else replace(request, orbit=OrbitCurve(*known))
 
     def _replace(self, vehicle: int, truth: VehicleTruth) -> None:
         if self._batch is not None:
@@ -296,7 +312,9 @@ class TruthSupply:
             return None
         has_wheels = described.wheels is not None
         return RigidBody.of(
-            described, self.store.timelines[vehicle].wheels_at(t_s) if has_wheels else None
+            described,
+            self.store.timelines[vehicle].wheels_at(t_s) if has_wheels else None,
+            field=field_of(self._vehicles[vehicle]),
         )
 
     def _parameters_at(self, t_s: float) -> PropagationParameters:
@@ -309,6 +327,10 @@ class TruthSupply:
     def _parameters_of(self, vehicle: int) -> PropagationParameters:
         """Return the settings for one vehicle by itself."""
         return replace(self._propagation.of([vehicle]), element_sets=())
+
+
+def _has_magnetorquers(vehicle: Vehicle) -> bool:
+    return vehicle.attitude is not None and vehicle.attitude.magnetorquers is not None
 
 
 class JobTable:

@@ -7,7 +7,7 @@ Positions and fields are Earth-fixed, geocentric, m and T.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 Vector = tuple[float, float, float]
 Coefficients = Mapping[tuple[int, int], float]
@@ -68,6 +68,21 @@ def dipole_field_t(coefficients: Coefficients, r_m: Vector) -> Vector:
     scale = (REFERENCE_RADIUS_M / r) ** 3
     along = 3.0 * (mx * x + my * y + mz * z)
     return scale * (along * x - mx), scale * (along * y - my), scale * (along * z - mz)
+
+
+def inertial_field_t(field_t: Callable[[Vector], Vector], r_m: Vector, gmst_rad: float) -> Vector:
+    """
+    Return the field in inertial axes, T.
+
+    Args:
+        field_t: Earth-fixed field at an Earth-fixed position.
+        r_m: Inertial position, m.
+        gmst_rad: Greenwich mean sidereal time, rad.
+    """
+    x, y, z = r_m
+    cosine, sine = math.cos(gmst_rad), math.sin(gmst_rad)
+    fx, fy, fz = field_t((cosine * x + sine * y, cosine * y - sine * x, z))
+    return cosine * fx - sine * fy, sine * fx + cosine * fy, fz
 
 
 class Harmonics:

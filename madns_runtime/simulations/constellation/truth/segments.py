@@ -155,6 +155,22 @@ class TruthStore:
             return None
         return knot * self.knot_s, self._knot(vehicle, knot)
 
+    def orbit_from(self, vehicle: int, t_s: float) -> tuple[Array, Array] | None:
+        """
+        Return times and states of the grid's knots from the last one not after *t_s* to the last known.
+
+        None if nothing is kept of that time, or if an effect changes the orbit between its knots.
+        """
+        first, last = math.floor(t_s / self.knot_s + 1e-9), self.end * self.knots_per_window
+        if not self._holds_knot(first) or first >= last:
+            return None
+        effects = self.timelines[vehicle].from_time(first * self.knot_s)
+        if any(effect.kind not in ("torque", "dipole") for effect in effects):
+            return None
+        rows = _gather(self._states, vehicle, (first, last), self.knots_per_window)
+        times_s: Array = np.arange(first, last + 1, dtype=np.float64) * self.knot_s
+        return times_s, rows
+
     def state(self, vehicle: int, t_s: float) -> tuple[float, ...] | None:
         """Return position (m) and velocity (m/s) at *t_s*, six numbers; None where nothing is known."""
         piece = self._piece_at(vehicle, t_s)

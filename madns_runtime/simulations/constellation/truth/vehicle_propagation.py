@@ -31,6 +31,7 @@ from madns_runtime.simulations.constellation.truth.maneuvers.effects import (
     spin_rad_s_max,
     total,
 )
+from madns_runtime.simulations.constellation.truth.orbit_curves import OrbitCurve
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
     conserved_by,
@@ -66,6 +67,8 @@ class VehicleRequest:
     """At start_s."""
     body: RigidBody | None = None
     """At start_s; None for a point mass."""
+    orbit: OrbitCurve | None = None
+    """Of all the time from start_s on, where it is known and no effect changes it; None to propagate it."""
 
 
 def propagate_vehicle(request: VehicleRequest, parameters: PropagationParameters) -> VehicleTruth:
@@ -102,7 +105,7 @@ def propagate_bodies(
     bodies: Sequence[RigidBody], states: Array, knots_s: Array, parameters: PropagationParameters
 ) -> Array:
     """Return attitude and rates of rigid bodies that nobody turns, shape (M, K, 7), from (M, 13) at the first knot."""
-    rows = _attitude_module().propagate_attitude(
+    rows = _engine("attitude").propagate_attitude(
         bodies, states, t0_s=float(knots_s[0]), knots_s=knots_s, parameters=parameters
     )
     return np.asarray(rows[..., 6:], dtype=np.float64)
@@ -120,7 +123,9 @@ class _Flight:
         self._ballistic = request.ballistic_m2_kg
         # An actuator does one thing at a time.
         self._thrust: Thrust | None = None
-        self._torque = COASTING
+        self._torque = self._dipole = COASTING
+        # By attitude in plain numbers; what nobody magnetises keeps its digits.
+        self._is_magnetic = any(effect.kind == "dipole" for effect in request.effects)
         self._thrusts: dict[int, Thrust] = {}
         self._pieces: list[Piece] = []
         self._first_knot = knot_at_or_after(request.change_s, request.knot_s)
@@ -137,7 +142,8 @@ class _Flight:
         knots = self._grid_knots(t0_s, stop_s)
         spans: list[Span] = []
         if t0_s >= request.change_s:
-            is_arc = self._thrust is not None or self._torque != COASTING
+            is_turned = self._torque != COASTING or self._dipole != COASTING
+            is_arc = self._thrust is not None or is_turned
             # Impulses change the velocity there; what drag acts on is one number in a segment.
             kinds = {e.kind for e in request.effects if e.start_s == stop_s}
             jumps = not kinds.isdisjoint(("impulse", "ballistic"))
@@ -202,6 +208,9 @@ class _Flight:
         if effect.kind == "torque":
             self._torque = effect.vector
             return
+        if effect.kind == "dipole":
+            self._dipole = effect.vector
+            return
         thrust = self._request.thrusts.get(effect.number)
         if thrust is None or effect.start_s > self._request.start_s:
             change = self._change_of_velocity(effect)
@@ -211,6 +220,8 @@ class _Flight:
     def _end(self, effect: Effect) -> None:
         if effect.kind == "torque":
             self._torque = COASTING
+        elif effect.kind == "dipole":
+            self._dipole = COASTING
         else:
             self._thrust = None
 
@@ -280,8 +291,10 @@ class _Flight:
         )
         knots, states = np.array(times_s), state[None]
         body = self._body_at(from_s)
-        if body is not None:
-            propagate_attitude = _attitude_module().propagate_attitude
+        if body is not None and self._is_magnetic:
+            rows = self._turned_by_field(body, states, from_s, knots, parameters)
+        elif body is not None:
+            propagate_attitude = _engine("attitude").propagate_attitude
             rows = propagate_attitude(
                 [body], states, t0_s=from_s, knots_s=knots, parameters=parameters
             )
@@ -291,6 +304,27 @@ class _Flight:
         self._check_spin(vehicle)
         return vehicle
 
+    def _turned_by_field(
+        self,
+        body: RigidBody,
+        states: Array,
+        from_s: float,
+        knots_s: Array,
+        parameters: PropagationParameters,
+    ) -> Array:
+        """Return the state at times after *from_s*, shape (1, K, 13), along the orbit that is known or propagated."""
+        orbit = self._request.orbit
+        if orbit is None:
+            support_s = _engine("attitude").support_times(from_s, knots_s)
+            rows = propagate(states[:, :6], from_s, support_s, parameters)[0]
+            orbit = OrbitCurve(support_s, rows)
+        times_s = np.concatenate(((from_s,), knots_s))
+        turned = _engine("magnetic_turn").turn_by_field(
+            body, states[0, 6:], orbit, times_s, parameters
+        )
+        points = np.array([orbit.state(t_s) for t_s in knots_s.tolist()])
+        return np.concatenate((points, turned), axis=1)[None]
+
     def _body_at(self, t_s: float) -> RigidBody | None:
         """Return the body under the present torque, and what its wheels hold at *t_s*."""
         body = self._body
@@ -299,7 +333,7 @@ class _Flight:
         wheels = body.wheels_n_m_s
         if wheels is not None:
             wheels = total((wheels, scaled(self._torque, self._t_s - t_s)))
-        return replace(body, torque_n_m=self._torque, wheels_n_m_s=wheels)
+        return replace(body, torque_n_m=self._torque, dipole_a_m2=self._dipole, wheels_n_m_s=wheels)
 
     def _check_spin(self, rows: Array) -> None:
         if self._body is None:
@@ -325,7 +359,8 @@ class _Flight:
         )
 
 
-def _attitude_module() -> ModuleType:
+def _engine(name: str) -> ModuleType:
+    """Return a module of the propagators that needs scipy, imported when it is first used."""
     return importlib.import_module(
-        "madns_runtime.simulations.constellation.truth.propagators.attitude"
+        f"madns_runtime.simulations.constellation.truth.propagators.{name}"
     )

@@ -16,7 +16,7 @@ from madns_runtime.plugin.api import HOST, AgentContext
 from madns_runtime.protocol.messages import Service
 from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.messages import Command, CommandFrame, CommandKind
-from madns_runtime.simulations.constellation.streams import COMMANDS
+from madns_runtime.simulations.constellation.streams import commands_fields
 from madns_runtime.simulations.constellation.thrust import Vector
 
 COMMANDS_PER_TICK_MAX = 16
@@ -31,9 +31,17 @@ class CommandDesk:
         context: Through which they leave.
         vehicle: What it is like.
         first_number: Of its first command.
+        opens_stream: Whether the stream commands is not open yet.
     """
 
-    def __init__(self, context: AgentContext, vehicle: Vehicle, first_number: int = 0) -> None:
+    def __init__(
+        self,
+        context: AgentContext,
+        vehicle: Vehicle,
+        first_number: int = 0,
+        *,
+        opens_stream: bool = True,
+    ) -> None:
         self._context = context
         self._vehicle = vehicle
         self._first_number = first_number
@@ -43,7 +51,8 @@ class CommandDesk:
         self._in_tick = 0
         self.count = 0
         """Commands given."""
-        context.open_stream("commands", COMMANDS)
+        if opens_stream:
+            context.open_stream("commands", commands_fields(context.parameters))
 
     def begin(self, tick: int, t_s: float, phase_s: float) -> None:
         """Begin a tick: from now on commands bear its time, and lie *phase_s* behind it as the vehicle's ticks do."""
@@ -76,11 +85,24 @@ class CommandDesk:
         check_running("torque", self._tick)
         if self._vehicle.attitude is None:
             raise PluginError("torque: needs a vehicle with vehicles.attitude")
-        duration_s = _number("torque", "duration_s", duration_s)
-        if duration_s <= 0.0:
-            raise PluginError(f"torque: expected duration_s > 0, got {duration_s}")
+        duration_s = _duration("torque", duration_s)
         vector = _vector("torque", torque_n_m, "N m")
         return self._give("torque", at_s=at_s, vector=vector, duration_s=duration_s)
+
+    def dipole(self, dipole_a_m2: Any, *, at_s: float, duration_s: float) -> int:
+        """
+        Command a magnetic dipole along the body axes and return the command's number.
+
+        Raises:
+            PluginError: It is none that a vehicle of this kind could carry out.
+        """
+        check_running("dipole", self._tick)
+        attitude = self._vehicle.attitude
+        if attitude is None or attitude.magnetorquers is None:
+            raise PluginError("dipole: needs a vehicle with vehicles.attitude.magnetorquers")
+        duration_s = _duration("dipole", duration_s)
+        vector = _vector("dipole", dipole_a_m2, "A m^2")
+        return self._give("dipole", at_s=at_s, vector=vector, duration_s=duration_s)
 
     def ballistic(self, ballistic_m2_kg: Any, *, at_s: float) -> int:
         """
@@ -145,6 +167,13 @@ def check_running(name: str, tick: int | None) -> None:
     """
     if tick is None:
         raise PluginError(f"{name}: there is no time before the first tick; call it in step()")
+
+
+def _duration(kind: str, value: Any) -> float:
+    duration_s = _number(kind, "duration_s", value)
+    if duration_s <= 0.0:
+        raise PluginError(f"{kind}: expected duration_s > 0, got {duration_s}")
+    return duration_s
 
 
 def _vector(kind: str, values: Any, unit: str) -> Vector:

@@ -20,6 +20,7 @@ from madns_runtime.protocol.codec import pack
 from madns_runtime.recording.records import Field
 from madns_runtime.simulations.constellation import streams
 from madns_runtime.simulations.constellation.equipment import Vehicle
+from madns_runtime.simulations.constellation.flight_rates import flight_rate
 from madns_runtime.simulations.constellation.messages import (
     CommandResult,
     Delivery,
@@ -33,6 +34,7 @@ from madns_runtime.simulations.constellation.vehicle.commands import (
     CommandDesk,
     check_running,
 )
+from madns_runtime.simulations.constellation.vehicles import flight_of
 
 PAYLOAD_BYTES_MAX = 16_384
 """Of one message by radio, encoded."""
@@ -88,12 +90,16 @@ class VehicleContext:
         self._has_stations = bool(parameters.stations)
         # One that rejoins goes on behind all numbers that it can have given before.
         rejoined_tick = max(0, math.ceil(context.now_s() * context.tick_hz))
-        self.first_number = rejoined_tick * COMMANDS_PER_TICK_MAX
+        flight = flight_of(parameters, context.name, initial.satellite)
+        rate = flight_rate(None if flight is None else flight.rate_hz, context.tick_hz)
+        steps = rejoined_tick * rate.steps_per_tick
+        self.first_number = steps * COMMANDS_PER_TICK_MAX
         """Of its first command: 0, or more in a vehicle that rejoined the run."""
-        self._first_message = rejoined_tick * MESSAGES_PER_TICK_MAX
+        self._first_message = steps * MESSAGES_PER_TICK_MAX
         self.desk = desk = CommandDesk(context, vehicle, self.first_number)
         """Of its commands."""
         self.delta_v, self.torque, self.ballistic = desk.delta_v, desk.torque, desk.ballistic
+        self.dipole = desk.dipole
         self._tick: int | None = None
         self._t_s = -math.inf
         self._messages = 0
@@ -170,19 +176,7 @@ class VehicleContext:
 
     def record_result(self, tick: int, result: CommandResult) -> None:
         """Record what flight software is about to be told of a command."""
-        self._context.record(
-            "command_results",
-            (
-                tick,
-                result.number,
-                result.status,
-                result.at_s,
-                result.revision,
-                result.delta_v_m_s,
-                result.propellant_kg,
-                result.reason,
-            ),
-        )
+        self._context.record("command_results", result_row(tick, result))
 
     def refuse(self, refusal: TransmissionRefusal) -> None:
         """Take that a message was refused, to be told in the next tick."""
@@ -235,6 +229,20 @@ class VehicleContext:
         self._context.open_stream("estimates", (*streams.ESTIMATES, *fields))
         self._estimate_names = names
         return names
+
+
+def result_row(tick: int, result: CommandResult) -> tuple[int | float | str, ...]:
+    """Return a result as the stream command_results has it."""
+    return (
+        tick,
+        result.number,
+        result.status,
+        result.at_s,
+        result.revision,
+        result.delta_v_m_s,
+        result.propellant_kg,
+        result.reason,
+    )
 
 
 def _payload_bytes(payload: Any) -> int:

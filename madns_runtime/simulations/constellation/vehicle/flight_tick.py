@@ -10,8 +10,9 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
+import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -23,11 +24,15 @@ from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.flight.api import (
     MASS,
     TRUTH,
+    WHEELS,
     Reading,
     Readings,
+    StepReadings,
 )
 from madns_runtime.simulations.constellation.flight.loading import load_flight_class
 from madns_runtime.simulations.constellation.flight.process import ExternalFlight
+from madns_runtime.simulations.constellation.flight_rates import FlightRate, flight_rate
+from madns_runtime.simulations.constellation.flight_settings import FlightClass, FlightRule
 from madns_runtime.simulations.constellation.messages import (
     CommandResult,
     Delivery,
@@ -35,16 +40,20 @@ from madns_runtime.simulations.constellation.messages import (
     TransmissionRefusal,
 )
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
-from madns_runtime.simulations.constellation.parameters import FlightClass, FlightProcess
 from madns_runtime.simulations.constellation.vehicle.flight_context import VehicleContext
 from madns_runtime.simulations.constellation.vehicle.sensors.environment import Scene
-from madns_runtime.simulations.constellation.vehicle.sensors.sensor import SensorSuite, generator_of
+from madns_runtime.simulations.constellation.vehicle.sensors.sensor import SensorSuite
+from madns_runtime.simulations.constellation.vehicle.sensors.sensor_errors import generator_of
 from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBuffer
 from madns_runtime.simulations.constellation.vehicles import flight_of
 
 RESULTS_MAX = 1024
 """Results of commands that wait for the next tick; older ones are dropped and counted."""
 
+MESSAGES_MAX = 16_384
+"""Messages that wait for a step of slow flight software; older ones are dropped and counted."""
+READINGS_MAX = 4096
+"""Readings of one sensor that wait for a step; older ones are dropped and counted."""
 CHANCE_BYTES = 32
 """Of the run's chance for one vehicle."""
 
@@ -79,7 +88,11 @@ class Cockpit:
         self._is_truth_fed = is_truth_fed
         self._messages: list[Delivery] = []
         self._results: deque[CommandResult] = deque(maxlen=RESULTS_MAX)
+        self._gauges: deque[CommandResult] = deque(maxlen=RESULTS_MAX)
         self._results_dropped = 0
+        self._news: dict[str, deque[Reading]] = {}
+        """Measurements since the step before."""
+        self._news_dropped = self._messages_dropped = 0
         self.phase_s = 0.0
         """By how much the vehicle's ticks lie behind their nominal times, s."""
         self.refuse = board.refuse
@@ -95,41 +108,69 @@ class Cockpit:
         tick: int,
         t_s: float,
         state: tuple[float, ...] | None,
-        measured: Mapping[str, Reading],
+        *,
+        is_early: bool = False,
     ) -> None:
         """
-        Do one tick; a tick without truth has no readings, but flight software runs all the same.
+        Do one step; one without truth has no readings, but flight software runs all the same.
 
         Args:
             tick: Its number.
             t_s: Its time.
             state: Truth, or None.
-            measured: What sensors have to say since the tick before.
+            is_early: Whether its time is before the tick's own: what came since the tick before is not told then,
+                but messages that had arrived by that time.
 
         Raises:
             BlamedError: Flight software raised.
         """
         board = self._board
         board.begin(tick, t_s, self.phase_s)
-        readings = dict(measured) if not self._is_truth_fed else {}
-        if self._is_truth_fed and state is not None:
-            readings[TRUTH] = Reading(t_s, state)
-        messages, self._messages = self._messages, []
-        for message in messages:
+        news, self._news = self._news, {}
+        readings = StepReadings({name: one[-1] for name, one in news.items()}, news)
+        if self._is_truth_fed:
+            readings = StepReadings({}, {})
+            if state is not None:
+                readings[TRUTH] = Reading(t_s, state)
+        for message in self._arrived(t_s if is_early else math.inf):
             board.record_received(tick, message)
             self._tell("receive", message)
-        while self._results:
+        while self._gauges and not is_early:
+            self._read_gauge(t_s, self._gauges.popleft(), readings)
+        while self._results and not is_early:
             result = self._results.popleft()
             board.record_result(tick, result)
             self._read_gauge(t_s, result, readings)
             self._tell("command_result", result)
-        for refusal in board.take_refusals(tick):
+        for refusal in () if is_early else board.take_refusals(tick):
             self._tell("message_refused", refusal)
         self._call("step", self._step, t_s, readings)
 
+    def take(self, measured: Mapping[str, Sequence[Reading]]) -> None:
+        """Keep what became known of sensors for the next step; of very many readings the oldest are given up."""
+        for name, readings in measured.items():
+            kept = self._news.get(name)
+            if kept is None:
+                kept = self._news[name] = deque(maxlen=READINGS_MAX)
+            self._news_dropped += max(0, len(kept) + len(readings) - READINGS_MAX)
+            kept.extend(readings)
+
+    def _arrived(self, until_s: float) -> list[Delivery]:
+        """Take the messages that had arrived by some time."""
+        messages = self._messages
+        self._messages = [one for one in messages if one.arrives_s > until_s]
+        return [one for one in messages if one.arrives_s <= until_s]
+
     def deliver(self, message: Delivery) -> None:
-        """Take a message by radio, to be told in the tick that begins."""
+        """Take a message by radio, to be told in the next step."""
+        if len(self._messages) >= MESSAGES_MAX:
+            self._messages.pop(0)
+            self._messages_dropped += 1
         self._messages.append(message)
+
+    def read_gauges(self, result: CommandResult) -> None:
+        """Let the next step read what a command of a device has changed."""
+        self._gauges.append(result)
 
     def tell(self, result: CommandResult) -> None:
         """Take what became of a command, to be told in the next tick."""
@@ -151,13 +192,17 @@ class Cockpit:
         return {
             "commands": self._board.desk.count,
             "command_results_dropped": self._results_dropped,
+            **({"readings_dropped": self._news_dropped} if self._news_dropped else {}),
+            **({"messages_dropped": self._messages_dropped} if self._messages_dropped else {}),
             "messages_sent": self._board.messages_sent,
             "sends_refused": dict(self._board.refused),
             "flight": told,
         }
 
     def _read_gauge(self, t_s: float, result: CommandResult, readings: dict[str, Reading]) -> None:
-        """Give mass and propellant with what changed them, and not before it has."""
+        """Give mass and propellant, and the wheels' momentum, with what changed them, and not before it has."""
+        if result.wheels_n_m_s is not None:
+            readings[WHEELS] = Reading(t_s, result.wheels_n_m_s)
         thruster = self._vehicle.thruster
         if thruster is None or result.status != "executed":
             return
@@ -200,10 +245,12 @@ def fit_out(
     # All that is left to chance on board hangs on these bytes and on a name, not on an order.
     chance = context.random.bytes(CHANCE_BYTES)
     suite = cockpit = None
+    rate = rate_of(flight, context.tick_hz)
     if has_sensors:
         gravity = GRAVITY_MODELS[context.parameters.gravity]
+        step_hz = rate.hz if rate.steps_per_tick > 1 else None
         scene = Scene(initial.epoch_utc, buffer, gravity.radius_m)
-        suite = SensorSuite(wanted, scene, context=context, chance=chance)
+        suite = SensorSuite(wanted, scene, context=context, chance=chance, step_hz=step_hz)
     if flight is not None:
         board = VehicleContext(
             context,
@@ -217,13 +264,20 @@ def fit_out(
     return suite, cockpit
 
 
-def _software(flight: FlightClass | FlightProcess, context: AgentContext) -> Callable[[], Any]:
+def rate_of(flight: FlightRule | None, tick_hz: float) -> FlightRate:
+    """
+    Return the steps of a vehicle's flight software.
+
+    Raises:
+        BlamedError: Its rate and that of the ticks have no whole ratio.
+    """
+    try:
+        return flight_rate(None if flight is None else flight.rate_hz, tick_hz)
+    except ValueError as error:
+        raise BlamedError(f"parameters.flight.rate_hz: {error}") from error
+
+
+def _software(flight: FlightRule, context: AgentContext) -> Callable[[], Any]:
     if isinstance(flight, FlightClass):
         return load_flight_class(flight.software, context.base_directory)
-    return partial(
-        ExternalFlight,
-        flight,
-        context.base_directory,
-        is_lockstep=context.is_lockstep,
-        keep_text=context.keep_text,
-    )
+    return partial(ExternalFlight, flight, context)

@@ -13,7 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from madns_runtime.simulations.constellation.equipment import ReactionWheels, Thruster, Vehicle
+from madns_runtime.simulations.constellation.equipment import (
+    Magnetorquers,
+    ReactionWheels,
+    Thruster,
+    Vehicle,
+)
 from madns_runtime.simulations.constellation.thrust import Vector
 from madns_runtime.simulations.constellation.truth.maneuvers.effects import scaled
 
@@ -23,6 +28,8 @@ DELTA_V_M_S_MIN = 1e-12
 """Less does not show in the last digit of an orbit's velocity."""
 TORQUE_N_M_MIN = 1e-15
 """Less than wheels can give is nothing."""
+DIPOLE_A_M2_MIN = 1e-12
+"""Less turns nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -179,6 +186,40 @@ def turn(
         return ActuatorRefusal(reason="the wheels are saturated")
     x, y, z = given
     return WheelTurn(torque_n_m=(x, y, z), limits=tuple(limits))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Magnetisation:
+    """Dipole that magnetorquers give."""
+
+    dipole_a_m2: Vector
+    """All through the time commanded, body axes, A m^2."""
+    limits: tuple[str, ...] = ()
+    """Limits that kept it below what was commanded."""
+
+
+def magnetise(
+    torquers: Magnetorquers, dipole_a_m2: Vector, random: np.random.Generator
+) -> Magnetisation | ActuatorRefusal:
+    """
+    Return what the magnetorquers make of a commanded dipole.
+
+    Args:
+        torquers: Of the vehicle.
+        dipole_a_m2: As commanded, body axes.
+        random: One number is drawn.
+    """
+    if max(map(abs, dipole_a_m2)) < DIPOLE_A_M2_MIN:
+        return ActuatorRefusal(reason="a dipole of 0 A m^2")
+    factor = 1.0 + float(random.standard_normal()) * torquers.dipole_error
+    most = torquers.dipole_a_m2_max
+    x, y, z = (min(max(commanded, -most), most) for commanded in dipole_a_m2)
+    limits = tuple(
+        f"{axis}: {most:g} A m^2 at most"
+        for axis, commanded in zip("xyz", dipole_a_m2, strict=True)
+        if abs(commanded) > most
+    )
+    return Magnetisation(dipole_a_m2=scaled((x, y, z), factor), limits=limits)
 
 
 def _turned(vector: Vector, along_rad: float, across_rad: float) -> Vector:

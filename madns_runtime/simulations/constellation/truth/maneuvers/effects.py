@@ -1,5 +1,5 @@
 """
-Effects of commands on truth: changes of velocity, arcs of thrust and torque, and of the ballistic coefficient. Pure.
+Effects of commands on truth: changes of velocity and of the ballistic coefficient, arcs of thrust, torque and dipole. Pure.
 
 An effect is what an actuator really gives, errors included; its frame is resolved when truth is propagated,
 since the directions at that time depend on what was done before.
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from madns_runtime.simulations.constellation.messages import CommandFrame, Segment
 from madns_runtime.simulations.constellation.thrust import Thrust, Vector
 
-EffectKind = Literal["impulse", "thrust", "torque", "ballistic"]
+EffectKind = Literal["impulse", "thrust", "torque", "ballistic", "dipole"]
 
 SNAP_S = 1e-7
 """A time this near to a knot is the knot's: 0.2 mm at 2 km/s."""
@@ -30,7 +30,7 @@ SHORT = 0.1
 """Part of a knot's time: a shorter piece is drawn out over the next interval, whose position would else lose
 digits when its small steps are divided by a small time."""
 ARC_INTERVALS_MIN = 4
-"""Knots in an arc of thrust or torque are at least this dense."""
+"""Knots in an arc of thrust, torque or dipole are at least this dense."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +47,8 @@ class Effect:
     end_s: float
     """Until when it acts; start_s for an impulse and for a ballistic coefficient."""
     vector: Vector
-    """impulse and thrust: change of velocity, m/s; torque: N m, body; ballistic: m^2/kg and two zeros."""
+    """impulse and thrust: change of velocity, m/s; torque: N m, body; dipole: A m^2, body;
+    ballistic: m^2/kg and two zeros."""
     frame: CommandFrame = "inertial"
     burnt: float = 0.0
     """Share of the vehicle's mass that a thrust arc burns."""

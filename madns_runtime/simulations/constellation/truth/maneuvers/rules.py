@@ -20,14 +20,22 @@ from madns_runtime.simulations.constellation.thrust import Vector
 from madns_runtime.simulations.constellation.truth.maneuvers.actuators import (
     ActuatorRefusal,
     Burn,
+    Magnetisation,
     Tank,
     WheelTurn,
     chance_of,
     fire,
+    magnetise,
     propellant_of,
     turn,
 )
+from madns_runtime.simulations.constellation.truth.maneuvers.command_faults import (
+    ARC_S_MIN,
+    number_fault,
+    vehicle_fault,
+)
 from madns_runtime.simulations.constellation.truth.maneuvers.effects import (
+    SNAP_S,
     Effect,
     EffectKind,
     Timeline,
@@ -37,12 +45,17 @@ from madns_runtime.simulations.constellation.truth.maneuvers.effects import (
 
 WAITING_MAX = 64
 """Commands of one vehicle whose time is not over."""
-ARC_S_MIN = 0.01
-"""A burn that is over sooner is an impulse; a torque is not given for less, s."""
-COMMANDS_MAX = 2**31
-"""Numbers of commands are below it."""
-ACTUATORS = {"impulse": "thruster", "thrust": "thruster", "torque": "wheels"}
+ACTUATORS = {
+    "impulse": "thruster",
+    "thrust": "thruster",
+    "torque": "wheels",
+    "dipole": "torquers",
+}
 """Actuator of each effect; it does one thing at a time."""
+FIELD_T_MAX = 7e-5
+"""The Earth's field is nowhere stronger, T."""
+Given = Burn | WheelTurn | Magnetisation
+"""What an actuator makes of a command."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,6 +85,8 @@ class Taken:
     """Begin as commanded, s: T_m, of a finite burn half its length before."""
     is_late: bool = False
     """Whether it could not be in truth by its time."""
+    wheels_n_m_s: Vector | None = None
+    """Momentum of the wheels after a torque that is over, body axes, N m s."""
 
     def result(self, revision: int, *, is_over: bool = False) -> CommandResult:
         """Return what the vehicle is told: now what is expected, for errors show when its time is over."""
@@ -83,6 +98,7 @@ class Taken:
             reason=self.reason,
             delta_v_m_s=self.delta_v_m_s if is_over else self.expected_m_s,
             propellant_kg=self.propellant_kg if is_over else self.expected_kg,
+            wheels_n_m_s=self.wheels_n_m_s if is_over else None,
         )
 
 
@@ -126,6 +142,8 @@ class Rules:
     settings: Maneuvers
     can_maneuver: bool
     """Whether the propagator starts from any state."""
+    can_magnetise: bool = True
+    """Whether truth follows a magnetic dipole."""
     duration_s: float
     tick_hz: float
     knot_s: float
@@ -193,12 +211,18 @@ class ManeuverDesk:
         account.slack_s_min = min(account.slack_s_min, slack_s)
         return Times(propagation_s=propagation_s, network_s=network_s, slack_s=slack_s)
 
-    def execute(self, taken: Taken) -> None:
-        """Enter that a command's time is over."""
+    def execute(self, taken: Taken) -> Taken:
+        """Enter that a command's time is over, and return it with what its actuator holds now."""
         self._waiting[taken.vehicle] -= 1
         self.account.executed += 1
         self.account.delta_v_m_s += taken.delta_v_m_s
         self.account.propellant_kg += taken.used_kg
+        attitude, effect = self._vehicles[taken.vehicle].attitude, taken.effect
+        has_wheels = attitude is not None and attitude.wheels is not None
+        if effect is None or effect.kind != "torque" or not has_wheels:
+            return taken
+        momentum = self._timelines[taken.vehicle].wheels_at(effect.end_s)
+        return replace(taken, wheels_n_m_s=momentum)
 
     def _judge(self, vehicle: int, command: Command, heard_s: float) -> Taken:
         refused = Taken(
@@ -210,61 +234,31 @@ class ManeuverDesk:
             propellant_kg=self._tanks[vehicle].propellant_kg,
             expected_kg=self._tanks[vehicle].propellant_kg,
         )
-        fault = self._fault(vehicle, command)
+        fault = (
+            number_fault(command)
+            or self._rule_fault(vehicle, command)
+            or vehicle_fault(command, self._vehicles[vehicle])
+        )
         if fault:
             return replace(refused, reason=fault)
         given = self._given(vehicle, command)
-        if isinstance(given, WheelTurn):
+        if isinstance(given, WheelTurn | Magnetisation):
             given = self._bearable(vehicle, command, given)
         if isinstance(given, ActuatorRefusal):
             return replace(refused, reason=given.reason)
         return self._in_time(refused, given)
 
-    def _fault(self, vehicle: int, command: Command) -> str:
-        """Return why a command cannot be carried out at any time; empty if it can."""
-        times_s = (command.commanded_s, command.phase_s, command.at_s, command.duration_s)
-        numbers = (*times_s, *command.vector)
-        described = self._vehicles[vehicle]
-        attitude, is_torque = described.attitude, command.kind == "torque"
-        is_burn, is_ballistic = command.kind == "delta_v", command.kind == "ballistic"
-        allowed, value = described.ballistic_m2_kg_range, command.vector[0]
-        low, high = allowed or (-math.inf, math.inf)
-        faults = (
-            (not all(map(math.isfinite, numbers)), f"expected finite numbers, got {numbers}"),
-            (
-                not 0 <= command.number < COMMANDS_MAX,
-                f"expected a number from 0 on, got {command.number}",
-            ),
-            (
-                not self._rules.can_maneuver,
-                "the scenario's propagator starts from no other states than its own",
-            ),
-            (
-                self._waiting[vehicle] >= WAITING_MAX,
-                f"{WAITING_MAX} commands are waiting already",
-            ),
-            (is_burn and described.thruster is None, "the vehicle has no thruster"),
-            (
-                is_burn and command.frame == "body" and attitude is None,
-                "body axes of a vehicle without attitude",
-            ),
-            (is_torque and attitude is None, "a torque on a vehicle without attitude"),
-            (
-                is_torque and command.duration_s < ARC_S_MIN,
-                f"expected a duration of at least {ARC_S_MIN} s, got {command.duration_s:g} s",
-            ),
-            (
-                is_ballistic and allowed is None,
-                "the vehicle's ballistic coefficient cannot be changed",
-            ),
-            (
-                is_ballistic and not low <= value <= high,
-                f"expected {low:g} to {high:g} m^2/kg, got {value:g}",
-            ),
-        )
-        return next((text for is_so, text in faults if is_so), "")
+    def _rule_fault(self, vehicle: int, command: Command) -> str:
+        """Return why the scenario has no room for a command; empty if it has."""
+        if not self._rules.can_maneuver:
+            return "the scenario's propagator starts from no other states than its own"
+        if command.kind == "dipole" and not self._rules.can_magnetise:
+            return "the scenario's propagator follows no magnetic dipole"
+        if self._waiting[vehicle] >= WAITING_MAX:
+            return f"{WAITING_MAX} commands are waiting already"
+        return ""
 
-    def _given(self, vehicle: int, command: Command) -> Burn | WheelTurn | ActuatorRefusal | None:
+    def _given(self, vehicle: int, command: Command) -> Given | ActuatorRefusal | None:
         """Return what the actuator makes of it; None if it needs none."""
         described = self._vehicles[vehicle]
         random = chance_of(self._rules.seed, self._agents[vehicle], command.number)
@@ -274,16 +268,23 @@ class ManeuverDesk:
             momentum = self._timelines[vehicle].wheels_at(math.inf)
             wheels = described.attitude.wheels
             return turn(wheels, momentum, command.vector, command.duration_s, random)
+        if command.kind == "dipole" and described.attitude is not None:
+            torquers = described.attitude.magnetorquers
+            return None if torquers is None else magnetise(torquers, command.vector, random)
         return None
 
     def _bearable(
-        self, vehicle: int, command: Command, given: WheelTurn
-    ) -> WheelTurn | ActuatorRefusal:
+        self, vehicle: int, command: Command, given: WheelTurn | Magnetisation
+    ) -> WheelTurn | Magnetisation | ActuatorRefusal:
         """Return a turn, or a refusal if it alone would spin the body faster than knots can tell."""
         described = self._vehicles[vehicle].attitude
         assert described is not None
         acting_s = min(command.duration_s, self._rules.duration_s)
-        pairs = zip(given.torque_n_m, described.inertia_kg_m2, strict=True)
+        if isinstance(given, WheelTurn):
+            torque_n_m = given.torque_n_m
+        else:
+            torque_n_m = (math.hypot(*given.dipole_a_m2) * FIELD_T_MAX,) * 3
+        pairs = zip(torque_n_m, described.inertia_kg_m2, strict=True)
         gained_rad_s = max(abs(torque) / inertia for torque, inertia in pairs) * acting_s
         limit_rad_s = spin_rad_s_max(self._rules.knot_s)
         if gained_rad_s < limit_rad_s:
@@ -293,18 +294,19 @@ class ManeuverDesk:
             f"less than {limit_rad_s:.4g} rad/s, half a turn a knot, can be told"
         )
 
-    def _in_time(self, refused: Taken, given: Burn | WheelTurn | None) -> Taken:
+    def _in_time(self, refused: Taken, given: Given | None) -> Taken:
         """Return the command at its time, or at the first feasible one, or refused."""
         command, rules = refused.command, self._rules
         burn_s = given.duration_s if isinstance(given, Burn) else 0.0
         burn_s = burn_s if burn_s >= ARC_S_MIN else 0.0
-        arc_s = command.duration_s if isinstance(given, WheelTurn) else burn_s
+        is_turn = isinstance(given, WheelTurn | Magnetisation)
+        arc_s = command.duration_s if is_turn else burn_s
         start_s = begins_s = snap(command.at_s - burn_s / 2.0, rules.knot_s)
         ready_s = refused.heard_s + rules.settings.propagation_s + rules.settings.network_s
         status: CommandStatus = "accepted"
         is_late = start_s + command.phase_s < ready_s
         refused = replace(refused, begins_s=begins_s, is_late=is_late)
-        reasons = given.limits if isinstance(given, WheelTurn) else ()
+        reasons = given.limits if isinstance(given, WheelTurn | Magnetisation) else ()
         if is_late:
             late = f"{ready_s - command.phase_s - start_s:.4g} s too late"
             if rules.settings.late == "refuse":
@@ -325,13 +327,27 @@ class ManeuverDesk:
             start_s=start_s,
             end_s=end_s,
             vector=_vector(command, given),
-            frame="body" if isinstance(given, WheelTurn) else command.frame,
+            frame="body" if is_turn else command.frame,
             burnt=given.burnt if isinstance(given, Burn) else 0.0,
         )
+        effect = self._abutting(refused.vehicle, effect)
         if busy := self._busy(refused.vehicle, effect):
             return replace(refused, at_s=at_s, reason=busy)
         taken = replace(refused, status=status, at_s=at_s, reason="; ".join(reasons), effect=effect)
         return self._booked(taken, given)
+
+    def _abutting(self, vehicle: int, effect: Effect) -> Effect:
+        """Return a torque or dipole that begins where the one before ends, were it not for the rounding of times."""
+        if effect.kind not in ("torque", "dipole"):
+            return effect
+        for other in self._timelines[vehicle].effects:
+            if other.kind != effect.kind:
+                continue
+            if 0.0 < abs(other.end_s - effect.start_s) <= SNAP_S:
+                effect = replace(effect, start_s=other.end_s)
+            if 0.0 < abs(other.start_s - effect.end_s) <= SNAP_S:
+                effect = replace(effect, end_s=other.start_s)
+        return effect
 
     def _busy(self, vehicle: int, effect: Effect) -> str:
         """Return why an effect cannot be made: its actuator is at work; empty if it can."""
@@ -342,7 +358,7 @@ class ManeuverDesk:
                 return f"{actuator} busy from {other.start_s:.3f} s to {other.end_s:.3f} s"
         return ""
 
-    def _booked(self, taken: Taken, given: Burn | WheelTurn | None) -> Taken:
+    def _booked(self, taken: Taken, given: Given | None) -> Taken:
         thruster = self._vehicles[taken.vehicle].thruster
         if not isinstance(given, Burn) or thruster is None:
             return taken
@@ -365,7 +381,9 @@ def _kind(command: Command, arc_s: float) -> EffectKind:
     return command.kind
 
 
-def _vector(command: Command, given: Burn | WheelTurn | None) -> Vector:
+def _vector(command: Command, given: Given | None) -> Vector:
     if isinstance(given, Burn):
         return given.vector
+    if isinstance(given, Magnetisation):
+        return given.dipole_a_m2
     return given.torque_n_m if isinstance(given, WheelTurn) else command.vector

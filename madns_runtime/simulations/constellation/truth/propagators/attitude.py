@@ -104,7 +104,7 @@ def propagate_attitude(
     Source: Markley and Crassidis, 3.3; gravity gradient 3.3.6.1.
     """
     by_engine = parameters.settings.PROPERTIES.turns_bodies
-    times_s = knots_s if by_engine else _support(t0_s, knots_s)
+    times_s = knots_s if by_engine else support_times(t0_s, knots_s)
     orbit = propagate(states[:, STATE], t0_s, times_s, parameters)
     result = np.empty((len(bodies), len(knots_s), 13))
     result[:, :, STATE] = orbit[:, np.searchsorted(times_s, knots_s)]
@@ -138,7 +138,7 @@ def _by_engine(
     return turned
 
 
-def _support(t0_s: float, knots_s: Array) -> Array:
+def support_times(t0_s: float, knots_s: Array) -> Array:
     """Return t0, the knots, and times between those that lie further apart than SUPPORT_S."""
     edges = knots_s if knots_s[0] == t0_s else np.concatenate(((t0_s,), knots_s))
     parts = np.ceil(np.diff(edges) / SUPPORT_S).astype(np.intp)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from madns_runtime.simulations.constellation.equipment import Attitude
+from madns_runtime.simulations.constellation.equipment import Attitude, FieldName
 from madns_runtime.simulations.constellation.orbit.frames import rtn_to_inertial
 from madns_runtime.simulations.constellation.orbit.quaternions import (
     IDENTITY,
@@ -19,7 +19,7 @@ from madns_runtime.simulations.constellation.orbit.quaternions import (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigidBody:
-    """Rigid body, and how the Earth's gravity and wheels turn it."""
+    """Rigid body, and how the Earth's gravity and field, and wheels, turn it."""
 
     inertia_kg_m2: Vector
     """Principal moments of inertia about body x, y, z, kg m^2, wheels included."""
@@ -29,14 +29,25 @@ class RigidBody:
     None: the torque is external."""
     torque_n_m: Vector = (0.0, 0.0, 0.0)
     """Commanded torque, body axes, N m; constant all through a call."""
+    dipole_a_m2: Vector = (0.0, 0.0, 0.0)
+    """Dipole of its magnetorquers, body axes, A m^2; constant all through a call. `magnetic_turn` alone heeds it."""
+    field: FieldName = "dipole"
+    """The Earth's field that acts on it."""
 
     @classmethod
-    def of(cls, attitude: Attitude, wheels_n_m_s: Vector | None = None) -> RigidBody:
+    def of(
+        cls,
+        attitude: Attitude,
+        wheels_n_m_s: Vector | None = None,
+        *,
+        field: FieldName = "dipole",
+    ) -> RigidBody:
         """Return the body that a scenario describes."""
         return cls(
             inertia_kg_m2=attitude.inertia_kg_m2,
             has_gravity_gradient=attitude.has_gravity_gradient,
             wheels_n_m_s=wheels_n_m_s,
+            field=field,
         )
 
 

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from datetime import datetime
 
 import numpy as np
 
 from madns_runtime.simulations.constellation.orbit.atmosphere import drag_m_s2
 from madns_runtime.simulations.constellation.orbit.constants import SECONDS_PER_DAY
-from madns_runtime.simulations.constellation.orbit.earth import days_since_j2000, gmst_rad
+from madns_runtime.simulations.constellation.orbit.earth import (
+    days_since_j2000,
+    gmst_rad,
+    gmst_rate_rad_s,
+)
 from madns_runtime.simulations.constellation.orbit.quaternions import Vector, rotate
 from madns_runtime.simulations.constellation.orbit.sun import is_in_umbra, sun_m
 from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBuffer
+
+State = tuple[float, ...]
 
 
 class Scene:
@@ -50,6 +58,22 @@ class Scene:
         """Return an inertial vector in body axes; unchanged for a vehicle without attitude."""
         state = self.state
         return rotate(state[6:10], vector) if len(state) > 6 else vector
+
+    def from_fixed(self, t_s: float, r_m: Sequence[float], v_m_s: Sequence[float]) -> State:
+        """Return position and velocity in the run's frame, six numbers, from those in the turning Earth's at a time."""
+        days = self._epoch_days + t_s / SECONDS_PER_DAY
+        angle, rate = gmst_rad(days), gmst_rate_rad_s(days)
+        cosine, sine = math.cos(angle), math.sin(angle)
+        (x, y, z), (vx, vy, vz) = r_m, v_m_s
+        vx, vy = vx - rate * y, vy + rate * x
+        return (
+            cosine * x - sine * y,
+            sine * x + cosine * y,
+            z,
+            cosine * vx - sine * vy,
+            sine * vx + cosine * vy,
+            vz,
+        )
 
     def given_m_s(self) -> Vector:
         """Return the change of velocity by thrust and impulses since the first call, inertial, m/s."""

@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
-from madns_runtime.bounded_files import read_regular_file
-from madns_runtime.errors import MissingExtraError, PluginError
 from madns_runtime.simulations.constellation.equipment import Magnetometer
-from madns_runtime.simulations.constellation.orbit.magnetic import (
-    NT,
-    Coefficients,
-    Harmonics,
-    decimal_year,
-    dipole_at,
-    dipole_field_t,
-)
+from madns_runtime.simulations.constellation.geomagnetic_field import field_model
+from madns_runtime.simulations.constellation.orbit.magnetic import decimal_year, inertial_field_t
 from madns_runtime.simulations.constellation.orbit.quaternions import from_rotation, multiply
 from madns_runtime.simulations.constellation.vehicle.sensors.environment import Scene
 
@@ -26,7 +16,6 @@ Measured = tuple[float, ...]
 Row = list[float]
 """Errors of one measurement."""
 
-FILE_BYTES_MAX = 16 * 1024 * 1024
 Vector = tuple[float, float, float]
 
 
@@ -43,6 +32,8 @@ class Instrument:
     channels: int = 3
     """Errors that a measurement needs."""
     stream: str = ""
+    is_mean: bool = False
+    """Whether it measures the mean since its measurement before, and not an instant."""
 
 
 def gnss(scene: Scene, error: Row) -> Measured:
@@ -138,63 +129,11 @@ class FluxGate:
 
     def __init__(self, settings: Magnetometer, scene: Scene) -> None:
         year = decimal_year(scene.days)
-        self._field_t: Callable[[Vector], Vector]
-        if settings.field == "igrf":
-            self._field_t = Harmonics(igrf_coefficients(year)).field_t
-        else:
-            dipole = dipole_at(year)
-            self._field_t = lambda r_m: dipole_field_t(dipole, r_m)
+        self._field_t = field_model(settings.field, year)
 
     def measure(self, scene: Scene, error: list[float]) -> tuple[float, ...]:
         """Return the field, T."""
         x, y, z = scene.state[:3]
-        gmst = scene.gmst_rad
-        cosine, sine = math.cos(gmst), math.sin(gmst)
-        fx, fy, fz = self._field_t((cosine * x + sine * y, cosine * y - sine * x, z))
-        bx, by, bz = scene.to_body((cosine * fx - sine * fy, sine * fx + cosine * fy, fz))
+        bx, by, bz = scene.to_body(inertial_field_t(self._field_t, (x, y, z), scene.gmst_rad))
         a, b, c = error
         return bx + a, by + b, bz + c
-
-
-def igrf_coefficients(year: float) -> Coefficients:
-    """
-    Return the newest IGRF's coefficients at a decimal year, linear between its epochs.
-
-    Only the data file of ppigrf is read: its code takes 15 ms for a point, and pandas to import.
-
-    Raises:
-        MissingExtraError: ppigrf is not installed.
-        PluginError: Its data are not where, or what, they were.
-    """
-    found = importlib.util.find_spec("ppigrf")
-    if found is None or not found.submodule_search_locations:
-        raise MissingExtraError("ppigrf", "igrf")
-    folder = Path(found.submodule_search_locations[0])
-    files = sorted(folder.glob("IGRF*.shc"))
-    if not files:
-        raise PluginError(f"{folder}: expected a file IGRF*.shc of the package ppigrf >= 2.1")
-    return read_coefficients(files[-1], year)
-
-
-def read_coefficients(path: Path, year: float) -> Coefficients:
-    """
-    Return the coefficients of an SHC file at a decimal year, T; of its nearest epoch outside of them.
-
-    Raises:
-        PluginError: It is no SHC file.
-    """
-    text = read_regular_file(path, bytes_max=FILE_BYTES_MAX).decode()
-    lines = [line.split() for line in text.splitlines()]
-    rows = [line for line in lines if line and not line[0].startswith("#")][1:]
-    try:
-        years = [float(number) for number in rows[0]]
-        year = min(max(year, years[0]), years[-1])
-        at = next(number for number, until in enumerate(years[1:]) if year <= until)
-        part = (year - years[at]) / (years[at + 1] - years[at])
-        table = {(int(row[0]), int(row[1])): [float(n) for n in row[2:]] for row in rows[1:]}
-        return {
-            key: NT * (values[at] + part * (values[at + 1] - values[at]))
-            for key, values in table.items()
-        }
-    except (IndexError, ValueError, StopIteration) as error:
-        raise PluginError(f"{path}: expected spherical harmonics as SHC text") from error

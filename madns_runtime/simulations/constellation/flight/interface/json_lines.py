@@ -1,5 +1,9 @@
 """
-Answers of a flight program, read and carried out, and the schema of all lines. Pure but for what the context does.
+Protocol `json_lines`: one JSON object per line, and the schema of all lines. Pure.
+
+    to the program      {"setup": {...}}
+                        {"t_s": 0.1, "readings": {...}, "messages": [...], "results": [...], "refusals": [...]}
+    from the program    {"commands": [...], "send": [...], "estimate": {...}, "log": [...]}
 
 The JSON Schema of the lines that a vehicle and its flight program exchange is made from what the code reads and
 writes; docs/flight-messages.schema.json is this schema, written by `python docs/generate.py`.
@@ -14,17 +18,25 @@ from typing import Any, Final, Literal
 
 import orjson
 
-from madns_runtime.errors import BlamedError, PluginError
-from madns_runtime.simulations.constellation.flight.api import FlightContext
+from madns_runtime.errors import PluginError
+from madns_runtime.simulations.constellation.flight.interface.answers import (
+    CommandRequest,
+    FlightAnswer,
+    shown,
+)
+from madns_runtime.simulations.constellation.flight.interface.content import LOG_LEVELS
+from madns_runtime.simulations.constellation.flight.interface.dialogue import to_plain
+from madns_runtime.simulations.constellation.flight.interface.reports import SetupReport, TickReport
 from madns_runtime.simulations.constellation.messages import (
     CommandFrame,
     CommandResult,
     Delivery,
     TransmissionRefusal,
 )
+from madns_runtime.simulations.constellation.thrust import Vector
 
-TIME_TOLERANCE_S = 1e-5
-"""Of the time that an answer names, which may have been printed with six decimals."""
+LINE_BYTES_MAX = 262_144
+"""Of one line; a longer one is no answer."""
 KEYS = frozenset({"t_s", "commands", "send", "estimate", "log"})
 SENDING = {"to", "payload"}
 LOGGING = {"level", "text"}
@@ -32,11 +44,18 @@ COMMANDS = {
     "delta_v_m_s": ({"delta_v_m_s", "at_s"}, {"frame"}),
     "torque_n_m": ({"torque_n_m", "at_s", "duration_s"}, set()),
     "ballistic_m2_kg": ({"ballistic_m2_kg", "at_s"}, set()),
+    "dipole_a_m2": ({"dipole_a_m2", "at_s", "duration_s"}, set()),
 }
 """By the key that tells the command: which keys it must and may have."""
+KINDS = {
+    "delta_v_m_s": "delta_v",
+    "torque_n_m": "torque",
+    "ballistic_m2_kg": "ballistic",
+    "dipole_a_m2": "dipole",
+}
+"""By the same key: the command's kind."""
 
 DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
-LOG_LEVELS: Final = ("critical", "error", "warning", "info", "debug")
 Schema = dict[str, Any]
 TEXT: Final[Schema] = {"type": "string"}
 NUMBER: Final[Schema] = {"type": "number"}
@@ -45,10 +64,17 @@ ANYTHING: Final[Schema] = {
     "description": "What JSON can hold; bytes are shown to a program as an object with the one key base64."
 }
 VECTOR: Final[Schema] = {"type": "array", "items": NUMBER, "minItems": 3, "maxItems": 3}
-OF_TYPE: Final[Mapping[Any, Schema]] = {str: TEXT, float: NUMBER, int: WHOLE, Any: ANYTHING}
+OF_TYPE: Final[Mapping[Any, Schema]] = {
+    str: TEXT,
+    float: NUMBER,
+    int: WHOLE,
+    Any: ANYTHING,
+    Vector | None: {**VECTOR, "type": ["array", "null"]},
+}
 OF_KEY: Final[Mapping[str, Schema]] = {
     "delta_v_m_s": VECTOR,
     "torque_n_m": VECTOR,
+    "dipole_a_m2": VECTOR,
     "ballistic_m2_kg": NUMBER,
     "at_s": NUMBER,
     "duration_s": NUMBER,
@@ -71,39 +97,78 @@ SETUP: Final[Mapping[str, Schema]] = {
 """Content of the first line to a program."""
 
 
-def carry_out(line: bytes, context: FlightContext, program: str, *, t_s: float) -> None:
-    """
-    Do what one line of a program asks for.
+class JsonLines:
+    """Both directions of a conversation in lines."""
 
-    Args:
-        line: A JSON object; each of its parts may be missing.
-        context: Takes commands, messages, estimates and words.
-        program: Its name, for who is to blame.
-        t_s: Of the tick that it answers; an answer that names a time names this one.
+    answers_by_time = False
+    """One answer for each tick, in their order."""
 
-    Raises:
-        BlamedError: It is no answer, or asks for what cannot be.
-    """
+    def __init__(self) -> None:
+        self.faults: dict[str, int] = {}
+        """None: a line that is no answer is a fault of whoever wrote it."""
+        self._rest = b""
+
+    def setup(self, setup: SetupReport) -> list[bytes]:
+        """Return the first line."""
+        told = {name: getattr(setup, name) for name in SETUP}
+        return [orjson.dumps({"setup": told}) + b"\n"]
+
+    def tick(self, tick: TickReport) -> list[bytes]:
+        """Return the line of a tick."""
+        told: dict[str, Any] = {
+            "t_s": tick.t_s,
+            "readings": {
+                name: {"t_s": reading.t_s, "values": reading.values}
+                for name, reading in tick.readings.items()
+            },
+            "messages": [dataclasses.asdict(one) for one in tick.messages],
+            "results": [dataclasses.asdict(one) for one in tick.results],
+            "refusals": [dataclasses.asdict(one) for one in tick.refusals],
+        }
+        if samples := getattr(tick.readings, "samples", None):
+            told["samples"] = {
+                name: [{"t_s": one.t_s, "values": one.values} for one in news]
+                for name, news in samples.items()
+            }
+        return [orjson.dumps(told, to_plain, orjson.OPT_SERIALIZE_NUMPY) + b"\n"]
+
+    def feed(self, data: bytes) -> list[FlightAnswer]:
+        """Take what came, and return the answers that are whole now; what has no end is one, too, with its fault."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        answers = [read_answer(line) for line in lines]
+        if len(self._rest) > LINE_BYTES_MAX:
+            fault = f"expected lines of at most {LINE_BYTES_MAX} bytes"
+            answers.append(FlightAnswer(fault=fault))
+            self._rest = b""
+        return answers
+
+
+def read_answer(line: bytes) -> FlightAnswer:
+    """Return one line of a program as an answer: a JSON object, each of whose parts may be missing."""
     try:
         answer = orjson.loads(line)
-        _check(answer, t_s)
-        for command in answer.get("commands", ()):
-            _command(command, context)
+    except orjson.JSONDecodeError:
+        return FlightAnswer(fault=f"expected a JSON object, got {shown(line)}")
+    try:
+        _check(answer)
+        commands = tuple(_command(command) for command in answer.get("commands", ()))
         for message in answer.get("send", ()):
             _check_keys("a message", message, SENDING)
-            context.send(message["to"], message["payload"])
-        if answer.get("estimate") not in (None, {}):
-            context.estimate(answer["estimate"])
         for words in answer.get("log", ()):
             _check_keys("words to log", words, LOGGING)
-            context.log(words["level"], words["text"])
-    except orjson.JSONDecodeError as error:
-        raise BlamedError(f"{program}: expected a JSON object, got {_shown(line)}") from error
     except (PluginError, TypeError) as error:
-        raise BlamedError(f"{program}: {error}; it wrote {_shown(line)}") from error
+        return FlightAnswer(fault=str(error), source=line)
+    return FlightAnswer(
+        t_s=answer.get("t_s"),
+        commands=commands,
+        sends=tuple((message["to"], message["payload"]) for message in answer.get("send", ())),
+        estimate=answer.get("estimate"),
+        logs=tuple((words["level"], words["text"]) for words in answer.get("log", ())),
+        source=line,
+    )
 
 
-def _check(answer: Any, t_s: float) -> None:
+def _check(answer: Any) -> None:
     if not isinstance(answer, Mapping):
         raise PluginError("expected a JSON object")
     unknown = set(answer) - KEYS
@@ -111,26 +176,25 @@ def _check(answer: Any, t_s: float) -> None:
         raise PluginError(
             f"expected the keys {', '.join(sorted(KEYS))}, got {', '.join(sorted(unknown))}"
         )
-    if abs(answer.get("t_s", t_s) - t_s) > TIME_TOLERANCE_S:
-        raise PluginError(f"expected the answer to the tick at {t_s:g} s, got {answer['t_s']!r}")
     for key in ("commands", "send", "log"):
         items = answer.get(key, [])
         if not isinstance(items, list) or not all(isinstance(item, Mapping) for item in items):
             raise PluginError(f"expected {key} to be a list of objects")
 
 
-def _command(command: Mapping[str, Any], context: FlightContext) -> None:
+def _command(command: Mapping[str, Any]) -> CommandRequest:
     told = [key for key in COMMANDS if key in command]
     if len(told) != 1:
         raise PluginError(f"expected a command with one of {', '.join(COMMANDS)}")
-    _check_keys("a command", command, *COMMANDS[told[0]])
-    at_s = command["at_s"]
-    if told[0] == "delta_v_m_s":
-        context.delta_v(command["delta_v_m_s"], at_s=at_s, frame=command.get("frame", "rtn"))
-    elif told[0] == "torque_n_m":
-        context.torque(command["torque_n_m"], at_s=at_s, duration_s=command["duration_s"])
-    else:
-        context.ballistic(command["ballistic_m2_kg"], at_s=at_s)
+    key = told[0]
+    _check_keys("a command", command, *COMMANDS[key])
+    return CommandRequest(
+        kind=KINDS[key],
+        value=command[key],
+        at_s=command["at_s"],
+        frame=command.get("frame", "rtn"),
+        duration_s=command.get("duration_s", 0.0),
+    )
 
 
 def _check_keys(
@@ -140,11 +204,6 @@ def _check_keys(
         raise PluginError(
             f"expected {what} with {', '.join(sorted(must))}, got {', '.join(item) or 'nothing'}"
         )
-
-
-def _shown(line: bytes) -> str:
-    text = line[:200].decode("utf-8", "backslashreplace")
-    return repr(text + (" [cut]" if len(line) > 200 else ""))
 
 
 def message_schema() -> Schema:
@@ -174,7 +233,13 @@ def message_schema() -> Schema:
 def _tick() -> Schema:
     parts = {key: _list_of(key[:-1]) for key in ("messages", "results", "refusals")}
     readings = {"type": "object", "additionalProperties": _ref("reading")}
-    return _object({"t_s": NUMBER, "readings": readings, **parts})
+    samples = {
+        "type": "object",
+        "additionalProperties": _list_of("reading"),
+        "description": "All new readings, oldest first, of the sensors that have more than one; else left out.",
+    }
+    must = {"t_s": NUMBER, "readings": readings, **parts}
+    return _object({**must, "samples": samples}, required=must)
 
 
 def _answer() -> Schema:

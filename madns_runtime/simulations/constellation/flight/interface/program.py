@@ -1,8 +1,8 @@
 """
-A program that speaks lines: started, written to and read from without ever blocking.
+A program of flight software: started, watched and ended without ever blocking a tick.
 
-The pipes end when either side does, so that neither outlives the other for long; the kernel kills the
-program when the agent's own process dies. What it starts itself ends with it.
+The kernel kills it when the agent's own process dies; what it starts itself ends with it. What it writes to its
+standard error is kept, and to its standard output as well where that is not its way to the vehicle.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import os
 import select
 import signal
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from time import monotonic
 
@@ -23,13 +23,10 @@ from madns_runtime.reactor.scheduling import die_with_parent
 from madns_runtime.simulations.constellation.flight.programs import find_program
 from madns_runtime.timing.granted_clock import GrantedClock
 
-LINE_BYTES_MAX = 262_144
-"""Of one line; a longer one is no answer."""
 LAST_LINE_CHARACTERS_MAX = 200
 """Of the last line of its standard error, in the words about its end."""
-WAITING_BYTES_MAX = 1_048_576
-"""Written, but not taken by the program yet."""
 READ_BYTES = 65_536
+NOTHING: Mapping[str, str] = {}
 END_S = 1.0
 """For a program to end by itself after its input has; and again after it was asked to by a signal."""
 PATIENCE_S = 6.0
@@ -37,13 +34,15 @@ PATIENCE_S = 6.0
 PATIENCE_S_MIN = 0.1
 
 
-class LineProcess:
+class FlightProgram:
     """
     A running program.
 
     Args:
         command: Program and arguments.
         base_directory: Folder of the scenario, and the program's working directory.
+        environment: Variables beside this process's own.
+        has_pipes: Whether its standard input and output are the way to it.
         is_patient: Whether time in which the program waits for a processor does not count at its end.
 
     Raises:
@@ -54,7 +53,13 @@ class LineProcess:
     """Rest of the wait, s."""
 
     def __init__(
-        self, command: Sequence[str], base_directory: Path, *, is_patient: bool = False
+        self,
+        command: Sequence[str],
+        base_directory: Path,
+        *,
+        environment: Mapping[str, str] = NOTHING,
+        has_pipes: bool = True,
+        is_patient: bool = False,
     ) -> None:
         self.name = command[0]
         self._is_patient = is_patient
@@ -66,52 +71,34 @@ class LineProcess:
         if libc.IS_LINUX:
             with contextlib.suppress(OSError):
                 libc.prctl(libc.PR_GET_TIMERSLACK)  # loads libc now, not between fork and exec
+        reader, writer = os.pipe()
         try:
             self._process = subprocess.Popen(
                 found,
                 cwd=base_directory,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
+                env={**os.environ, **environment} if environment else None,
+                stdin=subprocess.PIPE if has_pipes else subprocess.DEVNULL,
+                stdout=subprocess.PIPE if has_pipes else writer,
+                stderr=writer,
                 bufsize=0,
                 start_new_session=True,  # a terminal's Ctrl-C is the operator's
                 preexec_fn=die_with_parent if libc.IS_LINUX else None,
             )
-        except (OSError, subprocess.SubprocessError) as error:
+        except (OSError, ValueError, subprocess.SubprocessError) as error:
+            os.close(reader)
             raise BlamedError(f"{self.name}: cannot be started: {error}") from error
-        assert self._process.stdin and self._process.stdout and self._process.stderr
-        self._in = self._process.stdin.fileno()
-        self._out = _Lines(self._process.stdout.fileno())
-        self._err = _Talk(self._process.stderr.fileno())
-        os.set_blocking(self._in, False)
-        self._waiting = bytearray()
+        finally:
+            os.close(writer)
+        self._err = _Talk(reader)
+        self.pipes: tuple[int, int] | None = None
+        """Descriptors of its standard output and input, if those are the way to it."""
+        if self._process.stdin is not None and self._process.stdout is not None:
+            self.pipes = (self._process.stdout.fileno(), self._process.stdin.fileno())
 
     @property
     def pid(self) -> int:
         """Its process id."""
         return self._process.pid
-
-    def write(self, line: bytes) -> bool:
-        """Send a line, as soon as the program takes it; False if too much waits already."""
-        if len(self._waiting) + len(line) > WAITING_BYTES_MAX:
-            return False
-        self._waiting += line
-        self._waiting += b"\n"
-        self._push()
-        return True
-
-    def lines(self) -> list[bytes]:
-        """
-        Return the lines that it has written by now; never waits.
-
-        Raises:
-            BlamedError: A line has no end.
-        """
-        self._push()
-        self._out.read()
-        if self._out.is_overlong:
-            raise BlamedError(f"{self.name}: expected lines of at most {LINE_BYTES_MAX} bytes")
-        return self._out.take()
 
     def talk(self) -> bytes:
         """Return what is new of its standard error; never waits."""
@@ -128,20 +115,15 @@ class LineProcess:
         """The last line of its standard error that is not empty, cut; an empty text if there was none."""
         return clean_text(self._err.last_line.decode("utf-8", "replace"))
 
-    def wait(self, timeout_s: float) -> None:
-        """Wait until it writes, ends, or talks; or until the time is over."""
-        poller = select.poll()
-        for stream in (self._out, self._err):
-            if not stream.is_closed:
-                poller.register(stream.fd, select.POLLIN)
-        if self._waiting:
-            poller.register(self._in, select.POLLOUT)
-        poller.poll(max(0.0, timeout_s) * 1e3)
+    @property
+    def talk_fds(self) -> tuple[int, ...]:
+        """Descriptors on which it may have talked."""
+        return () if self._err.is_closed else (self._err.fd,)
 
     @property
-    def has_ended(self) -> bool:
-        """Whether it writes no more."""
-        return self._out.is_closed
+    def has_exited(self) -> bool:
+        """Whether it is gone."""
+        return self._process.poll() is not None
 
     def how_it_ended(self) -> str:
         """Return how it ended, in words; waits a moment for the kernel to know."""
@@ -149,10 +131,16 @@ class LineProcess:
             self._process.wait(END_S)
         code = self._process.returncode
         if code is None:
-            return "closed its standard output"
+            return f"closed {'its standard output' if self.pipes else 'the way to the vehicle'}"
         return f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
 
-    def end(self, *, is_patient: bool = True) -> int | None:
+    def end(
+        self,
+        close_input: Callable[[], None],
+        read: Callable[[], object],
+        *,
+        is_patient: bool = True,
+    ) -> int | None:
         """
         End it: its input ends, then it is asked by SIGTERM, then killed; returns its exit code.
 
@@ -160,29 +148,44 @@ class LineProcess:
         still writes meanwhile is read and kept.
 
         Args:
+            close_input: Closes the way to it.
+            read: Reads what it says on the way to the vehicle: it may not be able to end before its words are read.
             is_patient: False kills it at once.
         """
         process = self._process
-        gentle = (self._close_input, process.terminate) if is_patient else ()
-        if not any(self._goes_by_itself(stop) for stop in gentle):
+        gentle = (close_input, process.terminate) if is_patient else ()
+        if not any(self._goes_by_itself(stop, read) for stop in gentle):
             self._kill_all()
-            self._has_gone_within(END_S)
+            self._has_gone_within(END_S, read)
         self._kill_all()  # what it started and left behind
-        for stream in (process.stdout, process.stderr):
+        self._err.read()
+        for stream in (process.stdin, process.stdout):
             if stream is not None:
-                stream.close()
+                with contextlib.suppress(OSError):
+                    stream.close()
+        self._err.close()
         return process.returncode
 
-    def _goes_by_itself(self, stop: Callable[[], object]) -> bool:
+    def _goes_by_itself(self, stop: Callable[[], object], read: Callable[[], object]) -> bool:
         stop()
-        return self._has_gone_within(max(PATIENCE_S_MIN, min(END_S, LineProcess.patience_s)))
+        limit_s = max(PATIENCE_S_MIN, min(END_S, FlightProgram.patience_s))
+        return self._has_gone_within(limit_s, read)
 
-    def _has_gone_within(self, limit_s: float) -> bool:
+    def _has_gone_within(self, limit_s: float, read: Callable[[], object]) -> bool:
         clock = self.stopwatch()
+        deadline_s = clock() + limit_s
         try:
-            return self._is_gone_by(clock, clock() + limit_s)
+            while self._process.poll() is None:
+                left_s = deadline_s - clock()
+                if left_s <= 0.0:
+                    return False
+                wait_for(self.talk_fds, min(left_s, 0.02))
+                read()
+                self._err.read()
+            self._err.read()
+            return True
         finally:
-            LineProcess.patience_s -= clock()
+            FlightProgram.patience_s -= clock()
 
     def stopwatch(self) -> Callable[[], float]:
         """Return what tells the time since now, s: of a patient one, but the program's waits for a processor."""
@@ -191,43 +194,22 @@ class LineProcess:
         began_s = monotonic()
         return lambda: monotonic() - began_s
 
-    def _is_gone_by(self, clock: Callable[[], float], deadline_s: float) -> bool:
-        while self._process.poll() is None:
-            left_s = deadline_s - clock()
-            if left_s <= 0.0:
-                return False
-            # It may not be able to end before its words are read.
-            self.wait(min(left_s, 0.02))
-            self._out.read()
-            self._err.read()
-        self._err.read()
-        return True
-
-    def _close_input(self) -> None:
-        self._waiting.clear()
-        if self._process.stdin is not None:
-            with contextlib.suppress(OSError):
-                self._process.stdin.close()
-
     def _kill_all(self) -> None:
         """Kill it and what it started: they are a group of their own."""
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
 
-    def _push(self) -> None:
-        while self._waiting:
-            try:
-                written = os.write(self._in, memoryview(self._waiting)[:READ_BYTES])
-            except BlockingIOError:
-                return
-            except OSError:  # it is gone, which `has_ended` tells
-                self._waiting.clear()
-                return
-            del self._waiting[:written]
+
+def wait_for(fds: Sequence[int], timeout_s: float) -> None:
+    """Wait until one of these is readable; or until the time is over."""
+    poller = select.poll()
+    for fd in fds:
+        poller.register(fd, select.POLLIN)
+    poller.poll(max(0.0, timeout_s) * 1e3)
 
 
-class _Pipe:
-    """One end of a pipe that is read without waiting."""
+class _Talk:
+    """A standard error: counted, its last line known, and reading never stops."""
 
     def __init__(self, fd: int) -> None:
         os.set_blocking(fd, False)
@@ -235,46 +217,6 @@ class _Pipe:
         self.is_closed = False
         self._rest = b""
         """Of a line under way."""
-
-
-class _Lines(_Pipe):
-    """Lines from a pipe, bounded: more than LINES_MAX that nobody takes are read later."""
-
-    LINES_MAX = 4096
-
-    def __init__(self, fd: int) -> None:
-        super().__init__(fd)
-        self._found: list[bytes] = []
-
-    @property
-    def is_overlong(self) -> bool:
-        """Whether the line under way is too long to be one."""
-        return len(self._rest) > LINE_BYTES_MAX
-
-    def read(self) -> None:
-        """Read what is there, a bounded amount of it."""
-        if self.is_closed or self.is_overlong or len(self._found) > self.LINES_MAX:
-            return
-        data = _read(self.fd)
-        if data is None:
-            return
-        if not data:
-            self.is_closed = True
-            data = b"\n" if self._rest else b""
-        *lines, self._rest = (self._rest + data).split(b"\n")
-        self._found += lines
-
-    def take(self) -> list[bytes]:
-        """Return the lines found and forget them."""
-        lines, self._found = self._found, []
-        return lines
-
-
-class _Talk(_Pipe):
-    """A standard error: counted, its last line known, and reading never stops."""
-
-    def __init__(self, fd: int) -> None:
-        super().__init__(fd)
         self.lines = self.bytes = 0
         self.last_line = b""
         self._found = bytearray()
@@ -297,6 +239,11 @@ class _Talk(_Pipe):
         if told is not None:
             self.last_line = told[:LAST_LINE_CHARACTERS_MAX]
         self._rest = rest[:LAST_LINE_CHARACTERS_MAX]
+
+    def close(self) -> None:
+        """Read no more."""
+        self.is_closed = True
+        os.close(self.fd)
 
     def take(self) -> bytes:
         """Return what has come since the last call."""

@@ -1,0 +1,176 @@
+"""
+Records of a device and of its playback: the same values and ages to the microsecond, and the same outputs.
+
+Samples that no tick could find, after the last one, are counted and not compared. Frames are compared in their order,
+values of an output by the times at which they were due, or in their order where those are the ticks' own.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from cosmos_cli.rerun.recorded_run import FlownRun, RecordedAgent, UsedDevice
+from madns_runtime.hardware.contract import Channel
+from madns_runtime.hardware.kinds.playback import HEAD, OUTPUT_HEAD, streams_of
+from madns_runtime.recording.reader import read_stream
+
+SAME_TIME_S: Final = 1.5e-6
+"""Times are recorded in whole microseconds."""
+SAME_AGE_US: Final = 1
+Row = Sequence[Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FirstDifference:
+    """The first record that differs, as it is told."""
+
+    t_s: float
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChannelComparison:
+    """One channel of one device in both runs."""
+
+    name: str
+    """Device and channel, such as pi22/imu.gyro."""
+    agent: str
+    direction: str
+    records: int
+    """On record that were to be played, or put out."""
+    compared: int
+    different: int
+    """Compared records that differ, and those that only one run has."""
+    left_out: int
+    """Records after the agent's last tick, and outputs of after it: no rerun has them."""
+    in_ticks: int
+    """Samples that came while a tick was under way: it may have found them, or the next one did as in the rerun."""
+    first: FirstDifference | None = None
+
+    @property
+    def is_same(self) -> bool:
+        """Whether nothing differs."""
+        return not self.different
+
+
+def compare_devices(recorded: FlownRun, rerun: Path) -> list[ChannelComparison]:
+    """
+    Compare the records of all devices with those of their playback.
+
+    Args:
+        recorded: The run.
+        rerun: Directory of the rerun.
+
+    Raises:
+        MachineError: A stream cannot be read.
+    """
+    found = []
+    for used in recorded.devices:
+        for channel, path in streams_of(used.folder):
+            if channel.direction == "out" and not used.may_write:
+                continue
+            played = rerun / "devices" / used.agent / used.name / path.name
+            found.append(_compare(recorded, used, channel, path, played))
+    return found
+
+
+def _compare(
+    recorded: FlownRun, used: UsedDevice, channel: Channel, path: Path, played: Path
+) -> ChannelComparison:
+    a, b = _rows(path), _rows(played)
+    agent = recorded.agents[used.agent]
+    if channel.direction == "in":
+        kept = [row for row in a if None not in row[len(HEAD) :]]
+        seen = [row for row in kept if row[0] + row[2] * 1e-6 <= agent.last_wake_s + SAME_TIME_S]
+        if agent.ticks is None:
+            kept = seen = [row for row in a if row[0] <= agent.last_s + SAME_TIME_S]
+        pairs: list[tuple[Row | None, Row | None]] = _in_order(seen, b)
+        is_same, left_out = _is_same_input, len(kept) - len(seen)
+    else:
+        # Before time zero only lockstep records what is put out.
+        a, b = ([row for row in rows if row[0] >= 0.0] for rows in (a, b))
+        pairs = _in_order(a, b) if channel.is_frame else _by_time(a, b)
+        # What was put out after the last step of lockstep has no partner, at the end.
+        whole = len(pairs)
+        while pairs and pairs[-1][1] is None and (pairs[-1][0] or (0.0,))[0] > agent.last_s:
+            pairs.pop()
+        is_same, left_out = _is_same_output, whole - len(pairs)
+    differing = [pair for pair in pairs if None in pair or not is_same(*pair)]
+    return ChannelComparison(
+        name=f"{used.full_name}.{channel.name}",
+        agent=used.agent,
+        direction=channel.direction,
+        records=len(a),
+        compared=len(pairs),
+        different=len(differing),
+        left_out=left_out,
+        in_ticks=_count_in_ticks(agent, a) if channel.direction == "in" else 0,
+        first=_told(differing[0], channel) if differing else None,
+    )
+
+
+def _count_in_ticks(agent: RecordedAgent, rows: Sequence[Row]) -> int:
+    """Count the samples of which the record does not tell whether the tick then under way found them."""
+    woke_s = [woke_s for woke_s, _ in agent.under_way]
+    count = 0
+    for row in rows:
+        handed_s = row[0] + row[2] * 1e-6
+        place = bisect_left(woke_s, handed_s) - 1
+        count += place >= 0 and handed_s <= agent.under_way[place][1]
+    return count
+
+
+def _rows(path: Path) -> list[Row]:
+    return list(read_stream(path).records()) if path.is_file() else []
+
+
+def _in_order(a: Sequence[Row], b: Sequence[Row]) -> list[tuple[Row | None, Row | None]]:
+    longest = max(len(a), len(b))
+    return [
+        (a[place] if place < len(a) else None, b[place] if place < len(b) else None)
+        for place in range(longest)
+    ]
+
+
+def _by_time(a: Sequence[Row], b: Sequence[Row]) -> list[tuple[Row | None, Row | None]]:
+    """Pair what was due at the same time; in their order what mostly was not: then each tick wrote in its own time."""
+    pairs: list[tuple[Row | None, Row | None]] = []
+    of_b = {round(row[0] * 1e5): row for row in b}
+    for row in a:
+        key = round(row[0] * 1e5)
+        near = next((each for each in (key, key - 1, key + 1) if each in of_b), None)
+        pairs.append((row, None if near is None else of_b.pop(near)))
+    if sum(other is not None for _, other in pairs) * 2 < min(len(a), len(b)):
+        return _in_order(a, b)
+    pairs += [(None, row) for row in of_b.values()]
+    return sorted(pairs, key=lambda pair: (pair[0] or pair[1] or (0.0,))[0])
+
+
+def _is_same_input(a: Any, b: Any) -> bool:
+    has_same_time = abs(a[0] - b[0]) <= SAME_TIME_S and abs(a[2] - b[2]) <= SAME_AGE_US
+    return has_same_time and list(a[len(HEAD) :]) == list(b[len(HEAD) :])
+
+
+def _is_same_output(a: Any, b: Any) -> bool:
+    return list(a[len(OUTPUT_HEAD) :]) == list(b[len(OUTPUT_HEAD) :])
+
+
+def _told(pair: tuple[Row | None, Row | None], channel: Channel) -> FirstDifference:
+    a, b = pair
+    row: Row = a if a is not None else b if b is not None else (0.0,)
+    if a is None or b is None:
+        text = "only on record" if b is None else "only in the rerun"
+    else:
+        head = len(HEAD if channel.direction == "in" else OUTPUT_HEAD)
+        text = f"{_shown(a, head)} on record, {_shown(b, head)} in the rerun"
+        if list(a[head:]) == list(b[head:]):
+            text = f"t = {a[0]} s and age {a[2]} us on record, {b[0]} s and {b[2]} us in the rerun"
+    return FirstDifference(t_s=row[0], text=text)
+
+
+def _shown(row: Row, head: int) -> str:
+    return ", ".join(f"{value}"[:80] for value in row[head : head + 4])

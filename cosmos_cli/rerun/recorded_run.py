@@ -1,0 +1,225 @@
+"""A recorded run as a rerun needs it: its settings, its agents' ticks, and the devices that each of them used."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from cosmos_cli.errors import InputError
+from cosmos_cli.evidence.devices import expected_devices
+from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.table_labels import run_labels
+from cosmos_cli.ui.foreign_text import clean_line
+from madns_runtime.config import RunConfig
+from madns_runtime.errors import MadnsError
+from madns_runtime.hardware.kinds.playback import streams_of
+from madns_runtime.plain_values import mapping_at
+from madns_runtime.recording.reader import read_stream
+
+FAULTS_SHOWN_MAX: Final = 10
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UsedDevice:
+    """One device as one agent used it."""
+
+    agent: str
+    name: str
+    """As agents know it, such as imu."""
+    full_name: str
+    """In the records, such as pi22/imu."""
+    folder: Path
+    """Of its records."""
+    may_write: bool
+    """Whether this agent may have moved its outputs: what they were given is compared with what they are given now."""
+    given: int | None = None
+    """Place among the scenario's own devices; None for one of the inventory."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordedAgent:
+    """The ticks of one agent."""
+
+    ticks: Path | None
+    """Its stream of ticks; None in lockstep, which is always on time."""
+    phase_s: float = 0.0
+    last_s: float = 0.0
+    """Nominal time of its last tick, s."""
+    last_wake_s: float = 0.0
+    """When that woke up, simulated, s."""
+    missed: int = 0
+    """Ticks that were skipped."""
+    under_way: tuple[tuple[float, float], ...] = ()
+    """When each tick woke up and when its step ended, simulated, s: it looked at its devices in between."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlownRun:
+    """What a rerun is made of."""
+
+    run: RunDirectory
+    config: RunConfig
+    agents: Mapping[str, RecordedAgent]
+    devices: tuple[UsedDevice, ...]
+
+    @property
+    def folder(self) -> Path:
+        """The scenario's folder, as it is today."""
+        return Path(self.config.base_directory)
+
+
+def read_recorded_run(run: RunDirectory, given: str, as_recorded: Path | None = None) -> FlownRun:
+    """
+    Read what a rerun needs.
+
+    Args:
+        run: The run.
+        given: What a person called it, for advice.
+        as_recorded: A copy of its scenario's folder as it was; None for the folder as it is today.
+
+    Raises:
+        InputError: It cannot be flown again; the text says why, and what to do.
+    """
+    document = run.read_json(run.run_json)
+    if document is None or document.get("status") == "running":
+        raise InputError(f"{run.name} is not collected yet; do that with: cosmos collect {given}")
+    config = run.read_config()
+    if config is None:
+        raise InputError(
+            f"{run.plan_json}: expected the run's settings under config, found none that can be read;"
+            f" without them {run.name} cannot be flown again"
+        )
+    if as_recorded is not None:
+        config = dataclasses.replace(config, base_directory=str(as_recorded.resolve()))
+    if not Path(config.base_directory).is_dir():
+        raise InputError(
+            f"{run.name}: the scenario's folder {clean_line(config.base_directory)} is not there;"
+            " put it back, or name a copy with --as-recorded DIR"
+        )
+    plan = run.read_json(run.plan_json) or {}
+    names = config.agents.resolved_names()
+    faults: list[str] = []
+    agents = {}
+    for name in names:
+        try:
+            agents[name] = _read_agent(run.path / "agents" / name, config)
+        except InputError as error:
+            faults.append(str(error))
+    devices = tuple(_devices(run, config, plan, faults))
+    if faults:
+        more = len(faults) - FAULTS_SHOWN_MAX
+        told = "; ".join(faults[:FAULTS_SHOWN_MAX]) + (f"; and {more} more" if more > 0 else "")
+        raise InputError(f"{run.name} cannot be flown again: {told}")
+    return FlownRun(run=run, config=config, agents=agents, devices=devices)
+
+
+def _read_agent(folder: Path, config: RunConfig) -> RecordedAgent:
+    """
+    Read an agent's ticks.
+
+    Raises:
+        InputError: They are not there, or the agent was started anew.
+    """
+    if config.time.is_lockstep:
+        last_s = config.time.duration_s - 1.0 / config.agents.tick_hz
+        return RecordedAgent(ticks=None, last_s=last_s, last_wake_s=last_s)
+    name, ticks = folder.name, folder / "ticks.jsonl"
+    if any(folder.glob("ticks.[0-9]*.jsonl")):
+        raise InputError(
+            f"{name} was lost and started anew, which lockstep cannot repeat; rerun a run in which it lived"
+        )
+    try:
+        stream = read_stream(ticks)
+        rows = [row for row in stream.records() if len(row) >= 4]
+        phase_s = _phase_of(folder)
+    except (MadnsError, OSError, ValueError, TypeError) as error:
+        raise InputError(f"{name}: its ticks cannot be read: {error}") from error
+    if not rows:
+        raise InputError(f"{name}: {ticks}: expected its ticks, found none")
+    last_s = rows[-1][0] / config.agents.tick_hz
+    return RecordedAgent(
+        ticks=ticks,
+        phase_s=phase_s,
+        last_s=last_s,
+        last_wake_s=last_s + phase_s + rows[-1][1] * 1e-6,
+        missed=sum(row[3] for row in rows),
+        under_way=tuple(_under_way(rows, config.agents.tick_hz, phase_s)),
+    )
+
+
+def _under_way(
+    rows: Sequence[Sequence[int]], tick_hz: float, phase_s: float
+) -> Iterator[tuple[float, float]]:
+    for tick, lateness_us, margin_us, *_ in rows:
+        due_s = tick / tick_hz + phase_s
+        yield due_s + lateness_us * 1e-6, due_s + 1.0 / tick_hz - margin_us * 1e-6
+
+
+def _phase_of(folder: Path) -> float:
+    """Return by how much an agent's ticks were due behind their nominal times, s."""
+    for event in read_stream(folder / "events.jsonl").records():
+        if event.get("event") == "phase":
+            return float(event["phase_s"])
+    return 0.0
+
+
+def _devices(
+    run: RunDirectory, config: RunConfig, plan: Mapping[str, Any], faults: list[str]
+) -> Iterator[UsedDevice]:
+    """Yield the devices of each agent; enter those without records in *faults*."""
+    names, labels = config.agents.resolved_names(), run_labels(run)
+    agents_of = {
+        str(machine): [
+            str(agent) for agent in mapping_at(plan, "machines", machine).get("agents", ())
+        ]
+        for machine in mapping_at(plan, "machines")
+    }
+    for full_name in expected_devices(plan):
+        place, _, name = full_name.rpartition("/")
+        if clean_line(full_name) != full_name or {place, name} & {"", ".", ".."} or "/" in place:
+            faults.append(f"{clean_line(full_name)}: plan.json names no device so")
+            continue
+        folder = run.path / "devices" / place / name
+        try:
+            found = streams_of(folder)
+        except (MadnsError, OSError, KeyError, TypeError) as error:
+            faults.append(f"{clean_line(full_name)}: its records cannot be read: {error}")
+            continue
+        if not found:
+            faults.append(
+                f"{clean_line(full_name)}: no records of it in {folder}; fetch them with: cosmos collect {run.path}"
+            )
+            continue
+        own = (
+            number
+            for number, device in enumerate(config.hardware.devices)
+            if device.name == name and place in labels.like_any(device.agents, names)
+        )
+        if (given := next(own, None)) is not None:
+            yield UsedDevice(
+                agent=place,
+                name=name,
+                full_name=full_name,
+                folder=folder,
+                may_write=True,
+                given=given,
+            )
+            continue
+        users: dict[str, bool] = {}
+        for use in config.hardware.use:
+            if name in use.devices:
+                for agent in labels.like_any(use.agents, agents_of.get(place, ())):
+                    users[agent] = users.get(agent, False) or use.owner == agent
+        if not users:
+            faults.append(f"{clean_line(full_name)}: plan.json names no agent that used it")
+        for agent, is_owner in users.items():
+            yield UsedDevice(
+                agent=agent,
+                name=name,
+                full_name=full_name,
+                folder=folder,
+                may_write=is_owner or len(users) == 1,
+            )

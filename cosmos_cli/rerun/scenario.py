@@ -1,0 +1,207 @@
+"""The scenario of a rerun: that of the recorded run in lockstep, with a `playback` in the place of each device."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from cosmos_cli.errors import InputError
+from cosmos_cli.models.device_kinds import DeviceQuestion, KindAnswer, ask_kinds
+from cosmos_cli.models.loading import ScenarioFile, check_scenario
+from cosmos_cli.models.scenario import Scenario
+from cosmos_cli.models.separate_process import SeparateDefect, SeparateFailure, work_separately
+from cosmos_cli.rerun.recorded_run import FlownRun, UsedDevice
+from madns_runtime.config import RunConfig, ScenarioDevice, to_mapping
+from madns_runtime.errors import MadnsError
+from madns_runtime.plugin.queries import ask_rerun
+from madns_runtime.plugin.registry import is_shipped, parse_parameters, resolve
+from madns_runtime.recording.reader import read_stream
+
+RATE_HZ: Final = 10.0
+"""Of a device of which nobody knows how often it was read: its age is judged by it."""
+RATE_ROWS_MAX: Final = 1000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RerunScenario:
+    """What is flown, and what is not as it was."""
+
+    scenario: ScenarioFile
+    remarks: tuple[str, ...]
+    unlike: tuple[str, ...]
+    """Streams of the simulation that tell of computers and networks: they are not compared."""
+
+
+def make_rerun(recorded: FlownRun) -> RerunScenario:
+    """
+    Return the scenario of a rerun.
+
+    Raises:
+        InputError: It has faults.
+    """
+    config = recorded.config
+    try:
+        told = _ask_simulation(config, recorded.run.path)
+    except (MadnsError, SeparateFailure, SeparateDefect) as error:
+        raise InputError(f"{recorded.run.name} cannot be flown again: {error}") from error
+    remarks = list(told["remarks"])
+    remarks += [
+        f"{name}: {agent.missed} ticks were missed; lockstep misses none"
+        for name, agent in recorded.agents.items()
+        if agent.missed
+    ]
+    values = _values(recorded, told["parameters"], remarks)
+    text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
+    head = f"# {recorded.run.name}, flown again in lockstep with its devices played back.\n"
+    scenario = check_scenario(head + text, recorded.folder / f"{recorded.run.name}-rerun.yaml")
+    return RerunScenario(
+        scenario=scenario,
+        remarks=tuple(dict.fromkeys(remarks)),
+        unlike=() if config.time.is_lockstep else tuple(told["unlike"]),
+    )
+
+
+def _ask_simulation(config: RunConfig, run: Path) -> Mapping[str, Any]:
+    """
+    Return the parameters of the rerun as plain values, remarks, and streams that are not compared.
+
+    Raises:
+        MadnsError: The simulation cannot be asked.
+        SeparateFailure, SeparateDefect: Code that is not shipped did not answer.
+    """
+    folder = Path(config.base_directory)
+
+    def work(tell: Callable[[str], None]) -> Mapping[str, Any]:
+        tell(f"importing {config.simulation}")
+        simulation = resolve(config.simulation, folder)
+        if simulation.rerun is None:
+            return {"parameters": to_mapping(config.parameters), "remarks": [], "unlike": []}
+        parameters = parse_parameters(simulation, config.parameters)
+        tell(f"rerun() of {config.simulation}")
+        found = ask_rerun(
+            simulation.rerun,
+            folder,
+            parameters=parameters,
+            agents=config.agents.resolved_names(),
+            run=run,
+        )
+        return {
+            "parameters": to_mapping(found.parameters),
+            "remarks": list(found.remarks),
+            "unlike": list(found.unlike),
+        }
+
+    if is_shipped(config.simulation):
+        return work(lambda stage: None)
+
+    def guarded(tell: Callable[[str], None]) -> Mapping[str, Any]:
+        try:
+            return work(tell)
+        except MadnsError as error:
+            return {"fault": str(error)}
+
+    answer = work_separately(guarded, limit_s=config.timeouts.loading_s)
+    if "fault" in answer:
+        raise InputError(str(answer["fault"]))
+    return answer
+
+
+def _values(
+    recorded: FlownRun, parameters: Mapping[str, Any], remarks: list[str]
+) -> dict[str, Any]:
+    """Return the scenario as plain values."""
+    config = recorded.config
+    agents = dataclasses.replace(config.agents, restarts_max=0)
+    time = dataclasses.replace(config.time, mode="lockstep")
+    if config.on_agent_loss != "abort":
+        remarks.append("on_agent_loss: abort, as lockstep cannot go on without an agent")
+    hardware = dataclasses.replace(config.hardware, use=(), devices=_devices(recorded, remarks))
+    values = {
+        **{key: getattr(config, key) for key in Scenario.model_fields if hasattr(config, key)},
+        "name": config.scenario,
+        "agents": agents,
+        "time": time,
+        "hardware": hardware,
+        "on_agent_loss": "abort",
+        "parameters": dict(parameters),
+    }
+    plain: dict[str, Any] = json.loads(json.dumps(to_mapping(values)))
+    return plain
+
+
+def _devices(recorded: FlownRun, remarks: list[str]) -> tuple[ScenarioDevice, ...]:
+    """Return a player of each device, for each agent that used it."""
+    given = recorded.config.hardware.devices
+    answers = _kinds(recorded)
+    found = []
+    for used in recorded.devices:
+        device = None if used.given is None else given[used.given]
+        answer = None if used.given is None else answers[used.given]
+        if answer is None or answer.faults:
+            answer = None
+            remarks.append(
+                f"{used.full_name}: its channels' limits are not on record: outputs are put out as they are given"
+            )
+        found.append(_player(recorded, used, device, answer))
+    return tuple(found)
+
+
+def _kinds(recorded: FlownRun) -> list[KindAnswer]:
+    """Return what the kinds of the scenario's own devices say."""
+    asked = [
+        DeviceQuestion(
+            path=(), kind=each.kind, parameters=each.parameters, base_directory=recorded.folder
+        )
+        for each in recorded.config.hardware.devices
+    ]
+    return ask_kinds(asked, limit_s=recorded.config.timeouts.loading_s)
+
+
+def _player(
+    recorded: FlownRun,
+    used: UsedDevice,
+    device: ScenarioDevice | None,
+    answer: KindAnswer | None,
+) -> ScenarioDevice:
+    agent = recorded.agents[used.agent]
+    channels = answer.channels if answer else ()
+    parameters: dict[str, Any] = {
+        "directory": str(used.folder),
+        "tick_hz": recorded.config.agents.tick_hz,
+        "limits": {each.name: list(each.limits) for each in channels if each.limits is not None},
+        "queues": [
+            each.name
+            for each in channels
+            if each.passing == "queue" and each.direction == "in" and not each.is_frame
+        ],
+    }
+    if agent.ticks is not None:
+        parameters |= {"ticks": str(agent.ticks), "phase_s": agent.phase_s}
+    rate_hz = (device.rate_hz if device else None) or (answer.rate_hz if answer else None)
+    return ScenarioDevice(
+        name=used.name,
+        kind="playback",
+        agents=(used.agent,),
+        rate_hz=rate_hz or _recorded_rate(used.folder),
+        parameters=parameters,
+        frozen_s=device.frozen_s if device else {},
+    )
+
+
+def _recorded_rate(folder: Path) -> float:
+    """Return how often a device was read, by its records, Hz."""
+    rates = [RATE_HZ]
+    for path in sorted(folder.glob("*.jsonl")):
+        stream = read_stream(path)
+        if "age_us" not in stream.field_names:
+            continue
+        times = [row[0] for row, _ in zip(stream.records(), range(RATE_ROWS_MAX), strict=False)]
+        if len(times) > 2 and times[-1] > times[0]:
+            rates.append((len(times) - 1) / (times[-1] - times[0]))
+    return min(max(rates[1:], default=RATE_HZ), 1000.0)

@@ -1,0 +1,201 @@
+"""
+Faults in what a scenario says of flight software: who flies it, where it is, how it is reached.
+
+As in `check_vehicles`: nothing of it is run.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from madns_runtime.simulations.constellation.check_vehicles import WALL, code_faults, glob_faults
+from madns_runtime.simulations.constellation.flight.programs import find_program
+from madns_runtime.simulations.constellation.flight_rates import flight_rate
+from madns_runtime.simulations.constellation.flight_settings import (
+    FlightAttached,
+    FlightClass,
+    FlightProcess,
+    FlightRule,
+    Setting,
+)
+from madns_runtime.simulations.constellation.interface_settings import (
+    PROTOCOLS,
+    DeviceTransport,
+    FlightInterface,
+    SerialTransport,
+    StdioTransport,
+    TcpTransport,
+    UdpTransport,
+    UnixTransport,
+    is_played_back,
+)
+from madns_runtime.simulations.constellation.parameters import ConstellationParameters
+from madns_runtime.simulations.constellation.substitution import NAMES, unknown_names
+from madns_runtime.simulations.constellation.vehicles import flight_rules
+
+PLACES: Final = ("address", "pty")
+"""Further names in braces, which a program is given: where its transport is."""
+ADDRESS: Final = re.compile(r".+:(\d{1,5})")
+PORT_MAX: Final = 65_535
+SETTING_BYTES_MAX: Final = {"name": 32, "text": 48}
+"""Of a setting in frames and Space Packets, whose structs cut what is longer; a test holds them to the structs."""
+
+
+def flight_faults(
+    parameters: ConstellationParameters,
+    names: Sequence[tuple[str, str]],
+    base_directory: Path,
+    *,
+    is_lockstep: bool = False,
+) -> list[str]:
+    """
+    Return the faults.
+
+    Args:
+        parameters: Of the scenario, within their bounds.
+        names: Names of each agent and of its satellite; empty if they are not known.
+        base_directory: Folder of the scenario.
+        is_lockstep: Whether simulated time waits for everybody.
+    """
+    given = parameters.flight
+    if isinstance(given, str):
+        return code_faults("parameters.flight", given, base_directory, forbidden=WALL)
+    faults: list[str] = []
+    for number, rule in enumerate(flight_rules(parameters)):
+        field = f"parameters.flight[{number}]" if isinstance(given, tuple) else "parameters.flight"
+        if isinstance(given, tuple) and isinstance(given[number], str):
+            faults += code_faults(field, str(given[number]), base_directory, forbidden=WALL)
+            continue
+        faults += glob_faults(f"{field}.agents", rule.agents, names)
+        faults += _software_faults(field, rule, base_directory)
+        interface = None if isinstance(rule, FlightClass) else rule.interface
+        if interface is not None:
+            inner = f"{field}.interface"
+            faults += _interface_faults(inner, interface, base_directory, is_lockstep=is_lockstep)
+            if interface.protocol in ("frames", "space_packets"):
+                faults += _setting_faults(f"{field}.settings", rule.settings)
+    return faults
+
+
+def rate_faults(parameters: ConstellationParameters, tick_hz: float) -> list[str]:
+    """Return rates of flight software that have no whole ratio to the ticks'; none are judged without theirs."""
+    faults = []
+    for number, rule in enumerate(flight_rules(parameters) if tick_hz > 0.0 else ()):
+        try:
+            flight_rate(rule.rate_hz, tick_hz)
+        except ValueError as error:
+            place = f"[{number}]" if isinstance(parameters.flight, tuple) else ""
+            faults.append(f"parameters.flight{place}.rate_hz: {error}")
+    return faults
+
+
+def _software_faults(field: str, rule: FlightRule, base_directory: Path) -> list[str]:
+    if isinstance(rule, FlightClass):
+        return code_faults(f"{field}.software", rule.software, base_directory, forbidden=WALL)
+    if isinstance(rule, FlightAttached):
+        if isinstance(rule.interface.transport, StdioTransport):
+            return [f"{field}.interface.transport: stdio is that of a program; give its command"]
+        return []
+    return [
+        *_program_faults(f"{field}.command", rule.command[0], base_directory),
+        *_substitution_faults(field, rule),
+    ]
+
+
+def _program_faults(field: str, program: str, base_directory: Path) -> list[str]:
+    """Return what is wrong with a program; an absolute path may exist on the boards alone, one with ${...} is another for each."""
+    if Path(program).is_absolute() or "${" in program:
+        return []
+    if find_program((program,), base_directory) is not None:
+        return []
+    path = base_directory / program
+    if path.is_file():
+        return [f"{field}: {path} is not executable; chmod +x makes it so"]
+    where = base_directory if "/" in program else f"{base_directory} or on PATH"
+    return [f"{field}: no program {program!r} in {where}"]
+
+
+def _substitution_faults(field: str, rule: FlightProcess) -> Iterator[str]:
+    is_pty = rule.interface is not None and rule.interface.transport.kind == "pty"
+    known = (*NAMES, *(PLACES if is_pty else PLACES[:1]))
+    for number, word in enumerate(rule.command):
+        yield from _unknown(f"{field}.command[{number}]", word, known)
+    for name, text in rule.environment.items():
+        yield from _unknown(f"{field}.environment.{name}", text, known)
+
+
+def _unknown(field: str, text: str, known: tuple[str, ...]) -> Iterator[str]:
+    expected = ", ".join(f"${{{name}}}" for name in known)
+    for found in unknown_names(text, known):
+        yield f"{field}: expected one of {expected}, got {found}; $${{ stands for ${{ itself"
+
+
+def _interface_faults(
+    field: str, interface: FlightInterface, base_directory: Path, *, is_lockstep: bool
+) -> list[str]:
+    faults = []
+    if interface.protocol not in PROTOCOLS:
+        if ":" not in interface.protocol:
+            expected = ", ".join(PROTOCOLS)
+            faults.append(
+                f"{field}.protocol: expected {expected} or file.py:Class, got {interface.protocol!r}"
+            )
+        else:
+            faults += code_faults(
+                f"{field}.protocol", interface.protocol, base_directory, forbidden=WALL
+            )
+    if interface.clock == "own" and is_lockstep and not is_played_back(interface):
+        faults.append(
+            f"{field}.clock: software with a clock of its own cannot wait for simulated time; take "
+            "time.mode: realtime, or clock: stepped for software that answers each tick"
+        )
+    for name, address in _addresses(interface):
+        faults += _unknown(f"{field}.transport.{name}", address, NAMES)
+        is_socket = isinstance(interface.transport, TcpTransport | UdpTransport)
+        if is_socket and "${" not in address:
+            faults += _port_faults(f"{field}.transport.{name}", interface.transport, address)
+    return faults
+
+
+def _port_faults(field: str, transport: object, address: str) -> Iterator[str]:
+    found = ADDRESS.fullmatch(address)
+    if found is None:
+        yield f"{field}: expected HOST:PORT, got {address!r}"
+        return
+    if int(found[1]) > PORT_MAX:
+        yield f"{field}: expected a port of at most {PORT_MAX}, got {address!r}"
+        return
+    is_ours = transport.listen if isinstance(transport, TcpTransport) else field.endswith("local")
+    if int(found[1]) == 0 and not is_ours:
+        yield f"{field}: expected the port that the software listens at, got 0; a free one is for the agent's own address"
+
+
+def _setting_faults(field: str, settings: Mapping[str, Setting]) -> Iterator[str]:
+    """Yield settings that fixed structs would cut: two long names could become one."""
+    for name, given in settings.items():
+        if len(name.encode()) > (most := SETTING_BYTES_MAX["name"]):
+            yield f"{field}: expected names of at most {most} bytes for this protocol, got {name!r:.80}"
+        most = SETTING_BYTES_MAX["text"]
+        for value in given if isinstance(given, list) else [given]:
+            if isinstance(value, str) and len(value.encode()) > most:
+                yield f"{field}.{name}: expected a text of at most {most} bytes for this protocol, got {value!r:.80}"
+
+
+def _addresses(interface: FlightInterface) -> Iterator[tuple[str, str]]:
+    """Yield names and values of a transport's addresses."""
+    transport = interface.transport
+    if isinstance(transport, TcpTransport):
+        yield "address", transport.address
+    elif isinstance(transport, UdpTransport):
+        yield "local", transport.local
+        if transport.remote is not None:
+            yield "remote", transport.remote
+    elif isinstance(transport, UnixTransport):
+        yield "path", transport.path
+    elif isinstance(transport, SerialTransport):
+        yield "port", transport.port
+    elif isinstance(transport, DeviceTransport):
+        yield "device", transport.device

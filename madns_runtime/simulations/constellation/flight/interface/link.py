@@ -1,0 +1,172 @@
+"""The way to one vehicle's flight software: a transport, and the program at its other end if the agent starts it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+from madns_runtime.errors import BlamedError
+from madns_runtime.simulations.constellation.flight.interface.arrival_thread import ArrivalThread
+from madns_runtime.simulations.constellation.flight.interface.local_transports import StdioLink
+from madns_runtime.simulations.constellation.flight.interface.opening import make_transport
+from madns_runtime.simulations.constellation.flight.interface.program import FlightProgram, wait_for
+from madns_runtime.simulations.constellation.flight.interface.transport import (
+    READ_BYTES,
+    RETRY_S,
+    Arrival,
+    Transport,
+)
+from madns_runtime.simulations.constellation.flight_settings import FlightAttached, FlightProcess
+from madns_runtime.simulations.constellation.interface_settings import FlightInterface
+from madns_runtime.simulations.constellation.substitution import substitute
+
+ASK_S = 0.001
+"""Between two looks at a transport that has no descriptor to wait on."""
+
+
+class FlightLink:
+    """
+    Bytes to and from flight software, and its life.
+
+    Args:
+        settings: From the scenario.
+        base_directory: Folder of the scenario.
+        devices: Those that the agent uses.
+        values: What stands for ${name} and the others.
+        is_lockstep: Whether simulated time waits for the answers.
+
+    Raises:
+        BlamedError: The program cannot be started, or its place cannot be opened.
+    """
+
+    def __init__(
+        self,
+        settings: FlightProcess | FlightAttached,
+        base_directory: Path,
+        *,
+        devices: Mapping[str, Any],
+        values: Mapping[str, str],
+        is_lockstep: bool,
+    ) -> None:
+        given = settings.interface or FlightInterface()
+        self._start_s = given.start_s
+        self._is_lockstep = is_lockstep
+        self._has_thread = not is_lockstep and settings.interface is not None
+        self._thread: ArrivalThread | None = None
+        self.transport: Transport = make_transport(given.transport, values, base_directory, devices)
+        self.program: FlightProgram | None = None
+        self._opened_s = monotonic()
+        self.transport.open()
+        if isinstance(settings, FlightProcess):
+            try:
+                self.program = self._start(settings, base_directory, values)
+            except BlamedError:
+                self.transport.close()
+                raise
+        self.name = self.program.name if self.program else self.transport.name
+        """For who is to blame."""
+
+    def _start(
+        self, settings: FlightProcess, base_directory: Path, values: Mapping[str, str]
+    ) -> FlightProgram:
+        address = self.transport.address
+        known = {**values, "address": address, "pty": address}
+        program = FlightProgram(
+            [substitute(word, known) for word in settings.command],
+            base_directory,
+            environment={
+                name: substitute(text, known) for name, text in settings.environment.items()
+            },
+            has_pipes=isinstance(self.transport, StdioLink),
+            is_patient=self._is_lockstep,
+        )
+        if program.pipes is not None and isinstance(self.transport, StdioLink):
+            self.transport.use(*program.pipes)
+        return program
+
+    @property
+    def who(self) -> str:
+        """Name of the software, with the program's process id."""
+        return f"{self.name} (pid {self.program.pid})" if self.program else self.name
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the software is there."""
+        return self.transport.is_ready
+
+    def arrivals(self) -> list[Arrival]:
+        """
+        Return what has come by now; never waits.
+
+        Raises:
+            BlamedError: The software was not there in time.
+        """
+        transport = self.transport
+        if self._thread is None:
+            found = transport.arrivals()
+            if self._has_thread and transport.is_ready and transport.fds():
+                self._thread = ArrivalThread(transport)
+        else:
+            transport.push()
+            found = []
+            for arrival in self._thread.take():
+                found += transport.taken(*arrival)
+        transport.counts["floods"] += sum(len(one.data) for one in found) >= READ_BYTES
+        if not transport.is_ready and monotonic() - self._opened_s > self._start_s:
+            ended = self.how_it_ended()
+            raise BlamedError(
+                f"{self.who}: expected somebody at {transport.name} within {self._start_s:g} s "
+                f"(parameters.flight.interface.start_s){f', but it {ended}' if ended else ''}"
+            )
+        return found
+
+    def write(self, packets: Sequence[bytes]) -> bool:
+        """Send packets; False, and none of them, if too much waits already."""
+        return self.transport.write(packets)
+
+    def how_it_ended(self) -> str:
+        """Return how the software ended, in words; empty while it has not."""
+        program = self.program
+        if program is not None and (self.transport.is_closed or program.has_exited):
+            return program.how_it_ended()
+        return "closed its end" if self.transport.is_closed else ""
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait until the software says something; or until the time is over."""
+        fds = self.transport.fds()
+        talk = self.program.talk_fds if self.program else ()
+        limit_s = timeout_s if fds else ASK_S
+        wait_for((*fds, *talk), min(limit_s, timeout_s if self.is_ready else RETRY_S))
+
+    def stopwatch(self) -> Callable[[], float]:
+        """Return what tells the time since now, s: not counting a program's waits for a processor."""
+        if self.program is not None:
+            return self.program.stopwatch()
+        began_s = monotonic()
+        return lambda: monotonic() - began_s
+
+    def end(self, *, is_patient: bool = True) -> int | None:
+        """
+        End the conversation, and the program if there is one; return its exit code.
+
+        Args:
+            is_patient: False kills it at once.
+        """
+        if self._thread is not None:
+            self._thread.stop()
+            self._thread = None
+        self._has_thread = False
+        code = None
+        if self.program is not None:
+            transport = self.transport
+            code = self.program.end(
+                transport.close_input, transport.arrivals, is_patient=is_patient
+            )
+            if isinstance(transport, StdioLink):
+                transport.release()
+        else:
+            self.transport.close_input()
+        self.transport.close()
+        return code

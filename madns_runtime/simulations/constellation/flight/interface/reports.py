@@ -1,0 +1,46 @@
+"""What flight software is told, in values that are the same for every protocol. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from madns_runtime.simulations.constellation.flight.api import Reading
+from madns_runtime.simulations.constellation.messages import (
+    CommandResult,
+    Delivery,
+    TransmissionRefusal,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetupReport:
+    """What flight software is told before the first tick."""
+
+    name: str
+    satellite: str
+    agents: tuple[str, ...]
+    index: int
+    tick_hz: float
+    duration_s: float
+    epoch_utc: str
+    frame: str
+    input: str
+    """measurements or truth."""
+    first_number: int
+    seed: int
+    settings: Mapping[str, Any]
+    clock: str = "stepped"
+    """stepped or own."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TickReport:
+    """What flight software is told of one tick."""
+
+    t_s: float
+    readings: Mapping[str, Reading] = field(default_factory=dict)
+    messages: Sequence[Delivery] = ()
+    results: Sequence[CommandResult] = ()
+    refusals: Sequence[TransmissionRefusal] = ()

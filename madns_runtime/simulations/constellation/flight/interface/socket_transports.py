@@ -1,0 +1,269 @@
+"""Transports over sockets: tcp, unix, udp; never blocking."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import socket
+import stat
+from collections.abc import Sequence
+from time import monotonic
+from typing import Any
+
+from madns_runtime.errors import BlamedError
+from madns_runtime.simulations.constellation.flight.interface.transport import (
+    READ_BYTES,
+    RETRY_S,
+    StreamTransport,
+    Transport,
+)
+
+DATAGRAM_BYTES_MAX = 65_507
+DATAGRAMS_MAX = 256
+"""Read at once."""
+CONNECT_S = 1.0
+"""For one attempt."""
+QUEUED_MAX = 1024
+"""Packets that wait for somebody to send them to."""
+
+
+class SocketLink(StreamTransport):
+    """
+    One connection of a stream socket, in either direction.
+
+    Args:
+        name: For people.
+        family: Of the address.
+        place: The address.
+        listens: Whether the software connects to it.
+    """
+
+    def __init__(self, name: str, family: int, place: Any, *, listens: bool) -> None:
+        super().__init__(name)
+        self._family = family
+        self._place = place
+        self._listens = listens
+        self._socket: socket.socket | None = None
+        """The connection, or what is to become one."""
+        self._listener: socket.socket | None = None
+        self._tried_s = -RETRY_S
+
+    def open(self) -> None:
+        """
+        Listen, or have the address ready.
+
+        Raises:
+            BlamedError: The address cannot be listened at.
+        """
+        self.address = _shown(self._place)
+        if not self._listens:
+            return
+        try:
+            self._listener = listener = socket.socket(self._family, socket.SOCK_STREAM)
+            listener.setblocking(False)
+            if self._family == socket.AF_UNIX:
+                _remove_socket(self._place)
+            else:
+                listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind(self._place)
+            listener.listen(1)
+        except OSError as error:
+            raise BlamedError(f"{self.name}: cannot be listened at: {error}") from error
+        self.address = _shown(listener.getsockname())
+
+    def connect(self) -> None:
+        """Accept, or try to connect again."""
+        if self._listener is not None:
+            with contextlib.suppress(OSError):
+                self._begin(self._listener.accept()[0])
+        elif not self._listens:
+            self._try_to_connect()
+
+    def _try_to_connect(self) -> None:
+        if self._socket is None:
+            if monotonic() - self._tried_s < RETRY_S:
+                return
+            self._tried_s = monotonic()
+            self._socket = socket.socket(self._family, socket.SOCK_STREAM)
+            self._socket.setblocking(False)
+            try:
+                code = self._socket.connect_ex(self._place)
+            except (OSError, OverflowError) as error:  # no address at all, such as too long a path
+                raise BlamedError(f"{self.name}: cannot be reached: {error}") from error
+        else:
+            code = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        if code == 0 and _has_peer(self._socket):
+            self._begin(self._socket)
+        elif code not in (0, errno.EINPROGRESS) or monotonic() - self._tried_s > CONNECT_S:
+            self._socket.close()
+            self._socket = None
+
+    def _begin(self, connection: socket.socket) -> None:
+        self._socket = connection
+        connection.setblocking(False)
+        if self._family != socket.AF_UNIX:
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.use(connection.fileno(), connection.fileno())
+
+    def close_input(self) -> None:
+        """End this direction alone."""
+        self._waiting.clear()
+        self._is_over = True
+        if self._socket is not None:
+            with contextlib.suppress(OSError):
+                self._socket.shutdown(socket.SHUT_WR)
+
+    def close(self) -> None:
+        """Close the connection, and listen no more."""
+        self._in = self._out = -1
+        super().close()
+        for one in (self._socket, self._listener):
+            if one is not None:
+                one.close()
+        if self._listener is not None and self._family == socket.AF_UNIX:
+            with contextlib.suppress(OSError):
+                os.unlink(self._place)
+        self._socket = self._listener = None
+
+
+class UdpLink(Transport):
+    """
+    Datagrams, one for each packet.
+
+    Args:
+        name: For people.
+        local: Address to receive at.
+        remote: Address to send to; None for that of the first datagram.
+        family: Of both.
+    """
+
+    def __init__(self, name: str, local: Any, remote: Any, *, family: int) -> None:
+        super().__init__(name)
+        self._local = local
+        self._remote = remote
+        self._family = family
+        self._socket: socket.socket | None = None
+        self._queued: list[bytes] = []
+        self._first: list[bytes] = []
+        self.counts |= {"packets_overlong": 0, "packets_unsent": 0, "packets_foreign": 0}
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether it is known where to send."""
+        return self._remote is not None
+
+    def open(self) -> None:
+        """
+        Take the local address.
+
+        Raises:
+            BlamedError: It cannot be had.
+        """
+        try:
+            self._socket = one = socket.socket(self._family, socket.SOCK_DGRAM)
+            one.setblocking(False)
+            one.bind(self._local)
+        except OSError as error:
+            raise BlamedError(f"{self.name}: cannot be received at: {error}") from error
+        self.address = _shown(one.getsockname())
+
+    def fds(self) -> tuple[int, ...]:
+        """Return the socket's descriptor."""
+        return () if self._socket is None else (self._socket.fileno(),)
+
+    def push(self) -> None:
+        """Learn where to send from the first datagram."""
+        if self.is_ready or self._socket is None:
+            return
+        with contextlib.suppress(OSError):
+            data, self._remote = self._socket.recvfrom(READ_BYTES)
+            self._first = [data]
+            self.write([])
+
+    def write(self, packets: Sequence[bytes]) -> bool:
+        """Send each as a datagram; what the kernel has no room for is lost, as on any network, and counted."""
+        if len(self._queued) + len(packets) > QUEUED_MAX:
+            return False
+        self._queued += packets
+        if self._socket is None or not self.is_ready:
+            return True
+        queued, self._queued = self._queued, []
+        for packet in queued:
+            if len(packet) > DATAGRAM_BYTES_MAX:
+                self.counts["packets_overlong"] += 1
+                continue
+            try:
+                self._socket.sendto(packet, self._remote)
+                self.counts["bytes_sent"] += len(packet)
+            except OSError:  # nobody listens there, yet or any more: answers tell
+                self.counts["packets_unsent"] += 1
+        return True
+
+    def receive(self) -> bytes | None:
+        """Return the datagrams that are there, together; those of others are counted."""
+        found, self._first = self._first, []
+        while self._socket is not None and len(found) < DATAGRAMS_MAX:
+            try:
+                data, sender = self._socket.recvfrom(READ_BYTES)
+            except BlockingIOError:
+                break
+            except OSError:  # what was sent before could not be delivered
+                break
+            if sender == self._remote:
+                found.append(data)
+            else:
+                self.counts["packets_foreign"] += 1
+                if self.counts["packets_foreign"] % DATAGRAMS_MAX == 0:
+                    break
+        return b"".join(found) or None
+
+    def close_input(self) -> None:
+        """Send an empty datagram, which says that nothing more will come."""
+        if self._socket is not None and self.is_ready:
+            with contextlib.suppress(OSError):
+                self._socket.sendto(b"", self._remote)
+
+    def close(self) -> None:
+        """Give the address back."""
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
+
+
+def resolve(address: str, kind: int, where: str) -> tuple[int, Any]:
+    """
+    Return the family and the socket address of HOST:PORT.
+
+    Raises:
+        BlamedError: It is none, or its host is not known.
+    """
+    host, _, port = address.rpartition(":")
+    try:
+        found = socket.getaddrinfo(host.strip("[]") or None, int(port), type=kind)
+    except (OSError, ValueError, OverflowError) as error:
+        raise BlamedError(f"{where}: expected HOST:PORT, got {address!r}: {error}") from error
+    family, _, _, _, place = found[0]
+    return int(family), place
+
+
+def _has_peer(one: socket.socket) -> bool:
+    try:
+        one.getpeername()
+    except OSError:
+        return False
+    return True
+
+
+def _remove_socket(path: str) -> None:
+    """Remove a socket that an earlier run has left behind; anything else stays, and is in the way."""
+    with contextlib.suppress(OSError):
+        if stat.S_ISSOCK(os.stat(path, follow_symlinks=False).st_mode):
+            os.unlink(path)
+
+
+def _shown(place: Any) -> str:
+    if isinstance(place, str):
+        return place
+    host, port = place[:2]
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

@@ -1,0 +1,101 @@
+"""
+How a recorded run is flown again: software that can be stepped flies as it is today, other software is played back.
+
+Software behind a device is: the device's record has its bytes. Of software that was only attached to, or has a clock
+of its own, the commands are on record.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from madns_runtime.plugin.api import Rerun
+from madns_runtime.simulations.constellation.flight_settings import (
+    FlightAttached,
+    FlightClass,
+    FlightProcess,
+    FlightRule,
+)
+from madns_runtime.simulations.constellation.interface_settings import DeviceTransport
+from madns_runtime.simulations.constellation.parameters import ConstellationParameters
+from madns_runtime.simulations.constellation.sensor_channels import sensors_from_devices
+from madns_runtime.simulations.constellation.vehicles import flight_rules
+
+PLAYER: Final = "madns_runtime.simulations.constellation.flight.recorded_commands:RecordedCommands"
+UNLIKE: Final = (
+    "flight_answers",
+    "flight_clock",
+    "truth",
+    "truth_changes",
+    "command_results",
+    *(f"maneuvers.{name}" for name in ("heard_s", "propagation_s", "network_s", "slack_s")),
+)
+"""Streams and fields that tell of computers' clocks and networks: how truth came in pieces, when results were told."""
+
+NAMED: Final = re.compile(r"\$\{[a-z]+\}")
+
+
+def for_rerun(
+    parameters: ConstellationParameters, agents: tuple[str, ...], run_directory: Path
+) -> Rerun:
+    """Return the parameters of a rerun, and which software does not fly itself."""
+    remarks: list[str] = []
+    given = flight_rules(parameters)
+    rules = tuple(
+        _played(rule, number, run_directory, remarks) for number, rule in enumerate(given)
+    )
+    flown = replace(parameters, flight=rules) if remarks else parameters
+    return Rerun(
+        parameters=flown,
+        remarks=tuple(remarks),
+        unlike=(*UNLIKE, *_read_in_ticks(parameters), *_sent(rules)),
+    )
+
+
+def _read_in_ticks(parameters: ConstellationParameters) -> Iterator[str]:
+    """Yield what follows from when a tick of real time came to read a device: some microseconds after it woke up."""
+    hardware = {
+        name for vehicle in parameters.vehicles for name, _ in sensors_from_devices(vehicle)
+    }
+    for name in sorted(hardware):
+        yield from (f"{name}.t_s", f"{name}_model", f"{name}_truth")
+
+
+def _sent(rules: Iterable[FlightRule]) -> Iterator[str]:
+    """Yield what goes to flight computers: results of commands, among others, in the tick in which they come."""
+    for rule in rules:
+        interface = None if isinstance(rule, FlightClass) else rule.interface
+        if interface is not None and isinstance(interface.transport, DeviceTransport):
+            yield f"device.{NAMED.sub('*', interface.transport.device)}.sent"
+
+
+def _played(rule: FlightRule, number: int, run: Path, remarks: list[str]) -> FlightRule:
+    """Return a rule as it is flown again; one that is flown otherwise is told."""
+    interface = None if isinstance(rule, FlightClass) else rule.interface
+    if isinstance(rule, FlightClass) or interface is None:
+        return rule
+    which = f"flight[{number}] (agents {', '.join(rule.agents)})"
+    if isinstance(interface.transport, DeviceTransport):
+        remarks.append(
+            f"{which}: behind the device {interface.transport.device}: its recorded bytes are played back"
+        )
+        return FlightAttached(
+            interface=replace(interface, transport=replace(interface.transport, recorded=True)),
+            agents=rule.agents,
+            input=rule.input,
+            rate_hz=rule.rate_hz,
+            settings=rule.settings,
+            answer_s=rule.answer_s,
+        )
+    if isinstance(rule, FlightProcess) and interface.clock == "stepped":
+        return rule
+    why = "it has a clock of its own" if interface.clock == "own" else "it was only attached to"
+    remarks.append(f"{which}: cannot be stepped, as {why}: its recorded commands are given again")
+    settings: dict[str, bool | int | float | str | list[float] | list[str]] = {
+        "agents": str(run / "agents")
+    }
+    return FlightClass(software=PLAYER, agents=rule.agents, settings=settings)

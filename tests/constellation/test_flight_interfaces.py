@@ -1,0 +1,390 @@
+"""The same guidance by every protocol and over every transport; and what becomes of software that is not as it should."""
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import tty
+from pathlib import Path
+
+import guided_program
+import pytest
+from test_flight_process import HZ, Ship, patience  # noqa: F401 - a fixture
+
+from madns_runtime.errors import BlamedError
+from madns_runtime.plugin.device_view import ChannelFrame
+
+pytestmark = pytest.mark.process
+
+HERE = Path(__file__).parent
+FLIGHT = HERE.parents[1] / "scenarios/flight"
+WAYS = (
+    ("json_lines", {"kind": "stdio"}),
+    ("frames", {"kind": "pty"}),
+    ("space_packets", {"kind": "tcp", "address": "127.0.0.1:0", "listen": True}),
+    ("frames", {"kind": "udp", "local": "127.0.0.1:0"}),
+    ("json_lines", {"kind": "unix", "path": "${name}.sock", "listen": True}),
+    ("space_packets", {"kind": "stdio"}),
+)
+SCENARIO = {
+    "name": "ways",
+    "simulation": "constellation",
+    "time": {"mode": "lockstep", "duration_s": 9},
+    "parameters": {
+        "epoch_utc": "2026-01-01T00:00:00Z",
+        "propagator": {"kind": "scipy", "forces": ["two_body"]},
+        "vehicles": [
+            {
+                "thruster": {"isp_s": 220, "propellant_kg": 5},
+                "sensors": {"gnss": {"rate_hz": 10}},
+            }
+        ],
+    },
+}
+SETTINGS = {"a_m": 7_160_000, "tolerance_m": 0.01, "lead_s": 3}
+
+
+def rule(protocol, transport, **rest):
+    """Return the rule of the program above, which finds its way by its command and its environment."""
+    return {
+        "command": [sys.executable, str(HERE / "guided_program.py"), protocol]
+        + [transport["kind"], "${address}"],
+        "settings": SETTINGS,
+        "answer_s": 60,
+        "interface": {"transport": transport, "protocol": protocol, "start_s": 60},
+        **rest,
+    }
+
+
+def records(run, name):
+    """Return the rows of an agent's commands."""
+    lines = (run / "agents" / name / "commands.jsonl").read_text().splitlines()
+    return [row for row in map(json.loads, lines) if isinstance(row, list)]
+
+
+def test_the_same_guidance_gives_the_same_maneuvers_to_the_bit_by_every_way(tmp_path):
+    names = [f"agent-{number:02d}" for number in range(1, len(WAYS) + 1)]
+    rules = [rule(*way, agents=[name]) for name, way in zip(names, WAYS, strict=True)]
+    if shutil.which("cc") is not None:
+        names.append("in-c")
+        flags = ["-std=c99", "-O2", "-ffp-contract=off"]
+        program = tmp_path / "in-c"
+        subprocess.run(["cc", *flags, "-o", program, FLIGHT / "hold_frames.c", "-lm"], check=True)
+        rules.append({**rule("frames", {"kind": "stdio"}), "command": ["./${name}"]})
+    orbits = [{"name": f"SAT-{name}", "altitude_km": 780, "i_deg": 56} for name in names]
+    scenario = {**SCENARIO, "agents": {"count": len(names), "names": names, "tick_hz": 10}}
+    scenario["parameters"] |= {"satellites": {"keplerian": orbits}, "flight": rules}
+    (tmp_path / "ways.yaml").write_text(json.dumps(scenario))
+
+    done = subprocess.run(
+        [sys.executable, "-m", "cosmos_cli.app", "run", "ways.yaml", "--quiet", "--no-report"],
+        cwd=tmp_path,
+        env={**os.environ, "COSMOS_STATE_DIR": str(tmp_path / "state")},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+
+    assert done.returncode == 0, done.stderr
+    run = tmp_path / "runs/0001-ways"
+    flown = {name: records(run, name) for name in names}
+    assert len(flown["agent-01"]) == 2
+    assert set(map(str, flown.values())) == {str(flown["agent-01"])}
+    agents = json.loads((run / "run.json").read_text())["simulation"]["agents"]
+    for name in names:
+        told = agents[name]["flight"]
+        assert told["answers"] == 90 and told["exit_code"] == 0, name
+        assert not any(told["interface"]["faults"].values()), name
+    lines = (run / "host/maneuvers.jsonl").read_text().splitlines()
+    rows = [row for row in map(json.loads, lines) if isinstance(row, list)]
+    executed = {name: [row[6:10] for row in rows if row[1] == name] for name in names}
+    assert set(map(str, executed.values())) == {str(executed["agent-01"])}
+
+
+def answered(ship, count):
+    """Tick in real time until so many ticks were answered."""
+    software = ship.agent._cockpit._software
+    ship.run_until(lambda: software._counts["answers"] >= count)
+
+
+def played(protocol, read, write):
+    """Play flight software in a thread."""
+
+    def work():
+        guidance = guided_program.Guidance()
+        guidance.settings = dict(SETTINGS)
+        software = guided_program.PROTOCOLS[protocol](guidance)
+        try:
+            while data := read():
+                for answer in software.feed(data):
+                    write(answer)
+        except OSError:
+            return
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    return thread
+
+
+def attached(transport, protocol="frames", **rest):
+    interface = {"transport": transport, "protocol": protocol, "start_s": 20.0, **rest}
+    return {"interface": interface, "command": None, "settings": SETTINGS}
+
+
+class Attached(Ship):
+    """An agent whose flight software runs already."""
+
+    process = None
+
+    def __exit__(self, *_error):
+        self.summary = self.agent.finish()["flight"]
+
+
+def test_software_behind_a_serial_port_is_attached_to(tmp_path):
+    main, other = os.openpty()
+    tty.setraw(other)
+    played("frames", lambda: os.read(main, 65536), lambda data: os.write(main, data))
+    transport = {"kind": "serial", "port": os.ttyname(other), "baud_rate": 115_200}
+
+    with Attached(tmp_path, None, flight=attached(transport), is_lockstep=False) as ship:
+        answered(ship, 20)
+
+    os.close(main)
+    os.close(other)
+    assert ship.summary["interface"]["bytes_received"] >= 20 * 30
+    rows = ship.context.records["flight_answers"]
+    assert [row[1] for row in rows[:3]] == [0.0, 0.1, 0.2]
+    assert all(0.0 < row[2] < 60e6 for row in rows)
+
+
+@pytest.mark.parametrize("kind", ["tcp", "unix"])
+def test_an_agent_connects_to_software_that_listens(tmp_path, kind):
+    if kind == "tcp":
+        listener = socket.create_server(("127.0.0.1", 0))
+        transport = {"kind": "tcp", "address": f"127.0.0.1:{listener.getsockname()[1]}"}
+    else:
+        listener = socket.socket(socket.AF_UNIX)
+        listener.bind(str(tmp_path / "a.sock"))
+        listener.listen()
+        transport = {"kind": "unix", "path": "a.sock"}
+
+    with Attached(tmp_path, None, flight=attached(transport)) as ship, listener:
+        peer = []
+
+        def accept_and_play():
+            one, _ = listener.accept()
+            peer.append(one)
+            played("frames", lambda: one.recv(65536), one.sendall)
+
+        threading.Thread(target=accept_and_play, daemon=True).start()
+        ship.run(10)
+
+    assert ship.summary["answers"] == 10
+    assert "exit_code" not in ship.summary and "answer_s_max" not in ship.summary
+    peer[0].close()
+
+
+def test_a_clock_of_its_own_is_estimated_and_answers_are_taken_when_they_come(tmp_path):
+    ours, theirs = socket.socketpair()
+    frames = guided_program.Frames(None)
+    listener = socket.create_server(("127.0.0.1", 0))
+    transport = {"kind": "tcp", "address": f"127.0.0.1:{listener.getsockname()[1]}"}
+    flight = attached(transport, clock="own")
+    with Attached(tmp_path, None, flight=flight, is_lockstep=False) as ship:
+        software = ship.agent._cockpit._software
+        ship.run(1)
+        board, _ = listener.accept()
+        board.settimeout(20.0)
+        for number in range(200):  # of what comes late on a busy machine a part is taken for drift
+            ship.context.clock_s = 0.1 * number
+            # 4 % fast, started long ago, and unasked.
+            board_us = round((50.0 + 0.1 * number * 1.04) * 1e6)
+            board.sendall(frames.wrap(136, 0.0, board_us.to_bytes(8, "little")))
+            ship.run_until(lambda n=number: software._counts["answers"] > n)
+            ship._next = number + 1
+        board.close()
+        ours.close()
+        theirs.close()
+        listener.close()
+        software._link.transport.is_closed = False
+
+    assert ship.summary["interface"]["clock_drift_ppm"] == pytest.approx(40_000, abs=10_000)
+    assert ship.context.records["flight_clock"]
+    assert "flight_answers" not in ship.context.records
+
+
+class FakeDevice:
+    """A serial line, of which the far end is flight software that answers at once."""
+
+    name = "line"
+
+    def __init__(self):
+        guidance = guided_program.Guidance()
+        guidance.settings = dict(SETTINGS)
+        self.software = guided_program.Frames(guidance)
+        self.waiting = []
+
+    def write(self, channel, value, *, due_s=None):
+        assert channel == "sent"
+        self.waiting += self.software.feed(value)
+
+    def frames(self, channel):
+        assert channel == "received"
+        found, self.waiting = self.waiting, []
+        return [ChannelFrame(value, number, 0.002) for number, value in enumerate(found)]
+
+
+@pytest.mark.parametrize("is_lockstep", [True, False])
+def test_software_behind_a_device_of_the_run(tmp_path, is_lockstep):
+    flight = attached({"kind": "device", "device": "line"})
+    devices = {"line": FakeDevice()}
+    ship = Attached(tmp_path, None, flight=flight, is_lockstep=is_lockstep, hardware=devices)
+    with ship:
+        ship.run(10)
+
+    assert ship.summary["answers"] == 10
+    assert len(ship.context.records["flight_answers"]) == 10 * (not is_lockstep)
+    with pytest.raises(BlamedError, match="this agent's hardware, other; got 'line'"):
+        Attached(tmp_path, None, flight=flight, hardware={"other": FakeDevice()})
+
+
+def test_datagrams_go_to_a_place_that_is_known(tmp_path):
+    board = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    board.bind(("127.0.0.1", 0))
+    remote = f"127.0.0.1:{board.getsockname()[1]}"
+    transport = {"kind": "udp", "local": "127.0.0.1:0", "remote": remote}
+    vehicle = []
+
+    def read():
+        data, sender = board.recvfrom(65536)
+        vehicle.append(sender)
+        return data
+
+    with Attached(tmp_path, None, flight=attached(transport)) as ship:
+        played("frames", read, lambda data: board.sendto(data, vehicle[-1]))
+        ship.run(10)
+
+    assert ship.summary["answers"] == 10
+    board.close()
+
+
+def test_software_that_never_comes_is_named(tmp_path):
+    transport = {"kind": "tcp", "address": "127.0.0.1:0", "listen": True}
+    flight = attached(transport, start_s=0.2)
+    ship = Attached(tmp_path, None, flight=flight)
+
+    with pytest.raises(BlamedError, match=r"expected somebody at tcp 127.0.0.1:0 within 0.2 s"):
+        ship.run(1)
+
+
+@pytest.mark.parametrize(
+    ("transport", "words"),
+    [
+        ({"kind": "tcp", "address": "127.0.0.1:x"}, "transport.address: expected HOST:PORT"),
+        ({"kind": "unix", "path": "x" * 200}, "cannot be reached: AF_UNIX path too long"),
+        ({"kind": "unix", "path": "no/such", "listen": True}, "cannot be listened at"),
+        ({"kind": "udp", "local": "192.0.2.1:0"}, "cannot be received at"),
+        ({"kind": "serial", "port": "/dev/no-such"}, "serial /dev/no-such: cannot be opened"),
+    ],
+)
+def test_an_address_that_cannot_be_is_named(tmp_path, transport, words):
+    with pytest.raises(BlamedError, match=words):
+        Attached(tmp_path, None, flight=attached(transport)).run(1)
+
+
+def test_a_program_that_ends_before_it_connects_is_named_with_its_end(tmp_path):
+    transport = {"kind": "unix", "path": "x.sock", "listen": True}
+    flight = {**attached(transport), "command": ["sh", "-c", "echo no idea >&2; exit 3"]}
+    ship = Ship(tmp_path, flight["command"], flight=flight)
+
+    with pytest.raises(BlamedError, match=r"ended with exit code 3 .*'no idea'"):
+        ship.run(1)
+
+
+def test_a_peer_that_closes_its_end_is_named(tmp_path):
+    listener = socket.create_server(("127.0.0.1", 0))
+    transport = {"kind": "tcp", "address": f"127.0.0.1:{listener.getsockname()[1]}"}
+    ship = Attached(tmp_path, None, flight=attached(transport), is_lockstep=False)
+    ship.run(1)
+    listener.accept()[0].close()
+    listener.close()
+
+    with pytest.raises(BlamedError, match=r"tcp 127.0.0.1:\d+ closed its end before"):
+        ship.run_until(lambda: False)
+
+
+def test_one_that_hangs_in_lockstep_is_named_and_killed(tmp_path):
+    transport = {"kind": "pty"}
+    flight = attached(transport) | {"answer_s": 0.05}
+    command = [sys.executable, "-c", "import os, time; os.open('${pty}', 2); time.sleep(600)"]
+    flight["command"] = command
+    ship = Ship(tmp_path, None, flight=flight)
+
+    with pytest.raises(BlamedError, match=r"the answer to the tick at 0 s within 0\.05 s"):
+        ship.run(1)
+
+    assert not Path(f"/proc/{ship.process.pid}").exists()
+
+
+def test_one_that_floods_costs_no_tick_and_is_counted(tmp_path):
+    flight = attached({"kind": "stdio"})
+    flight["command"] = [
+        sys.executable,
+        "-c",
+        "import os\nwhile True: os.write(1, bytes(range(1, 256)) * 64 + b'\\0')",
+    ]
+    with Ship(tmp_path, None, flight=flight, is_lockstep=False) as ship:
+        software = ship.agent._cockpit._software
+        ship.run_until(lambda: software._link.transport.counts["floods"] > 3)
+
+    told = ship.summary["interface"]
+    assert told["faults"]["corrupt"] + told["faults"]["overlong"] > 3
+    assert ship.summary["answers"] == 0
+
+
+def test_what_cannot_be_ends_the_agent_with_blame(tmp_path):
+    software = guided_program.Frames(None)
+    told = software.wrap(129, 0.0, bytes(32) + b"\x07" + bytes(7)) + software.wrap(
+        136, 0.0, bytes(8)
+    )
+    flight = attached({"kind": "stdio"})
+    flight["command"] = [
+        sys.executable,
+        "-c",
+        f"import os; os.read(0, 9); os.write(1, {told!r}); os.read(0, 9**6); input()",
+    ]
+    ship = Ship(tmp_path, None, flight=flight)
+
+    with pytest.raises(BlamedError, match=r"one of inertial, rtn, body, got 'number 7'"):
+        ship.run(1)
+
+
+def test_a_protocol_of_ones_own_is_bytes_in_and_out(tmp_path):
+    (tmp_path / "own.py").write_text(
+        """
+from madns_runtime.simulations.constellation.flight.interface.answers import FlightAnswer
+
+
+class Own:
+    answers_by_time = False
+
+    def setup(self, setup):
+        return []
+
+    def tick(self, tick):
+        return [b"%r\\n" % tick.t_s]
+
+    def feed(self, data):
+        return [FlightAnswer(estimate={"t_s": float(line)}) for line in data.split()]
+"""
+    )
+    flight = attached({"kind": "stdio"}, "own.py:Own") | {"command": ["cat"]}
+
+    with Ship(tmp_path, None, flight=flight) as ship:
+        ship.run(5)
+
+    assert ship.context.records["estimates"] == [(n, n / HZ) for n in range(5)]

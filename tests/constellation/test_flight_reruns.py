@@ -1,0 +1,103 @@
+"""Flight software in a rerun: what can be stepped flies, what is behind a device or was attached to is played back."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from constellation_fakes import parameters
+
+from madns_runtime.errors import BlamedError
+from madns_runtime.simulations.constellation import simulation
+from madns_runtime.simulations.constellation.check_flight import flight_faults
+from madns_runtime.simulations.constellation.flight.recorded_commands import RecordedCommands
+from madns_runtime.simulations.constellation.flight_settings import FlightAttached, FlightClass
+from madns_runtime.simulations.constellation.rerun import for_rerun
+
+ATTACHED = {"interface": {"transport": {"kind": "tcp", "address": "127.0.0.1:4000"}}}
+BEHIND = {
+    "interface": {
+        "transport": {"kind": "device", "device": "mcu-${name}"},
+        "protocol": "frames",
+        "clock": "own",
+    }
+}
+FREE = {
+    "command": ["cat"],
+    "interface": {"transport": {"kind": "stdio"}, "protocol": "frames", "clock": "own"},
+}
+NAMES = (("agent-01", "star-1"),)
+
+
+def test_software_that_can_be_stepped_stays_as_it_is():
+    given = parameters(flight=[{"command": ["cat"]}])
+
+    found = for_rerun(given, ("agent-01",), Path("runs/1"))
+
+    assert found.parameters == given
+    assert found.remarks == ()
+
+
+@pytest.mark.parametrize(
+    ("rule", "why"), [(ATTACHED, "only attached to"), (FREE, "a clock of its")]
+)
+def test_software_that_cannot_be_stepped_is_named_and_its_commands_are_played(rule, why, tmp_path):
+    found = for_rerun(parameters(flight=[rule]), ("agent-01",), tmp_path)
+
+    [played] = found.parameters.flight
+    assert isinstance(played, FlightClass)
+    assert played.settings == {"agents": str(tmp_path / "agents")}
+    assert "flight[0] (agents *)" in found.remarks[0] and why in found.remarks[0]
+    assert not flight_faults(found.parameters, NAMES, tmp_path, is_lockstep=True)
+
+
+def test_software_behind_a_device_is_played_back_in_lockstep_whatever_its_clock(tmp_path):
+    given = parameters(flight=[BEHIND])
+    assert flight_faults(given, NAMES, tmp_path, is_lockstep=True)
+
+    found = for_rerun(given, ("agent-01",), tmp_path)
+
+    [played] = found.parameters.flight
+    assert isinstance(played, FlightAttached) and played.interface.transport.recorded
+    assert "device.mcu-*.sent" in found.unlike
+    assert not flight_faults(found.parameters, NAMES, tmp_path, is_lockstep=True)
+    assert simulation.rerun is not None
+
+
+class Desk(SimpleNamespace):
+    def note(self, *values, **more):
+        self.given.append((*values, *more.values()))
+
+
+def test_recorded_commands_are_given_in_their_ticks_and_those_of_devices_are_not(tmp_path):
+    names = ("tick", "number", "kind", "at_s", "frame", "x", "y", "z", "duration_s")
+    fields = ",".join(f'{{"name":"{name}","unit":"","kind":"float"}}' for name in names)
+    rows = (
+        '[2,0,"delta_v",1.5,"rtn",0.0,0.1,0.0,0.0]\n'
+        '[2,1,"torque",1.5,"body",1.0,0.0,0.0,0.5]\n'
+        f'[2,{2**30},"dipole",1.5,"body",1.0,0.0,0.0,0.5]\n'
+    )
+    folder = tmp_path / "agent-01"
+    folder.mkdir()
+    (folder / "commands.jsonl").write_text(
+        f'{{"schema":1,"stream":"commands","shape":"array","fields":[{fields}]}}\n{rows}'
+    )
+    desk = Desk(given=[])
+    context = SimpleNamespace(
+        name="agent-01",
+        tick_hz=10.0,
+        settings={"agents": str(tmp_path)},
+        delta_v=desk.note,
+        torque=desk.note,
+        dipole=desk.note,
+    )
+    software = RecordedCommands()
+    software.setup(context)
+
+    software.step(0.1, {})
+    assert desk.given == []
+    software.step(0.2, {})
+
+    assert desk.given == [((0.0, 0.1, 0.0), 1.5, "rtn"), ((1.0, 0.0, 0.0), 1.5, 0.5)]
+    context.name = "agent-02"
+    with pytest.raises(BlamedError, match="expected the commands of the recorded run, found none"):
+        RecordedCommands().setup(context)

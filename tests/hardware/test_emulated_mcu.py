@@ -1,0 +1,186 @@
+"""An emulated microcontroller with real firmware: its line, its sensors, its end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from madns_runtime.errors import ConfigurationError, MachineError, PluginError
+from madns_runtime.hardware.kind_registry import prepare
+from tests.hardware.driving import opened
+from tests.harness.firmware import build_firmware, needs_emulator
+from tests.harness.waiting import is_alive, wait_until
+
+HERE = Path(__file__).parent
+pytestmark = [pytest.mark.process, needs_emulator]
+
+
+@pytest.fixture(scope="module")
+def image(tmp_path_factory):
+    return build_firmware(
+        tmp_path_factory.mktemp("firmware"), "report", HERE / "firmware" / "report.c"
+    )
+
+
+def report(mcu):
+    """Ask the firmware, and return whether its sensor answers, field, nT, and clock, us."""
+    mcu.write({"sent": b"?"}, time.monotonic())
+    line = b""
+    while not line.endswith(b"\n"):
+        line += frames_of(mcu)
+    numbers = [int(number) for number in line.split()]
+    return numbers[0], numbers[1:4], numbers[4]
+
+
+def frames_of(mcu):
+    """Return the next bytes of the line, whatever else there is to read."""
+    return values_of(mcu, "received")
+
+
+def values_of(mcu, channel):
+    def look():
+        sample = mcu.read()
+        return sample is not None and sample.values.get(channel)
+
+    return wait_until(look, channel)
+
+
+def test_firmware_reads_by_registers_what_truth_has_set(image):
+    with opened("emulated_mcu", firmware=image) as mcu:
+        mcu.write({"magnetometer": [20e-6, 40e-6, 98e-6]}, time.monotonic())
+        held = values_of(mcu, "magnetometer_held")
+        answers, field_nt, _ = report(mcu)
+
+    assert held == pytest.approx([20e-6, 40e-6, 98e-6], abs=1e-7)  # as its registers round it
+    assert answers == 1
+    # 1100 counts per gauss along x and y, 980 along z: 91 and 102 nT per count.
+    assert field_nt == pytest.approx([20_000, 40_000, 98_000], abs=103)
+
+
+def test_identity_tells_board_and_firmware(image):
+    with opened("emulated_mcu", firmware=image) as mcu:
+        assert mcu.identity.startswith("lm3s6965evb ")
+        assert len(mcu.identity.split()[1]) == 12
+
+
+def test_its_own_clock_goes_on(image):
+    with opened("emulated_mcu", firmware=image) as mcu:
+        _, _, before_us = report(mcu)
+        _, _, after_us = report(mcu)
+
+    assert 0 < before_us < after_us
+
+
+def test_flood_is_taken_in_bounded_pieces(image):
+    with opened("emulated_mcu", firmware=image) as mcu:
+        mcu.write({"sent": b"F"}, time.monotonic())
+        flood = b""
+        while not flood.rstrip().endswith(b"1") and flood.count(b"\n") < 20_001:
+            piece = frames_of(mcu)
+            assert len(piece) <= 4096
+            flood += piece
+
+    assert flood.count(b"FLOODFLOODFLOOD\n") == 20_000
+
+
+def test_killed_emulator_is_named(image):
+    with opened("emulated_mcu", firmware=image) as mcu:
+        os.kill(mcu._process.pid, signal.SIGKILL)
+
+        with pytest.raises(MachineError, match="the emulator is gone"):
+            wait_until(lambda: mcu.read() and False)
+
+
+def test_frozen_emulator_is_named(image, monkeypatch):
+    with opened("emulated_mcu", firmware=image) as mcu:
+        os.kill(mcu._process.pid, signal.SIGSTOP)
+
+        with pytest.raises(MachineError, match="answers nothing for 2 s"):
+            wait_until(lambda: mcu.read() and False)
+
+
+def test_emulator_ends_with_its_device(image):
+    with opened("emulated_mcu", firmware=image) as mcu:
+        pid = mcu._process.pid
+        assert is_alive(pid)
+
+    assert not is_alive(pid)
+
+
+def test_missing_firmware_is_told_before_anything_starts(tmp_path):
+    with (
+        pytest.raises(MachineError, match=r"no firmware .*gone\.elf; build it first"),
+        opened("emulated_mcu", firmware=tmp_path / "gone.elf"),
+    ):
+        pass
+
+
+def test_board_that_is_unknown_is_told_in_the_emulators_words(image):
+    with (
+        pytest.raises(MachineError, match="it said: .*unsupported machine type"),
+        opened("emulated_mcu", firmware=image, machine="nothing"),
+    ):
+        pass
+
+
+def test_image_that_is_no_program_is_told(tmp_path):
+    image = tmp_path / "empty.elf"
+    image.write_bytes(b"\xff" * 4096)
+
+    with (
+        pytest.raises(MachineError, match="the emulator is gone.*Lockup"),
+        opened("emulated_mcu", firmware=image) as mcu,
+    ):
+        wait_until(lambda: mcu.read() and False)
+
+
+def test_missing_emulator_is_told_with_what_installs_it(image):
+    with (
+        pytest.raises(MachineError, match="apt install qemu-system-nothing"),
+        opened("emulated_mcu", firmware=image, program="qemu-system-nothing"),
+    ):
+        pass
+
+
+def test_value_that_the_model_refuses_is_told(image):
+    sensor = {
+        "name": "magnetometer",
+        "model": "lsm303dlhc_mag",
+        "address": 0x1E,
+        "properties": ["mag-x"],
+        "limits": [-1.0, 1.0],
+        "counts_per_unit": 1e9,
+    }
+    with opened("emulated_mcu", firmware=image, sensors=[sensor]) as mcu:
+        mcu.write({"magnetometer": -1e-6}, time.monotonic())
+
+        with pytest.raises(MachineError, match="the emulator refuses: .*-1000"):
+            wait_until(lambda: mcu.read() and False)
+
+
+def test_channels_of_sensors_are_declared_both_ways():
+    channels = {
+        each.name: each for each in prepare("emulated_mcu", {"firmware": "x"}, HERE).channels
+    }
+
+    assert list(channels) == ["received", "sent", "magnetometer", "magnetometer_held"]
+    assert channels["magnetometer"].direction == "out"
+    assert channels["magnetometer"].limits == (0.0, 1.7e-4)
+    assert channels["magnetometer_held"].unit == "T"
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"firmware": "x", "held_hz": 0}, "held_hz"),
+        ({"firmware": "x", "serial_port": 4}, "serial_port"),
+        ({}, "firmware"),
+    ],
+)
+def test_bad_parameters_are_refused(parameters, words):
+    with pytest.raises((ConfigurationError, PluginError), match=words):
+        prepare("emulated_mcu", parameters, HERE)
