@@ -54,17 +54,15 @@ void clock_interrupt(void)
 
 uint64_t clock_us(void)
 {
-    uint32_t before, value, pending;
-    do {
-        before = turns;
-        value = SYSTICK_VALUE;
+    uint32_t counted, pending, value;
+    do { /* 0 stands between two turns, and does not tell of which it is */
+        counted = turns;
         pending = INTERRUPT_STATE & SYSTICK_PENDING;
-    } while (before != turns);
-    if (pending) { /* it has begun anew, and the interrupt has yet to be taken */
-        before++;
         value = SYSTICK_VALUE;
-    }
-    return ((uint64_t)before * SYSTICK_PERIOD + (SYSTICK_PERIOD - 1 - value)) / CLOCKS_PER_US;
+    } while (value == 0 || counted != turns || pending != (INTERRUPT_STATE & SYSTICK_PENDING));
+    if (pending) /* it has begun anew, and the interrupt has yet to be taken */
+        counted++;
+    return ((uint64_t)counted * SYSTICK_PERIOD + (SYSTICK_PERIOD - value)) / CLOCKS_PER_US;
 }
 
 void uart_interrupt(void)
