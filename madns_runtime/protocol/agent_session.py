@@ -47,6 +47,22 @@ _RUNNING = AgentState.RUN_SIMULATION
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class PingPlan:
+    """
+    When an agent exchanges times with the host.
+
+    Agents of one process share one clock: the first brings it up, and the others only keep it, and tell of themselves,
+    so that a thousand agents that start at once do not all ask at once.
+    """
+
+    brings_clock_up: bool = True
+    """The first exchanges follow closely."""
+    delay_s: float = 0.0
+    """From the start to the first of one that does not bring the clock up."""
+    interval_s: float = PING_INTERVAL_S
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AgentIdentity:
     """Identity of an agent on the wire; *incarnation* is random, new at every start."""
 
@@ -67,9 +83,11 @@ class AgentSession:
         timeouts: The run's deadlines.
         report: Called for every ping; what it returns is shown to the operator.
         now_s: Present time of the local monotonic clock.
+        clock: Estimate of the host's clock, shared with other agents of the process; None for one of its own.
+        pings: When it exchanges times with the host.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
         self,
         identity: AgentIdentity,
         wire: LinkSettings,
@@ -77,9 +95,11 @@ class AgentSession:
         timeouts: Timeouts,
         report: Callable[[], Mapping[str, Any]],
         now_s: float,
+        clock: ClockEstimate | None = None,
+        pings: PingPlan = PingPlan(),  # noqa: B008 - frozen
     ) -> None:
         self.identity = identity
-        self.clock = ClockEstimate()
+        self.clock = clock or ClockEstimate()
         self.link = Link.for_agent(
             wire.run_key,
             wire.session,
@@ -95,8 +115,12 @@ class AgentSession:
         self._events: deque[AgentSessionEvent] = deque()
         self._heard_s: float | None = None
         self._wakefulness = Wakefulness(timeouts.silence_s, now_s)
-        self._ping_due_s = now_s
-        self._ping_count = 0
+        self._pings = pings
+        self.ping_due_s = now_s if pings.brings_clock_up else now_s + pings.delay_s
+        """When to say how it is; `handle_timer` does so. The timer comes `ping_slack_s` later."""
+        self.ping_slack_s = 0.0
+        """Time in which something else, such as a tick, wakes the loop for a ping that is due."""
+        self._pings_closely = PINGS_FIRST if pings.brings_clock_up else 0
         self._state_deadline_s: float | None = (
             now_s + timeouts.agents_ready_s + timeouts.host_setup_s + timeouts.agent_setup_s
         )
@@ -124,7 +148,7 @@ class AgentSession:
             return
         # Work in this process may have kept the answers waiting: what they say of the clock is worth little.
         self._ready_due_s = now_s + CLOCK_WAIT_S
-        self._ping_due_s, self._ping_count = now_s, 0
+        self.ping_due_s, self._pings_closely = now_s, PINGS_FIRST
 
     def run_finished(self, summary: Mapping[str, Any], now_s: float) -> None:
         """Say that the simulated time is over; the host's stop is awaited."""
@@ -217,7 +241,7 @@ class AgentSession:
             return None
         times = (
             self.link.get_timer(),
-            self._ping_due_s,
+            self.ping_due_s + self.ping_slack_s,
             self._ready_due_s,
             self._state_deadline_s,
         )
@@ -229,7 +253,7 @@ class AgentSession:
             return
         self._wakefulness.called(now_s)
         self.link.handle_timer(now_s)
-        if now_s >= self._ping_due_s:
+        if now_s >= self.ping_due_s:
             self._ping(now_s)
         if self._ready_due_s is not None and now_s >= self._ready_due_s:
             self._say_ready(now_s)
@@ -314,9 +338,9 @@ class AgentSession:
         self._held.clear()
 
     def _ping(self, now_s: float) -> None:
-        self._ping_count += 1
-        first = self._ping_count <= PINGS_FIRST
-        self._ping_due_s = now_s + (PING_INTERVAL_FIRST_S if first else PING_INTERVAL_S)
+        is_first = self._pings_closely > 0
+        self._pings_closely -= is_first
+        self.ping_due_s = now_s + (PING_INTERVAL_FIRST_S if is_first else self._pings.interval_s)
         self._send(messages.Ping(now_s, self._report()), Service.BEST, now_s)
 
     def _check_deadlines(self, now_s: float) -> None:

@@ -72,6 +72,8 @@ ALONE_AT: Final = HEADER_BYTES + FRAME_BYTES
 ALONE_BYTES_MIN: Final = ALONE_AT + MAC_BYTES
 
 _PEEK: Final = Struct("<BBHI8sQ")
+_AGENT_AT: Final = 2
+_AGENT_BYTES: Final = 2
 
 
 class Role(IntEnum):
@@ -127,6 +129,11 @@ def _pack_prefix(session: bytes, agent_index: int, incarnation: int, role: Role)
     if not 0 <= incarnation <= INCARNATION_MAX:
         raise ValueError(f"expected an incarnation of 32 bits, got {incarnation}")
     return PREFIX.pack(VERSION, role, agent_index, incarnation, session)
+
+
+def agent_index_of(datagram: bytes) -> int:
+    """Return the agent that a datagram claims to be of or for; whatever stands there if it is none."""
+    return int.from_bytes(datagram[_AGENT_AT : _AGENT_AT + _AGENT_BYTES], "little")
 
 
 class Header(NamedTuple):

@@ -33,14 +33,18 @@ from madns_runtime.realtime.agent_calls import (
 )
 from madns_runtime.realtime.agent_link import AgentPort
 from madns_runtime.realtime.agent_report import AgentReport
+from madns_runtime.realtime.packs import Pack
+from madns_runtime.realtime.process_port import ProcessPort
 from madns_runtime.realtime.process_records import ProcessRecords
 from madns_runtime.recording.newest_values import NewestValues
 from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
 from madns_runtime.recording.run_journal import RunJournal
 from madns_runtime.timing.clock import utc_at_iso
-from madns_runtime.timing.rate import Pacer, RealTimeFactor, stagger
+from madns_runtime.timing.rate import Pacer, RealTimeFactor
 
+PING_SLACK_S_MAX = 0.1
+"""For so long at most a ping waits for a tick's wake-up."""
 DRAIN_S = 0.1
 """After the last tick's period an agent listens this much longer for what is still under way."""
 
@@ -65,20 +69,24 @@ class AgentRunner:
         launch: The run.
         program: What it runs.
         reactor: The loop.
+        process: What it shares with the other agents of its process.
+        pack: Whom it ticks with.
         on_ended: Called once, with how it ended.
 
     Raises:
-        MachineError: It cannot record, or there is no socket to be had.
+        MachineError: It cannot record.
         HalfFailed: Its half cannot be made.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
         self,
         seat: LoopSeat,
         launch: AgentLaunch,
         program: RoleProgram,
         *,
         reactor: Reactor,
+        process: ProcessPort,
+        pack: Pack,
         on_ended: Callable[[str, AgentOutcome], None],
     ) -> None:
         self.name = name = seat.name
@@ -92,13 +100,14 @@ class AgentRunner:
             launch,
             program=program,
             reactor=reactor,
+            process=process,
             on_due=self._session_due,
             report=lambda: self._report.ping(),
         )
         self._session = self._port.session
         directory = Path(launch.directory) / "agents" / name
         files = RecordFiles(directory, run=config.run, source=name, life=program.life)
-        self._recorder = recorder = Recorder(files, config.recording)
+        self._recorder = recorder = Recorder(files, config.recording, process.writer.writes(files))
         self._journal = RunJournal(recorder, config.recording.verbosity, t_s=self._port.t_s)
         self._records = ProcessRecords(self._journal)
         self._hardware = seat.hardware
@@ -108,7 +117,8 @@ class AgentRunner:
         # Called every tick: without a layer between.
         self._step, self._receive = half.simulation.step, half.simulation.receive
         self._record = recorder.record
-        self._phase_s, self._pacer = _make_pacer(config, name)
+        self._pack = pack
+        self._pacer = _make_pacer(config, pack.phase_s)
         self._factor = RealTimeFactor()
         self._report = AgentReport(
             port=self._port,
@@ -120,7 +130,6 @@ class AgentRunner:
         )
         self._period_s = 1.0 / config.agents.tick_hz
         # Infinite is never: each timer is made once and moved.
-        self._tick_timer = reactor.call_at(math.inf, self._tick)
         self._end_timer = reactor.call_at(math.inf, self._finish_run)
         self._usage_timer = reactor.call_at(math.inf, self._record_usage)
         self._outcome = AgentOutcome(as_ordered=False, reason="did not end")
@@ -131,9 +140,10 @@ class AgentRunner:
         """Begin: says hello at once."""
         self._recorder.start()
         self._journal.event("start", pid=os.getpid())
-        if self._port.socket.warning:
-            self._journal.say("warning", self._port.socket.warning)
-        self._reactor.add_reader(self._port.socket.fileno(), self._readable)
+        warning = self._port.process.socket.warning
+        if warning:
+            self._journal.say("warning", warning)
+        self._port.listen(self._take_datagram)
         self._pump()
 
     def set_scheduling(self, grant: Mapping[str, Any]) -> None:
@@ -150,11 +160,7 @@ class AgentRunner:
 
     # The loop's callbacks ----------------------------------------------------------------------
 
-    def _readable(self) -> None:
-        # One datagram, and back to the loop, which looks for more: most often there is one.
-        data = self._port.socket.receive()
-        if data is None:
-            return
+    def _take_datagram(self, data: bytes) -> None:
         message = self._session.receive_data(data, monotonic())
         if message is not NO_DATA and self._takes_data:
             calls = self._calls
@@ -170,10 +176,10 @@ class AgentRunner:
 
     def _session_due(self) -> None:
         # What waits in the socket is heard before the host is blamed for silence.
-        for data, _ in self._port.socket.receive_all():
-            self._session.receive_datagram(data, monotonic())
-        self._session.handle_timer(monotonic())
-        self._pump()
+        self._port.process.drain()
+        if not self._is_closed:
+            self._session.handle_timer(monotonic())
+            self._pump()
 
     def _pump(self) -> None:
         """Carry out the session's events, send what is due, arm its timer."""
@@ -240,54 +246,74 @@ class AgentRunner:
         self._port.t0_host_s = t0_host_s
         now_s = self._port.now_s()
         self._recorder.set_t0(utc_at_iso(-now_s))
-        self._journal.event("phase", phase_s=self._phase_s)
+        self._journal.event("phase", phase_s=self._pack.phase_s)
         if now_s > 0:
             self._pacer.skip_to(now_s)
         freeze_garbage()  # what set-up made stays: no collection walks it in mid-run
-        self._arm_tick()
+        self._session.ping_slack_s = min(2 * self._period_s, PING_SLACK_S_MAX)
+        self._arm_end()
+        self._pack.arm()
         self._records.begin_usage()
         self._tell_time()
         self._usage_timer.reschedule(monotonic() + self._config.health.period_s)
 
-    def _arm_tick(self) -> None:
+    def next_deadline_s(self) -> float:
+        """Return the simulated time at which its next tick is due, s; infinite while it has none."""
+        if self._session.state is not AgentState.RUN_SIMULATION:
+            return math.inf
         deadline_s = self._pacer.next_deadline_s()
-        if deadline_s is None:
+        return math.inf if deadline_s is None else deadline_s
+
+    def local_s(self, t_s: float) -> float:
+        """Return when simulated time *t_s* is on this machine's monotonic clock, s."""
+        return self._port.local_s(t_s)
+
+    def _arm_end(self) -> None:
+        if self._pacer.next_deadline_s() is None:
             end_s = self._config.time.duration_s + DRAIN_S
             self._end_timer.reschedule(self._port.local_s(end_s))
-        else:
-            self._tick_timer.reschedule(self._port.local_s(deadline_s))
 
-    def _tick(self) -> None:
+    def tick(self) -> None:
+        """Run the tick that is due, if one is."""
         pacer, port = self._pacer, self._port
         if self._session.state is not AgentState.RUN_SIMULATION:
             return
         began_s = port.now_s()
         timing = pacer.begin(began_s)
-        if timing is not None:
-            index, t_s, deadline_s, lateness_s, missed = timing
-            self._factor.add(t_s, began_s)
-            calls = self._calls
-            calls[T_S] = t_s
-            if self._program.has_medium and not self._hear(t_s):
-                return
-            if self._has_devices and not self._look_at_devices():
-                return
-            calls[AGENT], calls[METHOD] = self._seat, STEP
-            try:
-                self._step(Tick(index, t_s, self._period_s, lateness_s, missed, deadline_s))
-            except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
-                calls[METHOD] = IDLE
-                self._fail(self._half.failure("step", error))
-                self._pump()
-                return
+        if timing is None:
+            self._arm_end()
+            return
+        index, t_s, deadline_s, lateness_s, missed = timing
+        self._factor.add(t_s, began_s)
+        calls = self._calls
+        calls[T_S] = t_s
+        if self._program.has_medium and not self._hear(t_s):
+            return
+        if self._has_devices and not self._look_at_devices():
+            return
+        calls[AGENT], calls[METHOD] = self._seat, STEP
+        try:
+            self._step(Tick(index, t_s, self._period_s, lateness_s, missed, deadline_s))
+        except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
             calls[METHOD] = IDLE
-            if port.must_flush:
-                # What the step sent leaves before anything else is done.
-                port.flush()
-            margin_s = pacer.end(port.now_s())
-            values = (index, int(lateness_s * 1e6), int(margin_s * 1e6), missed)
-            self._record("ticks", values)
-        self._arm_tick()
+            self._fail(self._half.failure("step", error))
+            self._pump()
+            return
+        calls[METHOD] = IDLE
+        if port.must_flush:
+            # What the step sent leaves before anything else is done.
+            port.flush()
+        margin_s = pacer.end(port.now_s())
+        values = (index, int(lateness_s * 1e6), int(margin_s * 1e6), missed)
+        self._record("ticks", values)
+        if pacer.is_over:
+            self._arm_end()
+
+    def ping_if_due(self, now_s: float) -> None:
+        """Say how it is, if that is due by *now_s* of the local clock: this wake-up then serves for both."""
+        if now_s >= self._session.ping_due_s and not self._is_closed:
+            self._session.handle_timer(now_s)
+            self._pump()
 
     def _hear(self, t_s: float) -> bool:
         """Hand in what other agents' messages bring in the tick at *t_s*; return whether the agent goes on."""
@@ -339,7 +365,7 @@ class AgentRunner:
         records = {
             **counts.to_mapping(),
             "messages": messages,
-            "network": self._port.socket.counters(),
+            "network": self._port.network(),
             "between_agents": self._port.mailbox.counts(),
             "held_dropped": self._session.held_dropped_count,
             "malformed": self._session.malformed_count,
@@ -353,7 +379,7 @@ class AgentRunner:
         self._on_ended(self.name, self._outcome)
 
     def _cancel_timers(self) -> None:
-        for timer in (self._tick_timer, self._end_timer, self._usage_timer):
+        for timer in (self._end_timer, self._usage_timer):
             timer.cancel()
 
     # Telling -----------------------------------------------------------------------------------
@@ -383,13 +409,9 @@ class AgentRunner:
         self._port.must_flush = True
 
 
-def _make_pacer(config: RunConfig, name: str) -> tuple[float, Pacer]:
-    """Return the agent's share of the period by which its ticks are put off, s, and its pace."""
-    agents = config.agents
-    index = agents.resolved_names().index(name)
-    phase_s = stagger(index, agents.count, agents.tick_hz, phase=agents.phase)
-    return phase_s, Pacer(
-        tick_hz=agents.tick_hz,
+def _make_pacer(config: RunConfig, phase_s: float) -> Pacer:
+    return Pacer(
+        tick_hz=config.agents.tick_hz,
         phase_s=phase_s,
         duration_s=config.time.duration_s,
         overrun_s=config.deadline.overrun_ms * 1e-3,

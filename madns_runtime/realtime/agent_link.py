@@ -1,4 +1,4 @@
-"""An agent's way to the host: its socket, its session, and the simulated time that the session knows."""
+"""An agent's way to the host: its share of the process's socket, its session, and the simulated time that the session knows."""
 
 from __future__ import annotations
 
@@ -20,27 +20,23 @@ from madns_runtime.protocol.link import LinkLimits
 from madns_runtime.protocol.link_settings import LinkSettings
 from madns_runtime.protocol.messages import Service, Transmission
 from madns_runtime.reactor.reactor import Reactor
-from madns_runtime.reactor.udp import UdpSocket
+from madns_runtime.realtime.process_port import ProcessPort
 
 BEST, SYNC = Service.BEST, Service.SYNC
-
-RECEIVE_BUFFER_BYTES = 1024 * 1024
 
 
 class AgentPort:
     """
-    The socket and the session of one agent.
+    The session of one agent, on the socket of its process.
 
     Args:
         name: The agent's.
         launch: The run.
         program: What it runs.
         reactor: The loop.
+        process: The socket, and the clock, of the agent's process.
         on_due: Called when the session's timer is due.
         report: Returns what a ping tells of the agent.
-
-    Raises:
-        MachineError: There is no socket to be had.
     """
 
     def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
@@ -50,13 +46,12 @@ class AgentPort:
         *,
         program: RoleProgram,
         reactor: Reactor,
+        process: ProcessPort,
         on_due: Callable[[], None],
         report: Callable[[], Mapping[str, Any]],
     ) -> None:
         config = launch.config
-        self.socket = UdpSocket.connect(
-            launch.host_address, launch.host_port, receive_buffer_bytes=RECEIVE_BUFFER_BYTES
-        )
+        self.process = process
         self.session = AgentSession(
             AgentIdentity(
                 name=name,
@@ -68,11 +63,13 @@ class AgentPort:
             LinkSettings(
                 run_key=bytes.fromhex(launch.run_key_hex),
                 session=bytes.fromhex(launch.session_hex),
-                limits=LinkLimits(receive_window_bytes=self.socket.receive_buffer_bytes // 4),
+                limits=LinkLimits(receive_window_bytes=process.window_bytes),
             ),
             timeouts=config.timeouts,
             report=report,
             now_s=reactor.now_s(),
+            clock=process.clock,
+            pings=process.pings(),
         )
         self.mailbox = Mailbox(
             name,
@@ -86,14 +83,17 @@ class AgentPort:
         self.must_flush = False
         """Whether something waits to be sent."""
         self._lead_s = config.timeouts.start_lead_s
-        self._reactor = reactor
         # Infinite is never: the timer is made once and moved.
         self._timer = reactor.call_at(math.inf, on_due)
+
+    def listen(self, take: Callable[[bytes], None]) -> None:
+        """Hand the datagrams for this agent to *take*."""
+        self.process.listen(self.session.identity.index, take)
 
     def flush(self) -> None:
         """Send what is due, and arm the session's timer."""
         self.must_flush = False
-        session, send = self.session, self.socket.send
+        session, send = self.session, self.process.send
         for data in session.datagrams_to_send(monotonic()):
             send(data)
         due_s = session.get_timer()
@@ -103,8 +103,12 @@ class AgentPort:
         """Send the last words, and listen no more."""
         self.flush()
         self._timer.cancel()
-        self._reactor.remove_reader(self.socket.fileno())
-        self.socket.close()
+        self.process.send_waiting()
+        self.process.leave(self.session.identity.index)
+
+    def network(self) -> dict[str, Any]:
+        """Return the socket's counters; it is one for all agents of the process, whose number stands beside."""
+        return {**self.process.socket.counters(), "agents_sharing": self.process.agents}
 
     # Towards the simulation ------------------------------------------------------------------------
 
@@ -142,7 +146,7 @@ class AgentPort:
         if service is BEST and to == HOST and deadline_s is None:
             datagram = self.session.seal_data(message, now_s)
             if datagram is not None:
-                self.socket.send(datagram)
+                self.process.send(datagram)
                 return None
         if to != HOST:
             return self.mailbox.send(to, message, service, deadline_s)
@@ -153,6 +157,7 @@ class AgentPort:
         self.must_flush = True
         if service is SYNC:
             self.flush()
+            self.process.send_waiting()
         return None
 
     def _transmit(self, transmission: Transmission) -> None:

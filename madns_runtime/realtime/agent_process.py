@@ -14,6 +14,8 @@ from madns_runtime.reactor.scheduling import apply as apply_scheduling
 from madns_runtime.reactor.watchdog import end_after_hang_up
 from madns_runtime.realtime.agent import AgentOutcome, AgentRunner
 from madns_runtime.realtime.agent_calls import LoopSeat
+from madns_runtime.realtime.packs import Pack, phase_of, split_into_packs
+from madns_runtime.realtime.process_port import ProcessPort
 
 HANG_GRACE_S = 2.0
 """Beyond the time for shutdown: an agent that hangs in its plug-in ends itself, and leaves its stack."""
@@ -54,16 +56,7 @@ class AgentProcess:
         reactor.on_signal(signal.SIGINT, lambda: None)
         reactor.add_reader(self._life_fd, self._life_ended)
         end_after_hang_up(self._life_fd, self._launch.config.timeouts.shutdown_s + HANG_GRACE_S)
-        runners = [
-            AgentRunner(
-                seat,
-                self._launch,
-                self._program,
-                reactor=reactor,
-                on_ended=self._ended,
-            )
-            for seat in self._seats
-        ]
+        runners = self._make_runners()
         self._runners = {runner.name: runner for runner in runners}
         for runner in runners:
             runner.start()
@@ -74,6 +67,27 @@ class AgentProcess:
         reactor.run()
         reactor.close()
         return self._outcomes
+
+    def _make_runners(self) -> list[AgentRunner]:
+        seats = {seat.name: seat for seat in self._seats}
+        process = ProcessPort(self._launch, self._reactor, len(seats))
+        runners = []
+        for names in split_into_packs(list(seats)):
+            phase_s = phase_of(names, self._launch.config.agents)
+            pack = Pack(phase_s, reactor=self._reactor, process=process)
+            for name in names:
+                runner = AgentRunner(
+                    seats[name],
+                    self._launch,
+                    self._program,
+                    reactor=self._reactor,
+                    process=process,
+                    pack=pack,
+                    on_ended=self._ended,
+                )
+                pack.add(runner)
+                runners.append(runner)
+        return runners
 
     def _life_ended(self) -> None:
         self._reactor.remove_reader(self._life_fd)

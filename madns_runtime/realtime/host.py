@@ -22,7 +22,9 @@ from madns_runtime.plugin.executor import JobRunner, make_executor
 from madns_runtime.plugin.half import HalfFailed, HostHalf, RoleProgram
 from madns_runtime.plugin.host_calls import HostCalls
 from madns_runtime.protocol import events as told
+from madns_runtime.protocol.bundle import is_bundle, split
 from madns_runtime.protocol.events import Phase
+from madns_runtime.protocol.host_peers import Address
 from madns_runtime.protocol.states import HOST_LIVE, HostState
 from madns_runtime.reactor.host_signals import heed_signals
 from madns_runtime.reactor.operator_link import (
@@ -154,11 +156,21 @@ class HostRuntime:
     # The loop's callbacks ----------------------------------------------------------------------
 
     def _readable(self) -> None:
-        # One datagram, and back to the loop, which looks for more: most often there is one.
+        # One packet, and back to the loop, which looks for more: most often there is one.
         received = self._port.socket.receive_from()
         if received is None:
             return
-        message = self._session.receive_data(*received, monotonic())
+        packet, address = received
+        datagrams = split(packet) if is_bundle(packet) else None
+        if datagrams is None:
+            self._take_datagram(packet, address)
+            return
+        with self._port.together(address):
+            for datagram in datagrams:
+                self._take_datagram(datagram, address)
+
+    def _take_datagram(self, data: bytes, address: Address) -> None:
+        message = self._session.receive_data(data, address, monotonic())
         if message is not None and self._takes_data:
             self._call("receive", *message)
             if not self._port.must_pump:
@@ -167,8 +179,10 @@ class HostRuntime:
 
     def _session_due(self) -> None:
         # What waits in the socket is heard before anybody is blamed for silence.
-        for data, address in self._port.socket.receive_all():
-            self._session.receive_datagram(data, address, monotonic())
+        for packet, address in self._port.socket.receive_all():
+            datagrams = split(packet) if is_bundle(packet) else None
+            for data in (packet,) if datagrams is None else datagrams:
+                self._session.receive_datagram(data, address, monotonic())
         self._session.handle_timer(monotonic())
         self._pump()
 

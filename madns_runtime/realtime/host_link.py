@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from time import monotonic
 from typing import Any
 
 from madns_runtime.config import HostLaunch
 from madns_runtime.medium.carrier import Carrier
 from madns_runtime.plugin.context import check_sending
+from madns_runtime.protocol.bundle import bundle_up
+from madns_runtime.protocol.host_peers import Address
 from madns_runtime.protocol.host_session import HostSession
 from madns_runtime.protocol.link import LinkLimits
 from madns_runtime.protocol.link_settings import LinkSettings
@@ -67,6 +70,8 @@ class HostPort:
         """Simulated time zero on this machine's monotonic clock; None before it is set."""
         self.must_pump = False
         """Whether something waits to be sent or carried out."""
+        self._kept_for: Address | None = None
+        self._kept: list[bytes] = []
         self._lead_s = config.timeouts.start_lead_s
         # Infinite is never: the timer is made once and moved.
         self._timer = reactor.call_at(math.inf, on_due)
@@ -75,9 +80,26 @@ class HostPort:
         """Send what is due, and what soon arrives of messages between agents."""
         if self.is_in(HostState.SIMULATION_START):
             self.carrier.hand_over()
-        send = self.socket.send
         for data, address in self.session.datagrams_to_send(monotonic()):
-            send(data, address)
+            self._post(data, address)
+
+    @contextmanager
+    def together(self, address: Address) -> Iterator[None]:
+        """Keep what is sent to *address* until the end of the block, and send it then: as few packets as hold it."""
+        self._kept_for, self._kept = address, []
+        try:
+            yield
+        finally:
+            kept, self._kept_for = self._kept, None
+            if kept:
+                for packet in bundle_up(kept):
+                    self.socket.send(packet, address)
+
+    def _post(self, data: bytes, address: Address) -> None:
+        if address == self._kept_for:
+            self._kept.append(data)
+        else:
+            self.socket.send(data, address)
 
     def arm(self) -> None:
         """Arm the session's timer, for what is to be handed over as well."""
@@ -119,7 +141,7 @@ class HostPort:
         if service is BEST and deadline_s is None:
             sealed = self.session.seal_data(to, message, now_s)
             if sealed is not None:
-                self.socket.send(*sealed)
+                self._post(*sealed)
                 return
         peers, t0_s = self.session.peers, self.t0_s
         check_sending(to, peers, service, deadline_s, is_running=t0_s is not None)

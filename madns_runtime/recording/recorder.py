@@ -40,7 +40,7 @@ class Recorder:
         self, files: RecordFiles, settings: Recording, writer: RecordWriter | None = None
     ) -> None:
         self._files = files
-        self._writer = writer or WriterThread(files, settings)
+        self._writer = writer or WriterThread(settings).writes(files)
         self._limit_bytes = settings.buffer_bytes
         self._queued_bytes = 0
         self._streams: dict[str, StreamFile] = {}

@@ -33,24 +33,79 @@ class RecordWriter(Protocol):
 
 class WriterThread:
     """
-    A thread that writes what waits, now and then or when much does.
+    A thread that writes what waits, now and then or when much does: of one recorder, or of all in a process.
 
     Args:
-        files: What it writes.
         settings: How often it writes and brings to the disk itself.
     """
 
-    def __init__(self, files: RecordFiles, settings: Recording) -> None:
-        self._files = files
+    def __init__(self, settings: Recording) -> None:
         self._settings = settings
+        self._lock = threading.Lock()
         self._wake = threading.Event()
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._write_on, name="recorder", daemon=True)
+        self._hurry = threading.Event()
+        self._writings: list[_Writing] = []
+        self._thread: threading.Thread | None = None
+
+    def writes(self, files: RecordFiles) -> RecordWriter:
+        """Return the writer of some more files."""
+        return _Writing(self, files, self._wake)
+
+    def start(self, writing: _Writing) -> None:
+        """Begin to write what *writing* has, if that has not begun."""
+        with self._lock:
+            if writing in self._writings or writing.is_done.is_set():
+                return
+            self._writings.append(writing)
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._write_on, name="recorder", daemon=True)
+                self._thread.start()
+
+    def hurry(self) -> None:
+        """Write now, also where the disk has just refused: somebody closes."""
+        self._hurry.set()
+        self._wake.set()
+
+    def _write_on(self) -> None:
+        _schedule_normally()
+        is_troubled = False
+        interval_s = self._settings.sync_interval_s or math.inf
+        synced_s = monotonic()
+        while True:
+            # In trouble only the interval counts: a full buffer would wake without pause.
+            (self._hurry if is_troubled else self._wake).wait(self._settings.flush_interval_s)
+            self._wake.clear()
+            self._hurry.clear()
+            closing = [writing for writing in self._writings if writing.is_closing]
+            must_sync = monotonic() - synced_s >= interval_s
+            writings = list(self._writings)
+            is_troubled = not all([writing.files.write_waiting() for writing in writings])
+            if must_sync:
+                is_troubled |= not all([writing.files.sync() for writing in writings])
+                synced_s = monotonic()
+            for writing in closing:
+                writing.files.finish()
+                writing.is_done.set()
+            with self._lock:
+                self._writings = [one for one in self._writings if one not in closing]
+                if not self._writings:
+                    self._thread = None
+                    return
+
+
+class _Writing:
+    """One recorder's part of what a thread writes."""
+
+    def __init__(self, thread: WriterThread, files: RecordFiles, wake: threading.Event) -> None:
+        self.files = files
+        self.is_closing = False
+        self.is_done = threading.Event()
+        self._thread = thread
+        self._wake = wake
 
     def start(self) -> None:
         """Start the thread, if it is not started."""
-        if self._thread.ident is None:
-            self._thread.start()
+        self._thread.start(self)
 
     def flush(self) -> None:
         """Wake the thread."""
@@ -58,30 +113,14 @@ class WriterThread:
             self._wake.set()
 
     def close(self, timeout_s: float) -> None:
-        """End the thread when it has written all; a disk that takes longer is an error in the counts."""
+        """Have all written and finished; a disk that takes longer is an error in the counts."""
         self.start()
-        self._stop.set()
-        self._wake.set()
-        self._thread.join(timeout_s)
-        if self._thread.is_alive():
-            directory = self._files.directory
-            self._files.add_error(f"{directory}: records not on disk after {timeout_s:g} s")
-
-    def _write_on(self) -> None:
-        _schedule_normally()
-        files, is_troubled = self._files, False
-        interval_s = self._settings.sync_interval_s or math.inf
-        synced_s = monotonic()
-        while not self._stop.is_set():
-            # In trouble only the interval counts: a full buffer would wake without pause.
-            (self._stop if is_troubled else self._wake).wait(self._settings.flush_interval_s)
-            self._wake.clear()
-            is_troubled = not files.write_waiting()
-            if monotonic() - synced_s >= interval_s:
-                is_troubled |= not files.sync()
-                synced_s = monotonic()
-        files.write_waiting()
-        files.finish()
+        self.is_closing = True
+        self._thread.hurry()
+        if not self.is_done.wait(timeout_s):
+            self.files.add_error(
+                f"{self.files.directory}: records not on disk after {timeout_s:g} s"
+            )
 
 
 def _schedule_normally() -> None:

@@ -132,6 +132,7 @@ class ClockEstimate:
         self._line: _Line | None = None
         self._served: _Served | None = None
         self._asked_s = -math.inf
+        self._is_settled = False
         self.exchanges = 0
         """Exchanges accepted."""
         self.rejected = 0
@@ -206,9 +207,10 @@ class ClockEstimate:
         Serve the estimate as it stands, at once; for the moment before anything relies on the clock.
 
         Exchanges that waited behind a long piece of work may have been far off; what they taught is not
-        slewed out of a run that has only just begun.
+        slewed out of a run that has only just begun. Of several that share the clock the first does this.
         """
-        if self._line is not None:
+        if self._line is not None and not self._is_settled:
+            self._is_settled = True
             self._served, self._asked_s = None, -math.inf
             self._serve(self._line, now_s, may_jump_ahead=False)
 

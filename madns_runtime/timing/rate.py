@@ -153,6 +153,11 @@ class Pacer:
         self._is_stepping = False
         self._move_to(0)
 
+    @property
+    def is_over(self) -> bool:
+        """Whether no tick is left."""
+        return self._index >= self.tick_count
+
     def next_deadline_s(self) -> float | None:
         """Return when the next tick is due, s since T0; None when none is left."""
         return self._deadline_s if self._index < self.tick_count else None

@@ -1,0 +1,92 @@
+"""
+Agents of one process that tick together: one wake-up of the loop for all of them.
+
+A wake-up from sleep costs several times a tick that follows another at once, so that agents that share a process
+share deadlines too. Packs are spread over the period as agents by themselves are; every agent's lateness counts from
+the shared deadline.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from time import monotonic
+from typing import Protocol
+
+from madns_runtime.config import Agents
+from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.realtime.process_port import ProcessPort
+from madns_runtime.timing.rate import stagger
+
+PACK_AGENTS_MAX = 8
+
+
+class PackMember(Protocol):
+    """An agent as its pack knows it."""
+
+    def next_deadline_s(self) -> float:
+        """Return the simulated time at which its next tick is due, s; infinite while it has none."""
+
+    def local_s(self, t_s: float) -> float:
+        """Return when simulated time *t_s* is on this machine's monotonic clock, s."""
+
+    def tick(self) -> None:
+        """Run the tick that is due, if one is."""
+
+    def ping_if_due(self, now_s: float) -> None:
+        """Say how it is, if that is due by *now_s* of the local clock."""
+
+
+class Pack:
+    """
+    Some agents of a process.
+
+    Args:
+        phase_s: Offset of their deadlines within the period, s.
+        reactor: The loop.
+        process: The socket that they share.
+    """
+
+    def __init__(self, phase_s: float, *, reactor: Reactor, process: ProcessPort) -> None:
+        self.phase_s = phase_s
+        self._process = process
+        self._members: list[PackMember] = []
+        # Infinite is never: the timer is made once and moved.
+        self._timer = reactor.call_at(math.inf, self._due)
+
+    def add(self, member: PackMember) -> None:
+        """Take an agent in."""
+        self._members.append(member)
+
+    def arm(self) -> None:
+        """Wake up for the earliest tick of any member."""
+        deadline_s, member = min(
+            ((member.next_deadline_s(), member) for member in self._members), key=_deadline_of
+        )
+        self._timer.reschedule(math.inf if deadline_s == math.inf else member.local_s(deadline_s))
+
+    def _due(self) -> None:
+        with self._process.together():
+            for member in self._members:
+                member.tick()
+            now_s = monotonic()
+            for member in self._members:
+                member.ping_if_due(now_s)
+        self.arm()
+
+
+def _deadline_of(due: tuple[float, PackMember]) -> float:
+    return due[0]
+
+
+def split_into_packs(names: Sequence[str]) -> list[Sequence[str]]:
+    """Return the agents of a process in as few packs of PACK_AGENTS_MAX at most as hold them, as even as can be."""
+    count = math.ceil(len(names) / PACK_AGENTS_MAX)
+    bounds = [round(number * len(names) / count) for number in range(count + 1)]
+    return [names[start:end] for start, end in zip(bounds, bounds[1:], strict=False)]
+
+
+def phase_of(pack: Sequence[str], agents: Agents) -> float:
+    """Return the phase of a pack, s: that of its first agent among all agents of the run."""
+    index = agents.resolved_names().index(pack[0])
+    return stagger(index, agents.count, agents.tick_hz, phase=agents.phase)

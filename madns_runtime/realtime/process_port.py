@@ -1,0 +1,150 @@
+"""
+The one UDP socket of an agent process, and its one estimate of the host's clock.
+
+What its agents send together leaves as one packet, and what comes is dealt out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from madns_runtime.config import AgentLaunch
+from madns_runtime.protocol.agent_session import PING_INTERVAL_S, PingPlan
+from madns_runtime.protocol.bundle import bundle_up, is_bundle, split
+from madns_runtime.protocol.datagram import agent_index_of
+from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.reactor.udp import UdpSocket
+from madns_runtime.recording.writer_thread import WriterThread
+from madns_runtime.timing.clocksync import ClockEstimate
+
+RECEIVE_BUFFER_BYTES = 1024 * 1024
+"""Receive buffer asked for per agent ..."""
+RECEIVE_BUFFER_BYTES_MAX = 4 * 1024 * 1024
+"""... and by one process at most."""
+WINDOW_BYTES_MIN = 4 * 1400
+PINGING_OFTEN_MAX = 8
+"""Agents of one process that all ping as often as one alone; more share the work ..."""
+PING_SLOWED_MAX = 4.0
+"""... down to so many times more rarely."""
+PACKETS_BATCH_MAX = 64
+"""Packets taken from the socket in a row before timers get their turn."""
+
+
+class ProcessPort:
+    """
+    The socket and the clock that the agents of one process share.
+
+    Args:
+        launch: The run.
+        reactor: The loop.
+        agents: How many agents share it.
+
+    Raises:
+        MachineError: There is no socket to be had.
+    """
+
+    def __init__(self, launch: AgentLaunch, reactor: Reactor, agents: int) -> None:
+        asked_bytes = min(agents * RECEIVE_BUFFER_BYTES, RECEIVE_BUFFER_BYTES_MAX)
+        self.socket = socket = UdpSocket.connect(
+            launch.host_address, launch.host_port, receive_buffer_bytes=asked_bytes
+        )
+        self.agents = agents
+        self.clock = ClockEstimate()
+        self.writer = WriterThread(launch.config.recording)
+        # The kernel charges a small datagram with more than its bytes: half the buffer is kept for that.
+        share_bytes = socket.receive_buffer_bytes // max(4, 2 * agents)
+        self.window_bytes = max(WINDOW_BYTES_MIN, share_bytes)
+        """Bytes that may be on their way to each agent unread, so that all together fit the socket's buffer."""
+        self._reactor = reactor
+        self._made = 0
+        self._takers: dict[int, Callable[[bytes], None]] = {}
+        self._packets_max = PACKETS_BATCH_MAX if agents > 1 else 1
+        self._waiting: list[bytes] | None = None
+
+    def pings(self) -> PingPlan:
+        """Return when the next agent, of those that are made one after the other, exchanges times with the host."""
+        number, self._made = self._made, self._made + 1
+        interval_s = PING_INTERVAL_S * min(
+            max(1.0, self.agents / PINGING_OFTEN_MAX), PING_SLOWED_MAX
+        )
+        return PingPlan(
+            brings_clock_up=number == 0,
+            delay_s=interval_s * (number + 1) / self.agents,
+            interval_s=interval_s,
+        )
+
+    # Receiving.
+
+    def listen(self, agent_index: int, take: Callable[[bytes], None]) -> None:
+        """Hand the datagrams for an agent, by its index on the wire, to *take*."""
+        if not self._takers:
+            self._reactor.add_reader(self.socket.fileno(), self._readable)
+        self._takers[agent_index] = take
+
+    def leave(self, agent_index: int) -> None:
+        """Listen for an agent no more; the last one closes the socket."""
+        if self._takers.pop(agent_index, None) is not None and not self._takers:
+            self._reactor.remove_reader(self.socket.fileno())
+            self.socket.close()
+
+    def drain(self) -> None:
+        """Take what waits in the socket, a bounded number of packets."""
+        for packet, _ in self.socket.receive_all():
+            self._deal_out(packet)
+
+    def _readable(self) -> None:
+        # Of an agent by itself one datagram, and back to the loop, which looks for more: most often there is one.
+        for _ in range(self._packets_max):
+            packet = self.socket.receive()
+            if packet is None:
+                return
+            self._deal_out(packet)
+
+    def _deal_out(self, packet: bytes) -> None:
+        datagrams = split(packet) if is_bundle(packet) else None
+        if datagrams is None:
+            self._give(packet)
+            return
+        with self.together():
+            for datagram in datagrams:
+                self._give(datagram)
+
+    def _give(self, datagram: bytes) -> None:
+        takers = self._takers
+        take = takers.get(agent_index_of(datagram))
+        if take is None:
+            # Nobody's: refused, and counted, by whoever is first.
+            take = next(iter(takers.values()), None)
+        if take is not None:
+            take(datagram)
+
+    # Sending.
+
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """Keep what is sent until the end of the block, and send it then: as few packets as hold it."""
+        if self._waiting is not None:
+            yield
+            return
+        self._waiting = []
+        try:
+            yield
+        finally:
+            self.send_waiting()
+            self._waiting = None
+
+    def send(self, datagram: bytes) -> None:
+        """Send a datagram: now, or with others at the end of the block under way."""
+        if self._waiting is None:
+            self.socket.send(datagram)
+        else:
+            self._waiting.append(datagram)
+
+    def send_waiting(self) -> None:
+        """Send what is kept, now."""
+        waiting = self._waiting
+        if waiting:
+            for packet in bundle_up(waiting):
+                self.socket.send(packet)
+            waiting.clear()
