@@ -72,8 +72,8 @@ class AgentProcess:
         seats = {seat.name: seat for seat in self._seats}
         process = ProcessPort(self._launch, self._reactor, len(seats))
         runners = []
-        for names in split_into_packs(list(seats)):
-            phase_s = phase_of(names, self._launch.config.agents)
+        for number, names in enumerate(split_into_packs(list(seats))):
+            phase_s = phase_of(number, names, self._launch.config.agents)
             pack = Pack(phase_s, reactor=self._reactor, process=process)
             for name in names:
                 runner = AgentRunner(

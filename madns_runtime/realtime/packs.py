@@ -86,7 +86,17 @@ def split_into_packs(names: Sequence[str]) -> list[Sequence[str]]:
     return [names[start:end] for start, end in zip(bounds, bounds[1:], strict=False)]
 
 
-def phase_of(pack: Sequence[str], agents: Agents) -> float:
-    """Return the phase of a pack, s: that of its first agent among all agents of the run."""
-    index = agents.resolved_names().index(pack[0])
-    return stagger(index, agents.count, agents.tick_hz, phase=agents.phase)
+def phase_of(number: int, pack: Sequence[str], agents: Agents) -> float:
+    """
+    Return the phase of a pack, s: all packs of the run are spread over the period.
+
+    Args:
+        number: Of the pack among those of its process, from 0.
+        pack: Its agents.
+        agents: Those of the run.
+    """
+    per_process = min(agents.per_process, agents.count)
+    packs = math.ceil(per_process / PACK_AGENTS_MAX)
+    process = agents.resolved_names().index(pack[0]) // per_process
+    processes = math.ceil(agents.count / per_process)
+    return stagger(process * packs + number, processes * packs, agents.tick_hz, phase=agents.phase)

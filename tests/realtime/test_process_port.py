@@ -1,0 +1,151 @@
+"""The socket that the agents of a process share: dealt out by agent, sent together, malformed packets refused by somebody."""
+
+from __future__ import annotations
+
+import socket
+from types import SimpleNamespace
+
+import pytest
+
+from madns_runtime.config import Recording
+from madns_runtime.protocol.bundle import BUNDLE, bundle_up, split
+from madns_runtime.protocol.datagram import OVERHEAD_BYTES
+from madns_runtime.realtime.process_port import PING_INTERVAL_S, ProcessPort
+
+
+class Loop:
+    """What a port asks of the reactor."""
+
+    def __init__(self):
+        self.readers = {}
+
+    def add_reader(self, fd, callback):
+        self.readers[fd] = callback
+
+    def remove_reader(self, fd):
+        del self.readers[fd]
+
+    def turn(self):
+        for callback in list(self.readers.values()):
+            callback()
+
+
+@pytest.fixture
+def host():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as handle:
+        handle.bind(("127.0.0.1", 0))
+        handle.settimeout(5)
+        yield handle
+
+
+def port_of(host, agents, loop=None):
+    launch = SimpleNamespace(
+        host_address="127.0.0.1",
+        host_port=host.getsockname()[1],
+        config=SimpleNamespace(recording=Recording()),
+    )
+    return ProcessPort(launch, loop or Loop(), agents)
+
+
+def datagram(index, fill=b"x"):
+    return bytes([1, 0, index, 0]) + fill * OVERHEAD_BYTES
+
+
+def test_each_agent_gets_what_is_for_it(host):
+    loop = Loop()
+    port = port_of(host, 2, loop)
+    got = {7: [], 8: []}
+    for index in got:
+        port.listen(index, got[index].append)
+    port.send(b"hello")
+    _, address = host.recvfrom(2048)
+
+    (bundle,) = bundle_up([datagram(7), datagram(8), datagram(7, b"y")])
+    host.sendto(bundle, address)
+    host.sendto(datagram(8, b"z"), address)
+    loop.turn()
+
+    assert got == {7: [datagram(7), datagram(7, b"y")], 8: [datagram(8), datagram(8, b"z")]}
+
+
+@pytest.mark.parametrize(
+    "packet", [datagram(9), b"", bytes([BUNDLE, 1])], ids=["stranger", "empty", "malformed"]
+)
+def test_what_is_nobodys_is_refused_by_the_first(host, packet):
+    loop = Loop()
+    port = port_of(host, 2, loop)
+    first, second = [], []
+    port.listen(7, first.append)
+    port.listen(8, second.append)
+    port.send(b"hello")
+    _, address = host.recvfrom(2048)
+
+    host.sendto(packet, address)
+    loop.turn()
+
+    assert (first, second) == ([packet], [])
+
+
+def test_what_is_sent_in_a_block_leaves_together_and_in_order(host):
+    port = port_of(host, 3)
+    with port.together():
+        for index in (1, 2, 3):
+            port.send(datagram(index))
+        with port.together():
+            port.send(datagram(1, b"y"))
+    port.send(datagram(2, b"z"))
+
+    assert split(host.recv(2048)) == [datagram(1), datagram(2), datagram(3), datagram(1, b"y")]
+    assert host.recv(2048) == datagram(2, b"z")
+
+
+def test_what_cannot_wait_takes_along_what_came_before_it(host):
+    port = port_of(host, 2)
+    with port.together():
+        port.send(datagram(1))
+        port.send_waiting()
+        assert host.recv(2048) == datagram(1)
+        port.send(datagram(2))
+    assert host.recv(2048) == datagram(2)
+
+
+def test_what_waits_is_sent_when_the_block_fails(host):
+    port = port_of(host, 2)
+    with pytest.raises(ValueError, match="a plug-in"), port.together():
+        port.send(datagram(1))
+        raise ValueError("a plug-in")
+
+    assert host.recv(2048) == datagram(1)
+    port.send(datagram(2))
+    assert host.recv(2048) == datagram(2)
+
+
+def test_the_last_agent_closes_the_socket(host):
+    loop = Loop()
+    port = port_of(host, 2, loop)
+    port.listen(1, list)
+    port.listen(2, list)
+    port.leave(1)
+    assert port.socket.fileno() >= 0
+    port.leave(2)
+    port.leave(2)
+
+    assert port.socket.fileno() == -1
+    assert not loop.readers
+
+
+def test_windows_of_all_agents_fit_half_the_buffer(host):
+    alone, many = port_of(host, 1), port_of(host, 64)
+
+    assert alone.window_bytes == alone.socket.receive_buffer_bytes // 4
+    assert 64 * many.window_bytes <= max(many.socket.receive_buffer_bytes // 2, 64 * 5600)
+
+
+def test_one_agent_brings_the_clock_up_and_many_ping_more_rarely(host):
+    port = port_of(host, 64)
+    plans = [port.pings() for _ in range(64)]
+
+    assert [plan.brings_clock_up for plan in plans] == [True, *[False] * 63]
+    assert {plan.interval_s for plan in plans} == {4 * PING_INTERVAL_S}
+    assert sorted({plan.delay_s for plan in plans}) == [plan.delay_s for plan in plans]
+    assert port_of(host, 1).pings().interval_s == PING_INTERVAL_S
