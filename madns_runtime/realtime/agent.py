@@ -20,7 +20,6 @@ from madns_runtime.protocol.codec import NO_DATA
 from madns_runtime.protocol.messages import Delivery, FaultOrder, TransmissionRefusal
 from madns_runtime.protocol.states import AgentState
 from madns_runtime.reactor.reactor import Reactor
-from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.realtime.agent_calls import (
     AGENT,
     IDLE,
@@ -249,7 +248,7 @@ class AgentRunner:
         self._journal.event("phase", phase_s=self._pack.phase_s)
         if now_s > 0:
             self._pacer.skip_to(now_s)
-        freeze_garbage()  # what set-up made stays: no collection walks it in mid-run
+        self._port.process.freeze()
         self._session.ping_slack_s = min(2 * self._period_s, PING_SLACK_S_MAX)
         self._arm_end()
         self._pack.arm()

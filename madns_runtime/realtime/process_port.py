@@ -14,6 +14,7 @@ from madns_runtime.protocol.agent_session import PING_INTERVAL_S, PingPlan
 from madns_runtime.protocol.bundle import bundle_up, is_bundle, split
 from madns_runtime.protocol.datagram import agent_index_of
 from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.udp import UdpSocket
 from madns_runtime.recording.writer_thread import WriterThread
 from madns_runtime.timing.clocksync import ClockEstimate
@@ -58,6 +59,7 @@ class ProcessPort:
         """Bytes that may be on their way to each agent unread, so that all together fit the socket's buffer."""
         self._reactor = reactor
         self._made = 0
+        self._is_frozen = False
         self._takers: dict[int, Callable[[bytes], None]] = {}
         self._packets_max = PACKETS_BATCH_MAX if agents > 1 else 1
         self._waiting: list[bytes] | None = None
@@ -73,6 +75,12 @@ class ProcessPort:
             delay_s=interval_s * (number + 1) / self.agents,
             interval_s=interval_s,
         )
+
+    def freeze(self) -> None:
+        """Take what set-up made out of the collector's way, so that it is not walked in mid-run: once for all agents."""
+        if not self._is_frozen:
+            self._is_frozen = True
+            freeze_garbage()
 
     # Receiving.
 
