@@ -60,23 +60,28 @@ class Pack:
 
     def arm(self) -> None:
         """Wake up for the earliest tick of any member."""
-        deadline_s, member = min(
-            ((member.next_deadline_s(), member) for member in self._members), key=_deadline_of
-        )
-        self._timer.reschedule(math.inf if deadline_s == math.inf else member.local_s(deadline_s))
+        earliest_s, first = math.inf, None
+        for member in self._members:
+            deadline_s = member.next_deadline_s()
+            if deadline_s < earliest_s:
+                earliest_s, first = deadline_s, member
+        self._timer.reschedule(math.inf if first is None else first.local_s(earliest_s))
 
     def _due(self) -> None:
-        with self._process.together():
-            for member in self._members:
+        members, process = self._members, self._process
+        is_shared = len(members) > 1
+        if is_shared:
+            process.begin()
+        try:
+            for member in members:
                 member.tick()
             now_s = monotonic()
-            for member in self._members:
+            for member in members:
                 member.ping_if_due(now_s)
+        finally:
+            if is_shared:
+                process.end()
         self.arm()
-
-
-def _deadline_of(due: tuple[float, PackMember]) -> float:
-    return due[0]
 
 
 def split_into_packs(names: Sequence[str]) -> list[Sequence[str]]:

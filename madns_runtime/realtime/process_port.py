@@ -6,8 +6,7 @@ What its agents send together leaves as one packet, and what comes is dealt out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 from madns_runtime.config import AgentLaunch
 from madns_runtime.protocol.agent_session import PING_INTERVAL_S, PingPlan
@@ -62,7 +61,8 @@ class ProcessPort:
         self._is_frozen = False
         self._takers: dict[int, Callable[[bytes], None]] = {}
         self._packets_max = PACKETS_BATCH_MAX if agents > 1 else 1
-        self._waiting: list[bytes] | None = None
+        self._waiting: list[bytes] = []
+        self._depth = 0
 
     def pings(self) -> PingPlan:
         """Return when the next agent, of those that are made one after the other, exchanges times with the host."""
@@ -114,9 +114,12 @@ class ProcessPort:
         if datagrams is None:
             self._give(packet)
             return
-        with self.together():
+        self.begin()
+        try:
             for datagram in datagrams:
                 self._give(datagram)
+        finally:
+            self.end()
 
     def _give(self, datagram: bytes) -> None:
         takers = self._takers
@@ -129,25 +132,22 @@ class ProcessPort:
 
     # Sending.
 
-    @contextmanager
-    def together(self) -> Iterator[None]:
-        """Keep what is sent until the end of the block, and send it then: as few packets as hold it."""
-        if self._waiting is not None:
-            yield
-            return
-        self._waiting = []
-        try:
-            yield
-        finally:
+    def begin(self) -> None:
+        """Keep what is sent until `end`, which is owed whatever happens; blocks may lie in each other."""
+        self._depth += 1
+
+    def end(self) -> None:
+        """Send what was kept, at the end of the outermost block: as few packets as hold it."""
+        self._depth -= 1
+        if not self._depth and self._waiting:
             self.send_waiting()
-            self._waiting = None
 
     def send(self, datagram: bytes) -> None:
         """Send a datagram: now, or with others at the end of the block under way."""
-        if self._waiting is None:
-            self.socket.send(datagram)
-        else:
+        if self._depth:
             self._waiting.append(datagram)
+        else:
+            self.socket.send(datagram)
 
     def send_waiting(self) -> None:
         """Send what is kept, now."""

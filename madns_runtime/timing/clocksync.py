@@ -82,18 +82,23 @@ class _Served:
     """
     The continuous line that callers see.
 
-    Up to *until_s* it runs at 1 + drift + slew, from there on it is the estimated line.
+    For *slewing_s* it runs at 1 + drift + slew, from there on it is the estimated line.
     """
 
     anchor_s: float
     offset_s: float
     drift: float
     slew: float
-    until_s: float
+    slewing_s: float
+
+    @property
+    def until_s(self) -> float:
+        """Return the local time at which it meets the estimated line."""
+        return self.anchor_s + self.slewing_s
 
     def offset_at(self, local_s: float) -> float:
         since_s = local_s - self.anchor_s
-        slewing_s = min(max(since_s, 0.0), self.until_s - self.anchor_s)
+        slewing_s = min(max(since_s, 0.0), self.slewing_s)
         return self.offset_s + since_s * self.drift + slewing_s * self.slew
 
     def correction_left_s(self, local_s: float) -> float:
@@ -106,7 +111,7 @@ class _Served:
         ahead_s = host_s - self.anchor_s - self.offset_s
         if ahead_s <= 0:
             return self.anchor_s + ahead_s / (1 + self.drift)
-        slewing_s = self.until_s - self.anchor_s
+        slewing_s = self.slewing_s
         slewed_host_s = slewing_s * (1 + self.drift + self.slew)
         if ahead_s <= slewed_host_s:
             return self.anchor_s + ahead_s / (1 + self.drift + self.slew)
@@ -221,10 +226,15 @@ class ClockEstimate:
         Raises:
             PeerError: No exchange has come yet.
         """
-        served = self._known()
+        served = self._served or self._known()
         if local_s > self._asked_s:
             self._asked_s = local_s
-        return local_s + served.offset_at(local_s)
+        # As `offset_at` has it, without a call: several times a tick.
+        since_s = local_s - served.anchor_s
+        slewing_s = served.slewing_s
+        if since_s < slewing_s:
+            slewing_s = since_s if since_s > 0.0 else 0.0
+        return local_s + (served.offset_s + since_s * served.drift + slewing_s * served.slew)
 
     def to_local_s(self, host_s: float) -> float:
         """
@@ -302,7 +312,7 @@ class ClockEstimate:
             offset_s=offset_s,
             drift=line.drift,
             slew=math.copysign(rate, correction_s),
-            until_s=anchor_s + abs(correction_s) / rate,
+            slewing_s=abs(correction_s) / rate,
         )
 
 

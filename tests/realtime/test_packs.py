@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
@@ -81,7 +80,7 @@ class Loop:
 
 def pack_of(*members):
     loop = Loop()
-    pack = Pack(0.0, reactor=loop, process=SimpleNamespace(together=nullcontext))
+    pack = Pack(0.0, reactor=loop, process=SimpleNamespace(begin=int, end=int))
     for member in members:
         pack.add(member)
     return loop, pack

@@ -88,11 +88,13 @@ def test_what_is_nobodys_is_refused_by_the_first(host, packet):
 
 def test_what_is_sent_in_a_block_leaves_together_and_in_order(host):
     port = port_of(host, 3)
-    with port.together():
-        for index in (1, 2, 3):
-            port.send(datagram(index))
-        with port.together():
-            port.send(datagram(1, b"y"))
+    port.begin()
+    for index in (1, 2, 3):
+        port.send(datagram(index))
+    port.begin()
+    port.send(datagram(1, b"y"))
+    port.end()
+    port.end()
     port.send(datagram(2, b"z"))
 
     assert split(host.recv(2048)) == [datagram(1), datagram(2), datagram(3), datagram(1, b"y")]
@@ -101,19 +103,30 @@ def test_what_is_sent_in_a_block_leaves_together_and_in_order(host):
 
 def test_what_cannot_wait_takes_along_what_came_before_it(host):
     port = port_of(host, 2)
-    with port.together():
-        port.send(datagram(1))
-        port.send_waiting()
-        assert host.recv(2048) == datagram(1)
-        port.send(datagram(2))
+    port.begin()
+    port.send(datagram(1))
+    port.send_waiting()
+    assert host.recv(2048) == datagram(1)
+    port.send(datagram(2))
+    port.end()
     assert host.recv(2048) == datagram(2)
 
 
 def test_what_waits_is_sent_when_the_block_fails(host):
-    port = port_of(host, 2)
-    with pytest.raises(ValueError, match="a plug-in"), port.together():
+    loop = Loop()
+    port = port_of(host, 2, loop)
+
+    def fail(data):
         port.send(datagram(1))
         raise ValueError("a plug-in")
+
+    port.listen(7, fail)
+    port.send(b"hello")
+    _, address = host.recvfrom(2048)
+    (bundle,) = bundle_up([datagram(7), datagram(7)])
+    host.sendto(bundle, address)
+    with pytest.raises(ValueError, match="a plug-in"):
+        loop.turn()
 
     assert host.recv(2048) == datagram(1)
     port.send(datagram(2))
