@@ -19,7 +19,9 @@ ByteOrder = Literal["<", ">"]
 NAME_BYTES: Final = 32
 """Of a name, UTF-8, filled up with zeros; a longer one is cut."""
 TAIL_BYTES_MAX: Final = 16_384
-"""Of what follows a struct: a message's payload, the text of a log."""
+"""Of what follows a struct: a message's payload."""
+LOG_BYTES_MAX: Final = 8192
+"""Of the text of a log: more than the characters of it that are kept can have."""
 VALUES_MAX: Final = 13
 """In one reading: truth of a rigid body."""
 
@@ -67,6 +69,7 @@ class FlightContent:
     fields: tuple[ContentField, ...]
     tail: Literal["", "bytes", "doubles"] = ""
     """bytes: as many as its field size says; doubles: as many as its field count says."""
+    tail_bytes_max: int = TAIL_BYTES_MAX
     _structs: dict[str, struct.Struct] = field(default_factory=dict, compare=False, repr=False)
 
     def struct(self, order: ByteOrder) -> struct.Struct:
@@ -101,9 +104,29 @@ class FlightContent:
 
     def unpack(self, order: ByteOrder, data: bytes) -> dict[str, Any] | None:
         """Return the fields, and what follows under `tail`; None if the length is not that of this content."""
-        size = self.size
-        if len(data) < size:
+        if len(data) < self.size or not self.is_size(len(data)):
             return None
+        values = self._head(order, data)
+        tail = data[self.size :]
+        if len(tail) != self._tail_bytes(values):
+            return None
+        is_numbers = self.tail == "doubles"
+        values["tail"] = struct.unpack(f"{order}{len(tail) // 8}d", tail) if is_numbers else tail
+        return values
+
+    def is_size(self, size: int) -> bool:
+        """Tell whether struct and tail may have so many bytes together, whatever the struct says."""
+        return self.size <= size <= self.size + (self.tail_bytes_max if self.tail else 0)
+
+    def told_size(self, order: ByteOrder, data: bytes) -> int | None:
+        """Return how many bytes struct and tail have by what the struct says; None if not all of it is there."""
+        if not self.tail:
+            return self.size
+        if len(data) < self.size:
+            return None
+        return self.size + self._tail_bytes(self._head(order, data))
+
+    def _head(self, order: ByteOrder, data: bytes) -> dict[str, Any]:
         numbers = iter(self.struct(order).unpack_from(data))
         values: dict[str, Any] = {}
         for each in self.fields:
@@ -115,11 +138,6 @@ class FlightContent:
                 values[each.name] = next(numbers).split(b"\0")[0].decode("utf-8", "replace")
             else:
                 values[each.name] = next(numbers)
-        tail = data[size:]
-        if len(tail) != self._tail_bytes(values):
-            return None
-        is_numbers = self.tail == "doubles"
-        values["tail"] = struct.unpack(f"{order}{len(tail) // 8}d", tail) if is_numbers else tail
         return values
 
     def _tail_bytes(self, values: Mapping[str, Any]) -> int:
@@ -311,6 +329,7 @@ LOG: Final = FlightContent(
         _field("reserved", "5x"),
     ),
     tail="bytes",
+    tail_bytes_max=LOG_BYTES_MAX,
 )
 DONE: Final = FlightContent(
     name="done",

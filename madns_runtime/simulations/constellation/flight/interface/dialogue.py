@@ -68,6 +68,10 @@ class SequenceCount:
         """Take whatever number comes next."""
         self._next = None
 
+    def is_next(self, number: int) -> bool:
+        """Tell whether a number is the one that is expected, or the first of all."""
+        return self._next in (None, number)
+
     def takes(self, number: int) -> bool:
         """Return whether what bears a number is new."""
         if self._next is not None:
