@@ -101,7 +101,7 @@ def _pvt(solution: GnssSolution, quality: ToldQuality) -> bytes:
             *(accuracy_mm, accuracy_mm),
             *(_whole(1e3 * speed) for speed in (north, east, down)),
             _whole(1e3 * math.hypot(north, east)),
-            round(_course_deg(north, east) * 1e5),
+            _course(north, east, 10**5),
             round(1e3 * quality.velocity_m_s),
             0,  # accuracy of the course
             round(100.0 * quality.dilution),
@@ -166,7 +166,7 @@ def _gga(solution: GnssSolution, quality: ToldQuality) -> bytes:
     latitude, longitude, height_m = solution.geodetic()
     return nmea(
         f"GNGGA,{_time_of_day(solution)},{_place(latitude, longitude)},1,{quality.satellites:02d},"
-        f"{quality.dilution:.2f},{height_m - quality.geoid_m:.3f},M,{quality.geoid_m:.3f},M,,"
+        f"{quality.dilution:.2f},{_metres(height_m - quality.geoid_m)},M,{_metres(quality.geoid_m)},M,,"
     )
 
 
@@ -176,7 +176,7 @@ def _rmc(solution: GnssSolution, quality: ToldQuality) -> bytes:
     speed_kn = math.hypot(north, east) / KNOT_M_S
     return nmea(
         f"GNRMC,{_time_of_day(solution)},A,{_place(latitude, longitude)},{speed_kn:.3f},"
-        f"{_course_deg(north, east):.3f},{solution.utc:%d%m%y},,,A,V"
+        f"{_course(north, east, 1000) / 1000:.3f},{solution.utc:%d%m%y},,,A,V"
     )
 
 
@@ -198,19 +198,25 @@ def _time_of_day(solution: GnssSolution) -> str:
 
 def _place(latitude_rad: float, longitude_rad: float) -> str:
     latitude, longitude = math.degrees(latitude_rad), math.degrees(longitude_rad)
-    north, east = "N" if latitude >= 0.0 else "S", "E" if longitude >= 0.0 else "W"
-    return f"{_minutes(latitude, 2)},{north},{_minutes(longitude, 3)},{east}"
+    return f"{_minutes(latitude, 2, 'NS')},{_minutes(longitude, 3, 'EW')}"
 
 
-def _minutes(angle_deg: float, digits: int) -> str:
-    """Return an angle's size as degrees and minutes, of 2e-4 m on the ground."""
-    degrees, rest = divmod(round(abs(angle_deg) * 60.0 * 10**7), 60 * 10**7)
+def _minutes(angle_deg: float, digits: int, sides: str) -> str:
+    """Return an angle as degrees and minutes, of 2e-4 m on the ground, and its side."""
+    whole = round(angle_deg * 60.0 * 10**7)
+    degrees, rest = divmod(abs(whole), 60 * 10**7)
     minutes, fraction = divmod(rest, 10**7)
-    return f"{degrees:0{digits}d}{minutes:02d}.{fraction:07d}"
+    return f"{degrees:0{digits}d}{minutes:02d}.{fraction:07d},{sides[whole < 0]}"
 
 
-def _course_deg(north: float, east: float) -> float:
-    return math.degrees(math.atan2(east, north)) % 360.0
+def _course(north: float, east: float, parts: int) -> int:
+    """Return the course over ground in parts of a degree, from 0 to below 360 degrees: what rounds up to 360 is 0."""
+    return round(math.degrees(math.atan2(east, north)) * parts) % (360 * parts)
+
+
+def _metres(height_m: float) -> str:
+    """Return a height to the millimetre, without the sign of what rounds to none."""
+    return f"{round(height_m, 3) + 0.0:.3f}"
 
 
 def _toward_zero(number: int, divisor: int) -> int:

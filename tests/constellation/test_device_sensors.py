@@ -133,6 +133,7 @@ def test_a_device_that_is_not_well_gives_no_reading_and_is_counted(status):
         "skipped": 0,
         "absent": 3,
         "refused": 0,
+        "unpaired": 0,
         "without_truth": 0,
     }
 
@@ -203,6 +204,44 @@ def test_a_position_waits_for_its_velocity():
     bench.device.give((0.0, 7e3, 0.0), 0.1, "velocity")
 
     assert bench.step(2)["gnss"].values == (7e6, 0.0, 0.0, 0.0, 7e3, 0.0)
+
+
+def receiver():
+    return Bench(
+        {"gnss": {"device": "imu.position", "velocity": "velocity", "frame": "TEME"}},
+        more={"position": ChannelForm("m", 3), "velocity": ChannelForm("m/s", 3)}.items(),
+    )
+
+
+def test_positions_whose_velocity_has_stopped_are_counted_and_told():
+    bench = receiver()
+    readings = []
+    for tick in range(1, 21):
+        bench.device.give((7e6, 0.0, 0.0), tick / HZ, "position")
+        if not 6 <= tick <= 15:
+            bench.device.give((0.0, 7e3, 0.0), tick / HZ, "velocity")
+        readings += bench.step(tick).values()
+
+    counts = bench.suite.summary()["gnss"]
+    assert len(readings) == counts["samples"] == 10
+    assert (counts["unpaired"], counts["skipped"], counts["absent"]) == (10, 0, 0)
+    (told,) = [text for level, text in bench.context.logs if level == "warning"]
+    assert told.startswith("imu.velocity gave nothing to a sample of position by 0.7 s")
+
+
+def test_a_velocity_that_was_only_late_makes_no_position_unpaired():
+    bench = receiver()
+    for tick in range(1, 9):
+        bench.device.give((7e6, 0.0, 0.0), tick / HZ, "position")
+        late = tick % 2  # at every other tick the velocity comes behind it
+        if not late:
+            bench.device.give((0.0, 7e3, 0.0), tick / HZ, "velocity")
+        bench.step(tick)
+        if late:
+            bench.device.give((0.0, 7e3, 0.0), tick / HZ, "velocity")
+
+    counts = bench.suite.summary()["gnss"]
+    assert (counts["unpaired"], counts["samples"], counts["skipped"]) == (0, 4, 3)
 
 
 def test_truth_is_recorded_beside_at_the_time_of_the_sample():

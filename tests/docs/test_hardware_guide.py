@@ -189,7 +189,7 @@ def test_its_table_of_measurements_names_all_sensors_and_counts():
         re.findall(r"^\| `(\w+)`", table, flags=re.MULTILINE) for table in (of_sensors, of_counts)
     ]
     assert set(keys[0]) == {field.name for field in dataclasses.fields(Sensors)}
-    assert keys[1] == ["samples", "skipped", "absent", "refused", "without_truth"]
+    assert keys[1] == ["samples", "skipped", "absent", "refused", "unpaired", "without_truth"]
 
 
 def test_its_tables_name_all_settings_and_kinds():

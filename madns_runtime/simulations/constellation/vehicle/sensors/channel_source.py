@@ -66,7 +66,14 @@ class ChannelSource:
         self.absent = 0
         """Ticks without a reading since the device was stale or lost, or had not begun."""
         self.refused = 0
-        """Samples that are none: not of one time, of before the epoch, or without a direction."""
+        """Samples that are none: of before the epoch, or without a direction."""
+        self.unpaired = 0
+        """Positions of a receiver that a newer one followed before any velocity had."""
+        self._log = context.log
+        self._waiting: tuple[int, int] | None = None
+        """Numbers of a position that waits for its velocity, and of the velocity that was the newest then."""
+        self._unpaired_before = 0
+        """Counted when a reading was taken last."""
 
     def take(self) -> Reading | None:
         """Return the newest sample as a reading; None if it is no fresh one, or was returned before."""
@@ -76,11 +83,12 @@ class ChannelSource:
             self.absent += 1
             return None
         now_s = self._now_s()
-        if first.number == self._number or not _are_of_one_time(newest):
+        if first.number == self._number or not self._is_paired(newest, now_s):
             return None
         if self._number:
-            self.skipped += first.number - self._number - 1
-        self._number = first.number
+            unpaired = self.unpaired - self._unpaired_before
+            self.skipped += max(0, first.number - self._number - 1 - unpaired)
+        self._number, self._unpaired_before = first.number, self.unpaired
         t_s = round(now_s - first.age_s, TIME_DIGITS)
         raw = tuple(number for reading in newest for number in _numbers(reading.value))
         try:
@@ -91,6 +99,31 @@ class ChannelSource:
             self.refused += 1
             return None
         return Reading(t_s, values)
+
+    def _is_paired(self, newest: Sequence[ChannelReading], now_s: float) -> bool:
+        """Tell whether samples of several channels belong together; a position whose velocity never came is counted."""
+        number, other = newest[0].number, newest[-1].number
+        is_paired = _are_of_one_time(newest)
+        if self._waiting is not None and number != self._waiting[0]:
+            since, came = number - self._waiting[0], other - self._waiting[1]
+            missing = min(since, since + is_paired - came)
+            if missing > 0:
+                self._tell(now_s)
+                self.unpaired += missing
+            self._waiting = None
+        if is_paired:
+            self._waiting = None
+        elif self._waiting is None:
+            self._waiting = (number, other)
+        return is_paired
+
+    def _tell(self, now_s: float) -> None:
+        if not self.unpaired:
+            self._log(
+                "warning",
+                f"{self._device.name}.{self._names[-1]} gave nothing to a sample of {self._names[0]} by {now_s:g} s, "
+                "which so is no reading; others like it are counted as unpaired",
+            )
 
 
 def _are_of_one_time(newest: Sequence[ChannelReading]) -> bool:

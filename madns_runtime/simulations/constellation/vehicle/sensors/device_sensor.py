@@ -70,5 +70,6 @@ class DeviceSensor:
             "skipped": source.skipped,
             "absent": source.absent,
             "refused": source.refused,
+            "unpaired": source.unpaired,
             "without_truth": beside.without_truth + beside.waiting,
         }
