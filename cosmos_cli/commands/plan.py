@@ -18,6 +18,7 @@ from cosmos_cli.commands.fleet_command import (
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.launch.device_plan import plan_devices
 from cosmos_cli.launch.feasibility import BITS_PER_BYTE, Resources
+from cosmos_cli.launch.place_plan import check_places
 from cosmos_cli.launch.plan import make_plan
 from cosmos_cli.launch.plan_view import (
     BANDWIDTH_MBIT_DEFAULT,
@@ -73,6 +74,7 @@ def plan(
         processors=processors_here(),
         labels=scenario_file.labels,
     )
+    check_places(scenario_file, launch_plan)
     devices = list(itertools.chain(*plan_devices(scenario_file, launch_plan).values()))
     latency_s, latency_source = latency_of(launch_plan, given_ms=latency_ms)
     resources = Resources(

@@ -9,6 +9,7 @@ import typer
 
 from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.launch.access import chosen_access
+from cosmos_cli.launch.place_plan import place_notes
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
 
@@ -38,6 +39,8 @@ def validate(
             omitted += error.omitted
         else:
             found.append(scenario_file)
+            for note in place_notes(scenario_file):
+                console.say(f"note: {note}")
             console.data(f"{path}: ok: {_summary(scenario_file)}")
     if faults:
         raise InputError(faults=faults, omitted=omitted)

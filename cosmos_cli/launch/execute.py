@@ -25,6 +25,7 @@ from cosmos_cli.launch.access import chosen_access, with_access
 from cosmos_cli.launch.device_plan import plan_devices
 from cosmos_cli.launch.machines import RETURN_TIMEOUT_S, RemoteMachine, close_machines
 from cosmos_cli.launch.operator import Operator
+from cosmos_cli.launch.place_plan import check_places
 from cosmos_cli.launch.plan import LaunchPlan, make_plan
 from cosmos_cli.launch.preparation import (
     host_config,
@@ -162,6 +163,7 @@ def plan_of(scenario: ScenarioFile, options: RunOptions) -> LaunchPlan:
         labels=scenario.labels,
     )
     manual_agents(options, plan, scenario.labels)
+    check_places(scenario, plan)
     plan_devices(scenario, plan)  # what is wrong with them is told before any machine is reached
     return plan
 

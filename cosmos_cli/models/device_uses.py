@@ -41,7 +41,7 @@ def use_faults(
         if text is not None:
             agents_of.setdefault((use.field, text), {})[use.agent] = None
     return [
-        fault_found_at(document, f"{field}: {text} (of {_named(tuple(agents))})")
+        fault_found_at(document, f"{field}: {text} (of {named_agents(tuple(agents))})")
         for (field, text), agents in agents_of.items()
     ]
 
@@ -94,7 +94,8 @@ def _channel_faults(use: DeviceUse, channel: Channel) -> Iterator[str]:
         yield f"{name}: {wrong}"
 
 
-def _named(agents: Sequence[str]) -> str:
+def named_agents(agents: Sequence[str]) -> str:
+    """Return the first of some agents' names, and how many more there are."""
     more = len(agents) - AGENTS_NAMED_MAX
     named = ", ".join(agents[:AGENTS_NAMED_MAX])
     return f"{named} and {more} more" if more > 0 else named

@@ -16,12 +16,13 @@ from cosmos_cli.models.document import Document, apply_overrides, read_document
 from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.hardware import hardware_faults
 from cosmos_cli.models.own_requirements import own_requirement_faults
-from cosmos_cli.models.plugin_answers import ask_plugin, ask_plugin_demand
+from cosmos_cli.models.place_uses import CURE, shared_places
+from cosmos_cli.models.plugin_answers import ask_plugin, ask_plugin_demand, fault_found_at
 from cosmos_cli.models.scenario import Scenario, cross_faults
 from cosmos_cli.models.translate import faults_of
 from cosmos_cli.models.yaml_source import YamlSource, read_source
 from madns_runtime.config import RunConfig, to_mapping
-from madns_runtime.plugin.api import DeclaredStream, Demand
+from madns_runtime.plugin.api import DeclaredStream, Demand, PlaceUse
 
 _PLACEHOLDERS = {"name": "x", "simulation": "x", "agents": {"count": 1}}
 """Stand in for sections with faults, while the others are checked against each other."""
@@ -45,6 +46,8 @@ class ScenarioFile:
     """Streams that the simulation declares; None if it declares none."""
     labels: AgentLabels = NO_LABELS
     """Second names of the agents."""
+    place_uses: tuple[PlaceUse, ...] = ()
+    """What each agent takes of its machine for itself."""
 
     @property
     def base_directory(self) -> Path:
@@ -54,6 +57,10 @@ class ScenarioFile:
     def fault(self, path: ValuePath, text: str) -> Fault:
         """Return a fault at its place in the file, for what only a later step can find wrong."""
         return self._document().fault(path, text)
+
+    def fault_of(self, text: str) -> Fault:
+        """Return a fault at the parameter that a text names, as in `parameters.gain: too large`."""
+        return fault_found_at(self._document(), text)
 
     def demand(self) -> Demand:
         """
@@ -163,6 +170,12 @@ def _check(
         faults += hardware_faults(
             document, scenario, base_directory, labels=answers.labels, uses=answers.device_uses
         )
+        if scenario.time.is_lockstep:  # all on this computer
+            names = scenario.agents.resolved_names()
+            faults += [
+                fault_found_at(document, f"{field}: {text}; {CURE}")
+                for field, text in shared_places(answers.place_uses, names)
+            ]
     faults += [
         document.fault(where, text)
         for where, text in cross_faults(scenario, skip=broken, labels=answers.labels)
@@ -179,6 +192,7 @@ def _check(
         has_demand=answers.has_demand,
         streams=answers.streams,
         labels=answers.labels or NO_LABELS,
+        place_uses=answers.place_uses,
     )
 
 

@@ -31,7 +31,7 @@ from cosmos_cli.models.yaml_source import WHOLE_MAX, WHOLE_MIN
 from madns_runtime import errors as runtime_errors
 from madns_runtime.config import Agents, Timeouts, from_mapping, to_mapping
 from madns_runtime.errors import ConfigurationError, MadnsError, MissingExtraError, PluginError
-from madns_runtime.plugin.api import DeclaredStream, Demand, DeviceUse, Simulation
+from madns_runtime.plugin.api import DeclaredStream, Demand, DeviceUse, PlaceUse, Simulation
 from madns_runtime.plugin.code_places import blame, place_of
 from madns_runtime.plugin.columns import unknown_columns
 from madns_runtime.plugin.isolation import said
@@ -40,6 +40,7 @@ from madns_runtime.plugin.queries import (
     ask_demand,
     ask_device_uses,
     ask_labels,
+    ask_place_uses,
     ask_streams,
 )
 from madns_runtime.plugin.registry import (
@@ -72,6 +73,8 @@ class PluginAnswers:
     """Second names of agents; None if the simulation could not be asked for those it gives."""
     device_uses: tuple[DeviceUse, ...] = ()
     """Channels of devices that the parameters name; empty if nobody could be asked."""
+    place_uses: tuple[PlaceUse, ...] = ()
+    """What each agent takes of its machine for itself; empty if nobody could be asked."""
     omitted: int = 0
     """Number of further faults."""
 
@@ -199,11 +202,13 @@ class _Asking:
         streams: tuple[DeclaredStream, ...] | None = None
         labels: AgentLabels | None = NO_LABELS
         uses: tuple[DeviceUse, ...] = ()
+        places: tuple[PlaceUse, ...] = ()
         if simulation is not None and parameters is not None and self._agents is not None:
             self._check(simulation, parameters, self._agents, duration_s)
             streams = self._streams(simulation, parameters, self._agents)
             labels = self._labels(simulation, parameters, self._agents)
-            uses = self._device_uses(simulation, parameters, self._agents)
+            uses = self._uses(ask_device_uses, simulation.device_uses, parameters, self._agents)
+            places = self._uses(ask_place_uses, simulation.place_uses, parameters, self._agents)
         elif simulation is not None and simulation.labels is not None:
             labels = None
         first = self._faults[:FAULTS_SHOWN_MAX]
@@ -215,6 +220,7 @@ class _Asking:
             streams=streams,
             labels=labels,
             device_uses=uses,
+            place_uses=places,
         )
 
     def _blame(self, *texts: str) -> None:
@@ -326,15 +332,16 @@ class _Asking:
             return None
         return AgentLabels(column=simulation.label_column, names=found)
 
-    def _device_uses(
-        self, simulation: Simulation, parameters: Any, agents: Agents
-    ) -> tuple[DeviceUse, ...]:
-        where, names = simulation.device_uses, agents.resolved_names()
+    def _uses(
+        self, ask: Callable[..., tuple[T, ...]], where: str | None, parameters: Any, agents: Agents
+    ) -> tuple[T, ...]:
+        """Ask what the parameters make agents use: channels of devices, or places of their machines."""
         if where is None or self._faults:  # what is faulty names nothing that can be looked for
             return ()
-        self._tell(f"device_uses() of {simulation.name}")
+        self._tell(f"{where}()")
+        names = agents.resolved_names()
         try:
-            return ask_device_uses(where, self._base_directory, parameters=parameters, agents=names)
+            return ask(where, self._base_directory, parameters=parameters, agents=names)
         except MadnsError as error:
             self._blame(str(error))
             return ()

@@ -23,6 +23,7 @@ from madns_runtime.plugin.returned_values import (
     Demand,
     DeviceUse,
     Flow,
+    PlaceUse,
     Rerun,
     Tabulated,
 )
@@ -43,6 +44,7 @@ __all__ = [
     "Delivery",
     "DeviceStatus",
     "DeviceUse",
+    "PlaceUse",
     "DeviceView",
     "Demand",
     "Field",
@@ -322,6 +324,9 @@ class Simulation:
     device_uses: str | None = None
     """module:function of (parameters, agents: tuple[str, ...], base_directory: Path) -> sequence of `DeviceUse`: the
     channels of devices that the parameters name; `cosmos validate` looks for them. None if they name none."""
+    place_uses: str | None = None
+    """module:function of (parameters, agents: tuple[str, ...], base_directory: Path) -> sequence of `PlaceUse`: what
+    each agent takes of its machine for itself, such as a TCP port; two on one machine are refused before a run."""
     rerun: str | None = None
     """module:function of (parameters, agents: tuple[str, ...], run_directory: Path) -> `Rerun`: how a recorded run is
     flown again in lockstep with its devices played back (`cosmos rerun`). None: with the same parameters."""

@@ -12,10 +12,10 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from madns_runtime.errors import PluginError
-from madns_runtime.plugin.api import DeclaredStream, Demand, DeviceUse, Flow, Rerun
+from madns_runtime.plugin.api import DeclaredStream, Demand, DeviceUse, Flow, PlaceUse, Rerun
 from madns_runtime.plugin.code_places import place_of
 from madns_runtime.plugin.isolation import call_plugin
 from madns_runtime.plugin.registry import load_function
@@ -29,6 +29,7 @@ CHECK_MORE = ("names", "duration_s", "is_lockstep", "tick_hz")
 """What a `check` may take beside parameters, count of agents and folder."""
 FIGURE_MAX = 1e18
 """Of bytes, seconds and hertz; what is beyond is a slip, and its products with agents and rates need no infinity."""
+Use = TypeVar("Use", DeviceUse, PlaceUse)
 
 
 def ask_check(  # noqa: PLR0913 - what a scenario is; all but two by name
@@ -166,16 +167,46 @@ def ask_device_uses(
         PluginError: It cannot be found, raised, or did not return uses by agents of the scenario.
         MissingExtraError: It needs an optional dependency that is not installed.
     """
-    function = load_function(where, base_directory)
-    found = call_plugin(
-        "device_uses", function, parameters, agents, base_directory, finish=_unfolded
+    return _ask_uses(
+        "device_uses", DeviceUse, where, base_directory, arguments=(parameters, agents)
     )
-    known = set(agents)
+
+
+def ask_place_uses(
+    where: str, base_directory: Path, *, parameters: Any, agents: tuple[str, ...]
+) -> tuple[PlaceUse, ...]:
+    """
+    Return what each agent takes of its machine for itself alone.
+
+    Args:
+        where: module:function.
+        base_directory: Folder of the scenario.
+        parameters: An instance of the simulation's parameters.
+        agents: Their names.
+
+    Raises:
+        PluginError: It cannot be found, raised, or did not return uses by agents of the scenario.
+        MissingExtraError: It needs an optional dependency that is not installed.
+    """
+    return _ask_uses("place_uses", PlaceUse, where, base_directory, arguments=(parameters, agents))
+
+
+def _ask_uses(
+    name: str,
+    kind: type[Use],
+    where: str,
+    base_directory: Path,
+    *,
+    arguments: tuple[Any, tuple[str, ...]],
+) -> tuple[Use, ...]:
+    function = load_function(where, base_directory)
+    found = call_plugin(name, function, *arguments, base_directory, finish=_unfolded)
+    known = set(arguments[1])
     if not isinstance(found, list) or not all(
-        isinstance(use, DeviceUse) and use.agent in known for use in found
+        isinstance(use, kind) and use.agent in known for use in found
     ):
         raise PluginError(
-            f"{place_of(function)}: device_uses() must return DeviceUses of madns_runtime.plugin.api by agents of the"
+            f"{place_of(function)}: {name}() must return {kind.__name__}s of madns_runtime.plugin.api by agents of the"
             f" scenario, got {_shown(found)}"
         )
     return tuple(found)

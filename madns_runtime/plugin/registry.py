@@ -50,6 +50,7 @@ PARTS = (
     "streams",
     "labels",
     "device_uses",
+    "place_uses",
     "rerun",
     "medium",
     "tabulate",

@@ -101,6 +101,17 @@ class DeviceUse:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class PlaceUse:
+    """What an agent's half takes of its machine for itself alone by the scenario's parameters: checked before a run."""
+
+    agent: str
+    field: str
+    """Dotted name of the parameter that says so."""
+    place: str
+    """Such as serial port /dev/ttyUSB0: two agents of one machine cannot have the same."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Rerun:
     """How a simulation flies a recorded run again, in lockstep and with its devices played back."""
 

@@ -16,6 +16,7 @@ from test_flight_process import HZ, Ship, patience  # noqa: F401 - a fixture
 
 from madns_runtime.errors import BlamedError
 from madns_runtime.plugin.device_view import ChannelFrame
+from madns_runtime.simulations.constellation.flight.interface.socket_transports import resolve_both
 
 pytestmark = pytest.mark.process
 
@@ -285,7 +286,7 @@ def test_software_that_never_comes_is_named(tmp_path):
     ("transport", "words"),
     [
         ({"kind": "tcp", "address": "127.0.0.1:x"}, "transport.address: expected HOST:PORT"),
-        ({"kind": "unix", "path": "x" * 200}, "cannot be reached: AF_UNIX path too long"),
+        ({"kind": "unix", "path": "x" * 200}, "expected a path of at most 107 bytes, got 2"),
         ({"kind": "unix", "path": "no/such", "listen": True}, "cannot be listened at"),
         ({"kind": "udp", "local": "192.0.2.1:0"}, "cannot be received at"),
         ({"kind": "serial", "port": "/dev/no-such"}, "serial /dev/no-such: cannot be opened"),
@@ -388,3 +389,29 @@ class Own:
         ship.run(5)
 
     assert ship.context.records["estimates"] == [(n, n / HZ) for n in range(5)]
+
+
+def test_a_socket_that_somebody_listens_at_is_left_to_him_and_one_left_behind_gives_way(tmp_path):
+    transport = {"kind": "unix", "path": "a.sock", "listen": True}
+    first = socket.socket(socket.AF_UNIX)
+    first.bind(str(tmp_path / "a.sock"))
+    first.listen()
+
+    with pytest.raises(BlamedError, match="cannot be listened at: another program listens there"):
+        Attached(tmp_path, None, flight=attached(transport))
+    first.close()
+    with Attached(tmp_path, None, flight=attached(transport)):
+        assert (tmp_path / "a.sock").is_socket()
+    assert not (tmp_path / "a.sock").exists()
+
+
+@pytest.mark.parametrize(
+    ("local", "remote"), [("localhost:0", "127.0.0.1:9"), ("127.0.0.1:0", "localhost:9")]
+)
+def test_a_name_that_stands_for_both_kinds_of_addresses_fits_either(local, remote):
+    family, ours, theirs = resolve_both(local, remote)
+
+    assert family == socket.AF_INET
+    assert (ours[0], theirs[0]) == ("127.0.0.1", "127.0.0.1")
+    with pytest.raises(BlamedError, match="same kind as local"):
+        resolve_both("127.0.0.1:0", "[::1]:9")

@@ -3,13 +3,18 @@
 import json
 import random
 import sys
+from pathlib import Path
 
 import pytest
 from constellation_fakes import WALKER, parameters
 
 from cosmos_cli.errors import InputError
+from cosmos_cli.launch.place_plan import check_places, place_notes
+from cosmos_cli.launch.plan import make_plan
+from cosmos_cli.models.inventory.machine import Machine, Variables
 from cosmos_cli.models.loading import load_scenario
-from madns_runtime.simulations.constellation.check import find_faults
+from cosmos_cli.models.place_uses import shared_places
+from madns_runtime.simulations.constellation.check import find_faults, place_uses
 from madns_runtime.simulations.constellation.check_flight import SETTING_BYTES_MAX
 from madns_runtime.simulations.constellation.flight.interface import content
 from madns_runtime.simulations.constellation.flight.interface.json_lines import JsonLines
@@ -69,8 +74,8 @@ MCU = {"kind": "device", "device": "mcu"}
 VALVE = {"channel": "valve.line", "command": "delta_v", "vector": [1, 0, 0]}
 
 
-def read_scenario_faults(tmp_path, change):
-    """Return the faults of a scenario with other parameters, as `cosmos validate` tells them."""
+def write_scenario(tmp_path, change, **rest):
+    """Write a scenario with other parameters, and sections."""
     path = tmp_path / "scenario.yaml"
     document = {
         "name": "rules",
@@ -84,8 +89,15 @@ def read_scenario_faults(tmp_path, change):
             "propagator": {"kind": "scipy", "forces": ["two_body"]},
             **change,
         },
+        **rest,
     }
     path.write_text(json.dumps(document))
+    return path
+
+
+def read_scenario_faults(tmp_path, change, **rest):
+    """Return the faults of a scenario with other parameters, as `cosmos validate` tells them."""
+    path = write_scenario(tmp_path, change, **rest)
     with pytest.raises(InputError) as refused:
         load_scenario(path)
     faults = refused.value.faults
@@ -135,12 +147,139 @@ def read_scenario_faults(tmp_path, change):
             program(interface={"protocol": "space_packets"}, settings={"way": "x" * 49}),
             "parameters.flight.settings.way: expected a text of at most 48 bytes",
         ),
+        (
+            {
+                "interface": {
+                    "transport": {"kind": "udp", "local": "127.0.0.1:4", "remote": "[::1]:5"}
+                }
+            },
+            "parameters.flight.interface.transport.remote: expected an address of IPv4 as local, "
+            "127.0.0.1:4, is, got [::1]:5 of IPv6",
+        ),
+        (
+            [
+                {
+                    "interface": {
+                        "transport": {
+                            "kind": "udp",
+                            "local": "[::]:0",
+                            "remote": "10.0.0.${index}:5",
+                        }
+                    }
+                }
+            ],
+            "parameters.flight[0].interface.transport.remote: expected an address of IPv6 as local",
+        ),
+        (
+            {"interface": {"transport": {"kind": "unix", "path": "/" + "x" * 107}}},
+            "parameters.flight.interface.transport.path: expected a path of at most 107 bytes",
+        ),
+        (
+            {"interface": {"transport": {"kind": "unix", "path": "/" + "x" * 99 + "${name}"}}},
+            "parameters.flight.interface.transport.path: expected a path of at most 107 bytes, which "
+            "is all that a socket's may have, got 108: /",
+        ),
+        (
+            {"interface": {"transport": {"kind": "tcp", "address": "mcu:7${index}999"}}},
+            "parameters.flight.interface.transport.address: expected a port of at most 65535",
+        ),
     ],
 )
 def test_faults_name_their_rule(tmp_path, flight, words):
     (fault,) = faults(tmp_path, flight)
 
     assert fault.startswith(words)
+
+
+@pytest.mark.parametrize(
+    "transport",
+    [
+        {"kind": "udp", "local": "localhost:4", "remote": "[::1]:5"},
+        {"kind": "udp", "local": "10.0.0.${index}:4", "remote": "10.0.1.${index}:5"},
+        {"kind": "unix", "path": "/" + "x" * 98 + "${name}"},
+    ],
+)
+def test_addresses_that_can_be_are_none(tmp_path, transport):
+    assert faults(tmp_path, {"interface": {"transport": transport}}) == []
+
+
+def shared(*transports):
+    """Return how two agents would share a place, one rule for both or one each."""
+    rules = [{"interface": {"transport": one}} for one in transports]
+    rules = [{**rule, "agents": [name]} for rule, name in zip(rules, AGENTS, strict=False)]
+    flight = rules if len(rules) > 1 else {"interface": {"transport": transports[0]}}
+    uses = place_uses(parameters(WALKER, flight=flight), AGENTS, Path("/here"))
+    return shared_places(uses, AGENTS)
+
+
+FIELD = "parameters.flight.interface.transport"
+
+
+@pytest.mark.parametrize(
+    ("transports", "field", "place"),
+    [
+        ([{**TCP, "listen": True}], f"{FIELD}.address", "TCP port 127.0.0.1:4000"),
+        ([{"kind": "udp", "local": "0.0.0.0:4001"}], f"{FIELD}.local", "UDP port 4001"),
+        ([{"kind": "serial", "port": "/dev/ttyUSB0"}], f"{FIELD}.port", "serial port /dev/ttyUSB0"),
+        (
+            [{"kind": "unix", "path": "a.sock", "listen": True}],
+            f"{FIELD}.path",
+            "socket /here/a.sock",
+        ),
+        (
+            [{"kind": "udp", "local": "[::1]:4001"}, {"kind": "udp", "local": "[0::1]:04001"}],
+            "parameters.flight[0].interface.transport.local",
+            "UDP port ::1:4001",
+        ),
+        (
+            [
+                {"kind": "tcp", "address": "0.0.0.0:4001", "listen": True},
+                {"kind": "tcp", "address": "localhost:4001", "listen": True},
+            ],
+            "parameters.flight[0].interface.transport.address",
+            "TCP port 4001",
+        ),
+    ],
+)
+def test_a_place_that_two_agents_would_have_is_found(transports, field, place):
+    told = shared(*transports)
+
+    assert told[0] == (field, f"{place}: agent-01, agent-02 cannot have it at once on one machine")
+    assert len(told) == len(transports)
+
+
+@pytest.mark.parametrize(
+    "transports",
+    [
+        [TCP],  # software may take several connections
+        [{"kind": "tcp", "address": "127.0.0.1:0", "listen": True}],
+        [{"kind": "tcp", "address": "127.0.0.1:400${index}", "listen": True}],
+        [{"kind": "udp", "local": "127.0.0.${index}:4000"}],
+        [{"kind": "serial", "port": "/dev/tty-${satellite}"}],
+        [{**TCP, "listen": True}, {"kind": "udp", "local": "127.0.0.1:4000"}],
+        [{"kind": "pty"}],
+    ],
+)
+def test_places_of_ones_own_are_shared_by_nobody(transports):
+    assert shared(*transports) == []
+
+
+def test_a_shared_place_is_a_fault_where_all_run_here_and_a_note_where_machines_decide(tmp_path):
+    transport = {"kind": "serial", "port": "/dev/ttyUSB0"}
+    flight = {"interface": {"transport": transport}}
+    words = "transport.port: serial port /dev/ttyUSB0: agent-01, agent-02 cannot have it at once"
+    lockstep = {"time": {"mode": "lockstep", "duration_s": 3}}
+    (fault,) = read_scenario_faults(tmp_path, {"flight": flight}, **lockstep)
+    assert words in fault and "${name} or ${index} in it tells them apart" in fault
+
+    write_scenario(tmp_path, {"flight": flight})
+    scenario_file = load_scenario(tmp_path / "scenario.yaml")
+    (note,) = place_notes(scenario_file)
+    assert words in note and "scenario.yaml:" in note
+    with pytest.raises(InputError, match=r"one machine \(here this computer\)"):
+        check_places(scenario_file, make_plan(scenario_file.scenario))
+    boards = [Machine(name=name, address=name, variables=Variables()) for name in ("pi01", "pi02")]
+    check_places(scenario_file, make_plan(scenario_file.scenario, boards))
 
 
 def test_settings_are_held_to_the_fields_of_their_struct():

@@ -22,6 +22,7 @@ simulation = Simulation(
     streams=f"{_HERE}.streams:declared_streams",
     labels=f"{_HERE}.check:name_satellites",
     device_uses=f"{_HERE}.check:device_uses",
+    place_uses=f"{_HERE}.check:place_uses",
     rerun=f"{_HERE}.rerun:for_rerun",
     label_column="satellite",
     columns=("elements.a_m", "elements.e", "elements.mean_anomaly_deg"),

@@ -13,7 +13,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 from madns_runtime.errors import ConfigurationError, MissingExtraError
-from madns_runtime.plugin.api import DeviceUse
+from madns_runtime.plugin.api import DeviceUse, PlaceUse
 from madns_runtime.simulations.constellation.check_flight import flight_faults, rate_faults
 from madns_runtime.simulations.constellation.check_vehicles import board_faults, code_faults
 from madns_runtime.simulations.constellation.device_uses import uses_devices, uses_of
@@ -24,6 +24,7 @@ from madns_runtime.simulations.constellation.parameters import (
     ElementSetSatellites,
     Sgp4Propagator,
 )
+from madns_runtime.simulations.constellation.place_uses import place_uses_of, uses_places
 from madns_runtime.simulations.constellation.truth.element_set import ElementSet
 from madns_runtime.simulations.constellation.truth.satellite_selection import (
     SatelliteSelection,
@@ -107,6 +108,21 @@ def device_uses(
         for index, (agent, satellite) in enumerate(satellites.items())
         for use in uses_of(parameters, agent, index, satellite)
     ]
+
+
+def place_uses(
+    parameters: ConstellationParameters, agents: tuple[str, ...], base_directory: Path
+) -> list[PlaceUse]:
+    """
+    Return what vehicles take of their machines for themselves; see `plugin.api.Simulation`.
+
+    Raises:
+        ConfigurationError: The satellites cannot be chosen.
+    """
+    if not uses_places(parameters):
+        return []
+    satellites = name_satellites(parameters, agents, base_directory)
+    return list(place_uses_of(parameters, satellites, Path(base_directory)))
 
 
 def _propagator_faults(parameters: ConstellationParameters, base_directory: Path) -> list[str]:

@@ -6,11 +6,11 @@ As in `check_vehicles`: nothing of it is run.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+from madns_runtime.simulations.constellation.check_addresses import address_faults
 from madns_runtime.simulations.constellation.check_vehicles import WALL, code_faults, glob_faults
 from madns_runtime.simulations.constellation.flight.programs import find_program
 from madns_runtime.simulations.constellation.flight_rates import flight_rate
@@ -23,23 +23,16 @@ from madns_runtime.simulations.constellation.flight_settings import (
 )
 from madns_runtime.simulations.constellation.interface_settings import (
     PROTOCOLS,
-    DeviceTransport,
     FlightInterface,
-    SerialTransport,
     StdioTransport,
-    TcpTransport,
-    UdpTransport,
-    UnixTransport,
     is_played_back,
 )
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
-from madns_runtime.simulations.constellation.substitution import NAMES, unknown_names
-from madns_runtime.simulations.constellation.vehicles import flight_rules
+from madns_runtime.simulations.constellation.substitution import NAMES, substitution_faults
+from madns_runtime.simulations.constellation.vehicles import flight_of, flight_rules
 
 PLACES: Final = ("address", "pty")
 """Further names in braces, which a program is given: where its transport is."""
-ADDRESS: Final = re.compile(r".+:(\d{1,5})")
-PORT_MAX: Final = 65_535
 SETTING_BYTES_MAX: Final = {"name": 32, "text": 48}
 """Of a setting in frames and Space Packets, whose structs cut what is longer; a test holds them to the structs."""
 
@@ -75,6 +68,13 @@ def flight_faults(
         if interface is not None:
             inner = f"{field}.interface"
             faults += _interface_faults(inner, interface, base_directory, is_lockstep=is_lockstep)
+            flown = [
+                {"name": agent, "index": str(index), "satellite": satellite}
+                for index, (agent, satellite) in enumerate(names)
+                if flight_of(parameters, agent, satellite) is rule
+            ]
+            transport = f"{inner}.transport"
+            faults += address_faults(transport, interface.transport, flown, base_directory)
             if interface.protocol in ("frames", "space_packets"):
                 faults += _setting_faults(f"{field}.settings", rule.settings)
     return faults
@@ -122,15 +122,9 @@ def _substitution_faults(field: str, rule: FlightProcess) -> Iterator[str]:
     is_pty = rule.interface is not None and rule.interface.transport.kind == "pty"
     known = (*NAMES, *(PLACES if is_pty else PLACES[:1]))
     for number, word in enumerate(rule.command):
-        yield from _unknown(f"{field}.command[{number}]", word, known)
+        yield from substitution_faults(f"{field}.command[{number}]", word, known)
     for name, text in rule.environment.items():
-        yield from _unknown(f"{field}.environment.{name}", text, known)
-
-
-def _unknown(field: str, text: str, known: tuple[str, ...]) -> Iterator[str]:
-    expected = ", ".join(f"${{{name}}}" for name in known)
-    for found in unknown_names(text, known):
-        yield f"{field}: expected one of {expected}, got {found}; $${{ stands for ${{ itself"
+        yield from substitution_faults(f"{field}.environment.{name}", text, known)
 
 
 def _interface_faults(
@@ -152,25 +146,7 @@ def _interface_faults(
             f"{field}.clock: software with a clock of its own cannot wait for simulated time; take "
             "time.mode: realtime, or clock: stepped for software that answers each tick"
         )
-    for name, address in _addresses(interface):
-        faults += _unknown(f"{field}.transport.{name}", address, NAMES)
-        is_socket = isinstance(interface.transport, TcpTransport | UdpTransport)
-        if is_socket and "${" not in address:
-            faults += _port_faults(f"{field}.transport.{name}", interface.transport, address)
     return faults
-
-
-def _port_faults(field: str, transport: object, address: str) -> Iterator[str]:
-    found = ADDRESS.fullmatch(address)
-    if found is None:
-        yield f"{field}: expected HOST:PORT, got {address!r}"
-        return
-    if int(found[1]) > PORT_MAX:
-        yield f"{field}: expected a port of at most {PORT_MAX}, got {address!r}"
-        return
-    is_ours = transport.listen if isinstance(transport, TcpTransport) else field.endswith("local")
-    if int(found[1]) == 0 and not is_ours:
-        yield f"{field}: expected the port that the software listens at, got 0; a free one is for the agent's own address"
 
 
 def _setting_faults(field: str, settings: Mapping[str, Setting]) -> Iterator[str]:
@@ -182,20 +158,3 @@ def _setting_faults(field: str, settings: Mapping[str, Setting]) -> Iterator[str
         for value in given if isinstance(given, list) else [given]:
             if isinstance(value, str) and len(value.encode()) > most:
                 yield f"{field}.{name}: expected a text of at most {most} bytes for this protocol, got {value!r:.80}"
-
-
-def _addresses(interface: FlightInterface) -> Iterator[tuple[str, str]]:
-    """Yield names and values of a transport's addresses."""
-    transport = interface.transport
-    if isinstance(transport, TcpTransport):
-        yield "address", transport.address
-    elif isinstance(transport, UdpTransport):
-        yield "local", transport.local
-        if transport.remote is not None:
-            yield "remote", transport.remote
-    elif isinstance(transport, UnixTransport):
-        yield "path", transport.path
-    elif isinstance(transport, SerialTransport):
-        yield "port", transport.port
-    elif isinstance(transport, DeviceTransport):
-        yield "device", transport.device

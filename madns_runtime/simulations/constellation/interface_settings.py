@@ -12,6 +12,8 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Gt, Le, MinLen
 
 PROTOCOLS = ("json_lines", "frames", "space_packets")
+SOCKET_PATH_BYTES_MAX = 107
+"""Of a Unix socket's path: sun_path of Linux without its last zero."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Final
 
 NAMES: Final = ("name", "index", "satellite")
@@ -29,3 +29,10 @@ def unknown_names(text: str, known: tuple[str, ...]) -> list[str]:
         for match in PATTERN.finditer(text)
         if not match[1] and not (match[0].endswith("}") and match[2] in known)
     ]
+
+
+def substitution_faults(field: str, text: str, known: tuple[str, ...]) -> Iterator[str]:
+    """Yield a fault for each ${...} of a field's text that stands for nothing."""
+    expected = ", ".join(f"${{{name}}}" for name in known)
+    for found in unknown_names(text, known):
+        yield f"{field}: expected one of {expected}, got {found}; $${{ stands for ${{ itself"

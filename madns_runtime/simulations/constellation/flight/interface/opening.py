@@ -26,6 +26,7 @@ from madns_runtime.simulations.constellation.flight.interface.socket_transports 
     SocketLink,
     UdpLink,
     resolve,
+    resolve_both,
 )
 from madns_runtime.simulations.constellation.flight.interface.space_packets import SpacePackets
 from madns_runtime.simulations.constellation.flight.interface.transport import Transport
@@ -125,7 +126,5 @@ def _udp(given: settings.UdpTransport, values: Mapping[str, str]) -> UdpLink:
     remote = None
     if given.remote is not None:
         there = substitute(given.remote, values)
-        family_there, remote = resolve(there, socket.SOCK_DGRAM, "transport.remote")
-        if family_there != family:
-            raise BlamedError(f"transport.remote: expected an address like {local}, got {there}")
+        family, place, remote = resolve_both(local, there)
     return UdpLink(f"udp {local}", place, remote, family=family)

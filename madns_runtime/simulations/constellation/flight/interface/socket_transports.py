@@ -18,6 +18,7 @@ from madns_runtime.simulations.constellation.flight.interface.transport import (
     StreamTransport,
     Transport,
 )
+from madns_runtime.simulations.constellation.interface_settings import SOCKET_PATH_BYTES_MAX
 
 DATAGRAM_BYTES_MAX = 65_507
 DATAGRAMS_MAX = 256
@@ -57,13 +58,18 @@ class SocketLink(StreamTransport):
             BlamedError: The address cannot be listened at.
         """
         self.address = _shown(self._place)
+        if self._family == socket.AF_UNIX and len(os.fsencode(self._place)) > SOCKET_PATH_BYTES_MAX:
+            raise BlamedError(
+                f"{self.name}: expected a path of at most {SOCKET_PATH_BYTES_MAX} bytes, got "
+                f"{len(os.fsencode(self._place))}; an absolute one such as /tmp/NAME is shorter"
+            )
         if not self._listens:
             return
         try:
             self._listener = listener = socket.socket(self._family, socket.SOCK_STREAM)
             listener.setblocking(False)
             if self._family == socket.AF_UNIX:
-                _remove_socket(self._place)
+                _remove_socket(self._place, self.name)
             else:
                 listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(self._place)
@@ -238,13 +244,34 @@ def resolve(address: str, kind: int, where: str) -> tuple[int, Any]:
     Raises:
         BlamedError: It is none, or its host is not known.
     """
+    return _resolved(address, kind, where)[0]
+
+
+def resolve_both(local: str, remote: str) -> tuple[int, Any, Any]:
+    """
+    Return the family and the socket addresses of both ends of a UDP transport: a name may stand for IPv4 and IPv6.
+
+    Raises:
+        BlamedError: One is none, its host is not known, or they have no family in common.
+    """
+    ours = _resolved(local, socket.SOCK_DGRAM, "transport.local")
+    theirs = dict(reversed(_resolved(remote, socket.SOCK_DGRAM, "transport.remote")))
+    for family, place in ours:
+        if family in theirs:
+            return family, place, theirs[family]
+    raise BlamedError(
+        f"transport.remote: expected an address of the same kind as local, {local}, got {remote}: one is of IPv4 and "
+        "the other of IPv6"
+    )
+
+
+def _resolved(address: str, kind: int, where: str) -> list[tuple[int, Any]]:
     host, _, port = address.rpartition(":")
     try:
         found = socket.getaddrinfo(host.strip("[]") or None, int(port), type=kind)
     except (OSError, ValueError, OverflowError) as error:
         raise BlamedError(f"{where}: expected HOST:PORT, got {address!r}: {error}") from error
-    family, _, _, _, place = found[0]
-    return int(family), place
+    return [(int(family), place) for family, _, _, _, place in found]
 
 
 def _has_peer(one: socket.socket) -> bool:
@@ -255,11 +282,22 @@ def _has_peer(one: socket.socket) -> bool:
     return True
 
 
-def _remove_socket(path: str) -> None:
-    """Remove a socket that an earlier run has left behind; anything else stays, and is in the way."""
+def _remove_socket(path: str, name: str) -> None:
+    """
+    Remove a socket that an earlier run has left behind; anything else stays, and is in the way.
+
+    Raises:
+        BlamedError: Somebody listens there.
+    """
     with contextlib.suppress(OSError):
-        if stat.S_ISSOCK(os.stat(path, follow_symlinks=False).st_mode):
-            os.unlink(path)
+        if not stat.S_ISSOCK(os.stat(path, follow_symlinks=False).st_mode):
+            return
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+            probe.setblocking(False)
+            code = probe.connect_ex(path)
+        if code in (0, errno.EAGAIN, errno.EINPROGRESS):
+            raise BlamedError(f"{name}: cannot be listened at: another program listens there")
+        os.unlink(path)
 
 
 def _shown(place: Any) -> str:
