@@ -25,6 +25,8 @@ DATAGRAMS_MAX = 256
 """Read at once."""
 CONNECT_S = 1.0
 """For one attempt."""
+REFUSED_MAX = 16
+"""Turned away at once."""
 QUEUED_MAX = 1024
 """Packets that wait for somebody to send them to."""
 
@@ -49,6 +51,8 @@ class SocketLink(StreamTransport):
         """The connection, or what is to become one."""
         self._listener: socket.socket | None = None
         self._tried_s = -RETRY_S
+        if listens:
+            self.counts["peers_refused"] = 0  # who connected while another was there
 
     def open(self) -> None:
         """
@@ -77,6 +81,18 @@ class SocketLink(StreamTransport):
         except OSError as error:
             raise BlamedError(f"{self.name}: cannot be listened at: {error}") from error
         self.address = _shown(listener.getsockname())
+
+    def push(self) -> None:
+        """Connect, and send what waits; who comes second is turned away at once, and counted."""
+        super().push()
+        if self._listener is None or not self.is_ready:
+            return
+        for _ in range(REFUSED_MAX):
+            try:
+                self._listener.accept()[0].close()
+            except OSError:  # nobody
+                return
+            self.counts["peers_refused"] += 1
 
     def connect(self) -> None:
         """Accept, or try to connect again."""
