@@ -2,6 +2,7 @@
 
 import json
 import sys
+from pathlib import Path
 
 import pytest
 from constellation_fakes import Star, parameters
@@ -200,3 +201,34 @@ def test_a_program_is_given_samples_where_there_are_several(tmp_path):
     star.summaries()
 
     assert star.contexts["agent-01"].records["estimates"] == [(0, -1.0), (5, 5.0), (10, 5.0)]
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("protocol", ["json_lines", "frames", "space_packets"])
+@pytest.mark.parametrize(("rate_hz", "steps"), [(2.0, 5), (10.0, 21), (50.0, 101)])
+def test_by_every_protocol_each_step_is_one_report_and_one_answer(
+    tmp_path, protocol, rate_hz, steps
+):
+    program = Path(__file__).with_name("guided_program.py")
+    params = parameters(
+        vehicles=[{"sensors": {"gnss": {"rate_hz": rate_hz}}}],
+        flight={
+            "command": [sys.executable, str(program), protocol, "stdio"],
+            "interface": {"protocol": protocol},
+            "rate_hz": rate_hz,
+            "answer_s": 60.0,
+            "settings": {"a_m": 0.0, "tolerance_m": 1e12, "lead_s": 1.0},
+        },
+    )
+    star = Star(params, 1, base_directory=tmp_path, is_lockstep=True)
+    star.run(2.05)
+    flight = star.summaries()["agent-01"]["flight"]
+
+    counts = {
+        name: flight[name] for name in ("ticks_sent", "answers", "unanswered", "ticks_skipped")
+    }
+    assert counts == {"ticks_sent": steps, "answers": steps, "unanswered": 0, "ticks_skipped": 0}
+    assert not any(flight["interface"]["faults"].values())
+    records = star.contexts["agent-01"].records
+    # Each step had a measurement, and what was believed at it is on record.
+    assert len(records["gnss"]) == len(records["estimates"]) == steps
