@@ -33,6 +33,8 @@ from madns_runtime.timing.clocksync import ClockEstimate
 
 PING_INTERVAL_S = 0.25
 PING_INTERVAL_FIRST_S = 0.02
+REPORT_INTERVAL_S = 0.9
+"""So often a ping tells how the agent fares; making that up costs more than the exchange of times."""
 PINGS_FIRST = 12
 """The first exchanges follow closely, so that a clock estimate stands before T0."""
 CLOCK_ERROR_S_MAX = 0.02
@@ -81,7 +83,7 @@ class AgentSession:
         identity: Who speaks.
         wire: The run's secret and the bounds of the link.
         timeouts: The run's deadlines.
-        report: Called for every ping; what it returns is shown to the operator.
+        report: Called now and then; what it returns is told with a ping and shown to the operator.
         now_s: Present time of the local monotonic clock.
         clock: Estimate of the host's clock, shared with other agents of the process; None for one of its own.
         pings: When it exchanges times with the host.
@@ -118,6 +120,7 @@ class AgentSession:
         self._pings = pings
         self.ping_due_s = now_s if pings.brings_clock_up else now_s + pings.delay_s
         """When to say how it is; `handle_timer` does so. The timer comes `ping_slack_s` later."""
+        self._report_due_s = now_s
         self.ping_slack_s = 0.0
         """Time in which something else, such as a tick, wakes the loop for a ping that is due."""
         self._pings_closely = PINGS_FIRST if pings.brings_clock_up else 0
@@ -341,7 +344,11 @@ class AgentSession:
         is_first = self._pings_closely > 0
         self._pings_closely -= is_first
         self.ping_due_s = now_s + (PING_INTERVAL_FIRST_S if is_first else self._pings.interval_s)
-        self._send(messages.Ping(now_s, self._report()), Service.BEST, now_s)
+        report: Mapping[str, Any] = {}
+        if now_s >= self._report_due_s:
+            report = self._report()
+            self._report_due_s = now_s + REPORT_INTERVAL_S
+        self._send(messages.Ping(now_s, report), Service.BEST, now_s)
 
     def _check_deadlines(self, now_s: float) -> None:
         state = self.state

@@ -277,7 +277,7 @@ class HostSession:
             case messages.Transmission() if math.isfinite(message.sent_s):
                 self._events.append(told.AgentDataReceived(peer.name, message))
             case messages.Ping(t_agent_s, report):
-                peer.report = report
+                peer.report = report or peer.report
                 peer.pings.append((t_agent_s, now_s))
                 self._links.mark(peer)
             case messages.SimulationReady() if peer.phase is Phase.SETTING_UP:

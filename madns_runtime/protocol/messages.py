@@ -101,11 +101,12 @@ class Expelled:
 
 @dataclass(frozen=True, slots=True)
 class Ping:
-    """Agent -> host, BEST, all through the run: sign of life, clock exchange, and how the agent fares."""
+    """Agent -> host, BEST, all through the run: sign of life, clock exchange, and now and then how the agent fares."""
 
     KIND: ClassVar[int] = 10
     t_agent_s: float
     report: Mapping[str, Any]
+    """Empty: as before."""
 
 
 @dataclass(frozen=True, slots=True)
