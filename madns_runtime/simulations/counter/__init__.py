@@ -14,4 +14,5 @@ simulation = Simulation(
     streams="madns_runtime.simulations.counter.parameters:declared_streams",
     columns=("round_trips.round_trip_us",),
     figures="madns_runtime.simulations.counter.analysis:figures",
+    document="madns_runtime.simulations.counter.analysis:document",
 )

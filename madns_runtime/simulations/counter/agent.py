@@ -12,10 +12,16 @@ from madns_runtime.simulations.counter.round_trips import RoundTrips
 
 IN_FLIGHT_MAX = 10_000
 """Packets whose return is still awaited; an older one counts as lost when it leaves."""
+UNREAD_MAX = 10_000
+"""Answers that wait for the next tick; one beyond that is not read, and its packet counts as lost."""
 
 
 class CounterAgent(AgentSimulation):
-    """Each tick sends [packet, value, payload]; the host returns value + 1."""
+    """
+    Each tick sends [packet, value, payload]; the host returns value + 1.
+
+    Where the host times its answers, too, a fourth value names the newest packet whose answer was read; -1 for none.
+    """
 
     def setup(self, context: AgentContext, initial: Mapping[str, Any]) -> None:
         """Prepare the stream of round trips."""
@@ -36,16 +42,27 @@ class CounterAgent(AgentSimulation):
         name = context.parameters.send_device
         self._device = context.hardware[name] if name and name in context.hardware else None
         self._numbers: dict[str, int] = {}
+        self._reads_on_tick = context.parameters.read_on_tick
+        self._unread: list[Any] = []
+        self._unread_refused_count = 0
+        self._names_newest = context.parameters.host_round_trips
 
     def step(self, tick: Tick) -> None:
         """Increment and send."""
         packet = tick.index
+        if self._unread:
+            unread, self._unread = self._unread, []
+            for message in unread:
+                self._read(message)
         self._value += 1
         if len(self._in_flight) >= IN_FLIGHT_MAX:
             del self._in_flight[next(iter(self._in_flight))]
         self._in_flight[packet] = (self._context.now_s(), self._value)
         self._sent_count += 1
-        self._context.send(HOST, [packet, self._value, self._payload], self._service)
+        message = [packet, self._value, self._payload]
+        if self._names_newest:
+            message.append(self._newest)
+        self._context.send(HOST, message, self._service)
         if self._device is not None:
             self._send_samples(self._device)
 
@@ -62,6 +79,15 @@ class CounterAgent(AgentSimulation):
             self._context.send(HOST, [device.name, samples], Service.BEST)
 
     def receive(self, message: Any) -> None:
+        """Read a packet that came back, or keep it for the next tick."""
+        if not self._reads_on_tick:
+            self._read(message)
+        elif len(self._unread) < UNREAD_MAX:
+            self._unread.append(message)
+        else:
+            self._unread_refused_count += 1
+
+    def _read(self, message: Any) -> None:
         """Time a packet that came back."""
         now_s = self._context.now_s()
         packet, value, _ = message
@@ -83,6 +109,9 @@ class CounterAgent(AgentSimulation):
 
     def finish(self) -> Mapping[str, Any]:
         """Return the thesis's figures over all round trips, in whole microseconds."""
+        for packet, *_ in self._unread:  # it came back, but the tick at which it would be timed does not follow
+            self._returned_count += self._in_flight.pop(packet, None) is not None
+        self._unread = []
         lost = self._sent_count - self._returned_count
         summary: dict[str, Any] = {
             "service": self._service.name.lower(),
@@ -95,6 +124,8 @@ class CounterAgent(AgentSimulation):
             "round_trip_us": self._round_trips.statistics(),
             "round_trips_left_out": self._round_trips.left_out,
         }
+        if self._reads_on_tick:
+            summary["unread_refused"] = self._unread_refused_count
         summary["checks"] = [
             {"name": f"counter.{name}", "limit": 0, "got": got, "passed": got == 0}
             for name, got in (("lost", lost), ("wrong_values", self._wrong_count))

@@ -16,6 +16,13 @@ ROUND_TRIPS = (
     Field("round_trip_us", "us", "int"),
 )
 """One record per packet that came back."""
+ANSWER_ROUND_TRIPS = (
+    Field("t_s", "s"),
+    Field("agent", "", "str"),
+    Field("packet", "", "int"),
+    Field("round_trip_us", "us", "int"),
+)
+"""One record per answer that an agent's later packet showed to have arrived: from the answer to that packet."""
 DEVICE_SAMPLES = (
     Field("t_s", "s"),
     Field("device", "", "str"),
@@ -39,13 +46,23 @@ class CounterParameters:
     """Further bytes in every packet."""
     send_device: str = ""
     """A device whose newest samples agents that use it send to the host in each tick, as bare datagrams; empty for none."""
+    answer_hz: Annotated[float, Ge(0), Le(10_000)] = 0.0
+    """Rate of the host's own tick, on which it answers all that has come since the last one, Hz; 0: it answers at once."""
+    read_on_tick: bool = False
+    """Agents read answers at their next tick, as in the thesis, instead of when they come."""
+    host_round_trips: bool = False
+    """The host times its answers as well: until the first packet that the agent sent after it had the answer."""
 
 
 def declared_streams(
     parameters: CounterParameters, agents: tuple[str, ...]
 ) -> tuple[DeclaredStream, ...]:
     """Return the streams of both halves; see `plugin.api.Simulation`."""
-    round_trips = DeclaredStream(role="agent", name="round_trips", fields=ROUND_TRIPS)
-    if not parameters.send_device:
-        return (round_trips,)
-    return (round_trips, DeclaredStream(role="host", name="device_samples", fields=DEVICE_SAMPLES))
+    streams = [DeclaredStream(role="agent", name="round_trips", fields=ROUND_TRIPS)]
+    if parameters.send_device:
+        streams.append(DeclaredStream(role="host", name="device_samples", fields=DEVICE_SAMPLES))
+    if parameters.host_round_trips:
+        streams.append(
+            DeclaredStream(role="host", name="answer_round_trips", fields=ANSWER_ROUND_TRIPS)
+        )
+    return tuple(streams)

@@ -429,7 +429,14 @@ def test_run_config_holds_everything_and_survives_the_journey(tmp_path):
     config = found.run_config("0001-a")
 
     assert (config.run, config.scenario, config.simulation) == ("0001-a", "a", "counter")
-    assert config.parameters == {"service": "best", "payload_bytes": 0, "send_device": ""}
+    assert config.parameters == {
+        "service": "best",
+        "payload_bytes": 0,
+        "send_device": "",
+        "answer_hz": 0.0,
+        "read_on_tick": False,
+        "host_round_trips": False,
+    }
     assert from_mapping(RunConfig, to_mapping(config)) == config
 
 

@@ -6,9 +6,12 @@ from madns_runtime.analysis.chapters import Chapter, build_sections
 from madns_runtime.analysis.tables import RecordedRun
 from madns_runtime.analysis.values import Section
 from madns_runtime.recording.records import Field
+from madns_runtime.simulations.counter.analysis.benchmark import document
 from madns_runtime.simulations.counter.analysis.device_samples import device_sample_blocks
 from madns_runtime.simulations.counter.analysis.round_trips import ROUND_TRIP, round_trip_blocks
 from madns_runtime.simulations.counter.parameters import DEVICE_SAMPLES
+
+__all__ = ["CHAPTERS", "document", "figures"]
 
 CHAPTERS = {
     "round_trips": Chapter(
