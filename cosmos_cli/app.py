@@ -15,7 +15,7 @@ import os
 import sys
 import tempfile
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import typer
@@ -63,6 +63,7 @@ COMMANDS = (
     "diff",
     "rerun",
     "tabulate",
+    "bench",
 )
 INVENTORY_VARIABLE = "COSMOS_INVENTORY"
 GARBAGE_AFTER = 50_000
@@ -82,16 +83,20 @@ CLICK_ERROR: Any = USAGE_ERROR.__mro__[1]
 class LazyGroup(typer.core.TyperGroup):
     """The command group: `cosmos_cli.commands.<verb>` holds a function of the verb's name."""
 
+    verbs: Sequence[str] = COMMANDS
+    prefix = ""
+    """Verb of a group within the group, and a space."""
+
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the verbs in the order in which one meets them."""
-        return list(COMMANDS)
+        return list(self.verbs)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Import one command and build it; None for an unknown one."""
-        if cmd_name not in COMMANDS:
+        if cmd_name not in self.verbs:
             return None
         if cmd_name not in self.commands:
-            self.commands[cmd_name] = load_command(cmd_name)
+            self.commands[cmd_name] = load_command(f"{self.prefix}{cmd_name}")
         return self.commands[cmd_name]
 
     def invoke(self, ctx: Any) -> Any:
@@ -103,12 +108,12 @@ class LazyGroup(typer.core.TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the command that is meant; typer looks for similar names among loaded ones only."""
-        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+        if args and args[0] not in self.verbs and not args[0].startswith("-"):
             import difflib  # for typing errors alone
 
-            close = difflib.get_close_matches(args[0], COMMANDS, n=1)
-            hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(COMMANDS)}"
-            raise USAGE_ERROR(f"no command {args[0]!r}; {hint}", ctx)
+            close = difflib.get_close_matches(args[0], self.verbs, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(self.verbs)}"
+            raise USAGE_ERROR(f"no command {self.prefix + args[0]!r}; {hint}", ctx)
         return super().resolve_command(ctx, args)
 
 
@@ -147,14 +152,15 @@ def _counts_once(parameter: Any) -> bool:
 
 
 def load_command(verb: str) -> Any:
-    """Import `cosmos_cli.commands.<verb>` and return its function as a command."""
-    module = importlib.import_module(f"cosmos_cli.commands.{verb}")
+    """Import `cosmos_cli.commands.<verb>` and return its function as a command, or as a group of its SUBCOMMANDS."""
+    module = importlib.import_module(f"cosmos_cli.commands.{verb.replace(' ', '_')}")
     gc.set_threshold(GARBAGE_AFTER)
     gc.enable()
+    function = getattr(module, verb.rpartition(" ")[2])
+    if hasattr(module, "SUBCOMMANDS"):
+        return _as_group(function, verb, module.SUBCOMMANDS)
     settings = getattr(module, "CONTEXT_SETTINGS", None)
-    command = _as_command(
-        getattr(module, verb), name=verb, cls=StrictCommand, context_settings=settings
-    )
+    command = _as_command(function, name=verb, cls=StrictCommand, context_settings=settings)
     if verb in TIMED:
         command.params.append(_verbose_option())
     for parameter in command.params:
@@ -183,6 +189,29 @@ def _verbose_option() -> Any:
         """Hold the option."""
 
     return next(option for option in _as_command(told).params if option.name == "verbose")
+
+
+def each_command() -> Iterator[tuple[str, Any]]:
+    """Yield every command with its words, those of groups within the group as well."""
+    for verb in COMMANDS:
+        command = load_command(verb)
+        if isinstance(command, LazyGroup):
+            yield from (
+                (f"{verb} {name}", load_command(f"{verb} {name}")) for name in command.verbs
+            )
+        else:
+            yield verb, command
+
+
+def _as_group(function: Any, verb: str, verbs: Sequence[str]) -> Any:
+    """Return a group within the group; its commands stand in `cosmos_cli.commands.<verb>_<subcommand>`."""
+    app = typer.Typer(
+        name=verb, cls=LazyGroup, add_completion=False, no_args_is_help=True, rich_markup_mode=None
+    )
+    app.callback()(function)
+    group: Any = typer.main.get_command(app)
+    group.verbs, group.prefix = verbs, f"{verb} "
+    return group
 
 
 def _as_command(function: Any, **settings: Any) -> Any:

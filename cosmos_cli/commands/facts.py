@@ -111,6 +111,7 @@ def _settings(told: MachineFacts) -> list[str]:
     buffer_bytes = told.network.receive_buffer_bytes_max
     priority = told.realtime_priority_max
     words = [f"buffer {buffer_bytes}"] if buffer_bytes is not None else []
+    words += ["PREEMPT_RT"] if told.board.is_preempt_rt else []
     words.append(f"priority {'any' if priority is None else priority}")
     words += sorted(set(told.governors.values()))
     words += [f"{r.type} off" for r in told.radios if r.is_soft_blocked or r.is_hard_blocked]

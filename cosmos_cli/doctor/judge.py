@@ -24,6 +24,7 @@ CHECKS: Mapping[str, Check] = {
     "throttled": computer.throttled,
     "temperature": computer.temperature,
     "governor": realtime.governor,
+    "preempt_rt": realtime.preempt_rt,
     "realtime": realtime.realtime,
     "realtime_throttling": realtime.realtime_throttling,
     "wake_up": realtime.wake_up,

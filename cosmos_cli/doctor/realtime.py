@@ -36,6 +36,13 @@ def governor(case: Case) -> Iterator[CheckRemark]:
         )
 
 
+def preempt_rt(case: Case) -> Iterator[CheckRemark]:
+    """A kernel that can be interrupted everywhere; what it is worth there says `cosmos bench floor`."""
+    if case.facts.board.is_preempt_rt is not None:
+        kind = "PREEMPT_RT" if case.facts.board.is_preempt_rt else "not PREEMPT_RT"
+        yield CheckRemark(found=f"kernel {case.facts.board.kernel} is {kind}")
+
+
 def realtime(case: Case) -> Iterator[CheckRemark]:
     """SCHED_FIFO: with it the tail of the lateness is shorter by far (15 / 171 us against 16 / 6200)."""
     measured = case.part("wake_ups")

@@ -234,10 +234,18 @@ class Evidence:
             "checks": [check.to_mapping() for check in verdict.checks],
             "remarks": list(verdict.remarks),
             "scheduling": result.get("scheduling", {}),
+            "preempt_rt": self._preempt_rt(),
             **({"devices": dict(self.devices)} if self.devices else {}),
             "columns": self._columns(),
             "simulation": self._simulation(),
         }
+
+    def _preempt_rt(self) -> dict[str, bool | None]:
+        """Return whether the kernel is PREEMPT_RT, of the host's machine and of those with agents, as far as they told."""
+        told = {"host": mapping_at(self.result, "scheduling")}
+        for name, scheduling in self._of_agents("scheduling").items():
+            told.setdefault(self.machine_of_agent.get(name, LOOPBACK.name), scheduling)
+        return {who: each["preempt_rt"] for who, each in told.items() if "preempt_rt" in each}
 
     def _agents(self) -> dict[str, Any]:
         restarted = {

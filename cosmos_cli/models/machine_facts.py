@@ -70,6 +70,8 @@ class Computer:
     node: str = ""
     kernel: str = ""
     processors: int | None = None
+    is_preempt_rt: bool | None = None
+    """Whether its kernel is PREEMPT_RT."""
     os_name: str = ""
     """Such as Debian GNU/Linux 12 (bookworm)."""
     os_id: str = ""
@@ -230,6 +232,7 @@ class MachineFacts:
             "processors": self.board.processors,
             "node": self.board.node,
             "kernel": self.board.kernel,
+            "preempt_rt": self.board.is_preempt_rt,
             "os": self.board.os_name,
             "python": ".".join(map(str, self.python.version)),
             "python_executable": self.python.executable,
@@ -252,7 +255,7 @@ class MachineFacts:
 
 
 MISSING = FileFact()
-_BOARD_KEYS = ("model", "machine", "bits", "node", "kernel", "processors")
+_BOARD_KEYS = ("model", "machine", "bits", "node", "kernel", "processors", "is_preempt_rt")
 _DISK_KEYS = ("path", "total_bytes", "free_bytes", "is_read_only", "is_writable")
 
 

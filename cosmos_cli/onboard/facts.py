@@ -71,7 +71,7 @@ def facts(request: VerbRequest) -> dict[str, PlainValue]:
     sudo = _start_sudo() if is_sudo_asked else None
     return {
         "user": _user(),
-        "board": _board(sys_),
+        "board": _board(sys_, proc),
         "os": _release(etc),
         "python": _python(),
         "clock": _clock(proc),
@@ -116,7 +116,7 @@ def _user() -> dict[str, PlainValue]:
     return {"name": user_name(uid), "id": uid, "home": os.path.expanduser("~")}
 
 
-def _board(sys_: str) -> dict[str, PlainValue]:
+def _board(sys_: str, proc: str) -> dict[str, PlainValue]:
     system = os.uname()
     return {
         "model": read_text(f"{sys_}/firmware/devicetree/base/model")
@@ -126,7 +126,16 @@ def _board(sys_: str) -> dict[str, PlainValue]:
         "node": system.nodename,
         "kernel": system.release,
         "processors": os.cpu_count(),
+        "is_preempt_rt": is_preempt_rt(sys_, proc),
     }
+
+
+def is_preempt_rt(sys_: str, proc: str) -> bool | None:
+    """Tell whether the kernel is PREEMPT_RT: by its own file, which only such a one has, else by its version; None if unknown."""
+    if read_number(f"{sys_}/kernel/realtime") == 1:
+        return True
+    version = read_text(f"{proc}/version")
+    return None if version is None else "PREEMPT_RT" in version or "PREEMPT RT" in version
 
 
 def _release(etc: str) -> dict[str, str]:

@@ -22,6 +22,8 @@ from madns_runtime.reactor import libc
 NOT_LINUX = "this system is not Linux"
 CAP_IPC_LOCK = 14
 STATUS_FILE = Path("/proc/self/status")
+PREEMPT_RT_FILE = Path("/sys/kernel/realtime")
+"""Holds 1, and is there on such a kernel alone; newer ones tell it in their version only."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,6 +46,8 @@ class SchedulingGrant:
     memory_lock_refusal: str | None
     memory_lock_bytes_max: int | None
     """RLIMIT_MEMLOCK; None for no limit or where the system has none."""
+    preempt_rt: bool | None = None
+    """Whether the kernel is PREEMPT_RT; None where the system does not tell."""
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -114,7 +118,19 @@ def apply(scheduling: Scheduling, *, is_host: bool) -> SchedulingGrant:
         memory_locked=is_host and lock_refusal is None,
         memory_lock_refusal=lock_refusal,
         memory_lock_bytes_max=limit_bytes,
+        preempt_rt=is_preempt_rt(),
     )
+
+
+def is_preempt_rt() -> bool | None:
+    """Tell whether this kernel is PREEMPT_RT; None where the system is not Linux."""
+    if not libc.IS_LINUX:
+        return None
+    with contextlib.suppress(OSError):
+        if PREEMPT_RT_FILE.read_text().strip() == "1":
+            return True
+    version = os.uname().version
+    return "PREEMPT_RT" in version or "PREEMPT RT" in version
 
 
 def freeze_garbage() -> int:

@@ -6,7 +6,7 @@ import pytest
 from guides import GUIDES, ROOT, commands, spans
 from tower.faults import FAULTS
 
-from cosmos_cli.app import COMMANDS, load_command
+from cosmos_cli.app import COMMANDS, each_command
 
 ENVIRONMENT = re.compile(r"\bCOSMOS_[A-Z_]+")
 OTHERS_OPTIONS = {"--privileged"}
@@ -17,8 +17,8 @@ OTHERS_OPTIONS = {"--privileged"}
 def options():
     """The options of each command, long and short."""
     found = {}
-    for verb in COMMANDS:
-        parameters = load_command(verb).params
+    for verb, command in each_command():
+        parameters = command.params
         names = [name for each in parameters for name in (*each.opts, *each.secondary_opts)]
         found[verb] = {name for name in names if name.startswith("-")} | {"--help"}
     return found
@@ -27,6 +27,10 @@ def options():
 def unknown(words, options):
     """Return what is wrong with one command."""
     verb, given = words[1], words[2:]
+    if f"{verb} {' '.join(given[:1])}" in options:
+        verb, given = f"{verb} {given[0]}", given[1:]
+    elif any(one.startswith(f"{verb} ") for one in options) and not given:
+        return []
     if verb not in options:
         return [verb]
     given = given[: given.index("--")] if "--" in given else given

@@ -118,7 +118,8 @@ _FACTS: Mapping[str, Shape] = {
             "node": name,
             "kernel": name,
             "processors": maybe(whole(1)),
-        }
+        },
+        {"is_preempt_rt": maybe(flag)},
     ),
     "os": record(dict.fromkeys(("id", "version", "name", "code"), name)),
     "python": record(

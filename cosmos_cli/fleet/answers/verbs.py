@@ -169,6 +169,17 @@ def _doctor(asked: Asked) -> Shape:
     )
 
 
+_RANKS_US = maybe(record(dict.fromkeys(("p50", "p99", "p999", "max"), number)))
+_TIMING_FLOOR = record(
+    {
+        "refusal": maybe(name),
+        **dict.fromkeys(("due", "missed", "sent", "answered"), size),
+        "lateness_us": _RANKS_US,
+        "round_trip_us": _RANKS_US,
+        "is_preempt_rt": maybe(flag),
+        "error": maybe(name),
+    }
+)
 _WAKE_UPS = either(
     record({"count": whole(1), "rate_hz": number, "p99_ms": nothing}),
     record(
@@ -310,6 +321,7 @@ _ANSWERS: Mapping[str, Callable[[Asked], Shape]] = {
     "several": _several,
     "sizes": _always(record({}, {"gone": flag, "sizes": list_of(row([name, size]))})),
     "signal_group": _always(list_of(process_number)),
+    "timing_floor": _always(_TIMING_FLOOR),
     "tail": _always(
         record(
             {

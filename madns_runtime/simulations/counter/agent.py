@@ -109,7 +109,10 @@ class CounterAgent(AgentSimulation):
 
     def finish(self) -> Mapping[str, Any]:
         """Return the thesis's figures over all round trips, in whole microseconds."""
-        for packet, *_ in self._unread:  # it came back, but the tick at which it would be timed does not follow
+        for (
+            packet,
+            *_,
+        ) in self._unread:  # it came back, but the tick at which it would be timed does not follow
             self._returned_count += self._in_flight.pop(packet, None) is not None
         self._unread = []
         lost = self._sent_count - self._returned_count

@@ -27,7 +27,7 @@ class CounterHost(HostSimulation):
         self._samples: Counter[str] = Counter()
         """Samples of a device that have come, by agent."""
         self._context = context
-        self._answer_hz = context.parameters.answer_hz
+        self._answer_hz: float = context.parameters.answer_hz
         # Half of an agent's share of the period before its end: between two agents' ticks, not at one's.
         self._ahead = 0.5 / len(context.agents)
         self._ticks = 0
@@ -60,7 +60,7 @@ class CounterHost(HostSimulation):
         for agent, message in waiting:
             self._answer(agent, message)
         by_clock = math.floor(self._context.now_s() * self._answer_hz + self._ahead)
-        following = max(self._ticks, by_clock) + 1
+        following: int = max(self._ticks, by_clock) + 1
         self._missed_count += following - self._ticks - 1
         self._ticks = following
         return (following - self._ahead) / self._answer_hz

@@ -3,7 +3,7 @@
 import pytest
 
 from cosmos_cli import app
-from cosmos_cli.app import COMMANDS, load_command
+from cosmos_cli.app import each_command
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.loading import load_scenario
 
@@ -21,8 +21,8 @@ def scenario(tmp_path, monkeypatch):
 
 
 def single_options():
-    for verb in COMMANDS:
-        for parameter in load_command(verb).params:
+    for verb, command in each_command():
+        for parameter in command.params:
             is_option = parameter.param_type_name == "option"
             if is_option and not (parameter.multiple or parameter.is_flag or parameter.count):
                 yield verb, parameter.opts[0]
@@ -30,7 +30,7 @@ def single_options():
 
 @pytest.mark.parametrize(("verb", "option"), sorted(set(single_options())))
 def test_option_given_twice_is_refused(scenario, capsys, verb, option):
-    code = app.run([verb, option, "1", option, "2"])
+    code = app.run([*verb.split(), option, "1", option, "2"])
 
     assert code == 2
     assert f"{option} is given twice" in capsys.readouterr().err

@@ -15,7 +15,17 @@ from cosmos_cli.app import run
 pytestmark = pytest.mark.process
 
 NAMES = [
-    *("model", "architecture", "bits", "processors", "node", "kernel", "os", "python"),
+    *(
+        "model",
+        "architecture",
+        "bits",
+        "processors",
+        "node",
+        "kernel",
+        "preempt_rt",
+        "os",
+        "python",
+    ),
     *("python_executable", "user", "clock_offset_s", "uptime_s", "boot_id", "disk_total_bytes"),
     *("disk_free_bytes", "memory_total_bytes", "memory_available_bytes", "temperature_c"),
     *("throttled", "receive_buffer_bytes_max", "realtime_priority_max", "governors", "radios"),

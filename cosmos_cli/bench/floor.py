@@ -1,0 +1,149 @@
+"""The floor of machines: lateness of a bare loop's wake-ups and round trips of bare datagrams, as asked there and shown here."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+from cosmos_cli.doctor.probe import Responder
+from cosmos_cli.fleet.connection import Connection
+from cosmos_cli.fleet.helper import Helper
+from cosmos_cli.fleet.liveness import SilenceWatch
+from cosmos_cli.models.inventory import Machine
+from cosmos_cli.ui.console import Column
+from madns_runtime.config import Scheduling
+
+PARTS = ("files", "links", "facts", "udp_probe", "timing_floor")
+RATES_HZ: Final = (100.0, 1000.0)
+LINK_RATE_HZ: Final = 100.0
+"""Over the network: the answers of this computer's one responder to all machines are not to be what is measured."""
+TIMEOUT_S = 30.0
+"""For an answer, beside the time of the measurement."""
+FIGURES = ("p50", "p99", "p999", "max")
+Policy = Literal["normal", "fifo"]
+POLICIES: tuple[Policy, ...] = ("normal", "fifo")
+POLICY_WORDS: Mapping[Policy, str] = {"normal": "normal", "fifo": "SCHED_FIFO"}
+COLUMNS = (
+    Column("machine"),
+    Column("kernel"),
+    Column("way"),
+    Column("Hz", is_number=True),
+    Column("scheduling"),
+    *(Column(f"late {name} us", is_number=True) for name in ("p50", "p99", "p99.9", "max")),
+    Column("missed", is_number=True),
+    *(Column(f"trip {name} us", is_number=True) for name in ("p50", "p99", "p99.9", "max")),
+    Column("lost", is_number=True),
+)
+
+Told = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FloorQuestion:
+    """One measurement."""
+
+    way: Literal["loopback", "network"]
+    """From where datagrams come back: the same machine, or this computer."""
+    rate_hz: float
+    policy: Policy
+
+
+def questions(*, has_network: bool) -> list[FloorQuestion]:
+    """Return all measurements of a machine, in their order."""
+    found = [
+        FloorQuestion(way="loopback", rate_hz=rate_hz, policy=policy)
+        for rate_hz, policy in itertools.product(RATES_HZ, POLICIES)
+    ]
+    if has_network:
+        found += [
+            FloorQuestion(way="network", rate_hz=LINK_RATE_HZ, policy=policy) for policy in POLICIES
+        ]
+    return found
+
+
+def measure_floor(
+    connection: Connection,
+    seconds: float,
+    *,
+    responder: Responder | None = None,
+    machine: Machine | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> list[Told]:
+    """
+    Measure one machine.
+
+    Args:
+        connection: To the machine.
+        seconds: Length of each measurement.
+        responder: Answers datagrams of the network; None to leave these out.
+        machine: Its entry in the inventory, if it has one.
+        say: Told of each measurement that begins.
+
+    Returns:
+        One mapping per measurement: way, rate_hz, policy, and what the machine told.
+
+    Raises:
+        MachineFailure: It cannot be asked.
+    """
+    found = []
+    with Helper.start(connection, PARTS, watch=SilenceWatch(connection)) as helper:
+        for question in questions(has_network=responder is not None):
+            words = f"{question.way} at {question.rate_hz:g} Hz, {POLICY_WORDS[question.policy]}"
+            say(f"{connection.target.name}: {words}")
+            arguments = {
+                "count": max(1, round(seconds * question.rate_hz)),
+                "rate_hz": question.rate_hz,
+                "policy": question.policy,
+                "priority": Scheduling().priority,
+                "link": _link(connection, responder, machine)
+                if question.way == "network"
+                else None,
+            }
+            told = helper.call("timing_floor", arguments, timeout_s=seconds + TIMEOUT_S).value
+            found.append(
+                {
+                    "way": question.way,
+                    "rate_hz": question.rate_hz,
+                    "policy": question.policy,
+                    **told,
+                }
+            )
+    return found
+
+
+def _link(
+    connection: Connection, responder: Responder | None, machine: Machine | None
+) -> dict[str, Any] | None:
+    if responder is None:
+        return None
+    own = machine.variables.cosmos_host_address if machine else None
+    return {
+        "address": own or connection.own_address,
+        "port": responder.port,
+        "nonce_hex": responder.nonce.hex(),
+    }
+
+
+def rows_of(machine: str, measured: Sequence[Told]) -> Iterator[tuple[str, ...]]:
+    """Yield one row of the table per measurement."""
+    for told in measured:
+        late, trip = told["lateness_us"], told["round_trip_us"]
+        policy = POLICY_WORDS[told["policy"]]
+        words = f"{policy}: {told['refusal'] or told['error']}" if late is None else policy
+        yield (
+            machine,
+            "PREEMPT_RT" if told["is_preempt_rt"] else "",
+            told["way"],
+            f"{told['rate_hz']:g}",
+            words,
+            *_figures(late),
+            "" if late is None else str(told["missed"]),
+            *_figures(trip),
+            "" if late is None else str(told["sent"] - told["answered"]),
+        )
+
+
+def _figures(told: Mapping[str, float] | None) -> list[str]:
+    return [""] * len(FIGURES) if told is None else [f"{told[name]:.0f}" for name in FIGURES]

@@ -1,0 +1,175 @@
+"""`cosmos bench capacity`: the largest number of agents that keeps a budget of missed ticks, found by runs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cosmos_cli.bench.capacity import (
+    COLUMNS,
+    FIRST_DEFAULT,
+    SCENARIO,
+    CapacityFound,
+    CapacityTrials,
+    find_capacity,
+)
+from cosmos_cli.bench.prediction import CapacityPrediction, predict
+from cosmos_cli.commands.fleet_command import (
+    HostOption,
+    LimitOption,
+    SomeInventoryOption,
+    some_machines,
+)
+from cosmos_cli.errors import InputError
+from cosmos_cli.evidence.run_directory import runs_root
+from cosmos_cli.models.loading import load_scenario
+from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
+from madns_runtime.config import AGENTS_MAX, RATE_HZ_MAX
+
+MINUTES_DEFAULT = 30.0
+MINUTES_MAX = 24 * 60.0
+SECONDS_MAX = 3600.0
+
+
+def capacity(
+    scenario: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[SCENARIO]", help="What agents do; default: they count with the host."
+        ),
+    ] = None,
+    hz: Annotated[
+        float,
+        typer.Option(
+            "--hz", metavar="HZ", min=0.1, max=RATE_HZ_MAX, help="Ticks per second of each agent."
+        ),
+    ] = 100.0,
+    max_miss_ratio: Annotated[
+        float,
+        typer.Option(min=0.0, max=1.0, help="Budget: largest share of ticks that may be missed."),
+    ] = 1e-3,
+    inventory: SomeInventoryOption = None,
+    limit: LimitOption = None,
+    host: HostOption = None,
+    seconds: Annotated[
+        float,
+        typer.Option("--seconds", metavar="S", min=1.0, max=SECONDS_MAX, help="Of each trial, s."),
+    ] = 10.0,
+    per_process: Annotated[
+        int, typer.Option("--per-process", metavar="N", min=1, help="Agents in one process.")
+    ] = 1,
+    first: Annotated[
+        int,
+        typer.Option(
+            "--first", metavar="N", min=1, max=AGENTS_MAX, help="Agents of the first trial."
+        ),
+    ] = FIRST_DEFAULT,
+    largest: Annotated[
+        int,
+        typer.Option("--largest", metavar="N", min=1, max=AGENTS_MAX, help="More are not tried."),
+    ] = AGENTS_MAX,
+    resolution: Annotated[
+        float,
+        typer.Option(
+            min=0.0, max=1.0, help="Ends when what breaks is within this share above what holds."
+        ),
+    ] = 0.05,
+    tries: Annotated[
+        int,
+        typer.Option(
+            min=1,
+            max=10,
+            help="Runs that must break the budget before a number counts as too large.",
+        ),
+    ] = 1,
+    minutes: Annotated[
+        float,
+        typer.Option(
+            metavar="M", min=0.1, max=MINUTES_MAX, help="No trial begins after so many minutes."
+        ),
+    ] = MINUTES_DEFAULT,
+    set_: SetOption = None,
+    runs: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", envvar="COSMOS_RUNS", help="Folder of all runs; default: ./runs."
+        ),
+    ] = None,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """
+    Find how many agents keep a budget of missed ticks, here or on an inventory, and what the plan predicts.
+
+    Doubles their number until the budget breaks, then bisects; each trial is a run, and is kept. Ends with 4 when no
+    number keeps it, with 3 when machines failed.
+    """
+    console = Console(json=json, quiet=quiet)
+    if first > largest:
+        raise InputError(f"--first {first} is more than --largest {largest}")
+    machines = some_machines(inventory, limit, host)
+    trials = CapacityTrials(
+        hz=hz,
+        max_miss_ratio=max_miss_ratio,
+        seconds=seconds,
+        per_process=per_process,
+        first=first,
+        largest=largest,
+        resolution=resolution,
+        tries=tries,
+        end_s=time.monotonic() + minutes * 60,
+        is_machines_fault=any(machine.connection != "local" for machine in machines),
+    )
+    _refuse_own_settings(set_ or (), trials)
+    options = ["--runs", str(runs_root(runs))]
+    options += [word for each in inventory or () for word in ("--inventory", each)]
+    options += ["--limit", limit] if limit else []
+    options += ["--host", host] if host else []
+    options += [word for each in set_ or () for word in ("--set", each)]
+    settings = [*(set_ or ()), *trials.overrides(first)]
+    checked = load_scenario(scenario or SCENARIO, settings, warn=console.warn)
+    predicted = predict(checked, machines)
+    found = find_capacity(trials, checked.path, options, console.say)
+    console.table(COLUMNS, [trial.row() for trial in found.trials])
+    console.data(_verdict(found, trials, predicted))
+    console.print_json(
+        {
+            "hz": hz,
+            "max_miss_ratio": max_miss_ratio,
+            "seconds": seconds,
+            "per_process": per_process,
+            "agents": found.search.held,
+            "broken_at": found.search.broken,
+            "predicted": asdict(predicted) if predicted else None,
+            "stopped_by": found.stopped_by or None,
+            "trials": [trial.to_mapping() for trial in found.trials],
+            "exit_code": int(found.exit_code),
+        }
+    )
+    return int(found.exit_code)
+
+
+def _refuse_own_settings(given: Sequence[str], trials: CapacityTrials) -> None:
+    own = {each.partition("=")[0] for each in trials.overrides(1)}
+    for each in given:
+        if each.partition("=")[0].strip() in own:
+            raise InputError(f"--set {each}: trials set that themselves; use the command's options")
+
+
+def _verdict(
+    found: CapacityFound, trials: CapacityTrials, predicted: CapacityPrediction | None
+) -> str:
+    parts = [
+        f"{trials.hz:g} Hz, at most {trials.max_miss_ratio:g} of the ticks missed: {found.words}"
+    ]
+    if found.stopped_by:
+        parts.append(f"stopped: {found.stopped_by}")
+    if predicted is not None:
+        limit = "no limit" if predicted.agents is None else str(predicted.agents)
+        parts.append(f"cosmos plan predicts {limit} ({predicted.source})")
+    return "; ".join(parts)
