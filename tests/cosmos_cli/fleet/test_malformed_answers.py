@@ -121,6 +121,13 @@ def questions(root: Path) -> dict[str, dict]:
             "round_trips": ROUND_TRIPS,
         },
         "round_trips": ROUND_TRIPS,
+        "timing_floor": {
+            "count": 2,
+            "rate_hz": 100.0,
+            "policy": "normal",
+            "priority": 1,
+            "link": None,
+        },
         "root_content": {"root": own, "state": state},
         "release": {**where, "manifest_sha256": "unknown"},
         "discard": {**where, "shown": {}},
