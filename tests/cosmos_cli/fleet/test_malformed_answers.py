@@ -45,6 +45,7 @@ PARTS = [
     "interfaces",
     "doctor",
     "apt_words",
+    "timing_floor",
 ]
 EMPTY = hashlib.sha256().hexdigest()
 NOT_TRIED = {
