@@ -89,9 +89,14 @@ class Deadline(ScenarioSection):
     overrun_ms: Annotated[float, Ge(0)] = 5.0
     """A step that ends later than this after its period is an error, before it a warning (thesis A.2.5)."""
     lateness_ms: Annotated[float, Ge(0)] | None = None
-    """Latest wake-up of an idle loop that `cosmos doctor` finds good enough for a run. Not given: overrun_ms."""
+    """Latest wake-up of an idle loop that `cosmos doctor` finds good enough for a run; a tick that begins later is told with its cause. Not given: overrun_ms."""
     max_miss_ratio: Annotated[float, Ge(0), Le(1)] = 1e-3
     """Largest share of ticks that may be missed, and of ticks whose step ended more than overrun_ms too late."""
+
+    @property
+    def lateness_limit_s(self) -> float:
+        """Latest begin of a tick that needs no explanation, s."""
+        return (self.overrun_ms if self.lateness_ms is None else self.lateness_ms) * 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,6 +7,7 @@ Nothing in it polls on a period, and no callback may block.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import signal
 import sys
@@ -118,6 +119,10 @@ class Reactor:
         self._is_woken = False
         self._is_stopping = False
         self._is_closed = False
+        self.slept_s = 0.0
+        """Time that it has waited for something to do, s."""
+        self.last_sleep = (-math.inf, -math.inf)
+        """When it waited last: from, to, on its clock, s."""
         self.add_reader(self._wake_read_fd, self._run_calls)
 
     def now_s(self) -> float:
@@ -213,15 +218,21 @@ class Reactor:
 
     def _turn(self) -> None:
         until_s = self._timers.earliest_s()
-        if until_s <= time.monotonic():
+        now_s = time.monotonic()
+        if until_s <= now_s:
             self._run_timers()
             if self._is_stopping:
                 return
             until_s = self._timers.earliest_s()
+            now_s = time.monotonic()
         if self._always_readable:
             until_s = 0.0
         self._added.clear()
-        self._run_readers(self._poller.wait(until_s))
+        ready = self._poller.wait(until_s)
+        woken_s = time.monotonic()
+        self.slept_s += woken_s - now_s
+        self.last_sleep = (now_s, woken_s)
+        self._run_readers(ready)
 
     def _run_timers(self) -> None:
         """Run timers that are due by now, a bounded number."""

@@ -32,6 +32,8 @@ from madns_runtime.realtime.agent_calls import (
 )
 from madns_runtime.realtime.agent_link import AgentPort
 from madns_runtime.realtime.agent_report import AgentReport
+from madns_runtime.realtime.late_ticks import LateTicks
+from madns_runtime.realtime.loop_account import Span
 from madns_runtime.realtime.packs import Pack
 from madns_runtime.realtime.process_port import ProcessPort
 from madns_runtime.realtime.process_records import ProcessRecords
@@ -40,6 +42,7 @@ from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
 from madns_runtime.recording.run_journal import RunJournal
 from madns_runtime.timing.clock import utc_at_iso
+from madns_runtime.timing.late_causes import Cause
 from madns_runtime.timing.rate import Pacer, RealTimeFactor
 
 PING_SLACK_S_MAX = 0.1
@@ -116,18 +119,24 @@ class AgentRunner:
         # Called every tick: without a layer between.
         self._step, self._receive = half.simulation.step, half.simulation.receive
         self._record = recorder.record
+        self._spans = process.account.add
         self._pack = pack
         self._pacer = _make_pacer(config, pack.phase_s)
+        self._period_s = 1.0 / config.agents.tick_hz
+        self._late_s = config.deadline.lateness_limit_s
+        self._late = LateTicks(
+            self._seat, self._period_s, recorder=recorder, account=process.account
+        )
         self._factor = RealTimeFactor()
         self._report = AgentReport(
             port=self._port,
             records=self._records,
             pacer=self._pacer,
             factor=self._factor,
+            late=self._late,
             columns=NewestValues(recorder, program.columns),
             devices=seat.hardware if launch.is_detached else NO_HARDWARE,
         )
-        self._period_s = 1.0 / config.agents.tick_hz
         # Infinite is never: each timer is made once and moved.
         self._end_timer = reactor.call_at(math.inf, self._finish_run)
         self._usage_timer = reactor.call_at(math.inf, self._record_usage)
@@ -174,11 +183,13 @@ class AgentRunner:
         self._pump()
 
     def _session_due(self) -> None:
+        began_s = monotonic()
         # What waits in the socket is heard before the host is blamed for silence.
         self._port.process.drain()
         if not self._is_closed:
             self._session.handle_timer(monotonic())
             self._pump()
+        self._spans(Span(Cause.HOUSEKEEPING, self._seat, began_s, monotonic()))
 
     def _pump(self) -> None:
         """Carry out the session's events, send what is due, arm its timer."""
@@ -253,6 +264,7 @@ class AgentRunner:
         self._arm_end()
         self._pack.arm()
         self._records.begin_usage()
+        self._late.started_s = monotonic()
         self._tell_time()
         self._usage_timer.reschedule(monotonic() + self._config.health.period_s)
 
@@ -277,7 +289,8 @@ class AgentRunner:
         pacer, port = self._pacer, self._port
         if self._session.state is not AgentState.RUN_SIMULATION:
             return
-        began_s = port.now_s()
+        local_s = monotonic()
+        began_s = port.at(local_s)
         timing = pacer.begin(began_s)
         if timing is None:
             self._arm_end()
@@ -302,9 +315,13 @@ class AgentRunner:
         if port.must_flush:
             # What the step sent leaves before anything else is done.
             port.flush()
-        margin_s = pacer.end(port.now_s())
+        ended_s = monotonic()
+        margin_s = pacer.end(port.at(ended_s))
         values = (index, int(lateness_s * 1e6), int(margin_s * 1e6), missed)
         self._record("ticks", values)
+        if missed or lateness_s > self._late_s:
+            self._late.explain(timing, local_s)
+        self._spans(Span(Cause.STEP, self._seat, local_s, ended_s))
         if pacer.is_over:
             self._arm_end()
 
@@ -343,7 +360,7 @@ class AgentRunner:
     def _finish_run(self) -> None:
         if self._session.state is not AgentState.RUN_SIMULATION:
             return
-        self._pacer.finish(self._port.now_s())
+        self._late.never_run(self._pacer.finish(self._port.now_s()), monotonic())
         self._takes_data = False  # what comes from now on is too late for the summary
         summary = self._call("finish")
         if self._session.state is AgentState.RUN_SIMULATION:
@@ -385,8 +402,11 @@ class AgentRunner:
 
     def _record_usage(self) -> None:
         if self._session.state is AgentState.RUN_SIMULATION:
+            began_s = monotonic()
             self._records.usage()
+            self._port.process.account.look()
             self._tell_time()
+            self._spans(Span(Cause.HOUSEKEEPING, self._seat, began_s, monotonic()))
             self._usage_timer.reschedule(monotonic() + self._config.health.period_s)
 
     # Towards the simulation ------------------------------------------------------------------------

@@ -118,6 +118,10 @@ class AgentPort:
             return -self._lead_s
         return self.session.clock.to_host_s(monotonic()) - self.t0_host_s
 
+    def at(self, local_s: float) -> float:
+        """Return the simulated time when this machine's monotonic clock shows *local_s*, s; it must have begun."""
+        return self.session.clock.to_host_s(local_s) - self.t0_host_s  # type: ignore[operator]
+
     def t_s(self) -> float | None:
         """Return the simulated time, s; None before it runs."""
         return None if self.t0_host_s is None else self.now_s()

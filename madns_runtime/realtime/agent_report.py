@@ -9,6 +9,7 @@ from typing import Any
 
 from madns_runtime.hardware.port import Hardware
 from madns_runtime.realtime.agent_link import AgentPort
+from madns_runtime.realtime.late_ticks import LateTicks
 from madns_runtime.realtime.process_records import ProcessRecords
 from madns_runtime.recording.newest_values import NewestValues
 from madns_runtime.timing.rate import Pacer, RealTimeFactor
@@ -22,6 +23,7 @@ class AgentReport:
     records: ProcessRecords
     pacer: Pacer
     factor: RealTimeFactor
+    late: LateTicks
     columns: NewestValues
     devices: Hardware
     """Devices that no operator hears of: the host hears of them by pings."""
@@ -49,7 +51,7 @@ class AgentReport:
         """Return what the host is told at the end; *simulation* is the summary of the agent's half."""
         clock, now_s = self.port.session.clock, monotonic()
         return {
-            "ticks": dict(self.pacer.summary()),
+            "ticks": {**self.pacer.summary(), "causes": self.late.counts()},
             "rtf": self._real_time_factor(),
             "clock": {
                 "offset_us": clock.offset_s(now_s) * 1e6,

@@ -72,6 +72,7 @@ class Pack:
         is_shared = len(members) > 1
         if is_shared:
             process.begin()
+        process.account.begin_ticks(monotonic())
         try:
             for member in members:
                 member.tick()

@@ -7,6 +7,7 @@ What its agents send together leaves as one packet, and what comes is dealt out.
 from __future__ import annotations
 
 from collections.abc import Callable
+from time import monotonic
 
 from madns_runtime.config import AgentLaunch
 from madns_runtime.protocol.agent_session import PING_INTERVAL_S, PingPlan
@@ -15,8 +16,10 @@ from madns_runtime.protocol.datagram import agent_index_of
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.udp import UdpSocket
+from madns_runtime.realtime.loop_account import NOBODY, LoopAccount, Span
 from madns_runtime.recording.writer_thread import WriterThread
 from madns_runtime.timing.clocksync import ClockEstimate
+from madns_runtime.timing.late_causes import Cause
 
 RECEIVE_BUFFER_BYTES = 1024 * 1024
 """Receive buffer asked for per agent ..."""
@@ -52,6 +55,7 @@ class ProcessPort:
         self.agents = agents
         self.clock = ClockEstimate()
         self.writer = WriterThread(launch.config.recording)
+        self.account = LoopAccount(reactor, self.writer, agents)
         # The kernel charges a small datagram with more than its bytes: half the buffer is kept for that.
         share_bytes = socket.receive_buffer_bytes // max(4, 2 * agents)
         self.window_bytes = max(WINDOW_BYTES_MIN, share_bytes)
@@ -95,6 +99,7 @@ class ProcessPort:
         if self._takers.pop(agent_index, None) is not None and not self._takers:
             self._reactor.remove_reader(self.socket.fileno())
             self.socket.close()
+            self.account.close()
 
     def drain(self) -> None:
         """Take what waits in the socket, a bounded number of packets."""
@@ -102,12 +107,14 @@ class ProcessPort:
             self._deal_out(packet)
 
     def _readable(self) -> None:
+        began_s = monotonic()
         # Of an agent by itself one datagram, and back to the loop, which looks for more: most often there is one.
         for _ in range(self._packets_max):
             packet = self.socket.receive()
             if packet is None:
-                return
+                break
             self._deal_out(packet)
+        self.account.add(Span(Cause.RECEIVING, NOBODY, began_s, monotonic()))
 
     def _deal_out(self, packet: bytes) -> None:
         datagrams = split(packet) if is_bundle(packet) else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from madns_runtime.health.probe import ProcessUsage
-from madns_runtime.recording.records import CLOCK, PROCESS, TICKS
+from madns_runtime.recording.records import CLOCK, LATE_TICKS, PROCESS, TICKS
 from madns_runtime.recording.run_journal import RunJournal
 from madns_runtime.timing.clocksync import ClockEstimate
 
@@ -17,7 +17,7 @@ PROBLEM_CHARACTERS_MAX = 200
 
 class ProcessRecords:
     """
-    The streams ticks, clock and process of one agent.
+    The streams ticks, late_ticks, clock and process of one agent.
 
     Args:
         journal: Of the agent; these streams lie beside its own.
@@ -29,7 +29,7 @@ class ProcessRecords:
     def __init__(self, journal: RunJournal) -> None:
         self._recorder = journal.recorder
         self._t_s = journal.t_s
-        for schema in (TICKS, CLOCK, PROCESS):
+        for schema in (TICKS, LATE_TICKS, CLOCK, PROCESS):
             self._recorder.open_stream(schema)
         self._clock_recorded_s = 0.0
         self._usage = ProcessUsage()

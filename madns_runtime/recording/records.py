@@ -65,6 +65,17 @@ TICKS = StreamSchema(
 )
 """Every tick of an agent: wake-up minus deadline, time left when the step ended, ticks skipped before it."""
 
+LATE_TICKS = StreamSchema(
+    "late_ticks",
+    (
+        Field("tick", "", "int"),
+        Field("lateness_us", "us", "int"),
+        Field("missed", "", "int"),
+        Field("cause", "", "str"),
+    ),
+)
+"""Ticks that began too late, or not at all (*missed*, just before this one), and what was measured to be the cause."""
+
 CLOCK = StreamSchema(
     "clock",
     (
@@ -158,6 +169,6 @@ PROCESS = StreamSchema(
 """Use of resources by a process of the run: CPU since its last record, memory, and counters since its start."""
 
 FRAMEWORK_STREAMS = frozenset(
-    schema.name for schema in (TICKS, CLOCK, EVENTS, LOG, HEALTH, PROCESS)
+    schema.name for schema in (TICKS, LATE_TICKS, CLOCK, EVENTS, LOG, HEALTH, PROCESS)
 )
 """Names that no simulation's stream can have."""

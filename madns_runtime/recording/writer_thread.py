@@ -6,7 +6,7 @@ import contextlib
 import math
 import os
 import threading
-from time import monotonic
+from time import monotonic, thread_time
 from typing import Protocol
 
 from madns_runtime.config import Recording
@@ -46,6 +46,8 @@ class WriterThread:
         self._hurry = threading.Event()
         self._writings: list[_Writing] = []
         self._thread: threading.Thread | None = None
+        self.newest_pass = (-math.inf, -math.inf, 0.0)
+        """When it wrote last: begin and end, s of the monotonic clock, and the CPU time that this took, s."""
 
     def writes(self, files: RecordFiles) -> RecordWriter:
         """Return the writer of some more files."""
@@ -76,6 +78,7 @@ class WriterThread:
             (self._hurry if is_troubled else self._wake).wait(self._settings.flush_interval_s)
             self._wake.clear()
             self._hurry.clear()
+            began_s, computed_s = monotonic(), thread_time()
             closing = [writing for writing in self._writings if writing.is_closing]
             must_sync = monotonic() - synced_s >= interval_s
             writings = list(self._writings)
@@ -83,6 +86,7 @@ class WriterThread:
             if must_sync:
                 is_troubled |= not all([writing.files.sync() for writing in writings])
                 synced_s = monotonic()
+            self.newest_pass = (began_s, monotonic(), thread_time() - computed_s)
             for writing in closing:
                 writing.files.finish()
                 writing.is_done.set()

@@ -70,6 +70,11 @@ class Member:
         self.pings += 1
 
 
+PROCESS = SimpleNamespace(
+    begin=int, end=int, account=SimpleNamespace(begin_ticks=lambda now_s: None)
+)
+
+
 class Loop:
     def call_at(self, when_s, callback):
         self.timer = SimpleNamespace(when_s=when_s)
@@ -80,7 +85,7 @@ class Loop:
 
 def pack_of(*members):
     loop = Loop()
-    pack = Pack(0.0, reactor=loop, process=SimpleNamespace(begin=int, end=int))
+    pack = Pack(0.0, reactor=loop, process=PROCESS)
     for member in members:
         pack.add(member)
     return loop, pack

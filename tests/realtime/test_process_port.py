@@ -16,6 +16,8 @@ from madns_runtime.realtime.process_port import PING_INTERVAL_S, ProcessPort
 class Loop:
     """What a port asks of the reactor."""
 
+    slept_s = 0.0
+
     def __init__(self):
         self.readers = {}
 

@@ -1,0 +1,67 @@
+"""The ticks of one agent that began late or never: each counted, and recorded, under one cause."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+
+from madns_runtime.realtime.loop_account import LateTick, LoopAccount
+from madns_runtime.recording.recorder import Recorder
+from madns_runtime.recording.records import LATE_TICKS
+from madns_runtime.timing.late_causes import CAUSES, Cause
+from madns_runtime.timing.rate import TickTiming
+
+
+class LateTicks:
+    """
+    The account of one agent.
+
+    Args:
+        seat: Its number among the agents of its process.
+        period_s: Of its ticks.
+        recorder: Where they are recorded.
+        account: What its loop did.
+    """
+
+    def __init__(
+        self, seat: int, period_s: float, *, recorder: Recorder, account: LoopAccount
+    ) -> None:
+        self.started_s = 0.0
+        """When the agent began to run, s of the local clock."""
+        self._seat = seat
+        self._period_s = period_s
+        self._recorder = recorder
+        self._account = account
+        self._counts: Counter[Cause] = Counter()
+
+    def explain(self, timing: TickTiming, began_s: float) -> None:
+        """
+        Count and record a tick that began late, and those missed before it, under one cause.
+
+        Args:
+            timing: Of the tick.
+            began_s: When it began, s of the local clock.
+        """
+        index, _, _, lateness_s, missed = timing
+        late = LateTick(
+            self._seat,
+            began_s - lateness_s - missed * self._period_s,
+            began_s,
+            self.started_s,
+            self._period_s,
+        )
+        cause = self._account.explain(late)
+        self._counts[cause] += missed or 1
+        self._recorder.record(LATE_TICKS.name, (index, int(lateness_s * 1e6), missed, cause.value))
+
+    def never_run(self, missed: int, now_s: float) -> None:
+        """Count the last ticks of the run, if they were *missed*, at the local time *now_s*, s."""
+        if missed:
+            late = LateTick(
+                self._seat, now_s - missed * self._period_s, now_s, self.started_s, self._period_s
+            )
+            self._counts[self._account.explain(late)] += missed
+
+    def counts(self) -> Mapping[str, int]:
+        """Return how many ticks were missed, or began late, by cause; those of which there are none left out."""
+        return {cause.value: self._counts[cause] for cause in CAUSES if self._counts[cause]}
