@@ -24,6 +24,9 @@ WAIT_S_MAX = 86_400.0
 class Poller(Protocol):
     """Waits for descriptors to be readable, until a deadline."""
 
+    timer_settings: int
+    """How often the kernel's timer was set; 0 without one."""
+
     def register(self, fd: int) -> None:
         """
         Watch *fd*.
@@ -92,6 +95,7 @@ class EpollPoller:
         self._timer = TimerFd()
         self._timer_fd = self._timer.fd
         self._armed_s = math.inf
+        self.timer_settings = 0
         self._epoll.register(self._timer.fd, select.EPOLLIN | select.EPOLLET)
 
     def register(self, fd: int) -> None:
@@ -111,6 +115,7 @@ class EpollPoller:
                 timeout_s = 0.0
             else:
                 self._timer.set(until_s)
+                self.timer_settings += 1
                 self._armed_s = until_s
         ready = []
         for fd, _ in self._epoll.poll(timeout_s, EVENTS_MAX):
@@ -132,6 +137,7 @@ class SelectorPoller:
 
     def __init__(self) -> None:
         self._selector = selectors.DefaultSelector()
+        self.timer_settings = 0
 
     def register(self, fd: int) -> None:
         """Watch *fd*; see `Poller`."""

@@ -119,6 +119,8 @@ class Reactor:
         self._is_woken = False
         self._is_stopping = False
         self._is_closed = False
+        self.waits = 0
+        """How often it has waited for something to do."""
         self.slept_s = 0.0
         """Time that it has waited for something to do, s."""
         self.last_sleep = (-math.inf, -math.inf)
@@ -128,6 +130,11 @@ class Reactor:
     def now_s(self) -> float:
         """Return the time of the clock that timers are set on, s."""
         return time.monotonic()
+
+    @property
+    def timer_settings(self) -> int:
+        """How often the kernel's timer was set."""
+        return self._poller.timer_settings
 
     def add_reader(self, fd: int, callback: Callback) -> None:
         """
@@ -230,6 +237,7 @@ class Reactor:
         self._added.clear()
         ready = self._poller.wait(until_s)
         woken_s = time.monotonic()
+        self.waits += 1
         self.slept_s += woken_s - now_s
         self.last_sleep = (now_s, woken_s)
         self._run_readers(ready)

@@ -43,6 +43,7 @@ class UdpSocket:
         warning: What to do about a receive buffer smaller than asked for; None if it is as asked.
         sent: Datagrams handed to the kernel.
         received: Datagrams received.
+        empty_reads: Looks for a datagram when none was waiting.
         send_refused: Datagrams not sent because the kernel's buffers were full.
         peer_refused: ICMP answers that nobody listens at the peer's port.
         failures: Other errors that the kernel reported; `last_failure` is the text of the last.
@@ -63,6 +64,7 @@ class UdpSocket:
         self.warning = buffer_warning(receive_buffer_bytes, self.receive_buffer_bytes)
         self.sent = 0
         self.received = 0
+        self.empty_reads = 0
         self.send_refused = 0
         self.peer_refused = 0
         self.failures = 0
@@ -167,6 +169,7 @@ class UdpSocket:
             try:
                 datagram = receive(DATAGRAM_BYTES_MAX)
             except BlockingIOError:
+                self.empty_reads += 1
                 return
             except OSError as error:
                 if self._is_closed:
@@ -206,6 +209,7 @@ class UdpSocket:
         return {
             "sent": self.sent,
             "received": self.received,
+            "empty_reads": self.empty_reads,
             "receive_buffer_bytes": self.receive_buffer_bytes,
             "dropped_by_kernel": self.dropped_by_kernel,
             "send_refused": self.send_refused,
@@ -220,7 +224,9 @@ class UdpSocket:
         self._socket.close()
 
     def _note_receive(self, error: OSError) -> None:
-        if not self._is_closed and not isinstance(error, BlockingIOError):
+        if isinstance(error, BlockingIOError):
+            self.empty_reads += 1
+        elif not self._is_closed:
             self._count(error)
 
     def _count(self, error: OSError) -> None:

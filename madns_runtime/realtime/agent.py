@@ -382,6 +382,7 @@ class AgentRunner:
             **counts.to_mapping(),
             "messages": messages,
             "network": self._port.network(),
+            "loop": self._port.process.loop(),
             "between_agents": self._port.mailbox.counts(),
             "held_dropped": self._session.held_dropped_count,
             "malformed": self._session.malformed_count,

@@ -86,6 +86,10 @@ class ProcessPort:
             self._is_frozen = True
             freeze_garbage()
 
+    def loop(self) -> dict[str, int]:
+        """Return how often the loop has waited, and set its timer; it is one for all agents of the process."""
+        return {"waits": self._reactor.waits, "timer_settings": self._reactor.timer_settings}
+
     # Receiving.
 
     def listen(self, agent_index: int, take: Callable[[bytes], None]) -> None:
