@@ -1,19 +1,23 @@
 """
 The counting benchmark beside a bare UDP echo star of the same shape, measured in the same run.
 
-    python benchmarks/star.py [--seconds 20] [--shapes 24x100,93x100] [--json]
+    python benchmarks/star.py [--seconds 20] [--shapes 24x100,93x100/47] [--pairs 1] [--json]
 
-The bare star is the least that Python can do: one echo process, one process an agent, no seal, no
-acknowledgement, no records; both stars stagger their agents, run under the same scheduling policy
-and alternate, so that what else the machine does hits both.
+A shape is agents x Hz, and how many agents share a process. The bare star is the least that Python can do: one echo
+process, the same processes and packs of agents, no seal, no acknowledgement, no records, and one datagram per pack.
+Both stars stagger their packs, run under the same scheduling policy and alternate, so that what else the machine
+does hits both; of several pairs the median of each figure and of each ratio is told.
 """
 
 from __future__ import annotations
 
 import argparse
+import heapq
 import json
+import math
 import os
 import resource
+import select
 import socket
 import statistics
 import struct
@@ -23,13 +27,15 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from madns_runtime.health.probe import pss_bytes
 from madns_runtime.processes import list_processes
+from madns_runtime.realtime.packs import split_into_packs
 
-PACKET = struct.Struct("<Id")
+PACKET = struct.Struct("<IId")
 PACKET_BYTES = 64
 RECEIVE_BUFFER_BYTES = 4 * 1024 * 1024
 FIFO_PRIORITY = 10
@@ -46,31 +52,70 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument("--seconds", type=float, default=20.0, help="length of each measurement")
     parser.add_argument(
-        "--shapes", type=shapes, default="24x100,93x100", help="agents x Hz, comma-separated"
+        "--shapes",
+        type=shapes,
+        default="24x100,93x100/47",
+        help="agents x Hz / agents per process, comma-separated",
     )
+    parser.add_argument("--pairs", type=int, default=1, help="measurements per shape")
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
     arguments = parser.parse_args()
     if not arguments.seconds >= SECONDS_MIN:
         parser.error(f"--seconds: expected at least {SECONDS_MIN:g}, got {arguments.seconds:g}")
     rows = []
-    for agents, hz in arguments.shapes:
-        # Bare before and after, as long as ours together: the sum of their counts stands beside ours, and
-        # the mean of everything else.
-        before = bare_star(agents, hz, arguments.seconds / 2)
-        ours = cosmos_star(agents, hz, arguments.seconds)
-        after = bare_star(agents, hz, arguments.seconds / 2)
-        bare = {key: (before[key] + after[key]) / (1 if key in COUNTS else 2) for key in before}
-        rows.append({"agents": agents, "hz": hz, "bare": bare, "cosmos": ours})
+    for shape in arguments.shapes:
+        pairs = [measure(shape, arguments.seconds) for _ in range(arguments.pairs)]
+        rows.append({**shape._asdict(), **median_of(pairs)})
     if arguments.json:
         print(json.dumps(rows, indent=2))
     else:
         print_table(rows)
 
 
-def shapes(text: str) -> list[tuple[int, int]]:
-    """Return (agents, Hz) of each shape."""
-    pairs = [shape.split("x") for shape in text.split(",")]
-    return [(int(agents), int(hz)) for agents, hz in pairs]
+class Shape(NamedTuple):
+    """What is measured."""
+
+    agents: int
+    hz: int
+    per_process: int
+
+    @property
+    def processes(self) -> int:
+        """How many processes the agents take."""
+        return math.ceil(self.agents / self.per_process)
+
+
+def shapes(text: str) -> list[Shape]:
+    """Return what each comma-separated shape says."""
+    found = []
+    for shape in text.split(","):
+        rate, _, per_process = shape.partition("/")
+        agents, hz = rate.split("x")
+        found.append(Shape(int(agents), int(hz), int(per_process or 1)))
+    return found
+
+
+def measure(shape: Shape, seconds: float) -> dict[str, dict[str, float]]:
+    """Return the figures of both stars, and their ratios."""
+    # Bare before and after, as long as ours together: the sum of their counts stands beside ours, and
+    # the mean of everything else.
+    before = bare_star(shape, seconds / 2)
+    ours = cosmos_star(shape, seconds)
+    after = bare_star(shape, seconds / 2)
+    bare = {key: (before[key] + after[key]) / (1 if key in COUNTS else 2) for key in before}
+    ratio = {key: ours[key] / value for key, value in bare.items() if value}
+    return {"bare": bare, "cosmos": ours, "ratio": ratio}
+
+
+def median_of(pairs: list[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+    """Return the median of each figure; of the ratios, that of the pairs' own."""
+    return {
+        side: {
+            key: statistics.median(pair[side][key] for pair in pairs if key in pair[side])
+            for key in pairs[0][side]
+        }
+        for side in pairs[0]
+    }
 
 
 def print_table(rows: list[dict]) -> None:
@@ -85,15 +130,16 @@ def print_table(rows: list[dict]) -> None:
         ("packets lost", "lost"),
         ("host CPU, % of a core", "host_cpu_percent"),
         ("all agents' CPU, %", "agents_cpu_percent"),
-        ("an agent's memory, MB PSS", "agent_pss_mb"),
-        ("recorded, B an agent tick", "bytes_per_tick"),
+        ("host's and agents' CPU, %", "cpu_percent"),
+        ("process's memory, MB PSS", "agent_pss_mb"),
+        ("recorded, B per agent tick", "bytes_per_tick"),
     ]
     for row in rows:
-        print(f"\n{row['agents']} agents, {row['hz']} Hz")
+        print(f"\n{row['agents']} agents, {row['hz']} Hz, {row['per_process']} per process")
         print(f"  {'':28}{'bare UDP':>12}{'cosmos':>12}{'ratio':>8}")
         for label, key in figures:
             bare, ours = row["bare"].get(key), row["cosmos"].get(key)
-            ratio = f"{ours / bare:8.2f}" if bare and ours is not None else ""
+            ratio = f"{row['ratio'][key]:8.2f}" if key in row["ratio"] else ""
             left = f"{bare:12.1f}" if bare is not None else f"{'-':>12}"
             right = f"{ours:12.1f}" if ours is not None else f"{'-':>12}"
             print(f"  {label:28}{left}{right}{ratio}")
@@ -102,36 +148,43 @@ def print_table(rows: list[dict]) -> None:
 # The bare star ------------------------------------------------------------------------------------
 
 
-def bare_star(agents: int, hz: int, seconds: float) -> dict[str, float]:
-    """Run one echo process and *agents* pinging ones; return their figures."""
+def bare_star(shape: Shape, seconds: float) -> dict[str, float]:
+    """Run one echo process and the pinging ones; return their figures."""
     server = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
     server.bind(("127.0.0.1", 0))
     address = server.getsockname()
+    processes = [
+        min(shape.per_process, shape.agents - first)
+        for first in range(0, shape.agents, shape.per_process)
+    ]
+    packs = [packs_of(size) for size in processes]
+    phases = iter(np.arange(sum(map(len, packs))) / sum(map(len, packs)) / shape.hz)
     with tempfile.TemporaryDirectory() as directory:
         t0_s = time.monotonic() + 0.5
         echo = fork(lambda: echo_until(server, t0_s + seconds + 0.5, Path(directory, "host")))
         server.close()
         children = [
             fork(
-                lambda i=i: bare_agent(
+                lambda i=i, own=own: bare_agents(
                     address,
-                    (t0_s + i / agents / hz, hz, int(seconds * hz)),
+                    (t0_s, shape.hz, int(seconds * shape.hz)),
+                    own,
                     Path(directory, str(i)),
                 )
             )
-            for i in range(agents)
+            for i, own in enumerate([[(size, next(phases)) for size in sizes] for sizes in packs])
         ]
         time.sleep(max(0.0, t0_s + seconds * 0.7 - time.monotonic()))
         pss = [pss_bytes(pid) for pid in children]
         for pid in (*children, echo):
             os.waitpid(pid, 0)
-        loaded = [np.load(Path(directory, f"{i}.npz")) for i in range(agents)]
+        loaded = [np.load(Path(directory, f"{i}.npz")) for i in range(len(children))]
         round_trips = np.concatenate([one["rtt_us"] for one in loaded])
         lateness = np.concatenate([one["late_us"] for one in loaded])
         host_cpu_s = float(np.load(Path(directory, "host.npz"))["cpu_s"])
         agents_cpu_s = sum(float(one["cpu_s"]) for one in loaded)
-    due = agents * int(seconds * hz)
+    due = shape.agents * int(seconds * shape.hz)
     return {
         "rtt_p50_us": float(np.percentile(round_trips, 50)),
         "rtt_p99_us": float(np.percentile(round_trips, 99)),
@@ -142,8 +195,14 @@ def bare_star(agents: int, hz: int, seconds: float) -> dict[str, float]:
         "lost": len(lateness) - len(round_trips),
         "host_cpu_percent": 100 * host_cpu_s / seconds,
         "agents_cpu_percent": 100 * agents_cpu_s / seconds,
+        "cpu_percent": 100 * (host_cpu_s + agents_cpu_s) / seconds,
         "agent_pss_mb": statistics.fmean(p for p in pss if p) / 1e6,
     }
+
+
+def packs_of(agents: int) -> list[int]:
+    """Return the sizes of a process's packs."""
+    return [len(pack) for pack in split_into_packs(["agent"] * agents)]
 
 
 def fork(work: Callable[[], None]) -> int:
@@ -178,30 +237,55 @@ def echo_until(server: socket.socket, end_s: float, path: Path) -> None:
     np.savez(path, cpu_s=cpu_seconds())
 
 
-def bare_agent(address: tuple[str, int], pace: tuple[float, int, int], path: Path) -> None:
-    """Send one datagram a tick on absolute deadlines and time its return."""
+def bare_agents(
+    address: tuple[str, int],
+    pace: tuple[float, int, int],
+    packs: list[tuple[int, float]],
+    path: Path,
+) -> None:
+    """Send one datagram per pack and tick on absolute deadlines, and time its return for each agent of the pack."""
     t0_s, hz, ticks = pace
     client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     client.connect(address)
-    round_trips, lateness = [], []
-    k = 0
-    while k < ticks:
-        deadline_s = t0_s + k / hz
+    client.setblocking(False)
+    due = [(t0_s + phase_s, number, 0) for number, (_, phase_s) in enumerate(packs)]
+    heapq.heapify(due)
+    sent_s: dict[tuple[int, int], float] = {}
+    round_trips: list[float] = []
+    lateness: list[float] = []
+
+    def take() -> None:
+        while True:
+            try:
+                data = client.recv(2048)
+            except BlockingIOError:
+                return
+            number, k, at_s = PACKET.unpack_from(data)
+            if sent_s.pop((number, k), None) is not None:
+                round_trips.extend([1e6 * (time.monotonic() - at_s)] * packs[number][0])
+
+    while due:
+        deadline_s, number, k = due[0]
         wait_s = deadline_s - time.monotonic()
         if wait_s > 0:
-            time.sleep(wait_s)
-        sent_s = time.monotonic()
-        lateness.append(1e6 * (sent_s - deadline_s))
-        client.send(PACKET.pack(k, sent_s).ljust(PACKET_BYTES, b"\0"))
-        k += 1
-        client.settimeout(max(1e-4, t0_s + k / hz - time.monotonic()))
-        try:
-            while PACKET.unpack_from(client.recv(2048))[0] != k - 1:
-                pass
-            round_trips.append(1e6 * (time.monotonic() - sent_s))
-        except TimeoutError:
-            pass
-        k = max(k, int((time.monotonic() - t0_s) * hz))  # whole periods overslept are missed
+            if not sent_s:
+                time.sleep(wait_s)
+            elif select.select([client], [], [], wait_s)[0]:
+                take()
+            continue
+        size, phase_s = packs[number]
+        begun_s = time.monotonic()
+        lateness.extend([1e6 * (begun_s - deadline_s)] * size)
+        sent_s[number, k] = begun_s
+        client.send(PACKET.pack(number, k, begun_s).ljust(PACKET_BYTES * size, b"\0"))
+        # Whole periods overslept are missed.
+        k = max(k + 1, int((time.monotonic() - t0_s - phase_s) * hz))
+        if k < ticks:
+            heapq.heapreplace(due, (t0_s + phase_s + k / hz, number, k))
+        else:
+            heapq.heappop(due)
+    if sent_s and select.select([client], [], [], 0.1)[0]:
+        take()
     np.savez(path, rtt_us=round_trips, late_us=lateness, cpu_s=cpu_seconds())
 
 
@@ -214,18 +298,19 @@ def cpu_seconds() -> float:
 # Ours ---------------------------------------------------------------------------------------------
 
 
-def cosmos_star(agents: int, hz: int, seconds: float) -> dict[str, float]:
+def cosmos_star(shape: Shape, seconds: float) -> dict[str, float]:
     """Run the counter simulation through `cosmos run`; return its figures."""
     with tempfile.TemporaryDirectory(prefix="cosmos-star-") as directory:
-        return run_cosmos(Path(directory), agents, hz, seconds)
+        return run_cosmos(Path(directory), shape, seconds)
 
 
-def run_cosmos(directory: Path, agents: int, hz: int, seconds: float) -> dict[str, float]:
+def run_cosmos(directory: Path, shape: Shape, seconds: float) -> dict[str, float]:
     """Run it in *directory*, and return the figures of what it left there."""
     environment = {**os.environ, "COSMOS_STATE_DIR": str(directory / "state")}
     scenario = directory / "star.yaml"
     scenario.write_text(
-        f"name: star\nsimulation: counter\nagents: {{count: {agents}, tick_hz: {hz}}}\n"
+        f"name: star\nsimulation: counter\nagents: "
+        f"{{count: {shape.agents}, tick_hz: {shape.hz}, per_process: {shape.per_process}}}\n"
         f"time: {{duration_s: {seconds}}}\nhealth: {{period_s: 5}}\n"
         "deadline: {max_miss_ratio: 1}\n",
         encoding="utf-8",
@@ -252,11 +337,12 @@ def run_cosmos(directory: Path, agents: int, hz: int, seconds: float) -> dict[st
         "rtt_p99_us": float(np.percentile(round_trips, 99)),
         "late_p50_us": float(np.percentile(lateness, 50)),
         "late_p99_us": float(np.percentile(lateness, 99)),
-        "due": agents * int(seconds * hz),
+        "due": shape.agents * int(seconds * shape.hz),
         "missed": result["timing"]["missed"],
         "lost": len(lateness) - len(round_trips),
         "host_cpu_percent": cpu["host"],
         "agents_cpu_percent": cpu["agent"],
+        "cpu_percent": cpu["host"] + cpu["agent"],
         "agent_pss_mb": pss / 1e6,
         "bytes_per_tick": recorded / len(lateness),
     }
