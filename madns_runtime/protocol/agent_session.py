@@ -291,8 +291,8 @@ class AgentSession:
                 self._events.append(told.ClockEstimated())
                 if self._ready_due_s is not None and self._is_clock_known(now_s):
                     self._say_ready(now_s)
-            case messages.SimulationSetup(initial):
-                self._move(AgentEvent.SETUP_RECEIVED, told.SetupReceived(initial))
+            case messages.SimulationSetup(initial, t_s):
+                self._move(AgentEvent.SETUP_RECEIVED, told.SetupReceived(initial, t_s))
             case messages.SimulationStart(t0_host_s):
                 if self._machine.allows(AgentEvent.START_RECEIVED):
                     self.clock.settle(now_s)

@@ -137,6 +137,8 @@ class SetupReceived:
     """Initial data came: set up the simulation, then call `setup_finished`."""
 
     initial: Any
+    t_s: float
+    """Simulated time, for one that rejoins; 0 for all others."""
 
 
 @dataclass(frozen=True, slots=True)

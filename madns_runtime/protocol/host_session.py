@@ -106,7 +106,9 @@ class HostSession:
         """Send one agent its initial data: after `AgentRejoining`."""
         peer = self.peers[agent]
         if peer.phase is Phase.READY:
-            self._links.send(peer, messages.SimulationSetup(initial), Service.RELIABLE, now_s)
+            t_s = 0.0 if self._t0_host_s is None else max(0.0, now_s - self._t0_host_s)
+            setup = messages.SimulationSetup(initial, t_s)
+            self._links.send(peer, setup, Service.RELIABLE, now_s)
             self._roster.move(peer, Phase.SETTING_UP)
 
     def start(self, t0_host_s: float, duration_s: float, now_s: float) -> None:

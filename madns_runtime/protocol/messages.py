@@ -42,6 +42,8 @@ class SimulationSetup:
 
     KIND: ClassVar[int] = 2
     initial: Any
+    t_s: float = 0.0
+    """Simulated time by which an agent that rejoins sets up; its clock is not set yet. 0 before the start."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -210,7 +210,8 @@ class AgentRunner:
                     self._records.clock(self._session.clock, monotonic())
             case told.AgentStateEntered(state):
                 self._journal.event("state", state=state.value)
-            case told.SetupReceived(initial):
+            case told.SetupReceived(initial, t_s):
+                self._port.rejoin_at(t_s)
                 self._set_up(initial)
             case told.StartReceived(t0_host_s):
                 self._start_run(t0_host_s)

@@ -80,6 +80,8 @@ class AgentPort:
         )
         self.t0_host_s: float | None = None
         """Simulated time zero on the host's clock; None before it is known."""
+        self._rejoined_at_s: float | None = None
+        """Simulated time zero on this machine's clock, as one that rejoins knows it while it sets up."""
         self.must_flush = False
         """Whether something waits to be sent."""
         self._lead_s = config.timeouts.start_lead_s
@@ -114,9 +116,15 @@ class AgentPort:
 
     def now_s(self) -> float:
         """Return the simulated time, s."""
-        if self.t0_host_s is None:
-            return -self._lead_s
-        return self.session.clock.to_host_s(monotonic()) - self.t0_host_s
+        if self.t0_host_s is not None:
+            return self.session.clock.to_host_s(monotonic()) - self.t0_host_s
+        if self._rejoined_at_s is not None:
+            return monotonic() - self._rejoined_at_s
+        return -self._lead_s
+
+    def rejoin_at(self, t_s: float) -> None:
+        """Take simulated time to be *t_s*, s, until the clock is set; 0 where it has not begun."""
+        self._rejoined_at_s = monotonic() - t_s if t_s > 0.0 else None
 
     def at(self, local_s: float) -> float:
         """Return the simulated time when this machine's monotonic clock shows *local_s*, s; it must have begun."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -16,6 +17,13 @@ from typing import Any
 
 import pytest
 import yaml
+from harness.emulated_flight import (
+    assert_returned,
+    assert_untouched,
+    emulated_flight,
+    has_commanded,
+)
+from harness.firmware import needs_emulator
 from harness.talking_process import TalkingProcess, find_marked
 
 from madns_runtime.reactor.operator_link import OPERATOR_SIDE_GONE
@@ -105,7 +113,8 @@ class Fleet(TalkingProcess):
         """Cut the link and end everything there, as a power cut does."""
         self.break_link(machine, "cut")
         for pid in self.living_on(machine):
-            os.kill(pid, signal.SIGKILL)
+            with contextlib.suppress(ProcessLookupError):  # an emulator dies with who started it
+                os.kill(pid, signal.SIGKILL)
 
     # What there is ----------------------------------------------------------------------------------
 
@@ -129,8 +138,11 @@ class Fleet(TalkingProcess):
         return [process.pid for process in find_marked(self.mark)]
 
     def living_on(self, machine: str) -> list[int]:
-        state = f"COSMOS_STATE_DIR={self.folder / machine}/state"
-        return [process.pid for process in find_marked(self.mark, state)]
+        return [process.pid for process in find_marked(*self.on(machine))]
+
+    def on(self, machine: str) -> tuple[str, str]:
+        """Return the variables that all processes of a machine have."""
+        return self.mark, f"COSMOS_STATE_DIR={self.folder / machine}/state"
 
     def pid_of(self, machine: str, role: str) -> int:
         """Wait for a process of a role to register on a machine."""
@@ -300,6 +312,35 @@ def test_machine_that_returns_is_given_its_agents_again(fleet: Fleet, how: str) 
         "health.2.jsonl",
         "health.jsonl",
     ]
+
+
+@needs_emulator
+def test_flight_computer_of_a_board_that_was_lost_is_started_anew_with_it(fleet: Fleet) -> None:
+    duration_s = 14
+    changes = emulated_flight(fleet.folder, "agent-01", "agent-03", count=4, duration_s=duration_s)
+    fleet.start(**changes)
+    fleet.wait_until_running()
+    fleet.wait_until(lambda: has_commanded(fleet.directory, "agent-01"), "command of agent-01")
+    fleet.power_off("pi01")
+    fleet.wait_for("machine pi01 is lost")
+    assert [each for each in find_marked(*fleet.on("pi01")) if "qemu" in each.command] == []
+    fleet.mend_link("pi01")
+    fleet.wait_for("agent-01 has rejoined")
+
+    code = fleet.finish()
+
+    assert code == 3
+    document = fleet.document
+    assert document["status"] == "complete"
+    assert document["agents"]["incarnations"] == {"agent-01": 2, "agent-02": 2}
+    assert "MACHINES FAILED: pi01: machine pi01 is lost" in fleet.verdict
+    lost = next(check for check in document["checks"] if check["name"] == "hardware.lost")
+    assert (lost["got"], lost["worst"]) == (1, "agent-01/mcu")
+    opened = fleet.directory.glob("devices/agent-01/mcu/events*.jsonl")
+    assert [path.read_text().count('"event":"opened"') for path in opened] == [1, 1]
+    assert_returned(fleet.directory, "agent-01")
+    assert_untouched(fleet.directory, "agent-03", duration_s, has_computer=True)
+    assert_untouched(fleet.directory, "agent-04", duration_s, has_computer=False)
 
 
 def test_detached_run_is_seen_and_ended_from_another_folder(fleet: Fleet, tmp_path: Path) -> None:
