@@ -161,7 +161,19 @@ def calibrate_device(console: Console, fleet: Fleet, wish: CalibrationWish, seco
                 )
             except ConfigurationError as error:
                 raise InputError(str(error)) from error
+            except KeyboardInterrupt:
+                _tell_interrupted(console, wish.device, sensor, found)
+                raise
     return _show(console, trial.launches[0].name, found)
+
+
+def _tell_interrupted(
+    console: Console, device: str, sensor: SensorName, found: Sequence[SensorCalibration]
+) -> None:
+    """Tell what was interrupted, and show what had been calibrated before."""
+    console.say(f"{sensor} of {device} was interrupted: nothing of it is kept")
+    if usable := [each for each in found if each.is_usable]:
+        console.data(pasteable(device, usable))
 
 
 class _Guide:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -201,6 +202,31 @@ def test_a_device_is_led_through_its_sensors(
     assert (accelerometer["channel"], accelerometer["is_usable"]) == ("force", False)
     assert any("did not stand upright both ways" in text for text in accelerometer["remarks"])
     assert found["yaml"].splitlines()[1].startswith("  gyro: {device: imu.rate, bias: [0.")
+
+
+@pytest.mark.process
+def test_what_was_done_before_ctrl_c_is_shown_and_nothing_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    inventory = tmp_path / "here.yaml"
+    inventory.write_text(INVENTORY)
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(kept))
+
+    def interrupt(*_words: object, **_more: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(devices_calibrate, "wait_for_enter", interrupt)
+
+    code = cosmos(["devices", "calibrate", "imu", "-i", str(inventory), "--seconds", "0.6"])
+
+    printed = capsys.readouterr()
+    assert code == 130
+    assert "accelerometer of imu was interrupted: nothing of it is kept" in printed.err
+    assert "gyro: {device: imu.rate" in printed.out
+    assert "accelerometer: {" not in printed.out
+    assert list(kept.iterdir()) == []
 
 
 @pytest.mark.process
