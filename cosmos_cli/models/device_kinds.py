@@ -92,6 +92,8 @@ class KindAnswer:
     channels: tuple[Channel, ...] = ()
     """Empty where only the parameters were asked about."""
     needs: Needs = dataclasses.field(default_factory=Needs)
+    files: tuple[str, ...] = ()
+    """Parameters that name a file which has to be there."""
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -179,6 +181,7 @@ def _answer(
         rate_hz_max=kind.rate_hz_max,
         needs_hardware=kind.needs_hardware,
         follows_simulated_time=kind.follows_simulated_time,
+        files=kind.files,
     )
     if not is_whole:
         return _to_plain(answer)
@@ -275,6 +278,7 @@ def _from_plain(told: Mapping[str, Any]) -> KindAnswer:
             "faults": tuple(Fault(**values) for values in told["faults"]),
             "channels": tuple(from_mapping(Channel, each) for each in told["channels"]),
             "needs": from_mapping(Needs, told["needs"]),
+            "files": tuple(told["files"]),
         }
     )
 

@@ -59,6 +59,7 @@ def hardware_faults(
     for path, device, answer in zip(paths, devices, answers, strict=True):
         if not answer.faults:
             found += device_faults(path, device, answer, is_lockstep=scenario.time.is_lockstep)
+            found += _missing_files(path, device, answer, base_directory)
     if scenario.hardware.use and scenario.time.is_lockstep:
         found.append((("hardware", "use"), NOT_IN_LOCKSTEP))
     if labels is not None:
@@ -87,6 +88,21 @@ def device_faults(
         if name not in answer.inputs:
             hint = did_you_mean(name, answer.inputs)
             yield (*path, "frozen_s", name), f"{device.kind} has no input {name!r}{hint}"
+
+
+def _missing_files(
+    path: ValuePath, device: ScenarioDevice, answer: KindAnswer, base_directory: Path
+) -> Iterator[SectionFault]:
+    """Yield files of the scenario's folder that are not there; an absolute path may be another machine's."""
+    for name in answer.files:
+        given = device.parameters.get(name)
+        if not isinstance(given, str) or Path(given).is_absolute():
+            continue
+        file = base_directory / given
+        if not file.is_file():
+            has_recipe = (file.parent / "Makefile").is_file()
+            hint = f"make -C {file.parent} builds it" if has_recipe else "build it first"
+            yield (*path, "parameters", name), f"no file {file}; {hint}"
 
 
 def agent_faults(

@@ -143,6 +143,8 @@ class Device:
 
     inserted_faults: Mapping[str, float] = MappingProxyType({})
     """Faults that are in force around it, with their values (not a number where they take none). Set before `open`."""
+    count: Callable[[str, int], object] = staticmethod(lambda name, number: None)
+    """Adds to a count of the run by name, such as lost_bytes; it outlives the device and its process. Set before `open`."""
     carries_out: frozenset[str] = frozenset()
     """Inserted faults that it carries out itself, in what it emulates: its samples are not altered by them."""
 
@@ -205,6 +207,8 @@ class DeviceKind:
     parameters: type = type(None)
     """A frozen stdlib dataclass as a simulation's; NoneType for a kind without parameters."""
     needs: Needs | Callable[[Any], Needs] = field(default_factory=Needs)
+    files: tuple[str, ...] = ()
+    """Parameters that name a file which has to be there before a run; one below the scenario's folder is looked for."""
     rate_hz: float = 10.0
     """Rate at which it is read where nobody says another, Hz."""
     rate_hz_max: float = 1000.0

@@ -70,6 +70,9 @@ class EmulatedMcuParameters:
     """The emulator."""
     gather_s: Annotated[float, Ge(0), Le(1)] = 0.002
     """Bytes that the serial line brings within so long of each other's first are handed over together, s."""
+    line_bytes_s: Annotated[float, Ge(4096), Le(1e7)] = 92_160.0
+    """Bytes per second that the serial line brings at most, as a UART at 921600 baud; an emulated one has no rate of its
+    own. What firmware sends beyond, after a burst of as many as in one second, is lost and counted."""
     held_hz: Annotated[float, Gt(0), Le(100)] = 10.0
     """Rate at which is read back what the sensors hold, Hz."""
 
@@ -123,5 +126,6 @@ kind = DeviceKind(
     parameters=EmulatedMcuParameters,
     channels=channels_of,
     needs=needs_of,
+    files=("firmware",),
     needs_hardware=False,
 )

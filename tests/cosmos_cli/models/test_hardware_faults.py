@@ -223,3 +223,28 @@ def test_a_machine_finds_files_in_its_own_copy_of_the_scenarios_folder(folder: P
     place = MachineConfig(directory="/run", base_directory="/srv/tree")
     config = scenario.run_config("0001-devices")
     assert [d.base_directory for d in devices_at(devices, config, place)] == ["/srv/tree/boards"]
+
+
+def test_firmware_that_is_not_there_is_told_with_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "one.yaml"
+    device = "{name: mcu, kind: emulated_mcu, parameters: {firmware: board/own.elf}}"
+    path.write_text(f"{HEAD}hardware:\n  devices:\n    - {device}\n")
+
+    with pytest.raises(InputError) as caught:
+        load_scenario(path)
+
+    (fault,) = caught.value.faults
+    assert fault.line == 8
+    assert fault.path == "hardware.devices[0].parameters.firmware"
+    assert fault.text == f"no file {tmp_path / 'board/own.elf'}; build it first"
+    (tmp_path / "board").mkdir()
+    (tmp_path / "board" / "own.elf").write_bytes(b"\x7fELF")
+    load_scenario(path)
+
+
+def test_firmware_of_an_absolute_path_may_be_another_machines(tmp_path: Path) -> None:
+    path = tmp_path / "one.yaml"
+    device = "{name: mcu, kind: emulated_mcu, parameters: {firmware: /nowhere/own.elf}}"
+    path.write_text(f"{HEAD}hardware:\n  devices:\n    - {device}\n")
+
+    load_scenario(path)
