@@ -251,6 +251,8 @@ class HardwareSettings:
     """Times that devices may be lost."""
     frozen: Annotated[int, Ge(0)] = 0
     """Times that inputs may be frozen (unchanged for their frozen_s)."""
+    lost_bytes: Annotated[int, Ge(0)] = 0
+    """Bytes for which serial lines of emulated boards may have no room, such as of firmware that floods."""
     stimulus_late_ms: Annotated[float, Ge(0), Le(60_000)] = 10.0
     """From how far behind its time on a point of a stimulus is late."""
     stimulus_late: Annotated[float, Ge(0), Le(1)] = 1e-2

@@ -21,6 +21,8 @@ ACCOUNT_NAME = re.compile(r"devices(?:\.([1-9][0-9]{0,8}))?\.json")
 NO_REPORT = "unknown"
 """Status of a device that nobody has given account of."""
 WHY_MISSING = "no account of it: its supervisor did not come to its end"
+LOST_BYTES = "lost_bytes"
+"""Count of bytes for which a line had no room: firmware that floods."""
 NEVER_PLAYED = ("skipped", "lost", "refused")
 """Counts of a profile's points that were due and never put out."""
 _TOLD_APART = frozenset(
@@ -79,9 +81,21 @@ def device_checks(
         _check(devices, "hardware.stale_ratio", limits.stale_ratio, key="stale_ratio"),
         _check(devices, "hardware.lost", limits.lost, key="lost"),
         _check(devices, "hardware.frozen", limits.frozen, key="frozen"),
+        *_lost_bytes_checks(devices, limits),
         *_stimulus_checks(devices, limits),
         *([_check(devices, "hardware.unsafe", 0, key="unsafe")] if _is_unsafe(devices) else []),
     ]
+
+
+def _lost_bytes_checks(
+    devices: Mapping[str, Mapping[str, Any]], limits: HardwareSettings
+) -> list[CheckResult]:
+    """Return the check of what serial lines have lost; none where nothing was lost."""
+    lost = {name: mapping_at(told, "counts").get(LOST_BYTES, 0) for name, told in devices.items()}
+    if not any(lost.values()):
+        return []
+    flat = {name: {LOST_BYTES: number} for name, number in lost.items()}
+    return [_check(flat, "hardware.lost_bytes", limits.lost_bytes, key=LOST_BYTES)]
 
 
 def _stimulus_checks(

@@ -96,6 +96,7 @@ class DeviceRunner:
         try:
             self._device = device = self._seat.make()
             device.may_move, device.place = self._launch.may_move, self._launch.place
+            device.count = self._intake.count
             self._intake.faults.show_to(device)
             identity = device.open()
             self._seat.check_identity(identity)
@@ -104,8 +105,7 @@ class DeviceRunner:
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything
             self._fail("open", error)
             return
-        now_s = monotonic()
-        header[page.OPENED_S] = header[page.ACTIVE_S] = now_s
+        header[page.OPENED_S] = header[page.ACTIVE_S] = now_s = monotonic()
         header[page.STATE] = page.OPEN
         self._records.event("opened", now_s, identity=identity)
         self._first_bytes = self._first_bytes or resident_bytes()

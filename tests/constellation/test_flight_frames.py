@@ -104,6 +104,20 @@ def test_an_answer_is_whole_with_its_done():
     assert not any(protocol.faults.values())
 
 
+def test_an_estimate_whose_packet_was_lost_is_none_and_ends_nothing():
+    protocol = Frames()
+    a, b = ((content.ESTIMATE, {"value": 1.0, "name": name}) for name in ("a_m", "b_m"))
+    protocol.feed(answer(0.1, 0, a, b))
+
+    (got,) = protocol.feed(answer(0.2, 4, b))
+    (silent,) = protocol.feed(answer(0.3, 6))
+
+    assert got.estimate == {"a_m": None, "b_m": 1.0}
+    assert list(got.estimate) == ["a_m", "b_m"]
+    assert silent.estimate is None
+    assert protocol.faults["lost"] == 1
+
+
 def test_every_kind_of_request_is_read():
     vector = (1.0, 2.0, 3.0)
     asked = (

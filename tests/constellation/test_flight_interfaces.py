@@ -253,6 +253,22 @@ def test_software_behind_a_device_of_the_run(tmp_path, is_lockstep):
         Attached(tmp_path, None, flight=flight, hardware={"other": FakeDevice()})
 
 
+def test_of_a_flood_through_a_device_the_newest_bytes_are_taken(tmp_path):
+    device = FakeDevice()
+    flight = attached({"kind": "device", "device": "line"})
+    with Attached(
+        tmp_path, None, flight=flight, is_lockstep=False, hardware={"line": device}
+    ) as ship:
+        ship.run(5)
+        device.waiting = [b"\xff" * 4095 + b"\0"] * 100 + device.waiting
+        ship.run(5)
+
+    interface = ship.summary["interface"]
+    assert interface["floods"] == 1
+    assert interface["bytes_dropped"] >= 100 * 4096 - 65_536
+    assert ship.summary["answers"] == 10
+
+
 def test_datagrams_go_to_a_place_that_is_known(tmp_path):
     board = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     board.bind(("127.0.0.1", 0))

@@ -31,8 +31,8 @@ RIGID = Vehicle(
 )
 
 
-def desk(vehicle=PLAIN, *, late="postpone", can_maneuver=True):
-    settings = Maneuvers(late=late, propagation_s=0.02, network_s=0.03)
+def desk(vehicle=PLAIN, *, can_maneuver=True, **settings):
+    settings = Maneuvers(propagation_s=0.02, network_s=0.03, **settings)
     rules = Rules(
         settings=settings,
         can_maneuver=can_maneuver,
@@ -140,6 +140,18 @@ def test_vehicles_without_the_actuator_are_told_so():
     assert "duration" in desk(RIGID).decide(0, instant, 10.0).reason
 
 
+@pytest.mark.parametrize(("duration_s", "status"), [(60.0, "accepted"), (60.1, "refused")])
+def test_a_torque_lasts_so_long_at_most_that_none_outlives_its_software_by_far(duration_s, status):
+    turn = command(
+        kind="torque", frame="body", vector=(1e-3, 0.0, 0.0), duration_s=duration_s, at_s=20.0
+    )
+
+    taken = desk(RIGID).decide(0, turn, 10.0)
+
+    assert taken.status == status
+    assert ("60 s at most (maneuvers.duration_s_max)" in taken.reason) == (status == "refused")
+
+
 def test_truth_that_cannot_be_changed_refuses_all():
     taken = desk(can_maneuver=False).decide(0, command(), 10.0)
 
@@ -226,7 +238,8 @@ def test_a_torque_that_no_knot_could_tell_is_refused():
     torque = {"kind": "torque", "frame": "body"}
 
     def given(vector, duration_s):
-        return desk(free).decide(0, command(vector=vector, duration_s=duration_s, **torque), 10.0)
+        at = desk(free, duration_s_max=1e10)
+        return at.decide(0, command(vector=vector, duration_s=duration_s, **torque), 10.0)
 
     assert given((3.0, 0.0, 0.0), 10.0).status == "accepted"
     assert "6 rad/s; less than 3.142 rad/s" in given((6.0, 0.0, 0.0), 10.0).reason

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -76,7 +77,7 @@ def test_its_own_clock_goes_on(image):
 
 
 def test_flood_is_taken_in_bounded_pieces(image):
-    with opened("emulated_mcu", firmware=image) as mcu:
+    with opened("emulated_mcu", firmware=image, line_bytes_s=1e7) as mcu:
         mcu.write({"sent": b"F"}, time.monotonic())
         flood = b""
         while not flood.rstrip().endswith(b"1") and flood.count(b"\n") < 20_001:
@@ -85,6 +86,28 @@ def test_flood_is_taken_in_bounded_pieces(image):
             flood += piece
 
     assert flood.count(b"FLOODFLOODFLOOD\n") == 20_000
+
+
+def test_what_a_flood_brings_beyond_the_lines_rate_is_lost_and_counted(image):
+    counts = Counter()
+    with opened("emulated_mcu", firmware=image, line_bytes_s=4096) as mcu:
+        mcu.count = lambda name, number: counts.update({name: number})
+        mcu.write({"sent": b"F"}, time.monotonic())
+        began_s, taken = time.monotonic(), 0
+
+        def read():
+            nonlocal taken
+            sample = mcu.read()
+            taken += len(sample.values.get("received", b"")) if sample is not None else 0
+            return taken + counts["lost_bytes"] >= 320_000
+
+        wait_until(read, "the whole flood")
+        passed_s = time.monotonic() - began_s
+        lost = mcu.health()["lost_bytes"]
+
+    assert counts["lost_bytes"] == lost > 0
+    assert taken <= 4096 * (1 + passed_s)
+    assert taken + lost <= 320_000 + 100  # and the one line that answers
 
 
 def test_killed_emulator_is_named(image):

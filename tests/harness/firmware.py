@@ -15,11 +15,11 @@ needs_emulator = pytest.mark.skipif(
 )
 
 
-def build_firmware(folder: Path, name: str = "detumble", main: Path | None = None) -> Path:
-    """Build the firmware, or one with another main program on the same board, and return its image."""
+def build_firmware(folder: Path, name: str = "detumble", *main: Path) -> Path:
+    """Build the firmware, or one with another main program, of some sources, on the same board; return its image."""
     command = ["make", "--silent", f"--makefile={FOLDER / 'Makefile'}", f"OUT={folder}"]
-    if main is not None:
-        command += [f"MAIN={main}", f"NAME={name}"]
+    if main:
+        command += [f"MAIN={' '.join(map(str, main))}", f"NAME={name}"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return folder / f"{name}.elf"

@@ -46,6 +46,7 @@ class EmulatedMcu(Device):
     carries_out = frozenset({"freeze"})
     """Sensors that are frozen hold what they held: the firmware reads it again and again."""
     _process: subprocess.Popen[bytes] | None = None
+    _lost_bytes = 0
 
     def open(self) -> str:
         """
@@ -78,7 +79,10 @@ class EmulatedMcu(Device):
         self._taken_s = -math.inf
         """When the last of them came."""
         self._unsent = b""
-        self._lost_bytes = 0
+        self._room_bytes = self.parameters.line_bytes_s
+        """Bytes that the line may still bring, by its rate."""
+        self._room_s = monotonic()
+        """When that was reckoned."""
         self._said = b""
         self._serial, far_serial = socket.socketpair()
         monitor, far_monitor = socket.socketpair()
@@ -192,7 +196,7 @@ class EmulatedMcu(Device):
             data = b""
         if data == b"":
             raise MachineError(f"the emulator is gone: its line is closed{self._words()}")
-        if data:
+        if data and (data := self._within_rate(data, now_s)):
             if not self._gathered:
                 self._gathered_s = now_s + self.parameters.gather_s
                 self._set_timer()
@@ -205,12 +209,25 @@ class EmulatedMcu(Device):
         self._set_timer()
         return sample
 
+    def _within_rate(self, data: bytes, now_s: float) -> bytes:
+        """Return as much of what has come as the line's rate has room for; the rest is lost."""
+        rate = self.parameters.line_bytes_s
+        room_bytes = min(rate, self._room_bytes + rate * (now_s - self._room_s))
+        taken = data[: int(room_bytes)]
+        self._room_bytes, self._room_s = room_bytes - len(taken), now_s
+        self._lose(len(data) - len(taken))
+        return taken
+
+    def _lose(self, number: int) -> None:
+        self._lost_bytes += number
+        self.count("lost_bytes", number)
+
     def _set_timer(self) -> None:
         self._timer.set(min(self._held_s, self._gathered_s))
 
     def _send(self, data: bytes) -> None:
         room = UNSENT_BYTES_MAX - len(self._unsent)
-        self._lost_bytes += max(0, len(data) - room)
+        self._lose(max(0, len(data) - room))
         self._unsent += data[:room]
         self._push()
 

@@ -223,6 +223,9 @@ class Maneuvers:
     late: Literal["postpone", "refuse"] = "postpone"
     """Fate of a command that cannot be in truth by its time: executed at the first feasible time,
     or not at all."""
+    duration_s_max: Annotated[float, Gt(0)] = 60.0
+    """Longest torque or dipole, s; longer ones are refused. So long at most acts what software commanded that is silent
+    since, or whose board is lost."""
     propagation_s: Annotated[float, Gt(0), Le(60)] = 0.02
     """T_p: time allowed for propagating one vehicle anew; more is counted against the inequality."""
     network_s: Annotated[float, Ge(0), Le(60)] = 0.02

@@ -71,6 +71,16 @@ def test_a_check_that_a_device_breaks_bears_its_name(
     assert all(passed for _, passed, _ in found.values())
 
 
+def test_bytes_that_a_line_lost_are_judged_where_there_were_any(tmp_path: Path) -> None:
+    flooded = {**SOUND, "report": {**SOUND["report"], "lost_bytes": 700}}
+    write(tmp_path, "devices.json", pi22_imu=flooded, pi22_gps=SOUND)
+
+    found = judged(read_devices(RunDirectory(tmp_path), PLAN, None))
+
+    assert found.pop("hardware.lost_bytes") == (700, False, "pi22/imu")
+    assert all(passed for _, passed, _ in found.values())
+
+
 @pytest.mark.parametrize("content", [None, "[]", "{", '{"pi22/gps": 3}'])
 def test_a_device_without_an_account_is_not_taken_for_sound(
     tmp_path: Path, content: str | None

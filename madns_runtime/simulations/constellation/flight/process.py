@@ -245,6 +245,12 @@ class ExternalFlight:
     def _send(self, t_s: float, readings: Readings) -> None:
         counts = self._counts
         if len(self._asked) >= UNANSWERED_MAX:
+            if not counts["ticks_skipped"]:
+                since = f"the tick at {self._asked[0][1]:g} s"
+                self._context.log(
+                    "warning",
+                    f"{self._link.who} has answered nothing since {since}: no further ones are sent",
+                )
             counts["ticks_skipped"] += 1
             return
         mail = {name: list(waiting) for name, waiting in self._mail.items()}

@@ -11,6 +11,7 @@ import base64
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import orjson
@@ -94,6 +95,8 @@ class Dialogue:
         self.faults: Counter[str] = Counter({name: 0 for name in FAULTS})
         self._setup: SetupReport | None = None
         self._pending: list[tuple[float, FlightContent, dict[str, Any]]] = []
+        self._estimates: dict[str, None] = {}
+        """Names of what was believed first, which stay: a packet of one may be lost."""
         self.is_greeted = False
         """Whether a hello has come that `setup_again` has not answered."""
 
@@ -217,7 +220,11 @@ class Dialogue:
         # Bits, not numbers: time comes back as it was given, and not a number is a time of nothing.
         of_this = [one for one in pending if one[0] == t_s]
         self.faults["other_time"] += len(pending) - len(of_this)
-        return _answer(t_s, values["board_us"], [(one, said) for _, one, said in of_this])
+        answer = _answer(t_s, values["board_us"], [(one, said) for _, one, said in of_this])
+        if not answer.estimate:
+            return answer
+        self._estimates = self._estimates or dict.fromkeys(answer.estimate)
+        return replace(answer, estimate={**self._estimates, **answer.estimate})
 
 
 def _answer(

@@ -12,8 +12,9 @@ from time import monotonic
 from typing import Any
 
 from madns_runtime.errors import BlamedError, MissingExtraError, PluginError
-from madns_runtime.plugin.device_view import DeviceView
+from madns_runtime.plugin.device_view import ChannelFrame, DeviceView
 from madns_runtime.simulations.constellation.flight.interface.transport import (
+    READ_BYTES,
     Arrival,
     StreamTransport,
     Transport,
@@ -139,6 +140,8 @@ class DeviceLink(Transport):
     def __init__(self, device: DeviceView) -> None:
         super().__init__(f"device {device.name}")
         self._device = device
+        self.counts |= {"bytes_dropped": 0}
+        """Of a flood: what came in a tick beyond READ_BYTES; the newest are kept, so that no answer waits behind it."""
 
     @property
     def is_ready(self) -> bool:
@@ -179,11 +182,22 @@ class DeviceLink(Transport):
     def arrivals(self) -> list[Arrival]:
         """Return what has come, with the times at which the device's process took it."""
         now_s = monotonic()
-        frames = self._device.frames(RECEIVED)
+        frames = self._newest(self._device.frames(RECEIVED))
         found = [
             self.taken(bytes(frame.value), now_s - frame.age_s) for frame in frames if frame.value
         ]
         return [arrival for one in found for arrival in one]
+
+    def _newest(self, frames: list[ChannelFrame]) -> list[ChannelFrame]:
+        """Return the newest frames, of READ_BYTES together at most; the others are dropped and counted."""
+        room_bytes = READ_BYTES - 1  # as many count as a flood where the kernel keeps the rest
+        for place in range(len(frames) - 1, -1, -1):
+            room_bytes -= len(frames[place].value)
+            if room_bytes < 0:
+                self.counts["floods"] += 1
+                self.counts["bytes_dropped"] += sum(len(one.value) for one in frames[: place + 1])
+                return frames[place + 1 :]
+        return frames
 
     def close(self) -> None:
         """Leave the device to its process."""

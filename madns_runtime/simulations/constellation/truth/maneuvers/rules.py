@@ -254,6 +254,12 @@ class ManeuverDesk:
             return "the scenario's propagator starts from no other states than its own"
         if command.kind == "dipole" and not self._rules.can_magnetise:
             return "the scenario's propagator follows no magnetic dipole"
+        longest_s = self._rules.settings.duration_s_max
+        if command.kind in ("torque", "dipole") and command.duration_s > longest_s:
+            return (
+                f"a {command.kind} of {command.duration_s:g} s: {longest_s:g} s at most "
+                "(maneuvers.duration_s_max), so that none outlives by far who commanded it"
+            )
         if self._waiting[vehicle] >= WAITING_MAX:
             return f"{WAITING_MAX} commands are waiting already"
         return ""
