@@ -468,6 +468,20 @@ def test_rejoin_survives_the_loss_of_its_first_datagram():
     assert w.host.peers["agent-2"].summary == {"ok": "agent-2"}
 
 
+def test_who_rejoins_sets_up_by_the_present_time_and_who_was_there_by_none():
+    w = world(policy="continue")
+    w.run_for(1.5)
+    w.host.agent_exited("agent-2", "killed by SIGKILL", w.now_s)
+    w.agent_events["agent-2"].clear()
+    del w.agents["agent-2"]
+    w.join("agent-2")
+    w.run_for(1)
+
+    first, again = (w.agent_saw(name, a.SetupReceived) for name in ("agent-1", "agent-2"))
+    assert first.t_s == 0.0
+    assert 0.0 < again.t_s <= w.now_s - w.t0_s
+
+
 def test_late_word_of_an_earlier_process_does_not_lose_its_successor():
     w = world(policy="continue")
     w.run_for(1.5)
