@@ -22,8 +22,8 @@ from madns_runtime.simulations.constellation.orbit.frames import vector_to_inert
 from madns_runtime.simulations.constellation.thrust import Thrust, Vector
 from madns_runtime.simulations.constellation.truth.maneuvers.effects import (
     Effect,
+    KnotSpan,
     Piece,
-    Span,
     VehicleTruth,
     knot_at_or_after,
     lay_out,
@@ -140,7 +140,7 @@ class _Flight:
         """Fly to *stop_s*, where the next change is."""
         request, t0_s = self._request, self._t_s
         knots = self._grid_knots(t0_s, stop_s)
-        spans: list[Span] = []
+        spans: list[KnotSpan] = []
         if t0_s >= request.change_s:
             is_turned = self._torque != COASTING or self._dipole != COASTING
             is_arc = self._thrust is not None or is_turned
@@ -346,7 +346,7 @@ class _Flight:
                 f"parameters.segments.knot_s, {limit_rad_s:.4g} rad/s, got {spin_rad_s:.4g} rad/s"
             )
 
-    def _add_piece(self, span: Span, rows: Array) -> None:
+    def _add_piece(self, span: KnotSpan, rows: Array) -> None:
         self._pieces.append(
             Piece(
                 t0_s=span.start_s,

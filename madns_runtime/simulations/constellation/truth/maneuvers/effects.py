@@ -184,7 +184,7 @@ class VehicleTruth:
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
+class KnotSpan:
     """Knots of a piece to be: count >= 2 of them, evenly from start_s to end_s."""
 
     start_s: float
@@ -219,7 +219,7 @@ def knot_at_or_after(t_s: float, knot_s: float) -> int:
 
 def lay_out(
     start_s: float, end_s: float, knot_s: float, *, jumps: bool, is_arc: bool
-) -> list[Span]:
+) -> list[KnotSpan]:
     """
     Return the pieces that an interval needs besides the grid.
 
@@ -248,6 +248,6 @@ def lay_out(
     return spans + ([_span(tail * knot_s, end_s, knot_s, 1)] if has_tail else [])
 
 
-def _span(start_s: float, end_s: float, knot_s: float, intervals_min: int) -> Span:
+def _span(start_s: float, end_s: float, knot_s: float, intervals_min: int) -> KnotSpan:
     intervals = max(intervals_min, math.ceil((end_s - start_s) / knot_s - 1e-9))
-    return Span(start_s, end_s, intervals + 1)
+    return KnotSpan(start_s, end_s, intervals + 1)
