@@ -10,9 +10,8 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, assert_never
 
-from madns_runtime.config import AgentLaunch, RunConfig
+from madns_runtime.config import AgentLaunch
 from madns_runtime.hardware.port import NO_HARDWARE
-from madns_runtime.plugin.api import Tick
 from madns_runtime.plugin.context import PeerContext
 from madns_runtime.plugin.half import Half, HalfFailed, RoleProgram
 from madns_runtime.protocol import events as told
@@ -26,24 +25,21 @@ from madns_runtime.realtime.agent_calls import (
     METHOD,
     NUMBER_OF,
     RECEIVE,
-    STEP,
-    T_S,
     LoopSeat,
 )
 from madns_runtime.realtime.agent_link import AgentPort
 from madns_runtime.realtime.agent_report import AgentReport
-from madns_runtime.realtime.late_ticks import LateTicks
 from madns_runtime.realtime.loop_account import Span
 from madns_runtime.realtime.packs import Pack
 from madns_runtime.realtime.process_port import ProcessPort
 from madns_runtime.realtime.process_records import ProcessRecords
+from madns_runtime.realtime.ticks import AgentTicks, TickCalls
 from madns_runtime.recording.newest_values import NewestValues
 from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
 from madns_runtime.recording.run_journal import RunJournal
 from madns_runtime.timing.clock import utc_at_iso
 from madns_runtime.timing.late_causes import Cause
-from madns_runtime.timing.rate import Pacer, RealTimeFactor
 
 PING_SLACK_S_MAX = 0.1
 """For so long at most a ping waits for a tick's wake-up."""
@@ -116,24 +112,31 @@ class AgentRunner:
         self._hardware.use_clock(self._port.local_s)
         self._has_devices = bool(seat.hardware)
         self._half = half = Half(program.make, self._journal.say)
-        # Called every tick: without a layer between.
-        self._step, self._receive = half.simulation.step, half.simulation.receive
-        self._record = recorder.record
+        self._receive = half.simulation.receive  # called often: without a layer between
         self._spans = process.account.add
         self._pack = pack
-        self._pacer = _make_pacer(config, pack.phase_s)
-        self._period_s = 1.0 / config.agents.tick_hz
-        self._late_s = config.deadline.lateness_limit_s
-        self._late = LateTicks(
-            self._seat, self._period_s, recorder=recorder, account=process.account
+        self._ticks = ticks = AgentTicks(
+            seat,
+            config,
+            pack.phase_s,
+            port=self._port,
+            recorder=recorder,
+            calls=TickCalls(
+                prepare=self._prepare_tick if program.has_medium or seat.hardware else None,
+                step=half.simulation.step,
+                failed=self._step_failed,
+                ended=self._ticks_over,
+                is_running=self._is_running,
+                say_how_it_is=self._say_how_it_is,
+            ),
         )
-        self._factor = RealTimeFactor()
+        pack.add(ticks)
         self._report = AgentReport(
             port=self._port,
             records=self._records,
-            pacer=self._pacer,
-            factor=self._factor,
-            late=self._late,
+            pacer=ticks.pacer,
+            factor=ticks.factor,
+            late=ticks.late,
             columns=NewestValues(recorder, program.columns),
             devices=seat.hardware if launch.is_detached else NO_HARDWARE,
         )
@@ -258,76 +261,32 @@ class AgentRunner:
         now_s = self._port.now_s()
         self._recorder.set_t0(utc_at_iso(-now_s))
         self._journal.event("phase", phase_s=self._pack.phase_s)
-        if now_s > 0:
-            self._pacer.skip_to(now_s)
         self._port.process.freeze()
-        self._session.ping_slack_s = min(2 * self._period_s, PING_SLACK_S_MAX)
-        self._arm_end()
+        self._session.ping_slack_s = min(2 * self._ticks.period_s, PING_SLACK_S_MAX)
+        self._ticks.begin(now_s)
         self._pack.arm()
         self._records.begin_usage()
-        self._late.started_s = monotonic()
         self._tell_time()
         self._usage_timer.reschedule(monotonic() + self._config.health.period_s)
 
-    def next_deadline_s(self) -> float:
-        """Return the simulated time at which its next tick is due, s; infinite while it has none."""
-        if self._session.state is not AgentState.RUN_SIMULATION:
-            return math.inf
-        deadline_s = self._pacer.next_deadline_s()
-        return math.inf if deadline_s is None else deadline_s
+    def _ticks_over(self) -> None:
+        end_s = self._config.time.duration_s + DRAIN_S
+        self._end_timer.reschedule(self._port.local_s(end_s))
 
-    def local_s(self, t_s: float) -> float:
-        """Return when simulated time *t_s* is on this machine's monotonic clock, s."""
-        return self._port.local_s(t_s)
+    def _step_failed(self, error: BaseException) -> None:
+        self._fail(self._half.failure("step", error))
+        self._pump()
 
-    def _arm_end(self) -> None:
-        if self._pacer.next_deadline_s() is None:
-            end_s = self._config.time.duration_s + DRAIN_S
-            self._end_timer.reschedule(self._port.local_s(end_s))
+    def _is_running(self) -> bool:
+        return self._session.state is AgentState.RUN_SIMULATION
 
-    def tick(self) -> None:
-        """Run the tick that is due, if one is."""
-        pacer, port = self._pacer, self._port
-        if self._session.state is not AgentState.RUN_SIMULATION:
-            return
-        local_s = monotonic()
-        began_s = port.at(local_s)
-        timing = pacer.begin(began_s)
-        if timing is None:
-            self._arm_end()
-            return
-        index, t_s, deadline_s, lateness_s, missed = timing
-        self._factor.add(t_s, began_s)
-        calls = self._calls
-        calls[T_S] = t_s
+    def _prepare_tick(self, t_s: float) -> bool:
+        """Hand in what comes with the tick at simulated time *t_s*; return whether the agent goes on."""
         if self._program.has_medium and not self._hear(t_s):
-            return
-        if self._has_devices and not self._look_at_devices():
-            return
-        calls[AGENT], calls[METHOD] = self._seat, STEP
-        try:
-            self._step(Tick(index, t_s, self._period_s, lateness_s, missed, deadline_s))
-        except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
-            calls[METHOD] = IDLE
-            self._fail(self._half.failure("step", error))
-            self._pump()
-            return
-        calls[METHOD] = IDLE
-        if port.must_flush:
-            # What the step sent leaves before anything else is done.
-            port.flush()
-        ended_s = monotonic()
-        margin_s = pacer.end(port.at(ended_s))
-        values = (index, int(lateness_s * 1e6), int(margin_s * 1e6), missed)
-        self._record("ticks", values)
-        if missed or lateness_s > self._late_s:
-            self._late.explain(timing, local_s)
-        self._spans(Span(Cause.STEP, self._seat, local_s, ended_s))
-        if pacer.is_over:
-            self._arm_end()
+            return False
+        return not self._has_devices or self._look_at_devices()
 
-    def ping_if_due(self, now_s: float) -> None:
-        """Say how it is, if that is due by *now_s* of the local clock: this wake-up then serves for both."""
+    def _say_how_it_is(self, now_s: float) -> None:
         if now_s >= self._session.ping_due_s and not self._is_closed:
             self._session.handle_timer(now_s)
             self._pump()
@@ -361,7 +320,7 @@ class AgentRunner:
     def _finish_run(self) -> None:
         if self._session.state is not AgentState.RUN_SIMULATION:
             return
-        self._late.never_run(self._pacer.finish(self._port.now_s()), monotonic())
+        self._ticks.finish(self._port.now_s())
         self._takes_data = False  # what comes from now on is too late for the summary
         summary = self._call("finish")
         if self._session.state is AgentState.RUN_SIMULATION:
@@ -428,12 +387,3 @@ class AgentRunner:
     def _fail(self, failure: HalfFailed) -> None:
         self._session.emergency(str(failure), monotonic())
         self._port.must_flush = True
-
-
-def _make_pacer(config: RunConfig, phase_s: float) -> Pacer:
-    return Pacer(
-        tick_hz=config.agents.tick_hz,
-        phase_s=phase_s,
-        duration_s=config.time.duration_s,
-        overrun_s=config.deadline.overrun_ms * 1e-3,
-    )

@@ -85,7 +85,6 @@ class AgentProcess:
                     pack=pack,
                     on_ended=self._ended,
                 )
-                pack.add(runner)
                 runners.append(runner)
         return runners
 

@@ -22,7 +22,6 @@ from madns_runtime.plugin.executor import JobRunner, make_executor
 from madns_runtime.plugin.half import HalfFailed, HostHalf, RoleProgram
 from madns_runtime.plugin.host_calls import HostCalls
 from madns_runtime.protocol import events as told
-from madns_runtime.protocol.bundle import is_bundle, split
 from madns_runtime.protocol.events import Phase
 from madns_runtime.protocol.host_peers import Address
 from madns_runtime.protocol.states import HOST_LIVE, HostState
@@ -145,7 +144,7 @@ class HostRuntime:
         socket = self._port.socket
         for warning in filter(None, (socket.warning, grant.warning)):
             self._log("warning", warning)
-        self._reactor.add_reader(socket.fileno(), self._readable)
+        self._reactor.add_reader(socket.fileno(), partial(self._port.read, self._take_datagram))
         self._operator.emit(self._port.listening())
         self._operator.emit({"event": "state", "state": self._session.state.value})
         self._progress_timer.reschedule(monotonic() + PROGRESS_INTERVAL_S)
@@ -154,20 +153,6 @@ class HostRuntime:
         return self._close()
 
     # The loop's callbacks ----------------------------------------------------------------------
-
-    def _readable(self) -> None:
-        # One packet, and back to the loop, which looks for more: most often there is one.
-        received = self._port.socket.receive_from()
-        if received is None:
-            return
-        packet, address = received
-        datagrams = split(packet) if is_bundle(packet) else None
-        if datagrams is None:
-            self._take_datagram(packet, address)
-            return
-        with self._port.together(address):
-            for datagram in datagrams:
-                self._take_datagram(datagram, address)
 
     def _take_datagram(self, data: bytes, address: Address) -> None:
         message = self._session.receive_data(data, address, monotonic())
@@ -179,10 +164,8 @@ class HostRuntime:
 
     def _session_due(self) -> None:
         # What waits in the socket is heard before anybody is blamed for silence.
-        for packet, address in self._port.socket.receive_all():
-            datagrams = split(packet) if is_bundle(packet) else None
-            for data in (packet,) if datagrams is None else datagrams:
-                self._session.receive_datagram(data, address, monotonic())
+        for data, address in self._port.waiting():
+            self._session.receive_datagram(data, address, monotonic())
         self._session.handle_timer(monotonic())
         self._pump()
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from time import monotonic
 from typing import Any
 
 from madns_runtime.config import HostLaunch
 from madns_runtime.medium.carrier import Carrier
 from madns_runtime.plugin.context import check_sending
-from madns_runtime.protocol.bundle import bundle_up
+from madns_runtime.protocol.bundle import bundle_up, is_bundle, split
 from madns_runtime.protocol.host_peers import Address
 from madns_runtime.protocol.host_session import HostSession
 from madns_runtime.protocol.link import LinkLimits
@@ -83,17 +82,36 @@ class HostPort:
         for data, address in self.session.datagrams_to_send(monotonic()):
             self._post(data, address)
 
-    @contextmanager
-    def together(self, address: Address) -> Iterator[None]:
-        """Keep what is sent to *address* until the end of the block, and send it then: as few packets as hold it."""
-        self._kept_for, self._kept = address, []
+    def read(self, take: Callable[[bytes, Address], None]) -> None:
+        """
+        Hand the datagrams of one packet, if one waits, to *take*; what it sends to their sender leaves together.
+
+        The loop looks for more: most often there is one.
+        """
+        received = self.socket.receive_from()
+        if received is None:
+            return
+        packet, address = received
+        datagrams = split(packet) if is_bundle(packet) else None
+        if datagrams is None:
+            take(packet, address)
+            return
+        self._kept_for = address
         try:
-            yield
+            for datagram in datagrams:
+                take(datagram, address)
         finally:
-            kept, self._kept_for = self._kept, None
+            kept, self._kept, self._kept_for = self._kept, [], None
             if kept:
-                for packet in bundle_up(kept):
-                    self.socket.send(packet, address)
+                for bundle in bundle_up(kept):
+                    self.socket.send(bundle, address)
+
+    def waiting(self) -> Iterator[tuple[bytes, Address]]:
+        """Yield the datagrams that wait in the socket, of a bounded number of packets."""
+        for packet, address in self.socket.receive_all():
+            datagrams = split(packet) if is_bundle(packet) else None
+            for datagram in (packet,) if datagrams is None else datagrams:
+                yield datagram, address
 
     def _post(self, data: bytes, address: Address) -> None:
         if address == self._kept_for:

@@ -22,7 +22,7 @@ PACK_AGENTS_MAX = 8
 
 
 class PackMember(Protocol):
-    """An agent as its pack knows it."""
+    """An agent's ticks as its pack knows them."""
 
     def next_deadline_s(self) -> float:
         """Return the simulated time at which its next tick is due, s; infinite while it has none."""
@@ -33,8 +33,8 @@ class PackMember(Protocol):
     def tick(self) -> None:
         """Run the tick that is due, if one is."""
 
-    def ping_if_due(self, now_s: float) -> None:
-        """Say how it is, if that is due by *now_s* of the local clock."""
+    def say_how_it_is(self, now_s: float) -> None:
+        """Ping the host, if that is due by *now_s* of the local clock: this wake-up then serves for both."""
 
 
 class Pack:
@@ -78,7 +78,7 @@ class Pack:
                 member.tick()
             now_s = monotonic()
             for member in members:
-                member.ping_if_due(now_s)
+                member.say_how_it_is(now_s)
         finally:
             if is_shared:
                 process.end()

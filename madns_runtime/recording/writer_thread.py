@@ -82,14 +82,12 @@ class WriterThread:
             closing = [writing for writing in self._writings if writing.is_closing]
             must_sync = monotonic() - synced_s >= interval_s
             writings = list(self._writings)
-            is_troubled = not all([writing.files.write_waiting() for writing in writings])
+            is_troubled = not all([writing.is_written(must_sync) for writing in writings])
             if must_sync:
-                is_troubled |= not all([writing.files.sync() for writing in writings])
                 synced_s = monotonic()
             self.newest_pass = (began_s, monotonic(), thread_time() - computed_s)
             for writing in closing:
-                writing.files.finish()
-                writing.is_done.set()
+                writing.finish()
             with self._lock:
                 self._writings = [one for one in self._writings if one not in closing]
                 if not self._writings:
@@ -106,6 +104,24 @@ class _Writing:
         self.is_done = threading.Event()
         self._thread = thread
         self._wake = wake
+
+    def is_written(self, must_sync: bool) -> bool:
+        """Write what waits, and bring it to the disk itself if it *must_sync*; return whether all went well."""
+        try:
+            is_written = self.files.write_waiting()
+            return self.files.sync() and is_written if must_sync else is_written
+        except Exception as error:  # noqa: BLE001 - others share the thread: told, and tried again
+            self.files.add_error(f"{self.files.directory}: {type(error).__name__}: {error}")
+            return False
+
+    def finish(self) -> None:
+        """Give up what is not written, close the files, and let go whoever waits for that."""
+        try:
+            self.files.finish()
+        except Exception as error:  # noqa: BLE001 - others share the thread
+            self.files.add_error(f"{self.files.directory}: {type(error).__name__}: {error}")
+        finally:
+            self.is_done.set()
 
     def start(self) -> None:
         """Start the thread, if it is not started."""

@@ -66,7 +66,7 @@ class Member:
         self.ticks += 1
         self.due_s += 0.5
 
-    def ping_if_due(self, now_s):
+    def say_how_it_is(self, now_s):
         self.pings += 1
 
 

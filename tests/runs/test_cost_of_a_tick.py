@@ -58,11 +58,11 @@ def test_an_agents_tick_costs_one_system_call(evidence):
 def test_a_pack_travels_as_one_packet_and_so_does_the_answer(evidence):
     records, host, _ = agent_and_host(evidence)
 
-    # The rest is set-up, acknowledgements and the end.
+    # The rest is set-up, acknowledgements and the end; agents by themselves would send eight times as many.
     periods = DURATION_S * TICK_HZ
-    assert records["network"]["sent"] <= 1.6 * PACKS * periods
-    assert host["sent"] <= 1.6 * PACKS * periods
-    assert host["received"] <= 1.6 * PACKS * periods
+    assert records["network"]["sent"] <= 2.2 * PACKS * periods
+    assert host["sent"] <= 2.2 * PACKS * periods
+    assert host["received"] <= 2.2 * PACKS * periods
 
 
 def test_every_message_arrived_all_the_same(evidence):

@@ -1,0 +1,136 @@
+"""The ticks of one agent: its step called when one is due, paced, timed and recorded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import monotonic
+from typing import Any
+
+from madns_runtime.config import RunConfig
+from madns_runtime.plugin.api import Tick
+from madns_runtime.realtime.agent_calls import AGENT, IDLE, METHOD, STEP, T_S, LoopSeat
+from madns_runtime.realtime.agent_link import AgentPort
+from madns_runtime.realtime.late_ticks import LateTicks
+from madns_runtime.realtime.loop_account import Span
+from madns_runtime.recording.recorder import Recorder
+from madns_runtime.timing.late_causes import Cause
+from madns_runtime.timing.rate import Pacer, RealTimeFactor
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TickCalls:
+    """What an agent does in its ticks, and when something comes between."""
+
+    prepare: Callable[[float], bool] | None
+    """Hands in what comes with the tick at a simulated time, s; False if the agent has ended over it. None: nothing ever does."""
+    step: Callable[[Tick], None]
+    failed: Callable[[BaseException], None]
+    """Told what the step raised."""
+    ended: Callable[[], None]
+    """Told that no tick is left."""
+    is_running: Callable[[], bool]
+    say_how_it_is: Callable[[float], None]
+    """Pings the host, if that is due by a local time, s."""
+
+
+class AgentTicks:
+    """
+    The ticks of one agent.
+
+    Args:
+        seat: The agent, and where its calls are noted.
+        config: The run.
+        phase_s: Offset of its deadlines within the period, s.
+        port: Knows simulated time.
+        recorder: Where each tick is recorded.
+        calls: What the agent does in them.
+    """
+
+    def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
+        self,
+        seat: LoopSeat,
+        config: RunConfig,
+        phase_s: float,
+        *,
+        port: AgentPort,
+        recorder: Recorder,
+        calls: TickCalls,
+    ) -> None:
+        self.period_s = 1.0 / config.agents.tick_hz
+        self.pacer = Pacer(
+            tick_hz=config.agents.tick_hz,
+            phase_s=phase_s,
+            duration_s=config.time.duration_s,
+            overrun_s=config.deadline.overrun_ms * 1e-3,
+        )
+        self.factor = RealTimeFactor()
+        account = port.process.account
+        self.late = LateTicks(seat.number, self.period_s, recorder=recorder, account=account)
+        self._late_s = config.deadline.lateness_limit_s
+        self._page, self._seat = seat.calls.page, seat.number
+        self._port = port
+        self._add_span = account.add
+        self._record = recorder.record
+        self._calls = calls
+        # Called every tick: without a layer between.
+        self._prepare, self._step, self._is_running = calls.prepare, calls.step, calls.is_running
+        self.say_how_it_is = calls.say_how_it_is
+
+    def begin(self, now_s: float) -> None:
+        """Take note that the agent runs from simulated time *now_s* on, s: ticks that are over were never its own."""
+        if now_s > 0:
+            self.pacer.skip_to(now_s)
+        self.late.started_s = monotonic()
+        if self.pacer.is_over:
+            self._calls.ended()
+
+    def finish(self, now_s: float) -> None:
+        """Close the account at simulated time *now_s*, s."""
+        self.late.never_run(self.pacer.finish(now_s), monotonic())
+
+    def next_deadline_s(self) -> float:
+        """Return the simulated time at which the next one is due, s; infinite while there is none."""
+        deadline_s = self.pacer.next_deadline_s() if self._is_running() else None
+        return math.inf if deadline_s is None else deadline_s
+
+    def local_s(self, t_s: float) -> float:
+        """Return when simulated time *t_s* is on this machine's monotonic clock, s."""
+        return self._port.local_s(t_s)
+
+    def tick(self) -> None:
+        """Run the one that is due, if one is."""
+        if not self._is_running():
+            return
+        pacer, port = self.pacer, self._port
+        local_s = monotonic()
+        began_s = port.at(local_s)
+        timing = pacer.begin(began_s)
+        if timing is not None:
+            index, t_s, deadline_s, lateness_s, missed = timing
+            self.factor.add(t_s, began_s)
+            page = self._page
+            page[T_S] = t_s
+            if self._prepare is not None and not self._prepare(t_s):
+                return
+            page[AGENT], page[METHOD] = self._seat, STEP
+            try:
+                self._step(Tick(index, t_s, self.period_s, lateness_s, missed, deadline_s))
+            except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
+                page[METHOD] = IDLE
+                self._calls.failed(error)
+                return
+            page[METHOD] = IDLE
+            if port.must_flush:
+                # What the step sent leaves before anything else is done.
+                port.flush()
+            ended_s = monotonic()
+            margin_s = pacer.end(port.at(ended_s))
+            values: tuple[Any, ...] = (index, int(lateness_s * 1e6), int(margin_s * 1e6), missed)
+            self._record("ticks", values)
+            if missed or lateness_s > self._late_s:
+                self.late.explain(timing, local_s)
+            self._add_span(Span(Cause.STEP, self._seat, local_s, ended_s))
+        if pacer.is_over:
+            self._calls.ended()

@@ -1,0 +1,98 @@
+"""What the host reads and sends by packets: datagrams of one process come together, and are answered together."""
+
+from __future__ import annotations
+
+import socket
+
+import pytest
+
+from madns_runtime.protocol.bundle import BUNDLE, bundle_up, split
+from madns_runtime.protocol.datagram import OVERHEAD_BYTES
+from madns_runtime.reactor.udp import UdpSocket
+from madns_runtime.realtime.host_link import HostPort
+
+
+@pytest.fixture
+def port():
+    # Without a session: what is tried here is the socket's side alone.
+    port = HostPort.__new__(HostPort)
+    port.socket = UdpSocket.bind("127.0.0.1", 0, receive_buffer_bytes=262_144)
+    port._kept_for, port._kept = None, []
+    yield port
+    port.socket.close()
+
+
+@pytest.fixture
+def agents(port):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as handle:
+        handle.bind(("127.0.0.1", 0))
+        handle.connect(port.socket.address)
+        handle.settimeout(5)
+        yield handle
+
+
+def datagram(fill):
+    return bytes([1]) + fill * OVERHEAD_BYTES
+
+
+def test_a_bundle_is_answered_by_one(port, agents):
+    sent = [datagram(b"a"), datagram(b"b"), datagram(b"c")]
+    (bundle,) = bundle_up(sent)
+    agents.send(bundle)
+    port.read(lambda data, address: port._post(data[::-1], address))
+
+    assert split(agents.recv(2048)) == [data[::-1] for data in sent]
+
+
+def test_a_datagram_by_itself_is_answered_at_once(port, agents):
+    agents.send(datagram(b"a"))
+    got = []
+
+    def take(data, address):
+        port._post(data, address)
+        got.append(agents.recv(2048))
+
+    port.read(take)
+    assert got == [datagram(b"a")]
+
+
+def test_what_goes_elsewhere_does_not_wait_for_the_answers(port, agents):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        other.settimeout(5)
+        (bundle,) = bundle_up([datagram(b"a"), datagram(b"b")])
+        agents.send(bundle)
+        got = []
+
+        def take(data, address):
+            port._post(data, other.getsockname())
+            got.append(other.recv(2048))
+
+        port.read(take)
+    assert got == [datagram(b"a"), datagram(b"b")]
+
+
+def test_answers_leave_also_when_a_call_fails(port, agents):
+    (bundle,) = bundle_up([datagram(b"a"), datagram(b"b")])
+    agents.send(bundle)
+
+    def take(data, address):
+        port._post(data, address)
+        raise ValueError("a plug-in")
+
+    with pytest.raises(ValueError, match="a plug-in"):
+        port.read(take)
+    assert agents.recv(2048) == datagram(b"a")
+    assert port._kept_for is None
+
+
+def test_a_malformed_bundle_is_handed_on_to_be_refused(port, agents):
+    agents.send(bytes([BUNDLE, 1, 2, 3]))
+    agents.send(bytes([BUNDLE, 1, 2]))
+    got = []
+    port.read(lambda data, address: got.append(data))
+
+    assert got == [bytes([BUNDLE, 1, 2, 3])]
+    assert [data for data, _ in port.waiting()] == [bytes([BUNDLE, 1, 2])]
+    port.read(lambda data, address: got.append(data))
+    assert len(got) == 1
