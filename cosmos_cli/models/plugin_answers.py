@@ -7,9 +7,8 @@ Code that is not shipped with COSMoS is imported and asked in a process of its o
 from __future__ import annotations
 
 import json
-import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,16 +17,16 @@ from pydantic import ValidationError
 
 from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault, InputError
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
-from cosmos_cli.models.document import Document, dotted, parse_override
+from cosmos_cli.models.document import Document, parse_override
 from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.parameters import adapter_of
+from cosmos_cli.models.plugin_values import changed, is_same, not_sendable
 from cosmos_cli.models.separate_process import (
     SeparateDefect,
     SeparateFailure,
     work_separately,
 )
 from cosmos_cli.models.translate import faults_of
-from cosmos_cli.models.yaml_source import WHOLE_MAX, WHOLE_MIN
 from madns_runtime import errors as runtime_errors
 from madns_runtime.config import Agents, Timeouts, from_mapping, to_mapping
 from madns_runtime.errors import ConfigurationError, MadnsError, MissingExtraError, PluginError
@@ -268,9 +267,9 @@ class _Asking:
             texts = [f"{blame(error, kind)}: {kind.__name__}: {said(error)}"]
         else:
             made = to_mapping(parameters)
-            wrong = list(_not_sendable(made, ()))
-            if not wrong and not _is_same(made, found):
-                wrong = [_changed(made, found)]
+            wrong = list(not_sendable(made, ()))
+            if not wrong and not is_same(made, found):
+                wrong = [changed(made, found)]
             texts = [f"{_place(kind)}: {text}" for text in wrong]
         self._blame(*texts)
         return None if texts else parameters
@@ -350,43 +349,6 @@ class _Asking:
 def _place(kind: type) -> str:
     """Return where a class of parameters stands, and its name: for a fault alone, as its file is read for it."""
     return f"{place_of(kind)}: {kind.__name__}"
-
-
-def _not_sendable(value: Any, path: ValuePath) -> Iterator[str]:
-    """
-    Say of each value that a run's messages and files cannot hold what is wrong: such a value is a default.
-
-    A scenario's own values were looked at when they were read.
-    """
-    if isinstance(value, Mapping):
-        for key, item in value.items():
-            yield from _not_sendable(item, (*path, str(key)))
-    elif isinstance(value, list | tuple):
-        for index, item in enumerate(value):
-            yield from _not_sendable(item, (*path, index))
-    elif isinstance(value, float) and not math.isfinite(value):
-        yield f"{dotted(path)}: expected a finite number, got {value}; None can stand for no limit"
-    elif isinstance(value, int) and not WHOLE_MIN <= value <= WHOLE_MAX:
-        yield f"{dotted(path)}: expected a whole number from -2^63 to 2^63 - 1"
-    elif (
-        isinstance(value, str)
-        and not value.isascii()
-        and value != value.encode("utf-8", "replace").decode("utf-8")
-    ):
-        yield f"{dotted(path)}: expected text that UTF-8 can hold, got {value!r:.60}"
-
-
-def _is_same(made: Any, found: Any) -> bool:
-    """Compare plain values; NaN is the same as NaN."""
-    return json.dumps(made, sort_keys=True) == json.dumps(found, sort_keys=True)
-
-
-def _changed(made: Mapping[str, Any], found: Mapping[str, Any]) -> str:
-    names = ", ".join(name for name in found if not _is_same(made.get(name), found[name]))
-    return (
-        f"made anew of its own values, as host and agents do, {names} came out another; let"
-        " __post_init__ keep what it made already"
-    )
 
 
 def fault_found_at(document: Document, text: str) -> Fault:
