@@ -372,7 +372,7 @@ def test_what_cannot_be_ends_the_agent_with_blame(tmp_path):
     flight["command"] = [
         sys.executable,
         "-c",
-        f"import os; os.read(0, 9); os.write(1, {told!r}); os.read(0, 9**6); input()",
+        f"import os, time; os.read(0, 9); os.write(1, {told!r}); time.sleep(60)",
     ]
     ship = Ship(tmp_path, None, flight=flight)
 

@@ -63,8 +63,9 @@ def test_lost_board_comes_back_with_its_emulator(tower: RunTower, fault: str) ->
     assert document["status"] == "complete"
     assert document["agents"]["incarnations"] == {AGENT: 2}
     assert f"MACHINES FAILED: {LOST}: machine {LOST} is lost" in tower.verdict
-    lost = next(check for check in document["checks"] if check["name"] == "hardware.lost")
-    assert lost["worst"] == f"{AGENT}/mcu"
+    if fault == "crash":  # a board that only hears nobody closes its devices in order
+        lost = next(check for check in document["checks"] if check["name"] == "hardware.lost")
+        assert lost["worst"] == f"{AGENT}/mcu"
     assert len(emulators) == 1, emulators
     assert_returned(tower.directory, AGENT)
     assert_untouched(tower.directory, WITH_COMPUTER, DURATION_S, has_computer=True)
