@@ -89,6 +89,7 @@ class LockstepAgent:
             directory=mates.directory,
             clock=mates.clock,
         )
+        self.has_devices = bool(self.devices)
         self.context = PeerContext(
             name=self.name,
             config=mates.config,

@@ -11,6 +11,7 @@ from pathlib import Path
 from madns_runtime.config import RunConfig
 from madns_runtime.errors import MachineError
 from madns_runtime.lockstep.clock import T0_UTC, SimulatedClock
+from madns_runtime.recording.number_rows import ROWS_TOGETHER
 from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
 from madns_runtime.recording.run_journal import RunJournal
@@ -69,6 +70,6 @@ def open_journal(
         MachineError: The directory cannot be made, or takes no new file.
     """
     files = RecordFiles(directory, run=config.scenario, source=source)
-    recorder = Recorder(files, config.recording, DirectWriter(files))
+    recorder = Recorder(files, config.recording, DirectWriter(files), rows_together=ROWS_TOGETHER)
     recorder.set_t0(T0_UTC)
     return RunJournal(recorder, config.recording.verbosity, t_s=clock.now_s, utc=clock.utc)

@@ -222,9 +222,9 @@ class Worker:
         agent = self._agents[0]
         try:
             for agent in self._agents:
-                if has_medium:
-                    self._hear(agent, t_s)
-                if agent.devices:
+                if has_medium and (heard := agent.mailbox.due(t_s)):
+                    self._hear(agent, heard)
+                if agent.has_devices:
                     self._look_at_devices(agent, t_s)
                 position[0] = agent.stepping
                 agent.step(tick)
@@ -237,8 +237,8 @@ class Worker:
         self._flush()
         return self._done([agent.columns.read() for agent in self._agents])
 
-    def _hear(self, agent: LockstepAgent, t_s: float) -> None:
-        for delivery in agent.mailbox.due(t_s):
+    def _hear(self, agent: LockstepAgent, heard: Sequence[Delivery]) -> None:
+        for delivery in heard:
             self._position[0] = agent.index * POSITIONS + frames.HEARING
             self._call(agent, "hear", delivery)
 

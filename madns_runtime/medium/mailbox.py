@@ -110,10 +110,13 @@ class Mailbox:
         entry = (delivery.arrives_s, delivery.sender, delivery.sent_s, self._serial, delivery)
         heapq.heappush(self._held, entry)
 
-    def due(self, t_s: float) -> list[Delivery]:
+    def due(self, t_s: float) -> Sequence[Delivery]:
         """Begin the tick at *t_s*: return what is received in it, in order, and forget it."""
         self.tick_s = t_s
-        held, found = self._held, []
+        held = self._held
+        if not held:  # as in most ticks
+            return ()
+        found = []
         while held and held[0][0] <= t_s + TIME_EPSILON_S:
             found.append(heapq.heappop(held)[-1])
         self._received += len(found)

@@ -34,10 +34,16 @@ class Recorder:
         files: Where records go.
         settings: Bounds and intervals.
         writer: What brings them there; None for a thread of its own.
+        rows_together: Records of numbers alone that are encoded at once, where whoever records can wait.
     """
 
     def __init__(
-        self, files: RecordFiles, settings: Recording, writer: RecordWriter | None = None
+        self,
+        files: RecordFiles,
+        settings: Recording,
+        writer: RecordWriter | None = None,
+        *,
+        rows_together: int = 1,
     ) -> None:
         self._files = files
         self._writer = writer or WriterThread(settings).writes(files)
@@ -45,8 +51,8 @@ class Recorder:
         self._queued_bytes = 0
         self._streams: dict[str, StreamFile] = {}
         self._texts: dict[str, TextFile] = {}
+        self._rows_together = rows_together
         self.start = self._writer.start
-        self.flush = self._writer.flush
 
     def open_stream(self, schema: StreamSchema) -> None:
         """
@@ -89,12 +95,43 @@ class Recorder:
             values = file.arrange(values)
         elif len(values) != file.width:
             raise file.width_error(len(values))
+        if (rows := file.rows) is not None:
+            if self._rows_together > 1 and type(values) is tuple:
+                rows.waiting.append(values)
+                if len(rows.waiting) >= self._rows_together:
+                    self._encode_rows(file)
+                return
+            if rows.waiting:  # which come first
+                self._encode_rows(file)
+            values = rows.rounded([*values])
+        self._encode(file, values)
+
+    def _encode(self, file: StreamFile, values: Any) -> None:
         try:
             line = orjson.dumps(values, to_plain, ENCODING)
         except TypeError as error:
-            raise explain_refusal(stream, values, error) from error
+            raise explain_refusal(file.schema.name, values, error) from error
         if b"null" in line:
             file.not_finite += count_not_finite(values)
+        self._queue(file, line)
+
+    def _encode_rows(self, file: StreamFile) -> None:
+        """Encode the records of numbers that wait for others."""
+        rows = file.rows
+        if rows is None or not rows.waiting:
+            return
+        try:
+            lines, not_finite = rows.encode()
+        except TypeError:  # one is something else: told, or encoded, by itself
+            waiting, rows.waiting = rows.waiting, []
+            for values in waiting:
+                self._encode(file, rows.rounded(values))
+            return
+        file.not_finite += not_finite
+        for line in lines:
+            self._queue(file, line)
+
+    def _queue(self, file: StreamFile, line: bytes) -> None:
         queued_bytes = self._queued_bytes + len(line) + LINE_OVERHEAD_BYTES
         waiting_bytes = queued_bytes - self._files.freed_bytes
         if waiting_bytes > self._limit_bytes:
@@ -103,7 +140,18 @@ class Recorder:
         self._queued_bytes = queued_bytes
         file.lines.append(line)
         if waiting_bytes > WAKE_BYTES:
-            self.flush()
+            self._writer.flush()
+
+    def flush(self) -> None:
+        """
+        Have what waits written without delay.
+
+        Raises:
+            MachineError: The writer writes at once, and the disk refuses.
+        """
+        for file in self._streams.values():
+            self._encode_rows(file)
+        self._writer.flush()
 
     def keep_text(self, name: str, data: bytes) -> None:
         """
@@ -120,7 +168,10 @@ class Recorder:
     def newest(self, stream: str) -> Mapping[str, Any]:
         """Return the newest record of a stream by its fields' names; empty where there is none."""
         file = self._streams.get(stream)
-        if file is None or not (line := file.newest):
+        if file is None:
+            return {}
+        self._encode_rows(file)
+        if not (line := file.newest):
             return {}
         record = orjson.loads(line)
         if isinstance(record, dict):
@@ -145,6 +196,8 @@ class Recorder:
         Args:
             timeout_s: How long to wait for the disk; after it an error is in the counts.
         """
+        for file in self._streams.values():
+            self._encode_rows(file)
         self._limit_bytes = -1
         self._writer.close(timeout_s)
         return self.counts()

@@ -24,6 +24,9 @@ class Field:
     unit: str = ""
     kind: Literal["float", "int", "str", "bool", "json", "packed"] = "float"
     """packed: text that its simulation alone reads; it is left out of tables."""
+    digits: int | None = None
+    """Decimal places that are recorded of a float; None for all. In a stream that has such a field every other
+    one is an int: `number_rows` then rounds and encodes many records at once."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ import numpy as np
 import orjson
 
 from madns_runtime.errors import MachineError, PluginError
+from madns_runtime.recording.number_rows import DIGITS_MAX, NumberRows
 from madns_runtime.recording.records import StreamSchema
 
 LINES_PER_WRITE_MAX = 1024
@@ -46,12 +47,25 @@ def check_schema(schema: StreamSchema) -> None:
     Check that a stream of this schema can be a file that is read back.
 
     Raises:
-        PluginError: Its name is no file name, it has no fields, or two of one name.
+        PluginError: Its name is no file name, it has no fields, two of one name, or some that are rounded among
+            others that are no numbers.
     """
     check_name(schema.name)
     names = [field.name for field in schema.fields]
     if not names or len(set(names)) != len(names):
         raise PluginError(f"stream {schema.name}: expected fields with distinct names, got {names}")
+    digits = [field.digits for field in schema.fields]
+    is_int = [field.kind == "int" for field in schema.fields]
+    is_rounded = any(places is not None for places in digits)
+    if is_rounded and (
+        schema.shape != "array"
+        or any((places is None) != whole for places, whole in zip(digits, is_int, strict=True))
+        or not all(0 <= (places or 0) <= DIGITS_MAX for places in digits)
+    ):
+        raise PluginError(
+            f"stream {schema.name}: expected digits, 0 to {DIGITS_MAX}, of every field of kind float, ints besides,"
+            " and records that are arrays"
+        )
     if schema.shape == "object" and len(names) == 1 and names[0] in CONTROL_KEYS:
         raise PluginError(f"stream {schema.name}: a single field may not be named {names[0]}")
 
@@ -83,6 +97,11 @@ def create_file(directory: Path, name: str, first: int) -> tuple[Path, int, int]
     raise MachineError(f"{directory}: holds {FILES_MAX} files of stream {name}; clear it out")
 
 
+def _number_rows(schema: StreamSchema) -> NumberRows | None:
+    digits = [field.digits for field in schema.fields]
+    return None if all(places is None for places in digits) else NumberRows(digits)
+
+
 class StreamFile:
     """One open stream: what waits, what was written, and how its values become a line."""
 
@@ -103,6 +122,7 @@ class StreamFile:
         "not_finite",
         "overflowed",
         "path",
+        "rows",
         "schema",
         "unwritten",
         "width",
@@ -115,6 +135,8 @@ class StreamFile:
         self.width = len(schema.fields)
         self.direct: tuple[type, ...] = (tuple, list) if schema.shape == "array" else ()
         """Types of values that need no rearranging before they are encoded."""
+        self.rows = _number_rows(schema)
+        """Rounds its records; None where every digit is kept."""
         self.lines: list[bytes] = []
         self.overflowed = 0
         self.not_finite = 0

@@ -13,6 +13,7 @@ from madns_runtime.medium.mailbox import Mailbox
 from madns_runtime.plugin.api import Tick
 from madns_runtime.protocol.codec import decode_message, encode_message, pack, unpack
 from madns_runtime.protocol.messages import Delivery, Transmission, TransmissionRefusal
+from madns_runtime.recording.number_rows import NumberRows
 from madns_runtime.simulations.constellation.agent import ConstellationAgent
 from madns_runtime.simulations.constellation.host import ConstellationHost, radio_of
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
@@ -74,8 +75,11 @@ class FakeContext:
         self.streams[name] = tuple(fields)
 
     def record(self, stream, values):
-        assert len(values) == len(self.streams[stream])
-        self.records[stream].append(tuple(values))
+        fields = self.streams[stream]
+        assert len(values) == len(fields)
+        rounded = NumberRows([field.digits for field in fields]).rounded(values)
+        is_whole = all(field.digits is None for field in fields)
+        self.records[stream].append(tuple(values if is_whole else rounded))
 
     def log(self, level, text):
         self.logs.append((level, text))

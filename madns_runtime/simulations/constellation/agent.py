@@ -2,7 +2,7 @@
 An agent's half of the constellation: one vehicle with its truth, its sensors and its flight software.
 
 Needs numpy and nothing of the host's side. A tick costs about 3 us besides recording, 8 us with
-elements; values are rounded to 1 um and 1 nm/s, which keeps a tick's records near 103 B at 10 Hz: what is flown on
+elements; their streams round them, to 1 um and 1 nm/s, which keeps a tick's records near 103 B at 10 Hz: what is flown on
 from a record, in LEO, is 0.3 mm off after a day. The host's own record has every bit.
 """
 
@@ -25,17 +25,23 @@ from madns_runtime.simulations.constellation.orbit.constants import (
     EARTH_POLAR_RADIUS_M,
     GRAVITY_MODELS,
 )
-from madns_runtime.simulations.constellation.orbit.elements import elements_from_state
+from madns_runtime.simulations.constellation.orbit.elements import element_numbers
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
 from madns_runtime.simulations.constellation.streams import ATTITUDE, ELEMENTS, STATE, TRUTH_CHANGES
 from madns_runtime.simulations.constellation.vehicle.device_commands import (
     DEVICE_NUMBER_FIRST,
     DeviceCommands,
 )
-from madns_runtime.simulations.constellation.vehicle.flight_tick import fit_out, rate_of
+from madns_runtime.simulations.constellation.vehicle.flight_tick import (
+    Cockpit,
+    fit_out,
+    rate_of,
+)
 from madns_runtime.simulations.constellation.vehicle.stimuli import Stimuli
 from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBuffer
 from madns_runtime.simulations.constellation.vehicles import flight_of, vehicle_of
+
+EARTH_POLAR_RADIUS_M2 = EARTH_POLAR_RADIUS_M**2
 
 
 class ConstellationAgent(AgentSimulation):
@@ -86,6 +92,7 @@ class ConstellationAgent(AgentSimulation):
         self._is_commanded = self._cockpit is not None or self._devices is not None
         self._phase_s = 0.0
         self._flight_tick = 0
+        self._has_early_steps = self._cockpit is not None and self._rate.steps_per_tick > 1
         self._has_begun = False
         if self._is_commanded:
             context.open_stream("truth_changes", TRUTH_CHANGES)
@@ -98,38 +105,45 @@ class ConstellationAgent(AgentSimulation):
         Raises:
             BlamedError: The vehicle has met the Earth.
         """
+        index, t_s = tick.index, tick.t_s
         # Its ticks lie that much behind their nominal times, and so do its maneuvers.
-        self._phase_s = max(0.0, tick.deadline_s - tick.t_s)
-        self._step_early(tick)
-        state = self._buffer.lookup(tick.t_s)
+        phase_s = tick.deadline_s - t_s
+        self._phase_s = phase_s = phase_s if phase_s > 0.0 else 0.0
+        cockpit = self._cockpit
+        if cockpit is not None:
+            cockpit.phase_s = phase_s
+            if self._has_early_steps:
+                self._step_early(index, cockpit)
+        state = self._buffer.lookup(t_s)
         if state is not None:
             x, y, z = state[:3]
-            if x * x + y * y + z * z < EARTH_POLAR_RADIUS_M**2:
-                raise BlamedError(f"{self._satellite} has met the Earth at {tick.t_s:g} s")
-            self._record_truth(tick, state)
-        self._measure(tick.index, tick.t_s, state)
-        if self._cockpit is not None and tick.index >= self._flight_tick:
+            if x * x + y * y + z * z < EARTH_POLAR_RADIUS_M2:
+                raise BlamedError(f"{self._satellite} has met the Earth at {t_s:g} s")
+            self._served += 1
+            if index >= self._state_tick:
+                self._record_state(index, state)
+            if index >= self._elements_tick:
+                self._record_elements(index, state)
+        if self._sensors is not None:
+            self._measure(index, t_s, state)
+        if cockpit is not None and index >= self._flight_tick:
             # At the first tick at or after each of its times.
             every = self._rate.ticks_per_step
-            self._flight_tick = tick.index - tick.index % every + every
-            self._cockpit.step(tick.index, tick.t_s, state)
+            self._flight_tick = index - index % every + every
+            cockpit.step(index, t_s, state)
         if self._devices is not None:
-            self._devices.step(tick.index, tick.t_s, self._phase_s)
+            self._devices.step(index, t_s, phase_s)
         if self._stimuli is not None:
-            self._stimuli.step(tick.t_s)
+            self._stimuli.step(t_s)
 
-    def _step_early(self, tick: Tick) -> None:
+    def _step_early(self, tick: int, cockpit: Cockpit) -> None:
         """Do the steps of flight software since the tick before, but the one at the tick's own time."""
-        cockpit = self._cockpit
-        if cockpit is None:
-            return
-        cockpit.phase_s = self._phase_s
         has_begun, self._has_begun = self._has_begun, True
         # Who has just begun, or rejoined, was not there yet.
-        for t_s in self._rate.early_times_s(tick.index) if has_begun else ():
+        for t_s in self._rate.early_times_s(tick) if has_begun else ():
             state = self._buffer.lookup(t_s)
-            self._measure(tick.index, t_s, state)
-            cockpit.step(tick.index, t_s, state, is_early=True)
+            self._measure(tick, t_s, state)
+            cockpit.step(tick, t_s, state, is_early=True)
 
     def _measure(self, tick: int, t_s: float, state: tuple[float, ...] | None) -> None:
         if self._sensors is not None:
@@ -137,31 +151,13 @@ class ConstellationAgent(AgentSimulation):
             if self._cockpit is not None:
                 self._cockpit.take(self._sensors.news())
 
-    def _record_truth(self, tick: Tick, state: tuple[float, ...]) -> None:
-        self._served += 1
-        if tick.index >= self._state_tick:
-            self._state_tick = tick.index - tick.index % self._state_stride + self._state_stride
-            self._record_state(tick.index, state)
-        if tick.index >= self._elements_tick:
-            self._elements_tick = tick.index - tick.index % self._stride + self._stride
-            self._record_elements(tick.index, state)
-
     def _record_state(self, tick: int, state: tuple[float, ...]) -> None:
-        x, y, z, vx, vy, vz = state[:6]
-        self._context.record(
-            "state",
-            (
-                tick,
-                round(x, 6),
-                round(y, 6),
-                round(z, 6),
-                round(vx, 9),
-                round(vy, 9),
-                round(vz, 9),
-            ),
-        )
-        if len(state) > 6:
-            self._context.record("attitude", (tick, *[round(value, 12) for value in state[6:]]))
+        self._state_tick = tick - tick % self._state_stride + self._state_stride
+        if len(state) == 6:
+            self._context.record("state", (tick, *state))
+        else:
+            self._context.record("state", (tick, *state[:6]))
+            self._context.record("attitude", (tick, *state[6:]))
 
     def receive(self, message: Any) -> None:
         """
@@ -261,20 +257,9 @@ class ConstellationAgent(AgentSimulation):
         }
 
     def _record_elements(self, tick: int, state: tuple[float, ...]) -> None:
-        x, y, z, vx, vy, vz = state[:6]
+        self._elements_tick = tick - tick % self._stride + self._stride
         try:
-            elements = elements_from_state((x, y, z), (vx, vy, vz), self._mu_m3_s2)
+            a_m, e, *angles_rad = element_numbers(state[:6], self._mu_m3_s2)
         except ValueError:
             return  # an escape orbit has none of these
-        self._context.record(
-            "elements",
-            (
-                tick,
-                round(elements.a_m, 3),
-                round(elements.e, 10),
-                round(math.degrees(elements.i_rad), 8),
-                round(math.degrees(elements.raan_rad), 8),
-                round(math.degrees(elements.argp_rad), 7),
-                round(math.degrees(elements.mean_anomaly_rad), 7),
-            ),
-        )
+        self._context.record("elements", (tick, a_m, e, *map(math.degrees, angles_rad)))

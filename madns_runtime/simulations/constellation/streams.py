@@ -14,23 +14,23 @@ from madns_runtime.simulations.constellation.parameters import ConstellationPara
 
 STATE = (
     Field("tick", "", "int"),
-    Field("x_teme_m", "m"),
-    Field("y_teme_m", "m"),
-    Field("z_teme_m", "m"),
-    Field("vx_teme_m_s", "m/s"),
-    Field("vy_teme_m_s", "m/s"),
-    Field("vz_teme_m_s", "m/s"),
+    Field("x_teme_m", "m", digits=6),
+    Field("y_teme_m", "m", digits=6),
+    Field("z_teme_m", "m", digits=6),
+    Field("vx_teme_m_s", "m/s", digits=9),
+    Field("vy_teme_m_s", "m/s", digits=9),
+    Field("vz_teme_m_s", "m/s", digits=9),
 )
 """Truth at every tick, or as often as the scenario says; a tick without truth has no record."""
 
 ELEMENTS = (
     Field("tick", "", "int"),
-    Field("a_m", "m"),
-    Field("e", "1"),
-    Field("i_deg", "deg"),
-    Field("raan_deg", "deg"),
-    Field("argp_deg", "deg"),
-    Field("mean_anomaly_deg", "deg"),
+    Field("a_m", "m", digits=3),
+    Field("e", "1", digits=10),
+    Field("i_deg", "deg", digits=8),
+    Field("raan_deg", "deg", digits=8),
+    Field("argp_deg", "deg", digits=7),
+    Field("mean_anomaly_deg", "deg", digits=7),
 )
 """Osculating elements of the state, in the scenario's gravity constants; none of a vehicle on an escape orbit."""
 
@@ -45,13 +45,13 @@ the beginning of a burn."""
 
 ATTITUDE = (
     Field("tick", "", "int"),
-    Field("q1", "1"),
-    Field("q2", "1"),
-    Field("q3", "1"),
-    Field("q4", "1"),
-    Field("wx_body_rad_s", "rad/s"),
-    Field("wy_body_rad_s", "rad/s"),
-    Field("wz_body_rad_s", "rad/s"),
+    Field("q1", "1", digits=12),
+    Field("q2", "1", digits=12),
+    Field("q3", "1", digits=12),
+    Field("q4", "1", digits=12),
+    Field("wx_body_rad_s", "rad/s", digits=12),
+    Field("wy_body_rad_s", "rad/s", digits=12),
+    Field("wz_body_rad_s", "rad/s", digits=12),
 )
 """Truth of a rigid body: quaternion, scalar last, inertial to body, and body rates."""
 
@@ -208,6 +208,12 @@ UNITS = {
 }
 """Units that end the name of an estimate."""
 
+
+def _of_sensor(fields: tuple[Field, ...]) -> tuple[Field, ...]:
+    """Return the same fields with every digit: what truth rounds away may be what a sensor's noise is made of."""
+    return tuple(replace(field, digits=None) for field in fields)
+
+
 OF_HOST = {
     "truth": TRUTH,
     "invariants": INVARIANTS,
@@ -226,15 +232,15 @@ OF_AGENTS = {
     "refusals": REFUSALS,
     "flight_answers": FLIGHT_ANSWERS,
     "flight_clock": FLIGHT_CLOCK,
-    "gyro": (*SAMPLE, *ATTITUDE[5:]),
-    "gnss": (*SAMPLE, *STATE[1:]),
+    "gyro": (*SAMPLE, *_of_sensor(ATTITUDE[5:])),
+    "gnss": (*SAMPLE, *_of_sensor(STATE[1:])),
     "accelerometer": (
         *SAMPLE,
         Field("ax_m_s2", "m/s^2"),
         Field("ay_m_s2", "m/s^2"),
         Field("az_m_s2", "m/s^2"),
     ),
-    "star_tracker": (*SAMPLE, *ATTITUDE[1:5]),
+    "star_tracker": (*SAMPLE, *_of_sensor(ATTITUDE[1:5])),
     "sun_sensor": (*SAMPLE, Field("sx", "1"), Field("sy", "1"), Field("sz", "1")),
     "clock_sensor": (*SAMPLE, Field("clock_s", "s")),
     "magnetometer": (*SAMPLE, Field("bx_t", "T"), Field("by_t", "T"), Field("bz_t", "T")),

@@ -14,6 +14,7 @@ are in the run's inertial frame unless it says otherwise.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from madns_runtime.simulations.constellation.messages import (
@@ -59,11 +60,15 @@ class StepReadings(dict[str, Reading]):
     """
 
     def __init__(
-        self, newest: Mapping[str, Reading], all_new: Mapping[str, Sequence[Reading]]
+        self,
+        newest: Mapping[str, Reading] = MappingProxyType({}),
+        all_new: Mapping[str, Sequence[Reading]] = MappingProxyType({}),
     ) -> None:
-        super().__init__(newest)
-        self.samples = {name: tuple(news) for name, news in all_new.items() if len(news) > 1}
+        self.samples: dict[str, tuple[Reading, ...]] = {}
         """Of the sensors with more than one."""
+        if newest:  # in lockstep many a step of many a vehicle has none
+            super().__init__(newest)
+            self.samples = {name: tuple(news) for name, news in all_new.items() if len(news) > 1}
 
     def since(self, name: str) -> tuple[Reading, ...]:
         """Return all readings of a sensor since the step before, oldest first; none for one without news."""

@@ -16,6 +16,7 @@ from the node, or from the x axis if there is none either.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 Vector = tuple[float, float, float]
@@ -89,8 +90,31 @@ def elements_from_state(r_m: Vector, v_m_s: Vector, mu_m3_s2: float) -> Elements
     Raises:
         ValueError: The state is not that of an ellipse (parabolic, hyperbolic or straight).
     """
-    x, y, z = r_m
-    vx, vy, vz = v_m_s
+    a_m, e, i_rad, raan_rad, argp_rad, mean_anomaly_rad = element_numbers((*r_m, *v_m_s), mu_m3_s2)
+    return Elements(
+        a_m=a_m,
+        e=e,
+        i_rad=i_rad,
+        raan_rad=raan_rad,
+        argp_rad=argp_rad,
+        mean_anomaly_rad=mean_anomaly_rad,
+    )
+
+
+def element_numbers(
+    state: Sequence[float], mu_m3_s2: float
+) -> tuple[float, float, float, float, float, float]:
+    """
+    Return the same as plain numbers, in the order of `Elements`: an object costs a third of the mathematics.
+
+    Args:
+        state: Position (m) and velocity (m/s) in an inertial frame, six numbers.
+        mu_m3_s2: Gravitational parameter, m^3/s^2.
+
+    Raises:
+        ValueError: The state is not that of an ellipse (parabolic, hyperbolic or straight).
+    """
+    x, y, z, vx, vy, vz = state
     radius = math.sqrt(x * x + y * y + z * z)
     rv = x * vx + y * vy + z * vz
     v2 = vx * vx + vy * vy + vz * vz
@@ -111,13 +135,13 @@ def elements_from_state(r_m: Vector, v_m_s: Vector, mu_m3_s2: float) -> Elements
     u = math.atan2(x * mx + y * my + z * mz, x * nx + y * ny)
     circular = e < CIRCULAR_ECCENTRICITY
     nu = u if circular else math.atan2(e_sin, e_cos)
-    return Elements(
-        a_m=1.0 / alpha,
-        e=0.0 if circular else e,
-        i_rad=math.atan2(sine, hz),
-        raan_rad=0.0 if equatorial else _turn(math.atan2(ny, nx)),
-        argp_rad=0.0 if circular else _turn(u - nu),
-        mean_anomaly_rad=_turn(mean_from_true(nu, 0.0 if circular else e)),
+    return (
+        1.0 / alpha,
+        0.0 if circular else e,
+        math.atan2(sine, hz),
+        0.0 if equatorial else _turn(math.atan2(ny, nx)),
+        0.0 if circular else _turn(u - nu),
+        _turn(mean_from_true(nu, 0.0 if circular else e)),
     )
 
 

@@ -17,6 +17,7 @@ import binascii
 import zlib
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -184,14 +185,16 @@ def pack_numbers(numbers: Array) -> str:
         numbers: Shape (K, C), float64, rows in order of time.
     """
     bits = np.ascontiguousarray(numbers, dtype=_LAYOUT).view("<i8")
-    order, size = 0, _size(bits)
-    while order < min(ORDER_MAX, len(bits) - 1):
-        further = bits.copy()
-        further[order + 1 :] -= bits[order:-1]
-        size_further = _size(further)
-        if size_further >= size:
-            break
-        order, bits, size = order + 1, further, size_further
+    orders = np.empty((min(ORDER_MAX, len(bits) - 1) + 1, *bits.shape), bits.dtype)
+    orders[0] = bits
+    for before, after in pairwise(range(len(orders))):
+        orders[after] = orders[before]
+        orders[after, after:] -= orders[before, before:-1]
+    sizes = _sizes(orders)
+    order = 0
+    while order + 1 < len(sizes) and sizes[order + 1] < sizes[order]:
+        order += 1
+    bits = orders[order]
     # Sign last, so that small negative numbers have leading zeros too; then byte by byte, not number by number.
     folded = (bits << 1) ^ (bits >> 63)
     planes = np.ascontiguousarray(folded.T).view(np.uint8).reshape(-1, 8).T
@@ -224,6 +227,8 @@ def unpack_numbers(text: str, rows: int, columns: int) -> Array:
     return np.ascontiguousarray(bits).view(_LAYOUT).astype(np.float64, copy=False)
 
 
-def _size(bits: NDArray[np.int64]) -> float:
-    """Return a measure of what the numbers need: the sum of their lengths in bits, or nearly so."""
-    return float(np.log2(np.abs(bits.astype(np.float64)) + 1.0).sum())
+def _sizes(orders: NDArray[np.int64]) -> list[float]:
+    """Return a measure of what the numbers of each order need: the sum of their lengths in bits, or nearly so."""
+    lengths = np.log2(np.abs(orders.astype(np.float64)) + 1.0)
+    sizes: list[float] = lengths.reshape(len(orders), -1).sum(axis=1).tolist()
+    return sizes

@@ -106,7 +106,8 @@ class VehicleContext:
         self._messages_in_tick = 0
         self.messages_sent = 0
         """Messages handed to the radio."""
-        self._refusals: deque[TransmissionRefusal] = deque(maxlen=REFUSALS_MAX)
+        self.refusals: deque[TransmissionRefusal] = deque(maxlen=REFUSALS_MAX)
+        """Refusals that wait to be told."""
         self.refused: Counter[str] = Counter()
         """Messages refused, by reason: on board, where they never reach the radio, or by the host."""
         self._has_refusals_stream = False
@@ -182,7 +183,7 @@ class VehicleContext:
         """Take that a message was refused, to be told in the next tick."""
         reason = refusal.reason
         self.refused[reason] += 1
-        self._refusals.append(refusal)
+        self.refusals.append(refusal)
         if reason in MISTAKES and self.refused[reason] == 1:
             words = f"{reason.replace('_', ' ')}: {MISTAKES[reason]}"
             self._context.log(
@@ -193,8 +194,8 @@ class VehicleContext:
 
     def take_refusals(self, tick: int) -> list[TransmissionRefusal]:
         """Record and return what flight software is about to be told of its messages."""
-        taken = list(self._refusals)
-        self._refusals.clear()
+        taken = list(self.refusals)
+        self.refusals.clear()
         if taken and not self._has_refusals_stream:
             self._context.open_stream("refusals", streams.REFUSALS)
             self._has_refusals_stream = True

@@ -126,25 +126,40 @@ class Cockpit:
         """
         board = self._board
         board.begin(tick, t_s, self.phase_s)
-        news, self._news = self._news, {}
-        readings = StepReadings({name: one[-1] for name, one in news.items()}, news)
+        readings = self._read(t_s, state)
+        # Most steps find nothing that came.
+        if self._messages:
+            self._tell_messages(tick, t_s if is_early else math.inf)
+        if (self._results or self._gauges) and not is_early:
+            self._tell_results(tick, t_s, readings)
+        if board.refusals and not is_early:
+            for refusal in board.take_refusals(tick):
+                self._tell("message_refused", refusal)
+        self._call("step", self._step, t_s, readings)
+
+    def _read(self, t_s: float, state: tuple[float, ...] | None) -> StepReadings:
+        """Return what a step is given: truth, or what was measured since the step before."""
         if self._is_truth_fed:
-            readings = StepReadings({}, {})
+            readings = StepReadings()
             if state is not None:
                 readings[TRUTH] = Reading(t_s, state)
-        for message in self._arrived(t_s if is_early else math.inf):
-            board.record_received(tick, message)
+            return readings
+        news, self._news = self._news, {}
+        return StepReadings({name: one[-1] for name, one in news.items()}, news)
+
+    def _tell_messages(self, tick: int, until_s: float) -> None:
+        for message in self._arrived(until_s):
+            self._board.record_received(tick, message)
             self._tell("receive", message)
-        while self._gauges and not is_early:
+
+    def _tell_results(self, tick: int, t_s: float, readings: StepReadings) -> None:
+        while self._gauges:
             self._read_gauge(t_s, self._gauges.popleft(), readings)
-        while self._results and not is_early:
+        while self._results:
             result = self._results.popleft()
-            board.record_result(tick, result)
+            self._board.record_result(tick, result)
             self._read_gauge(t_s, result, readings)
             self._tell("command_result", result)
-        for refusal in () if is_early else board.take_refusals(tick):
-            self._tell("message_refused", refusal)
-        self._call("step", self._step, t_s, readings)
 
     def take(self, measured: Mapping[str, Sequence[Reading]]) -> None:
         """Keep what became known of sensors for the next step; of very many readings the oldest are given up."""

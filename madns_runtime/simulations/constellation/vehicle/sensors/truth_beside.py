@@ -79,7 +79,7 @@ def _between(earlier: tuple[float, State], later: tuple[float, State], t_s: floa
     if step_s > GAP_S_MAX:
         return None
     part = (t_s - start_s) / step_s
-    orbit = evaluate(coefficients(first, second, step_s), part, step_s)
+    orbit = evaluate(coefficients(first[:6], second[:6], step_s), part, step_s)
     if len(first) <= 6:
         return orbit
     if math.hypot(*first[10:13]) * step_s > TURN_RAD_MAX:
