@@ -2,7 +2,7 @@ import pytest
 from constellation_fakes import FakeContext, parameters
 
 from madns_runtime.errors import PluginError
-from madns_runtime.simulations.constellation.host_side.truth_propagation import JobTable
+from madns_runtime.simulations.constellation.host_side.job_table import JobTable
 
 
 def make_table():

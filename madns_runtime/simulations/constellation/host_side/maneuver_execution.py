@@ -74,7 +74,10 @@ class Maneuvering:
         while self._pending and self._pending[0][0] <= t_s:
             taken = heapq.heappop(self._pending)[2]
             self._tell(self._desk.execute(taken), is_over=True)
-        return min([heap[0][0] for heap in (self._waiting, self._pending) if heap], default=None)
+        times_s = [heap[0][0] for heap in (self._waiting, self._pending) if heap]
+        if (settle_s := self._supply.remainders.timer(t_s)) is not None:
+            times_s.append(settle_s)
+        return min(times_s, default=None)
 
     def finish(self) -> Mapping[str, Any]:
         """Return the account of all commands."""
@@ -106,7 +109,10 @@ class Maneuvering:
         vehicle, start_s = taken.vehicle, taken.effect.start_s
         due_s = start_s + taken.command.phase_s
         if is_urgent or due_s - self._context.now_s() < URGENT_S:
-            self._announce(taken, is_changed=self._supply.change(vehicle, start_s))
+            # In lockstep nobody waits: there truth comes in one, and to the same digits as ever.
+            in_parts = not self._context.is_lockstep
+            is_changed = self._supply.change(vehicle, start_s, in_parts=in_parts)
+            self._announce(taken, is_changed=is_changed)
             return
         job = self._supply.change_by_job(vehicle, start_s, partial(self._came, taken))
         if job is None:

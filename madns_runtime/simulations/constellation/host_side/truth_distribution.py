@@ -80,9 +80,11 @@ class Refills:
         """Of each vehicle the first window that is not on record yet."""
         self._revisions_given = [0] * count
         self._cursor = 0
+        supply.remainders.followed = self.followed
 
     def initial(self, vehicle: int) -> list[Segment]:
         """Return a vehicle's truth from now on for a whole buffer, as far as it is computed."""
+        self._supply.remainders.settle(vehicle)
         now = self._window_at(self._context.now_s())
         # What its turn has passed already will not come again.
         last = max(now + 1, self._turns_passed(vehicle) - 1)
@@ -104,6 +106,7 @@ class Refills:
             if window >= self._store.end:
                 return t_s + RETRY_S
             self._cursor += 1
+            self._supply.remainders.settle(vehicle)
             self._refill(vehicle, window)
             self._conservation.record(vehicle, window)
             self._record_window(vehicle, window)
@@ -123,13 +126,16 @@ class Refills:
         """
         Send a vehicle what it has been sent already and what has changed since.
 
-        The first knots go as SYNC, before anything else; they must be there by *deadline_s*.
+        The first knots go as SYNC, before anything else; they must be there by *deadline_s*. What is not
+        propagated yet goes when it is (`followed`).
         """
+        until_s = self._supply.remainders.known_until_s(vehicle)
         until = self._recorded_until[vehicle]
-        self._record(vehicle, self._store.segments_from(vehicle, change_s, until))
+        self._record(vehicle, self._store.segments_from(vehicle, change_s, until, until_s))
         if not self._active[vehicle]:
             return
-        segments = self._store.segments_from(vehicle, change_s, self._sent_until[vehicle])
+        until = self._sent_until[vehicle]
+        segments = self._store.segments_from(vehicle, change_s, until, until_s)
         left = URGENT_KNOTS_MAX
         agent = self._context.agents[vehicle]
         for whole in segments:
@@ -142,12 +148,25 @@ class Refills:
                 self._context.send(agent, later.to_message(), Service.RELIABLE)
             self.segments_sent += (urgent is not None) + (later is not None)
 
+    def followed(self, vehicle: int, from_s: float) -> None:
+        """Send the rest of a change, and record it."""
+        until = self._recorded_until[vehicle]
+        self._record(vehicle, self._store.segments_from(vehicle, from_s, until))
+        if not self._active[vehicle]:
+            return
+        segments = self._store.segments_from(vehicle, from_s, self._sent_until[vehicle])
+        for segment in segments:
+            message = segment.to_message()
+            self._context.send(self._context.agents[vehicle], message, Service.RELIABLE)
+        self.segments_sent += len(segments)
+
     def lost(self, vehicle: int) -> None:
         """Send a vehicle no more."""
         self._active[vehicle] = False
 
     def rejoined(self, vehicle: int) -> None:
         """Send a vehicle again, and at once what became due while it set itself up."""
+        self._supply.remainders.settle(vehicle)
         self._active[vehicle] = True
         if self._store.revisions[vehicle] != self._revisions_given[vehicle]:
             # A maneuver came in between: what it was given to begin with holds no more.

@@ -19,6 +19,13 @@ from numpy.typing import NDArray
 from madns_runtime.errors import PluginError
 from madns_runtime.plugin.api import HostContext
 from madns_runtime.simulations.constellation.equipment import Vehicle
+from madns_runtime.simulations.constellation.host_side.job_table import JobTable, Owner
+from madns_runtime.simulations.constellation.host_side.truth_remainders import (
+    TruthRemainders,
+)
+from madns_runtime.simulations.constellation.host_side.truth_remainders import (
+    split as split_change,
+)
 from madns_runtime.simulations.constellation.truth.maneuvers.effects import Effect, VehicleTruth
 from madns_runtime.simulations.constellation.truth.orbit_curves import OrbitCurve
 from madns_runtime.simulations.constellation.truth.propagation import (
@@ -55,9 +62,6 @@ MENDS_INLINE_MAX = 2
 """Vehicles mended in the loop; more are mended by another job."""
 MENDING_ROUNDS_MAX = 4
 """After so many all that is left is mended in the loop: commands without end must not hold truth up."""
-
-Owner = Callable[[Any], None]
-"""Takes a job's value."""
 
 
 @dataclass(slots=True)
@@ -114,6 +118,13 @@ class TruthSupply:
         self.has_drag = "drag" in propagation.forces
         """Whether ballistic coefficients matter."""
         self._batch: _Batch | None = None
+        self.remainders = TruthRemainders(
+            context,
+            store,
+            self.jobs,
+            request_of=self._remainder_request,
+            parameters_of=self._parameters_of,
+        )
 
     @property
     def is_busy(self) -> bool:
@@ -145,6 +156,8 @@ class TruthSupply:
         per_window = self.store.knots_per_window
         first_knot = self.store.end * per_window
         batch = self._batch = _Batch(first_knot=first_knot, knots=windows * per_window + 1)
+        # Of these the states may be old ones: they are mended when the batch has come.
+        batch.changed.update(self.remainders.vehicles)
         request = StretchRequest(
             first_knot=first_knot, knots=batch.knots, knot_s=self.store.knot_s, states=states
         )
@@ -161,9 +174,14 @@ class TruthSupply:
         ]
         self._submit_vehicles(batch, commanded, states, attitude)
 
-    def change(self, vehicle: int, change_s: float) -> bool:
+    def change(self, vehicle: int, change_s: float, *, in_parts: bool = False) -> bool:
         """
         Propagate a vehicle anew from where its timeline has changed; False if nothing is known of that time yet.
+
+        Args:
+            vehicle: Whose truth.
+            change_s: From when its timeline has changed.
+            in_parts: Whether what takes long may follow (`remainders`); for the last digits it makes a difference.
 
         Raises:
             PluginError: The time is over.
@@ -172,7 +190,11 @@ class TruthSupply:
         request = self._change_request(vehicle, change_s)
         if request is None:
             return False
-        self._replace(vehicle, propagate_vehicle(request, self._parameters_of(vehicle)))
+        urgent = split_change(request) if in_parts else None
+        truth = propagate_vehicle(urgent or request, self._parameters_of(vehicle))
+        self._replace(vehicle, truth)
+        if urgent is not None:
+            self.remainders.owe(urgent, vehicle, truth)
         return True
 
     def change_by_job(
@@ -210,13 +232,17 @@ class TruthSupply:
             if self._batch is not None:
                 self._batch.changed.add(vehicle)
             return None
+        is_magnetic = vehicle in self._magnetic and store.knot_s <= ORBIT_KNOT_S_MAX
+        is_beyond = change_s > self.remainders.known_until_s(vehicle)
+        if is_beyond or (is_magnetic and not self.remainders.leaves_orbit(vehicle)):
+            self.remainders.settle(vehicle)
         restart = store.restart(vehicle, change_s)
         if restart is None:
             raise PluginError(f"constellation: truth of {change_s:g} s is over and forgotten")
         start_s, state = restart
         end_knot = store.end * store.knots_per_window
         request = self._request(vehicle, start_s, state, change_s=change_s, end_knot=end_knot)
-        if vehicle not in self._magnetic or store.knot_s > ORBIT_KNOT_S_MAX:
+        if not is_magnetic:
             return request
         known = store.orbit_from(vehicle, start_s)
         return request if known is None else replace(request, orbit=OrbitCurve(*known))
@@ -224,11 +250,17 @@ class TruthSupply:
     def _replace(self, vehicle: int, truth: VehicleTruth) -> None:
         if self._batch is not None:
             self._batch.changed.add(vehicle)
+        self.remainders.drop(vehicle)
         self.store.replace(vehicle, truth)
         self.propagated_anew += 1
 
+    def _remainder_request(self, vehicle: int, from_s: float, state: Array) -> VehicleRequest:
+        end_knot = self.store.end * self.store.knots_per_window
+        return self._request(vehicle, from_s, state, change_s=from_s, end_knot=end_knot)
+
     def _finish(self, batch: _Batch) -> None:
         """Take over a batch whose jobs are all done."""
+        self.remainders.settle_all()
         if batch.changed:
             states, attitude = self.store.last_states(), self.store.last_attitude()
             for vehicle in sorted(batch.changed):
@@ -274,6 +306,7 @@ class TruthSupply:
             return
         if len(batch.changed) > MENDS_INLINE_MAX and batch.rounds < MENDING_ROUNDS_MAX:
             batch.rounds += 1
+            self.remainders.settle_all()
             changed, batch.changed = sorted(batch.changed), set()
             states, attitude = self.store.last_states(), self.store.last_attitude()
             self._submit_vehicles(batch, changed, states, attitude)
@@ -331,45 +364,3 @@ class TruthSupply:
 
 def _has_magnetorquers(vehicle: Vehicle) -> bool:
     return vehicle.attitude is not None and vehicle.attitude.magnetorquers is not None
-
-
-class JobTable:
-    """
-    The jobs under way, each with its owner.
-
-    Args:
-        context: Whose executor works.
-    """
-
-    def __init__(self, context: HostContext) -> None:
-        self._context = context
-        self._owners: dict[int, Owner] = {}
-
-    def submit(self, owner: Owner, function: Callable[..., Any], *arguments: Any) -> int:
-        """Have a function computed for an owner and return the job's number."""
-        job = self._context.submit(function, *arguments)
-        self._owners[job] = owner
-        return job
-
-    def give_up(self, job: int) -> bool:
-        """Let nobody take a job's value when it comes; False if it has come already."""
-        if job not in self._owners:
-            return False
-        self._owners[job] = _nobody
-        return True
-
-    def take(self, job: int, value: Any) -> None:
-        """
-        Hand a job's value to its owner.
-
-        Raises:
-            PluginError: No such job is under way.
-        """
-        owner = self._owners.pop(job, None)
-        if owner is None:
-            raise PluginError(f"constellation: job {job} is not under way")
-        owner(value)
-
-
-def _nobody(_value: Any) -> None:
-    """Take what is wanted no more."""

@@ -209,9 +209,22 @@ class TruthStore:
         n = self.knots_per_window
         return self._segments(vehicle, first * n * self.knot_s, (last + 1) * n)
 
-    def segments_from(self, vehicle: int, change_s: float, window: int) -> list[Segment]:
-        """Return a vehicle's segments from a change on, which is a knot or a piece's first, up to *window*, excluded."""
-        return self._segments(vehicle, change_s, min(window, self.end) * self.knots_per_window)
+    def segments_from(
+        self, vehicle: int, change_s: float, window: int, until_s: float = math.inf
+    ) -> list[Segment]:
+        """
+        Return a vehicle's segments from a change on, which is a knot or a piece's first.
+
+        Args:
+            vehicle: Whose.
+            change_s: Their beginning.
+            window: The first window that is not wanted.
+            until_s: A knot's time; what lies behind it is not wanted either.
+        """
+        last_knot = min(window, self.end) * self.knots_per_window
+        if math.isfinite(until_s):
+            last_knot = min(last_knot, round(until_s / self.knot_s))
+        return self._segments(vehicle, change_s, last_knot)
 
     def invariants(self, vehicle: int, window: int) -> Array:
         """Return what is conserved, at every knot of a window, shape (knots_per_window + 1, 3)."""
