@@ -35,9 +35,8 @@ from cosmos_cli.fleet.pool import for_each
 from cosmos_cli.fleet.retry_file import offer_retry
 from cosmos_cli.fleet.target import Target
 from cosmos_cli.launch.device_sampling import missing_for
-from cosmos_cli.launch.feasibility import BITS_PER_BYTE, Resources
 from cosmos_cli.launch.plan import make_plan
-from cosmos_cli.launch.plan_view import feasibility_of
+from cosmos_cli.launch.plan_view import feasibility_of, resources_of
 from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.inventory.devices import driven_devices
 from cosmos_cli.models.inventory.machine import LOOPBACK
@@ -210,11 +209,7 @@ class _Examination:
             and trip.get("p50_ms") is not None
         ]
         latency_s = max(trips_ms) / 2e3 if trips_ms else LATENCY_S_UNKNOWN
-        resources = Resources(
-            workers=self._scenario_file.scenario.executor.workers,
-            bandwidth_bytes_s=1e9 / BITS_PER_BYTE,
-            latency_s=latency_s,
-        )
+        resources = resources_of(self._scenario_file, latency_s)
         found = feasibility_of(self._scenario_file, resources)
         return None if found is None else found.to_mapping()
 

@@ -16,24 +16,26 @@ from cosmos_cli.commands.fleet_command import (
     some_machines,
 )
 from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.launch.capacity import predict_capacity
+from cosmos_cli.launch.capacity_view import computers_of, show_capacity
 from cosmos_cli.launch.device_plan import plan_devices
-from cosmos_cli.launch.feasibility import BITS_PER_BYTE, Resources
+from cosmos_cli.launch.feasibility import BITS_PER_BYTE
 from cosmos_cli.launch.place_plan import check_places
 from cosmos_cli.launch.plan import make_plan
 from cosmos_cli.launch.plan_view import (
-    BANDWIDTH_MBIT_DEFAULT,
     LOCKSTEP_WORDS,
+    demand_of,
     feasibility_of,
     latency_of,
+    resources_of,
     show_feasibility,
+    show_flows,
     show_placement,
 )
 from cosmos_cli.models.loading import load_scenario
+from cosmos_cli.models.planning import COUNT_MAX
 from cosmos_cli.ui.console import Console, JsonOption, SetOption
 from madns_runtime.lockstep.partition import processors_here
-
-COUNT_MAX = 1_000_000
-"""Of workers and of maneuvers: more has nobody."""
 
 
 def plan(
@@ -43,8 +45,9 @@ def plan(
     host: HostOption = None,
     set_: SetOption = None,
     bandwidth_mbit: Annotated[
-        float, typer.Option(min=0.001, help="Bandwidth of the host's link, Mbit/s (B_n).")
-    ] = BANDWIDTH_MBIT_DEFAULT,
+        float | None,
+        typer.Option(min=0.001, help="Bandwidth of the host's link, Mbit/s (B_n); 1000."),
+    ] = None,
     latency_ms: Annotated[
         float | None,
         typer.Option(min=0.0, help="One-way time of a datagram, ms (T_n); measured on loopback."),
@@ -63,7 +66,7 @@ def plan(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Show which machine runs which agents, and the four inequalities of real time."""
+    """Show which machine runs which agents, the four inequalities of real time, and how many agents fit."""
     console = Console(json=json)
     scenario_file = load_scenario(file, set_ or (), warn=console.warn)
     launch_plan = make_plan(
@@ -76,12 +79,18 @@ def plan(
     )
     check_places(scenario_file, launch_plan)
     devices = list(itertools.chain(*plan_devices(scenario_file, launch_plan).values()))
-    latency_s, latency_source = latency_of(launch_plan, given_ms=latency_ms)
-    resources = Resources(
-        workers=workers or scenario_file.scenario.executor.workers,
-        bandwidth_bytes_s=bandwidth_mbit * 1e6 / BITS_PER_BYTE,
-        latency_s=latency_s,
-        maneuvers_at_once=maneuvers_at_once,
+    given = scenario_file.scenario.plan
+    latency_s, latency_source = latency_of(
+        launch_plan, given_ms=given.latency_ms if latency_ms is None else latency_ms
+    )
+    offered = resources_of(scenario_file, latency_s)
+    resources = dataclasses.replace(
+        offered,
+        workers=workers or offered.workers,
+        maneuvers_at_once=maneuvers_at_once or offered.maneuvers_at_once,
+        bandwidth_bytes_s=offered.bandwidth_bytes_s
+        if bandwidth_mbit is None
+        else bandwidth_mbit * 1e6 / BITS_PER_BYTE,
     )
     is_lockstep = launch_plan.is_lockstep
     if is_lockstep and {latency_ms, workers, maneuvers_at_once} != {None}:
@@ -89,13 +98,22 @@ def plan(
             "--latency-ms, --workers and --maneuvers-at-once say what real time has to bear; in lockstep"
             " none of it applies"
         )
-    feasibility = None if is_lockstep else feasibility_of(scenario_file, resources)
+    demand = None if is_lockstep else demand_of(scenario_file)
+    feasibility = capacity = None
+    if demand is not None:
+        feasibility = feasibility_of(scenario_file, resources, demand)
+        capacity = predict_capacity(
+            scenario_file.scenario, demand, computers_of(launch_plan), resources
+        )
     show_placement(console, launch_plan, devices)
     for note in launch_plan.notes:
         console.say(f"note: {note}")
     if is_lockstep:
         console.data(LOCKSTEP_WORDS)
     else:
+        if demand is not None and capacity is not None:
+            show_flows(console, demand, resources)
+            show_capacity(console, capacity)
         show_feasibility(console, feasibility, resources, latency_source)
     console.print_json(
         {
@@ -103,6 +121,7 @@ def plan(
             "devices": [dataclasses.asdict(device) for device in devices],
             "resources": dataclasses.asdict(resources) | {"latency_source": latency_source},
             "feasibility": feasibility.to_mapping() if feasibility else None,
+            "capacity": capacity.to_mapping() if capacity else None,
         }
     )
     if feasibility and not feasibility.holds:

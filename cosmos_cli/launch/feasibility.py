@@ -1,18 +1,21 @@
 """
 The four inequalities of a real-time run (thesis 2.5.4, equations 2.7-2.10), with margins and limits. Pure.
 
-Two things differ from the thesis's own figures. Sizes are encoded sizes in bytes, and what travels is
+Three things differ from the thesis's own figures. Sizes are encoded sizes in bytes, and what travels is
 counted with the datagrams' overhead: its table 2.2 gives S_b as 100 x 6 x 64 bits, which is 4,800
-bytes and not the 38,400 of table 2.3. And inequality 2.8 is taken for several maneuvers that reach
+bytes and not the 38,400 of table 2.3. Inequality 2.8 is taken for several maneuvers that reach
 the host at once, by default one of every agent: as written, for one alone, it has no limit in agents.
+And 2.10 holds for every interval, down to the shortest in which something must arrive (`busiest_interval`).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from cosmos_cli.launch.busiest_interval import Sending, busiest_interval
 from madns_runtime.plugin.api import Demand
 from madns_runtime.protocol.datagram import FRAGMENT_BYTES_MAX, FRAME_BYTES, OVERHEAD_BYTES
 
@@ -36,6 +39,8 @@ class Resources:
     """T_n: one way."""
     maneuvers_at_once: int | None = None
     """Maneuvers that reach the host at one instant at worst; None for one of every agent."""
+    has_headers: bool = True
+    """Whether sizes are of messages, to which headers come; else all is counted in them already."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -206,19 +211,72 @@ def _lead(demand: Demand, tick_hz: float) -> Inequality:
     )
 
 
+def sendings_of(demand: Demand, resources: Resources) -> list[Sending]:
+    """Return all that travels for one agent, maneuvers as well, with what of it must be there by when."""
+
+    def on_wire(message_bytes: int) -> float:
+        return wire_bytes(message_bytes) if resources.has_headers else message_bytes
+
+    sendings = [
+        Sending(
+            name=flow.name,
+            wire_bytes=on_wire(flow.message_bytes),
+            rate_hz=flow.rate_hz,
+            within_s=1.0 / flow.rate_hz if flow.within_s is None else flow.within_s,
+        )
+        for flow in demand.flows
+        if flow.rate_hz > 0.0
+    ]
+    if demand.sync_rate_hz > 0.0 and demand.sync_bytes > 0:
+        at_once = resources.maneuvers_at_once
+        maneuver = Sending(
+            name="maneuvers",
+            wire_bytes=on_wire(demand.sync_bytes),
+            rate_hz=demand.sync_rate_hz,
+            within_s=demand.lead_s if math.isfinite(demand.lead_s) else 1.0 / demand.sync_rate_hz,
+            senders_max=math.inf if at_once is None else at_once,
+        )
+        sendings.append(maneuver)
+    return sendings
+
+
 def _bandwidth(demand: Demand, resources: Resources, agents: int) -> Inequality:
-    planned = sum(wire_bytes(flow.message_bytes) * flow.rate_hz for flow in demand.flows)
-    unplanned = wire_bytes(demand.sync_bytes) * demand.sync_rate_hz
+    sendings = sendings_of(demand, resources)
+    found = busiest_interval(sendings, agents)
+    length = "over a long time" if math.isinf(found.length_s) else f"in {found.length_s:.4g} s"
     return Inequality(
         number="2.10",
-        name="network: all messages within the bandwidth",
-        formula="N_a (sum S_Di R_Di + N_sync S_sync) <= B_n",
-        left=agents * (planned + unplanned),
+        name=f"network: all messages of the busiest interval, {length}",
+        formula="N_a max over any dT of (sum S_Di R_Di + N_sync S_sync) <= B_n dT",
+        left=found.bytes_s,
         relation="<=",
         right=resources.bandwidth_bytes_s,
         unit="B/s",
-        breaks_at=_first_beyond(planned + unplanned, resources.bandwidth_bytes_s),
+        breaks_at=_first_too_busy(sendings, resources.bandwidth_bytes_s),
     )
+
+
+def _first_too_busy(sendings: Sequence[Sending], bandwidth_bytes_s: float) -> float:
+    """Return the smallest number of agents whose busiest interval is too busy; infinity below COUNT_MAX."""
+
+    def is_too_busy(agents: int) -> bool:
+        return busiest_interval(sendings, agents).bytes_s > bandwidth_bytes_s
+
+    # In proportion to the agents as long as each may maneuver at the worst instant: look there first.
+    one = busiest_interval(sendings, 1).bytes_s
+    if one <= 0.0 or math.isinf(bandwidth_bytes_s) or bandwidth_bytes_s / one >= COUNT_MAX:
+        return math.inf
+    low = max(0, math.floor(bandwidth_bytes_s / one) - 1)
+    step = 2
+    while not is_too_busy(low + step):
+        low, step = low + step, 2 * step
+        if low >= COUNT_MAX:
+            return math.inf
+    high = low + step
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if is_too_busy(middle) else (middle, high)
+    return high
 
 
 def wire_bytes(message_bytes: int) -> int:

@@ -9,13 +9,20 @@ import statistics
 import time
 from collections.abc import Sequence
 
-from cosmos_cli.launch.feasibility import BITS_PER_BYTE, Feasibility, Inequality, Resources, judge
+from cosmos_cli.launch.feasibility import (
+    BITS_PER_BYTE,
+    Feasibility,
+    Inequality,
+    Resources,
+    judge,
+    sendings_of,
+)
 from cosmos_cli.launch.plan import LaunchPlan
 from cosmos_cli.models.loading import ScenarioFile
 from cosmos_cli.ui.console import Column, Console
 from cosmos_cli.ui.plural import counted
 from madns_runtime.config import DeviceLaunch
-from madns_runtime.plugin.api import Flow
+from madns_runtime.plugin.api import Demand, Flow
 
 LATENCY_MS_UNKNOWN = 0.5
 """One way over a switch: the thesis's 1 ms is a bound, its own network was quicker."""
@@ -25,8 +32,10 @@ PROBE_TIMEOUT_S = 0.05
 FRAMEWORK_FLOWS = (
     Flow(name="ping", message_bytes=250, rate_hz=4.0),
     Flow(name="pong", message_bytes=40, rate_hz=4.0),
+    Flow(name="acknowledgements", message_bytes=1, rate_hz=4.0),
 )
-"""Signs of life and clock exchange, which every agent needs beside the simulation's own messages."""
+"""Signs of life with telemetry and clock exchange, and datagrams that acknowledge and hold nothing else: those that find
+no message to travel with, which are no more than there are pings where messages go both ways."""
 LOCKSTEP_WORDS = (
     "lockstep: the host runs the agents in these processes here, as fast as they allow;"
     " the inequalities of real time do not apply"
@@ -37,6 +46,12 @@ PLACEMENT = (
     Column("agents", is_number=True),
     Column("processes", is_number=True),
     Column("names"),
+)
+FLOWS = (
+    Column("of one agent"),
+    Column("bytes on the wire", is_number=True),
+    Column("Hz", is_number=True),
+    Column("within s", is_number=True),
 )
 INEQUALITIES = (
     Column("eq."),
@@ -51,12 +66,42 @@ INEQUALITIES = (
 )
 
 
-def feasibility_of(scenario_file: ScenarioFile, resources: Resources) -> Feasibility | None:
-    """Return None for a simulation that does not tell what it asks for."""
+def demand_of(scenario_file: ScenarioFile) -> Demand | None:
+    """
+    Return what is asked of host and network for one agent, the framework's own messages as well.
+
+    What the scenario's section `plan` gives takes the place of what the simulation says; None if neither says anything.
+    """
+    given = scenario_file.scenario.plan
+    if given.says_all:
+        return given.applied_to(None)
     if not scenario_file.has_demand:
         return None
-    agents, demand = scenario_file.scenario.agents, scenario_file.demand()
+    demand = scenario_file.demand()
     demand = dataclasses.replace(demand, flows=(*demand.flows, *FRAMEWORK_FLOWS))
+    return given.applied_to(demand)
+
+
+def resources_of(scenario_file: ScenarioFile, latency_s: float) -> Resources:
+    """Return what host and network offer by the scenario, over a link of BANDWIDTH_MBIT_DEFAULT if it names none."""
+    scenario, given = scenario_file.scenario, scenario_file.scenario.plan
+    return Resources(
+        workers=given.workers or scenario.executor.workers,
+        bandwidth_bytes_s=(given.bandwidth_mbit or BANDWIDTH_MBIT_DEFAULT) * 1e6 / BITS_PER_BYTE,
+        latency_s=latency_s,
+        maneuvers_at_once=given.maneuvers_at_once,
+        has_headers=given.has_headers,
+    )
+
+
+def feasibility_of(
+    scenario_file: ScenarioFile, resources: Resources, demand: Demand | None = None
+) -> Feasibility | None:
+    """Return None for a simulation that does not tell what it asks for; asks it if *demand* is not given."""
+    demand = demand or demand_of(scenario_file)
+    if demand is None:
+        return None
+    agents = scenario_file.scenario.agents
     return judge(demand, resources, agents=agents.count, tick_hz=agents.tick_hz)
 
 
@@ -111,6 +156,27 @@ def show_placement(
         console.data(f"without an agent: {', '.join(launch_plan.idle)}")
     for device in devices:
         console.data(f"{device.full_name} ({device.kind}): {', '.join(device.users)}")
+
+
+def show_flows(console: Console, demand: Demand, resources: Resources) -> None:
+    """Print what travels for one agent, and the sizes of states, batches and buffer."""
+    console.data("")
+    rows = [
+        (each.name, f"{each.wire_bytes:g}", f"{each.rate_hz:.4g}", f"{each.within_s:.4g}")
+        for each in sendings_of(demand, resources)
+    ]
+    console.table(FLOWS, rows)
+    sizes = (
+        ("a state", demand.state_bytes),
+        ("S_a", demand.buffer_bytes),
+        ("S_b", demand.batch_bytes),
+        ("S_sync", demand.sync_bytes),
+    )
+    told = ", ".join(f"{name} = {size:,} B" for name, size in sizes if size)
+    times = (("T_p(S_b)", demand.batch_compute_s), ("T_p(S_sync)", demand.sync_compute_s))
+    told_s = ", ".join(f"{name} = {time_s * 1e3:.3g} ms" for name, time_s in times if time_s)
+    if told or told_s:
+        console.data("; ".join(text for text in (told, told_s) if text))
 
 
 def show_feasibility(

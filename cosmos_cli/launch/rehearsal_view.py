@@ -16,14 +16,14 @@ from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.liveness import SilenceWatch
 from cosmos_cli.fleet.outcome import Outcome
 from cosmos_cli.fleet.target import target_of
-from cosmos_cli.launch.feasibility import BITS_PER_BYTE, Feasibility, Resources
+from cosmos_cli.launch.feasibility import Feasibility, Resources
 from cosmos_cli.launch.plan import LaunchPlan
 from cosmos_cli.launch.plan_view import (
-    BANDWIDTH_MBIT_DEFAULT,
     LOCKSTEP_WORDS,
     broken_words,
     feasibility_of,
     latency_of,
+    resources_of,
     show_feasibility,
     show_placement,
 )
@@ -248,11 +248,7 @@ def pace_of(rehearsal: Rehearsal, outcomes: Sequence[Outcome[MachineRehearsal]])
         latency_s, source = max(trips_ms) / 2e3, "measured"
     else:
         latency_s, source = latency_of(rehearsal.plan)
-    resources = Resources(
-        workers=rehearsal.scenario.scenario.executor.workers,
-        bandwidth_bytes_s=BANDWIDTH_MBIT_DEFAULT * 1e6 / BITS_PER_BYTE,
-        latency_s=latency_s,
-    )
+    resources = resources_of(rehearsal.scenario, latency_s)
     feasibility, unknown = None, ""
     if not rehearsal.plan.is_lockstep:
         try:

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
 from cosmos_cli.models.placement import PlacementRule, claim_agents
+from cosmos_cli.models.planning import Planning
 from cosmos_cli.models.text_forms import NAME_PATTERN, ScenarioRequirement
 from madns_runtime.config import (
     SEED_MAX,
@@ -78,6 +79,8 @@ class Scenario(BaseModel):
     """Python packages that the simulation needs on the agents' machines, as pip names them; or ./paths of wheels or of sources, which need no index."""
     placement: tuple[PlacementRule, ...] = ()
     """Machines of agents, rule by rule; the rest is spread evenly over all."""
+    plan: Planning = Planning()
+    """Terms of the inequalities of real time, for `cosmos plan` alone."""
     parameters: dict[str, Any] = {}
     """The simulation's own settings."""
 

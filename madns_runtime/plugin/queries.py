@@ -23,6 +23,8 @@ from madns_runtime.recording.records import FRAMEWORK_STREAMS, Field
 
 NO_FIGURES = ("name", "flows", "measured")
 """Fields of a Demand or a Flow that are no amounts."""
+UNSAID = ("within_s",)
+"""Figures that may be None."""
 ENDLESS = ("buffer_s",)
 """Figures that may be infinite: of who needs nothing."""
 CHECK_MORE = ("names", "duration_s", "is_lockstep", "tick_hz")
@@ -288,6 +290,8 @@ def _demand_fault(demand: Any) -> str | None:
     for owner, label in [(demand, "demand"), *((flow, f"flow {flow.name!r}") for flow in flows)]:
         for field in dataclasses.fields(owner):
             value, name = getattr(owner, field.name), field.name
+            if value is None and name in UNSAID:
+                continue
             if name not in NO_FIGURES and not _is_amount(value, may_be_endless=name in ENDLESS):
                 endless = ", or math.inf" if name in ENDLESS else ""
                 limits = f"of at least 0 and at most {FIGURE_MAX:g}{endless}"

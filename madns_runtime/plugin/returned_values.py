@@ -34,6 +34,8 @@ class Flow:
     message_bytes: int
     """Encoded size of one message, without datagram overhead."""
     rate_hz: float
+    within_s: float | None = None
+    """How long a message may be on its way, s; None for until the next one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,6 +60,12 @@ class Demand:
     """T_m - T_s: how far ahead of its execution a maneuver is commanded."""
     measured: bool
     """Whether the compute times were measured on this machine (else they are declared)."""
+    state_bytes: int = 0
+    """Encoded size of one state in a batch; 0 if there are no batches."""
+    buffer_bytes: int = 0
+    """S_a: size of the states that an agent holds after a refill."""
+    step_s: float = 0.0
+    """Processor time of one step of an agent's half, beside what the framework takes for a tick."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

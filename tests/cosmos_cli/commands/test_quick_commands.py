@@ -166,9 +166,12 @@ def test_plan_shows_placement_and_inequalities(cosmos):
         "agent-02,",
         "agent-03",
     ]
-    assert [line.split()[0] for line in lines[4:8]] == ["2.7", "2.8", "2.9", "2.10"]
-    assert "T_n = 0.5 ms (given)" in lines[8]
-    assert lines[9].startswith("3 agents keep real time; 2.10 binds first, at ")
+    flows = ["count", "count", "ping", "pong", "acknowledgements"]
+    assert [line.split()[0] for line in lines[4:9]] == flows
+    assert any(line.startswith("predicted at ") for line in lines)
+    assert [line.split()[0] for line in lines[-6:-2]] == ["2.7", "2.8", "2.9", "2.10"]
+    assert "T_n = 0.5 ms (given)" in lines[-2]
+    assert lines[-1].startswith("3 agents keep real time; 2.10 binds first, at ")
 
 
 def test_plan_of_an_impossible_run_ends_with_4(cosmos):

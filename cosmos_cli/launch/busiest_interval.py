@@ -1,0 +1,97 @@
+"""
+The network's inequality 2.10 as a maximum over any interval (thesis 2.5.3). Pure.
+
+A message counts in an interval if it is sent in it and must have arrived by its end. The worst instant is the one at
+which every agent sends one message of every kind, and after which each goes on at its rate: all are refilled, all
+maneuver, all tick. An average over time would let that burst pass; it must get through as well.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+POINTS_MAX = 4096
+"""Interval lengths that are looked at; beyond, a bound stands for what a longer one could hold."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sending:
+    """Messages of one kind and of a number of senders."""
+
+    name: str
+    wire_bytes: float
+    """Of one message, all headers included."""
+    rate_hz: float
+    """Of each sender."""
+    within_s: float
+    """How long a message may be on its way."""
+    senders_max: float = math.inf
+    """Senders that there are at most, however many agents."""
+
+    def senders(self, agents: float) -> float:
+        """Return how many of the agents send these."""
+        return min(agents, self.senders_max)
+
+    def messages(self, length_s: float) -> int:
+        """Return how many of one sender's messages an interval of that length has to carry at worst."""
+        if length_s < self.within_s:
+            return 0
+        return math.floor((length_s - self.within_s) * self.rate_hz + 1e-9) + 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BusiestInterval:
+    """The interval in which most has to be carried for its length."""
+
+    length_s: float
+    """Infinity if the average over a long time is the most."""
+    bytes_s: float
+    """What it carries, over its length."""
+
+
+def busiest_interval(sendings: Sequence[Sending], agents: float) -> BusiestInterval:
+    """
+    Return the busiest interval of so many agents.
+
+    It begins with everybody's message of every kind. What an interval of length L carries is at most
+    U L + C, with U the mean rate, so that no interval longer than C / (best - U) can be busier than the best so far.
+    """
+    mean = sum(each.senders(agents) * each.wire_bytes * each.rate_hz for each in sendings)
+    best = BusiestInterval(length_s=math.inf, bytes_s=mean)
+    excess = sum(
+        each.senders(agents) * each.wire_bytes * max(0.0, 1.0 - each.within_s * each.rate_hz)
+        for each in sendings
+    )
+    for count, length_s in enumerate(_lengths(sendings)):
+        if best.bytes_s > mean and length_s * (best.bytes_s - mean) > excess:
+            break
+        if count >= POINTS_MAX:
+            bound = mean + excess / length_s
+            best = max(best, BusiestInterval(length_s=length_s, bytes_s=bound), key=_load)
+            break
+        carried = sum(e.senders(agents) * e.wire_bytes * e.messages(length_s) for e in sendings)
+        here = BusiestInterval(length_s=length_s, bytes_s=carried / length_s)
+        if here.bytes_s > best.bytes_s * (1.0 + 1e-12):
+            best = here
+    return best
+
+
+def _load(interval: BusiestInterval) -> float:
+    return interval.bytes_s
+
+
+def _lengths(sendings: Sequence[Sending]) -> Iterator[float]:
+    """Yield the lengths at which one message more must be carried, in order; at most one more than POINTS_MAX."""
+    following = [[each.within_s, each.rate_hz] for each in sendings if each.within_s > 0.0]
+    for _ in range(POINTS_MAX + 1):
+        if not following:
+            return
+        length_s = min(each[0] for each in following)
+        if not math.isfinite(length_s):
+            return
+        yield length_s
+        for each in following:
+            if each[0] <= length_s * (1.0 + 1e-12):
+                each[0] = each[0] + 1.0 / each[1] if each[1] > 0.0 else math.inf
