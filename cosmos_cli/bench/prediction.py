@@ -6,9 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from cosmos_cli.launch.feasibility import BITS_PER_BYTE, Resources
+from cosmos_cli.launch.capacity import predict_capacity
+from cosmos_cli.launch.capacity_view import computers_of
 from cosmos_cli.launch.plan import make_plan
-from cosmos_cli.launch.plan_view import BANDWIDTH_MBIT_DEFAULT, feasibility_of, latency_of
+from cosmos_cli.launch.plan_view import demand_of, latency_of, resources_of
 from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.loading import ScenarioFile
 
@@ -32,17 +33,11 @@ def predict(scenario: ScenarioFile, machines: Sequence[Machine]) -> CapacityPred
         machines: Those of the inventory, or this computer alone.
     """
     plan = make_plan(scenario.scenario, machines, fault_at=scenario.fault, labels=scenario.labels)
-    latency_s, _ = latency_of(plan)
-    resources = Resources(
-        workers=scenario.scenario.executor.workers,
-        bandwidth_bytes_s=BANDWIDTH_MBIT_DEFAULT * 1e6 / BITS_PER_BYTE,
-        latency_s=latency_s,
-    )
-    found = feasibility_of(scenario, resources)
-    if found is None:
+    demand = demand_of(scenario)
+    if demand is None:
         return None
-    binding = found.binding
-    source = f"inequality {binding.number}"
-    if math.isinf(binding.breaks_at):
-        return CapacityPrediction(agents=None, source=source)
-    return CapacityPrediction(agents=int(binding.breaks_at) - 1, source=source)
+    latency_s, _ = latency_of(plan, given_ms=scenario.scenario.plan.latency_ms)
+    resources = resources_of(scenario, latency_s)
+    found = predict_capacity(scenario.scenario, demand, computers_of(plan), resources)
+    agents = None if math.isinf(found.agents) else int(found.agents)
+    return CapacityPrediction(agents=agents, source=found.binding.name)
