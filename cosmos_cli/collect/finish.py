@@ -41,6 +41,7 @@ from cosmos_cli.evidence.statistics import clock_statistics, round_trip_statisti
 from cosmos_cli.evidence.table_labels import TableLabels
 from cosmos_cli.evidence.tables import open_tables
 from cosmos_cli.evidence.tabulate import Gathered, Progress, gather
+from cosmos_cli.evidence.tick_causes import recorded_causes
 from cosmos_cli.evidence.verdict import Verdict
 from cosmos_cli.onboard.processes import words_of
 from cosmos_cli.report.html import write_report
@@ -274,6 +275,7 @@ def _evidence(
         problems=end.problems,
         scans=gathered.scans,
         ticks=tick_statistics(tables.get("ticks")),
+        recorded_causes=recorded_causes(tables.get("late_ticks")),
         round_trip_ms=round_trip_statistics(tables),
         clock=clock_statistics(tables.get("clock")),
         missing=(*missing, *gathered.faults),

@@ -28,6 +28,12 @@ from cosmos_cli.evidence.run_directory import SCHEMA
 from cosmos_cli.evidence.run_documents import Problem
 from cosmos_cli.evidence.statistics import TickStatistics, TickTotals, tick_totals, worst_sources
 from cosmos_cli.evidence.streams import StreamScan
+from cosmos_cli.evidence.tick_causes import (
+    AgentCauses,
+    CauseTotals,
+    cause_totals,
+    told_causes,
+)
 from cosmos_cli.evidence.verdict import (
     CheckLimits,
     CheckResult,
@@ -58,6 +64,8 @@ class Evidence:
     """Report of the host; None if it could not give one."""
     scans: Sequence[StreamScan]
     ticks: TickStatistics
+    recorded_causes: Mapping[str, AgentCauses] = field(default_factory=dict)
+    """Causes of missed and late ticks by agent, from the records."""
     round_trip_ms: Mapping[str, Any] = field(default_factory=dict)
     clock: Mapping[str, float] = field(default_factory=dict)
     host_machine: str | None = None
@@ -74,8 +82,9 @@ class Evidence:
     def judged(self) -> tuple[Verdict, dict[str, Any]]:
         """Return the verdict and run.json."""
         totals = self._totals()
-        verdict = judge(self._facts(totals), self._limits())
-        return verdict, _plain(self._document(verdict, totals))
+        causes = self._causes(totals)
+        verdict = judge(self._facts(totals, causes), self._limits())
+        return verdict, _plain(self._document(verdict, totals, causes))
 
     def _of_agents(self, *keys: str) -> dict[str, Mapping[str, Any]]:
         """Return what the host told of each agent under these keys."""
@@ -89,6 +98,25 @@ class Evidence:
         return tick_totals(
             self.ticks.agents, self._of_agents("ticks"), agents=names, due_each=due_each
         )
+
+    def _causes(self, totals: TickTotals) -> CauseTotals | None:
+        """Return why ticks were missed or late; None in lockstep, and for a run of a version that did not tell."""
+        if self._is_lockstep():
+            return None
+        told = dict(self.recorded_causes)
+        summaries = self._of_agents("ticks")
+        for name, ticks in summaries.items():
+            own = told_causes(ticks)
+            # A restarted agent's summary is of its last life alone; its records are of all.
+            if own is not None and not self._is_restarted(name):
+                told[name] = own
+        if not told and totals.missed:
+            return None
+        return cause_totals(told, {name: of.missed for name, of in totals.agents.items()})
+
+    def _is_restarted(self, agent: str) -> bool:
+        incarnations = mapping_at(self.result, "agents", agent).get("incarnations")
+        return is_number(incarnations) and incarnations > 1
 
     def _limits(self) -> CheckLimits:
         if self.config is None:
@@ -112,7 +140,7 @@ class Evidence:
             not_finite_max=int(told.get("records.not_finite", default.not_finite_max)),
         )
 
-    def _facts(self, totals: TickTotals) -> RunFacts:
+    def _facts(self, totals: TickTotals, causes: CauseTotals | None) -> RunFacts:
         result = self.result or {}
         messages = mapping_at(result, "messages")
         ticks_due = self._ticks_due()
@@ -143,14 +171,19 @@ class Evidence:
             records_truncated=sum(scan.truncated for scan in self.scans),
             records_not_finite=sum(scan.not_finite for scan in self.scans),
             worst=worst_sources(totals.agents, mapping_at(result, "agents"), self.scans),
+            late_hint=causes.hint if causes else "",
             plugin_checks=(*self._device_checks(), *self._plugin_checks()),
             remarks=(
+                *(causes.remarks(self._lateness_limit_s()) if causes else ()),
                 *affinity_remarks(mapping_at(result, "agents")),
                 *datagram_remarks(datagram_account(result)),
                 *long_call_remarks(mapping_at(result, "host_calls")),
                 *undeclared_remarks(self.declared, self.scans),
             ),
         )
+
+    def _lateness_limit_s(self) -> float | None:
+        return None if self.config is None else self.config.deadline.lateness_limit_s
 
     def _host_lost(self) -> str | None:
         met = (p for p in self.problems if p.machine == self.host_machine and p.step == "run")
@@ -199,7 +232,9 @@ class Evidence:
         lost = (self.result or {}).get("lost")
         return tuple(map(str, lost)) if isinstance(lost, Sequence | Mapping) else ()
 
-    def _document(self, verdict: Verdict, totals: TickTotals) -> dict[str, Any]:
+    def _document(
+        self, verdict: Verdict, totals: TickTotals, causes: CauseTotals | None
+    ) -> dict[str, Any]:
         result = self.result or {}
         config = self.config
         return {
@@ -219,7 +254,7 @@ class Evidence:
             "time_mode": config.time.mode if config else self.started.get("time_mode"),
             "seed": config.seed if config else self.started.get("seed"),
             "versions": self.started.get("versions", {}),
-            "timing": self._timing(totals),
+            "timing": self._timing(totals, causes),
             "messages": self._messages(),
             "between_agents": dict(mapping_at(result, "between_agents")),
             "packets": packet_counts(mapping_at(self.result, "agents")),
@@ -251,7 +286,7 @@ class Evidence:
         restarted = {
             name: agent["incarnations"]
             for name, agent in self._of_agents().items()
-            if is_number(agent.get("incarnations")) and agent["incarnations"] > 1
+            if self._is_restarted(name)
         }
         count = len(self.expected.agents) or len(self.ticks.agents)
         return {"count": count, "lost": list(self._lost()), "incarnations": restarted}
@@ -261,11 +296,14 @@ class Evidence:
         totals = {name: mapping_at(self.result, "messages", name) for name in SERVICES}
         return {name: {**totals[name], "duplicates": twice[name]} for name in SERVICES}
 
-    def _timing(self, totals: TickTotals) -> dict[str, Any]:
+    def _timing(self, totals: TickTotals, causes: CauseTotals | None) -> dict[str, Any]:
         return {
             "ticks": totals.due,
             "missed": totals.missed,
             "miss_ratio": totals.miss_ratio,
+            "late": causes.late if causes else None,
+            "causes": causes.causes if causes else {},
+            "causes_by_agent": causes.agents if causes else {},
             "overrun_errors": totals.overrun_errors,
             "lateness_ms": self.ticks.lateness_ms,
             "margin_ms": self.ticks.margin_ms,

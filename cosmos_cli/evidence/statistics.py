@@ -25,7 +25,7 @@ CLOCK_ROUND_TRIP = "round_trip_us_min"
 CLOCK_ROUND_TRIP_STREAM = "clock (minimum a window)"
 CLOCK_ROUND_TRIP_NAMES = ("count", "min", "p50", "max")
 """Each is the quickest exchange of a window: it says nothing of the mean, nor of the tail."""
-FRAMEWORK_TABLES = ("ticks", "clock", "events", "log", "process")
+FRAMEWORK_TABLES = ("ticks", "late_ticks", "clock", "events", "log", "process")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,6 +19,8 @@ ORDER = (
     " a check broken 4, not clean 3"
 )
 """Order of endings: of several that are true the first is told. README and docs/fleet.md hold the same words."""
+OF_TICKS = "deadline."
+"""Begins the names of the checks that late and missed ticks break."""
 WAKE_UP_LATE_S = 0.02
 """A single wake-up may be late by this much on an idle machine; lateness has checks of its own."""
 
@@ -99,6 +101,8 @@ class RunFacts:
     """Values of all records that were NaN or infinite."""
     worst: Mapping[str, str] = field(default_factory=dict)
     """By name of a check: whose value is the worst."""
+    late_hint: str = ""
+    """The dominant cause of missed and late ticks, with its cure; empty if none was."""
     plugin_checks: tuple[CheckResult, ...] = ()
     remarks: tuple[str, ...] = ()
     """Remarks that decide nothing, such as on processors that were refused."""
@@ -310,7 +314,12 @@ def _conclude(
         return ExitCode.DATA_INCOMPLETE, f"DATA INCOMPLETE: {_listed(facts.missing)}"
     broken = [check for check in checks if not check.passed]
     if broken:
-        return ExitCode.BUDGET_BROKEN, f"CHECK BROKEN: {_listed([_told(c) for c in broken])}"
+        text = f"CHECK BROKEN: {_listed([_told(c) for c in broken])}"
+        is_of_ticks = any(check.name.startswith(OF_TICKS) for check in broken)
+        hint = (
+            f"; ticks late or missed: {facts.late_hint}" if is_of_ticks and facts.late_hint else ""
+        )
+        return ExitCode.BUDGET_BROKEN, text + hint
     if facts.problems:
         return ExitCode.MACHINES, f"NOT CLEAN: {_listed(facts.problems)}"
     return ExitCode.OK, f"PASSED: {len(checks)} checks hold"

@@ -15,6 +15,7 @@ from cosmos_cli.evidence.tables import no_tables, open_recorded_run
 from cosmos_cli.report.devices import device_sections, is_told_in_words
 from cosmos_cli.report.health import health_blocks, process_blocks
 from cosmos_cli.report.second_names import with_second_names
+from cosmos_cli.report.tick_causes import cause_blocks
 from cosmos_cli.report.timing import clock_blocks, tick_blocks
 from madns_runtime.analysis import chapters
 from madns_runtime.analysis.chapters import Chapter
@@ -22,14 +23,17 @@ from madns_runtime.analysis.lines import generic_blocks
 from madns_runtime.analysis.tables import RecordedRun, Tables
 from madns_runtime.analysis.values import Heading, ReportRemark, Section, TableBlock, headings
 from madns_runtime.errors import PluginError
-from madns_runtime.recording.records import CLOCK, HEALTH, PROCESS, TICKS
+from madns_runtime.recording.records import CLOCK, HEALTH, LATE_TICKS, PROCESS, TICKS
 
 SENTENCES_MAX = 60
 LEVELS_TOLD = ("critical", "error", "warning")
 NOT_MEASURED = "not measured"
 CORE_FIELDS = 3
 """The first of each stream: later versions may record more, and earlier ones recorded less."""
-TIME_CHAPTERS = {"ticks": Chapter("Real time", tick_blocks, TICKS.fields[:CORE_FIELDS])}
+TIME_CHAPTERS = {
+    "ticks": Chapter("Real time", tick_blocks, TICKS.fields[:CORE_FIELDS]),
+    "late_ticks": Chapter("Causes of missed and late ticks", cause_blocks, LATE_TICKS.fields),
+}
 MACHINE_CHAPTERS = {
     "machine_health": Chapter("State of health", health_blocks, HEALTH.fields[:CORE_FIELDS]),
     "host_health": Chapter(

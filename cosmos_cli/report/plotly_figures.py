@@ -69,6 +69,8 @@ def to_plotly(figure: Figure | SpaceFigure) -> PlotlyFigure:
         )
     layout, height_px = _grid(figure) if figure.panels else _plain(figure)
     has_bars = any(isinstance(mark, Bars | Histogram) for mark in _marks(figure))
+    if has_bars:
+        layout["barmode"] = "stack"
     layout["showlegend"] = not (figure.panels and has_bars) and any(
         getattr(mark, "name", "") for mark in _marks(figure)
     )
@@ -98,13 +100,22 @@ def _plain(figure: Figure) -> tuple[dict[str, Any], int]:
         x |= {"type": "category", "tickangle": -90}
     layout = base_layout(xaxis=x, yaxis=_ordinate(figure.y, marks))
     if histograms:
-        layout |= {"bargap": 0.05, "barmode": "stack"}
-    if bars and max((value or 0 for mark in bars for value in mark.values), default=0) <= WHOLE_MAX:
+        layout |= {"bargap": 0.05}
+    if bars and _highest(bars) <= WHOLE_MAX:
         layout["yaxis"] |= {"dtick": 1}
     if figure.is_to_scale:
         layout["yaxis"] |= {"scaleanchor": "x", "scaleratio": 1}
     layout["shapes"] = _shapes(figure)
     return layout, BARS_HEIGHT_PX if bars else HEIGHT_PX
+
+
+def _highest(bars: Sequence[Bars]) -> float:
+    """Return the height of the highest bar, of those that stand on each other together."""
+    heights: dict[str, float] = {}
+    for mark in bars:
+        for name, value in zip(mark.names, mark.values, strict=True):
+            heights[name] = heights.get(name, 0.0) + (value or 0.0)
+    return max(heights.values(), default=0.0)
 
 
 def _ordinate(y: Axis, marks: Sequence[Mark]) -> dict[str, Any]:
@@ -253,14 +264,16 @@ def _(mark: Histogram, place: int, figure: Figure) -> list[Trace]:
 
 @_drawn.register
 def _(mark: Bars, place: int, figure: Figure) -> list[Trace]:
+    told = " %{fullData.name}" if mark.name else ""
     return [
         {
             "type": "bar",
+            "name": mark.name,
             "x": list(mark.names),
             "y": list(mark.values),
             "marker": {"color": _colour(mark.tone, place)},
-            "showlegend": False,
-            "hovertemplate": "%{x}: %{y:.4g}<extra></extra>",
+            "showlegend": bool(mark.name),
+            "hovertemplate": f"%{{x}}: %{{y:.4g}}{told}<extra></extra>",
         }
     ]
 

@@ -118,10 +118,12 @@ class Histogram:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bars:
-    """One bar per name; None where there is no value."""
+    """One bar per name; None where there is no value. Several of one figure stand on each other."""
 
     names: Sequence[str]
     values: Sequence[float | None]
+    name: str = ""
+    """Of what the values are, where a figure has several."""
     tone: Tone = "main"
     panel: int = 0
 

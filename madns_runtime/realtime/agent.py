@@ -189,10 +189,12 @@ class AgentRunner:
         began_s = monotonic()
         # What waits in the socket is heard before the host is blamed for silence.
         self._port.process.drain()
+        heard_s = monotonic()
+        self._spans(Span(Cause.RECEIVING, self._seat, began_s, heard_s))
         if not self._is_closed:
-            self._session.handle_timer(monotonic())
+            self._session.handle_timer(heard_s)
             self._pump()
-        self._spans(Span(Cause.HOUSEKEEPING, self._seat, began_s, monotonic()))
+        self._spans(Span(Cause.HOUSEKEEPING, self._seat, heard_s, monotonic()))
 
     def _pump(self) -> None:
         """Carry out the session's events, send what is due, arm its timer."""
@@ -290,6 +292,7 @@ class AgentRunner:
         if now_s >= self._session.ping_due_s and not self._is_closed:
             self._session.handle_timer(now_s)
             self._pump()
+            self._spans(Span(Cause.HOUSEKEEPING, self._seat, now_s, monotonic()))
 
     def _hear(self, t_s: float) -> bool:
         """Hand in what other agents' messages bring in the tick at *t_s*; return whether the agent goes on."""

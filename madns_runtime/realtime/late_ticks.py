@@ -33,6 +33,7 @@ class LateTicks:
         self._recorder = recorder
         self._account = account
         self._counts: Counter[Cause] = Counter()
+        self._missed = 0
 
     def explain(self, timing: TickTiming, began_s: float) -> None:
         """
@@ -52,15 +53,23 @@ class LateTicks:
         )
         cause = self._account.explain(late)
         self._counts[cause] += missed or 1
+        self._missed += missed
         self._recorder.record(LATE_TICKS.name, (index, int(lateness_s * 1e6), missed, cause.value))
 
     def never_run(self, missed: int, now_s: float) -> None:
-        """Count the last ticks of the run, if they were *missed*, at the local time *now_s*, s."""
-        if missed:
-            late = LateTick(
-                self._seat, now_s - missed * self._period_s, now_s, self.started_s, self._period_s
-            )
-            self._counts[self._account.explain(late)] += missed
+        """
+        Count the ticks that no other followed, at the end of the run: none is recorded.
+
+        Args:
+            missed: By the agent until now, all together.
+            now_s: Now, s of the local clock.
+        """
+        new = missed - self._missed
+        if new > 0:
+            due_s = now_s - new * self._period_s
+            late = LateTick(self._seat, due_s, now_s, self.started_s, self._period_s)
+            self._counts[self._account.explain(late)] += new
+            self._missed = missed
 
     def counts(self) -> Mapping[str, int]:
         """Return how many ticks were missed, or began late, by cause; those of which there are none left out."""

@@ -9,15 +9,17 @@ from collections.abc import Mapping
 from time import monotonic, thread_time
 from typing import Any, NamedTuple
 
-from madns_runtime.health.kernel_times import stolen_s, waited_s
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.recording.writer_thread import WriterThread
+from madns_runtime.timing.kernel_times import KernelCount, stolen_s, waited_s
 from madns_runtime.timing.late_causes import Cause, name_cause, overlap_s
 
 SPANS_MIN = 256
 SPANS_PER_AGENT = 8
-LOOK_INTERVAL_S = 0.02
-"""The kernel is not asked more often, however many ticks are late."""
+STOLEN_INTERVAL_S = 0.02
+"""The kernel counts what was stolen in steps of 10 ms, and is not asked more often, however many ticks are late."""
+WAITED_INTERVAL_S = 0.001
+"""What the loop waited for a processor is counted in nanoseconds and read more quickly."""
 NOBODY = -1
 """The agent of a span that is of none in particular."""
 
@@ -43,6 +45,25 @@ class LateTick(NamedTuple):
     period_s: float
 
 
+class _Mark(NamedTuple):
+    """What the loop's time had gone into at a moment, s."""
+
+    at_s: float
+    computed_s: float
+    slept_s: float
+
+    @classmethod
+    def now(cls, reactor: Reactor) -> _Mark:
+        """Return it of this moment; the calling thread is the loop's."""
+        return cls(monotonic(), thread_time(), reactor.slept_s)
+
+    def kept_off_since_s(self, before: _Mark) -> float:
+        """Return the time since *before* in which the loop neither slept nor computed, s."""
+        passed_s = self.at_s - before.at_s
+        busy_s = self.computed_s - before.computed_s + self.slept_s - before.slept_s
+        return max(0.0, passed_s - busy_s)
+
+
 class LoopAccount:
     """
     The newest spans of one loop's time.
@@ -59,11 +80,10 @@ class LoopAccount:
         self._spans: deque[Span] = deque(maxlen=max(SPANS_MIN, SPANS_PER_AGENT * agents))
         self.add = self._spans.append
         self._collection_began_s = math.nan
-        self._mark = (monotonic(), thread_time(), reactor.slept_s)
-        self._kept_off_s = 0.0
-        self._kernel_s = stolen_s(), waited_s()
-        self._newly_stolen_s = self._newly_waited_s = 0.0
-        self._look_due_s = -math.inf
+        self._mark = _Mark.now(reactor)
+        self._before = self._mark
+        self._stolen = KernelCount(stolen_s, STOLEN_INTERVAL_S)
+        self._waited = KernelCount(waited_s, WAITED_INTERVAL_S)
         gc.callbacks.append(self._collecting)
 
     def close(self) -> None:
@@ -71,35 +91,39 @@ class LoopAccount:
         gc.callbacks.remove(self._collecting)
 
     def begin_ticks(self, now_s: float) -> None:
-        """Note for how long the loop was neither asleep nor on a processor since ticks were begun last."""
-        before_s, computed_before_s, slept_before_s = self._mark
-        computed_s, slept_s = thread_time(), self._reactor.slept_s
-        self._mark = (now_s, computed_s, slept_s)
-        self._kept_off_s = (
-            now_s - before_s - (computed_s - computed_before_s) - (slept_s - slept_before_s)
-        )
+        """Note how much of its time the loop has slept and computed until now, as ticks are begun."""
+        self._before, self._mark = self._mark, _Mark(now_s, thread_time(), self._reactor.slept_s)
 
     def look(self) -> None:
         """Read the kernel's counts, so that a late tick is charged with what it met alone: called now and then."""
-        now_s = monotonic()
-        if now_s < self._look_due_s:
-            return
-        self._look_due_s = now_s + LOOK_INTERVAL_S
-        before = self._kernel_s
-        self._kernel_s = stolen_s(), waited_s()
-        stolen_before_s, waited_before_s = before
-        stolen_now_s, waited_now_s = self._kernel_s
-        self._newly_stolen_s = stolen_now_s - stolen_before_s
-        self._newly_waited_s = (
-            waited_now_s - waited_before_s if math.isfinite(waited_now_s) else math.inf
-        )
+        self._stolen.read()
+        self._waited.read()
 
     def explain(self, late: LateTick) -> Cause:
         """Return the cause of a late tick, right after its step."""
-        began_s = monotonic()
+        explained_s = monotonic()
+        window = late.due_s, late.began_s
+        filled_s = self._spans_within(late)
+        filled_s[Cause.START] = overlap_s(late.due_s, late.started_s, window)
+        overslept_s = overlap_s(*self._reactor.last_sleep, window)
+        awake_s = late.began_s - late.due_s - overslept_s
+        kept_off_s = min(self._kept_off_s(explained_s - late.began_s), awake_s)
+        self.look()
+        stolen_since_s = self._stolen.grown_since(self._before.at_s)
+        waited_since_s = self._waited.grown_since(self._before.at_s)
+        absent_s = overslept_s + kept_off_s
+        filled_s[Cause.WAKE_UP] = overslept_s + min(kept_off_s, waited_since_s)
+        if stolen_since_s > waited_since_s or math.isinf(waited_since_s):
+            filled_s[Cause.STOLEN] = min(absent_s, stolen_since_s)
+        filled_s[Cause.RECORDING] = min(absent_s, self._writer.computed_within_s(window))
+        cause = name_cause(late.began_s - late.due_s, filled_s)
+        self.add(Span(Cause.HOUSEKEEPING, late.agent, explained_s, monotonic()))
+        return cause
+
+    def _spans_within(self, late: LateTick) -> dict[Cause, float]:
+        """Return how long each cause was at work in a late tick's window, s."""
         window = late.due_s, late.began_s
         filled_s = dict.fromkeys(Cause, 0.0)
-        filled_s[Cause.START] = overlap_s(late.due_s, late.started_s, window)
         for cause, agent, begin_s, end_s in reversed(self._spans):
             if end_s < late.due_s:
                 break  # they end one after the other
@@ -109,20 +133,18 @@ class LoopAccount:
             elif cause is Cause.STEP and end_s - begin_s < late.period_s:
                 what = Cause.TICK_BEFORE
             filled_s[what] += overlap_s(begin_s, end_s, window)
-        self.look()
-        overslept_s = overlap_s(*self._reactor.last_sleep, window)
-        kept_s = max(overslept_s, min(self._kept_off_s, self._newly_waited_s))
-        filled_s[Cause.WAKE_UP] = kept_s
-        filled_s[Cause.STOLEN] = min(kept_s, self._newly_stolen_s)
-        filled_s[Cause.RECORDING] = min(overslept_s, self._writing_s(window))
-        cause = name_cause(late.began_s - late.due_s, filled_s)
-        self.add(Span(Cause.HOUSEKEEPING, late.agent, began_s, monotonic()))
-        return cause
+        return filled_s
 
-    def _writing_s(self, window: tuple[float, float]) -> float:
-        """Return for how long the writer of records computed, of the pass that fell into a window, s."""
-        began_s, ended_s, computed_s = self._writer.newest_pass
-        return min(computed_s, overlap_s(began_s, ended_s, window))
+    def _kept_off_s(self, own_step_s: float) -> float:
+        """
+        Return for how long the loop was neither asleep nor on a processor before a step that has just ended, s.
+
+        Counted since the ticks before these were begun. What the step itself may have met is left out.
+        """
+        now = _Mark.now(self._reactor)
+        return self._mark.kept_off_since_s(self._before) + max(
+            0.0, now.kept_off_since_s(self._mark) - own_step_s
+        )
 
     def _collecting(self, phase: str, info: Mapping[str, Any]) -> None:
         now_s = monotonic()

@@ -88,7 +88,8 @@ class AgentTicks:
 
     def finish(self, now_s: float) -> None:
         """Close the account at simulated time *now_s*, s."""
-        self.late.never_run(self.pacer.finish(now_s), monotonic())
+        self.pacer.finish(now_s)
+        self.late.never_run(self.pacer.missed, monotonic())
 
     def next_deadline_s(self) -> float:
         """Return the simulated time at which the next one is due, s; infinite while there is none."""
@@ -107,7 +108,9 @@ class AgentTicks:
         local_s = monotonic()
         began_s = port.at(local_s)
         timing = pacer.begin(began_s)
-        if timing is not None:
+        if timing is None:
+            self.late.never_run(pacer.missed, local_s)
+        else:
             index, t_s, deadline_s, lateness_s, missed = timing
             self.factor.add(t_s, began_s)
             page = self._page

@@ -11,6 +11,8 @@ from typing import Protocol
 
 from madns_runtime.config import Recording
 from madns_runtime.recording.record_files import RecordFiles
+from madns_runtime.timing.kernel_times import thread_computed_s
+from madns_runtime.timing.late_causes import overlap_s
 
 
 class RecordWriter(Protocol):
@@ -46,8 +48,11 @@ class WriterThread:
         self._hurry = threading.Event()
         self._writings: list[_Writing] = []
         self._thread: threading.Thread | None = None
-        self.newest_pass = (-math.inf, -math.inf, 0.0)
-        """When it wrote last: begin and end, s of the monotonic clock, and the CPU time that this took, s."""
+        self._newest_pass = (-math.inf, -math.inf, 0.0)
+        """Begin and end of the last time that it wrote, s of the monotonic clock, and the CPU time that this took, s."""
+        self._pass_under_way: tuple[float, float] | None = None
+        """Its begin, and the thread's CPU time then, s."""
+        self._thread_id = 0
 
     def writes(self, files: RecordFiles) -> RecordWriter:
         """Return the writer of some more files."""
@@ -63,6 +68,20 @@ class WriterThread:
                 self._thread = threading.Thread(target=self._write_on, name="recorder", daemon=True)
                 self._thread.start()
 
+    def computed_within_s(self, window: tuple[float, float]) -> float:
+        """
+        Return for how long at most it computed in a time that has just passed, s: in its newest pass.
+
+        Args:
+            window: Begin and end, s of the monotonic clock.
+        """
+        under_way = self._pass_under_way
+        began_s, ended_s, computed_s = self._newest_pass
+        if under_way is not None and under_way[0] < window[1]:
+            began_s, ended_s = under_way[0], math.inf
+            computed_s = max(0.0, thread_computed_s(self._thread_id) - under_way[1])
+        return min(computed_s, overlap_s(began_s, ended_s, window))
+
     def hurry(self) -> None:
         """Write now, also where the disk has just refused: somebody closes."""
         self._hurry.set()
@@ -70,6 +89,7 @@ class WriterThread:
 
     def _write_on(self) -> None:
         _schedule_normally()
+        self._thread_id = threading.get_native_id()
         is_troubled = False
         interval_s = self._settings.sync_interval_s or math.inf
         synced_s = monotonic()
@@ -78,14 +98,15 @@ class WriterThread:
             (self._hurry if is_troubled else self._wake).wait(self._settings.flush_interval_s)
             self._wake.clear()
             self._hurry.clear()
-            began_s, computed_s = monotonic(), thread_time()
+            began_s, computed_s = self._pass_under_way = monotonic(), thread_time()
             closing = [writing for writing in self._writings if writing.is_closing]
             must_sync = monotonic() - synced_s >= interval_s
             writings = list(self._writings)
             is_troubled = not all([writing.is_written(must_sync) for writing in writings])
             if must_sync:
                 synced_s = monotonic()
-            self.newest_pass = (began_s, monotonic(), thread_time() - computed_s)
+            self._newest_pass = (began_s, monotonic(), thread_time() - computed_s)
+            self._pass_under_way = None
             for writing in closing:
                 writing.finish()
             with self._lock:

@@ -223,10 +223,10 @@ class Pacer:
         due = self._newest_due(now_s)
         return self._skip(due if self._deadline_of(due) == now_s else due + 1, "not_run")
 
-    def finish(self, now_s: float) -> int:
-        """Close the account at *now_s*: whatever was due until then and never run is missed; return how many."""
+    def finish(self, now_s: float) -> None:
+        """Close the account at *now_s*: whatever was due until then and never run is missed."""
         self._is_stepping = False
-        return self._skip(self._newest_due(now_s) + 1, "missed")
+        self._skip(self._newest_due(now_s) + 1, "missed")
 
     def summary(self) -> Mapping[str, int | None]:
         """

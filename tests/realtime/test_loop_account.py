@@ -1,0 +1,94 @@
+"""What a loop did between a deadline and a late begin, with made-up spans of its time."""
+
+from __future__ import annotations
+
+import gc
+from time import monotonic
+from types import SimpleNamespace
+
+import pytest
+
+from madns_runtime.realtime.loop_account import NOBODY, LateTick, LoopAccount, Span
+from madns_runtime.timing.late_causes import Cause
+
+PERIOD_S = 0.010
+ME, OTHER = 0, 1
+
+
+@pytest.fixture
+def loop():
+    """A loop that sleeps when it is told to, and its writer of records."""
+    reactor = SimpleNamespace(slept_s=0.0, last_sleep=(-9.0, -9.0))
+    writer = SimpleNamespace(computed_s=0.0)
+    writer.computed_within_s = lambda window: min(writer.computed_s, window[1] - window[0])
+    account = LoopAccount(reactor, writer, agents=2)
+    yield SimpleNamespace(reactor=reactor, writer=writer, account=account)
+    account.close()
+
+
+def late_by(window_s, *, started_s=0.0):
+    """A tick of mine that has just begun, so much too late."""
+    now_s = monotonic()
+    return LateTick(ME, now_s - window_s, now_s, started_s, PERIOD_S)
+
+
+@pytest.mark.parametrize(
+    ("cause", "agent", "lasted_s", "named"),
+    [
+        (Cause.STEP, ME, 0.020, Cause.STEP),
+        (Cause.STEP, ME, 0.009, Cause.TICK_BEFORE),
+        (Cause.STEP, OTHER, 0.009, Cause.OTHER_AGENT),
+        (Cause.RECEIVING, NOBODY, 0.009, Cause.RECEIVING),
+        (Cause.HOUSEKEEPING, ME, 0.009, Cause.HOUSEKEEPING),
+        (Cause.GARBAGE, NOBODY, 0.009, Cause.GARBAGE),
+    ],
+)
+def test_what_the_loop_did_is_the_cause(loop, cause, agent, lasted_s, named):
+    late = late_by(0.008)
+    loop.account.add(Span(cause, agent, late.began_s - lasted_s, late.began_s))
+
+    assert loop.account.explain(late) is named
+
+
+def test_a_loop_that_slept_over_its_deadline_was_woken_late(loop):
+    late = late_by(0.008)
+    loop.reactor.last_sleep = (late.due_s - 0.001, late.began_s)
+
+    assert loop.account.explain(late) is Cause.WAKE_UP
+
+
+def test_a_writer_that_computed_while_the_loop_was_to_wake_is_the_cause(loop):
+    late = late_by(0.008)
+    loop.reactor.last_sleep = (late.due_s - 0.001, late.began_s)
+    loop.writer.computed_s = 0.006
+
+    assert loop.account.explain(late) is Cause.RECORDING
+
+
+def test_an_agent_that_began_after_its_deadline_was_started_late(loop):
+    now_s = monotonic()
+
+    assert (
+        loop.account.explain(LateTick(ME, now_s - 0.008, now_s, now_s - 0.001, PERIOD_S))
+        is Cause.START
+    )
+
+
+def test_what_nobody_timed_is_unexplained(loop):
+    late = late_by(0.008)
+    loop.account.add(Span(Cause.STEP, ME, late.due_s - 0.005, late.due_s - 0.001))
+
+    assert loop.account.explain(late) is Cause.UNEXPLAINED
+
+
+def test_collections_are_noted_until_the_account_is_closed():
+    reactor = SimpleNamespace(slept_s=0.0, last_sleep=(-9.0, -9.0))
+    account = LoopAccount(reactor, SimpleNamespace(), agents=1)
+    gc.collect()
+    spans = [span for span in account._spans if span.cause is Cause.GARBAGE]
+    account.close()
+    gc.collect()
+
+    assert len(spans) == 1
+    assert spans[0].end_s >= spans[0].begin_s
+    assert len(account._spans) == 1
