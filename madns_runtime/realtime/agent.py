@@ -33,7 +33,7 @@ from madns_runtime.realtime.loop_account import Span
 from madns_runtime.realtime.packs import Pack
 from madns_runtime.realtime.process_port import ProcessPort
 from madns_runtime.realtime.process_records import ProcessRecords
-from madns_runtime.realtime.ticks import AgentTicks, TickCalls
+from madns_runtime.realtime.ticks import PacedTicks, TickCalls
 from madns_runtime.recording.newest_values import NewestValues
 from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
@@ -115,7 +115,7 @@ class AgentRunner:
         self._receive = half.simulation.receive  # called often: without a layer between
         self._spans = process.account.add
         self._pack = pack
-        self._ticks = ticks = AgentTicks(
+        self._ticks = ticks = PacedTicks(
             seat,
             config,
             pack.phase_s,

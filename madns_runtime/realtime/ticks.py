@@ -35,7 +35,7 @@ class TickCalls:
     """Pings the host, if that is due by a local time, s."""
 
 
-class AgentTicks:
+class PacedTicks:
     """
     The ticks of one agent.
 
