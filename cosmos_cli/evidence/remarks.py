@@ -122,7 +122,7 @@ def _faults(declared: DeclaredStream | None, fields: Sequence[Field]) -> Iterato
         expected = known.pop(field.name, field if declared.is_open else None)
         if expected is None:
             yield f": field {field.name} is {NOT_DECLARED}"
-        elif field != expected:
+        elif (field.unit, field.kind) != (expected.unit, expected.kind):
             yield f": field {field.name} is {_told(field)} where {_told(expected)} is declared"
     for name in known:
         yield f": field {name} is declared and not recorded"
