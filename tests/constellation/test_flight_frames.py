@@ -5,6 +5,7 @@ import shutil
 import struct
 import subprocess
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -227,3 +228,18 @@ def test_the_header_in_c_reads_and_writes_what_python_does(tmp_path):
     assert answers[1].commands == () and answers[3].estimate is None
     assert done.stderr == b"29 frames, 2 damaged, 1 overlong, 2 lost\n"
     assert not any(vehicle.faults.values())
+
+
+@pytest.mark.parametrize(("is_kept", "setups"), [(True, [0, 1, 1]), (False, [1, 1, 1])])
+def test_first_hello_of_software_that_finds_the_setup_asks_for_nothing(is_kept, setups):
+    """So no record shows whether the program began before the first tick or behind it."""
+    protocol = Frames()
+    protocol.setup(replace(SETUP, is_kept=is_kept))
+
+    again = []
+    for sequence in range(len(setups)):
+        protocol.feed(frame(128, 0.0, bytes(8), sequence=sequence))
+        kinds = [cobs_decode(packet[:-1])[0] for packet in protocol.tick(FULL)]
+        again.append(kinds.count(1))
+
+    assert again == setups

@@ -145,6 +145,7 @@ class ExternalFlight:
             seed=int(context.random.integers(2**31)),
             settings=dict(context.settings),
             clock="own" if self._has_own_clock else "stepped",
+            is_kept=self._link.transport.keeps_all,
         )
         # One that has ended already is told with its end in the first tick.
         if not self._link.write(self._protocol.setup(told)) and not self._link.how_it_ended():

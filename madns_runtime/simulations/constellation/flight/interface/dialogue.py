@@ -99,11 +99,16 @@ class Dialogue:
         """Names of what was believed first, which stay: a packet of one may be lost."""
         self.is_greeted = False
         """Whether a hello has come that `setup_again` has not answered."""
+        self._knows_setup = False
+        """Whether the hello still to come is of software that finds the setup where it listens."""
 
     # To the program ----------------------------------------------------------------------------
 
     def setup(self, setup: SetupReport) -> Iterator[Said]:
         """Yield the structs of a setup."""
+        if self._setup is None:
+            # Whether its hello comes before the first tick or behind it is chance, and must not show.
+            self._knows_setup = setup.is_kept
         self._setup = setup
         settings = list(_settings(setup.settings))
         values = {
@@ -208,7 +213,8 @@ class Dialogue:
             return None
         if known is content.HELLO:
             self._pending.clear()
-            self.is_greeted = True
+            self.is_greeted = not self._knows_setup
+            self._knows_setup = False
             return None
         if known is not content.DONE:
             if len(self._pending) >= PENDING_MAX:

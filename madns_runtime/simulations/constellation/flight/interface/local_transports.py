@@ -27,6 +27,8 @@ RECEIVED, SENT = "received", "sent"
 class StdioLink(StreamTransport):
     """Standard input and output of a program, which are given when it has started."""
 
+    keeps_all = True
+
     def open(self) -> None:
         """Wait for the program."""
 

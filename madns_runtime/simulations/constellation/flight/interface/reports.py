@@ -33,6 +33,8 @@ class SetupReport:
     settings: Mapping[str, Any]
     clock: str = "stepped"
     """stepped or own."""
+    is_kept: bool = False
+    """Whether software that begins to listen later finds it all the same: its first hello asks for nothing more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

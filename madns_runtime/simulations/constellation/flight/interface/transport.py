@@ -13,7 +13,7 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from time import monotonic
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 WAITING_BYTES_MAX = 1_048_576
 """Written, but not taken by the software yet."""
@@ -37,6 +37,9 @@ class Transport(ABC):
     Args:
         name: For people, such as tcp 127.0.0.1:4000.
     """
+
+    keeps_all: ClassVar[bool] = False
+    """Whether what is sent before the software listens is there when it does."""
 
     def __init__(self, name: str) -> None:
         self.name = name
