@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from madns_runtime.errors import BlamedError, PluginError
@@ -37,6 +38,7 @@ from madns_runtime.simulations.constellation.vehicle.flight_tick import (
     fit_out,
     rate_of,
 )
+from madns_runtime.simulations.constellation.vehicle.recorded_results import RecordedResults
 from madns_runtime.simulations.constellation.vehicle.stimuli import Stimuli
 from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBuffer
 from madns_runtime.simulations.constellation.vehicles import flight_of, vehicle_of
@@ -94,8 +96,11 @@ class ConstellationAgent(AgentSimulation):
         self._flight_tick = 0
         self._has_early_steps = self._cockpit is not None and self._rate.steps_per_tick > 1
         self._has_begun = False
+        self._recorded = None
         if self._is_commanded:
             context.open_stream("truth_changes", TRUTH_CHANGES)
+            if parameters.recorded_agents is not None:
+                self._recorded = RecordedResults(Path(parameters.recorded_agents, context.name))
         self._stimuli = Stimuli(vehicle.stimuli, context, first) if vehicle.stimuli else None
 
     def step(self, tick: Tick) -> None:
@@ -109,6 +114,8 @@ class ConstellationAgent(AgentSimulation):
         # Its ticks lie that much behind their nominal times, and so do its maneuvers.
         phase_s = tick.deadline_s - t_s
         self._phase_s = phase_s = phase_s if phase_s > 0.0 else 0.0
+        if self._recorded is not None:
+            self._take_recorded(self._recorded, index)
         cockpit = self._cockpit
         if cockpit is not None:
             cockpit.phase_s = phase_s
@@ -131,6 +138,8 @@ class ConstellationAgent(AgentSimulation):
             every = self._rate.ticks_per_step
             self._flight_tick = index - index % every + every
             cockpit.step(index, t_s, state)
+        if self._recorded is not None and cockpit is not None:
+            self._recorded.commanded(index, cockpit.commands)
         if self._devices is not None:
             self._devices.step(index, t_s, phase_s)
         if self._stimuli is not None:
@@ -170,7 +179,11 @@ class ConstellationAgent(AgentSimulation):
         if kind == Segment.KIND:
             self._take_segment(Segment.from_message(message))
         elif kind == CommandResult.KIND and self._is_commanded:
-            self._take_result(CommandResult.from_message(message))
+            result = CommandResult.from_message(message)
+            if self._recorded is not None:
+                self._recorded.hold_result(result)
+            else:
+                self._take_result(result)
         elif kind != CommandResult.KIND:
             raise PluginError(f"constellation: expected a segment, got {message!r:.200}")
 
@@ -181,8 +194,18 @@ class ConstellationAgent(AgentSimulation):
 
     def refused(self, refusal: TransmissionRefusal) -> None:
         """Take that a message to others was refused."""
-        if self._cockpit is not None:
+        if self._recorded is not None:
+            self._recorded.hold_refusal(refusal)
+        elif self._cockpit is not None:
             self._cockpit.refuse(refusal)
+
+    def _take_recorded(self, recorded: RecordedResults, tick: int) -> None:
+        """Take what has come by this tick and had come by it in the recorded run."""
+        for result in recorded.results.take(tick):
+            self._take_result(result)
+        for refusal in recorded.refusals.take(tick):
+            if self._cockpit is not None:
+                self._cockpit.refuse(refusal)
 
     def _take_result(self, result: CommandResult) -> None:
         if self._devices is not None and result.number >= DEVICE_NUMBER_FIRST:
@@ -232,6 +255,7 @@ class ConstellationAgent(AgentSimulation):
             **({} if self._sensors is None else {"sensors": self._sensors.summary()}),
             **({} if self._devices is None else {"actuation": self._devices.finish()}),
             **self._stimuli_summary(),
+            **({"told_early": self._recorded.overflown} if self._recorded else {}),
             **flown,
             **self._message_counts(),
             "checks": [underruns, *(checks if isinstance(checks, list) else [checks])],

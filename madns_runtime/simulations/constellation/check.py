@@ -75,6 +75,10 @@ def find_faults(  # noqa: PLR0913 - what a scenario is; see plugin.api.Simulatio
     faults += board_faults(parameters, pairs)
     faults += flight_faults(parameters, pairs, folder, is_lockstep=is_lockstep)
     faults += rate_faults(parameters, tick_hz)
+    if parameters.recorded_agents is not None and not is_lockstep:
+        faults.append(
+            "parameters.recorded_agents: expected time.mode lockstep: in real time results come when they come"
+        )
     return faults
 
 

@@ -347,3 +347,6 @@ class ConstellationParameters:
     """Way of truth to the agents."""
     record: RecordSettings = field(default_factory=RecordSettings)
     """Selection of what is recorded."""
+    recorded_agents: Annotated[str, MinLen(1)] | None = None
+    """Folder of a recorded run's agents, such as runs/0007-hwil/agents: results of commands and refusals of messages
+    are told in the ticks in which they were told then, not as soon as they come, in lockstep; `cosmos rerun` writes it."""

@@ -1,14 +1,14 @@
 """
 How a recorded run is flown again: software that can be stepped flies as it is today, other software is played back.
 
-Software behind a device is: the device's record has its bytes. Of software that was only attached to, or has a clock
-of its own, the commands are on record.
+Of software behind a device the device's record has the bytes; of software that was only attached to, or has a clock of
+its own, the commands are on record. All software is told what became of its commands in the ticks in which it was told
+then: in lockstep it would hear of it a tick earlier, and all that it is sent would move with that.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -31,12 +31,9 @@ UNLIKE: Final = (
     "flight_clock",
     "truth",
     "truth_changes",
-    "command_results",
     *(f"maneuvers.{name}" for name in ("heard_s", "propagation_s", "network_s", "slack_s")),
 )
-"""Streams and fields that tell of computers' clocks and networks: how truth came in pieces, when results were told."""
-
-NAMED: Final = re.compile(r"\$\{[a-z]+\}")
+"""Streams and fields that tell of computers' clocks and networks: how truth came in pieces, when the host heard."""
 
 
 def for_rerun(
@@ -49,10 +46,12 @@ def for_rerun(
         _played(rule, number, run_directory, remarks) for number, rule in enumerate(given)
     )
     flown = replace(parameters, flight=rules) if remarks else parameters
+    if given or any(vehicle.actuation for vehicle in parameters.vehicles):
+        flown = replace(flown, recorded_agents=str(run_directory / "agents"))
     return Rerun(
         parameters=flown,
         remarks=tuple(remarks),
-        unlike=(*UNLIKE, *_read_in_ticks(parameters), *_sent(rules)),
+        unlike=(*UNLIKE, *_read_in_ticks(parameters)),
     )
 
 
@@ -63,14 +62,6 @@ def _read_in_ticks(parameters: ConstellationParameters) -> Iterator[str]:
     }
     for name in sorted(hardware):
         yield from (f"{name}.t_s", f"{name}_model", f"{name}_truth")
-
-
-def _sent(rules: Iterable[FlightRule]) -> Iterator[str]:
-    """Yield what goes to flight computers: results of commands, among others, in the tick in which they come."""
-    for rule in rules:
-        interface = None if isinstance(rule, FlightClass) else rule.interface
-        if interface is not None and isinstance(interface.transport, DeviceTransport):
-            yield f"device.{NAMED.sub('*', interface.transport.device)}.sent"
 
 
 def _played(rule: FlightRule, number: int, run: Path, remarks: list[str]) -> FlightRule:

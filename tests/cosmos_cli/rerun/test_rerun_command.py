@@ -230,10 +230,13 @@ def test_a_flight_computer_is_played_back_without_its_emulator(tmp_path):
     received = found["agent-01/mcu.received"]
     assert received["different"] == 0 and received["compared"] >= 20, (received, err)
     assert found["agent-01/mcu.magnetometer"]["records"] >= 40
-    assert found["agent-01/mcu.sent"]["judged"] is False
+    assert found["agent-01/mcu.sent"]["judged"] is True
     assert any("its recorded bytes are played back" in remark for remark in told["remarks"])
     tables = {each["table"]: each for each in told["diff"]["streams"]}
     assert tables["commands"]["matched"] >= 1
     if not (document["timing"]["missed"] or received["in_ticks"]):
         assert code == 0, (told["devices"], err)
         assert tables["commands"]["identical"]
+        # Results among it: to the bit, in their ticks.
+        assert found["agent-01/mcu.sent"]["different"] == 0
+        assert tables["command_results"]["identical"]

@@ -161,6 +161,11 @@ class Cockpit:
             self._read_gauge(t_s, result, readings)
             self._tell("command_result", result)
 
+    @property
+    def commands(self) -> int:
+        """Count of commands that flight software has given."""
+        return self._board.desk.count
+
     def take(self, measured: Mapping[str, Sequence[Reading]]) -> None:
         """Keep what became known of sensors for the next step; of very many readings the oldest are given up."""
         for name, readings in measured.items():
