@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -11,13 +12,19 @@ import typer
 from cosmos_cli.commands.runs import RunsOption
 from cosmos_cli.diff.compare import Selection, compare
 from cosmos_cli.diff.side import open_side
-from cosmos_cli.errors import ExitCode
+from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import runs_root
 from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.launch.execute import Detached, RunOptions, execute
 from cosmos_cli.rerun.device_comparison import compare_devices
+from cosmos_cli.rerun.flown_software import recorded_software, software_remarks, version_remarks
 from cosmos_cli.rerun.outcome import RerunOutcome, print_outcome
-from cosmos_cli.rerun.recorded_run import read_recorded_run
+from cosmos_cli.rerun.recorded_run import (
+    FlownRun,
+    check_collected,
+    read_recorded_run,
+    scenario_folder,
+)
 from cosmos_cli.rerun.scenario import make_rerun
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
 from cosmos_cli.ui.progress import told_progress
@@ -31,11 +38,17 @@ def rerun(
         str, typer.Argument(metavar="RUN", help="Number, name or path of a run, or: last.")
     ],
     as_recorded: Annotated[
+        bool,
+        typer.Option(
+            "--as-recorded", help="Fly the run's own copy of its software; default: today's."
+        ),
+    ] = False,
+    as_recorded_from: Annotated[
         Path | None,
         typer.Option(
-            "--as-recorded",
+            "--as-recorded-from",
             metavar="DIR",
-            help="Fly the software in DIR, a copy of the scenario's folder as it was; default: today's folder.",
+            help="Fly the software in DIR, a copy of the scenario's folder as it was.",
         ),
     ] = None,
     folder: RunsOption = None,
@@ -45,16 +58,39 @@ def rerun(
     """
     Fly a recorded run again without its hardware: in lockstep, each device played back from its records.
 
-    Today's software flies where it can be stepped. Ends with 0 when all that is compared is the same, with 1 when
+    Today's software flies where it can be stepped, and what of it differs from what was flown is named. Ends with 0 when all that is compared is the same, with 1 when
     something differs, with 2 when the run cannot be flown again.
     """
+    if as_recorded and as_recorded_from is not None:
+        raise InputError("--as-recorded and --as-recorded-from DIR: give one of them")
     console = Console(json=as_json, quiet=quiet)
     root = runs_root(folder)
-    recorded = read_recorded_run(find_run(root, run), run, as_recorded)
+    found = find_run(root, run)
+    with ExitStack() as stack:
+        software = as_recorded_from
+        if as_recorded:
+            check_collected(found, run)
+            software = stack.enter_context(recorded_software(found, scenario_folder(found)))
+        recorded = read_recorded_run(found, run, software)
+        if as_recorded:
+            remarks = version_remarks(found)
+        else:
+            which = "today's" if software is None else f"{software}: the"
+            remarks = software_remarks(found, recorded.folder, which)
+        outcome = _fly(recorded, console, root, given=run, remarks=remarks)
+    console.print_json(outcome.to_mapping())
+    print_outcome(console, outcome)
+    raise typer.Exit(int(ExitCode.OK if outcome.is_same else ExitCode.RUN_FAILED))
+
+
+def _fly(
+    recorded: FlownRun, console: Console, root: Path, *, given: str, remarks: tuple[str, ...]
+) -> RerunOutcome:
     flown = make_rerun(recorded)
-    for remark in flown.remarks:
+    remarks += flown.remarks
+    for remark in remarks:
         console.say(remark)
-    before = open_side(recorded.run, run)
+    before = open_side(recorded.run, given)
     summary = execute(
         flown.scenario,
         RunOptions(runs=root, has_report=False),
@@ -67,12 +103,9 @@ def rerun(
         raise typer.Exit(int(summary.exit_code))
     with told_progress(console, "rerun") as progress:
         after = open_side(summary.run, summary.run.name)
-        outcome = RerunOutcome(
+        return RerunOutcome(
             devices=compare_devices(recorded, summary.run.path),
             streams=compare(before, after, Selection(), progress),
-            remarks=flown.remarks,
+            remarks=remarks,
             unlike=flown.unlike,
         )
-    console.print_json(outcome.to_mapping())
-    print_outcome(console, outcome)
-    raise typer.Exit(int(ExitCode.OK if outcome.is_same else ExitCode.RUN_FAILED))

@@ -292,7 +292,12 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
     write_whole(path, orjson.dumps(value, option=options))
 
 
-def begin_run(run: RunDirectory, config: RunConfig, plan: Mapping[str, Any]) -> None:
+def begin_run(
+    run: RunDirectory,
+    config: RunConfig,
+    plan: Mapping[str, Any],
+    flown: Mapping[str, Any] | None = None,
+) -> None:
     """
     Write what is known at the start: plan.json with the whole configuration, run.json as running.
 
@@ -300,9 +305,11 @@ def begin_run(run: RunDirectory, config: RunConfig, plan: Mapping[str, Any]) -> 
         run: A fresh run directory.
         config: What every process of the run is told; holds no secret.
         plan: The launch plan; "machines" maps each machine to the names of its agents.
+        flown: What the run keeps of the files that it flies, as `evidence.flown_files` reads it.
     """
     write_json(run.plan_json, {**plan, "config": to_mapping(config)})
-    write_json(run.run_json, starting_document(run.name, config, utc_now()))
+    document = starting_document(run.name, config, utc_now())
+    write_json(run.run_json, document | ({} if flown is None else {"flown": flown}))
 
 
 def starting_document(name: str, config: RunConfig, started_utc: str) -> dict[str, Any]:

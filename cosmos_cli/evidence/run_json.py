@@ -18,6 +18,8 @@ from cosmos_cli.evidence.datagrams import (
     packet_counts,
 )
 from cosmos_cli.evidence.devices import device_checks
+from cosmos_cli.evidence.flown_files import KEY as FLOWN
+from cosmos_cli.evidence.flown_files import flown_remarks
 from cosmos_cli.evidence.remarks import (
     Declared,
     affinity_remarks,
@@ -179,6 +181,7 @@ class Evidence:
                 *datagram_remarks(datagram_account(result)),
                 *long_call_remarks(mapping_at(result, "host_calls")),
                 *undeclared_remarks(self.declared, self.scans),
+                *flown_remarks(self.started),
             ),
         )
 
@@ -254,6 +257,7 @@ class Evidence:
             "time_mode": config.time.mode if config else self.started.get("time_mode"),
             "seed": config.seed if config else self.started.get("seed"),
             "versions": self.started.get("versions", {}),
+            **({FLOWN: self.started[FLOWN]} if FLOWN in self.started else {}),
             "timing": self._timing(totals, causes),
             "messages": self._messages(),
             "between_agents": dict(mapping_at(result, "between_agents")),

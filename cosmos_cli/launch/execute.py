@@ -23,6 +23,7 @@ from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.pool import FORKS_DEFAULT
 from cosmos_cli.launch.access import chosen_access, with_access
 from cosmos_cli.launch.device_plan import plan_devices
+from cosmos_cli.launch.flown_copy import copy_flown
 from cosmos_cli.launch.machines import RETURN_TIMEOUT_S, RemoteMachine, close_machines
 from cosmos_cli.launch.operator import Operator
 from cosmos_cli.launch.place_plan import check_places
@@ -211,7 +212,8 @@ def _begin(  # noqa: PLR0913 - all that a run is made of; two by name
     config = with_access(host_config(config, places), access)
     mapping = plan_mapping(plan, places, session_hex, is_detached=options.is_detached)
     try:
-        begin_run(run, config, {**mapping, **_declared(scenario), **_named(devices)})
+        flown = copy_flown(scenario.base_directory, run, access).to_mapping()
+        begin_run(run, config, {**mapping, **_declared(scenario), **_named(devices)}, flown)
         (run.path / "scenario.yaml").write_text(scenario_text(scenario), encoding="utf-8")
         if options.machines != (LOOPBACK,):
             (run.path / "inventory.yaml").write_text(inventory_text(plan), encoding="utf-8")

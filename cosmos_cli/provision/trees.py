@@ -280,27 +280,31 @@ def _walk(folder: Path, top: Path, above: tuple[Path, ...] = ()) -> Iterator[tup
     above = (*above, folder.resolve())
     for entry in entries_in(folder):
         path = folder / entry.name
-        if entry.name.startswith(".") or entry.name.endswith(CACHE_SUFFIXES):
+        if not is_name_of_tree(entry.name):
             continue
         if not entry.name.isprintable():
             raise InputError(f"{str(path)!r}: expected a file name of printable characters")
         if entry.is_symlink():
             _refuse_outside(path, top)
         if entry.is_dir():
-            if path.resolve() not in above and not _is_left_out(path):
+            if path.resolve() not in above and is_folder_of_tree(path):
                 yield from _walk(path, top, above)
         elif entry.is_file():
-            is_bundle = entry.name.endswith(BUNDLE_SUFFIX) and RUN_NAME.match(entry.name)
-            if not is_bundle:
-                yield path, path.relative_to(top).as_posix()
+            yield path, path.relative_to(top).as_posix()
         elif entry.is_symlink():
             raise InputError(f"{path}: a link that leads nowhere; remove it")
 
 
-def _is_left_out(path: Path) -> bool:
-    """Tell whether a folder is a cache, a virtual environment or a run."""
+def is_name_of_tree(name: str) -> bool:
+    """Tell whether what has this name may belong to a tree: no hidden file, no cache, no package of a run."""
+    is_bundle = name.endswith(BUNDLE_SUFFIX) and RUN_NAME.match(name) is not None
+    return not (name.startswith(".") or name.endswith(CACHE_SUFFIXES) or is_bundle)
+
+
+def is_folder_of_tree(path: Path) -> bool:
+    """Tell whether a folder belongs to a tree: no cache, virtual environment or run."""
     is_run = RUN_NAME.match(path.name) is not None and (path / "plan.json").exists()
-    return is_run or path.name in CACHE_FOLDERS or (path / "pyvenv.cfg").exists()
+    return not (is_run or path.name in CACHE_FOLDERS or (path / "pyvenv.cfg").exists())
 
 
 def _refuse_outside(path: Path, top: Path) -> None:

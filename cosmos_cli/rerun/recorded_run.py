@@ -83,9 +83,7 @@ def read_recorded_run(run: RunDirectory, given: str, as_recorded: Path | None = 
     Raises:
         InputError: It cannot be flown again; the text says why, and what to do.
     """
-    document = run.read_json(run.run_json)
-    if document is None or document.get("status") == "running":
-        raise InputError(f"{run.name} is not collected yet; do that with: cosmos collect {given}")
+    check_collected(run, given)
     config = run.read_config()
     if config is None:
         raise InputError(
@@ -97,7 +95,7 @@ def read_recorded_run(run: RunDirectory, given: str, as_recorded: Path | None = 
     if not Path(config.base_directory).is_dir():
         raise InputError(
             f"{run.name}: the scenario's folder {clean_line(config.base_directory)} is not there;"
-            " put it back, or name a copy with --as-recorded DIR"
+            " put it back, fly the run's own copy with --as-recorded, or name another with --as-recorded-from DIR"
         )
     plan = run.read_json(run.plan_json) or {}
     names = config.agents.resolved_names()
@@ -114,6 +112,25 @@ def read_recorded_run(run: RunDirectory, given: str, as_recorded: Path | None = 
         told = "; ".join(faults[:FAULTS_SHOWN_MAX]) + (f"; and {more} more" if more > 0 else "")
         raise InputError(f"{run.name} cannot be flown again: {told}")
     return FlownRun(run=run, config=config, agents=agents, devices=devices)
+
+
+def check_collected(run: RunDirectory, given: str) -> None:
+    """
+    See that a run is over and collected.
+
+    Raises:
+        InputError: It is not.
+    """
+    document = run.read_json(run.run_json)
+    if document is None or document.get("status") == "running":
+        raise InputError(f"{run.name} is not collected yet; do that with: cosmos collect {given}")
+
+
+def scenario_folder(run: RunDirectory) -> Path | None:
+    """Return the folder of a run's scenario; None if it is not known, or not there any more."""
+    config = run.read_config()
+    folder = Path(config.base_directory) if config is not None else None
+    return folder if folder is not None and folder.is_dir() else None
 
 
 def _read_agent(folder: Path, config: RunConfig) -> RecordedAgent:

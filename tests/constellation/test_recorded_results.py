@@ -21,8 +21,13 @@ def write(folder, stream, names, rows):
 def recorded(tmp_path):
     """Three commands of ticks 2, 4 and 6: executed, refused, and one whose execution the run did not live to see."""
     write(tmp_path, "commands", ("tick", "number"), [[2, 0], [4, 1], [6, 2]])
-    results = [[5, 1, "refused"], [5, 0, "accepted"], [8, 0, "executed"], [8, 2, "postponed"]]
-    write(tmp_path, "command_results", ("tick", "number", "status"), results)
+    results = [
+        [5, 1, "refused", 0],
+        [5, 0, "accepted", 7],
+        [8, 0, "executed", 9],
+        [8, 2, "postponed", 8],
+    ]
+    write(tmp_path, "command_results", ("tick", "number", "status", "revision"), results)
     write(tmp_path, "refusals", ("tick", "number", "to", "sent_s"), [[7, 3, "agent-02", 0.4]])
     return RecordedResults(tmp_path)
 
@@ -32,7 +37,7 @@ def result(number, status):
 
 
 def told(recorded, tick):
-    return [(one.number, one.status) for one in recorded.results.take(tick)]
+    return [(one.number, one.status) for one in recorded.take_results(tick)]
 
 
 def test_what_comes_early_is_told_in_its_tick_and_in_the_order_on_record(recorded):
@@ -46,6 +51,24 @@ def test_what_comes_early_is_told_in_its_tick_and_in_the_order_on_record(recorde
     assert told(recorded, 5) == [(1, "refused"), (0, "accepted")]
     assert [told(recorded, tick) for tick in (6, 7)] == [[], []]
     assert told(recorded, 8) == [(0, "executed")]
+
+
+def test_a_revision_is_that_on_record_and_of_others_as_it_comes(recorded):
+    recorded.commanded(2, 1)
+    recorded.hold_result(result(0, "executed"))
+    recorded.hold_result(result(3, "accepted"))
+
+    found = {one.number: one.revision for one in recorded.take_results(8)}
+    assert found == {0: 9, 3: 1}
+
+
+def test_what_is_over_and_not_on_record_is_told_no_tick_ahead(recorded):
+    recorded.take_results(10)
+    recorded.hold_result(result(3, "executed"))
+    recorded.hold_result(result(3, "accepted"))
+
+    assert told(recorded, 11) == [(3, "accepted")]
+    assert told(recorded, 12) == [(3, "executed")]
 
 
 def test_what_comes_later_than_on_record_is_told_when_it_comes(recorded):

@@ -201,7 +201,7 @@ class ConstellationAgent(AgentSimulation):
 
     def _take_recorded(self, recorded: RecordedResults, tick: int) -> None:
         """Take what has come by this tick and had come by it in the recorded run."""
-        for result in recorded.results.take(tick):
+        for result in recorded.take_results(tick):
             self._take_result(result)
         for refusal in recorded.refusals.take(tick):
             if self._cockpit is not None:

@@ -44,6 +44,8 @@ GROUND = "ground"
 
 CommandKind = Literal["delta_v", "torque", "ballistic", "dipole"]
 CommandFrame = Literal["inertial", "rtn", "body"]
+LEAD_TICKS = 1
+"""So much ahead of its time the host of a rerun tells that a command is over; the agent holds that back."""
 CommandStatus = Literal["accepted", "executed", "postponed", "refused"]
 
 

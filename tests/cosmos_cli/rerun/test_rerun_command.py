@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import pytest
 from harness.cosmos_command import LOOSE, SCENARIOS, CosmosCommand
@@ -91,17 +92,24 @@ def rerun(cosmos, *arguments):
 @pytest.fixture(scope="module")
 def braked(tmp_path_factory):
     """A run in real time whose flight software brakes by the rates of a device; none of its tests changes it."""
-    folder = tmp_path_factory.mktemp("braked")
+    top = tmp_path_factory.mktemp("braked")
+    folder = top / "scenario"
+    folder.mkdir()
     (folder / "noisy.py").write_text(DRIVER)
     (folder / "brake.py").write_text(FLIGHT)
     (folder / "braked.yaml").write_text(REAL)
-    cosmos = CosmosCommand(folder)
+    cosmos = CosmosCommand(top)
     code, document = cosmos.run(
         folder / "braked.yaml", *LOOSE, "hardware.stale_ratio=1", "hardware.stimulus_late=1"
     )
     # A busy machine may break deadlines of commands; what came of them is recorded, and so the same again.
     assert document["status"] == "complete" and code in (0, 4), document["verdict"]
     return cosmos, document
+
+
+def records(path):
+    lines = map(json.loads, path.read_text().splitlines())
+    return [line for line in lines if isinstance(line, list)]
 
 
 def channels(told):
@@ -111,11 +119,12 @@ def channels(told):
 def test_a_lockstep_run_with_devices_is_the_same_again(tmp_path):
     (tmp_path / "even.yaml").write_text(EVEN)
     cosmos = CosmosCommand(tmp_path)
-    cosmos.run(tmp_path / "even.yaml", *LOOSE)
+    _, document = cosmos.run(tmp_path / "even.yaml", *LOOSE)
 
-    code, told, err = rerun(cosmos, "last")
+    code, told, err = rerun(cosmos, "last", "--as-recorded")
 
     assert code == 0, err
+    assert "even.yaml" in document["flown"]["files"]
     assert told["same"]
     value = channels(told)["agent-02/gps.value"]
     assert (value["compared"], value["different"], value["left_out"]) == (60, 0, 0)
@@ -144,13 +153,16 @@ def test_a_run_in_real_time_has_the_same_samples_commands_and_truth_in_lockstep(
 def test_a_change_of_the_flight_software_is_found_and_its_copy_is_not(braked, tmp_path):
     cosmos, document = braked
     for name in ("noisy.py", "brake.py"):
-        shutil.copy(cosmos.folder / name, tmp_path)
+        shutil.copy(cosmos.folder / "scenario" / name, tmp_path)
     changed = FLIGHT.replace("-1e-3 * rate", "-2e-3 * rate")
     (tmp_path / "brake.py").write_text(changed)
 
-    code, told, _ = rerun(cosmos, document["run"], "--as-recorded", tmp_path)
+    code, told, _ = rerun(cosmos, document["run"], "--as-recorded-from", tmp_path)
 
     assert code == 1
+    assert (
+        f"{tmp_path}: the flight software differs: brake.py, braked.yaml (gone)" in told["remarks"]
+    )
     tables = {each["table"]: each for each in told["diff"]["streams"]}
     assert tables["commands"]["fields"]["x"]["different"] >= 20
     assert channels(told)["agent-01/imu.gyro"]["different"] == 0
@@ -198,10 +210,143 @@ def test_a_plan_that_names_devices_elsewhere_is_refused(braked, tmp_path):
 def test_a_folder_that_is_not_there_any_more_is_named(braked, tmp_path):
     cosmos, document = braked
 
-    done = cosmos("rerun", document["run"], "--as-recorded", tmp_path / "gone")
+    done = cosmos("rerun", document["run"], "--as-recorded-from", tmp_path / "gone")
 
     assert done.returncode == 2
-    assert "is not there; put it back, or name a copy with --as-recorded DIR" in done.stderr
+    assert "is not there; put it back, fly the run's own copy with --as-recorded" in done.stderr
+
+
+def test_two_sources_of_software_are_refused(braked, tmp_path):
+    cosmos, document = braked
+
+    done = cosmos("rerun", document["run"], "--as-recorded", "--as-recorded-from", tmp_path)
+
+    assert done.returncode == 2
+    assert "give one of them" in done.stderr
+
+
+@pytest.fixture
+def changed(braked, tmp_path):
+    """The same run in a place of its own, with what it flew changed since where it was flown."""
+    cosmos, document = braked
+    copy = tmp_path / "runs" / document["run"]
+    shutil.copytree(cosmos.directory(document), copy)
+    today = tmp_path / "today"
+    today.mkdir()
+    (today / "noisy.py").write_text(DRIVER)
+    (today / "brake.py").write_text(FLIGHT.replace("-1e-3 * rate", "-2e-3 * rate"))
+    (today / "braked.yaml").write_text(REAL)
+    (today / "gains.json").write_text("{}")
+    plan = json.loads((copy / "plan.json").read_text())
+    plan["config"]["base_directory"] = str(today)
+    (copy / "plan.json").write_text(json.dumps(plan))
+    return CosmosCommand(tmp_path, COSMOS_CACHE=str(tmp_path / "cache")), copy
+
+
+def test_a_run_keeps_a_copy_of_what_it_flew_and_packages_it(braked):
+    cosmos, document = braked
+    run = cosmos.directory(document)
+
+    listed = json.loads((run / "run.json").read_text())["flown"]
+    manifest = json.loads((run / "manifest.json").read_text())["files"]
+
+    assert listed["whole"] and not listed["left_out"]
+    assert set(listed["files"]) == {"brake.py", "braked.yaml", "noisy.py"}
+    for name, entry in listed["files"].items():
+        assert manifest[f"flown/{name}"] == {"bytes": entry["bytes"], "sha256": entry["sha256"]}
+        assert (run / "flown" / name).read_bytes() == (
+            cosmos.folder / "scenario" / name
+        ).read_bytes()
+
+
+def test_the_copy_flies_whatever_todays_files_are_and_without_it_they_are_named(changed):
+    cosmos, copy = changed
+
+    code, told, _ = rerun(cosmos, str(copy))
+
+    assert code == 1
+    assert "today's flight software differs: brake.py, gains.json (new)" in told["remarks"]
+    tables = {each["table"]: each for each in told["diff"]["streams"]}
+    assert tables["commands"]["fields"]["x"]["different"] >= 20
+
+    shutil.rmtree(copy.parents[1] / "today")
+    code, told, err = rerun(cosmos, str(copy), "--as-recorded")
+
+    tables = {each["table"]: each for each in told["diff"]["streams"]}
+    assert tables["commands"]["matched"] >= 20, err
+    if not unsure(copy, told):
+        assert code == 0, (told, err)
+        assert tables["commands"]["identical"]
+    assert not any("differs" in remark for remark in told["remarks"])
+    assert not list((cosmos.folder / "cache" / "flown").glob("*"))
+
+
+def unsure(copy, told):
+    """Count what lockstep cannot know of a run in real time: samples that came within ticks, and missed ticks."""
+    document = json.loads((copy / "run.json").read_text())
+    return sum(each["in_ticks"] for each in told["devices"]) + document["timing"]["missed"]
+
+
+def test_a_copy_that_was_changed_or_escapes_is_refused(changed):
+    cosmos, copy = changed
+    whole = json.loads((copy / "run.json").read_text())
+    entry = whole["flown"]["files"]["brake.py"]
+    (copy.parent / "evil.py").write_text("raise SystemExit")
+    for files, words in (
+        ({"../evil.py": entry}, "expected no part that starts with a dot"),
+        ({"/etc/passwd": entry}, "expected a path within the folder"),
+        ({"brake.py": {**entry, "bytes": 1 << 40}}, "expected at most 8388608 bytes"),
+        ({"brake.py": {**entry, "sha256": "0" * 64}}, "what lies in flown/ is not what was flown"),
+        ({"gone.py": entry}, "gone.py: No such file"),
+        ({"brake.py": entry, "brake.py/x.py": entry}, "brake.py/x.py: "),
+    ):
+        (copy / "run.json").write_text(json.dumps({**whole, "flown": {"files": files}}))
+
+        done = cosmos("rerun", str(copy), "--as-recorded")
+
+        assert done.returncode == 2, files
+        assert words in done.stderr, (files, done.stderr)
+        assert "--as-recorded-from DIR" in done.stderr
+        assert "Traceback" not in done.stderr
+    (copy / "run.json").write_text(json.dumps(whole))
+    (copy / "flown" / "brake.py").unlink()
+    (copy / "flown" / "brake.py").symlink_to(copy.parents[1] / "today" / "brake.py")
+
+    done = cosmos("rerun", str(copy), "--as-recorded")
+
+    assert done.returncode == 2
+    assert "brake.py: a link that leads elsewhere" in done.stderr
+
+
+def test_a_run_of_before_there_were_copies_says_what_to_do(changed):
+    cosmos, copy = changed
+    document = json.loads((copy / "run.json").read_text())
+    del document["flown"]
+    (copy / "run.json").write_text(json.dumps(document))
+
+    done = cosmos("rerun", str(copy), "--as-recorded")
+
+    assert done.returncode == 2
+    assert "keeps no copy of what it flew" in done.stderr
+    assert "--as-recorded-from DIR" in done.stderr
+
+
+def test_played_samples_have_the_recorded_values_times_and_ages(braked):
+    cosmos, document = braked
+    _, told, _ = rerun(cosmos, document["run"])
+
+    for agent in ("agent-01", "agent-02"):
+        first, second = (
+            [row for row in records(root / "devices" / agent / "imu" / "gyro.jsonl")]
+            for root in (cosmos.directory(document), Path(told["directory"]))
+        )
+        compared = channels(told)[f"{agent}/imu.gyro"]["compared"]
+        assert compared == len(second) >= 20
+        whole = [row for row in first if None not in row]
+        for recorded, played in zip(whole, second, strict=False):
+            assert played[3:] == recorded[3:]
+            assert played[0] == pytest.approx(recorded[0], abs=1.5e-6)
+            assert abs(played[2] - recorded[2]) <= 1
 
 
 @needs_emulator

@@ -17,7 +17,7 @@ from madns_runtime.plugin.api import HostContext
 from madns_runtime.protocol.messages import Service
 from madns_runtime.simulations.constellation.host_side.truth_distribution import Refills
 from madns_runtime.simulations.constellation.host_side.truth_propagation import TruthSupply
-from madns_runtime.simulations.constellation.messages import Command
+from madns_runtime.simulations.constellation.messages import LEAD_TICKS, Command
 from madns_runtime.simulations.constellation.streams import MANEUVERS
 from madns_runtime.simulations.constellation.truth.maneuvers.rules import (
     ManeuverDesk,
@@ -53,6 +53,9 @@ class Maneuvering:
         """Time at which each job is overtaken, and the job; also of those that are done."""
         self._pending: list[tuple[float, int, Taken]] = []
         self._count = 0
+        # Of a rerun: its agents hold the results until the ticks on record.
+        is_rerun = context.parameters.recorded_agents is not None
+        self._lead_s = LEAD_TICKS / context.tick_hz if is_rerun else 0.0
         context.open_stream("maneuvers", MANEUVERS)
 
     def receive(self, vehicle: int, command: Command) -> None:
@@ -140,7 +143,7 @@ class Maneuvering:
             self._refills.changed(vehicle, start_s, start_s + phase_s)
         self._record(taken, self._desk.measure(taken, self._context.now_s()))
         self._tell(taken)
-        over_s = taken.effect.end_s + phase_s
+        over_s = taken.effect.end_s + phase_s - self._lead_s
         self._count += 1
         heapq.heappush(self._pending, (over_s, self._count, taken))
         self._context.wake(over_s)

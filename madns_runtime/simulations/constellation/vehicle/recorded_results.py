@@ -1,20 +1,28 @@
 """
 Results of commands and refusals of messages in a rerun, each held until the tick in which the recorded run told it.
 
-In lockstep a result comes in the first tick that can know it; in real time the host's turn and the network may bring
-it a tick later. Flight software that is told in the recorded tick sees the same as then. Where today's commands are no
-longer those on record, from the first one that is given in another tick on, results are told as they come.
+In lockstep a result comes in the first tick that can know it. In real time the host's turn and the network may bring it
+a tick later; or a tick that woke up late hears of what was over after its nominal time: the host of a rerun tells what
+is over a tick ahead, see `LEAD_TICKS`. Flight software that is told in the recorded tick sees the same as then. A
+result's revision counts the changes of truth in the order in which the host heard of them, and is as on record, too.
+Where today's commands are no longer those on record, from the first one that is given in another tick on, results are
+told as they would come.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
 from madns_runtime.errors import BlamedError
 from madns_runtime.recording.reader import read_stream
-from madns_runtime.simulations.constellation.messages import CommandResult, TransmissionRefusal
+from madns_runtime.simulations.constellation.messages import (
+    LEAD_TICKS,
+    CommandResult,
+    TransmissionRefusal,
+)
 
 HELD_MAX: Final = 4096
 """Results that are held, and refusals; further ones are told as they come, and counted."""
@@ -60,12 +68,13 @@ class RecordedResults:
         self.results: HeldNews[CommandResult] = HeldNews()
         self.refusals: HeldNews[TransmissionRefusal] = HeldNews()
         self._given = {row["number"]: row["tick"] for row in _rows(folder / "commands.jsonl")}
-        self._told: dict[tuple[int, bool], tuple[int, int]] = {}
-        """Tick, and place among all results, by number and whether it is that of the execution."""
+        self._told: dict[tuple[int, bool], tuple[int, int, int]] = {}
+        """Tick, place among all results, and revision, by number and whether it is that of the execution."""
         self._refused: set[int] = set()
         for place, row in enumerate(_rows(folder / "command_results.jsonl")):
             number, status = row["number"], row["status"]
-            self._told.setdefault((number, status == "executed"), (row["tick"], place))
+            told = (row["tick"], place, row["revision"])
+            self._told.setdefault((number, status == "executed"), told)
             if status == "refused":
                 self._refused.add(number)
         path = folder / "refusals.jsonl"  # only of a run in which a message was refused
@@ -73,6 +82,7 @@ class RecordedResults:
             (row["number"], row["to"], row["sent_s"]): (row["tick"], place)
             for place, row in enumerate(_rows(path) if path.is_file() else ())
         }
+        self._tick = -1
         self._checked = 0
         self._differs_from = NEVER
 
@@ -90,22 +100,26 @@ class RecordedResults:
 
     def hold_result(self, result: CommandResult) -> None:
         """Take a result that has come."""
-        self.results.hold(self._due(result), result)
+        number, is_executed = result.number, result.status == "executed"
+        is_on_record = number < self._differs_from and number in self._given
+        if not is_on_record or (is_executed and number in self._refused):
+            next_tick = self._tick + 1
+            due = (next_tick + LEAD_TICKS, -1) if is_executed else AT_ONCE
+            self.results.hold(due, result)
+            return
+        # Without a record the run had ended before its agent heard of it.
+        tick, place, revision = self._told.get((number, is_executed), (NEVER, 0, result.revision))
+        self.results.hold((tick, place), replace(result, revision=revision))
+
+    def take_results(self, tick: int) -> list[CommandResult]:
+        """Return the results of a tick."""
+        self._tick = tick
+        return self.results.take(tick)
 
     def hold_refusal(self, refusal: TransmissionRefusal) -> None:
         """Take a refusal that has come; one that is not on record is told at once."""
         key = (refusal.number, refusal.to, refusal.sent_s)
         self.refusals.hold(self._refusals.get(key, AT_ONCE), refusal)
-
-    def _due(self, result: CommandResult) -> tuple[int, int]:
-        """Return tick and place at which a result is told: at once what is not on record."""
-        number, is_executed = result.number, result.status == "executed"
-        if number >= self._differs_from or number not in self._given:
-            return AT_ONCE
-        if is_executed and number in self._refused:
-            return AT_ONCE
-        # Without a record the run had ended before its agent heard of it.
-        return self._told.get((number, is_executed), (NEVER, 0))
 
 
 def _rows(path: Path) -> Iterator[dict[str, Any]]:
