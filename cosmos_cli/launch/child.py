@@ -19,7 +19,6 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from cosmos_cli.fleet.layout import Layout
 from cosmos_cli.launch.channel import PipeChannel
 from cosmos_cli.launch.children import GROUP_CHECK_S, KILL_WAIT_S
 from cosmos_cli.launch.machines import MachinePaths
@@ -239,6 +238,5 @@ def _assignments(paths: MachinePaths, more: Mapping[str, str]) -> str:
         **paths.variables,
         **more,
         "COSMOS_STATE_DIR": paths.state,
-        "PYTHONPYCACHEPREFIX": Layout(paths.root).compiled,
     }
     return " ".join(f"{name}={shlex.quote(value)}" for name, value in environment.items())

@@ -72,6 +72,8 @@ class Computer:
     processors: int | None = None
     is_preempt_rt: bool | None = None
     """Whether its kernel is PREEMPT_RT."""
+    processor_kind: str | None = None
+    """A word that processors of the same kind and abilities share; None: not known."""
     os_name: str = ""
     """Such as Debian GNU/Linux 12 (bookworm)."""
     os_id: str = ""
@@ -255,7 +257,10 @@ class MachineFacts:
 
 
 MISSING = FileFact()
-_BOARD_KEYS = ("model", "machine", "bits", "node", "kernel", "processors", "is_preempt_rt")
+_BOARD_KEYS = (
+    *("model", "machine", "bits", "node", "kernel", "processors"),
+    *("is_preempt_rt", "processor_kind"),
+)
 _DISK_KEYS = ("path", "total_bytes", "free_bytes", "is_read_only", "is_writable")
 
 

@@ -42,20 +42,33 @@ def read_mark(folder: str) -> dict[str, PlainValue] | None:
 
 
 def trace(folder: str, names: Iterable[str]) -> dict[str, list[int]]:
-    """Return size and time of files: what changes when somebody writes to one."""
+    """Return size, time and mode of files and links: what changes when somebody writes to one."""
     found = {}
     for name in names:
         status = os.lstat(f"{folder}/{name}")
-        found[name] = [status.st_size, status.st_mtime_ns]
+        found[name] = [status.st_size, status.st_mtime_ns, status.st_mode]
     return found
 
 
 def is_untouched(folder: str, files: Mapping[str, list[int]]) -> bool:
-    """Tell whether files still have the size and the time that `trace` found; others do not matter."""
+    """Tell whether files still are as `trace` found them; others do not matter."""
     try:
         return trace(folder, files) == files
     except (OSError, ValueError, TypeError):
         return False
+
+
+def files_below(folder: str, left_out: str) -> Iterator[str]:
+    """Yield the path of every file and link below a folder, but for its mark and what is in folders named *left_out*."""
+    waiting = [""]
+    while waiting:
+        inner = waiting.pop()
+        for entry in os.scandir(os.path.join(folder, inner)):
+            if not entry.is_dir(follow_symlinks=False):
+                if inner or entry.name != MARK:
+                    yield f"{inner}{entry.name}"
+            elif entry.name != left_out:
+                waiting.append(f"{inner}{entry.name}/")
 
 
 def names_in(folder: str) -> list[str]:

@@ -17,7 +17,12 @@ import sys
 from collections.abc import Iterator, Mapping
 
 from cosmos_cli.onboard import content_changes, content_store
-from cosmos_cli.onboard.installed import is_environment_whole, prunable
+from cosmos_cli.onboard.installed import (
+    interpreter_path,
+    is_environment_whole,
+    prunable,
+    site_folder,
+)
 from cosmos_cli.onboard.request_loop import (
     HelperRefusal,
     PlainValue,
@@ -65,7 +70,7 @@ def environment(request: VerbRequest) -> dict[str, PlainValue]:
     folder = content_store.expand(asked["folder"])
     wheels = content_store.expand(asked["wheels_folder"])
     path = os.path.join(folder, asked["key"])
-    if is_environment_whole(path):
+    if is_environment_whole(path, is_strict=True):
         return {"changed": False, "missing": []}
     if list(sys.version_info[:2]) != asked["python"]:
         found = ".".join(map(str, sys.version_info[:2]))
@@ -122,7 +127,7 @@ class Builder:
         self._asked = asked
         self._python = os.path.join(path, "bin/python")
         self._version = ".".join(map(str, asked["python"]))
-        self._site = f"lib/python{self._version}/site-packages"
+        self._site = site_folder(asked["python"])
         self._made: set[str] = set()
 
     def build(self) -> None:
@@ -148,16 +153,17 @@ class Builder:
         interpreter = interpreter_path()
         for folder in ("bin", self._site):
             os.makedirs(os.path.join(self._path, folder))
-        for name in ("python", "python3", f"python{self._version}"):
-            target = interpreter if name == "python" else "python"
-            os.symlink(target, os.path.join(self._path, "bin", name))
+        links = [f"bin/{name}" for name in ("python", "python3", f"python{self._version}")]
+        for name in links:
+            target = interpreter if name == links[0] else "python"
+            os.symlink(target, os.path.join(self._path, name))
         lines = {
             "home": os.path.dirname(interpreter),
             "include-system-site-packages": "true" if self._asked["sees_system"] else "false",
             "version": ".".join(map(str, sys.version_info[:3])),
         }
         text = "".join(f"{key} = {value}\n" for key, value in lines.items())
-        return [self._write("pyvenv.cfg", text.encode())]
+        return [*links, self._write("pyvenv.cfg", text.encode())]
 
     def _install(self, wheel: str) -> list[str]:
         mark = content_store.read_mark(wheel) or {}
@@ -256,16 +262,6 @@ class Builder:
             os.makedirs(folder, exist_ok=True)
             self._made.add(folder)
         return path
-
-
-def interpreter_path() -> str:
-    """
-    Return the interpreter that an environment links to: this one, or what stands behind it.
-
-    Its full name, such as /usr/bin/python3.11: an upgrade of the system must not put another Python under
-    packages that were made for this one.
-    """
-    return os.path.realpath(getattr(sys, "_base_executable", None) or sys.executable)
 
 
 @verb("versions")

@@ -9,6 +9,7 @@ Every path begins with one of the folders that the request gives for /etc, /sys 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import resource
 import subprocess
@@ -42,6 +43,11 @@ TIMED_OUT_STATUS = 124
 """Of `timeout`, which root's process heeds; a signal of ours it would not."""
 THROTTLED = "devices/platform/soc/soc:firmware/get_throttled"
 READ_ONLY = os.ST_RDONLY
+PROCESSOR_KEYS = (
+    *(b"vendor_id", b"model name", b"flags"),
+    *(b"Features", b"CPU implementer", b"CPU architecture", b"CPU variant", b"CPU part"),
+)
+"""Of /proc/cpuinfo: what tells processors of an x86-64 and of an ARM computer apart."""
 DPKG_QUERY = (
     "dpkg-query",
     "-W",
@@ -127,7 +133,21 @@ def _board(sys_: str, proc: str) -> dict[str, PlainValue]:
         "kernel": system.release,
         "processors": os.cpu_count(),
         "is_preempt_rt": is_preempt_rt(sys_, proc),
+        "processor_kind": _processor_kind(proc),
     }
+
+
+def _processor_kind(proc: str) -> str | None:
+    """Return a word that processors of the same kind and abilities share; None where the kernel does not tell."""
+    found = set()
+    with contextlib.suppress(OSError), open(f"{proc}/cpuinfo", "rb") as file:
+        for line in file:
+            if not line.strip() and found:
+                break  # the next processor
+            key, _, value = line.partition(b":")
+            if key.strip() in PROCESSOR_KEYS:
+                found.add((key.strip(), value.strip()))
+    return hashlib.sha256(repr(sorted(found)).encode()).hexdigest()[:16] if found else None
 
 
 def is_preempt_rt(sys_: str, proc: str) -> bool | None:

@@ -1,55 +1,27 @@
 """
-State of what is installed on a machine: is it whole, does it run, does anybody still need it?
+State of what is installed on a machine: is it whole, does anybody still need it?
 
 Asked at every `up` and every run, so it imports little and changes nothing.
 """
 
 from __future__ import annotations
 
-import _socket  # what `socket` is made of: enough here, and a look is short of milliseconds
 import contextlib
 import hashlib
 import os
 import stat
+import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from cosmos_cli.onboard import content_store
-from cosmos_cli.onboard.request_loop import HelperRefusal, PlainValue, VerbRequest, last_words, verb
+from cosmos_cli.onboard.request_loop import PlainValue, VerbRequest, verb
 
 CACHE = "__pycache__"
 NEWEST_KEPT = 2
 """Of the trees of one label, and of the environments, that nobody asks for."""
 ORPHAN_S = 3600.0
 """A wheel that belongs to no environment after so long belongs to nobody."""
-ECHO_TRIES = 3
-ECHO_WAIT_S = 0.3
-ECHO_BYTES_MAX = 256
-VARIABLES = {"OPENBLAS_NUM_THREADS": "1", "PYTHONNOUSERSITE": "1"}
-"""Variables of a run's programs: one thread per process, and nothing of the user's own packages."""
-
-LIGHT = """
-import sys
-import madns_runtime
-missing = [name for name in {modules!r} if not any(
-    finder.find_spec(name) for finder in sys.meta_path)]
-if missing:
-    sys.exit("no module named " + ", ".join(missing))
-print(madns_runtime.__version__)
-"""
-FULL = """
-import importlib
-import madns_runtime
-import madns_runtime.agent
-for name in {modules!r}:
-    importlib.import_module(name)
-if {simulation!r}:
-    from pathlib import Path
-    from madns_runtime.plugin.registry import load_half, resolve
-    base = Path({base!r})
-    load_half(resolve({simulation!r}, base), "agent", base)
-print(madns_runtime.__version__)
-"""
 
 
 @verb("installed")
@@ -57,12 +29,17 @@ def installed(request: VerbRequest) -> dict[str, PlainValue]:
     """
     Tell which trees and environments are there, and really what they should be.
 
-    With "touch", those are also remembered as wanted now.
+    With "touch", those are also remembered as wanted now. With "is_strict", a file that was added to an environment
+    counts as damage.
     """
     asked = request.arguments
     folders = {kind: content_store.expand(path) for kind, path in asked["folders"].items()}
     wanted = {"trees": asked["trees"], "environments": asked["environments"]}
-    checks = {"trees": is_tree_whole, "environments": is_environment_whole}
+    is_strict = bool(asked.get("is_strict"))
+    checks = {
+        "trees": is_tree_whole,
+        "environments": lambda path: is_environment_whole(path, is_strict=is_strict),
+    }
     told: dict[str, PlainValue] = {"folders": folders}
     for kind, names in wanted.items():
         told[kind] = {name: checks[kind](os.path.join(folders[kind], name)) for name in names}
@@ -143,17 +120,38 @@ def hash_of_tree(path: str, files: list[tuple[str, bool]]) -> str:
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
-def is_environment_whole(path: str) -> bool:
+def is_environment_whole(path: str, *, is_strict: bool = False) -> bool:
     """
     Tell whether an environment is whole and nobody touched it since it was built.
 
-    Its thousands of files are looked at, not read again: a byte that somebody changes leaves a trace in the
-    time of its file. What was added, such as a package's own caches, does no harm.
+    Its hundreds of files are looked at, not read again: whoever changes a byte or a mode leaves a trace. What was added
+    breaks it only when *is_strict*, and not under a living run: a package may keep something beside its code. What Python
+    compiles is nobody's.
     """
     mark = content_store.read_mark(path)
     if mark is None or not os.access(os.path.join(path, "bin/python"), os.X_OK):
         return False
-    return content_store.is_untouched(path, mark.get("files", {"": []}))
+    files = mark.get("files", {"": []})
+    if not content_store.is_untouched(path, files):
+        return False
+    if not is_strict or all(name in files for name in content_store.files_below(path, CACHE)):
+        return True
+    return bool(content_store.used([path]))
+
+
+def interpreter_path() -> str:
+    """
+    Return the interpreter that an environment links to: this one, or what stands behind it.
+
+    Its full name, such as /usr/bin/python3.11: an upgrade of the system must not put another Python under
+    packages that were made for this one.
+    """
+    return os.path.realpath(getattr(sys, "_base_executable", None) or sys.executable)
+
+
+def site_folder(python: Sequence[int]) -> str:
+    """Return where an environment of a version of Python has its packages."""
+    return f"lib/python{'.'.join(map(str, python))}/site-packages"
 
 
 def prunable(folders: Mapping[str, str], wanted: Mapping[str, PlainValue]) -> dict[str, list[str]]:
@@ -204,79 +202,3 @@ def _orphans(folders: Mapping[str, str], gone: list[str]) -> list[str]:
             or now_s - os.stat(os.path.join(folders["wheels"], name)).st_mtime > ORPHAN_S
         )
     ]
-
-
-@verb("check_runtime")
-def check_runtime(request: VerbRequest) -> dict[str, PlainValue]:
-    """See that the runtime starts here as an agent will, and that datagrams come and go."""
-    import subprocess  # a look at what is installed starts no process
-
-    asked = request.arguments
-    code = (FULL if asked["is_full"] else LIGHT).format(
-        modules=asked["modules"],
-        simulation=asked.get("simulation", ""),
-        base=content_store.expand(asked["base"]) if asked.get("base") else "/",
-    )
-    python = content_store.expand(asked["python"])
-    path = os.pathsep.join(content_store.expand(folder) for folder in asked["path"])
-    started_s = time.monotonic()
-    try:
-        done = subprocess.run(
-            [python, "-P", "-c", code],
-            capture_output=True,
-            timeout=asked["timeout_s"],
-            env={**os.environ, **VARIABLES, "PYTHONPATH": path},
-            check=False,
-        )
-    except FileNotFoundError:
-        raise HelperRefusal("step", f"{python}: no such program", "repeat `cosmos up`") from None
-    except subprocess.TimeoutExpired:
-        raise HelperRefusal(
-            "timeout", f"the runtime did not start in {asked['timeout_s']} s"
-        ) from None
-    start_s = time.monotonic() - started_s
-    if done.returncode:
-        said = last_words(done.stderr) or f"exit status {done.returncode}"
-        raise HelperRefusal("step", f"the runtime does not start there: {said}")
-    version = done.stdout.decode(errors="replace").split()[-1:]
-    udp = asked.get("udp")
-    return {
-        "runtime": version[0] if version else "",
-        "start_ms": round(start_s * 1000, 1),
-        "round_trip_ms": round_trip_ms(udp) if udp else None,
-    }
-
-
-def round_trip_ms(udp: Mapping[str, PlainValue]) -> float:
-    """Send a nonce to the operator until it comes back."""
-    nonce = bytes.fromhex(udp["nonce_hex"])
-    address, port = str(udp["address"]), int(udp["port"])
-    said = ""
-    try:
-        family, _, _, _, where = _socket.getaddrinfo(address, port, 0, _socket.SOCK_DGRAM)[0]
-        with contextlib.closing(_socket.socket(family, _socket.SOCK_DGRAM)) as link:
-            for attempt in range(ECHO_TRIES):
-                sent_s = time.monotonic()
-                link.sendto(nonce + bytes([attempt]), where)
-                if _comes_back(link, nonce, sent_s + ECHO_WAIT_S):
-                    return round((time.monotonic() - sent_s) * 1000, 3)
-    except OSError as error:
-        said = f" ({error.strerror or error})"
-    raise HelperRefusal(
-        "step",
-        f"no UDP from here to {address}:{port}{said}",
-        "is a firewall closing it? let UDP in on the operator's computer, or name the address by which"
-        " this machine reaches it with cosmos_host_address",
-    )
-
-
-def _comes_back(link: _socket.socket, nonce: bytes, until_s: float) -> bool:
-    while (left_s := until_s - time.monotonic()) > 0:
-        link.settimeout(left_s)
-        try:
-            answer = link.recv(ECHO_BYTES_MAX)
-        except (TimeoutError, ConnectionRefusedError):
-            continue
-        if answer[: len(nonce)] == nonce:
-            return True
-    return False

@@ -1,8 +1,8 @@
 """
 Unpacks wheels on a machine with nothing but the standard library.
 
-Follows the PyPA specification of the binary distribution format; what RECORD says is verified. A wheel is
-unpacked once and stays as it is; environments are made of links to its files (`environment`).
+Follows the PyPA specification of the binary distribution format; what RECORD says is verified, here or before it was
+sent. A wheel is unpacked once and stays as it is; environments are made of links to its files (`environment`).
 """
 
 from __future__ import annotations
@@ -18,10 +18,18 @@ import zlib
 from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile
 
 from cosmos_cli.onboard import content_changes, content_store
-from cosmos_cli.onboard.request_loop import HelperRefusal, VerbRequest, no_links, sync_folder, verb
+from cosmos_cli.onboard.request_loop import (
+    HelperRefusal,
+    PlainValue,
+    VerbRequest,
+    no_links,
+    sync_folder,
+    verb,
+)
 
 TYPE_CHECKING = False  # to import typing takes longer than most that is done here
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from zipfile import ZipInfo
 
 WHEEL_VERSION_MAJOR = "1"
@@ -62,7 +70,7 @@ def wheel(request: VerbRequest) -> None:
         raise HelperRefusal(
             "data", f"{asked['filename']}: what came is not what was announced", "repeat"
         )
-    _settle(partial, folder, asked["sha256"], asked["filename"])
+    _settle(Archive(partial, asked["filename"], is_verified=asked["is_verified"]), folder, asked)
 
 
 def partial_path(folder: str, sha256: str) -> str:
@@ -76,15 +84,16 @@ def is_wheel_whole(path: str) -> bool:
     return mark is not None and content_store.is_untouched(path, mark.get("files", {"": []}))
 
 
-def _settle(partial: str, folder: str, sha256: str, filename: str) -> None:
+def _settle(archive: Archive, folder: str, asked: Mapping[str, PlainValue]) -> None:
     """Unpack a wheel beside its name, and give it its name."""
+    partial, sha256 = archive.path, asked["sha256"]
     new = content_changes.beside(folder, sha256)
     try:
         os.mkdir(new)
-        names, info = Archive(partial, filename).unpack(new)
+        names, info = archive.unpack(new)
         os.unlink(partial)  # before what follows writes all that is new to the disk
         content_changes.sync(new)
-        document = {"schema": MARK_SCHEMA, "filename": filename, "info": info}
+        document = {"schema": MARK_SCHEMA, "filename": asked["filename"], "info": info}
         content_changes.mark_complete(new, {**document, "files": content_store.trace(new, names)})
         path = os.path.join(folder, sha256)
         content_changes.remove(path)
@@ -104,17 +113,19 @@ class Archive:
     Args:
         path: Where it is.
         filename: Its own name.
+        is_verified: Whether its files were verified by RECORD before it was sent; else they are here.
     """
 
-    def __init__(self, path: str, filename: str) -> None:
-        self._path = path
+    def __init__(self, path: str, filename: str, *, is_verified: bool = False) -> None:
+        self.path = path
+        self._is_verified = is_verified
         self._name = filename
         self._info = "-".join(filename.split("-")[:2]) + ".dist-info"
         self._entries: dict[str, ZipInfo] = {}
 
     def unpack(self, folder: str) -> tuple[list[str], str]:
         """
-        Unpack it, each file verified by what RECORD says of it.
+        Unpack it, each file verified by what RECORD, or its entry, says of it.
 
         Returns:
             The paths of its files within *folder*, and the name of its dist-info folder.
@@ -122,7 +133,7 @@ class Archive:
         Raises:
             Refusal: It is not what the specification asks for.
         """
-        with open(self._path, "rb") as file:
+        with open(self.path, "rb") as file:
             try:
                 with ZipFile(file) as archive:
                     entries = archive.infolist()
@@ -130,12 +141,15 @@ class Archive:
                 raise self._refusal(str(error)) from None
             self._entries = {e.filename: e for e in entries if not e.is_dir()}
             self._check(file)
-            record = self._record(file)
+            record = {} if self._is_verified else self._record(file)
             made: set[str] = set()
             for name, entry in self._entries.items():
                 self._check_name(name)
                 content = self._read(file, entry)
-                self._verify(name, content, record)
+                if not self._is_verified:
+                    self._verify(name, content, record)
+                elif zlib.crc32(content) != entry.CRC:
+                    raise self._refusal(f"{name} did not come out as it was packed")
                 self._write(os.path.join(folder, name), content, self._mode(entry), made)
         return list(self._entries), self._info
 

@@ -11,7 +11,15 @@ From bare machines to ready ones, idempotently.
 hash of its content. `desired`, `steps`, `settings` and `inventory_steps` are pure.
 """
 
-STORE_PARTS = ("content_store", "installed", "content_changes", "trees", "wheels", "environment")
+STORE_PARTS = (
+    "content_store",
+    "installed",
+    "runtime_check",
+    "content_changes",
+    "trees",
+    "wheels",
+    "environment",
+)
 """Modules of `cosmos_cli.onboard` that a `Helper` must be started with for trees and environments."""
 HELPER_PARTS = ("files", "links", "facts", "sshd", *STORE_PARTS, "system", "apt_words", "apt")
 """Those for `cosmos up`; each is loaded there when it is first needed."""

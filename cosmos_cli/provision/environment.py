@@ -1,7 +1,7 @@
 """
 Gives machines their environments, and asks them what is installed, whether it runs, and what nobody needs.
 
-The operator's side of `cosmos_cli.onboard.environment` and `.installed`.
+The operator's side of `cosmos_cli.onboard.environment`, `.installed` and `.runtime_check`.
 """
 
 from __future__ import annotations
@@ -9,14 +9,15 @@ from __future__ import annotations
 import mmap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from packaging.specifiers import SpecifierSet
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
-from cosmos_cli.provision.lock import Locked, normal_name
+from cosmos_cli.provision.lock import normal_name
+from cosmos_cli.provision.sent_wheels import RUNTIME_NAMES, SentWheel, sent_wheel
 from cosmos_cli.provision.trees import Progress, no_progress
 from cosmos_cli.provision.wheelhouse import Environment
 from cosmos_cli.provision.wheels import see_verified
@@ -51,6 +52,9 @@ class Installed:
         )
 
 
+CheckDepth = Literal["look", "start", "full"]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RuntimeCheck:
     """Check of programs on a machine."""
@@ -59,8 +63,8 @@ class RuntimeCheck:
     """Of the environment."""
     trees: Sequence[str]
     """Hashes of the trees on the path, the runtime's first."""
-    is_full: bool
-    """After a change: import everything; else only look whether it is there."""
+    depth: CheckDepth
+    """`look`: find what is to be imported; `start`: have the environment's Python find it; `full`: import it."""
     modules: Sequence[str] = ()
     """Names of the modules that wheels and the distribution brought."""
     simulation: str = ""
@@ -77,6 +81,7 @@ def installed_request(
     trees: Sequence[str],
     environments: Sequence[str],
     touch: bool = False,
+    is_strict: bool = False,
 ) -> dict[str, Any]:
     """
     Return the arguments of the verbs "installed" and "prune_installed".
@@ -86,6 +91,7 @@ def installed_request(
         trees: Hashes of the trees that are wanted; never pruned.
         environments: Keys of the environments that are wanted; never pruned.
         touch: Whether these are remembered as wanted just now, so that no other operator prunes them.
+        is_strict: Whether a file that was added to an environment makes it one that is to be built anew.
     """
     return {
         "folders": {
@@ -97,6 +103,7 @@ def installed_request(
         "trees": list(trees),
         "environments": list(environments),
         "touch": touch,
+        "is_strict": is_strict,
     }
 
 
@@ -133,16 +140,20 @@ def install_environment(
         MachineFailure: The distribution's packages are missing or too old, a run uses what is to be rebuilt,
             the disk is full or read-only, or the connection is lost.
     """
-    content = environment.content
+    sent = _sent_wheels(environment)
     asked = {
         "folder": layout.environments,
         "wheels_folder": layout.wheels,
         "key": environment.key,
         "python": list(environment.platform.python),
-        "sees_system": content.sees_system,
+        "sees_system": environment.content.sees_system,
         "wheels": [
-            {"sha256": wheel.sha256, "filename": wheel.filename, "size": wheel.size_bytes}
-            for wheel in environment.lock
+            {
+                "sha256": each.locked.sha256,
+                "filename": each.locked.filename,
+                "size": each.locked.size_bytes,
+            }
+            for each in sent
         ],
     }
     told: Mapping[str, Any] = board.call("environment", asked, timeout_s=BUILD_TIMEOUT_S).value
@@ -150,8 +161,8 @@ def install_environment(
         return bool(told["changed"])
     check_distribution(board, environment)
     have = {each["sha256"]: each["have"] for each in told["missing"]}
-    wheels = [(wheel, have[wheel.sha256]) for wheel in environment.lock if wheel.sha256 in have]
-    _send_wheels(board, layout, environment, wheels, progress)
+    wheels = [(each, have[each.locked.sha256]) for each in sent if each.locked.sha256 in have]
+    _send_wheels(board, layout, wheels, progress)
     progress("installing", 1.0)
     told = board.call("environment", asked, timeout_s=BUILD_TIMEOUT_S).value
     if told["missing"]:
@@ -159,6 +170,16 @@ def install_environment(
             FailureKind.DATA, "wheels that were sent are not there", "repeat the command"
         )
     return bool(told["changed"])
+
+
+def _sent_wheels(environment: Environment) -> list[SentWheel]:
+    """Return the wheels as they are sent; those that they are made of are verified."""
+    found = []
+    for wheel in environment.lock:
+        path = environment.wheel(wheel)
+        see_verified(path, wheel)
+        found.append(sent_wheel(path, wheel, environment.platform))
+    return found
 
 
 def check_distribution(board: Helper, environment: Environment) -> None:
@@ -201,7 +222,7 @@ def check_request(layout: Layout, check: RuntimeCheck) -> dict[str, Any]:
     return {
         "python": layout.python(check.key),
         "path": [layout.tree(each) for each in check.trees],
-        "is_full": check.is_full,
+        "depth": check.depth,
         "modules": list(check.modules),
         "simulation": check.simulation,
         "base": layout.tree(check.base) if check.base else "",
@@ -219,32 +240,30 @@ def modules_of(environment: Environment) -> tuple[str, ...]:
     )
 
 
-RUNTIME_NAMES = ("annotated-types", "msgpack", "numpy", "orjson", "psutil")
-
-
 def _send_wheels(
     board: Helper,
     layout: Layout,
-    environment: Environment,
-    wheels: Sequence[tuple[Locked, int]],
+    wheels: Sequence[tuple[SentWheel, int]],
     progress: Progress,
 ) -> None:
-    whole_bytes = sum(wheel.size_bytes - have for wheel, have in wheels)
+    """Send wheels, each from the byte to which it has come there."""
+    whole_bytes = sum(wheel.locked.size_bytes - have for wheel, have in wheels)
     sent_bytes = 0
     for wheel, have in wheels:
-        path = environment.wheel(wheel)
-        see_verified(path, wheel)
+        locked = wheel.locked
+        see_verified(wheel.path, locked)
         arguments = {
             "folder": layout.wheels,
-            "sha256": wheel.sha256,
-            "filename": wheel.filename,
-            "size": wheel.size_bytes,
+            "sha256": locked.sha256,
+            "filename": locked.filename,
+            "size": locked.size_bytes,
+            "is_verified": wheel.is_verified,
         }
         with (
-            path.open("rb") as file,
+            wheel.path.open("rb") as file,
             mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
         ):
-            offsets = range(have, wheel.size_bytes, PIECE_BYTES)
+            offsets = range(have, locked.size_bytes, PIECE_BYTES)
             for offset in offsets or [
                 have
             ]:  # all of it may have come, before the connection was cut

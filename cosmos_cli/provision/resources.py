@@ -18,7 +18,13 @@ from cosmos_cli.models.machine_facts import SystemPaths
 from cosmos_cli.models.provision_steps import FILE_BYTES_MAX
 from cosmos_cli.provision.desired import DesiredState
 from cosmos_cli.provision.driver_files import drivers_by_machine
-from cosmos_cli.provision.environment import RuntimeCheck, check_request, modules_of
+from cosmos_cli.provision.environment import (
+    CheckDepth,
+    RuntimeCheck,
+    check_request,
+    modules_of,
+)
+from cosmos_cli.provision.full_checks import FullChecks
 from cosmos_cli.provision.inventory_steps import Content
 from cosmos_cli.provision.trees import Tree, runtime_tree, scenario_tree
 from cosmos_cli.provision.udp_echo import Echo
@@ -73,6 +79,8 @@ class UpResources:
         self._echo = echo
         self._options = fleet.options
         self._runtime = runtime_tree()
+        self.full_checks = FullChecks()
+        """Which kinds of machines have passed theirs."""
         self._files: dict[Path, Content] = {}
         self._environments: dict[EnvironmentNeed, Environment] = {}
         self._environment_locks: dict[EnvironmentNeed, threading.Lock] = {}
@@ -150,15 +158,15 @@ class UpResources:
         return self._echo.heard(question)
 
     def checks(
-        self, desired: DesiredState, udp: Mapping[str, Any], *, is_full: bool
+        self, desired: DesiredState, udp: Mapping[str, Any], *, depth: CheckDepth
     ) -> list[dict[str, Any]]:
         """
         Return the calls that ask whether the runtime starts there; the first asks for a datagram as well.
 
-        A full one, after a change, imports each scenario's agents' half too.
+        A full one imports each scenario's agents' half too.
         """
         checks: dict[tuple[str, str], RuntimeCheck] = {}
-        scenarios = self._scenarios if is_full else ()
+        scenarios = self._scenarios if depth == "full" else ()
         for environment, scenario in zip_longest(desired.environments, scenarios):
             file, tree = scenario or (None, None)
             key = (environment.key, tree.hash if tree else "")
@@ -167,7 +175,7 @@ class UpResources:
                 RuntimeCheck(
                     key=environment.key,
                     trees=(self._runtime.hash,),
-                    is_full=is_full,
+                    depth=depth,
                     modules=modules_of(environment),
                     simulation=file.scenario.simulation if file else "",
                     base=tree.hash if tree else "",

@@ -148,6 +148,7 @@ def installed_question(desired: DesiredState, *, touch: bool = False) -> dict[st
         trees=[tree.hash for tree in desired.trees],
         environments=[environment.key for environment in desired.distinct_environments],
         touch=touch,
+        is_strict=True,
     )
 
 

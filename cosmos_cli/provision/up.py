@@ -29,6 +29,7 @@ from cosmos_cli.models.machine_facts import MachineFacts
 from cosmos_cli.provision.apply import REPEAT, Applier
 from cosmos_cli.provision.desired import DesiredState, desired_state
 from cosmos_cli.provision.device_steps import reboot_notes
+from cosmos_cli.provision.full_checks import machine_kind
 from cosmos_cli.provision.gather_facts import (
     Answer,
     Call,
@@ -106,7 +107,7 @@ class MachineUp:
         self.teller.detail("looking")
         desired = self._desired()
         udp = self.resources.udp_question(self.connection, self.machine)
-        checks = self._look(desired, also=self.resources.checks(desired, udp, is_full=False))
+        checks = self._look(desired, also=self.resources.checks(desired, udp, depth="look"))
         steps = self._plan(desired)
         if not steps:
             self._raise_first(checks, udp)
@@ -147,9 +148,10 @@ class MachineUp:
             self.result.notes += applier.notes
         self.teller.detail("checking")
         udp = self.resources.udp_question(self.connection, self.machine)
-        self._raise_first(
-            several(self.board, self.resources.checks(desired, udp, is_full=True)), udp
-        )
+        kind = machine_kind(self._facts, desired)
+        with self.resources.full_checks.turn(kind) as is_full:
+            checks = self.resources.checks(desired, udp, depth="full" if is_full else "start")
+            self._raise_first(several(self.board, checks), udp)
 
     def _apply(self, desired: DesiredState, applier: Applier) -> None:
         """Make the folders, for the lock is in one of them; lock; look again; do the rest."""

@@ -148,7 +148,7 @@ def checked(name, environment, runtime):
         check = RuntimeCheck(
             key=environment.key,
             trees=[runtime.hash],
-            is_full=True,
+            depth="full",
             modules=modules_of(environment),
             simulation="constellation",
             udp=echo.question(connection.own_address),
@@ -260,7 +260,7 @@ def test_closed_udp_is_told_with_the_address(tower):
     with on("pi07") as (connection, board), Echo() as echo:
         question = echo.question(connection.own_address)
         check = RuntimeCheck(
-            key=environment.key, trees=[runtime.hash], is_full=False, udp={**question, "port": 9}
+            key=environment.key, trees=[runtime.hash], depth="start", udp={**question, "port": 9}
         )
         started_s = time.monotonic()
         with pytest.raises(MachineFailure) as caught:

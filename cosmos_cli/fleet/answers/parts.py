@@ -119,7 +119,7 @@ _FACTS: Mapping[str, Shape] = {
             "kernel": name,
             "processors": maybe(whole(1)),
         },
-        {"is_preempt_rt": maybe(flag)},
+        {"is_preempt_rt": maybe(flag), "processor_kind": maybe(name)},
     ),
     "os": record(dict.fromkeys(("id", "version", "name", "code"), name)),
     "python": record(

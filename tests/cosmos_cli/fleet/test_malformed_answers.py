@@ -25,6 +25,7 @@ PARTS = [
     "facts",
     "content_store",
     "installed",
+    "runtime_check",
     "content_changes",
     "trees",
     "wheels",
@@ -92,7 +93,7 @@ def questions(root: Path) -> dict[str, dict]:
         "versions": {"names": ["pip"]},
         "prune_installed": {"folders": folders, **wanted},
         "check_runtime": {
-            "is_full": False,
+            "depth": "look",
             "modules": [],
             "python": sys.executable,
             "path": [str(ONBOARD.parents[2])],

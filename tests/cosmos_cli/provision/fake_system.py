@@ -11,6 +11,7 @@ from cosmos_cli.fleet.target import Target
 from cosmos_cli.models.device_needs import NO_NEEDS
 from cosmos_cli.models.machine_facts import SystemPaths
 from cosmos_cli.provision import HELPER_PARTS
+from cosmos_cli.provision.full_checks import FullChecks
 from cosmos_cli.provision.inventory_steps import Content
 from cosmos_cli.provision.up import MachineUp, UpOptions
 from cosmos_cli.provision.up_table import MachineResult
@@ -63,6 +64,7 @@ class FakeKit:
         self.paths = paths or SystemPaths()
         self._trees = tuple(trees)
         self._needs = needs
+        self.full_checks = FullChecks()
 
     def trees(self, machine):
         return self._trees
@@ -82,7 +84,7 @@ class FakeKit:
     def udp_heard(self, question):
         return 0
 
-    def checks(self, wanted, udp, *, is_full):
+    def checks(self, wanted, udp, *, depth):
         return []
 
     def connect_again(self, connection):

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from cosmos_cli.onboard import installed
+from cosmos_cli.onboard import runtime_check
 from cosmos_cli.onboard.request_loop import HelperRefusal
 from cosmos_cli.provision import udp_echo as module
 from cosmos_cli.provision.udp_echo import Echo
@@ -28,7 +28,7 @@ def link():
 def test_round_trip_is_measured_and_counted(echo):
     question = echo.question("127.0.0.1")
 
-    assert 0 < installed.round_trip_ms(question) < 300
+    assert 0 < runtime_check.round_trip_ms(question) < 300
     assert echo.heard(question) == 1
 
 
@@ -36,7 +36,7 @@ def test_many_machines_share_one_echo(echo):
     questions = [echo.question("127.0.0.1") for _ in range(20)]
     found = []
     threads = [
-        threading.Thread(target=lambda q=q: found.append(installed.round_trip_ms(q)))
+        threading.Thread(target=lambda q=q: found.append(runtime_check.round_trip_ms(q)))
         for q in questions
     ]
     for thread in threads:
@@ -68,7 +68,7 @@ def test_answer_has_no_more_bytes_than_the_question(echo, link):
 
 def test_lost_datagrams_are_sent_again(monkeypatch, echo):
     """The first two go nowhere, as on a lossy link."""
-    monkeypatch.setattr(installed, "ECHO_WAIT_S", 0.05)
+    monkeypatch.setattr(runtime_check, "ECHO_WAIT_S", 0.05)
     question = echo.question("127.0.0.1")
     sent = []
 
@@ -79,35 +79,35 @@ def test_lost_datagrams_are_sent_again(monkeypatch, echo):
 
     monkeypatch.setattr(_socket, "socket", Lossy)
 
-    assert installed.round_trip_ms(question) > 0
+    assert runtime_check.round_trip_ms(question) > 0
     assert len(sent) == 3
     assert echo.heard(question) == 1
 
 
 def test_silence_names_the_address_and_what_to_do(monkeypatch, link):
-    monkeypatch.setattr(installed, "ECHO_WAIT_S", 0.02)
+    monkeypatch.setattr(runtime_check, "ECHO_WAIT_S", 0.02)
     link.bind(("127.0.0.1", 0))
     port = link.getsockname()[1]
 
     with pytest.raises(HelperRefusal) as caught:
-        installed.round_trip_ms({"address": "127.0.0.1", "port": port, "nonce_hex": "00" * 16})
+        runtime_check.round_trip_ms({"address": "127.0.0.1", "port": port, "nonce_hex": "00" * 16})
 
     assert caught.value.text == f"no UDP from here to 127.0.0.1:{port}"
     assert "is a firewall closing it?" in caught.value.advice
 
 
 def test_address_that_is_none_is_told(monkeypatch):
-    monkeypatch.setattr(installed, "ECHO_WAIT_S", 0.02)
+    monkeypatch.setattr(runtime_check, "ECHO_WAIT_S", 0.02)
 
     with pytest.raises(HelperRefusal, match=r"no UDP from here to no\.such\.host\.invalid:9 \("):
-        installed.round_trip_ms(
+        runtime_check.round_trip_ms(
             {"address": "no.such.host.invalid", "port": 9, "nonce_hex": "00" * 16}
         )
 
 
 def test_foreign_answers_are_not_taken_for_ours(monkeypatch):
     """Somebody else answers on that port."""
-    monkeypatch.setattr(installed, "ECHO_WAIT_S", 0.05)
+    monkeypatch.setattr(runtime_check, "ECHO_WAIT_S", 0.05)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         other.settimeout(5)
@@ -121,7 +121,7 @@ def test_foreign_answers_are_not_taken_for_ours(monkeypatch):
         thread.start()
         question = {"address": "127.0.0.1", "port": other.getsockname()[1], "nonce_hex": "00" * 16}
         with pytest.raises(HelperRefusal, match="no UDP"):
-            installed.round_trip_ms(question)
+            runtime_check.round_trip_ms(question)
         thread.join(5)
 
 
@@ -130,7 +130,7 @@ def test_questions_are_bounded(monkeypatch, echo):
     questions = [echo.question("127.0.0.1") for _ in range(5)]
 
     assert len(echo._nonces) == 3
-    assert installed.round_trip_ms(questions[-1]) > 0
+    assert runtime_check.round_trip_ms(questions[-1]) > 0
 
 
 def test_closing_twice_is_harmless():
@@ -148,4 +148,4 @@ def test_machines_of_both_families_are_heard(address):
         if ":" in address and echo.family != socket.AF_INET6:
             pytest.skip("no IPv6 here")
 
-        assert installed.round_trip_ms(echo.question(address)) > 0
+        assert runtime_check.round_trip_ms(echo.question(address)) > 0

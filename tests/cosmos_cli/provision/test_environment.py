@@ -16,6 +16,7 @@ import pytest
 from made_wheels import make_runtime_wheels, make_wheel, only_index
 from onboard_machine import OwnMachine, snapshot
 
+import madns_runtime
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.onboard.environment import environment as build
 from cosmos_cli.onboard.request_loop import VerbRequest
@@ -31,6 +32,7 @@ from cosmos_cli.provision.environment import (
 )
 from cosmos_cli.provision.lock import Distributed, Lock, Locked
 from cosmos_cli.provision.platform import greeted_platform
+from cosmos_cli.provision.sent_wheels import sent_wheel
 from cosmos_cli.provision.trees import runtime_tree, send_tree
 from cosmos_cli.provision.wheelhouse import Environment, prepare
 
@@ -118,10 +120,18 @@ def started(board, layout, check):
     return board.call("check_runtime", check_request(layout, check), timeout_s=240.0).value
 
 
-def is_whole(machine, environment):
+def is_whole(machine, environment, *, is_strict=False):
     with machine.board() as board:
-        request = installed_request(machine.layout, trees=[], environments=[environment.key])
+        request = installed_request(
+            machine.layout, trees=[], environments=[environment.key], is_strict=is_strict
+        )
         return ask_installed(board, request).environments[environment.key]
+
+
+def sent(environment):
+    """Return the first wheel of an environment as machines are sent it."""
+    wheel = environment.lock[0]
+    return sent_wheel(environment.wheel(wheel), wheel, environment.platform)
 
 
 def top_of(machine, environment):
@@ -238,7 +248,7 @@ def test_helper_killed_at_any_moment_leaves_nothing_half(machine, house, tmp_pat
     assert killed
 
 
-@pytest.mark.parametrize("harm", ["byte", "gone", "mark", "python", "half-built"])
+@pytest.mark.parametrize("harm", ["byte", "mode", "gone", "added", "mark", "python", "half-built"])
 def test_damage_is_noticed_and_the_environment_built_anew(machine, house, navlib, harm):
     environment = house.environment(navlib)
     install(machine, environment)
@@ -248,28 +258,56 @@ def test_damage_is_noticed_and_the_environment_built_anew(machine, house, navlib
     match harm:
         case "byte":
             file.write_text(file.read_text().replace("1.2", "1.3"))
+        case "mode":
+            file.chmod(0o600)
         case "gone":
             file.unlink()
+        case "added":
+            (top / "lib/other.pth").write_text("import nothing\n")
         case "mark" | "half-built":
             (top / ".complete").unlink()
         case "python":
             (top / "bin/python").unlink()
             (top / "bin/python").symlink_to("/usr/bin/python2.7")
 
-    assert not is_whole(machine, environment)
+    assert not is_whole(machine, environment, is_strict=True)
+    assert is_whole(machine, environment) == (harm == "added")
     assert install(machine, environment)
-    assert is_whole(machine, environment)
+    assert is_whole(machine, environment, is_strict=True)
     assert python(machine, environment, "import nav_lib; print(nav_lib.version)") == "1.2"
 
 
-def test_what_a_package_adds_for_itself_is_no_damage(machine, house, navlib):
+def test_what_a_package_adds_for_itself_holds_up_no_run(machine, house, navlib):
     environment = house.environment(navlib)
     install(machine, environment)
     python(machine, environment, "import nav_lib")
     site = next(top_of(machine, environment).rglob("nav_lib"))
+    (site / "__pycache__/numba.nbi").write_bytes(b"x")
+    with_compiled = is_whole(machine, environment, is_strict=True)
     (site / "cache.bin").write_bytes(b"x")
+    command = [machine.layout.python(environment.key), "-c", "input()"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+        under_a_run = is_whole(machine, environment, is_strict=True)
+        process.communicate(b"\n", timeout=120)
 
+    assert with_compiled
+    assert under_a_run
     assert is_whole(machine, environment)
+
+
+def test_modules_come_compiled_and_a_change_of_what_is_compiled_is_found(machine, house, navlib):
+    environment = house.environment(navlib)
+    install(machine, environment)
+    compiled = next(
+        top_of(machine, environment).rglob(f"__init__.{sys.implementation.cache_tag}.pyc")
+    )
+    told = python(machine, environment, "import nav_lib; print(nav_lib.__cached__)")
+    has_come = compiled.read_bytes()
+    compiled.write_bytes(has_come[:-1] + b"?")
+
+    assert told == str(compiled)
+    assert has_come[4] == 1  # taken without a look at the source: PEP 552
+    assert not is_whole(machine, environment)
 
 
 def test_damaged_environment_of_a_living_run_is_left_alone(machine, house, navlib):
@@ -314,7 +352,7 @@ def test_wheel_that_rots_in_the_operators_cache_is_thrown_away(machine, house, n
 def test_wheel_that_changed_on_its_way_is_refused(machine, house, navlib, monkeypatch):
     environment = house.environment(navlib)
     monkeypatch.setattr(module, "see_verified", lambda *_: None)
-    path = environment.wheel(environment.lock[0])
+    path = sent(environment).path
     path.write_bytes(path.read_bytes()[:-1] + b"!")
 
     with pytest.raises(MachineFailure, match="not what was announced"):
@@ -467,7 +505,7 @@ def test_prune_spares_the_wanted_the_newest_and_the_used(machine, house, tmp_pat
     compiled = Path(f"{machine.layout.compiled}{machine.layout.environments}")
     assert {path.name for path in compiled.iterdir()} == {e.key for e in environments} - gone
     kept = {path.name for path in Path(machine.layout.wheels).iterdir()}
-    assert {e.lock[0].sha256 for e in environments if e.key not in gone} == kept
+    assert {sent(e).locked.sha256 for e in environments if e.key not in gone} == kept
 
 
 def test_what_a_run_asked_for_is_among_the_newest(machine, house, tmp_path):
@@ -511,12 +549,15 @@ def test_runtime_runs_from_its_environment_and_tree_alone(machine, tmp_path, mon
         check = RuntimeCheck(
             key=environment.key,
             trees=[runtime.hash],
-            is_full=True,
+            depth="full",
             modules=modules_of(environment),
             simulation="constellation",
         )
         told = started(board, machine.layout, check)
-        light = started(board, machine.layout, dataclasses.replace(check, is_full=False))
+        others = [
+            started(board, machine.layout, dataclasses.replace(check, depth=depth))
+            for depth in ("start", "look")
+        ]
     program = (
         "import madns_runtime.agent, numpy, sys\n"
         "print(sorted({m.__file__.split('/lib/')[0] for m in sys.modules.values()\n"
@@ -532,7 +573,7 @@ def test_runtime_runs_from_its_environment_and_tree_alone(machine, tmp_path, mon
         check=True,
     )
 
-    assert told["runtime"] == light["runtime"] != ""
+    assert {told["runtime"]} == {each["runtime"] for each in others} == {madns_runtime.__version__}
     top = machine.layout.environment(environment.key)
     folder = f"lib/python{environment.platform.python_text}/site-packages"
     assert f"{[f'{top}/{folder}']}" == done.stdout.splitlines()[1]
@@ -543,7 +584,7 @@ def test_runtime_runs_from_its_environment_and_tree_alone(machine, tmp_path, mon
 def test_runtime_that_does_not_start_is_told_with_its_last_words(machine, house, navlib):
     environment = house.environment(navlib)
     install(machine, environment)
-    check = RuntimeCheck(key=environment.key, trees=["0" * 64], is_full=False)
+    check = RuntimeCheck(key=environment.key, trees=["0" * 64], depth="start")
 
     with machine.board() as board, pytest.raises(MachineFailure) as caught:
         started(board, machine.layout, check)
@@ -552,11 +593,12 @@ def test_runtime_that_does_not_start_is_told_with_its_last_words(machine, house,
     assert "No module named 'madns_runtime'" in caught.value.text
 
 
-def test_missing_module_is_named_by_the_light_check(machine, house, navlib):
+@pytest.mark.parametrize("depth", ["look", "start"])
+def test_missing_module_is_named_by_the_light_check(machine, house, navlib, depth):
     environment, runtime = house.environment(navlib), runtime_tree()
     install(machine, environment)
     check = RuntimeCheck(
-        key=environment.key, trees=[runtime.hash], is_full=False, modules=("nav_lib", "numpy")
+        key=environment.key, trees=[runtime.hash], depth=depth, modules=("nav_lib", "numpy")
     )
 
     with machine.board() as board, pytest.raises(MachineFailure, match="no module named numpy$"):
