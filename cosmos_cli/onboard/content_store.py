@@ -8,7 +8,6 @@ got its name or its mark last (`cosmos_cli.onboard.content_changes`).
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping
@@ -27,6 +26,8 @@ def expand(path: str) -> str:
 
 def hash_of(path: str) -> str:
     """Return the SHA-256 of a file."""
+    import hashlib  # 3 ms, which a look without a trace need not wait for
+
     with open(path, "rb", buffering=0) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -9,12 +9,11 @@ Every path begins with one of the folders that the request gives for /etc, /sys 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import resource
-import subprocess
 import sys
 import time
+import zlib
 from collections.abc import Mapping, Sequence
 
 from cosmos_cli.onboard.files import content_hash, look_at, user_name
@@ -35,6 +34,10 @@ from cosmos_cli.onboard.request_loop import (
     refusal_of,
     verb,
 )
+
+TYPE_CHECKING = False  # to import typing takes longer than most that is done here
+if TYPE_CHECKING:
+    import subprocess
 
 CONDITION_TIMEOUT_S = 60.0
 SUDO_TIMEOUT_S = 20.0
@@ -139,7 +142,7 @@ def _board(sys_: str, proc: str) -> dict[str, PlainValue]:
 
 def _processor_kind(proc: str) -> str | None:
     """Return a word that processors of the same kind and abilities share; None where the kernel does not tell."""
-    found = set()
+    found: set[tuple[bytes, bytes]] = set()
     with contextlib.suppress(OSError), open(f"{proc}/cpuinfo", "rb") as file:
         for line in file:
             if not line.strip() and found:
@@ -147,7 +150,7 @@ def _processor_kind(proc: str) -> str | None:
             key, _, value = line.partition(b":")
             if key.strip() in PROCESSOR_KEYS:
                 found.add((key.strip(), value.strip()))
-    return hashlib.sha256(repr(sorted(found)).encode()).hexdigest()[:16] if found else None
+    return f"{zlib.crc32(repr(sorted(found)).encode()):08x}" if found else None
 
 
 def is_preempt_rt(sys_: str, proc: str) -> bool | None:
@@ -225,6 +228,8 @@ def _throttled(sys_: str) -> int | None:
 
 
 def _output(command: list[str], timeout_s: float) -> str:
+    import subprocess  # 8 ms, which most looks need not wait for
+
     try:
         done = subprocess.run(
             command, stdin=subprocess.DEVNULL, capture_output=True, timeout=timeout_s, check=False
@@ -330,6 +335,8 @@ def _condition(condition: Mapping[str, PlainValue]) -> bool | None:
 
 def is_done(unless: str, *, as_root: bool) -> bool:
     """Tell whether a command's condition succeeds; one that may not be asked as root does not."""
+    import subprocess
+
     shell = ["timeout", f"{CONDITION_TIMEOUT_S:g}", "/bin/sh", "-c", unless]
     done = subprocess.run(
         ["sudo", "-n", *shell] if as_root and os.geteuid() != 0 else shell,
@@ -347,6 +354,8 @@ def _start_sudo() -> subprocess.Popen[bytes] | None:
     """Ask whether this user may become root, and go on meanwhile; None for root itself."""
     if os.geteuid() == 0:
         return None
+    import subprocess
+
     with contextlib.suppress(OSError):
         return subprocess.Popen(
             ["sudo", "-n", "true"],
@@ -360,6 +369,8 @@ def _start_sudo() -> subprocess.Popen[bytes] | None:
 def _end_sudo(sudo: subprocess.Popen[bytes] | None) -> bool:
     if sudo is None:
         return os.geteuid() == 0
+    import subprocess
+
     with contextlib.suppress(subprocess.TimeoutExpired):
         return sudo.wait(SUDO_TIMEOUT_S) == 0
     return False

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import grp
-import hashlib
 import os
 import pwd
 import re
@@ -52,6 +51,8 @@ def content_hash(path: str) -> str | None:
     with open(os.path.expanduser(path), "rb") as file:
         if os.fstat(file.fileno()).st_size > CONTENT_BYTES_MAX:
             return None
+        import hashlib  # only where there is a file to compare
+
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -7,7 +7,6 @@ Asked at every `up` and every run, so it imports little and changes nothing.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import stat
 import sys
@@ -36,13 +35,15 @@ def installed(request: VerbRequest) -> dict[str, PlainValue]:
     folders = {kind: content_store.expand(path) for kind, path in asked["folders"].items()}
     wanted = {"trees": asked["trees"], "environments": asked["environments"]}
     is_strict = bool(asked.get("is_strict"))
-    checks = {
-        "trees": is_tree_whole,
-        "environments": lambda path: is_environment_whole(path, is_strict=is_strict),
-    }
+
+    def is_whole(kind: str, path: str) -> bool:
+        if kind == "trees":
+            return is_tree_whole(path)
+        return is_environment_whole(path, is_strict=is_strict)
+
     told: dict[str, PlainValue] = {"folders": folders}
     for kind, names in wanted.items():
-        told[kind] = {name: checks[kind](os.path.join(folders[kind], name)) for name in names}
+        told[kind] = {name: is_whole(kind, os.path.join(folders[kind], name)) for name in names}
         for name in names if asked.get("touch") else ():
             if told[kind][name]:
                 os.utime(os.path.join(folders[kind], name, content_store.MARK))
@@ -110,6 +111,8 @@ def traces_of_tree(path: str) -> dict[str, list[int]]:
 
 def hash_of_tree(path: str, files: list[tuple[str, bool]]) -> str:
     """Return the hash of these files as `cosmos_cli.provision.trees.tree_of` makes it."""
+    import hashlib  # a tree without a trace is not read
+
     try:
         lines = [
             f"{'x' if is_program else '-'} {content_store.hash_of(f'{path}/{name}')} {name}\n"

@@ -2,7 +2,7 @@
 Check on a machine that the runtime runs there, and that datagrams come and go.
 
 At one of three depths: a *look* finds the modules and starts nothing, a *start* has the environment's interpreter find
-them, a *full* check imports all that an agent imports.
+them, a *full* check imports all that an agent imports. None leaves anything behind: not even what Python compiles.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def _start(asked: Mapping[str, PlainValue]) -> str:
     path = os.pathsep.join(content_store.expand(folder) for folder in asked["path"])
     try:
         done = subprocess.run(
-            [python, "-P", "-c", code],
+            [python, "-B", "-P", "-c", code],
             capture_output=True,
             timeout=asked["timeout_s"],
             env={**os.environ, **VARIABLES, "PYTHONPATH": path},
