@@ -5,8 +5,7 @@ Layout of COSMoS's folder on a machine: the one place that knows. Pure.
     <root>/environments/<key>/      virtual environments, by the hash of their lock; whole when `.complete` is there
     <root>/wheels/<sha256>/         wheels that environments were made from
     <root>/runs/<run>-<session>/    what a run records there, until it is collected
-    <root>/state/                   the register of processes, the lock, what was set and what it was before,
-                                    what Python compiled of trees and environments
+    <root>/state/                   the register of processes, the lock, what was set and what it was before
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ class Layout:
 
     @property
     def compiled(self) -> str:
-        """Folder of what Python compiles, by the path of the source: trees never change."""
+        """Folder of what Python compiled for earlier versions, by the path of the source: only pruned."""
         return self._below("state", "pycache")
 
     @property

@@ -293,7 +293,7 @@ def prune_installed(request: VerbRequest) -> dict[str, PlainValue]:
     for folder in folders.values():
         content_changes.remove_left_overs(folder)
     for kind in wanted:
-        # Python puts what it compiles below that folder under the whole path of the source.
+        # Python put what it compiled below that folder under the whole path of the source.
         compiled = content_store.expand(asked["compiled"]) + folders[kind]
         for name in set(content_store.names_in(compiled)) - set(
             content_store.names_in(folders[kind])
