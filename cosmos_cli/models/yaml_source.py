@@ -72,6 +72,7 @@ _MEANINGS = (
     ),
     ("", "could not find expected ':'", True, "expected `key: value`, got no ':' after the key"),
     ("", "cannot start any token", False, "{} cannot start a value: put it in quotes"),
+    ("", "maximum nesting depth", False, f"expected at most {DEPTH_MAX} levels of nesting"),
     ("block mapping", "block end", False, "expected a key at the indentation of its neighbours"),
 )
 """The parser's terms: within what, which problem, whether the fault is where that began, and what it means."""

@@ -19,7 +19,7 @@ from harness.waiting import wait_until
 from . import kernel
 from .fixtures import need_tower
 from .network import list_networks
-from .places import Places
+from .places import TOWERS_MAX, Places
 from .specification import BoardSpec
 from .tower import Tower, TowerError, wait_until_gone
 
@@ -32,7 +32,7 @@ OWNER = """
 import sys, time
 sys.path.insert(0, sys.argv[1])
 from tower import Tower
-with Tower(count=2) as tower:
+with Tower(count=2, index=int(sys.argv[2])) as tower:
     print(tower.places.index, flush=True)
     time.sleep(600)
 """
@@ -89,6 +89,11 @@ def list_groups(places: Places) -> list[str]:
     os.waitpid(child, 0)
     with os.fdopen(read) as pipe:
         return json.loads(pipe.read())  # type: ignore[no-any-return]
+
+
+def own_index() -> int:
+    """Return an index that no tower takes by itself: those take the first, and would leave traces of their own there."""
+    return secrets.choice(range(TOWERS_MAX // 2, TOWERS_MAX))
 
 
 def stress(tower: Tower) -> None:
@@ -149,7 +154,7 @@ def test_ended_tower_lets_its_disks_go(make_tower, how):
 
 
 def test_stopped_tower_leaves_nothing(make_tower):
-    tower = make_tower(count=2)
+    tower = make_tower(count=2, index=own_index())
     stress(tower)
     tower.stop()
     assert list_traces(tower.places) == []
@@ -159,13 +164,13 @@ def test_tower_ends_with_a_failing_test(make_tower):
     class Failure(Exception):
         pass
 
-    with pytest.raises(Failure), Tower(count=1) as tower:
+    with pytest.raises(Failure), Tower(count=1, index=own_index()) as tower:
         raise Failure
     assert list_traces(tower.places) == []
 
 
 def test_killed_supervisor_leaves_nothing(make_tower):
-    tower = make_tower(count=2)
+    tower = make_tower(count=2, index=own_index())
     stress(tower)
     assert len(list_processes(str(tower.places.folder))) >= 4
 
@@ -176,7 +181,7 @@ def test_killed_supervisor_leaves_nothing(make_tower):
 
 
 def test_down_cleans_up_after_supervisor_and_guardian_were_killed(make_tower):
-    tower = make_tower(count=2)
+    tower = make_tower(count=2, index=own_index())
     stress(tower)
     guardian = find_guardian(tower.process.pid)
 
@@ -191,7 +196,7 @@ def test_down_cleans_up_after_supervisor_and_guardian_were_killed(make_tower):
 
 def test_killed_owner_takes_its_tower_with_it():
     need_tower()
-    command = [sys.executable, "-c", OWNER, str(ROOT / "tests")]
+    command = [sys.executable, "-c", OWNER, str(ROOT / "tests"), str(own_index())]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as owner:
         assert owner.stdout is not None
         places = Places(int(owner.stdout.readline()))
@@ -206,7 +211,10 @@ def test_killed_boot_leaves_nothing():
     need_tower()
     for delay_s in (0.1, 0.3, 0.5, 0.7):
         with subprocess.Popen(
-            [*CLI, "up", "4"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+            [*CLI, "--tower", str(own_index()), "up", "4"],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
         ) as process:
             time.sleep(delay_s)
             process.send_signal(signal.SIGSTOP)
@@ -276,7 +284,10 @@ def test_networks_of_this_computer_are_known():
 def test_ctrl_c_ends_a_tower_in_the_foreground():
     need_tower()
     with subprocess.Popen(
-        [*CLI, "up", "2", "--json"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        [*CLI, "--tower", str(own_index()), "up", "2", "--json"],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
     ) as process:
         assert process.stdout is not None
         places = Places(json.loads(process.stdout.readline())["tower"])

@@ -65,12 +65,14 @@ class Tower:
         boot_delay_s: float = 0.5,
         disk_mib: int = 1024,
         network: str | None = None,
+        index: int | None = None,
     ) -> None:
         self.spec = TowerSpec(
             boards=(*name_boards(count), *boards),
             boot_delay_s=boot_delay_s,
             disk_mib=disk_mib,
             network=network,
+            index=index,
         )
         self.boards: dict[str, BoardInfo] = {}
         self.places: Places
