@@ -12,7 +12,7 @@ import json
 import os
 from collections.abc import Iterable, Iterator, Mapping
 
-from cosmos_cli.onboard.request_loop import PlainValue
+from cosmos_cli.onboard.request_loop import PlainValue, sha256
 
 MARK = ".complete"
 HIDDEN = "."
@@ -26,10 +26,8 @@ def expand(path: str) -> str:
 
 def hash_of(path: str) -> str:
     """Return the SHA-256 of a file."""
-    import hashlib  # 3 ms, which a look without a trace need not wait for
-
     with open(path, "rb", buffering=0) as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        return sha256(file)
 
 
 def read_mark(folder: str) -> dict[str, PlainValue] | None:

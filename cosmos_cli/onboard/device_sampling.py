@@ -9,8 +9,10 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 
@@ -46,9 +48,6 @@ def sample_devices(request: VerbRequest) -> Iterator[AnswerPart]:
     Raises:
         Refusal: TIMEOUT, and it was ended; STEP: it cannot be started, or failed.
     """
-    import shutil  # most commands need neither
-    import tempfile
-
     asked = request.arguments
     parent = content_store.expand(asked["directory"])
     _remove_left_overs(parent, shutil.rmtree)

@@ -7,6 +7,7 @@ pip nor uv is needed there. Its packages are hard links to the wheels' files: no
 
 from __future__ import annotations
 
+import configparser
 import contextlib
 import errno
 import json
@@ -212,8 +213,6 @@ class Builder:
         """Yield the programs that a wheel's entry points ask for."""
         if not os.path.exists(entry_points):
             return
-        import configparser  # few wheels have any
-
         entries = configparser.ConfigParser(delimiters=("=",), interpolation=None)
         entries.optionxform = str  # type: ignore[method-assign,assignment]
         entries.read(entry_points, encoding="utf-8")

@@ -229,6 +229,11 @@ def _throttled(sys_: str) -> int | None:
 
 
 def _output(command: list[str], timeout_s: float) -> str:
+    return _run(command, timeout_s)[1].decode(errors="replace")
+
+
+def _run(command: list[str], timeout_s: float) -> tuple[int | None, bytes]:
+    """Return a command's exit code and what it printed; None and nothing for one that never began or came to no end."""
     import subprocess  # 8 ms, which most looks need not wait for
 
     try:
@@ -236,8 +241,8 @@ def _output(command: list[str], timeout_s: float) -> str:
             command, stdin=subprocess.DEVNULL, capture_output=True, timeout=timeout_s, check=False
         )
     except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return done.stdout.decode(errors="replace")
+        return None, b""
+    return done.returncode, done.stdout
 
 
 def _limit(which: int) -> int | None:
@@ -336,19 +341,18 @@ def _condition(condition: Mapping[str, PlainValue]) -> bool | None:
 
 def is_done(unless: str, *, as_root: bool) -> bool:
     """Tell whether a command's condition succeeds; one that may not be asked as root does not."""
-    import subprocess  # 3 ms here, more on a board, which a look without conditions is spared
-
-    shell = ["timeout", f"{CONDITION_TIMEOUT_S:g}", "/bin/sh", "-c", unless]
-    done = subprocess.run(
-        ["sudo", "-n", *shell] if as_root and os.geteuid() != 0 else shell,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        check=False,
-    )
-    if done.returncode == TIMED_OUT_STATUS:
+    shell = [
+        "timeout",
+        f"{CONDITION_TIMEOUT_S:g}",
+        "/bin/sh",
+        "-c",
+        f"exec >/dev/null 2>&1; {unless}",
+    ]
+    command = ["sudo", "-n", *shell] if as_root and os.geteuid() != 0 else shell
+    status, _ = _run(command, CONDITION_TIMEOUT_S + TOOL_TIMEOUT_S)
+    if status == TIMED_OUT_STATUS:
         raise HelperRefusal("timeout", f"unless: {unless}: not done in {CONDITION_TIMEOUT_S:g} s")
-    return done.returncode == 0
+    return status == 0
 
 
 def _start_sudo() -> subprocess.Popen[bytes] | None:

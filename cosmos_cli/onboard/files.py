@@ -19,6 +19,7 @@ from cosmos_cli.onboard.request_loop import (
     HelperRefusal,
     PlainValue,
     VerbRequest,
+    sha256,
     sync_folder,
     verb,
 )
@@ -51,9 +52,7 @@ def content_hash(path: str) -> str | None:
     with open(os.path.expanduser(path), "rb") as file:
         if os.fstat(file.fileno()).st_size > CONTENT_BYTES_MAX:
             return None
-        import hashlib  # only where there is a file to compare
-
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        return sha256(file)
 
 
 def edited(content: str, *, line: str | None, regexp: str | None, is_present: bool) -> str:

@@ -14,7 +14,7 @@ import time
 from collections.abc import Mapping, Sequence
 
 from cosmos_cli.onboard import content_store
-from cosmos_cli.onboard.request_loop import PlainValue, VerbRequest, verb
+from cosmos_cli.onboard.request_loop import PlainValue, VerbRequest, sha256, verb
 
 CACHE = "__pycache__"
 NEWEST_KEPT = 2
@@ -111,8 +111,6 @@ def traces_of_tree(path: str) -> dict[str, list[int]]:
 
 def hash_of_tree(path: str, files: list[tuple[str, bool]]) -> str:
     """Return the hash of these files as `cosmos_cli.provision.trees.tree_of` makes it."""
-    import hashlib  # a tree without a trace is not read
-
     try:
         lines = [
             f"{'x' if is_program else '-'} {content_store.hash_of(f'{path}/{name}')} {name}\n"
@@ -120,7 +118,7 @@ def hash_of_tree(path: str, files: list[tuple[str, bool]]) -> str:
         ]
     except OSError:
         return ""
-    return hashlib.sha256("".join(lines).encode()).hexdigest()
+    return sha256("".join(lines).encode())
 
 
 def is_environment_whole(path: str, *, is_strict: bool = False) -> bool:
