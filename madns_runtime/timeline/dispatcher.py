@@ -1,0 +1,79 @@
+"""From the word of an action to its handler; each begin, end and refusal is recorded as an event. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from madns_runtime.timeline.action import ActionHandler, ActionRefused, TimelineAction
+
+BEGAN: Final = "action_began"
+ENDED: Final = "action_ended"
+REFUSED: Final = "action_refused"
+
+
+class Dispatcher:
+    """
+    Hands actions to their handlers.
+
+    Args:
+        handlers: By word. A word without one is refused: the time mode does not have it.
+        record: Records an event, given its name and values.
+    """
+
+    def __init__(self, handlers: Mapping[str, ActionHandler], record: Callable[..., None]) -> None:
+        self._handlers = handlers
+        self._record = record
+        self._in_force: dict[int, TimelineAction] = {}
+
+    @property
+    def in_force(self) -> tuple[TimelineAction, ...]:
+        """The actions that have begun and have an end to come, or none before the run's."""
+        return tuple(self._in_force.values())
+
+    def begin(self, action: TimelineAction, now_s: float, *, lasts: bool) -> str:
+        """
+        Begin an action; return why it is refused, "" if it takes place.
+
+        Args:
+            action: Due at its t_s.
+            now_s: Simulated time, s: the delay is recorded.
+            lasts: Whether it is in force from now on.
+        """
+        handler = self._handlers.get(action.word)
+        try:
+            if handler is None:
+                raise ActionRefused(f"there is no action {action.word!r} in this run")
+            handler.begin(action)
+        except ActionRefused as refusal:
+            self._record(REFUSED, **described(action, now_s), reason=str(refusal))
+            return str(refusal)
+        self._record(BEGAN, **described(action, now_s), for_s=action.for_s, lasts=lasts)
+        if lasts:
+            self._in_force[action.number] = action
+        return ""
+
+    def end(self, action: TimelineAction, due_s: float, now_s: float) -> str:
+        """End one that is in force, due at *due_s*; return why that was refused, or ""."""
+        if self._in_force.pop(action.number, None) is None:
+            return f"{action.word} is not in force"
+        values = {**described(action, now_s), "due_s": due_s, "delay_s": now_s - due_s}
+        try:
+            self._handlers[action.word].end(action)
+        except ActionRefused as refusal:
+            self._record(REFUSED, **values, reason=f"to end: {refusal}")
+            return str(refusal)
+        self._record(ENDED, **values)
+        return ""
+
+
+def described(action: TimelineAction, now_s: float) -> dict[str, Any]:
+    """Return the values by which an event tells of an action at *now_s*."""
+    return {
+        "number": action.number,
+        "action": action.word,
+        "agents": list(action.agents),
+        "parameters": dict(action.parameters),
+        "due_s": action.t_s,
+        "delay_s": now_s - action.t_s,
+    }
