@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from madns_runtime.conditions.tap import ConditionTap
 from madns_runtime.config import DeviceLaunch, RunConfig
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware.inline import InlineDevice
@@ -27,7 +28,7 @@ from madns_runtime.plugin.context import PeerContext, check_sending, describe_ex
 from madns_runtime.plugin.device_view import DeviceStatus
 from madns_runtime.plugin.half import Half, RoleProgram
 from madns_runtime.protocol.codec import encode_message
-from madns_runtime.protocol.messages import Service, Transmission
+from madns_runtime.protocol.messages import ConditionMet, Service, Transmission
 from madns_runtime.recording.newest_values import NewestValues
 
 
@@ -64,11 +65,21 @@ class LockstepAgent:
         self.name = mates.config.agents.resolved_names()[index]
         self._clock = mates.clock
         self._outbox = mates.outbox
+        self.conditions = ConditionTap(
+            self.name,
+            mates.config.conditions,
+            tick_hz=mates.config.agents.tick_hz,
+            now_s=mates.clock.now_s,
+            report=self._condition_met,
+        )
+        self.look = self.conditions.look if self.conditions.must_look else None
+        """Called after each step with its simulated time, s; None if no condition has to hold for a while."""
         self.journal = open_journal(
             mates.directory / "agents" / self.name,
             mates.config,
             source=self.name,
             clock=mates.clock,
+            tap=self.conditions,
         )
         self.columns = NewestValues(self.journal.recorder, mates.program.columns)
         self.half = Half(mates.program.make, self.journal.say)
@@ -121,6 +132,11 @@ class LockstepAgent:
             self.journal.event("sync_deadline_broken", late_s=t_s - deadline_s)
         self._outbox.append(Sent(self.index, int(service), body))
         return None
+
+    def _condition_met(self, number: int, agent: str, t_s: float) -> None:
+        del agent  # this one
+        body = encode_message(ConditionMet(number, t_s))
+        self._outbox.append(Sent(self.index, int(Service.RELIABLE), body))
 
     def _transmit(self, transmission: Transmission) -> None:
         body = encode_message(transmission)

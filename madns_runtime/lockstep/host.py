@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from time import monotonic
 
+from madns_runtime.conditions.reports import HostConditions
 from madns_runtime.config import HostLaunch
 from madns_runtime.lockstep import frames
 from madns_runtime.lockstep.barrier import Meeting, RunEnds
@@ -31,6 +32,7 @@ from madns_runtime.plugin.executor import make_executor
 from madns_runtime.plugin.half import HostHalf, RoleProgram
 from madns_runtime.plugin.host_calls import HostCalls
 from madns_runtime.protocol.codec import pack
+from madns_runtime.protocol.messages import ConditionMet
 from madns_runtime.protocol.states import HostEvent, host_machine
 from madns_runtime.reactor.host_signals import heed_signals
 from madns_runtime.reactor.operator_link import tell_loading
@@ -72,7 +74,15 @@ class LockstepHost:
         self._account = account = RunAccount(
             self._names, config.time.duration_s, len(shares), program.columns
         )
-        self._journal = open_journal(self._directory, config, source=HOST, clock=clock)
+        self._conditions = conditions = HostConditions(
+            config.conditions,
+            tick_hz=config.agents.tick_hz,
+            now_s=clock.now_s,
+            end=self._end,
+        )
+        self._journal = open_journal(
+            self._directory, config, source=HOST, clock=clock, tap=conditions.tap
+        )
         self._outbox = Outbox(shares, account=account, clock=clock, journal=self._journal)
         self._meeting = Meeting(
             launch, self._crew, account=account, clock=clock, fds=fds, pending=pending
@@ -128,8 +138,10 @@ class LockstepHost:
             self._meeting.exchange((frames.TICK, number), self._outbox.boxes)
             self._account.ticks = number + 1
             self._take_messages()
+            self._settle_conditions()
         self._advance(duration_s)
         self._drain()
+        self._settle_conditions()
         self._finish()
 
     def _set_up(self) -> None:
@@ -205,8 +217,29 @@ class LockstepHost:
         names, accounts, half = self._names, self._account.agents, self._guarded
         for number, service, body in self._meeting.messages():
             accounts[number].up[service] += 1
-            half.take(names[number], decode(body))
+            message = decode(body)
+            if isinstance(message, ConditionMet):
+                self._conditions.hear(names[number], message.number, message.t_s)
+            else:
+                half.take(names[number], message)
             self._meeting.serve()
+
+    # Conditions -----------------------------------------------------------------------------------
+
+    def _settle_conditions(self) -> None:
+        """
+        Act at the end of a tick on the conditions that were met in it.
+
+        Raises:
+            RunEnds: One of them ends the run.
+        """
+        self._conditions.tap.look(self._clock.t_s)
+        self._conditions.settle(self._journal)
+        if self._meeting.ending is not None:
+            raise RunEnds
+
+    def _end(self, who: str, reason: str, status: str) -> None:
+        self._meeting.end(who, reason, status=status)
 
     # The end --------------------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ from madns_runtime.errors import MachineError
 from madns_runtime.lockstep.clock import T0_UTC, SimulatedClock
 from madns_runtime.recording.number_rows import ROWS_TOGETHER
 from madns_runtime.recording.record_files import RecordFiles
-from madns_runtime.recording.recorder import Recorder
+from madns_runtime.recording.recorder import Recorder, StreamTap
 from madns_runtime.recording.run_journal import RunJournal
 
 
@@ -52,7 +52,12 @@ class DirectWriter:
 
 
 def open_journal(
-    directory: Path, config: RunConfig, *, source: str, clock: SimulatedClock
+    directory: Path,
+    config: RunConfig,
+    *,
+    source: str,
+    clock: SimulatedClock,
+    tap: StreamTap | None = None,
 ) -> RunJournal:
     """
     Return the journal, with a recorder, of the host or of one agent.
@@ -65,11 +70,14 @@ def open_journal(
         config: The run.
         source: host, or the agent's name.
         clock: What events and logged sentences carry the time of.
+        tap: Looks at the records; None if nobody does.
 
     Raises:
         MachineError: The directory cannot be made, or takes no new file.
     """
     files = RecordFiles(directory, run=config.scenario, source=source)
-    recorder = Recorder(files, config.recording, DirectWriter(files), rows_together=ROWS_TOGETHER)
+    recorder = Recorder(
+        files, config.recording, DirectWriter(files), rows_together=ROWS_TOGETHER, tap=tap
+    )
     recorder.set_t0(T0_UTC)
     return RunJournal(recorder, config.recording.verbosity, t_s=clock.now_s, utc=clock.utc)

@@ -228,6 +228,8 @@ class Worker:
                     self._look_at_devices(agent, t_s)
                 position[0] = agent.stepping
                 agent.step(tick)
+                if agent.look is not None:
+                    agent.look(t_s)
         except AgentFailed:
             raise
         except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything

@@ -26,7 +26,7 @@ from madns_runtime.protocol.codec import (
 from madns_runtime.protocol.events import AgentSessionEvent
 from madns_runtime.protocol.link import Link
 from madns_runtime.protocol.link_settings import PLUGIN_CHANNEL, LinkSettings
-from madns_runtime.protocol.messages import Message, Service, Transmission
+from madns_runtime.protocol.messages import ConditionMet, Message, Service, Transmission
 from madns_runtime.protocol.silence_limits import Wakefulness, host_silence_limit_s
 from madns_runtime.protocol.states import AGENT_LIVE, AgentEvent, AgentState, agent_machine
 from madns_runtime.timing.clocksync import ClockEstimate
@@ -199,6 +199,10 @@ class AgentSession:
         self.link.send(
             encode_message(transmission), Service.RELIABLE, now_s, channel=PLUGIN_CHANNEL
         )
+
+    def condition_met(self, met: ConditionMet, now_s: float) -> None:
+        """Tell the host that a condition on this agent's records is met."""
+        self._send(met, Service.RELIABLE, now_s)
 
     def seal_data(self, payload: Any, now_s: float) -> bytes | None:
         """

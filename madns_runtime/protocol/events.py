@@ -74,11 +74,11 @@ class AgentRejoined:
 
 @dataclass(frozen=True, slots=True)
 class AgentDataReceived:
-    """An agent's half sent this, to the host's or to other agents."""
+    """An agent's half sent this, to the host's or to other agents; or a condition on its records is met."""
 
     agent: str
     payload: Any
-    """A message's payload, or a Transmission, which no payload is."""
+    """A message's payload, or a Transmission or ConditionMet, which no payload is."""
 
 
 @dataclass(frozen=True, slots=True)

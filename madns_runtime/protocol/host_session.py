@@ -276,7 +276,9 @@ class HostSession:
                 self._send_expelled(peer, now_s)
             case messages.SimulationData(payload):
                 self._events.append(told.AgentDataReceived(peer.name, payload))
-            case messages.Transmission() if math.isfinite(message.sent_s):
+            case messages.Transmission(sent_s=t_s) | messages.ConditionMet(t_s=t_s) if (
+                math.isfinite(t_s)
+            ):
                 self._events.append(told.AgentDataReceived(peer.name, message))
             case messages.Ping(t_agent_s, report):
                 peer.report = report or peer.report

@@ -185,6 +185,17 @@ class FaultOrder:
     """Not a number for an action without one."""
 
 
+@dataclass(frozen=True, slots=True)
+class ConditionMet:
+    """Agent -> host, RELIABLE: a condition on what I record is met."""
+
+    KIND: ClassVar[int] = 17
+    number: int
+    """The condition's in the run."""
+    t_s: float
+    """Simulated time of it."""
+
+
 Message = (
     Hello
     | SimulationSetup
@@ -202,6 +213,7 @@ Message = (
     | Delivery
     | TransmissionRefusal
     | FaultOrder
+    | ConditionMet
 )
 
 MESSAGES: tuple[type[Message], ...] = get_args(Message)

@@ -105,7 +105,9 @@ class AgentRunner:
         self._session = self._port.session
         directory = Path(launch.directory) / "agents" / name
         files = RecordFiles(directory, run=config.run, source=name, life=program.life)
-        self._recorder = recorder = Recorder(files, config.recording, process.writer.writes(files))
+        self._recorder = recorder = Recorder(
+            files, config.recording, process.writer.writes(files), tap=self._port.conditions
+        )
         self._journal = RunJournal(recorder, config.recording.verbosity, t_s=self._port.t_s)
         self._records = ProcessRecords(self._journal)
         self._hardware = seat.hardware

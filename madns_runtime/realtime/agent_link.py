@@ -9,6 +9,7 @@ from time import monotonic
 from typing import Any
 
 from madns_runtime import __version__
+from madns_runtime.conditions.tap import ConditionTap
 from madns_runtime.config import AgentLaunch
 from madns_runtime.errors import MadnsError
 from madns_runtime.medium.mailbox import Mailbox
@@ -18,7 +19,7 @@ from madns_runtime.plugin.half import RoleProgram
 from madns_runtime.protocol.agent_session import AgentIdentity, AgentSession
 from madns_runtime.protocol.link import LinkLimits
 from madns_runtime.protocol.link_settings import LinkSettings
-from madns_runtime.protocol.messages import Service, Transmission
+from madns_runtime.protocol.messages import ConditionMet, Service, Transmission
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.realtime.process_port import ProcessPort
 
@@ -78,6 +79,14 @@ class AgentPort:
             post=self._transmit,
             life=program.life,
         )
+        self.conditions = ConditionTap(
+            name,
+            config.conditions,
+            tick_hz=config.agents.tick_hz,
+            now_s=self.t_s,
+            report=self._condition_met,
+        )
+        """What is waited for in this agent's records."""
         self.t0_host_s: float | None = None
         """Simulated time zero on the host's clock; None before it is known."""
         self._rejoined_at_s: float | None = None
@@ -171,6 +180,11 @@ class AgentPort:
             self.flush()
             self.process.send_waiting()
         return None
+
+    def _condition_met(self, number: int, agent: str, t_s: float) -> None:
+        del agent  # this one
+        self.session.condition_met(ConditionMet(number, t_s), monotonic())
+        self.must_flush = True
 
     def _transmit(self, transmission: Transmission) -> None:
         self.session.transmit(transmission, monotonic())

@@ -14,6 +14,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, assert_never
 
+from madns_runtime.conditions.reports import HostConditions
 from madns_runtime.config import HostLaunch
 from madns_runtime.health.sampler import SAMPLER_TIMEOUT_S, start_sampler
 from madns_runtime.plugin.api import HOST
@@ -24,6 +25,7 @@ from madns_runtime.plugin.host_calls import HostCalls
 from madns_runtime.protocol import events as told
 from madns_runtime.protocol.events import Phase
 from madns_runtime.protocol.host_peers import Address
+from madns_runtime.protocol.messages import ConditionMet
 from madns_runtime.protocol.states import HOST_LIVE, HostState
 from madns_runtime.reactor.host_signals import heed_signals
 from madns_runtime.reactor.operator_link import (
@@ -37,6 +39,7 @@ from madns_runtime.reactor.reattachment import way_back_of
 from madns_runtime.reactor.scheduling import apply as apply_scheduling
 from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.watchdog import end_after_hang_up, extend
+from madns_runtime.realtime.announcements import Announcements
 from madns_runtime.realtime.host_link import HostPort
 from madns_runtime.realtime.host_result import HostReport
 from madns_runtime.realtime.operator_orders import OperatorOrders
@@ -96,8 +99,18 @@ class HostRuntime:
         self._port = HostPort(launch, reactor=self._reactor, on_due=self._session_due)
         self._session = self._port.session
         files = RecordFiles(self._directory, run=config.run, source=HOST)
-        self._recorder = recorder = Recorder(files, config.recording)
+        self._conditions = HostConditions(
+            config.conditions,
+            tick_hz=config.agents.tick_hz,
+            now_s=self._port.now_s,
+            end=self._end,
+            on_heard=self._port.want_pump,
+        )
+        recorder = Recorder(files, config.recording, tap=self._conditions.tap)
+        self._recorder = recorder
         self._journal = RunJournal(recorder, config.recording.verbosity, t_s=self._port.t_s)
+        self._announced = Announcements(self._journal, self._operator.emit)
+        self._log = self._announced.log
         self._orders = OperatorOrders(
             self._session, self._journal, end=self._end, refuse=self._operator.refuse
         )
@@ -174,6 +187,7 @@ class HostRuntime:
         while (event := self._session.next_event()) is not None:
             self._handle(event)
         self._port.must_pump = False
+        self._conditions.settle(self._journal)
         self._port.flush()
         if self._port.is_in(HostState.EXIT):
             self._reactor.stop()
@@ -182,14 +196,15 @@ class HostRuntime:
 
     def _handle(self, event: told.HostSessionEvent) -> None:
         match event:
+            case told.AgentDataReceived(agent, ConditionMet(number, t_s)):
+                self._conditions.hear(agent, number, t_s)
             case told.AgentDataReceived(agent, payload):
                 if self._takes_data:
                     self._guard(self._half.take, agent, payload)
             case told.HostStateEntered(state):
-                self._journal.event("state", state=state.value)
-                self._operator.emit({"event": "state", "state": state.value})
-            case told.AgentMoved():
-                self._agent_moved(event)
+                self._announced.state(state)
+            case told.AgentMoved(agent):
+                self._announced.agent_moved(event, self._session.peers[agent])
             case told.AgentsReady():
                 self._set_up()
             case told.AgentsSimulationReady():
@@ -311,17 +326,6 @@ class HostRuntime:
         self._report.records = {**counts.to_mapping(), "health": health}
         self._session.records_closed(now_s)
 
-    def _agent_moved(self, event: told.AgentMoved) -> None:
-        peer = self._session.peers[event.agent]
-        moved = {
-            "agent": event.agent,
-            "state": event.phase.value,
-            "reason": event.reason,
-            "incarnation": len(peer.incarnations_seen),
-        }
-        self._journal.event("agent", **moved)
-        self._operator.emit({"event": "agent", **moved})
-
     def _agent_lost(self, agent: str, reason: str) -> None:
         self._report.lost[agent] = reason
         self._log("error", f"{agent} is lost: {reason}")
@@ -363,12 +367,9 @@ class HostRuntime:
         self._progress_timer.reschedule(monotonic() + PROGRESS_INTERVAL_S)
         self._operator.emit(self._report.progress(self._session, self._port.t_s()))
         self._devices.look()
+        self._conditions.tap.look(self._port.now_s())
         for text in self._report.new_troubles(self._session, self._recorder.problem):
             self._log("error", text)
-
-    def _log(self, level: str, text: str) -> None:
-        self._journal.say(level, text)
-        self._operator.emit({"event": "log", "level": level, "source": HOST, "text": text})
 
     def _close(self) -> int:
         self._devices.close()

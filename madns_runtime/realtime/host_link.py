@@ -127,6 +127,10 @@ class HostPort:
             due_s = min(due_s, t0_s + carrier_s)
         self._timer.reschedule(due_s)
 
+    def want_pump(self) -> None:
+        """Note that something waits to be carried out."""
+        self.must_pump = True
+
     def is_in(self, state: HostState) -> bool:
         """Tell whether the session is in *state*."""
         return self.session.state is state

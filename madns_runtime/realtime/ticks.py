@@ -77,6 +77,7 @@ class PacedTicks:
         # Called every tick: without a layer between.
         self._prepare, self._step, self._is_running = calls.prepare, calls.step, calls.is_running
         self.say_how_it_is = calls.say_how_it_is
+        self._look = port.conditions.look if port.conditions.must_look else None
 
     def begin(self, now_s: float) -> None:
         """Take note that the agent runs from simulated time *now_s* on, s: ticks that are over were never its own."""
@@ -125,6 +126,8 @@ class PacedTicks:
                 self._calls.failed(error)
                 return
             page[METHOD] = IDLE
+            if self._look is not None:
+                self._look(t_s)
             if port.must_flush:
                 # What the step sent leaves before anything else is done.
                 port.flush()

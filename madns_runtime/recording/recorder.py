@@ -7,8 +7,8 @@ thread, the loop's, may call a recorder, and a recorder does not survive a fork:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
 
 import orjson
 
@@ -26,6 +26,15 @@ WAKE_BYTES = 65_536
 CLOSE_TIMEOUT_S = 10.0
 
 
+class StreamTap(Protocol):
+    """What looks at some of the streams as they are recorded."""
+
+    def open(
+        self, stream: str, fields: Sequence[str]
+    ) -> Callable[[Sequence[Any] | Mapping[str, Any]], None] | None:
+        """Return what is to be given every record of a stream with these fields; None if it is not looked at."""
+
+
 class Recorder:
     """
     The record streams of one process (or of one agent of several in a process).
@@ -35,6 +44,7 @@ class Recorder:
         settings: Bounds and intervals.
         writer: What brings them there; None for a thread of its own.
         rows_together: Records of numbers alone that are encoded at once, where whoever records can wait.
+        tap: Looks at records; None if nobody does.
     """
 
     def __init__(
@@ -44,6 +54,7 @@ class Recorder:
         writer: RecordWriter | None = None,
         *,
         rows_together: int = 1,
+        tap: StreamTap | None = None,
     ) -> None:
         self._files = files
         self._writer = writer or WriterThread(settings).writes(files)
@@ -52,6 +63,7 @@ class Recorder:
         self._streams: dict[str, StreamFile] = {}
         self._texts: dict[str, TextFile] = {}
         self._rows_together = rows_together
+        self._tap = tap
         self.start = self._writer.start
 
     def open_stream(self, schema: StreamSchema) -> None:
@@ -64,7 +76,11 @@ class Recorder:
         """
         if schema.name in self._streams:
             raise PluginError(f"stream {schema.name}: declared twice")
-        self._streams[schema.name] = self._files.create_stream(schema)
+        file = self._streams[schema.name] = self._files.create_stream(schema)
+        if self._tap is not None:
+            take = self._tap.open(schema.name, [field.name for field in schema.fields])
+            if take is not None:
+                file.tap_with(take)
 
     def set_t0(self, t0_utc: str) -> None:
         """

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +124,7 @@ class StreamFile:
         "path",
         "rows",
         "schema",
+        "tap",
         "unwritten",
         "width",
         "written",
@@ -137,6 +138,8 @@ class StreamFile:
         """Types of values that need no rearranging before they are encoded."""
         self.rows = _number_rows(schema)
         """Rounds its records; None where every digit is kept."""
+        self.tap: Callable[[Any], None] | None = None
+        """Given every record; None if nobody looks at them."""
         self.lines: list[bytes] = []
         self.overflowed = 0
         self.not_finite = 0
@@ -170,13 +173,23 @@ class StreamFile:
 
     # What follows is called by the loop's thread.
 
+    def tap_with(self, take: Callable[[Any], None]) -> None:
+        """Give every record from now on to *take*, as it will be read: no value is spared being arranged."""
+        self.tap, self.direct = take, ()
+
     def arrange(self, values: Any) -> Any:
         """
-        Return *values* in the stream's shape.
+        Return *values* in the stream's shape, seen by who looks at records.
 
         Raises:
             PluginError: The number of values, or a name among them, is not the schema's.
         """
+        arranged = self._arrange(values)
+        if self.tap is not None:
+            self.tap(arranged if self.rows is None else self.rows.rounded(arranged))
+        return arranged
+
+    def _arrange(self, values: Any) -> Any:
         if isinstance(values, Mapping):
             return self._arrange_mapping(values)
         if isinstance(values, np.ndarray):

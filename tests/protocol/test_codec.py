@@ -27,6 +27,7 @@ from madns_runtime.protocol.codec import (
 from madns_runtime.protocol.messages import (
     MESSAGES,
     AgentStopped,
+    ConditionMet,
     Delivery,
     EmergencyShutdown,
     Expelled,
@@ -61,6 +62,7 @@ EXAMPLES = (
     Delivery(sender="b", sent_s=1.0, arrives_s=1.01, payload="text"),
     TransmissionRefusal(number=7, to="*", sent_s=1.0, reason="no_radio"),
     FaultOrder(number=3, device="pi22/imu", action="bias", value=0.5),
+    ConditionMet(number=3, t_s=1.5),
 )
 
 SCALARS = (

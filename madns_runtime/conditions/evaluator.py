@@ -1,0 +1,63 @@
+"""One condition of one agent, followed through its records in order of time."""
+
+from __future__ import annotations
+
+from madns_runtime.conditions.condition import Condition
+
+
+class ConditionEvaluator:
+    """
+    Finds when a condition is met, once.
+
+    Args:
+        condition: What is waited for.
+    """
+
+    __slots__ = ("_count", "_since_s", "condition", "is_met")
+
+    def __init__(self, condition: Condition) -> None:
+        self.condition = condition
+        self.is_met = False
+        self._count = 0
+        self._since_s: float | None = None
+
+    def take(self, t_s: float | None, value: object) -> float | None:
+        """
+        Take one record's value.
+
+        Args:
+            t_s: The record's simulated time, s; None before it runs.
+            value: Of the condition's field.
+
+        Returns:
+            The simulated time at which the condition is met by this record, s; None if it is not, or was before.
+        """
+        condition = self.condition
+        if self.is_met or not condition.is_at(t_s):
+            return None
+        if not condition.bounds.holds(value):
+            self._since_s = None
+            return None
+        at_s = 0.0 if t_s is None else t_s
+        if self._since_s is None:
+            self._since_s = at_s
+        self._count += 1
+        if condition.for_s > 0.0:
+            return self.look(at_s)
+        if self._count < condition.times:
+            return None
+        self.is_met = True
+        return at_s
+
+    def look(self, now_s: float) -> float | None:
+        """
+        Take the newest value for that of *now_s*, too; a condition that is to hold for a while may be met by it.
+
+        Returns:
+            The simulated time from which on it has held for long enough, s; None if it has not.
+        """
+        since_s, for_s = self._since_s, self.condition.for_s
+        if self.is_met or since_s is None or for_s <= 0.0 or now_s < since_s + for_s:
+            return None
+        self.is_met = True
+        return since_s + for_s

@@ -1,0 +1,109 @@
+"""A tap on the recorder of an agent, or of the host's half: hands what conditions name to their evaluators."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from madns_runtime.conditions.condition import AGENT, HOST, TICK, TIME, Condition, conditions_of
+from madns_runtime.conditions.evaluator import ConditionEvaluator
+
+Take = Callable[[Any], None]
+"""Takes one record in its stream's shape: a sequence in the order of its fields, or a mapping."""
+Report = Callable[[int, str, float], None]
+"""Takes the number of a condition that is met, whose record it is, and the simulated time of it, s."""
+
+
+class ConditionTap:
+    """
+    The conditions of one who records.
+
+    Args:
+        source: An agent's name, or `host`.
+        conditions: All of the run.
+        tick_hz: Rate of agents' ticks: a record of a tick is of its time.
+        now_s: Returns the simulated time, s, for records that tell none.
+        report: Told of each condition that is met.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        conditions: Sequence[Condition],
+        *,
+        tick_hz: float,
+        now_s: Callable[[], float | None],
+        report: Report,
+    ) -> None:
+        self._source = source
+        self._tick_hz = tick_hz
+        self._now_s = now_s
+        self._report = report
+        self._by_stream: dict[str, list[Condition]] = {}
+        for condition in conditions_of(source, conditions):
+            self._by_stream.setdefault(condition.stream, []).append(condition)
+        self._lasting: list[tuple[str, ConditionEvaluator]] = []
+
+    def __bool__(self) -> bool:
+        return bool(self._by_stream)
+
+    @property
+    def must_look(self) -> bool:
+        """Whether conditions that have to hold for a while are open: `look` is to be called now and then."""
+        return any(each.for_s > 0.0 for own in self._by_stream.values() for each in own)
+
+    def open(self, stream: str, fields: Sequence[str]) -> Take | None:
+        """Return what is to be given every record of a stream with these fields; None if no condition names it."""
+        own = self._by_stream.get(stream)
+        if not own:
+            return None
+        places = {name: place for place, name in enumerate(fields)}
+        when = self._time_of(fields)
+        has_agents = self._source == HOST and AGENT in places
+        evaluators: dict[str, list[ConditionEvaluator]] = {}
+        if not has_agents:
+            evaluators[self._source] = self._evaluators(self._source, own)
+
+        def take(record: Any) -> None:
+            if isinstance(record, Mapping):
+                read: Callable[[str], Any] = record.get
+            else:
+                read = lambda name: record[places[name]] if name in places else None  # noqa: E731
+            who = str(read(AGENT)) if has_agents else self._source
+            if (following := evaluators.get(who)) is None:
+                named = [each for each in own if who in each.agents]
+                following = evaluators[who] = self._evaluators(who, named)
+            t_s = when(read)
+            for evaluator in following:
+                self._note(who, evaluator, evaluator.take(t_s, read(evaluator.condition.field)))
+
+        return take
+
+    def look(self, now_s: float) -> None:
+        """Look at conditions that have to hold for a while, at simulated time *now_s*."""
+        for who, evaluator in self._lasting:
+            self._note(who, evaluator, evaluator.look(now_s))
+
+    def _evaluators(self, who: str, conditions: Sequence[Condition]) -> list[ConditionEvaluator]:
+        made = [ConditionEvaluator(each) for each in conditions]
+        self._lasting += [(who, each) for each in made if each.condition.for_s > 0.0]
+        return made
+
+    def _note(self, who: str, evaluator: ConditionEvaluator, met_s: float | None) -> None:
+        if met_s is not None:
+            self._report(evaluator.condition.number, who, met_s)
+
+    def _time_of(self, fields: Sequence[str]) -> Callable[[Callable[[str], Any]], float | None]:
+        """Return what reads a record's simulated time: from its field t_s, its tick, or the clock."""
+        if TIME in fields:
+            return lambda read: _seconds(read(TIME))
+        if TICK in fields and self._source != HOST:
+            return lambda read: _seconds(read(TICK), self._tick_hz)
+        return lambda read: self._now_s()
+
+
+def _seconds(value: Any, per_s: float = 1.0) -> float | None:
+    try:
+        return float(value) / per_s
+    except (TypeError, ValueError):
+        return None

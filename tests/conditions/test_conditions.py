@@ -1,0 +1,182 @@
+"""Conditions: bounds, when one is met, what a tap hands to whom, and what the host does with word of it."""
+
+import math
+
+import numpy as np
+import pytest
+
+from madns_runtime.conditions.condition import Condition, ValueBounds, conditions_of
+from madns_runtime.conditions.evaluator import ConditionEvaluator
+from madns_runtime.conditions.reports import HostConditions
+from madns_runtime.conditions.tap import ConditionTap
+from madns_runtime.config import Agents, Recording, RunConfig, from_mapping, to_mapping
+from madns_runtime.protocol.codec import decode_message, encode_message
+from madns_runtime.protocol.messages import ConditionMet
+from madns_runtime.recording.record_files import RecordFiles
+from madns_runtime.recording.recorder import Recorder
+from madns_runtime.recording.records import Field, StreamSchema
+
+DRIVE = StreamSchema("drive", (Field("tick", "", "int"), Field("speed_m_s", "m/s")))
+ROUNDED = StreamSchema("state", (Field("tick", "", "int"), Field("x_m", "m", digits=1)))
+
+
+def condition(**values):
+    told = {"number": 0, "name": "fast", "stream": "drive", "field": "speed_m_s"}
+    given = {"bounds": ValueBounds.above(10.0), "agents": ("a",)}
+    return Condition(**(told | given | values))
+
+
+@pytest.mark.parametrize(
+    ("bounds", "held", "not_held"),
+    [
+        (ValueBounds.below(2.0), (1.9, -5, True, np.float64(0)), (2.0, 3)),
+        (ValueBounds.above(2.0), (2.1, np.int64(3)), (2.0, 1, False)),
+        (ValueBounds.within(-1.0, 1.0), (-1.0, 0, 1.0), (-1.1, 1.1)),
+        (ValueBounds.equals(3.0, 0.5), (2.5, 3, 3.5), (2.4, 3.6)),
+        (ValueBounds.equals("lost"), ("lost",), ("found", 3)),
+        (ValueBounds.within(-1.0, 1.0).negated(), (-1.1, 2), (0.5, 1.0)),
+        (ValueBounds.equals("lost").negated(), ("found",), ("lost", 3)),
+    ],
+)
+def test_bounds_hold_for_values_within_and_never_for_none_of_their_kind(bounds, held, not_held):
+    assert [value for value in held if not bounds.holds(value)] == []
+    assert [value for value in not_held if bounds.holds(value)] == []
+    assert not any(map(bounds.holds, (None, math.nan, np.nan, [1], {})))
+
+
+def test_a_condition_is_met_once_at_the_record_that_meets_it():
+    evaluator = ConditionEvaluator(condition())
+
+    met = [evaluator.take(t, v) for t, v in enumerate((1.0, math.nan, 11.0, 1.0, 12.0))]
+
+    assert met == [None, None, 2.0, None, None]
+
+
+def test_a_condition_that_has_to_hold_for_a_while_begins_anew_when_it_does_not():
+    evaluator = ConditionEvaluator(condition(for_s=2.0))
+
+    assert [evaluator.take(t, v) for t, v in enumerate((11, 11, 5, 11, 11))] == [None] * 5
+    assert evaluator.look(4.5) is None
+    assert evaluator.look(5.5) == 5.0
+    assert evaluator.look(6.0) is None
+
+
+def test_records_outside_its_times_do_not_count():
+    evaluator = ConditionEvaluator(condition(from_s=2.0, to_s=3.0))
+
+    assert [evaluator.take(t, 11.0) for t in (None, 1.0, 2.0)] == [None, None, 2.0]
+
+
+def test_a_condition_on_a_number_of_records_is_met_by_the_last_of_them():
+    evaluator = ConditionEvaluator(condition(times=3))
+
+    assert [evaluator.take(t, 11.0) for t in range(3)] == [None, None, 2.0]
+
+
+def tapped(conditions, source="a"):
+    told = []
+    tap = ConditionTap(
+        source, conditions, tick_hz=10.0, now_s=lambda: 99.0, report=lambda *met: told.append(met)
+    )
+    return tap, told
+
+
+def test_a_tap_takes_a_records_own_time_from_t_s_or_its_tick_or_the_clock():
+    conditions = [
+        condition(number=1),
+        condition(number=2, stream="gyro", field="rate"),
+        condition(number=3, stream="bare", field="speed_m_s"),
+    ]
+    tap, told = tapped(conditions)
+
+    tap.open("drive", ("tick", "speed_m_s"))((25, 11.0))
+    tap.open("gyro", ("tick", "t_s", "rate"))({"tick": 1, "t_s": 7.5, "rate": 11.0})
+    tap.open("bare", ("speed_m_s",))((11.0,))
+
+    assert told == [(1, "a", 2.5), (2, "a", 7.5), (3, "a", 99.0)]
+    assert tap.open("other", ("tick", "speed_m_s")) is None
+
+
+def test_a_hosts_records_that_name_agents_are_followed_agent_by_agent():
+    of_host = condition(agents=("a", "b"), is_of_host=True)
+    tap, told = tapped([of_host], "host")
+    take = tap.open("drive", ("t_s", "agent", "speed_m_s"))
+
+    for record in ((1.0, "a", 1.0), (2.0, "c", 11.0), (3.0, "b", 11.0), (4.0, "a", 12.0)):
+        take(record)
+
+    assert told == [(0, "b", 3.0), (0, "a", 4.0)]
+    assert conditions_of("a", [of_host]) == ()
+
+
+def test_a_recorder_shows_a_tap_what_will_be_read_and_writes_what_it_would_without(tmp_path):
+    conditions = [condition(stream="state", field="x_m", bounds=ValueBounds.above(1.0))]
+    written = []
+    for number, tap in enumerate((None, tapped(conditions)[0])):
+        folder = tmp_path / str(number)
+        files = RecordFiles(folder, run="0001-test", source="a")
+        recorder = Recorder(files, Recording(), tap=tap)
+        for schema in (DRIVE, ROUNDED):
+            recorder.open_stream(schema)
+        recorder.record("state", (0, 1.04))
+        recorder.record("state", {"tick": 1, "x_m": 1.06})
+        recorder.record("drive", (0, 99.0))
+        files.write_waiting()
+        written.append([(folder / f"{name}.jsonl").read_bytes() for name in ("state", "drive")])
+
+    assert written[0] == written[1]
+
+
+def test_a_recorder_shows_a_tap_rounded_values(tmp_path):
+    tap, told = tapped([condition(stream="state", field="x_m", bounds=ValueBounds.above(1.0))])
+    recorder = Recorder(RecordFiles(tmp_path, run="r", source="a"), Recording(), tap=tap)
+    recorder.open_stream(ROUNDED)
+
+    recorder.record("state", (0, 1.04))
+    assert told == []
+    recorder.record("state", (1, 1.06))
+    assert told == [(0, "a", 0.1)]
+
+
+class Journal:
+    def __init__(self):
+        self.events = []
+
+    def event(self, event, **values):
+        self.events.append({"event": event, **values})
+
+
+def test_the_host_notes_what_is_met_calls_who_waits_and_ends_the_run_that_is_to_end():
+    waited = condition(number=1, name="low")
+    broken = condition(number=2, name="slip", ends_run=True)
+    endings, met, journal = [], [], Journal()
+    host = HostConditions(
+        [waited, broken], tick_hz=10.0, now_s=lambda: 5.5, end=lambda *end: endings.append(end)
+    )
+    host.on_met(1, met.append)
+
+    host.hear("a", 1, 5.0)
+    host.hear("b", 2, 5.25)
+    host.hear("a", 77, 5.0)
+    assert (journal.events, met, endings) == ([], [], [])
+    host.settle(journal)
+
+    told = {"event": "condition_met", "agent": "a", "met_s": 5.0, "delay_s": 0.5}
+    assert journal.events[0] == told | {"condition": "low"}
+    assert [(each.agent, each.t_s, each.delay_s) for each in met] == [("a", 5.0, 0.5)]
+    assert endings == [("b", "expectation slip is broken at t = 5.25 s", "broken")]
+    assert host.unknown_count == 1
+
+
+def test_conditions_travel_to_agents_and_word_of_them_to_the_host():
+    config = RunConfig(
+        run="r",
+        scenario="s",
+        simulation="counter",
+        base_directory="/",
+        agents=Agents(count=1),
+        conditions=(condition(bounds=ValueBounds.equals("lost").negated(), to_s=3.0),),
+    )
+
+    assert from_mapping(RunConfig, to_mapping(config)).conditions == config.conditions
+    assert decode_message(encode_message(ConditionMet(3, 1.5))) == ConditionMet(3, 1.5)
