@@ -18,6 +18,7 @@ from cosmos_cli.commands.fleet_command import (
     fleet_of,
 )
 from cosmos_cli.errors import ExitCode
+from cosmos_cli.fleet.fleet import machines_of
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.liveness import SilenceWatch
 from cosmos_cli.fleet.pool import BackgroundCall
@@ -110,9 +111,8 @@ def _look_at_devices(
     # Imported here, as above: not needed for the runtime alone.
     with IMPORT_TURN:
         from cosmos_cli.launch.device_plan import look_at_devices
-        from cosmos_cli.models.inventory import load_machines
 
-    machines = fleet.machines if whole is None else load_machines(whole)
+    machines = fleet.machines if whole is None else machines_of(whole)
     for scenario in fleet_up.scenarios:
         look_at_devices(scenario, machines, host=host, warn=fleet_up.warn)
 

@@ -116,7 +116,7 @@ def fleet_of(
     """
     key = key_of(inventory, limit)
     targets = recall(key)
-    load = functools.partial(_machines, inventory, limit)
+    load = functools.partial(machines_of, inventory, limit)
     if targets is None:
         machines = load()
         load = functools.partial(tuple, machines)
@@ -132,7 +132,13 @@ def fleet_of(
     )
 
 
-def _machines(inventory: Given, limit: str | None) -> tuple[Machine, ...]:
+def machines_of(inventory: Given, limit: str | None = None) -> tuple[Machine, ...]:
+    """
+    Return the machines of an inventory that are meant.
+
+    Raises:
+        InputError: With every fault found.
+    """
     with IMPORT_TURN:
         from cosmos_cli.models.inventory import load_machines  # takes 0.2 s to import
 

@@ -14,6 +14,7 @@ from cosmos_cli.collect.retrieval_state import asked_sources
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.run_index import remembered_runs
 from cosmos_cli.fleet.connection import ConnectOptions
+from cosmos_cli.fleet.fleet import machines_of
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
 from cosmos_cli.fleet.outcome import Outcome
@@ -127,11 +128,7 @@ def targets_of(inventory: Sequence[str] | None, limit: str | None) -> list[Targe
     if not inventory:
         refuse_stray_limit(limit)
         return []
-    # Imported here: what checks inventories takes its time.
-    with IMPORT_TURN:
-        from cosmos_cli.models.inventory import load_machines
-
-    return [target_of(machine) for machine in load_machines(inventory, limit)]
+    return [target_of(machine) for machine in machines_of(inventory, limit)]
 
 
 def distinct(targets: Iterable[Target]) -> list[Target]:

@@ -14,7 +14,7 @@ import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 
 from cosmos_cli.onboard import content_store
 from cosmos_cli.onboard.request_loop import (
@@ -50,7 +50,7 @@ def sample_devices(request: VerbRequest) -> Iterator[AnswerPart]:
     """
     asked = request.arguments
     parent = content_store.expand(asked["directory"])
-    _remove_left_overs(parent, shutil.rmtree)
+    _remove_left_overs(parent)
     folder = tempfile.mkdtemp(prefix=PREFIX, dir=parent)
     try:
         yield from _driven(asked, folder)
@@ -149,9 +149,9 @@ def _file(folder: str, name: str) -> Iterator[AnswerPart]:
                 return
 
 
-def _remove_left_overs(parent: str, remove: Callable[..., object]) -> None:
+def _remove_left_overs(parent: str) -> None:
     now_s = time.clock_gettime(time.CLOCK_REALTIME)
     for entry in list(os.scandir(parent)):
         is_ours = entry.name.startswith(PREFIX) and entry.is_dir(follow_symlinks=False)
         if is_ours and now_s - entry.stat(follow_symlinks=False).st_mtime > LEFT_OVER_S:
-            remove(entry.path, ignore_errors=True)
+            shutil.rmtree(entry.path, ignore_errors=True)
