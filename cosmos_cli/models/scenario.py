@@ -186,13 +186,6 @@ def _restarts(scenario: Scenario) -> Iterator[SectionFault]:
         yield ("agents", "restarts_max"), f"{text}, got {scenario.agents.restarts_max}: {why}"
 
 
-def _lockstep(scenario: Scenario) -> Iterator[SectionFault]:
-    if scenario.time.is_lockstep and scenario.on_agent_loss == "continue":
-        text = "expected abort with time.mode: lockstep, got continue"
-        why = "a run that repeats to the bit cannot depend on when an agent was lost"
-        yield ("on_agent_loss",), f"{text}: {why}; drop it, or simulate the loss in the simulation"
-
-
 def _executor(scenario: Scenario) -> Iterator[SectionFault]:
     kind = scenario.executor.kind
     module, _, attribute = kind.partition(":")
@@ -217,6 +210,5 @@ _CHECKS: tuple[tuple[frozenset[str], Callable[[Scenario], Iterator[SectionFault]
     (frozenset({"agents"}), _processes),
     (frozenset({"agents", "time"}), _duration),
     (frozenset({"agents", "on_agent_loss"}), _restarts),
-    (frozenset({"time", "on_agent_loss"}), _lockstep),
     (frozenset({"executor"}), _executor),
 )

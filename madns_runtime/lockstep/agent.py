@@ -54,13 +54,22 @@ class LockstepAgent:
     Args:
         index: Its number among the run's agents, from 0.
         mates: What it shares with the others of its process.
+        life: Which incarnation of the agent this is.
+        devices: Those of the incarnation before, if its worker has them.
 
     Raises:
         MachineError: It cannot record.
         HalfFailed: Its half cannot be made.
     """
 
-    def __init__(self, index: int, mates: Crewmates) -> None:
+    def __init__(
+        self,
+        index: int,
+        mates: Crewmates,
+        *,
+        life: int = 1,
+        devices: AgentDevices | None = None,
+    ) -> None:
         self.index = index
         self.name = mates.config.agents.resolved_names()[index]
         self._clock = mates.clock
@@ -80,6 +89,7 @@ class LockstepAgent:
             source=self.name,
             clock=mates.clock,
             tap=self.conditions,
+            life=life,
         )
         self.columns = NewestValues(self.journal.recorder, mates.program.columns)
         self.half = Half(mates.program.make, self.journal.say)
@@ -93,8 +103,9 @@ class LockstepAgent:
             mates.config.agents.resolved_names(),
             has_medium=mates.program.has_medium,
             post=self._transmit,
+            life=life,
         )
-        self.devices = AgentDevices(
+        self.devices = devices or AgentDevices(
             [each for each in mates.devices if self.name in each.users],
             mates.config,
             directory=mates.directory,

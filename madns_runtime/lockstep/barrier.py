@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from operator import itemgetter
 from time import monotonic
 from typing import Any, NoReturn
 
@@ -16,7 +17,7 @@ from madns_runtime.config import HostLaunch
 from madns_runtime.lockstep import frames
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.frames import encode_frame
-from madns_runtime.lockstep.result import EarlyEnd, RunAccount
+from madns_runtime.lockstep.result import LOST, EarlyEnd, RunAccount
 from madns_runtime.lockstep.workers import WorkerProcess, Workers
 from madns_runtime.reactor.operator_link import OPERATOR_GONE, OperatorLink
 from madns_runtime.reactor.reactor import Reactor
@@ -72,11 +73,14 @@ class Meeting:
             is_detached=launch.is_detached,
         )
         crew.listen(self.reactor, on_frame=self._said, on_lost=self._worker_lost)
+        self.goes_on = False
+        """Whether the run goes on without an agent that is lost now."""
         self.is_open = True
         """Whether an ending would be news."""
         self.ending: EarlyEnd | None = None
         """Why the run ends before its time, if it does."""
-        self._late: tuple[GrantedLimit, Callable[[], EarlyEnd]] | None = None
+        self._late: tuple[GrantedLimit, Callable[[], EarlyEnd | None]] | None = None
+        self._limit_s = 0.0
         self._served_s = monotonic()
         self._progress_timer = self.reactor.call_at(0.0, self._progress)
 
@@ -122,12 +126,16 @@ class Meeting:
         Raises:
             RunEnds: It does not read.
         """
+        if worker.has_ended:
+            return
         limit_s = self._timeouts.tick_s
         try:
             self._crew.order(worker, encode_frame(*parts), limit_s)
         except TimeoutError:
-            self._note(self._blame(worker, limit_s, "does not read"))
-            raise RunEnds from None
+            ending = self._blame(worker, limit_s, "does not read")
+            if ending is not None:
+                self._note(ending)
+                raise RunEnds from None
 
     def await_all(self, limit_s: float, late: str = "has not answered") -> None:
         """
@@ -140,9 +148,20 @@ class Meeting:
         for answer in self._crew.answers():
             if answer[0] == frames.FAILED:
                 self.fail(self._account.names[answer[1]], answer[2])
+            for loss in answer[frames.LOSSES] if len(answer) > frames.LOSSES else ():
+                self._account.note_loss(frames.Loss(*loss))
+
+    def forget_answers(self) -> None:
+        """Forget what the workers answered: those that are told nothing next have nothing to say."""
+        for worker in self._crew.workers:
+            worker.answer = None if worker.has_ended else [frames.DONE, (), ()]
+
+    def await_told(self, late: str) -> None:
+        """Wait until those have answered that were given an order; see `await_all`."""
+        self.await_all(self._timeouts.tick_s, late)
 
     def wait(
-        self, is_done: Callable[[], bool], limit_s: float, late: Callable[..., EarlyEnd]
+        self, is_done: Callable[[], bool], limit_s: float, late: Callable[..., EarlyEnd | None]
     ) -> None:
         """
         Wait in the loop.
@@ -150,12 +169,14 @@ class Meeting:
         Args:
             is_done: Asked whenever something has happened.
             limit_s: How long; time spent waiting for a processor does not count.
-            late: Called then with the first worker that is awaited (or None) and *limit_s*.
+            late: Called then with the first worker that is awaited (or None) and *limit_s*; where it
+                returns None the wait goes on for as long again.
 
         Raises:
             RunEnds: The time is over, or something else ends the run.
         """
         self._late = (GrantedLimit(limit_s), lambda: late(self._crew.awaited, limit_s))
+        self._limit_s = limit_s
         while self.ending is None and not is_done():
             self.reactor.run()
         self._late = None
@@ -180,10 +201,14 @@ class Meeting:
 
     def messages(self) -> Iterator[tuple[int, int, bytes]]:
         """Yield what the agents sent: whose it is, its class of service, its body."""
-        for worker in self._crew.workers:
-            if worker.answer is not None:
-                self._account.note_values(worker.agents, worker.answer[2])
-                yield from worker.answer[1]
+        sent = []
+        for answer in self._crew.answers():
+            self._account.note_values(answer[2])
+            if not self._crew.are_mixed:
+                yield from answer[1]
+            else:
+                sent += answer[1]
+        yield from sorted(sent, key=itemgetter(0))  # of one agent, as it sent them
 
     def stop_workers(self, reason: str | None) -> tuple[str, ...]:
         """Have all close their records and end; return the agents of which there is no word that they did."""
@@ -196,7 +221,8 @@ class Meeting:
             self.reactor.run()
         self._crew.end_left()
         agents = zip(self._account.names, self._account.agents, strict=True)
-        return tuple(name for name, account in agents if account.state != "stopped")
+        settled = ("stopped", LOST) if self.goes_on else ("stopped",)
+        return tuple(name for name, account in agents if account.state not in settled)
 
     def _is_in_time(self) -> bool:
         return self._late is not None
@@ -207,7 +233,9 @@ class Meeting:
         kind = frame[0]
         if kind == frames.CLOSED:
             account = self._account.agents[frame[1]]
-            account.records, account.state = frame[2], "stopped"
+            account.records = {**account.records, **frame[2]}
+            if account.state != LOST:
+                account.state = "stopped"
             if self._late is not None:
                 self._late = (GrantedLimit(self._timeouts.shutdown_s), self._late[1])
             return
@@ -225,7 +253,8 @@ class Meeting:
         where = f" in the agent's {method}" if method else ""
         reason = f"{self._process(worker)} {how}{where}{self.when()}"
         self._lose(worker, reason)
-        self.end(self._account.names[number], reason)
+        if not self.goes_on:
+            self.end(self._account.names[number], reason)
 
     def _command(self, command: Mapping[str, Any]) -> None:
         if command.get("command") == "stop":
@@ -240,12 +269,16 @@ class Meeting:
         self.operator.emit(self._account.progress(self._clock.t_s, now_s))
         if self._late is not None and self._late[0].is_over():
             late, self._late = self._late[1], None
-            self._note(late())
+            ending = late()
+            if ending is None:
+                self._late = (GrantedLimit(self._limit_s), late)
+            else:
+                self._note(ending)
 
     # Blame ----------------------------------------------------------------------------------------
 
-    def _blame(self, worker: WorkerProcess | None, limit_s: float, late: str) -> EarlyEnd:
-        """Return who of a worker that does not answer is to blame, and end it."""
+    def _blame(self, worker: WorkerProcess | None, limit_s: float, late: str) -> EarlyEnd | None:
+        """Return who of a worker that does not answer is to blame, if the run ends by it, and end the worker."""
         assert worker is not None, "somebody is awaited"
         number, method = worker.at
         what = f"the agent's {method} has not returned" if method else ""
@@ -254,11 +287,14 @@ class Meeting:
         reason = f"{what} within {limit_s:g} s{self.when()}{stopped}; {STACK_HINT}"
         self._crew.tell_stack(worker)
         self._lose(worker, reason)
+        if self.goes_on:
+            return None
         return EarlyEnd(who=self._account.names[number], reason=reason)
 
     def _lose(self, worker: WorkerProcess, reason: str) -> None:
+        worker.answer = None
         for number in worker.agents:
-            self._account.lost[self._account.names[number]] = reason
+            self._account.lose(number, reason, is_kept=self.goes_on)
 
     def _process(self, worker: WorkerProcess) -> str:
         names, agents = self._account.names, worker.agents

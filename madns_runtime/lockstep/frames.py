@@ -26,15 +26,20 @@ FINISH: Final = 4
 """[FINISH]: ask every agent for its summary."""
 STOP: Final = 5
 """[STOP, reason]: close the records and end; the reason of an emergency, or None."""
+RETURN: Final = 6
+"""[RETURN, tick, [[index, incarnation, initial data], ...]]: make lost agents anew; *tick* is the next."""
+FAULT: Final = 7
+"""[FAULT, word, value, [index, ...]]: begin or end a fault of agents, see `lockstep.agent_faults`."""
 
 # Worker to host.
 READY: Final = 11
 """[READY]: the agents' half is loaded."""
 DONE: Final = 12
-"""[DONE, [[index, service, body], ...], [newest values of columns, ...]]: SETUP, TICK or DRAIN is carried out, and
-this was sent; now and then with the values of each of the worker's agents."""
+"""[DONE, [[index, service, body], ...], [[index, newest values of columns], ...], [loss, ...]]: an order is carried
+out, and this was sent; now and then with the values of the worker's agents. Losses, see `Loss`, only if there are."""
 SUMMARIES: Final = 13
-"""[SUMMARIES, [[index, summary, deadlines broken, counts of messages between agents, newest values], ...]]"""
+"""[SUMMARIES, [], [], [loss, ...], [[index, summary, deadlines broken, counts of messages between agents, newest
+values], ...]]"""
 FAILED: Final = 14
 """[FAILED, index, reason]"""
 CLOSED: Final = 15
@@ -56,6 +61,23 @@ class Sent(NamedTuple):
     agent: int
     service: int
     body: bytes
+
+
+class Loss(NamedTuple):
+    """An agent that its worker runs no more, while the others go on."""
+
+    agent: int
+    reason: str
+    records: dict[str, Any]
+    """Counts of its records."""
+    unheard: int
+    """Messages that came for it in the same order and were not handed in."""
+    deadlines_broken: int
+    peer_messages: dict[str, int]
+
+
+LOSSES: Final = 3
+"""Place of the losses in a DONE or SUMMARIES frame, which ends before it if there are none."""
 
 
 def encode_frame(*parts: Any) -> bytes:

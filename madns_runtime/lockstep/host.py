@@ -17,6 +17,7 @@ from time import monotonic
 from madns_runtime.conditions.reports import HostConditions
 from madns_runtime.config import HostLaunch
 from madns_runtime.lockstep import frames
+from madns_runtime.lockstep.absences import Absences
 from madns_runtime.lockstep.barrier import Meeting, RunEnds
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.host_half import LockstepHalf
@@ -109,6 +110,17 @@ class LockstepHost:
             submit=self._guarded.submit,
             wake=self._half.wake,
         )
+        self._absences = Absences(
+            config,
+            account=account,
+            crew=self._crew,
+            meeting=self._meeting,
+            outbox=self._outbox,
+            half=self._guarded,
+            journal=self._journal,
+            clock=clock,
+            log=self._log,
+        )
         self._machine = host_machine()
 
     def run(self) -> int:
@@ -135,9 +147,10 @@ class LockstepHost:
         duration_s, tick_hz = self._config.time.duration_s, self._config.agents.tick_hz
         for number in range(count_ticks(duration_s, tick_hz)):
             self._advance(number / tick_hz)
+            self._absences.bring_back(number, self._settle)
             self._meeting.exchange((frames.TICK, number), self._outbox.boxes)
             self._account.ticks = number + 1
-            self._take_messages()
+            self._settle()
             self._settle_conditions()
         self._advance(duration_s)
         self._drain()
@@ -157,10 +170,11 @@ class LockstepHost:
             initial.append((number, pack(data)))
             meeting.serve()
         self._fire(HostEvent.SETUP_FINISHED)
+        self._absences.begin()
         for worker in self._crew.workers:
             meeting.order(worker, frames.SETUP, [initial[number] for number in worker.agents])
         meeting.await_all(timeouts.agent_setup_s, "has not set itself up")
-        self._take_messages()
+        self._settle()
 
     def _start(self) -> None:
         self._fire(HostEvent.AGENTS_SIMULATION_READY)
@@ -187,7 +201,7 @@ class LockstepHost:
             if not any(self._outbox.boxes):
                 break
             self._meeting.exchange((frames.DRAIN,), self._outbox.boxes)
-            self._take_messages()
+            self._settle()
         self._outbox.give_up()
 
     def _finish(self) -> None:
@@ -198,8 +212,9 @@ class LockstepHost:
             self._meeting.order(worker, frames.FINISH)
         limit_s = max(timeouts.complete_s, timeouts.tick_s)
         self._meeting.await_all(limit_s, "has not summed itself up")
+        self._absences.take()
         for answer in self._crew.answers():
-            for number, summary, deadlines_broken, counts, newest in answer[1]:
+            for number, summary, deadlines_broken, counts, newest in answer[frames.LOSSES + 1]:
                 account.agents[number].summary = summary
                 account.agents[number].deadlines_broken += deadlines_broken
                 account.agents[number].peer_messages = counts
@@ -211,6 +226,11 @@ class LockstepHost:
         return None if self._account.began_s is None else self._clock.t_s
 
     # Messages -------------------------------------------------------------------------------------
+
+    def _settle(self) -> None:
+        """Hand in what the agents sent, and tell of those that were lost."""
+        self._take_messages()
+        self._absences.take()
 
     def _take_messages(self) -> None:
         """Hand what the agents sent to the half, in the order of agents and of sending."""

@@ -134,6 +134,9 @@ class Outbox:
         is_running = self._account.began_s is not None
         check_sending(to, self._index, service, deadline_s, is_running=is_running)
         number, t_s = self._index[to], self._clock.t_s
+        if self._account.agents[number].is_lost:
+            self._account.agents[number].not_sent += 1
+            return
         body = encode(message, service)
         self._allowances[number].take(len(body), t_s)
         account = self._account.agents[number]
@@ -146,10 +149,23 @@ class Outbox:
     def post(self, to: str, message: Delivery | TransmissionRefusal) -> bool:
         """Send an agent what came of messages between agents."""
         number, body = self._index[to], encode_message(message)
+        if self._account.agents[number].is_lost:
+            return False
         self._allowances[number].take(len(body), self._clock.t_s)
         self._account.agents[number].down[int(Service.RELIABLE)] += 1
         self._box_of[number].append((number, body))
         return True
+
+    def lose(self, number: int) -> None:
+        """Count what waits for an agent that is lost, and forget it."""
+        box = self._box_of[number]
+        kept = [entry for entry in box if entry[0] != number]
+        self._account.agents[number].too_late += len(box) - len(kept)
+        box[:] = kept
+
+    def move(self, number: int, worker: int) -> None:
+        """Give what is sent to an agent from now on to another worker."""
+        self._box_of[number] = self.boxes[worker]
 
     def give_up(self) -> None:
         """Count what nobody is to receive any more."""

@@ -51,13 +51,14 @@ class DirectWriter:
             self._files.finish()
 
 
-def open_journal(
+def open_journal(  # noqa: PLR0913 - what a journal is of; two are optional and by name
     directory: Path,
     config: RunConfig,
     *,
     source: str,
     clock: SimulatedClock,
     tap: StreamTap | None = None,
+    life: int = 1,
 ) -> RunJournal:
     """
     Return the journal, with a recorder, of the host or of one agent.
@@ -71,11 +72,12 @@ def open_journal(
         source: host, or the agent's name.
         clock: What events and logged sentences carry the time of.
         tap: Looks at the records; None if nobody does.
+        life: Which incarnation of its source this is.
 
     Raises:
         MachineError: The directory cannot be made, or takes no new file.
     """
-    files = RecordFiles(directory, run=config.scenario, source=source)
+    files = RecordFiles(directory, run=config.scenario, source=source, life=life)
     recorder = Recorder(
         files, config.recording, DirectWriter(files), rows_together=ROWS_TOGETHER, tap=tap
     )

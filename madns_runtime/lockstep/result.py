@@ -6,11 +6,15 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from madns_runtime.faults.intended_losses import IntendedLosses, of_intended
+from madns_runtime.lockstep.frames import Loss
 from madns_runtime.medium.outcomes import between_agents
 from madns_runtime.recording.newest_values import Value, told_columns
 
 SERVICES: Final = ("best", "reliable", "sync")
 """By the number of the class of service."""
+LOST: Final = "lost"
+"""State of an agent that no worker runs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,29 +35,51 @@ class AgentAccount:
     down: list[int] = field(default_factory=lambda: [0] * len(SERVICES))
     too_late: int = 0
     """Of those, sent when nobody was to receive any more."""
+    not_sent: int = 0
+    """Messages of the host's half that had nobody to go to."""
     deadlines_broken: int = 0
     peer_messages: Mapping[str, int] = field(default_factory=dict)
     """Its counts of messages between agents."""
+    peer_messages_before: dict[str, int] = field(default_factory=dict)
+    """The same of incarnations that were lost."""
     columns: list[Value] | None = None
     """The newest values of its columns; None before any were told."""
     state: str = "starting"
     """stopped once there is word that its records are closed."""
+    reason: str | None = None
+    """Why it was lost, the last time; None if it never was."""
+    incarnations: int = 1
+    ticks_away: int = 0
+    """Ticks of earlier absences."""
+    lost_at_tick: int | None = None
+    """Tick that an agent that is away did not take any more."""
     summary: Mapping[str, Any] = field(default_factory=dict)
     records: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether no worker runs it."""
+        return self.state == LOST
+
+    def ticks_of(self, ticks: int) -> int:
+        """Return how many of the run's *ticks* it was there for; none of them is ever missed."""
+        away = 0 if self.lost_at_tick is None else ticks - self.lost_at_tick
+        return ticks - self.ticks_away - away
 
     def to_mapping(self, ticks: int, reason: str | None) -> dict[str, Any]:
         """
         Return the agent's part of the result.
 
         Args:
-            ticks: How many it has run; none is ever missed.
-            reason: Why it was lost, if it was.
+            ticks: How many the run has taken.
+            reason: Why it was lost, if the run ended by it.
         """
+        own = self.ticks_of(ticks)
         return {
-            "state": self.state if reason is None else "lost",
-            "reason": reason,
-            "incarnations": 1,
-            "ticks": {"due": ticks, "run": ticks, "missed": 0, "not_run": 0, "overrun_errors": 0},
+            "state": self.state if reason is None else LOST,
+            "reason": reason or self.reason,
+            "incarnations": self.incarnations,
+            "ticks": {"due": own, "run": own, "missed": 0, "not_run": 0, "overrun_errors": 0},
             "rtf": None,
             "clock": None,
             "messages": self.messages(),
@@ -70,6 +96,7 @@ class AgentAccount:
             messages[service] = {"sent": count, "received": count, "lost": 0, "resent": 0}
         messages["sync"]["deadlines_broken"] = self.deadlines_broken
         messages["too_late"] = self.too_late
+        messages["not_sent"] = self.not_sent
         return messages
 
 
@@ -86,6 +113,10 @@ class RunAccount:
     ticks: int = 0
     """Run by every agent."""
     lost: dict[str, str] = field(default_factory=dict)
+    """Agents that were lost, and are judged by it."""
+    just_lost: list[int] = field(default_factory=list)
+    """Agents whose loss the host's half has not heard of."""
+    intended: IntendedLosses = field(default_factory=IntendedLosses)
     not_stopped: tuple[str, ...] = ()
     ending: EarlyEnd | None = None
     t0_utc: str | None = None
@@ -105,12 +136,48 @@ class RunAccount:
     def set_states(self, state: str) -> None:
         """Note how far all agents are."""
         for agent in self.agents:
-            agent.state = state
+            if not agent.is_lost:
+                agent.state = state
 
-    def note_values(self, agents: Iterable[int], newest: Iterable[list[Value]]) -> None:
-        """Keep the newest values of columns that a worker told of its *agents*, if it did."""
-        for number, values in zip(agents, newest, strict=False):
+    def note_values(self, newest: Iterable[tuple[int, list[Value]]]) -> None:
+        """Keep the newest values of columns that a worker told of its agents, by index, if it did."""
+        for number, values in newest:
             self.agents[number].columns = values
+
+    def lose(self, number: int, reason: str, *, is_kept: bool) -> None:
+        """
+        Note that no worker runs an agent any more.
+
+        Args:
+            number: The agent's.
+            reason: Why, in words.
+            is_kept: Whether the run goes on.
+        """
+        agent = self.agents[number]
+        if not is_kept:
+            self.lost[self.names[number]] = reason
+        elif not agent.is_lost:
+            agent.state, agent.reason, agent.lost_at_tick = LOST, reason, self.ticks
+            self.just_lost.append(number)
+
+    def note_loss(self, loss: Loss) -> None:
+        """Note what a worker told of an agent that it lost."""
+        agent = self.agents[loss.agent]
+        agent.records = loss.records
+        agent.deadlines_broken += loss.deadlines_broken
+        agent.too_late += loss.unheard
+        for name, count in loss.peer_messages.items():
+            agent.peer_messages_before[name] = agent.peer_messages_before.get(name, 0) + count
+        self.lose(loss.agent, loss.reason, is_kept=True)
+
+    def take_back(self, number: int) -> int:
+        """Note that an agent is to be made anew, and return the number of its incarnation."""
+        agent = self.agents[number]
+        agent.incarnations += 1
+        if agent.lost_at_tick is not None:
+            agent.ticks_away += self.ticks - agent.lost_at_tick
+        agent.state, agent.lost_at_tick = "running", None
+        return agent.incarnations
 
     def progress(self, t_s: float, now_s: float) -> dict[str, Any]:
         """Return the progress event at simulated time *t_s* and *now_s* of the monotonic clock."""
@@ -132,8 +199,8 @@ class RunAccount:
             "t_s": None if self.began_s is None else round(t_s, 3),
             "rtf": None if speed is None else round(speed, 3),
             **counts,
-            "lost": len(self.lost),
-            "ticks": self.ticks * len(self.names),
+            "lost": max(len(self.lost), sum(agent.is_lost for agent in self.agents)),
+            "ticks": sum(agent.ticks_of(self.ticks) for agent in self.agents),
             **told_columns(self.columns, told),
         }
 
@@ -152,15 +219,24 @@ class RunAccount:
             "rtf": round(self.duration_s / wall_s, 3) if wall_s else None,
             "workers": self.workers,
             "agents": {
-                name: agent.to_mapping(self.ticks, self.lost.get(name))
+                name: {
+                    **agent.to_mapping(self.ticks, None if agent.reason else self.lost.get(name)),
+                    **of_intended(self.intended, name),
+                }
                 for name, agent in by_name.items()
             },
-            "lost": sorted(self.lost),
+            "lost": sorted({*self.lost, *self.intended.overdue(self.duration_s, 0.0)}),
+            "lost_on_purpose": self.intended.names(),
             "not_stopped": list(self.not_stopped),
             "network": {},
             "messages": self._totals(),
             "between_agents": between_agents(
-                self.peer_messages, (agent.peer_messages for agent in self.agents)
+                self.peer_messages,
+                (
+                    counts
+                    for agent in self.agents
+                    for counts in (agent.peer_messages, agent.peer_messages_before)
+                ),
             ),
             "refused": {},
             "records": dict(self.records),

@@ -13,7 +13,7 @@ import signal
 import socket
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,11 +22,14 @@ from typing import Any, NoReturn
 
 from madns_runtime.config import DeviceLaunch, RunConfig
 from madns_runtime.errors import MadnsError
+from madns_runtime.faults.step_faults import StepFaults
+from madns_runtime.faults.words import KILL
 from madns_runtime.lockstep import frames
 from madns_runtime.lockstep.agent import Crewmates, LockstepAgent
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.frames import POSITIONS, FrameReader, encode_frame
 from madns_runtime.lockstep.messages import decode
+from madns_runtime.lockstep.worker_losses import WorkerLosses
 from madns_runtime.plugin.api import Tick
 from madns_runtime.plugin.context import clean_text
 from madns_runtime.plugin.half import HalfFailed, RoleProgram
@@ -43,6 +46,7 @@ HANG_GRACE_S = 2.0
 """Beyond the time for shutdown: a worker that hangs in a plug-in ends by force when its host is gone."""
 STACK_SIGNAL = signal.SIGUSR1
 """Makes a worker write where it is to standard error."""
+TERMINATED = "its process was ended by SIGTERM"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,6 +74,10 @@ class AgentFailed(Exception):
 
 class _Terminated(BaseException):
     """SIGTERM came while nothing was under way."""
+
+
+class _Ends(Exception):
+    """The process ends, and the run goes on without its agents."""
 
 
 class _HostGone(Exception):
@@ -115,6 +123,10 @@ class Worker:
         self._period_s = 1.0 / config.agents.tick_hz
         self._tick_hz = config.agents.tick_hz
         self._agents: list[LockstepAgent] = []
+        self._losses = WorkerLosses()
+        self._goes_on = False
+        """Whether the run goes on without an agent that fails now."""
+        self._faults: dict[int, StepFaults] = {}
         self._mates: Crewmates
         self._flush_interval_s = config.recording.flush_interval_s
         self._flushed_s = monotonic()
@@ -125,6 +137,8 @@ class Worker:
             frames.TICK: self._tick,
             frames.DRAIN: self._drain,
             frames.FINISH: self._finish,
+            frames.RETURN: self._return,
+            frames.FAULT: self._fault,
         }
 
     def run(self) -> int:
@@ -135,6 +149,9 @@ class Worker:
             while (order := self._next_order())[0] != frames.STOP:
                 self._answer(partial(self._orders[order[0]], *order[1:]))
             self._close_all(order[1], is_told=True)
+        except _Ends:
+            self._close_all(TERMINATED, is_told=False)
+            return 1
         except _HostGone:
             self._close_all("its host is gone", is_told=False)
             return 1
@@ -179,8 +196,10 @@ class Worker:
             raise _Terminated
 
     def _check_terminated(self) -> None:
+        if self._is_terminated and self._goes_on:
+            raise _Ends
         if self._is_terminated:
-            raise AgentFailed(self._assignment.agents[0], "its process was ended by SIGTERM")
+            raise AgentFailed(self._assignment.agents[0], TERMINATED)
 
     # Orders -----------------------------------------------------------------------------------------
 
@@ -202,13 +221,21 @@ class Worker:
         return encode_frame(frames.READY)
 
     def _set_up(self, initial: list[tuple[int, bytes]]) -> bytes:
-        for agent, (index, packed) in zip(self._agents, initial, strict=True):
-            self._position[0] = index * POSITIONS + frames.SETTING_UP
-            agent.journal.event("start")
-            self._ask_devices(agent, agent.devices.open)
-            self._call(agent, "setup", agent.context, unpack(packed))
+        self._goes_on = self._assignment.config.on_agent_loss == "continue"
+        for agent, (_, packed) in zip(self._agents, initial, strict=True):
+            self._set_up_one(agent, packed)
         freeze_garbage()  # what set-up made stays: no collection walks it in mid-run
         return self._done()
+
+    def _set_up_one(self, agent: LockstepAgent, packed: bytes, *, has_devices: bool = False) -> None:
+        self._position[0] = agent.index * POSITIONS + frames.SETTING_UP
+        agent.journal.event("start")
+        try:
+            if not has_devices:
+                self._ask_devices(agent, agent.devices.open)
+            self._call(agent, "setup", agent.context, unpack(packed))
+        except AgentFailed as failure:
+            self._lose(agent, failure)
 
     def _tick(self, number: int, messages: list[tuple[int, bytes]]) -> bytes:
         if number == 0:
@@ -218,10 +245,20 @@ class Worker:
         if messages:
             self._hand_out(messages)
         tick = Tick(number, t_s, self._period_s, 0.0, 0, t_s)
-        position, has_medium = self._position, self._mates.program.has_medium
-        agent = self._agents[0]
+        agents = iter(self._agents if not self._faults else self._unhindered(number))
+        while not self._step_all(agents, tick):
+            pass  # one of them is lost; the next have their turn
+        if monotonic() - self._flushed_s <= self._flush_interval_s:
+            return self._done()
+        self._flush()
+        return self._done([(agent.index, agent.columns.read()) for agent in self._agents])
+
+    def _step_all(self, agents: Iterator[LockstepAgent], tick: Tick) -> bool:
+        """Step one agent after the other; return False after one that is lost by it."""
+        t_s, position, has_medium = tick.t_s, self._position, self._mates.program.has_medium
+        agent = None
         try:
-            for agent in self._agents:
+            for agent in agents:
                 if has_medium and (heard := agent.mailbox.due(t_s)):
                     self._hear(agent, heard)
                 if agent.has_devices:
@@ -230,14 +267,26 @@ class Worker:
                 agent.step(tick)
                 if agent.look is not None:
                     agent.look(t_s)
-        except AgentFailed:
-            raise
+        except AgentFailed as failure:
+            assert agent is not None
+            self._lose(agent, failure)
+            return False
         except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
-            raise AgentFailed(agent.index, str(agent.half.failure("step", error))) from error
-        if monotonic() - self._flushed_s <= self._flush_interval_s:
-            return self._done()
-        self._flush()
-        return self._done([agent.columns.read() for agent in self._agents])
+            assert agent is not None
+            failed = AgentFailed(agent.index, str(agent.half.failure("step", error)))
+            failed.__cause__ = error
+            self._lose(agent, failed)
+            return False
+        return True
+
+    def _unhindered(self, number: int) -> list[LockstepAgent]:
+        """Return whom no fault keeps from the step of tick *number*."""
+        faults = self._faults
+        return [
+            agent
+            for agent in self._agents
+            if agent.index not in faults or not faults[agent.index].withholds(number)
+        ]
 
     def _hear(self, agent: LockstepAgent, heard: Sequence[Delivery]) -> None:
         for delivery in heard:
@@ -267,29 +316,90 @@ class Worker:
         summaries = []
         for agent in self._agents:
             self._position[0] = agent.index * POSITIONS + frames.FINISHING
-            summary = self._call(agent, "finish")
+            try:
+                summary = self._call(agent, "finish")
+            except AgentFailed as failure:
+                self._lose(agent, failure)
+                continue
             counts = agent.mailbox.counts()
             newest = agent.columns.read()
             summaries.append((agent.index, summary, agent.deadlines_broken, counts, newest))
-        return encode_frame(frames.SUMMARIES, summaries)
+        return encode_frame(frames.SUMMARIES, (), (), self._losses.take(), summaries)
 
-    def _done(self, newest: Sequence[list[Value]] = ()) -> bytes:
+    def _done(self, newest: Sequence[tuple[int, list[Value]]] = ()) -> bytes:
         outbox = self._mates.outbox
-        answer = encode_frame(frames.DONE, outbox, newest)
+        if self._losses:
+            answer = encode_frame(frames.DONE, outbox, newest, self._losses.take())
+        else:
+            answer = encode_frame(frames.DONE, outbox, newest)
         outbox.clear()
         return answer
 
     def _hand_out(self, messages: list[tuple[int, bytes]]) -> None:
-        first = self._assignment.agents[0]
+        agents = {agent.index: agent for agent in self._agents}
         for index, body in messages:
-            agent, message = self._agents[index - first], decode(body)
+            agent, message = agents[index], decode(body)
+            if self._losses and self._losses.unheard(index):
+                continue
             if isinstance(message, Delivery):
                 agent.mailbox.add(message)
                 continue
             is_refusal = isinstance(message, TransmissionRefusal)
             doing = frames.REFUSED if is_refusal else frames.RECEIVING
             self._position[0] = index * POSITIONS + doing
-            self._call(agent, frames.METHODS[doing], message)
+            try:
+                self._call(agent, frames.METHODS[doing], message)
+            except AgentFailed as failure:
+                self._lose(agent, failure)
+
+    # Losses and faults -------------------------------------------------------------------------------
+
+    def _lose(self, agent: LockstepAgent, failure: AgentFailed) -> None:
+        """
+        Run an agent no more, and close its records.
+
+        Raises:
+            AgentFailed: The run does not go on without it.
+        """
+        if not self._goes_on:
+            raise failure
+        self._position[0] = agent.index * POSITIONS + frames.CLOSING
+        self._agents = [other for other in self._agents if other is not agent]
+        self._faults.pop(agent.index, None)
+        self._losses.add(agent, clean_text(failure.reason))
+
+    def _return(self, number: int, returning: list[tuple[int, int, bytes]]) -> bytes:
+        """Make lost agents anew, and set them up, before tick *number*."""
+        self._clock.t_s = number / self._tick_hz
+        for index, life, packed in returning:
+            self._position[0] = index * POSITIONS + frames.LOADING
+            devices = self._losses.devices_of(index)
+            try:
+                agent = LockstepAgent(index, self._mates, life=life, devices=devices)
+            except MadnsError as error:
+                raise AgentFailed(index, str(error)) from error
+            agent.is_running = True
+            self._agents = sorted((*self._agents, agent), key=lambda each: each.index)
+            self._set_up_one(agent, packed, has_devices=devices is not None)
+        return self._done()
+
+    def _fault(self, word: str, begins: bool, value: Any, indices: list[int]) -> bytes:
+        """Begin or end a fault of agents: of their steps, or their loss, whose reason is *value*."""
+        for agent in [each for each in self._agents if each.index in indices]:
+            if word == KILL:
+                agent.journal.event("killed", reason=value)
+                self._lose(agent, AgentFailed(agent.index, value))
+                continue
+            faults = self._faults.setdefault(agent.index, StepFaults())
+            if begins:
+                faults.begin(word, value)
+            else:
+                faults.end(word, value)
+            told = {} if begins else {"ticks_withheld": faults.withheld}
+            agent.journal.event(f"{word}_{'begins' if begins else 'ends'}", factor=value, **told)
+            if not faults.are_in_force:
+                del self._faults[agent.index]
+        return self._done()
 
     # Faults and records ------------------------------------------------------------------------------
 
@@ -318,5 +428,10 @@ class Worker:
                 counts["devices"] = agent.devices.close()
             if is_told:
                 self._say(encode_frame(frames.CLOSED, agent.index, counts))
-        for index in self._assignment.agents[len(self._agents) :] if is_told else ():
-            self._say(encode_frame(frames.CLOSED, index, {}))  # it never opened any
+        for index, counts in self._losses.close_devices().items():
+            if is_told:
+                self._say(encode_frame(frames.CLOSED, index, {"devices": counts}))
+        known = {agent.index for agent in self._agents}
+        for index in self._assignment.agents if is_told and not self._goes_on else ():
+            if index not in known:
+                self._say(encode_frame(frames.CLOSED, index, {}))  # it never opened any

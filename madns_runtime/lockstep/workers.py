@@ -38,7 +38,8 @@ SOCKET_BUFFER_BYTES = 4 * 1024 * 1024
 class WorkerProcess:
     """One worker."""
 
-    agents: range
+    agents: list[int]
+    """Those it runs, and lost ones that would return to it, by index, in order."""
     pid: int
     line: socket.socket
     position: memoryview
@@ -69,6 +70,8 @@ class Workers:
         self.workers: list[WorkerProcess] = []
         self._by_agent: list[WorkerProcess] = []
         self._reactor: Reactor | None = None
+        self.are_mixed = False
+        """Whether a worker has agents of another's share: theirs are no neighbours then."""
         for share in shares:
             worker = _fork(launch, directory, share)
             self.workers.append(worker)
@@ -121,6 +124,28 @@ class Workers:
     def have_all_ended(self) -> bool:
         """Whether no worker is left."""
         return all(worker.has_ended for worker in self.workers)
+
+    def worker_for(self, agent: int) -> WorkerProcess | None:
+        """Return the worker of an agent that returns: its own, or if that has ended one that lives; None: none does."""
+        before = self._by_agent[agent]
+        living = [worker for worker in self.workers if not worker.has_ended]
+        if before in living or not living:
+            return before if living else None
+        after = min(living, key=lambda worker: len(worker.agents))
+        before.agents.remove(agent)
+        after.agents = sorted((*after.agents, agent))
+        self._by_agent[agent] = after
+        self.are_mixed = True
+        return after
+
+    @property
+    def are_living(self) -> bool:
+        """Whether a worker is left."""
+        return not self.have_all_ended
+
+    def number_of(self, worker: WorkerProcess) -> int:
+        """Return a worker's place among all."""
+        return self.workers.index(worker)
 
     @property
     def awaited(self) -> WorkerProcess | None:
@@ -216,7 +241,7 @@ def _fork(launch: HostLaunch, directory: Path, share: range) -> WorkerProcess:
         )
         run_worker(assignment, there)
     there.close()
-    return WorkerProcess(agents=share, pid=pid, line=here, position=position)
+    return WorkerProcess(agents=list(share), pid=pid, line=here, position=position)
 
 
 def _await_exit(pid: int) -> int | None:

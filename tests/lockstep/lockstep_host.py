@@ -39,14 +39,19 @@ class HostRun:
         fault: str = "",
         timeouts: Timeouts | None = None,
         executor: str = "thread",
+        restarts_max: int | None = None,
     ) -> None:
+        """With *restarts_max* the run goes on without an agent that is lost."""
         self.folder = folder
         config = RunConfig(
             run=run,
             scenario="lockstep",
             simulation="./lockstep_simulation.py:simulation",
             base_directory=str(HERE),
-            agents=Agents(count=6, tick_hz=10.0, per_process=per_process),
+            agents=Agents(
+                count=6, tick_hz=10.0, per_process=per_process, restarts_max=restarts_max or 0
+            ),
+            on_agent_loss="abort" if restarts_max is None else "continue",
             time=TimeSettings(mode="lockstep", duration_s=1.0),
             timeouts=timeouts or Timeouts(shutdown_s=5.0),
             seed=seed,

@@ -118,6 +118,12 @@ class Host(HostSimulation):
     def result(self, job, value):
         self.note("job", [job, value])
 
+    def agent_lost(self, agent, reason):
+        self.note("lost", [agent, reason])
+
+    def agent_rejoined(self, agent):
+        self.note("rejoined", agent)
+
     def finish(self):
         self.context.submit(square, 12)  # too late: nothing is called any more
         return {"draws": self.context.random.random()}

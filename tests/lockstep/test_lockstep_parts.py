@@ -151,8 +151,8 @@ def test_the_account_tells_speed_and_result():
 def test_the_account_tells_newest_values_of_those_whose_worker_has_told_them():
     account = RunAccount(("a", "b"), duration_s=100.0, workers=1, columns=("drive.speed_m_s",))
 
-    account.note_values(range(1, 2), [[2.5]])
-    account.note_values(range(1, 2), [])
+    account.note_values([(1, [2.5])])
+    account.note_values([])
 
     progress = account.progress(1.0, 7.0)
     assert (progress["columns"], progress["values"]) == (["drive.speed_m_s"], {"b": [2.5]})

@@ -150,14 +150,12 @@ def test_what_cannot_be_done_in_lockstep_is_refused_with_what_to_do(cosmos, tmp_
         "an inventory": cosmos("run", scenario, *LOCKSTEP, "-i", inventory),
         "a plan for it": cosmos("plan", scenario, *LOCKSTEP, "-i", inventory),
         "by hand": cosmos("run", scenario, *LOCKSTEP, "--manual", "agent-01"),
-        "losses": cosmos("validate", scenario, *LOCKSTEP, "--set", "on_agent_loss=continue"),
     }
 
-    assert [done.returncode for done in refused.values()] == [2, 2, 2, 2]
+    assert [done.returncode for done in refused.values()] == [2, 2, 2]
     for name in ("an inventory", "a plan for it"):
         assert "lockstep runs on this computer alone" in refused[name].stderr
     assert "--set time.mode=realtime" in refused["by hand"].stderr
-    assert "on_agent_loss: expected abort with time.mode: lockstep" in refused["losses"].stderr
     assert not cosmos.runs.exists()
 
 

@@ -1,0 +1,103 @@
+"""Losses of agents that faults cause on purpose: ordered, come true, and gone back on. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+RETURN_S_MAX: Final = 5.0
+"""Time that a return may take beyond its moment, s of simulated time: a process starts and sets itself up."""
+
+
+@dataclass(slots=True)
+class _Absence:
+    """The newest ordered loss of one agent."""
+
+    why: str
+    returns_s: float | None
+    """Simulated time of its return, s; None for never."""
+    is_awaited: bool = True
+    """Whether the loss has still to come true."""
+    is_away: bool = True
+    incarnations: list[int] = field(default_factory=list)
+    """Those that were ended on purpose, from 1, of all absences."""
+
+
+class IntendedLosses:
+    """The losses that were ordered in one run."""
+
+    def __init__(self) -> None:
+        self._absences: dict[str, _Absence] = {}
+
+    def order(self, agent: str, why: str, *, returns_s: float | None) -> None:
+        """
+        Note that an agent is to be lost now.
+
+        Args:
+            agent: Its name.
+            why: In words, for people.
+            returns_s: Simulated time of its return, s; None for never.
+        """
+        before = self._absences.get(agent)
+        kept = before.incarnations if before else []
+        self._absences[agent] = _Absence(why, returns_s, incarnations=kept)
+
+    def take(self, agent: str, incarnation: int) -> str | None:
+        """
+        Note that an agent is lost.
+
+        Args:
+            agent: Its name.
+            incarnation: Which of its starts has ended, from 1.
+
+        Returns:
+            Why, if this loss was ordered; None if it was not, and is to be judged.
+        """
+        absence = self._absences.get(agent)
+        if absence is None or not absence.is_awaited:
+            return None
+        absence.is_awaited = False
+        absence.incarnations.append(incarnation)
+        return absence.why
+
+    def returned(self, agent: str) -> None:
+        """Note that an agent is back."""
+        if (absence := self._absences.get(agent)) is not None:
+            absence.is_away = absence.is_awaited = False
+
+    def returns_s(self, agent: str) -> float | None:
+        """Return the simulated time at which a lost agent is to return, s; None if it is not."""
+        absence = self._absences.get(agent)
+        return absence.returns_s if absence is not None and absence.is_away else None
+
+    def are_expected(self, before_s: float) -> bool:
+        """Tell whether an agent is still to return before a simulated time, s."""
+        return any(
+            absence.is_away and absence.returns_s is not None and absence.returns_s < before_s
+            for absence in self._absences.values()
+        )
+
+    def overdue(self, t_s: float, patience_s: float = RETURN_S_MAX) -> dict[str, str]:
+        """Return the agents that should have been back by *t_s*, s of simulated time, with the reason in words."""
+        return {
+            agent: f"{absence.why}; it was to return at t = {absence.returns_s:g} s and did not"
+            for agent, absence in self._absences.items()
+            if absence.is_away
+            and absence.returns_s is not None
+            and absence.returns_s + patience_s < t_s
+        }
+
+    def names(self) -> list[str]:
+        """Return the agents that were lost on purpose, also those that came back, sorted."""
+        return sorted(agent for agent, each in self._absences.items() if each.incarnations)
+
+    def incarnations(self, agent: str) -> list[int]:
+        """Return which of an agent's starts were ended on purpose, from 1."""
+        absence = self._absences.get(agent)
+        return list(absence.incarnations) if absence is not None else []
+
+
+def of_intended(losses: IntendedLosses, agent: str) -> dict[str, Any]:
+    """Return what an agent's part of a result tells of its ordered losses: nothing without one."""
+    ended = losses.incarnations(agent)
+    return {"ended_on_purpose": ended} if ended else {}

@@ -1,0 +1,148 @@
+"""The kinds of faults: the words of a timeline for them, and their parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Final, Literal
+
+from annotated_types import Gt, Le
+
+from madns_runtime.timeline.action import ActionKind
+
+KILL: Final = "kill"
+RESTART: Final = "restart"
+HANG: Final = "hang"
+SLOW: Final = "slow"
+LOSE: Final = "lose_messages"
+DELAY: Final = "delay_messages"
+REORDER: Final = "reorder_messages"
+DUPLICATE: Final = "duplicate_messages"
+LINK_DOWN: Final = "link_down"
+PARTITION: Final = "partition"
+
+LOSSES: Final = (KILL, RESTART)
+STEP_FAULTS: Final = (HANG, SLOW)
+MESSAGE_FAULTS: Final = (LOSE, DELAY, REORDER, DUPLICATE, LINK_DOWN, PARTITION)
+
+Traffic = Literal["all", "with_host", "between_agents"]
+Probability = Annotated[float, Gt(0.0), Le(1.0)]
+DELAY_S_MAX: Final = 3600.0
+Delay = Annotated[float, Gt(0.0), Le(DELAY_S_MAX)]
+_FORBID: Final[dict[str, Any]] = {"extra": "forbid"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlowSteps:
+    """Parameters of slow."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
+
+    factor: Annotated[float, Gt(1.0), Le(1000.0)]
+    """How many times as long a step takes; in lockstep, where steps take no time, a step is taken in one of so many ticks."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LostMessages:
+    """Parameters of lose_messages."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
+
+    probability: Probability = 1.0
+    traffic: Traffic = "all"
+    """Which messages: those with the host's half, those between agents, or all."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DelayedMessages:
+    """Parameters of delay_messages."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
+
+    delay_s: Delay
+    jitter_s: Annotated[float, Le(DELAY_S_MAX)] = 0.0
+    """Up to so much is added, by chance; less than 0 adds nothing."""
+    traffic: Traffic = "all"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReorderedMessages:
+    """Parameters of reorder_messages."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
+
+    probability: Probability = 0.5
+    within_s: Delay = 1.0
+    """A message that is chosen is late by up to this, by chance, so that later ones overtake it."""
+    traffic: Traffic = "all"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DuplicatedMessages:
+    """Parameters of duplicate_messages."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
+
+    probability: Probability = 1.0
+    traffic: Traffic = "all"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DownLink:
+    """Parameters of link_down."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
+
+    traffic: Traffic = "all"
+
+
+FAULT_KINDS: Final[tuple[ActionKind, ...]] = (
+    ActionKind(
+        word=KILL,
+        summary="Ends the agents without a word; with for_s they return after it.",
+        lasting="may",
+    ),
+    ActionKind(word=RESTART, summary="Ends the agents without a word, and starts them anew."),
+    ActionKind(word=HANG, summary="Withholds the agents' steps.", lasting="may"),
+    ActionKind(
+        word=SLOW,
+        summary="Makes the agents' steps take longer by a factor.",
+        parameters=SlowSteps,
+        lasting="may",
+    ),
+    ActionKind(
+        word=LOSE,
+        summary="Loses messages of the agents by chance.",
+        parameters=LostMessages,
+        lasting="may",
+    ),
+    ActionKind(
+        word=DELAY,
+        summary="Delivers messages of the agents later.",
+        parameters=DelayedMessages,
+        lasting="may",
+    ),
+    ActionKind(
+        word=REORDER,
+        summary="Lets messages of the agents overtake each other.",
+        parameters=ReorderedMessages,
+        lasting="may",
+    ),
+    ActionKind(
+        word=DUPLICATE,
+        summary="Delivers messages of the agents twice.",
+        parameters=DuplicatedMessages,
+        lasting="may",
+    ),
+    ActionKind(
+        word=LINK_DOWN,
+        summary="Cuts the agents off from the host's half and from each other.",
+        parameters=DownLink,
+        lasting="may",
+    ),
+    ActionKind(
+        word=PARTITION,
+        summary="Parts the agents from all others: neither side hears the other.",
+        lasting="may",
+    ),
+)
+"""Every fault of agents and of their messages, by which `timeline:` and `cosmos inject` know it."""

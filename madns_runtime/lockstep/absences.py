@@ -1,0 +1,181 @@
+"""Agents that a lockstep run goes on without: whose loss is told, and who returns when."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterable
+from typing import Any, Final
+
+from madns_runtime.config import RunConfig
+from madns_runtime.lockstep import frames
+from madns_runtime.lockstep.barrier import Meeting
+from madns_runtime.lockstep.clock import SimulatedClock
+from madns_runtime.lockstep.host_half import LockstepHalf
+from madns_runtime.lockstep.messages import Outbox
+from madns_runtime.lockstep.result import RunAccount
+from madns_runtime.lockstep.workers import Workers
+from madns_runtime.plugin.api import HOST
+from madns_runtime.protocol.codec import pack
+from madns_runtime.recording.run_journal import RunJournal
+
+RESTART_DELAY_S: Final = 0.2
+"""From the loss of an agent that agents.restarts_max gives another start to its return, s of simulated time."""
+TIME_EPSILON_S: Final = 1e-9
+
+
+class Absences:
+    """
+    The agents that are away.
+
+    Args:
+        config: The run.
+        account: Where losses are counted.
+        crew: The workers.
+        meeting: Where they are told and awaited.
+        outbox: The host's messages.
+        half: The simulation's, which hears of losses and returns.
+        journal: The host's.
+        clock: Simulated time.
+        log: Takes level and text.
+    """
+
+    def __init__(  # noqa: PLR0913 - the collaborators of a seam, all by name
+        self,
+        config: RunConfig,
+        *,
+        account: RunAccount,
+        crew: Workers,
+        meeting: Meeting,
+        outbox: Outbox,
+        half: LockstepHalf,
+        journal: RunJournal,
+        clock: SimulatedClock,
+        log: Callable[[str, str], None],
+    ) -> None:
+        self._restarts_max = config.agents.restarts_max
+        self._tick_hz = config.agents.tick_hz
+        self._duration_s = config.time.duration_s
+        self._goes_on = config.on_agent_loss == "continue"
+        self._account = account
+        self._crew = crew
+        self._meeting = meeting
+        self._outbox = outbox
+        self._half = half
+        self._journal = journal
+        self._clock = clock
+        self._log = log
+        self._returns: list[tuple[float, int]] = []
+        """Simulated time, s, and agent, by index: a heap."""
+
+    def begin(self) -> None:
+        """Go on without who is lost from now on, if the run is to."""
+        self._meeting.goes_on = self._goes_on
+
+    # Losses ---------------------------------------------------------------------------------------
+
+    def take(self) -> None:
+        """
+        Tell of all that were lost in what the workers were told last, in the order of agents.
+
+        Raises:
+            RunEnds: Nobody is left, or the half raised.
+        """
+        account = self._account
+        if account.just_lost:
+            lost, account.just_lost = sorted(account.just_lost), []
+            for number in lost:
+                self._lost(number)
+            self._end_without_agents()
+
+    def _lost(self, number: int) -> None:
+        name, agent = self._account.names[number], self._account.agents[number]
+        reason, intended = agent.reason or "", self._account.intended
+        self._outbox.lose(number)
+        told = {"agent": name, "state": "lost", "incarnation": agent.incarnations}
+        if intended.take(name, agent.incarnations) is not None:
+            returns_s = intended.returns_s(name)
+            if returns_s is not None:
+                heapq.heappush(self._returns, (returns_s, number))
+            self._journal.event("agent", **told, reason=reason, is_intended=True)
+            self._log("warning", f"{name} is lost on purpose: {reason}")
+        else:
+            self._account.lost[name] = reason
+            if agent.incarnations <= self._restarts_max:
+                returns_s = self._clock.t_s + RESTART_DELAY_S
+                heapq.heappush(self._returns, (returns_s, number))
+            self._journal.event("agent", **told, reason=reason)
+            self._log("error", f"{name} is lost: {reason}")
+        self._half.call("agent_lost", name, reason)
+
+    def _end_without_agents(self) -> None:
+        """End a run of which no agent is left, nor returns before it is over."""
+        agents = self._account.agents
+        is_waiting = any(due_s < self._duration_s for due_s, _ in self._returns)
+        if all(agent.is_lost for agent in agents) and not (is_waiting and self._crew.are_living):
+            names = self._account.names
+            reasons = dict.fromkeys(agent.reason or "" for agent in agents)
+            self._meeting.fail(", ".join(names), "; ".join(reasons))
+
+    # Returns --------------------------------------------------------------------------------------
+
+    def bring_back(self, number: int, settle: Callable[[], None]) -> None:
+        """
+        Give the agents whose time has come another start, before tick *number*.
+
+        Args:
+            number: Of the tick.
+            settle: Hands in what the agents send in their set-up, and tells of those lost in it.
+
+        Raises:
+            RunEnds: The half raised, or a worker hangs.
+        """
+        returns, t_s = self._returns, number / self._tick_hz
+        due: list[int] = []
+        while returns and returns[0][0] <= t_s + TIME_EPSILON_S:
+            due.append(heapq.heappop(returns)[1])
+        returning = [index for index in sorted(set(due)) if self._account.agents[index].is_lost]
+        if returning and self._crew.are_living:
+            self._start_anew(number, returning, settle)
+
+    def _start_anew(self, number: int, returning: list[int], settle: Callable[[], None]) -> None:
+        account, orders = self._account, dict[int, list[tuple[int, int, bytes]]]()
+        for index in returning:
+            worker = self._crew.worker_for(index)
+            assert worker is not None, "one lives"
+            place = self._crew.number_of(worker)
+            self._outbox.move(index, place)
+            data = pack(self._half.call("initial_data", account.names[index]))
+            orders.setdefault(place, []).append((index, account.take_back(index), data))
+        self._meeting.forget_answers()
+        for place in sorted(orders):
+            worker = self._crew.workers[place]
+            self._meeting.order(worker, frames.RETURN, number, orders[place])
+        self._meeting.await_told("has not set up the agents that return")
+        settle()
+        for index in returning:
+            if not account.agents[index].is_lost:
+                self._returned(account.names[index])
+
+    def _returned(self, name: str) -> None:
+        self._account.intended.returned(name)
+        self._log("info", f"{name} has rejoined at t = {self._clock.t_s:.2f} s")
+        self._journal.event("agent_rejoined", agent=name)
+        self._half.call("agent_rejoined", name)
+
+    # Faults ---------------------------------------------------------------------------------------
+
+    def order(self, word: str, value: Any, agents: Iterable[str], *, begins: bool) -> None:
+        """
+        Have the workers begin or end a fault of agents; see `frames.FAULT`.
+
+        Raises:
+            RunEnds: A worker hangs.
+        """
+        wanted = set(agents)
+        indices = [i for i, name in enumerate(self._account.names) if name in wanted]
+        self._meeting.forget_answers()
+        for worker in self._crew.workers:
+            own = [index for index in indices if index in worker.agents]
+            if own:
+                self._meeting.order(worker, frames.FAULT, word, begins, value, own)
+        self._meeting.await_told("has not begun a fault")
