@@ -120,7 +120,7 @@ def _values(
     agents = dataclasses.replace(config.agents, restarts_max=0)
     time = dataclasses.replace(config.time, mode="lockstep")
     if config.on_agent_loss != "abort":
-        remarks.append("on_agent_loss: abort, as lockstep cannot go on without an agent")
+        remarks.append("on_agent_loss: abort, as its losses are not flown again")
     hardware = dataclasses.replace(config.hardware, use=(), devices=_devices(recorded, remarks))
     values = {
         **{key: getattr(config, key) for key in Scenario.model_fields if hasattr(config, key)},

@@ -189,6 +189,8 @@ def _apply(rule: MessageRule, fate: Fate, draw: Callable[[], float], *, is_best:
                 fate.late_s += value["within_s"] * draw()
         case words.DUPLICATE:
             fate.is_doubled = fate.is_doubled or draw() < value["probability"]
+        case _:
+            pass
 
 
 def _resent_after_s(probability: float, draw: Callable[[], float]) -> float:

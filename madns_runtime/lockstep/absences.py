@@ -14,7 +14,6 @@ from madns_runtime.lockstep.host_half import LockstepHalf
 from madns_runtime.lockstep.messages import Outbox
 from madns_runtime.lockstep.result import RunAccount
 from madns_runtime.lockstep.workers import Workers
-from madns_runtime.plugin.api import HOST
 from madns_runtime.protocol.codec import pack
 from madns_runtime.recording.run_journal import RunJournal
 

@@ -27,8 +27,9 @@ from madns_runtime.faults.words import KILL
 from madns_runtime.lockstep import frames
 from madns_runtime.lockstep.agent import Crewmates, LockstepAgent
 from madns_runtime.lockstep.clock import SimulatedClock
-from madns_runtime.lockstep.frames import POSITIONS, FrameReader, encode_frame
+from madns_runtime.lockstep.frames import POSITIONS, encode_frame
 from madns_runtime.lockstep.messages import decode
+from madns_runtime.lockstep.worker_line import HostGone, WorkerLine
 from madns_runtime.lockstep.worker_losses import WorkerLosses
 from madns_runtime.plugin.api import Tick
 from madns_runtime.plugin.context import clean_text
@@ -41,7 +42,6 @@ from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.watchdog import end_after_hang_up
 from madns_runtime.recording.newest_values import Value
 
-READ_BYTES = 1 << 18
 HANG_GRACE_S = 2.0
 """Beyond the time for shutdown: a worker that hangs in a plug-in ends by force when its host is gone."""
 STACK_SIGNAL = signal.SIGUSR1
@@ -72,16 +72,8 @@ class AgentFailed(Exception):
         self.reason = reason
 
 
-class _Terminated(BaseException):
-    """SIGTERM came while nothing was under way."""
-
-
 class _Ends(Exception):
     """The process ends, and the run goes on without its agents."""
-
-
-class _HostGone(Exception):
-    """The other end of the line is closed."""
 
 
 def run_worker(assignment: Assignment, line: socket.socket) -> NoReturn:
@@ -116,8 +108,7 @@ class Worker:
     def __init__(self, assignment: Assignment, line: socket.socket) -> None:
         config = assignment.config
         self._assignment = assignment
-        self._line = line
-        self._reader = FrameReader()
+        self._line = WorkerLine(line)
         self._position = assignment.position
         self._clock = SimulatedClock(-config.timeouts.start_lead_s)
         self._period_s = 1.0 / config.agents.tick_hz
@@ -130,8 +121,6 @@ class Worker:
         self._mates: Crewmates
         self._flush_interval_s = config.recording.flush_interval_s
         self._flushed_s = monotonic()
-        self._is_waiting = False
-        self._is_terminated = False
         self._orders: dict[int, Callable[..., bytes]] = {
             frames.SETUP: self._set_up,
             frames.TICK: self._tick,
@@ -143,16 +132,16 @@ class Worker:
 
     def run(self) -> int:
         """Carry out orders until the last, and return the exit code."""
-        signal.signal(signal.SIGTERM, self._on_sigterm)
+        self._line.heed_sigterm()
         try:
             self._answer(self._load)
-            while (order := self._next_order())[0] != frames.STOP:
+            while (order := self._line.next_order())[0] != frames.STOP:
                 self._answer(partial(self._orders[order[0]], *order[1:]))
             self._close_all(order[1], is_told=True)
         except _Ends:
             self._close_all(TERMINATED, is_told=False)
             return 1
-        except _HostGone:
+        except HostGone:
             self._close_all("its host is gone", is_told=False)
             return 1
         return 0 if order[1] is None else 1
@@ -164,41 +153,12 @@ class Worker:
         except AgentFailed as failure:
             answer = encode_frame(frames.FAILED, failure.index, clean_text(failure.reason))
         self._position[0] = frames.IDLE
-        self._say(answer)
-
-    def _say(self, frame: bytes) -> None:
-        try:
-            self._line.sendall(frame)
-        except OSError as error:
-            raise _HostGone from error
-
-    def _next_order(self) -> list[Any]:
-        data = b""
-        try:
-            self._is_waiting = True
-            while True:
-                for order in self._reader.feed(data):
-                    return order
-                data = self._line.recv(READ_BYTES)
-                if not data:
-                    raise _HostGone
-        except _Terminated:
-            return [frames.DRAIN, []]  # whose answer tells it
-        except OSError as error:
-            raise _HostGone from error
-        finally:
-            self._is_waiting = False
-
-    def _on_sigterm(self, number: int, frame: object) -> None:
-        self._is_terminated = True
-        if self._is_waiting:
-            self._is_waiting = False
-            raise _Terminated
+        self._line.say(answer)
 
     def _check_terminated(self) -> None:
-        if self._is_terminated and self._goes_on:
+        if self._line.is_terminated and self._goes_on:
             raise _Ends
-        if self._is_terminated:
+        if self._line.is_terminated:
             raise AgentFailed(self._assignment.agents[0], TERMINATED)
 
     # Orders -----------------------------------------------------------------------------------------
@@ -227,7 +187,9 @@ class Worker:
         freeze_garbage()  # what set-up made stays: no collection walks it in mid-run
         return self._done()
 
-    def _set_up_one(self, agent: LockstepAgent, packed: bytes, *, has_devices: bool = False) -> None:
+    def _set_up_one(
+        self, agent: LockstepAgent, packed: bytes, *, has_devices: bool = False
+    ) -> None:
         self._position[0] = agent.index * POSITIONS + frames.SETTING_UP
         agent.journal.event("start")
         try:
@@ -427,11 +389,11 @@ class Worker:
             if agent.devices:
                 counts["devices"] = agent.devices.close()
             if is_told:
-                self._say(encode_frame(frames.CLOSED, agent.index, counts))
+                self._line.say(encode_frame(frames.CLOSED, agent.index, counts))
         for index, counts in self._losses.close_devices().items():
             if is_told:
-                self._say(encode_frame(frames.CLOSED, index, {"devices": counts}))
+                self._line.say(encode_frame(frames.CLOSED, index, {"devices": counts}))
         known = {agent.index for agent in self._agents}
         for index in self._assignment.agents if is_told and not self._goes_on else ():
             if index not in known:
-                self._say(encode_frame(frames.CLOSED, index, {}))  # it never opened any
+                self._line.say(encode_frame(frames.CLOSED, index, {}))  # it never opened any

@@ -10,7 +10,7 @@ import heapq
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from madns_runtime.errors import MessageTooLarge, PluginError
 from madns_runtime.medium.outcomes import (
@@ -25,6 +25,15 @@ from madns_runtime.protocol.messages import Delivery, Transmission, Transmission
 
 LEAD_S: Final = 1.0
 """Lead of the hand-over before the arrival, s: far more than a network takes."""
+
+
+class WayFaults(Protocol):
+    """Faults of messages between agents."""
+
+    def ways(
+        self, sender: str, transmission: Transmission, outcomes: Sequence[LinkOutcome]
+    ) -> list[LinkOutcome]:
+        """Return what becomes of a message that the medium has carried, for each receiver."""
 
 
 class Carrier:
@@ -44,6 +53,8 @@ class Carrier:
         now_s: Callable[[], float],
     ) -> None:
         self.medium: Medium | None = None
+        self.faults: WayFaults | None = None
+        """What becomes of messages beyond what the medium says, while faults are in force."""
         self._agents = frozenset(agents)
         self._post = post
         self._now_s = now_s
@@ -72,6 +83,8 @@ class Carrier:
             isinstance(outcome, LinkOutcome) for outcome in outcomes or (None,)
         ):
             raise PluginError(f"{outcomes!r:.200}: expected a list of one or more LinkOutcome")
+        if self.faults is not None:
+            outcomes = self.faults.ways(sender, transmission, outcomes)
         now_s = self._now_s()
         self.account(outcomes[0].channel).transmissions += 1
         for outcome in outcomes:

@@ -27,7 +27,7 @@ from madns_runtime.plugin.executor import WORKER_DIED, JobFailed
 from madns_runtime.plugin.host_calls import HostCalls
 from madns_runtime.plugin.registry import Role, load_function, load_half, parse_parameters, resolve
 from madns_runtime.processes import own_age_s
-from madns_runtime.protocol.messages import Transmission
+from madns_runtime.protocol.messages import Service, Transmission
 
 CHECKS: Final[Mapping[str, Callable[[Any], Any]]] = {
     "initial_data": validation.initial_data,
@@ -201,6 +201,8 @@ class HostHalf(Half):
         """Simulated time at which its timer is to be called; None if it wants none."""
         self.lateness_s = 0.0
         """Delay of the timer's last call behind the time asked for, s."""
+        self.intake: Callable[[str, Any, Service], None] | None = None
+        """Takes what agents sent while faults are in force, and hands it on to `take_now`."""
         self._calls = calls or HostCalls()
         self._timer_s = -math.inf
         self._repeats = 0
@@ -221,12 +223,29 @@ class HostHalf(Half):
         if self._make_medium is not None:
             self.carrier.medium = self.run("medium", self._make_medium, self.simulation, context)
 
-    def take(self, agent: str, message: Any) -> None:
+    def take(self, agent: str, message: Any, service: Service = Service.RELIABLE) -> None:
         """
         Hand in what an agent sent: to the host's half, or (a Transmission) to others, through the medium.
 
+        Args:
+            agent: Its name.
+            message: What it sent.
+            service: Its class of service.
+
         Raises:
             HalfFailed: `receive` or the medium raised, or what the medium returned is no outcome.
+        """
+        if self.intake is not None:
+            self.intake(agent, message, service)
+            return
+        self.take_now(agent, message)
+
+    def take_now(self, agent: str, message: Any) -> None:
+        """
+        Hand in what an agent sent, whatever faults are in force; see `take`.
+
+        Raises:
+            HalfFailed: As there.
         """
         if not isinstance(message, Transmission):
             self.call("receive", agent, message)
