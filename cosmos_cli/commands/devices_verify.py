@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from cosmos_cli.errors import ExitCode, InputError
-from cosmos_cli.models.document import Document, apply_overrides, read_document
+from cosmos_cli.models.document import Document, read_document
+from cosmos_cli.models.overrides import apply_overrides
 from cosmos_cli.models.yaml_source import YamlSource, read_source
 from cosmos_cli.ui.console import Column, Console
 

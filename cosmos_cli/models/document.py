@@ -1,13 +1,12 @@
 """
 A YAML document as plain values, where every path still knows its line and column.
 
-Values given with --set replace those of the file; their place is the option.
+What other modules put into it keeps the place where it was written: another file, or --set (`overrides`).
 """
 
 from __future__ import annotations
 
 import difflib
-import re
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
@@ -19,23 +18,24 @@ from cosmos_cli.models.yaml_source import DEPTH_MAX, Node, YamlSource, compose
 VALUES_MAX = 200_000
 """Bound of the values that a document may unfold to: aliases of aliases grow without end."""
 
-KEY_CHARACTERS_SHOWN = 60
-OVERRIDES_MAX = 1000
 GUESSES_MAX = 20_000
 """Words that are compared with what was written, for all faults of a kind together: a third of a second."""
 Path = tuple[str | int, ...]
-_STEP = re.compile(r"([^.\[\]]+)|\[([0-9]{1,9})\]")
-_INDEX = re.compile(r"[0-9]{1,9}")
-_KEY = re.compile(r"[^.\[\]]+(?:\.[^.\[\]]+|\[[0-9]{1,9}\])*")
 
 
 @dataclass(frozen=True, slots=True)
 class SourcePlace:
-    """Place of a value: line and column of the file, or the key of --set."""
+    """Place of a value: line and column of its file, or the key of --set."""
 
     line: int = 0
     column: int = 0
     override: str = ""
+    source: YamlSource | None = None
+    """The file, if it is another than the document's own."""
+    path: Path | None = None
+    """Where it is written, if that is elsewhere than where it counts."""
+    variables: tuple[str, ...] = ()
+    """Names of the variables that it is made of."""
 
 
 @dataclass(slots=True)
@@ -53,12 +53,15 @@ class Document:
 
     def fault(self, path: Path, text: str, *, at_key: bool = False) -> Fault:
         """Return a fault at the place of *path*; of one that was not written, at the key above."""
-        place = self._place(path, at_key)
+        place = self.place(path, at_key=at_key)
+        name = dotted(path if place.path is None else place.path)
         if place.override:
-            return Fault(text=text, path=dotted(path), override=place.override)
-        return self.source.fault(text, line=place.line, column=place.column, path=dotted(path))
+            return Fault(text=text, path=name, override=place.override)
+        source = place.source or self.source
+        return source.fault(text, line=place.line, column=place.column, path=name)
 
-    def _place(self, path: Path, at_key: bool) -> SourcePlace:
+    def place(self, path: Path, *, at_key: bool = False) -> SourcePlace:
+        """Return the place of *path*; of one that was not written, of the key above."""
         for length in range(len(path), 0, -1):
             part = path[:length]
             exact = self.key_places if at_key or length < len(path) else self.value_places
@@ -67,17 +70,6 @@ class Document:
             if place is not None:
                 return place
         return SourcePlace(1, 1)
-
-    def set(self, key: str, path: Path, value: Any) -> None:
-        """Replace the value at *path*; what stood below it is forgotten."""
-        parent: Any = self.value
-        written: Path = ()
-        for step, following in zip(path, path[1:], strict=False):
-            parent, written = _descend(parent, (*written, step), key, following)
-        written = _assign(parent, (*written, path[-1]), key, value)
-        for places in (self.value_places, self.key_places, self.texts):
-            _forget(places, written)
-        self.value_places[written] = self.key_places[written] = SourcePlace(override=key)
 
     def rename(self, path: Path, name: str) -> None:
         """Call the key at *path*, a scalar's, *name*: its value and places stay."""
@@ -90,11 +82,6 @@ class Document:
         for places in maps:
             if path in places:
                 places[new] = places.pop(path)
-
-
-def _forget(places: dict[Path, Any], path: Path) -> None:
-    for known in [known for known in places if known[: len(path)] == path]:
-        del places[known]
 
 
 def dotted(path: Sequence[str | int]) -> str:
@@ -132,6 +119,19 @@ def read_document(source: YamlSource, *, has_64_bits: bool = True) -> Document:
         raise InputError(faults=[source.fault(text, line=root.line, column=root.column)])
     document.value = value
     return document
+
+
+def read_value(source: YamlSource) -> tuple[Any, list[Fault]]:
+    """
+    Return what a text means that is any value, and its faults.
+
+    Raises:
+        InputError: It is no YAML.
+    """
+    root = compose(source)
+    builder = _Builder(Document(source))
+    value = builder.build(root, ()) if root else None
+    return value, builder.faults + builder.document.faults
 
 
 def kind_of(value: Any) -> str:
@@ -245,116 +245,6 @@ class _Builder:
 
 def _is_merge(key: Node) -> bool:
     return key.is_plain and key.text == "<<"
-
-
-def apply_overrides(document: Document, overrides: Sequence[str]) -> list[Fault]:
-    """Apply every KEY=VALUE of --set, in order; return the faults of those that are malformed or have no place."""
-    faults: list[Fault] = []
-    seen: dict[tuple[str, ...], str] = {}
-    if len(overrides) > OVERRIDES_MAX:
-        text = f"expected at most {OVERRIDES_MAX} of --set, got {len(overrides)}; write a file"
-        return [Fault(text=text, override=overrides[OVERRIDES_MAX].partition("=")[0])]
-    for override in overrides:
-        try:
-            key, path, value = parse_override(override)
-            _refuse_replacing(key, path, seen)
-            document.set(key, path, value)
-        except InputError as error:
-            faults += error.faults
-    return faults
-
-
-def _refuse_replacing(key: str, path: Path, seen: dict[tuple[str, ...], str]) -> None:
-    """
-    Enter a key of --set, unless it would replace what an earlier one said.
-
-    Raises:
-        InputError: It would, in silence.
-    """
-    steps = tuple(map(str, path))
-    for other, other_key in seen.items():
-        if other == steps:
-            also = " (--duration sets it, too)" if key == "time.duration_s" else ""
-            raise _override_error(key, f"is given twice, and only one could count{also}")
-        if other[: len(steps)] == steps:
-            raise _override_error(key, f"would replace what --set {other_key} says; give it first")
-    seen[steps] = key
-
-
-def parse_override(override: str) -> tuple[str, Path, Any]:
-    """
-    Split KEY=VALUE; the value is read as YAML.
-
-    Raises:
-        InputError: There is no '=', the key is no dotted path, or the value no YAML.
-    """
-    key, equals, text = override.partition("=")
-    key = key.strip()
-    if not equals:
-        raise _override_error(override, "expected KEY=VALUE, such as agents.count=5")
-    if not _KEY.fullmatch(key):
-        raise _override_error(key or override, "expected a dotted path, such as agents.names[0]")
-    if len(_STEP.findall(key)) > DEPTH_MAX:
-        text = f"expected at most {DEPTH_MAX} levels of nesting"
-        raise _override_error(f"{key[:KEY_CHARACTERS_SHOWN]}...", text)
-    path = tuple(
-        int(index) if index else int(name) if _INDEX.fullmatch(name) else name
-        for name, index in _STEP.findall(key)
-    )
-    source = YamlSource.of("", text)
-    try:
-        root = compose(source)
-        builder = _Builder(Document(source))
-        value = builder.build(root, ()) if root else None
-    except InputError as error:
-        raise _override_error(key, error.faults[0].text) from None
-    faults = builder.faults + builder.document.faults
-    if faults:
-        raise _override_error(key, faults[0].text)
-    return key, path, value
-
-
-def _override_error(key: str, text: str) -> InputError:
-    return InputError(faults=[Fault(text=text, override=key)])
-
-
-def _descend(parent: Any, path: Path, key: str, following: str | int) -> tuple[Any, Path]:
-    """Return the container at *path*, made if it is not there, and the path in its own terms."""
-    fresh: Any = [] if isinstance(following, int) else {}
-    path = _checked_step(parent, path, key)
-    if isinstance(parent, list):
-        index = int(path[-1])
-        if index == len(parent):
-            parent.append(fresh)
-        child = parent[index]
-    else:
-        child = parent.get(path[-1])
-        if child is None:
-            child = parent[path[-1]] = fresh
-    if not isinstance(child, dict | list):
-        raise _override_error(key, f"{dotted(path)} is {kind_of(child)} and has nothing inside")
-    return child, path
-
-
-def _assign(parent: Any, path: Path, key: str, value: Any) -> Path:
-    path = _checked_step(parent, path, key)
-    if isinstance(parent, list) and path[-1] == len(parent):
-        parent.append(value)
-    else:
-        parent[path[-1]] = value
-    return path
-
-
-def _checked_step(parent: Any, path: Path, key: str) -> Path:
-    """Return *path* with its last step as *parent* knows it: an index in a list, else a key."""
-    step, above = path[-1], dotted(path[:-1])
-    if not isinstance(parent, list):
-        return (*path[:-1], str(step))
-    if not isinstance(step, int):
-        raise _override_error(key, f"{above} is a list: expected an index, got {step}")
-    if step > len(parent):
-        raise _override_error(key, f"{above} has {len(parent)} items: got the index {step}")
-    return path
 
 
 def may_guess(faults: int, known: int) -> bool:

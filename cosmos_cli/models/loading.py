@@ -12,9 +12,10 @@ from pydantic import ValidationError
 
 from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
-from cosmos_cli.models.document import Document, apply_overrides, read_document
+from cosmos_cli.models.document import Document, read_document
 from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.hardware import hardware_faults
+from cosmos_cli.models.overrides import apply_overrides
 from cosmos_cli.models.own_requirements import own_requirement_faults
 from cosmos_cli.models.place_uses import CURE, shared_places
 from cosmos_cli.models.plugin_answers import ask_plugin, ask_plugin_demand, fault_found_at

@@ -17,8 +17,9 @@ from pydantic import ValidationError
 
 from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault, InputError
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
-from cosmos_cli.models.document import Document, parse_override
+from cosmos_cli.models.document import Document
 from cosmos_cli.models.document import Path as ValuePath
+from cosmos_cli.models.overrides import parse_override
 from cosmos_cli.models.parameters import adapter_of
 from cosmos_cli.models.plugin_values import changed, is_same, not_sendable
 from cosmos_cli.models.separate_process import (

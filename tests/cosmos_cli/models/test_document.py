@@ -3,7 +3,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cosmos_cli.errors import InputError
-from cosmos_cli.models.document import apply_overrides, dotted, parse_override, read_document
+from cosmos_cli.models.document import dotted, read_document
+from cosmos_cli.models.overrides import apply_overrides, parse_override
 from cosmos_cli.models.yaml_source import YamlSource
 
 

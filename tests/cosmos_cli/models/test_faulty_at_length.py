@@ -17,10 +17,11 @@ import pytest
 
 from cosmos_cli import app
 from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault, InputError
-from cosmos_cli.models.document import GUESSES_MAX, apply_overrides, read_document
+from cosmos_cli.models.document import GUESSES_MAX, read_document
 from cosmos_cli.models.inventory import Machine, read_inventory
 from cosmos_cli.models.limit import select_machines
 from cosmos_cli.models.loading import load_scenario
+from cosmos_cli.models.overrides import apply_overrides
 from cosmos_cli.models.placement import PlacementRule, claim_agents
 from cosmos_cli.models.yaml_source import YamlSource
 from madns_runtime.simulations.constellation.check_vehicles import glob_faults

@@ -1,0 +1,145 @@
+"""Values given with --set KEY=VALUE: they replace those of the file, and their place is the option."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from cosmos_cli.errors import Fault, InputError
+from cosmos_cli.models.document import Document, Path, SourcePlace, dotted, kind_of, read_value
+from cosmos_cli.models.yaml_source import DEPTH_MAX, YamlSource
+
+KEY_CHARACTERS_SHOWN = 60
+OVERRIDES_MAX = 1000
+_STEP = re.compile(r"([^.\[\]]+)|\[([0-9]{1,9})\]")
+_INDEX = re.compile(r"[0-9]{1,9}")
+_KEY = re.compile(r"[^.\[\]]+(?:\.[^.\[\]]+|\[[0-9]{1,9}\])*")
+
+
+def apply_overrides(document: Document, overrides: Sequence[str]) -> list[Fault]:
+    """Apply every KEY=VALUE of --set, in order; return the faults of those that are malformed or have no place."""
+    faults: list[Fault] = []
+    seen: dict[tuple[str, ...], str] = {}
+    if len(overrides) > OVERRIDES_MAX:
+        text = f"expected at most {OVERRIDES_MAX} of --set, got {len(overrides)}; write a file"
+        return [Fault(text=text, override=overrides[OVERRIDES_MAX].partition("=")[0])]
+    for override in overrides:
+        try:
+            key, path, value = parse_override(override)
+            _refuse_replacing(key, path, seen)
+            set_value(document, key, path, value)
+        except InputError as error:
+            faults += error.faults
+    return faults
+
+
+def _refuse_replacing(key: str, path: Path, seen: dict[tuple[str, ...], str]) -> None:
+    """
+    Enter a key of --set, unless it would replace what an earlier one said.
+
+    Raises:
+        InputError: It would, in silence.
+    """
+    steps = tuple(map(str, path))
+    for other, other_key in seen.items():
+        if other == steps:
+            also = " (--duration sets it, too)" if key == "time.duration_s" else ""
+            raise _override_error(key, f"is given twice, and only one could count{also}")
+        if other[: len(steps)] == steps:
+            raise _override_error(key, f"would replace what --set {other_key} says; give it first")
+    seen[steps] = key
+
+
+def parse_override(override: str) -> tuple[str, Path, Any]:
+    """
+    Split KEY=VALUE; the value is read as YAML.
+
+    Raises:
+        InputError: There is no '=', the key is no dotted path, or the value no YAML.
+    """
+    key, equals, text = override.partition("=")
+    key = key.strip()
+    if not equals:
+        raise _override_error(override, "expected KEY=VALUE, such as agents.count=5")
+    if not _KEY.fullmatch(key):
+        raise _override_error(key or override, "expected a dotted path, such as agents.names[0]")
+    if len(_STEP.findall(key)) > DEPTH_MAX:
+        text = f"expected at most {DEPTH_MAX} levels of nesting"
+        raise _override_error(f"{key[:KEY_CHARACTERS_SHOWN]}...", text)
+    path = tuple(
+        int(index) if index else int(name) if _INDEX.fullmatch(name) else name
+        for name, index in _STEP.findall(key)
+    )
+    try:
+        value, faults = read_value(YamlSource.of("", text))
+    except InputError as error:
+        raise _override_error(key, error.faults[0].text) from None
+    if faults:
+        raise _override_error(key, faults[0].text)
+    return key, path, value
+
+
+def set_value(document: Document, key: str, path: Path, value: Any) -> None:
+    """
+    Replace the value at *path* by that of *key*; what stood below it is forgotten.
+
+    Raises:
+        InputError: There is no such place.
+    """
+    parent: Any = document.value
+    written: Path = ()
+    for step, following in zip(path, path[1:], strict=False):
+        parent, written = _descend(parent, (*written, step), key, following)
+    written = _assign(parent, (*written, path[-1]), key, value)
+    for places in (document.value_places, document.key_places, document.texts):
+        _forget(places, written)
+    document.value_places[written] = document.key_places[written] = SourcePlace(override=key)
+
+
+def _forget(places: dict[Path, Any], path: Path) -> None:
+    for known in [known for known in places if known[: len(path)] == path]:
+        del places[known]
+
+
+def _override_error(key: str, text: str) -> InputError:
+    return InputError(faults=[Fault(text=text, override=key)])
+
+
+def _descend(parent: Any, path: Path, key: str, following: str | int) -> tuple[Any, Path]:
+    """Return the container at *path*, made if it is not there, and the path in its own terms."""
+    fresh: Any = [] if isinstance(following, int) else {}
+    path = _checked_step(parent, path, key)
+    if isinstance(parent, list):
+        index = int(path[-1])
+        if index == len(parent):
+            parent.append(fresh)
+        child = parent[index]
+    else:
+        child = parent.get(path[-1])
+        if child is None:
+            child = parent[path[-1]] = fresh
+    if not isinstance(child, dict | list):
+        raise _override_error(key, f"{dotted(path)} is {kind_of(child)} and has nothing inside")
+    return child, path
+
+
+def _assign(parent: Any, path: Path, key: str, value: Any) -> Path:
+    path = _checked_step(parent, path, key)
+    if isinstance(parent, list) and path[-1] == len(parent):
+        parent.append(value)
+    else:
+        parent[path[-1]] = value
+    return path
+
+
+def _checked_step(parent: Any, path: Path, key: str) -> Path:
+    """Return *path* with its last step as *parent* knows it: an index in a list, else a key."""
+    step, above = path[-1], dotted(path[:-1])
+    if not isinstance(parent, list):
+        return (*path[:-1], str(step))
+    if not isinstance(step, int):
+        raise _override_error(key, f"{above} is a list: expected an index, got {step}")
+    if step > len(parent):
+        raise _override_error(key, f"{above} has {len(parent)} items: got the index {step}")
+    return path
