@@ -276,11 +276,12 @@ def _execute(
 
 
 def scenario_text(scenario: ScenarioFile) -> str:
-    """Return the scenario as it was run: the file itself, or with --set applied and defaults filled in."""
-    if not scenario.overrides:
+    """Return the scenario as it was run: the file itself, or with all that changed it and defaults filled in."""
+    if not scenario.overrides and len(scenario.files) == 1:
         return scenario.text
-    changes = "".join(f"\n#   --set {override}" for override in scenario.overrides)
-    resolved = yaml.safe_dump(scenario.to_mapping(), sort_keys=False, allow_unicode=True)
+    changes = "".join(f"\n#   extends {file}" for file in scenario.files[1:])
+    changes += "".join(f"\n#   --set {override}" for override in scenario.overrides)
+    resolved = yaml.safe_dump(scenario.to_written(), sort_keys=False, allow_unicode=True)
     return f"# {scenario.path.name}, with its defaults and:{changes}\n{resolved}"
 
 

@@ -50,6 +50,12 @@ class Document:
     """Scalars as they are written."""
     faults: list[Fault] = field(default_factory=list)
     """Of single scalars, which are None in `value`: everything else can be checked all the same."""
+    variables: tuple[str, ...] = ()
+    """Names of the scenario's variables."""
+    without_value: list[Path] = field(default_factory=list)
+    """Values that have a fault told elsewhere, such as at their variable; None in `value`."""
+    open_texts: list[Path] = field(default_factory=list)
+    """Texts of a plug-in's settings that still hold ${...}: only the plug-in knows what words it replaces itself."""
 
     def fault(self, path: Path, text: str, *, at_key: bool = False) -> Fault:
         """Return a fault at the place of *path*; of one that was not written, at the key above."""

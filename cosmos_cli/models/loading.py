@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,21 @@ from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
 from cosmos_cli.models.document import Document, read_document
 from cosmos_cli.models.document import Path as ValuePath
+from cosmos_cli.models.extending import ScenarioSource, read_scenario_source
 from cosmos_cli.models.hardware import hardware_faults
 from cosmos_cli.models.overrides import apply_overrides
 from cosmos_cli.models.own_requirements import own_requirement_faults
 from cosmos_cli.models.place_uses import CURE, shared_places
 from cosmos_cli.models.plugin_answers import ask_plugin, ask_plugin_demand, fault_found_at
-from cosmos_cli.models.scenario import Scenario, cross_faults
+from cosmos_cli.models.scenario import OF_AUTHORS, Scenario, cross_faults
 from cosmos_cli.models.translate import faults_of
-from cosmos_cli.models.yaml_source import YamlSource, read_source
+from cosmos_cli.models.variables import (
+    author_override_faults,
+    escaped_values,
+    substitute_variables,
+    texts_with_words,
+)
+from cosmos_cli.models.yaml_source import YamlSource
 from madns_runtime.config import RunConfig, to_mapping
 from madns_runtime.plugin.api import DeclaredStream, Demand, PlaceUse
 
@@ -34,8 +41,12 @@ class ScenarioFile:
     """A scenario that was read and found right, and what it was read from."""
 
     path: Path
-    text: str
-    """The file as it stands on disk."""
+    document: Document
+    """Its values with those of the files that it extends, each with its place."""
+    root: Path
+    """The folder that travels with it, absolute."""
+    files: tuple[str, ...]
+    """The file, and those that it extends."""
     overrides: tuple[str, ...]
     """Of --set, applied after reading."""
     scenario: Scenario
@@ -49,19 +60,26 @@ class ScenarioFile:
     """Second names of the agents."""
     place_uses: tuple[PlaceUse, ...] = ()
     """What each agent takes of its machine for itself."""
+    placeholders: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Words that the simulation replaces itself, by field."""
+
+    @property
+    def text(self) -> str:
+        """The file as it stands on disk."""
+        return self.document.source.text
 
     @property
     def base_directory(self) -> Path:
-        """The folder of the file, absolute: relative files are found from here."""
-        return self.path.resolve().parent
+        """The root, absolute: relative files are found from here."""
+        return self.root
 
     def fault(self, path: ValuePath, text: str) -> Fault:
         """Return a fault at its place in the file, for what only a later step can find wrong."""
-        return self._document().fault(path, text)
+        return self.document.fault(path, text)
 
     def fault_of(self, text: str) -> Fault:
         """Return a fault at the parameter that a text names, as in `parameters.gain: too large`."""
-        return fault_found_at(self._document(), text)
+        return fault_found_at(self.document, text)
 
     def demand(self) -> Demand:
         """
@@ -72,12 +90,7 @@ class ScenarioFile:
             MissingExtraError: It needs an optional dependency that is not installed.
         """
         agents = self.scenario.agents
-        return ask_plugin_demand(self._document(), self.parameters, agents, self.base_directory)
-
-    def _document(self) -> Document:
-        document = read_document(YamlSource.of(str(self.path), self.text))
-        apply_overrides(document, self.overrides)
-        return document
+        return ask_plugin_demand(self.document, self.parameters, agents, self.base_directory)
 
     def run_config(self, run: str) -> RunConfig:
         """Return what host and agents of the run named *run* are told."""
@@ -85,9 +98,16 @@ class ScenarioFile:
             run=run, base_directory=self.base_directory, parameters=self.parameters
         )
 
+    def to_written(self) -> dict[str, Any]:
+        """Return the same as a scenario file holds it: what is no variable there is escaped."""
+        kept = texts_with_words(self.document, self.placeholders)
+        values: dict[str, Any] = escaped_values(json.loads(json.dumps(self.to_mapping())), kept)
+        return values
+
     def to_mapping(self) -> dict[str, Any]:
         """Return the scenario as plain values, overrides applied and defaults filled in."""
-        values = {key: getattr(self.scenario, key) for key in Scenario.model_fields}
+        keys = (key for key in Scenario.model_fields if key not in OF_AUTHORS)
+        values = {key: getattr(self.scenario, key) for key in keys}
         return to_mapping(values | {"parameters": self.parameters})
 
 
@@ -106,11 +126,13 @@ def load_scenario(
         InputError: With every fault found, in the order of the file; faults of --set come last.
         MissingExtraError: The simulation needs an optional dependency that is not installed.
     """
-    document = read_document(read_source(path))
-    faults = apply_overrides(document, overrides)
+    source = read_scenario_source(path)
+    document = source.document
+    faults = [*author_override_faults(document, overrides), *apply_overrides(document, overrides)]
+    substitute_variables(document)
     faults += document.faults
     remarks, old_faults = _rename_old_keys(document)
-    checked = _check(document, path, tuple(overrides), faults + old_faults)
+    checked = _check(source, path, tuple(overrides), faults + old_faults)
     for remark in remarks:
         warn(remark)
     return checked
@@ -118,7 +140,7 @@ def load_scenario(
 
 def check_scenario(text: str, path: Path) -> ScenarioFile:
     """
-    Check a scenario that lies in no file.
+    Check a scenario that lies in no file, extends none, and in which ${...} is no variable.
 
     Args:
         text: As YAML.
@@ -129,15 +151,16 @@ def check_scenario(text: str, path: Path) -> ScenarioFile:
         MissingExtraError: The simulation needs an optional dependency that is not installed.
     """
     document = read_document(YamlSource.of(str(path), text))
-    return _check(document, path, (), list(document.faults))
+    source = ScenarioSource(document=document, root=path.resolve().parent, files=(str(path),))
+    return _check(source, path, (), list(document.faults))
 
 
 def _rename_old_keys(document: Document) -> tuple[tuple[str, ...], list[Fault]]:
     """Give old keys their new names; return a remark on each, and a fault on each beside its new one."""
     remarks, faults = [], []
-    for section, field in Scenario.model_fields.items():
+    for section, known in Scenario.model_fields.items():
         written = document.value.get(section)
-        old_keys: Mapping[str, str] = getattr(field.annotation, "__old_keys__", {})
+        old_keys: Mapping[str, str] = getattr(known.annotation, "__old_keys__", {})
         if not isinstance(written, dict):
             continue
         for old in sorted(old_keys.keys() & written):
@@ -154,11 +177,11 @@ def _rename_old_keys(document: Document) -> tuple[tuple[str, ...], list[Fault]]:
 
 
 def _check(
-    document: Document, path: Path, overrides: tuple[str, ...], faults: list[Fault]
+    source: ScenarioSource, path: Path, overrides: tuple[str, ...], faults: list[Fault]
 ) -> ScenarioFile:
+    document, base_directory = source.document, source.root
     scenario, broken, scenario_faults = _scenario(document)
     faults = faults + scenario_faults
-    base_directory = path.resolve().parent
     agents, duration_s = (None, 0.0) if broken else (scenario.agents, scenario.time.duration_s)
     requirements = () if broken else scenario.requirements
     faults += [
@@ -182,11 +205,13 @@ def _check(
         for where, text in cross_faults(scenario, skip=broken, labels=answers.labels)
     ]
     if broken or answers.parameters is None or faults:
-        told = sorted(_told_once(faults, document.faults), key=_order)
+        told = _told_once(faults, document)
         raise InputError(faults=told, omitted=answers.omitted)
     return ScenarioFile(
         path=path,
-        text=document.source.text,
+        document=document,
+        root=source.root,
+        files=source.files,
         overrides=overrides,
         scenario=scenario,
         parameters=answers.parameters,
@@ -194,18 +219,35 @@ def _check(
         streams=answers.streams,
         labels=answers.labels or NO_LABELS,
         place_uses=answers.place_uses,
+        placeholders=answers.placeholders,
     )
 
 
-def _told_once(faults: Sequence[Fault], scalars: Sequence[Fault]) -> list[Fault]:
-    """Leave out what follows from a scalar without a value: that it is missing, or of the wrong type."""
-    places = {(fault.line, fault.column) for fault in scalars}
-    own = set(scalars)
-    return [f for f in faults if f in own or f.override or (f.line, f.column) not in places]
+def _told_once(faults: Sequence[Fault], document: Document) -> list[Fault]:
+    """Sort faults, without those that follow from a scalar without a value: that it is missing, or of the wrong type."""
+    own = set(document.faults)
+    lost = [*document.faults, *(document.fault(path, "") for path in document.without_value)]
+    places = {_place(fault) for fault in lost}
+    told = (fault for fault in faults if fault in own or _place(fault) not in places)
+    files = {label: number for number, label in enumerate(_labels(document))}
+    return sorted(
+        told,
+        key=lambda fault: (
+            bool(fault.override),
+            files.get(fault.file, len(files)),
+            fault.line or 0,
+            fault.column or 0,
+        ),
+    )
 
 
-def _order(fault: Fault) -> tuple[bool, int, int]:
-    return bool(fault.override), fault.line or 0, fault.column or 0
+def _labels(document: Document) -> list[str]:
+    others = (place.source.label for place in document.value_places.values() if place.source)
+    return list(dict.fromkeys([document.source.label, *others]))
+
+
+def _place(fault: Fault) -> tuple[object, ...]:
+    return fault.override, fault.file, fault.line, fault.column
 
 
 def _scenario(document: Document) -> tuple[Scenario, frozenset[str], list[Fault]]:

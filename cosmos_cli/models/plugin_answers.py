@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,6 +28,7 @@ from cosmos_cli.models.separate_process import (
     work_separately,
 )
 from cosmos_cli.models.translate import faults_of
+from cosmos_cli.models.variables import judge_open_texts
 from madns_runtime import errors as runtime_errors
 from madns_runtime.config import Agents, Timeouts, from_mapping, to_mapping
 from madns_runtime.errors import ConfigurationError, MadnsError, MissingExtraError, PluginError
@@ -75,6 +76,8 @@ class PluginAnswers:
     """Channels of devices that the parameters name; empty if nobody could be asked."""
     place_uses: tuple[PlaceUse, ...] = ()
     """What each agent takes of its machine for itself; empty if nobody could be asked."""
+    placeholders: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Words that it replaces itself, by field."""
     omitted: int = 0
     """Number of further faults."""
 
@@ -221,6 +224,7 @@ class _Asking:
             labels=labels,
             device_uses=uses,
             place_uses=places,
+            placeholders={} if simulation is None else simulation.placeholders,
         )
 
     def _blame(self, *texts: str) -> None:
@@ -243,6 +247,8 @@ class _Asking:
         return simulation
 
     def _parameters(self, simulation: Simulation) -> Any:
+        opened = judge_open_texts(self._document, simulation.placeholders)
+        self._faults += opened
         value = self._document.value.get("parameters", {})
         if not isinstance(value, Mapping):
             return None  # the model has said so already
@@ -257,7 +263,9 @@ class _Asking:
         except ValidationError as error:
             self._document.value.setdefault("parameters", {})
             errors = error.errors(include_url=False)
-            self._faults += faults_of(self._document, errors, kind, below=("parameters",))
+            places = {(fault.file, fault.line, fault.column) for fault in opened}
+            found_faults = faults_of(self._document, errors, kind, below=("parameters",))
+            self._faults += [f for f in found_faults if (f.file, f.line, f.column) not in places]
             return None
         except ConfigurationError as error:  # what the scenario gives was found right above
             told = str(error).removeprefix("parameters.")
@@ -273,7 +281,7 @@ class _Asking:
                 wrong = [changed(made, found)]
             texts = [f"{_place(kind)}: {text}" for text in wrong]
         self._blame(*texts)
-        return None if texts else parameters
+        return None if texts or opened else parameters
 
     def _check(
         self, simulation: Simulation, parameters: Any, agents: Agents, duration_s: float

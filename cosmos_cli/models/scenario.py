@@ -36,6 +36,9 @@ AGENT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 RESERVED_NAMES = ("host",)
 EXECUTOR_KINDS = ("process", "thread", "dask")
 
+OF_AUTHORS = ("extends", "root", "vars")
+"""Keys that have done their part when a scenario is read: nothing is left of them in what results."""
+
 SectionFault = tuple[tuple[str | int, ...], str]
 """The path within the scenario, and what is wrong there."""
 
@@ -45,6 +48,12 @@ class Scenario(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    extends: str = ""
+    """Another scenario, by its path from this file's folder: what this file does not say comes from there."""
+    root: Literal[".", "..", "../.."] = "."
+    """The folder that travels to machines and from which relative files are found, from this file's: it holds all that the scenario needs."""
+    vars: dict[str, str | int | float | bool | None] = {}
+    """Values by name, for ${name} elsewhere in the scenario; --set vars.NAME=VALUE gives another."""
     name: Annotated[str, Field(pattern=NAME_PATTERN, max_length=64)]
     """Name of the scenario; runs are named after it: lower-case letters, digits and hyphens."""
     description: str = ""

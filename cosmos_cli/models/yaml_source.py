@@ -52,6 +52,8 @@ _WORDS: dict[str, bool | None] = {
     "False": False,
     "FALSE": False,
 }
+_BARE_VARIABLE = re.compile(r"""[\[{,:]\s*([^"'\[\]{},]*)\$\{""")
+"""In a line of a flow mapping or list: there a plain text ends at the brace."""
 _UNPRINTABLE = re.compile("[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 _MEANINGS = (
@@ -311,6 +313,9 @@ def _syntax_fault(source: YamlSource, error: yaml.MarkedYAMLError) -> Fault:
         "\t"
     ):
         text = "expected spaces, got a tab: YAML is indented with spaces"
+    elif "flow" in context and (bare := _BARE_VARIABLE.search(line)):
+        text = "a brace within braces or brackets: put ${...} in quotes"
+        return source.fault(text, line=mark.line + 1, column=bare.end(1) + 1)
     else:
         for in_context, in_problem, is_at_start, meaning in _MEANINGS:
             if in_context in context and in_problem in problem:

@@ -10,7 +10,7 @@ longer work goes through `HostContext.submit`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -330,6 +330,10 @@ class Simulation:
     rerun: str | None = None
     """module:function of (parameters, agents: tuple[str, ...], run_directory: Path) -> `Rerun`: how a recorded run is
     flown again in lockstep with its devices played back (`cosmos rerun`). None: with the same parameters."""
+    placeholders: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Words that the simulation itself replaces in texts of its parameters, as ${name}, by the dotted keys of the
+    fields (globs; no indices of lists), such as {"flight.command": ("name",)}: there a scenario's variables leave
+    them alone, and $${ is the simulation's to read."""
     columns: tuple[str, ...] = ()
     """Fields of the agents' declared streams, as "drive.speed_m_s", at most six: whoever watches a run is shown
     their newest values per agent."""

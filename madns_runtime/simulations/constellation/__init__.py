@@ -11,6 +11,9 @@ from madns_runtime.plugin.api import Simulation
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
 
 _HERE = "madns_runtime.simulations.constellation"
+_WORDS = ("name", "index", "satellite")
+_PROGRAM_WORDS = (*_WORDS, "address", "pty")
+"""Of agents, and of programs also where their transport is; `substitution` replaces them, and `check_flight` judges."""
 
 simulation = Simulation(
     name="constellation",
@@ -25,6 +28,11 @@ simulation = Simulation(
     place_uses=f"{_HERE}.check:place_uses",
     rerun=f"{_HERE}.rerun:for_rerun",
     label_column="satellite",
+    placeholders={
+        "flight.command": _PROGRAM_WORDS,
+        "flight.environment.*": _PROGRAM_WORDS,
+        "flight.interface.transport.*": _WORDS,
+    },
     columns=("elements.a_m", "elements.e", "elements.mean_anomaly_deg"),
     medium=f"{_HERE}.host:radio_of",
     tabulate=f"{_HERE}.tabulation:tabulate_truth",
