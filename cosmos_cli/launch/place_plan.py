@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 from cosmos_cli.errors import InputError
-from cosmos_cli.launch.plan import LaunchPlan
 from cosmos_cli.models.loading import ScenarioFile
 from cosmos_cli.models.place_uses import CURE, shared_places
+
+if TYPE_CHECKING:  # `cosmos validate` plans nothing, and a plan's imports would double its own
+    from cosmos_cli.launch.plan import LaunchPlan
 
 
 def check_places(scenario_file: ScenarioFile, plan: LaunchPlan) -> None:
