@@ -15,8 +15,13 @@ from madns_runtime.errors import PluginError
 from madns_runtime.plugin.api import HOST, AgentContext
 from madns_runtime.protocol.messages import Service
 from madns_runtime.simulations.constellation.equipment import Vehicle
-from madns_runtime.simulations.constellation.messages import Command, CommandFrame, CommandKind
-from madns_runtime.simulations.constellation.streams import commands_fields
+from madns_runtime.simulations.constellation.messages import (
+    Command,
+    CommandFrame,
+    CommandKind,
+    CommandResult,
+)
+from madns_runtime.simulations.constellation.streams import COMMAND_RESULTS, commands_fields
 from madns_runtime.simulations.constellation.thrust import Vector
 
 COMMANDS_PER_TICK_MAX = 16
@@ -31,7 +36,7 @@ class CommandDesk:
         context: Through which they leave.
         vehicle: What it is like.
         first_number: Of its first command.
-        opens_stream: Whether the stream commands is not open yet.
+        opens_streams: Whether the streams of commands and their results are not open yet.
     """
 
     def __init__(
@@ -40,7 +45,7 @@ class CommandDesk:
         vehicle: Vehicle,
         first_number: int = 0,
         *,
-        opens_stream: bool = True,
+        opens_streams: bool = True,
     ) -> None:
         self._context = context
         self._vehicle = vehicle
@@ -51,8 +56,9 @@ class CommandDesk:
         self._in_tick = 0
         self.count = 0
         """Commands given."""
-        if opens_stream:
+        if opens_streams:
             context.open_stream("commands", commands_fields(context.parameters))
+            context.open_stream("command_results", COMMAND_RESULTS)
 
     def begin(self, tick: int, t_s: float, phase_s: float) -> None:
         """Begin a tick: from now on commands bear its time, and lie *phase_s* behind it as the vehicle's ticks do."""
@@ -121,6 +127,12 @@ class CommandDesk:
                 f"ballistic: expected {limits[0]:g} to {limits[1]:g} m^2/kg, got {value:g}"
             )
         return self._give("ballistic", at_s=at_s, vector=(value, 0.0, 0.0))
+
+    def record_result(self, tick: int, result: CommandResult) -> None:
+        """Record what became of a command, as the vehicle is about to hear it."""
+        row = (tick, result.number, result.status, result.at_s, result.revision)
+        numbers = (result.delta_v_m_s, result.propellant_kg)
+        self._context.record("command_results", (*row, *numbers, result.reason))
 
     def _give(
         self,

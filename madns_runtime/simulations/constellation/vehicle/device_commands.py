@@ -17,13 +17,11 @@ from madns_runtime.plugin.api import AgentContext
 from madns_runtime.simulations.constellation.actuation import VECTOR_SIZE, Actuation
 from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.messages import CommandResult
-from madns_runtime.simulations.constellation.streams import COMMAND_RESULTS
 from madns_runtime.simulations.constellation.thrust import Vector
 from madns_runtime.simulations.constellation.vehicle.commands import (
     COMMANDS_PER_TICK_MAX,
     CommandDesk,
 )
-from madns_runtime.simulations.constellation.vehicle.flight_context import result_row
 
 DEVICE_NUMBER_FIRST = 2**30
 """Of a device's first command; those of flight software are below it."""
@@ -46,9 +44,7 @@ class DeviceCommands:
         self._context = context
         rejoined_tick = max(0, math.ceil(context.now_s() * context.tick_hz))
         first = DEVICE_NUMBER_FIRST + rejoined_tick * COMMANDS_PER_TICK_MAX
-        self._desk = CommandDesk(context, vehicle, first, opens_stream=not has_flight)
-        if not has_flight:
-            context.open_stream("command_results", COMMAND_RESULTS)
+        self._desk = CommandDesk(context, vehicle, first, opens_streams=not has_flight)
         self._lines = [
             _Line(actuation, context, place) for place, actuation in enumerate(vehicle.actuation)
         ]
@@ -65,7 +61,7 @@ class DeviceCommands:
         """
         self._desk.begin(tick, t_s, phase_s)
         for result in self._results:
-            self._context.record("command_results", result_row(tick, result))
+            self._desk.record_result(tick, result)
         self._results.clear()
         for line in self._lines:
             vector = line.take()

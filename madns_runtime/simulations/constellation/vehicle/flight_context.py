@@ -22,7 +22,6 @@ from madns_runtime.simulations.constellation import streams
 from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.flight_rates import flight_rate
 from madns_runtime.simulations.constellation.messages import (
-    CommandResult,
     Delivery,
     Initial,
     TransmissionRefusal,
@@ -112,7 +111,6 @@ class VehicleContext:
         """Messages refused, by reason: on board, where they never reach the radio, or by the host."""
         self._has_refusals_stream = False
         self._estimate_names: tuple[str, ...] = ()
-        context.open_stream("command_results", streams.COMMAND_RESULTS)
         if self._has_crosslinks or self._has_stations:
             context.open_stream("messages", streams.MESSAGES)
 
@@ -175,10 +173,6 @@ class VehicleContext:
 
     # What the vehicle itself calls -------------------------------------------------------------
 
-    def record_result(self, tick: int, result: CommandResult) -> None:
-        """Record what flight software is about to be told of a command."""
-        self._context.record("command_results", result_row(tick, result))
-
     def refuse(self, refusal: TransmissionRefusal) -> None:
         """Take that a message was refused, to be told in the next tick."""
         reason = refusal.reason
@@ -230,20 +224,6 @@ class VehicleContext:
         self._context.open_stream("estimates", (*streams.ESTIMATES, *fields))
         self._estimate_names = names
         return names
-
-
-def result_row(tick: int, result: CommandResult) -> tuple[int | float | str, ...]:
-    """Return a result as the stream command_results has it."""
-    return (
-        tick,
-        result.number,
-        result.status,
-        result.at_s,
-        result.revision,
-        result.delta_v_m_s,
-        result.propellant_kg,
-        result.reason,
-    )
 
 
 def _payload_bytes(payload: Any) -> int:

@@ -157,7 +157,7 @@ class Cockpit:
             self._read_gauge(t_s, self._gauges.popleft(), readings)
         while self._results:
             result = self._results.popleft()
-            self._board.record_result(tick, result)
+            self._board.desk.record_result(tick, result)
             self._read_gauge(t_s, result, readings)
             self._tell("command_result", result)
 
