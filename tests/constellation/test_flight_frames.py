@@ -1,5 +1,6 @@
 """Protocol `frames`: its two sides, Python's and that of flight_frames.h, speak the same, and no bytes break them."""
 
+import math
 import random
 import shutil
 import struct
@@ -228,6 +229,36 @@ def test_the_header_in_c_reads_and_writes_what_python_does(tmp_path):
     assert answers[1].commands == () and answers[3].estimate is None
     assert done.stderr == b"29 frames, 2 damaged, 1 overlong, 2 lost\n"
     assert not any(vehicle.faults.values())
+
+
+@pytest.mark.process
+def test_the_detumbling_computer_commands_nothing_before_it_is_set_up():
+    """One that has started anew hears ticks before its setup, and knows none of its settings."""
+    if shutil.which("cc") is None:
+        pytest.skip("no C compiler")
+    vehicle = Frames()
+    setup = vehicle.setup(SETUP)
+    unheard = [packet for number in range(60) for packet in vehicle.tick(turning(0.1 * number))]
+    heard = [packet for number in range(60, 120) for packet in vehicle.tick(turning(0.1 * number))]
+
+    done = subprocess.run(
+        [FLIGHT.parent / "firmware/detumble/detumble.sh"],
+        input=b"".join([*unheard, *setup, *heard]),
+        capture_output=True,
+        check=True,
+    )
+
+    answers = vehicle.feed(done.stdout)
+    assert len(answers) == 120
+    commanded = [one.t_s for one in answers if one.commands]
+    assert len(commanded) >= 10 and min(commanded) > 6.0
+
+
+def turning(t_s):
+    """Return the tick of a body that turns 8 deg/s across the field."""
+    field_t = (3e-5 * math.cos(0.14 * t_s), 3e-5 * math.sin(0.14 * t_s), 0.0)
+    readings = {"gyro": Reading(t_s, (0.0, 0.0, -0.14)), "magnetometer": Reading(t_s, field_t)}
+    return TickReport(t_s=t_s, readings=readings)
 
 
 @pytest.mark.parametrize(("is_kept", "setups"), [(True, [0, 1, 1]), (False, [1, 1, 1])])

@@ -17,15 +17,13 @@ TROUBLED, SOUND = "agent-01", ("agent-02", "agent-03")
 HZ = 10
 DURATION_S = 14
 BEGINS_S, FLOOD_S = 4, 4
-BYTES_S = 92_160
-"""Of the line: `line_bytes_s` of emulated_mcu."""
+BYTES_S = 8_192
+"""Of the line: `line_bytes_s` of emulated_mcu. An emulator that waits for a processor writes more than that, too."""
 ANSWER_BYTES_MAX = 400
-CHECKS = {
-    "constellation.flight_answers_late",
-    "constellation.maneuver_deadlines_broken",
-    "messages.sync.deadlines_broken",
-}
-"""Checks that a flight computer breaks that falls silent for a time."""
+ANSWERS_LATE = "constellation.flight_answers_late"
+"""Broken by a flight computer that falls silent for a time; that of a sound one has a minute."""
+BUSY = {"constellation.maneuver_deadlines_broken", "messages.sync.deadlines_broken"}
+"""Also broken where a command takes long on its way: on a busy machine by any vehicle."""
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +65,11 @@ def scenario(trouble):
     troubled["agents"] = [TROUBLED]
     told["parameters"]["flight"] = [troubled, sound]
     told["hardware"]["devices"] = [
-        {**device, "agents": agents, "parameters": {"firmware": f"firmware/{name}.elf"}}
+        {
+            **device,
+            "agents": agents,
+            "parameters": {"firmware": f"firmware/{name}.elf", "line_bytes_s": BYTES_S},
+        }
         for agents, name in (([TROUBLED], "trouble"), (list(SOUND), "detumble"))
     ]
     return told
@@ -94,7 +96,7 @@ def assert_nobody_else_noticed(folder, document):
     assert document["records"]["dropped"] == 0
     for agent in SOUND:
         flight = flight_of(document, agent)
-        assert flight["answers"] + flight["unanswered"] == DURATION_S * HZ
+        assert (flight["answers"], flight["unanswered"]) == (DURATION_S * HZ, 0)
         assert set(flight["interface"]["faults"].values()) == {0}
         device = document["devices"][f"{agent}/mcu"]
         assert (device["errors"], device["lost"], device["restarts"]) == (0, 0, 0)
@@ -129,7 +131,7 @@ def test_flood_is_held_to_the_lines_rate_and_the_vehicle_flies_on(fly, frames):
     assert_nobody_else_noticed(folder, document)
     found = broken(document)
     assert found.pop("hardware.lost_bytes") == f"{TROUBLED}/mcu"
-    assert set(found) <= CHECKS and set(found.values()) == {TROUBLED}
+    assert {name: found[name] for name in set(found) - BUSY} == {ANSWERS_LATE: TROUBLED}, found
     assert f"of {TROUBLED}/mcu" in document["verdict"]
 
     device, interface = document["devices"][f"{TROUBLED}/mcu"], flight_of(document)["interface"]
@@ -154,7 +156,8 @@ def test_firmware_that_stops_in_its_fault_handler_is_named_and_commands_no_more(
 
     assert code == 4
     assert_nobody_else_noticed(folder, document)
-    assert broken(document) == {"constellation.flight_answers_late": TROUBLED}
+    found = broken(document)
+    assert {name: found[name] for name in set(found) - BUSY} == {ANSWERS_LATE: TROUBLED}, found
     flight = flight_of(document)
     assert flight["answers"] < BEGINS_S * HZ + 5
     assert flight["ticks_skipped"] > 0
@@ -170,7 +173,8 @@ def test_emulator_that_gives_up_is_named_in_its_own_words(fly):
     assert_nobody_else_noticed(folder, document)
     found = broken(document)
     assert found["hardware.lost"] == f"{TROUBLED}/mcu"
-    assert set(found.values()) <= {TROUBLED, f"{TROUBLED}/mcu", f"{TROUBLED}/mcu.magnetometer"}
+    named = {worst for name, worst in found.items() if name not in BUSY}
+    assert named <= {TROUBLED, f"{TROUBLED}/mcu", f"{TROUBLED}/mcu.magnetometer"}, found
     device = document["devices"][f"{TROUBLED}/mcu"]
     assert device["why"].startswith("the emulator is gone: ")
     assert 'it said: "qemu: fatal: Lockup' in device["why"]

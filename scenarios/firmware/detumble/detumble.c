@@ -14,6 +14,7 @@ static flight_sender sender;
 static struct control control;
 static double command_s = 0.5, lead_s = 0.5; /* a command is given as often, and begins so long after it was given */
 static double next_s;
+static bool is_set_up; /* before that it knows none of the vehicle's settings, and commands nothing */
 static uint32_t deaf; /* times that the magnetometer did not answer */
 
 static struct control_settings settings = {
@@ -83,7 +84,7 @@ static void answer_tick(void)
         control_take_field(&control, t_s, field_t);
     else
         deaf++;
-    if (t_s >= next_s - 1e-6) {
+    if (is_set_up && t_s >= next_s - 1e-6) {
         if (control_dipole(&control, wanted))
             flight_command_dipole(&sender, wanted, t_s + lead_s, command_s);
         else if (control_torque(&control, wanted))
@@ -106,6 +107,7 @@ static void take_frame(void)
     switch (parser.frame.header.type) {
     case FLIGHT_SETUP:
         next_s = parser.frame.header.t_s;
+        is_set_up = true;
         control_start(&control, &settings);
         break;
     case FLIGHT_SETTING:

@@ -54,6 +54,10 @@ MAIL_MAX = 1024
 """Messages, results, and refusals, that wait for the next tick that is sent; older ones are dropped and counted."""
 CLOCK_S = 1.0
 """Between two records of its clock, simulated."""
+LAST_ANSWERS_S = 3.0
+"""In real time, for the answers to the last ticks: of all vehicles of this process together, which end one after the other."""
+LOOK_S = 0.02
+"""Between two looks for them, at most."""
 
 
 class ExternalFlight:
@@ -64,6 +68,9 @@ class ExternalFlight:
         settings: From the scenario.
         agent: The framework as the agent sees it.
     """
+
+    last_answers_s = LAST_ANSWERS_S
+    """Rest of that wait, s."""
 
     def __init__(self, settings: FlightProcess | FlightAttached, agent: AgentContext) -> None:
         self._settings = settings
@@ -84,7 +91,7 @@ class ExternalFlight:
         }
         self._answer_s_max = 0.0
         self._listened_s = 0.0
-        """Time at which answers were taken last: those to the last tick come when nobody listens any more."""
+        """Time at which answers were taken last."""
         self._begun_s = -math.inf
         """Time of its first answer: what it had to do before that is no lateness of the ticks asked meanwhile."""
         self._counts = {
@@ -186,8 +193,8 @@ class ExternalFlight:
 
     def finish(self) -> Mapping[str, Any]:
         """End the program, and return what came of it; in real time what was late is judged."""
-        if self._is_recorded:
-            self._account_for_last()
+        if not self._is_lockstep:
+            self._await_last()
         overdue = sum(self._is_late(sent_s, self._listened_s) for sent_s, _ in self._asked)
         code = self._link.end()
         self._keep_talk()
@@ -211,15 +218,26 @@ class ExternalFlight:
             summary["checks"] = [{"name": LATE_CHECK, "limit": 0, "got": late, "passed": late == 0}]
         return summary
 
+    def _await_last(self) -> None:
+        """Count the answers to the last ticks; there is no tick any more in which they could be carried out."""
+        began_s = monotonic()
+        is_owed = self._counts["answers"] > 0 and len(self._asked) < UNANSWERED_MAX
+        wait_s = min(self._settings.answer_s, ExternalFlight.last_answers_s) if is_owed else 0.0
+        with contextlib.suppress(BlamedError):  # whoever is gone answers no more
+            self._account_for_last()
+            while self._asked and monotonic() - began_s < wait_s and not self._link.how_it_ended():
+                self._link.wait(LOOK_S)
+                self._account_for_last()
+        ExternalFlight.last_answers_s -= monotonic() - began_s
+
     def _account_for_last(self) -> None:
-        """Count what has come since the last tick; there is none any more in which it could be carried out."""
-        with contextlib.suppress(BlamedError):
-            for arrival in self._link.arrivals():
-                for answer in self._protocol.feed(arrival.data):
-                    asked = None if self._has_own_clock else self._find_asked(answer, math.inf)
-                    if asked is not None:
-                        self._counts["answers"] += 1
-                        self._record_answer(asked, arrival.came_s)
+        self._listened_s = self._present_s()
+        for arrival in self._link.arrivals():
+            for answer in self._protocol.feed(arrival.data):
+                asked = None if self._has_own_clock else self._find_asked(answer, math.inf)
+                if asked is not None:
+                    came_s = arrival.came_s if self._is_recorded else self._present_s()
+                    self._count_answer(asked, came_s)
 
     def _interface_summary(self) -> dict[str, Any]:
         transport = self._link.transport
@@ -289,14 +307,9 @@ class ExternalFlight:
             if asked is None:
                 self._answers_unasked += 1
                 return
-            sent_s = asked[0]
-            self._answer_s_max = max(self._answer_s_max, came_s - sent_s)
-            if not counts["answers"]:
-                self._begun_s = came_s
-            counts["answers_late"] += self._is_late(sent_s, came_s)
-            if self._is_recorded:
-                self._record_answer(asked, came_s)
-        counts["answers"] += 1
+            self._count_answer(asked, came_s)
+        else:
+            counts["answers"] += 1
         if answer.board_us and self._is_recorded:
             self._clock.add(answer.board_us * 1e-6, self._agent.now_s() - (monotonic() - came_s))
         carry_out(answer, self._context, self._link.name, t_s=asked[1] if asked else None)
@@ -323,6 +336,16 @@ class ExternalFlight:
                 f"one before {t_s:g} s: {shown(answer.source)}"
             )
         return self._asked.popleft()
+
+    def _count_answer(self, asked: tuple[float, float], came_s: float) -> None:
+        sent_s, counts = asked[0], self._counts
+        self._answer_s_max = max(self._answer_s_max, came_s - sent_s)
+        if not counts["answers"]:
+            self._begun_s = came_s
+        counts["answers"] += 1
+        counts["answers_late"] += self._is_late(sent_s, came_s)
+        if self._is_recorded:
+            self._record_answer(asked, came_s)
 
     def _record_answer(self, asked: tuple[float, float], came_s: float) -> None:
         sent_s, asked_s = asked
