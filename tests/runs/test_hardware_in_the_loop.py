@@ -92,6 +92,25 @@ def test_firmware_reads_its_own_sensor_and_brakes_its_vehicle(cosmos):
 
 @pytest.mark.nightly
 @pytest.mark.timeout(600)
+def test_firmware_answers_every_tick_at_100_hz(cosmos):
+    folder, document, err = run(
+        cosmos, "--duration", "20", "--set", "agents.count=1", "--set", "agents.tick_hz=100"
+    )
+
+    assert document["status"] == "complete", err
+    flight = document["simulation"]["agents"]["agent-01"]["flight"]
+    # A machine that is busy for half a second skips ticks; those that were sent are answered.
+    assert (flight["answers"], flight["unanswered"]) == (flight["ticks_sent"], 0)
+    assert flight["ticks_sent"] + flight["ticks_skipped"] == 2000
+    assert flight["ticks_sent"] >= 1000
+    assert set(faults_of(document, "agent-01").values()) == {0}
+    assert len(records(folder, "flight_answers", "agent-01")) == flight["answers"]
+    report = (folder / "report.html").read_text()
+    assert "Answers of flight software" in report and "Latency of the loop, ms" in report
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(600)
 def test_ten_vehicles_come_to_rest_three_by_their_own_firmware(cosmos):
     folder, document, err = run(cosmos)
 
