@@ -53,6 +53,7 @@ COMMANDS = (
     "reboot",
     "wipe",
     "run",
+    "test",
     "inject",
     "ps",
     "down",

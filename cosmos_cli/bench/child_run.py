@@ -8,9 +8,7 @@ signals go on to it, and it ends cleanly by itself; should this process be kille
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -20,8 +18,8 @@ from types import FrameType
 from typing import Any
 
 from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.system.parent_death import end_with_parent
 
-PR_SET_PDEATHSIG = 1
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CLEAN_END_S = 120.0
 """For the shutdown of a run that was told to end, records and verdict included."""
@@ -70,7 +68,7 @@ def run_child(
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE if is_quiet else None,
         process_group=0,  # Ctrl-C comes once, by us
-        preexec_fn=_end_with_parent,  # noqa: PLW1509 - there is one thread
+        preexec_fn=end_with_parent,  # noqa: PLW1509 - there is one thread
     ) as process:
         try:
             with _forwarded(process) as stops:
@@ -122,14 +120,6 @@ def _forwarded(process: subprocess.Popen[bytes]) -> Iterator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _end_with_parent() -> None:
-    parent = os.getppid()
-    with contextlib.suppress(Exception):
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGTERM), 0, 0, 0)
-    if os.getppid() != parent:
-        os._exit(int(ExitCode.INTERRUPTED))
 
 
 def _document(out: bytes) -> Mapping[str, Any]:

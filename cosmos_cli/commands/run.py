@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -17,13 +19,15 @@ from cosmos_cli.commands.fleet_command import (
     SomeInventoryOption,
     some_machines,
 )
-from cosmos_cli.evidence.run_directory import runs_root
+from cosmos_cli.errors import InputError
+from cosmos_cli.evidence.run_directory import runs_root, utc_now
 from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.launch.access import chosen_access
 from cosmos_cli.launch.execute import Detached, RunOptions, execute, plan_of
 from cosmos_cli.launch.rehearsal import Rehearsal
 from cosmos_cli.launch.rehearsal_view import Asked, check_run
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
+from cosmos_cli.testing.junit import JunitOption, junit_case_of, write_junit
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption, losing_output
 from cosmos_cli.view.factory import make_view
 
@@ -60,6 +64,7 @@ def run(
             help="Print the command that starts this agent (or label, or glob) by hand.",
         ),
     ] = None,
+    junit: JunitOption = None,
     report: Annotated[
         bool, typer.Option("--report/--no-report", help="Write report.html at the end.")
     ] = True,
@@ -87,19 +92,28 @@ def run(
         connecting=ConnectOptions(accept_new_host_keys=accept_new_host_keys),
     )
     checked = load_scenario(scenario, [*(set_ or ()), *duration], warn=console.warn)
+    if junit is not None and (check or detach):
+        raise InputError("--junit writes the verdict: leave out --check and --detach")
     if check:
         asked = Asked(scenario=scenario, inventory=tuple(inventory or ()), limit=limit, host=host)
         raise typer.Exit(_check(console, checked, options, asked))
-    _run(console, checked, options)
+    _run(console, checked, options, junit)
 
 
-def _run(console: Console, checked: ScenarioFile, options: RunOptions) -> None:
+def _run(console: Console, checked: ScenarioFile, options: RunOptions, junit: Path | None) -> None:
     """Run, and end with the verdict; or without, where the run goes on by itself."""
+    started_utc, started_s = utc_now(), time.monotonic()
     summary = execute(checked, options, partial(make_view, quiet=console.quiet), console.say)
     say = console.say if console.json else console.data
     if isinstance(summary, Detached):
         console.print_json(summary.to_mapping())
         return say(summary.words)
+    if junit is not None:
+        case = junit_case_of(checked.path, summary.run.path, summary.document)
+        seconds = time.monotonic() - started_s
+        write_junit(
+            junit, [replace(case, seconds=seconds)], seconds=seconds, started_utc=started_utc
+        )
     with losing_output(f"{summary.verdict.text}; it stands in {summary.run.run_json}"):
         console.print_json(dict(summary.document))
         say(summary.last_line)

@@ -11,6 +11,7 @@ from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.launch.access import chosen_access
 from cosmos_cli.launch.place_plan import place_notes
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
+from cosmos_cli.models.scenario_outline import check_test
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
 
 READERS = {
@@ -34,6 +35,7 @@ def validate(
     for path in files:
         try:
             scenario_file = load_scenario(path, set_ or (), warn=console.warn)
+            check_test(path, set_ or (), console.warn)
         except InputError as error:
             faults += error.faults
             omitted += error.omitted

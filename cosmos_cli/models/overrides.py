@@ -14,7 +14,8 @@ KEY_CHARACTERS_SHOWN = 60
 OVERRIDES_MAX = 1000
 _STEP = re.compile(r"([^.\[\]]+)|\[([0-9]{1,9})\]")
 _INDEX = re.compile(r"[0-9]{1,9}")
-_KEY = re.compile(r"[^.\[\]]+(?:\.[^.\[\]]+|\[[0-9]{1,9}\])*")
+KEY_FORM = re.compile(r"[^.\[\]]+(?:\.[^.\[\]]+|\[[0-9]{1,9}\])*")
+"""A dotted path, such as agents.names[0]."""
 
 
 def apply_overrides(document: Document, overrides: Sequence[str]) -> list[Fault]:
@@ -62,7 +63,7 @@ def parse_override(override: str) -> tuple[str, Path, Any]:
     key = key.strip()
     if not equals:
         raise _override_error(override, "expected KEY=VALUE, such as agents.count=5")
-    if not _KEY.fullmatch(key):
+    if not KEY_FORM.fullmatch(key):
         raise _override_error(key or override, "expected a dotted path, such as agents.names[0]")
     if len(_STEP.findall(key)) > DEPTH_MAX:
         text = f"expected at most {DEPTH_MAX} levels of nesting"

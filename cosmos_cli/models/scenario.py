@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
 from cosmos_cli.models.placement import PlacementRule, claim_agents
 from cosmos_cli.models.planning import Planning
+from cosmos_cli.models.scenario_test import ScenarioTest, faults_of_test
 from cosmos_cli.models.text_forms import NAME_PATTERN, ScenarioRequirement
 from madns_runtime.config import (
     SEED_MAX,
@@ -90,6 +91,8 @@ class Scenario(BaseModel):
     """Machines of agents, rule by rule; the rest is spread evenly over all."""
     plan: Planning = Planning()
     """Terms of the inequalities of real time, for `cosmos plan` alone."""
+    test: ScenarioTest = ScenarioTest()
+    """The scenario as a test, for `cosmos test` alone."""
     parameters: dict[str, Any] = {}
     """The simulation's own settings."""
 
@@ -195,6 +198,11 @@ def _restarts(scenario: Scenario) -> Iterator[SectionFault]:
         yield ("agents", "restarts_max"), f"{text}, got {scenario.agents.restarts_max}: {why}"
 
 
+def _test(scenario: Scenario) -> Iterator[SectionFault]:
+    for path, text in faults_of_test(scenario.test):
+        yield ("test", *path), text
+
+
 def _executor(scenario: Scenario) -> Iterator[SectionFault]:
     kind = scenario.executor.kind
     module, _, attribute = kind.partition(":")
@@ -220,4 +228,5 @@ _CHECKS: tuple[tuple[frozenset[str], Callable[[Scenario], Iterator[SectionFault]
     (frozenset({"agents", "time"}), _duration),
     (frozenset({"agents", "on_agent_loss"}), _restarts),
     (frozenset({"executor"}), _executor),
+    (frozenset({"test"}), _test),
 )

@@ -1,0 +1,261 @@
+"""`cosmos test`: scenarios as tests, many at once."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cosmos_cli.errors import InputError
+from cosmos_cli.evidence.run_directory import runs_root, utc_now
+from cosmos_cli.testing.case import CaseSettings, SuiteCase
+from cosmos_cli.testing.discovery import ChosenCases, choose_cases, find_scenarios
+from cosmos_cli.testing.expression import parse_expression
+from cosmos_cli.testing.junit import JunitCase, JunitOption, write_junit
+from cosmos_cli.testing.last_failed import read_failed, remember_failed
+from cosmos_cli.testing.outcome import CaseOutcome
+from cosmos_cli.testing.seeds import parse_seeds
+from cosmos_cli.testing.suite import FOLDER, SuiteOptions, SuiteResult, check_folder, run_cases
+from cosmos_cli.testing.terminal import (
+    case_line,
+    collected_line,
+    details,
+    failure_lines,
+    summary_line,
+)
+from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
+
+JOBS_MAX = 256
+SECONDS_MAX = 86_400.0 * 30
+
+
+def test(
+    paths: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[PATH]...", help="Scenarios, or folders of them; default: ./scenarios, or ."
+        ),
+    ] = None,
+    expression: Annotated[
+        str,
+        typer.Option(
+            "-k",
+            metavar="EXPR",
+            help="Only tests whose name, file or tags match, as in 'quick and not hohmann'.",
+        ),
+    ] = "",
+    jobs: Annotated[
+        int,
+        typer.Option(
+            "-j",
+            "--jobs",
+            metavar="N",
+            min=0,
+            max=JOBS_MAX,
+            help="Scenarios in lockstep beside each other; 0 for one per processor.",
+        ),
+    ] = 0,
+    last_failed: Annotated[
+        bool, typer.Option("--last-failed", help="Only what failed last time; all if nothing did.")
+    ] = False,
+    seeds: Annotated[
+        str | None,
+        typer.Option(metavar="SEEDS", help="Run each with these seeds: 1..20, or 1,5,9."),
+    ] = None,
+    set_: SetOption = None,
+    full_length: Annotated[
+        bool, typer.Option("--full-length", help="Leave out what test.set changes, and baselines.")
+    ] = False,
+    realtime_s_max: Annotated[
+        float | None,
+        typer.Option(
+            "--realtime-max",
+            metavar="S",
+            min=0.1,
+            max=SECONDS_MAX,
+            help="Longest simulated time of a scenario in real time, s.",
+        ),
+    ] = None,
+    junit: JunitOption = None,
+    update_baselines: Annotated[
+        bool,
+        typer.Option("--update-baselines", help="Write what comes as what baselines expect."),
+    ] = False,
+    keep: Annotated[
+        bool, typer.Option("--keep", help="Keep the runs of tests that pass, too.")
+    ] = False,
+    runs: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            envvar="COSMOS_RUNS",
+            help="Folder of all runs, tests are in tests there; default: ./runs.",
+        ),
+    ] = None,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """
+    Run scenarios as tests: each shortened by its `test.set`, judged by its verdict, `test.expect` and `test.baseline`.
+
+    Ends with 0 if all passed, 1 if one failed, 2 if a scenario is wrong or none is meant, 130 if interrupted.
+    """
+    console = Console(json=json, quiet=quiet)
+    if update_baselines and (seeds or full_length):
+        raise InputError(
+            "--update-baselines writes figures of the test as it stands: leave out --seeds and"
+            " --full-length"
+        )
+    settings = CaseSettings(
+        overrides=tuple(set_ or ()), is_shortened=not full_length, realtime_s_max=realtime_s_max
+    )
+    chosen = _chosen(
+        console,
+        paths or [],
+        settings,
+        expression=expression,
+        seeds_of=_seeds_of(console, seeds, last_failed=last_failed),
+    )
+    if update_baselines:
+        _check_owners(chosen.cases)
+    options = SuiteOptions(
+        runs=runs_root(runs) / FOLDER,
+        jobs=jobs or len(os.sched_getaffinity(0)),
+        keeps_all=keep,
+        updates_baselines=update_baselines,
+    )
+    check_folder(options.runs)
+    started_utc, started_s = utc_now(), time.monotonic()
+    result = _run(console, chosen.cases, options)
+    seconds = time.monotonic() - started_s
+    remember_failed(result.outcomes)
+    ordered = in_order(result.outcomes, chosen.cases)
+    for line in failure_lines(ordered):
+        console.data(line)
+    console.data(summary_line(result, deselected=chosen.deselected, seconds=seconds))
+    console.print_json(
+        {
+            "tests": [each.to_mapping() for each in ordered],
+            "passed": result.count("passed"),
+            "failed": result.count("failed"),
+            "interrupted": result.count("interrupted"),
+            "not_run": result.not_run,
+            "deselected": chosen.deselected,
+            "seconds": round(seconds, 3),
+            "exit_code": int(result.exit_code),
+        }
+    )
+    if junit is not None:
+        cases = [junit_case(each) for each in ordered]
+        write_junit(junit, cases, seconds=seconds, started_utc=started_utc)
+    return int(result.exit_code)
+
+
+def _seeds_of(
+    console: Console, text: str | None, *, last_failed: bool
+) -> Callable[[Path], Sequence[int | None]]:
+    """Return the function that tells a scenario's seeds; none for one that did not fail last time."""
+    given: Sequence[int | None] = parse_seeds(text) if text else (None,)
+    failed = read_failed() if last_failed else ()
+    if not failed:
+        if last_failed:
+            console.say("nothing failed last time: all tests are meant")
+        return lambda path: given
+    by_path: dict[str, list[int | None]] = {}
+    for place, seed in failed:
+        by_path.setdefault(place, []).append(seed)
+    return lambda path: [
+        seed for seed in by_path.get(str(path.resolve()), []) if text is None or seed in given
+    ]
+
+
+def _chosen(
+    console: Console,
+    paths: Sequence[Path],
+    settings: CaseSettings,
+    *,
+    expression: str,
+    seeds_of: Callable[[Path], Sequence[int | None]],
+) -> ChosenCases:
+    is_meant = parse_expression(expression) if expression else lambda names: True
+    found = find_scenarios(paths)
+    chosen = choose_cases(found, settings, seeds_of=seeds_of, is_meant=is_meant, warn=console.warn)
+    console.say(
+        collected_line(
+            len(chosen.cases),
+            scenarios=len(found.outlines),
+            others=len(found.others),
+            deselected=chosen.deselected,
+        )
+    )
+    if not chosen.cases:
+        raise InputError(
+            "no tests: "
+            + (
+                f"none of {len(found.outlines)} scenarios is meant by -k, --last-failed and --seeds"
+                if found.outlines
+                else "no scenarios there; name files, or folders with scenarios"
+            )
+        )
+    return chosen
+
+
+def _check_owners(cases: Sequence[SuiteCase]) -> None:
+    """
+    Refuse a baseline that two tests would write.
+
+    Raises:
+        InputError: There is one.
+    """
+    owners: dict[Path, SuiteCase] = {}
+    for case in cases:
+        if case.baseline is None:
+            continue
+        other = owners.setdefault(case.baseline.path.resolve(), case)
+        if other is not case:
+            text = f"is the baseline of {other.name} and of {case.name}: each needs its own"
+            raise InputError(f"{case.baseline.path}: {text}")
+
+
+def _run(console: Console, cases: Sequence[SuiteCase], options: SuiteOptions) -> SuiteResult:
+    width = max(len(case.name) for case in cases)
+    number = 0
+
+    def tell(outcome: CaseOutcome) -> None:
+        nonlocal number
+        number += 1
+        console.data(case_line(outcome, number=number, total=len(cases), width=width))
+
+    return run_cases(cases, options, tell)
+
+
+def in_order(outcomes: Sequence[CaseOutcome], cases: Sequence[SuiteCase]) -> list[CaseOutcome]:
+    """Return what came of tests in the tests' own order."""
+    places = {case.key: place for place, case in enumerate(cases)}
+    return sorted(outcomes, key=lambda each: places[each.case.key])
+
+
+def junit_case(outcome: CaseOutcome) -> JunitCase:
+    """Return a test as JUnit XML holds it."""
+    case = outcome.case
+    is_failed = outcome.outcome == "failed"
+    return JunitCase(
+        classname=str(case.path),
+        name=f"{case.scenario_name}[seed={case.seed}]"
+        if case.has_given_seed
+        else case.scenario_name,
+        seconds=outcome.seconds,
+        failure=outcome.reasons[0] if is_failed else "",
+        details="\n".join(details(outcome)) if is_failed else "",
+        skipped="interrupted" if outcome.outcome == "interrupted" else "",
+        properties=(
+            ("seed", str(case.seed)),
+            ("verdict", outcome.verdict),
+            ("repeat", case.repeat_command),
+            *((("run", outcome.directory),) if outcome.directory else ()),
+        ),
+    )

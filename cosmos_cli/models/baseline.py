@@ -1,0 +1,121 @@
+"""
+A baseline: figures of a test's runs, what is expected of each, and how far it may be off.
+
+A figure is a value of run.json by its path, or a statistic of a recorded field over all agents that are meant. The
+expected values are written by `cosmos test --update-baselines`; names, tolerances and comments are a person's.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Le, MaxLen, MinLen
+from pydantic import Field, TypeAdapter, ValidationError
+
+from cosmos_cli.errors import Fault, InputError
+from cosmos_cli.models.document import KEY_FORM, Document, read_document
+from cosmos_cli.models.text_forms import NonBlank
+from cosmos_cli.models.translate import faults_of
+from cosmos_cli.models.yaml_source import read_source
+from madns_runtime.config import FORBID_EXTRA
+
+FIGURES_MAX = 1000
+Statistic = Literal["count", "mean", "sd", "rms", "min", "max", "p50", "p99", "last"]
+Tolerance = Annotated[float, Ge(0), Le(1e300)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BaselineFigure:
+    """One figure."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    path: Annotated[str, Field(max_length=500)] = ""
+    """Place of the value in run.json, such as timing.ticks; empty for a recorded field."""
+    stream: Annotated[str, Field(max_length=100)] = ""
+    """Stream as its table is called, such as state."""
+    field: Annotated[str, Field(max_length=100)] = ""
+    """Field of the stream."""
+    statistic: Statistic | None = None
+    """Statistic over all records; last: the largest of the last values."""
+    agents: Annotated[tuple[NonBlank, ...], MinLen(1), MaxLen(1000)] = ("*",)
+    """Names or globs of the agents whose records count."""
+    expected: float | bool | str | None = None
+    """Expected value; none until `cosmos test --update-baselines` has written it."""
+    tolerance: Tolerance = 0.0
+    """Largest difference that passes, in the field's unit."""
+    relative: Tolerance = 0.0
+    """Largest difference that passes, as a share of the expected value; the larger of both counts."""
+
+    @property
+    def text(self) -> str:
+        """The figure in words: its path, or stream.field and statistic."""
+        return self.path or f"{self.stream}.{self.field} {self.statistic}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BaselineContent:
+    """Content of a baseline's file."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    figures: dict[str, BaselineFigure]
+    """The figures by name."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Baseline:
+    """A file of figures, and the places of what stands in it."""
+
+    path: Path
+    figures: dict[str, BaselineFigure]
+    document: Document
+
+    def fault(self, name: str, text: str) -> Fault:
+        """Return a fault at the place of a figure."""
+        return self.document.fault(("figures", name), text, at_key=True)
+
+
+def read_baseline(path: Path) -> Baseline:
+    """
+    Read a baseline.
+
+    Raises:
+        InputError: With every fault.
+    """
+    document = read_document(read_source(path))
+    try:
+        content = _ADAPTER.validate_json(json.dumps(document.value), strict=True)
+    except ValidationError as error:
+        errors = error.errors(include_url=False)
+        raise InputError(faults=faults_of(document, errors, BaselineContent)) from error
+    faults = [*document.faults, *_faults(document, content)]
+    if faults:
+        raise InputError(faults=faults)
+    return Baseline(path=path, figures=content.figures, document=document)
+
+
+def _faults(document: Document, content: BaselineContent) -> list[Fault]:
+    faults = []
+    if not 1 <= len(content.figures) <= FIGURES_MAX:
+        text = f"expected 1 to {FIGURES_MAX} figures, got {len(content.figures)}"
+        faults.append(document.fault(("figures",), text))
+    for name, figure in content.figures.items():
+        of_stream = [word for word in ("stream", "field", "statistic") if getattr(figure, word)]
+        where = ("figures", name)
+        if figure.path and of_stream:
+            text = "expected a path of run.json, or stream, field and statistic; got both"
+            faults.append(document.fault((*where, "path"), text))
+        elif not figure.path and len(of_stream) < 3:
+            text = "expected path, or all of stream, field and statistic"
+            faults.append(document.fault(where, text, at_key=True))
+        elif figure.path and not KEY_FORM.fullmatch(figure.path):
+            text = "expected a dotted path, such as timing.ticks or checks[0].got"
+            faults.append(document.fault((*where, "path"), text))
+    return faults
+
+
+_ADAPTER: TypeAdapter[BaselineContent] = TypeAdapter(BaselineContent)

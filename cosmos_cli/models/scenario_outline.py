@@ -1,0 +1,166 @@
+"""A scenario as a test: what is known of it before it is checked, and the scenario with what its test changes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import TypeAdapter, ValidationError
+
+from cosmos_cli.errors import Fault, InputError
+from cosmos_cli.models.baseline import Baseline, read_baseline
+from cosmos_cli.models.document import Document, parse_override
+from cosmos_cli.models.loading import ScenarioFile, load_scenario, open_document
+from cosmos_cli.models.scenario_test import ScenarioTest, faults_of_test, override_of
+from cosmos_cli.models.translate import faults_of
+
+SECTION = "test"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScenarioOutline:
+    """A scenario's name and its section `test`, by which a suite chooses; nothing else is checked yet."""
+
+    path: Path
+    name: str
+    test: ScenarioTest
+    document: Document
+
+    def overrides(self, given: Sequence[str] = (), *, is_shortened: bool = True) -> list[str]:
+        """
+        Return KEY=VALUE for all that the test changes.
+
+        Args:
+            given: Of --set; what the test would set at or below one of these keys gives way.
+            is_shortened: Whether `test.set` counts.
+        """
+        if not is_shortened:
+            return list(given)
+        taken = [_steps(override) for override in given]
+        own = [
+            override
+            for override in self.test.overrides()
+            if not any(_steps(override)[: len(steps)] == steps for steps in taken)
+        ]
+        return [*own, *given]
+
+    def load(self, overrides: Sequence[str], warn: Callable[[str], None]) -> ScenarioFile:
+        """
+        Return the checked scenario.
+
+        Args:
+            overrides: As `overrides` returned them.
+            warn: Told of old names.
+
+        Raises:
+            InputError: With every fault; what follows from `test.set` has its place there.
+            MissingExtraError: The simulation needs an optional dependency that is not installed.
+        """
+        try:
+            return load_scenario(self.path, overrides, warn=warn)
+        except InputError as error:
+            own = {key: override_of(key, value) for key, value in self.test.set.items()}
+            applied = {key for key, override in own.items() if override in overrides}
+            faults = [self._placed(fault, applied) for fault in error.faults]
+            raise InputError(faults=faults, omitted=error.omitted) from error
+
+    def baseline(self) -> Baseline | None:
+        """
+        Return the figures that the test's runs are compared with; None for none.
+
+        Raises:
+            InputError: The file is missing or wrong.
+        """
+        name = self.test.baseline
+        if not name:
+            return None
+        path = self.path.parent / name
+        if not path.exists():
+            text = f"{path}: no such file; write the names of the figures there: docs/ci.md"
+            raise InputError(faults=[self.document.fault((SECTION, "baseline"), text)])
+        return read_baseline(path)
+
+    def _placed(self, fault: Fault, applied: set[str]) -> Fault:
+        """Return a fault of --set KEY=VALUE at KEY of `test.set`, if it came from there."""
+        if fault.override not in applied:
+            return fault
+        told = f"{fault.path}: {fault.text}" if fault.path != fault.override else fault.text
+        return self.document.fault((SECTION, "set", fault.override), told)
+
+
+def read_outline(path: Path) -> ScenarioOutline:
+    """
+    Read a scenario's name and its section `test`.
+
+    Raises:
+        InputError: The file is no YAML, or the section is wrong.
+    """
+    document = open_document(path)
+    value = document.value.get(SECTION, {})
+    try:
+        test = _ADAPTER.validate_json(json.dumps(value), strict=True)
+    except ValidationError as error:
+        faults = faults_of(
+            document, error.errors(include_url=False), ScenarioTest, below=(SECTION,)
+        )
+        raise InputError(faults=faults) from error
+    faults = [document.fault((SECTION, *where), text) for where, text in faults_of_test(test)]
+    if faults:
+        raise InputError(faults=faults)
+    name = document.value.get("name")
+    return ScenarioOutline(
+        path=path,
+        name=name if isinstance(name, str) and name else path.stem,
+        test=test,
+        document=document,
+    )
+
+
+def is_scenario(document: Document) -> bool:
+    """Tell whether a file of a folder means to be a scenario that can run, and no inventory, baseline or base of others."""
+    value = document.value
+    return "name" in value and ("simulation" in value or "extends" in value)
+
+
+def check_test(path: Path, given: Sequence[str], warn: Callable[[str], None]) -> None:
+    """
+    Check what `cosmos test` would meet beyond the scenario itself, which is right.
+
+    Raises:
+        InputError: With the faults of the scenario as its test changes it, and of the baseline.
+    """
+    outline = read_outline(path)
+    faults: list[Fault] = []
+    omitted = 0
+    for look in (
+        lambda: outline.load(outline.overrides(given), warn) if outline.test.set else None,
+        outline.baseline,
+    ):
+        try:
+            look()
+        except InputError as error:
+            faults += error.faults
+            omitted += error.omitted
+    if faults:
+        raise InputError(faults=faults, omitted=omitted)
+
+
+def with_seed(overrides: Sequence[str], seed: int | None) -> list[str]:
+    """Return settings with the seed of a run; None for the scenario's own."""
+    if seed is None:
+        return list(overrides)
+    return [*(item for item in overrides if _steps(item) != ("seed",)), f"seed={seed}"]
+
+
+def _steps(override: str) -> tuple[str, ...]:
+    """Return a dotted key as its steps; of one that is no key, the whole, which is told of later."""
+    try:
+        _, path, _ = parse_override(override)
+    except InputError:
+        return (override,)
+    return tuple(map(str, path))
+
+
+_ADAPTER: TypeAdapter[ScenarioTest] = TypeAdapter(ScenarioTest)

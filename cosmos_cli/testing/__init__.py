@@ -1,0 +1,14 @@
+"""
+Scenarios as tests: suites of them, and one run from a test of one's own.
+
+A suite's paths are searched for scenarios (`discovery`), each becomes a test with settings, seed and deadline
+(`case`). The schedule lets tests in lockstep run beside each other and those in real time alone (`schedule`); each
+runs as `cosmos run` in a process of its own (`suite_process`), its end is judged beside what its scenario expects
+(`outcome`) and beside the figures of its baseline (`figures`), and told on the terminal and as JUnit XML.
+"""
+
+from __future__ import annotations
+
+from cosmos_cli.testing.single_run import FinishedRun, run
+
+__all__ = ["FinishedRun", "run"]

@@ -1,0 +1,152 @@
+"""Scenarios in files and folders, those of them that are meant, and each one's tests."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from cosmos_cli.errors import Fault, InputError
+from cosmos_cli.models.loading import open_document
+from cosmos_cli.models.scenario_outline import ScenarioOutline, is_scenario, read_outline
+from cosmos_cli.models.yaml_source import FILE_BYTES_MAX
+from cosmos_cli.testing.case import CaseSettings, SuiteCase, make_cases
+from cosmos_cli.testing.expression import Matcher
+from madns_runtime.bounded_files import read_regular_file
+from madns_runtime.errors import MissingExtraError
+
+SUFFIXES: Final = (".yaml", ".yml")
+FILES_MAX: Final = 10_000
+CASES_MAX: Final = 20_000
+_SIMULATION: Final = re.compile(rb"^(?:simulation|extends)\s*:", re.MULTILINE)
+DEFAULT_FOLDERS: Final = (Path("scenarios"), Path())
+"""Looked into if no path is given: the first that is there."""
+
+
+@dataclass(slots=True, kw_only=True)
+class FoundScenarios:
+    """Scenarios of files and folders."""
+
+    outlines: list[ScenarioOutline] = field(default_factory=list)
+    others: list[Path] = field(default_factory=list)
+    """Files of folders that are YAML and no scenarios."""
+    faults: list[Fault] = field(default_factory=list)
+
+
+def find_scenarios(paths: Sequence[Path]) -> FoundScenarios:
+    """
+    Return the scenarios of files, and those in and below folders.
+
+    A file that is named is one; of a folder's files those are that have a name and a simulation; one that cannot be
+    read is at fault if it seems to have them. Folders whose name begins with a dot are left out, as are links to
+    folders.
+
+    Raises:
+        InputError: A path is missing, or the folders hold too many files.
+    """
+    found = FoundScenarios()
+    missing = [path for path in paths if not path.exists()]
+    if missing:
+        told = ", ".join(map(str, missing))
+        raise InputError(f"{told}: no such file or folder; name scenarios or folders of them")
+    seen: set[Path] = set()
+    for path in paths or (next(each for each in DEFAULT_FOLDERS if each.is_dir()),):
+        for file, is_named in [(path, True)] if path.is_file() else _files_below(path):
+            if file.resolve() not in seen:
+                seen.add(file.resolve())
+                _add(found, file, is_named=is_named)
+    return found
+
+
+def _files_below(folder: Path) -> list[tuple[Path, bool]]:
+    files: list[tuple[Path, bool]] = []
+    for here, folders, names in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        files += [(Path(here) / name, False) for name in sorted(names) if name.endswith(SUFFIXES)]
+        if len(files) > FILES_MAX:
+            raise InputError(
+                f"{folder}: expected at most {FILES_MAX} YAML files; name folders of it"
+            )
+    return files
+
+
+def _add(found: FoundScenarios, file: Path, *, is_named: bool) -> None:
+    try:
+        if not is_named and not is_scenario(open_document(file)):
+            found.others.append(file)
+            return
+        found.outlines.append(read_outline(file))
+    except InputError as error:
+        if is_named or _seems_scenario(file):
+            found.faults += error.faults or (Fault(text=str(error)),)
+        else:
+            found.others.append(file)
+
+
+def _seems_scenario(file: Path) -> bool:
+    """Tell whether a file that is no proper YAML means to be a scenario: other programs have YAML of their own."""
+    try:
+        return bool(_SIMULATION.search(read_regular_file(file, bytes_max=FILE_BYTES_MAX)))
+    except OSError:
+        return False
+
+
+@dataclass(slots=True, kw_only=True)
+class ChosenCases:
+    """Tests that are to be run."""
+
+    cases: list[SuiteCase] = field(default_factory=list)
+    deselected: int = 0
+
+
+def choose_cases(
+    found: FoundScenarios,
+    settings: CaseSettings,
+    *,
+    seeds_of: Callable[[Path], Sequence[int | None]],
+    is_meant: Matcher,
+    warn: Callable[[str], None],
+) -> ChosenCases:
+    """
+    Check the scenarios that are meant, and return each one's tests.
+
+    Args:
+        found: Scenarios and faults.
+        settings: Of the command line.
+        seeds_of: Returns the seeds with which a scenario is run; None among them for its own.
+        is_meant: Of the expression.
+        warn: Told of old names.
+
+    Raises:
+        InputError: With every fault of every scenario that is meant.
+    """
+    chosen = ChosenCases()
+    faults = list(found.faults)
+    messages: list[str] = []
+    omitted = 0
+    for outline in found.outlines:
+        seeds = seeds_of(outline.path)
+        meant = [seed for seed in seeds if is_meant(_names(outline, seed))]
+        chosen.deselected += max(1, len(seeds)) - len(meant)
+        try:
+            chosen.cases += make_cases(outline, settings, meant, warn) if meant else []
+        except InputError as error:
+            faults += error.faults
+            omitted += error.omitted
+            messages += [] if error.faults else [str(error)]
+        except MissingExtraError as error:
+            messages.append(f"{outline.path}: {error}")
+        if len(chosen.cases) > CASES_MAX:
+            raise InputError(f"expected at most {CASES_MAX} tests; choose with -k or fewer seeds")
+    faults += [Fault(text=text) for text in messages]
+    if faults:
+        raise InputError(faults=faults, omitted=omitted)
+    return chosen
+
+
+def _names(outline: ScenarioOutline, seed: int | None) -> list[str]:
+    names = [outline.name, outline.path.name, *outline.test.tags]
+    return [name.lower() for name in (*names, *([f"seed={seed}"] if seed is not None else []))]

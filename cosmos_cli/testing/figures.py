@@ -1,0 +1,166 @@
+"""Figures of a run by the names of a baseline, and their comparison with what is expected."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any, TypeGuard
+
+from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.table_labels import run_labels
+from cosmos_cli.evidence.tables import TableReader, open_tables
+from cosmos_cli.models.agent_labels import AgentLabels
+from cosmos_cli.models.baseline import Baseline, BaselineFigure
+from cosmos_cli.models.document import parse_override
+from madns_runtime.analysis.distribution import Distribution
+from madns_runtime.analysis.sampling import as_array
+
+ROWS_MAX = 200_000
+"""Records that are read at a time."""
+
+FigureValue = float | bool | str | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ComparedFigure:
+    """One figure of a baseline beside what came."""
+
+    name: str
+    expected: FigureValue
+    got: FigureValue
+    why_none: str = ""
+    """Why nothing came."""
+    allowed: float = 0.0
+    """Largest difference that passes."""
+
+    @property
+    def passed(self) -> bool:
+        """Whether what came is what is expected, within the tolerance; texts and truth values are the same or not."""
+        if self.expected is None or self.got is None:
+            return False
+        if _is_number(self.expected) and _is_number(self.got):
+            # Written so that a NaN does not pass.
+            return abs(self.got - self.expected) <= self.allowed
+        return type(self.expected) is type(self.got) and self.expected == self.got
+
+    def reason(self) -> str:
+        """Return why it does not pass."""
+        if self.expected is None:
+            return (
+                f"{self.name}: has no expected value: write it with cosmos test --update-baselines"
+            )
+        within = f" within {self.allowed:.10g}" if self.allowed else ""
+        told = f"{self.name}: expected {shown(self.expected)}{within}, got {shown(self.got)}"
+        return f"{told}: {self.why_none}" if self.why_none else told
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values for --json."""
+        return {
+            "name": self.name,
+            "expected": self.expected,
+            "allowed": self.allowed,
+            "got": self.got,
+            "passed": self.passed,
+        }
+
+
+def shown(value: object) -> str:
+    """Return a figure for people."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int | float):
+        return f"{value:.10g}"
+    return "none" if value is None else str(value)
+
+
+def compare_figures(
+    baseline: Baseline, run: RunDirectory, document: Mapping[str, Any]
+) -> list[ComparedFigure]:
+    """
+    Return every figure of a baseline beside a run's.
+
+    Args:
+        baseline: The figures.
+        run: The run, its tables written.
+        document: Its run.json.
+    """
+    tables = open_tables(run.tables)
+    labels = run_labels(run)
+    compared = []
+    for name, figure in baseline.figures.items():
+        got, why_none = (
+            _at_path(document, figure.path) if figure.path else _of_stream(figure, tables, labels)
+        )
+        expected = figure.expected
+        share = figure.relative * abs(expected) if _is_number(expected) else 0.0
+        compared.append(
+            ComparedFigure(
+                name=name,
+                expected=expected,
+                got=got,
+                why_none=why_none,
+                allowed=max(figure.tolerance, share),
+            )
+        )
+    return compared
+
+
+def _is_number(value: object) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _at_path(document: Mapping[str, Any], path: str) -> tuple[FigureValue, str]:
+    value: Any = document
+    for step in parse_override(f"{path}=")[1]:
+        if isinstance(value, list) and isinstance(step, int) and step < len(value):
+            value = value[step]
+        elif isinstance(value, Mapping) and str(step) in value:
+            value = value[str(step)]
+        else:
+            return None, f"run.json has no {path}: there is no {step}"
+    if isinstance(value, bool | str | int | float):
+        return value, ""
+    return None, f"run.json has no single value at {path}"
+
+
+def _of_stream(
+    figure: BaselineFigure, tables: Mapping[str, TableReader], labels: AgentLabels
+) -> tuple[FigureValue, str]:
+    table = tables.get(figure.stream)
+    if table is None:
+        return None, f"no stream {figure.stream}; there are {', '.join(tables) or 'none'}"
+    known = [field.name for field in table.fields]
+    if figure.field not in known:
+        return None, f"no field {figure.field} in {figure.stream}; there are {', '.join(known)}"
+    meant = {*figure.agents, *labels.labelled(figure.agents)}
+    sources = [
+        name for name in table.sources if any(fnmatchcase(name, pattern) for pattern in meant)
+    ]
+    if not sources:
+        return None, f"nobody of {', '.join(figure.agents)} recorded {figure.stream}"
+    return _statistic(figure, table, sources)
+
+
+def _statistic(
+    figure: BaselineFigure, table: TableReader, sources: list[str]
+) -> tuple[FigureValue, str]:
+    samples = Distribution()
+    newest: list[float] = []
+    for source in sources:
+        last = math.nan
+        for columns in table.batches(source, (figure.field,), ROWS_MAX):
+            values = as_array(columns[figure.field])
+            samples.add(Distribution.of(values))
+            last = float(values[-1]) if len(values) else last
+        newest.append(last)
+    summary = samples.summary()
+    if summary is None:
+        return (0, "") if figure.statistic == "count" else (None, "no value of it is a number")
+    if figure.statistic == "last":
+        finite = [value for value in newest if math.isfinite(value)]
+        return (max(finite), "") if finite else (None, "no last value is a number")
+    if figure.statistic == "rms":
+        return math.hypot(summary.mean, summary.sd), ""
+    return getattr(summary, figure.statistic or "mean"), ""

@@ -1,0 +1,145 @@
+"""The judgement of one test: what its run came to beside what was expected. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any, Literal
+
+from cosmos_cli.errors import ExitCode
+from cosmos_cli.models.scenario_test import ExpectedOutcome
+from cosmos_cli.system.bounded_process import describe_exit
+from cosmos_cli.testing.case import SuiteCase
+from cosmos_cli.testing.figures import ComparedFigure, shown
+from cosmos_cli.testing.suite_process import ProcessResult
+
+ResultWord = Literal["passed", "failed", "interrupted"]
+WORDS_LINES_MAX = 12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CaseOutcome:
+    """A test that has ended."""
+
+    case: SuiteCase
+    outcome: ResultWord
+    seconds: float
+    reasons: tuple[str, ...] = ()
+    """Reasons for which it did not pass, the first the shortest."""
+    exit_code: int | None = None
+    verdict: str = ""
+    broken: tuple[str, ...] = ()
+    """One line per broken check."""
+    words: str = ""
+    """What the run said last, where it came to no verdict."""
+    directory: str = ""
+    """Kept evidence; empty where none is kept."""
+    figures: tuple[ComparedFigure, ...] = ()
+    """Those of the baseline."""
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values for --json."""
+        return {
+            "name": self.case.name,
+            "scenario": str(self.case.path),
+            "seed": self.case.seed,
+            "outcome": self.outcome,
+            "seconds": round(self.seconds, 3),
+            "exit_code": self.exit_code,
+            "verdict": self.verdict or None,
+            "reasons": list(self.reasons),
+            "broken": list(self.broken),
+            "figures": [figure.to_mapping() for figure in self.figures],
+            "run": self.directory or None,
+            "repeat": self.case.repeat_command,
+        }
+
+
+def broken_checks(document: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the checks of a run.json that do not hold."""
+    checks = document.get("checks")
+    listed = checks if isinstance(checks, list) else []
+    return [c for c in listed if isinstance(c, Mapping) and c.get("passed") is False]
+
+
+def check_line(check: Mapping[str, Any]) -> str:
+    """Return a broken check in words: name, what came, the limit, the worst agent and when."""
+    unit = f" {check['unit']}" if check.get("unit") else ""
+    got = "not measured" if check.get("got") is None else f"{shown(check['got'])}{unit}"
+    whose = check.get("agent") or check.get("worst")
+    at = f" at {shown(check['t_s'])} s" if check.get("t_s") is not None else ""
+    who = f", worst: {whose}{at}" if whose else at
+    return f"{check.get('name')}: got {got}, limit {shown(check.get('limit'))}{unit}{who}"
+
+
+def judge_case(
+    case: SuiteCase,
+    result: ProcessResult,
+    *,
+    is_interrupted: bool,
+    figures: Sequence[ComparedFigure] = (),
+) -> CaseOutcome:
+    """
+    Judge a test.
+
+    Args:
+        case: The test.
+        result: End of its run.
+        is_interrupted: Whether somebody stopped the suite, and the run did not come to its end before.
+        figures: The baseline's, with what came.
+    """
+    reasons = _reasons(case, result, figures)
+    is_cut = is_interrupted and result.exit_code == ExitCode.INTERRUPTED
+    killed = is_interrupted and result.exit_code < 0
+    outcome: ResultWord = "failed" if reasons else "passed"
+    if is_cut or killed:
+        outcome, reasons = "interrupted", []
+    verdict = str(result.document.get("verdict") or "")
+    return CaseOutcome(
+        case=case,
+        outcome=outcome,
+        seconds=result.seconds,
+        reasons=tuple(reasons),
+        exit_code=result.exit_code,
+        verdict=verdict,
+        broken=tuple(map(check_line, broken_checks(result.document))),
+        words="" if verdict else "\n".join(result.words.splitlines()[-WORDS_LINES_MAX:]),
+        directory=str(result.directory or ""),
+        figures=tuple(figures),
+    )
+
+
+def _reasons(
+    case: SuiteCase, result: ProcessResult, figures: Sequence[ComparedFigure]
+) -> list[str]:
+    if result.is_too_long:
+        return [f"not done after {case.deadline_s:g} s (test.deadline_s), and ended"]
+    reasons = []
+    code, expected = result.exit_code, case.expect.exit_code
+    verdict = str(result.document.get("verdict") or "")
+    if code != expected:
+        wanted = f", expected {expected}" if expected else ""
+        reasons.append(f"{verdict or describe_exit(code)} (exit code {code}{wanted})")
+    reasons += _unexpected(case.expect, result.document, verdict)
+    return reasons + [f"baseline: {each.reason()}" for each in figures if not each.passed]
+
+
+def _unexpected(expect: ExpectedOutcome, document: Mapping[str, Any], verdict: str) -> list[str]:
+    reasons = []
+    if expect.verdict and expect.verdict not in verdict:
+        reasons.append(f"expected a verdict with {expect.verdict!r}, got {verdict or 'none'!r}")
+    if expect.broken is None:
+        return reasons
+    names = [str(check.get("name")) for check in broken_checks(document)]
+    reasons += [
+        f"expected {pattern} to be broken: it held, or was not judged"
+        for pattern in expect.broken
+        if not any(fnmatchcase(name, pattern) for name in names)
+    ]
+    reasons += [
+        f"{name} is broken, which is not among test.expect.broken"
+        for name in names
+        if not any(fnmatchcase(name, pattern) for pattern in expect.broken)
+    ]
+    return reasons

@@ -1,0 +1,200 @@
+"""
+A suite: tests are started as the schedule says, looked after until they end, judged, and told one by one.
+
+Stop signals go on to every run, once each: a run ends cleanly by itself. A second one ends all at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+from cosmos_cli.errors import ExitCode, RunFailedError
+from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.testing.baseline_update import update_baseline
+from cosmos_cli.testing.case import SuiteCase
+from cosmos_cli.testing.figures import ComparedFigure, compare_figures
+from cosmos_cli.testing.outcome import CaseOutcome, judge_case
+from cosmos_cli.testing.schedule import SuiteSchedule
+from cosmos_cli.testing.suite_process import ProcessResult, SuiteProcess
+
+FOLDER: Final = "tests"
+"""Of the runs of tests, in the folder of all runs."""
+POLL_S: Final = 0.05
+STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SuiteOptions:
+    """How a suite is run."""
+
+    runs: Path
+    """Folder of its runs."""
+    jobs: int
+    """Tests in lockstep beside each other."""
+    keeps_all: bool = False
+    """Whether evidence of tests that passed stays."""
+    updates_baselines: bool = False
+
+
+@dataclass(slots=True, kw_only=True)
+class SuiteResult:
+    """What came of a suite."""
+
+    outcomes: list[CaseOutcome] = field(default_factory=list)
+    not_run: int = 0
+    """Tests that an interruption left out."""
+    is_interrupted: bool = False
+
+    def count(self, word: str) -> int:
+        """Return how many tests ended so."""
+        return sum(each.outcome == word for each in self.outcomes)
+
+    @property
+    def exit_code(self) -> ExitCode:
+        """130 if it was interrupted, 1 if a test failed, else 0."""
+        if self.is_interrupted:
+            return ExitCode.INTERRUPTED
+        return ExitCode.RUN_FAILED if self.count("failed") else ExitCode.OK
+
+
+def run_cases(
+    cases: Sequence[SuiteCase], options: SuiteOptions, tell: Callable[[CaseOutcome], None]
+) -> SuiteResult:
+    """
+    Run tests.
+
+    Args:
+        cases: The tests.
+        options: How they are run.
+        tell: Told of each test that has ended.
+    """
+    suite = _Suite(cases, options, tell)
+    try:
+        with _stop_signals() as stops:
+            suite.run(stops)
+    finally:
+        suite.end_all()
+    return suite.result
+
+
+class _Suite:
+    def __init__(
+        self,
+        cases: Sequence[SuiteCase],
+        options: SuiteOptions,
+        tell: Callable[[CaseOutcome], None],
+    ) -> None:
+        self.schedule = SuiteSchedule(cases, options.jobs)
+        self.options = options
+        self.tell = tell
+        self.processes: list[tuple[SuiteCase, SuiteProcess]] = []
+        self.result = SuiteResult()
+
+    def run(self, stops: list[int]) -> None:
+        """Run until all have ended, or those that began when a stop signal comes."""
+        heard = 0
+        while not self.schedule.is_done:
+            now_s = time.monotonic()
+            if len(stops) > heard:
+                heard = len(stops)
+                self.stop(now_s, at_once=heard > 1)
+            while (case := self.schedule.begin()) is not None:
+                self.start(case, now_s)
+            for case, process in list(self.processes):
+                found = process.poll(now_s)
+                if found is not None:
+                    self.end(case, process, found)
+            time.sleep(POLL_S)
+
+    def start(self, case: SuiteCase, now_s: float) -> None:
+        """Start a test's run."""
+        process = SuiteProcess(
+            case.arguments(), self.options.runs, deadline_s=case.deadline_s, now_s=now_s
+        )
+        self.processes.append((case, process))
+
+    def stop(self, now_s: float, *, at_once: bool) -> None:
+        """Begin no more tests, and end those that run."""
+        self.result.is_interrupted = True
+        self.result.not_run += len(self.schedule.waiting)
+        self.schedule.waiting.clear()
+        for _, process in self.processes:
+            if at_once:
+                process.kill()
+            else:
+                process.stop(now_s)
+
+    def end_all(self) -> None:
+        """End what still runs, whatever happened."""
+        for _, process in self.processes:
+            process.kill()
+
+    def end(self, case: SuiteCase, process: SuiteProcess, found: ProcessResult) -> None:
+        """Judge a test that has ended, and clear up behind it."""
+        self.processes.remove((case, process))
+        self.schedule.end(case)
+        figures = self.figures(case, found)
+        outcome = judge_case(
+            case, found, is_interrupted=self.result.is_interrupted, figures=figures
+        )
+        if outcome.outcome == "passed" and not self.options.keeps_all:
+            if found.directory is not None:
+                _forget(RunDirectory(found.directory))
+            outcome = replace(outcome, directory="")
+        self.result.outcomes.append(outcome)
+        self.tell(outcome)
+
+    def figures(self, case: SuiteCase, found: ProcessResult) -> list[ComparedFigure]:
+        """Return the baseline's figures, or write them, if the run came to what is expected."""
+        if case.baseline is None or found.directory is None:
+            return []
+        if found.exit_code != case.expect.exit_code:
+            return []
+        compared = compare_figures(case.baseline, RunDirectory(found.directory), found.document)
+        if self.options.updates_baselines and all(each.got is not None for each in compared):
+            update_baseline(case.baseline, compared)
+            return [replace(each, expected=each.got) for each in compared]
+        return compared
+
+
+def _forget(run: RunDirectory) -> None:
+    shutil.rmtree(run.path, ignore_errors=True)
+    with contextlib.suppress(OSError):
+        run.bundle.unlink()
+
+
+@contextlib.contextmanager
+def _stop_signals() -> Iterator[list[int]]:
+    """Yield the stop signals that came, as they come."""
+    came: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        came.append(number)
+
+    before = {number: signal.signal(number, note) for number in STOP_SIGNALS}
+    try:
+        yield came
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def check_folder(runs: Path) -> None:
+    """
+    Make the folder of the suite's runs.
+
+    Raises:
+        RunFailedError: It cannot be made.
+    """
+    try:
+        runs.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunFailedError(f"{runs}: cannot be made: {error.strerror}; name another") from error

@@ -1,0 +1,66 @@
+"""A suite on the terminal, in the form that people know from pytest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from cosmos_cli.testing.outcome import CaseOutcome
+from cosmos_cli.testing.suite import SuiteResult
+from cosmos_cli.ui.plural import counted
+
+WIDTH = 79
+WORDS = {"passed": "PASSED", "failed": "FAILED", "interrupted": "INTERRUPTED"}
+
+
+def case_line(outcome: CaseOutcome, *, number: int, total: int, width: int) -> str:
+    """Return the line of one test: name, result, time, and how far the suite is."""
+    share = f"[{100 * number // total:3d}%]"
+    word = WORDS[outcome.outcome]
+    return f"{outcome.case.name:<{width}} {word:<11} {outcome.seconds:7.1f} s  {share}"
+
+
+def failure_lines(outcomes: Sequence[CaseOutcome]) -> list[str]:
+    """Return what is told of the tests that failed; nothing if none did."""
+    failed = [each for each in outcomes if each.outcome == "failed"]
+    if not failed:
+        return []
+    lines = [_ruled("FAILURES", "=")]
+    for each in failed:
+        lines += [_ruled(each.case.name, "_"), *details(each), ""]
+    return lines
+
+
+def details(outcome: CaseOutcome) -> list[str]:
+    """Return all that is told of one test that failed."""
+    lines = list(outcome.reasons)
+    lines += [f"  {line}" for line in outcome.broken]
+    lines += [f"  {line}" for line in outcome.words.splitlines()]
+    lines.append(f"repeat it: {outcome.case.repeat_command}")
+    if outcome.directory:
+        lines.append(f"its run: {outcome.directory}")
+        lines.append(f"its figures: cosmos report {outcome.directory}")
+    return lines
+
+
+def summary_line(result: SuiteResult, *, deselected: int, seconds: float) -> str:
+    """Return the last line: how many ended how, and the time of all together."""
+    parts = [
+        f"{result.count(word)} {word}"
+        for word in ("failed", "interrupted", "passed")
+        if result.count(word)
+    ]
+    parts += [f"{result.not_run} not run"] if result.not_run else []
+    parts += [f"{deselected} deselected"] if deselected else []
+    return _ruled(f"{', '.join(parts) or 'no tests ran'} in {seconds:.1f} s", "=")
+
+
+def collected_line(tests: int, *, scenarios: int, others: int, deselected: int) -> str:
+    """Return the line before the tests."""
+    told = [f"collected {counted(tests + deselected, 'test')}"]
+    told += [f"{deselected} deselected, {tests} selected"] if deselected else []
+    told += [f"{counted(others, 'YAML file')} not of scenarios"] if others else []
+    return f"{' / '.join(told)} ({counted(scenarios, 'scenario')})"
+
+
+def _ruled(text: str, mark: str) -> str:
+    return f" {text} ".center(WIDTH, mark)
