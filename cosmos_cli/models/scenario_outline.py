@@ -144,6 +144,7 @@ def check_test(path: Path, given: Sequence[str], warn: Callable[[str], None]) ->
             faults += error.faults
             omitted += error.omitted
     if faults:
+        faults.sort(key=lambda fault: (bool(fault.override), fault.line or 0, fault.column or 0))
         raise InputError(faults=faults, omitted=omitted)
 
 

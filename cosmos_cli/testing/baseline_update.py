@@ -53,9 +53,11 @@ def edited(document: Document, values: Mapping[str, FigureValue]) -> str:
 
 
 def _scalar(value: FigureValue) -> str:
-    if isinstance(value, float):
-        return f"{value:.10g}"
-    return json.dumps(value)
+    if not isinstance(value, float):
+        return json.dumps(value)
+    mantissa, mark, power = f"{value:.10g}".partition("e")
+    # Readers of YAML 1.1 take 1e-07 for a text.
+    return f"{mantissa}{'' if '.' in mantissa or not mark else '.0'}{mark}{power}"
 
 
 def _edit(document: Document, lines: Sequence[str], name: str, text: str) -> Edit:

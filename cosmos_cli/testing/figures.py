@@ -14,6 +14,7 @@ from cosmos_cli.evidence.tables import TableReader, open_tables
 from cosmos_cli.models.agent_labels import AgentLabels
 from cosmos_cli.models.baseline import Baseline, BaselineFigure
 from cosmos_cli.models.document import parse_override
+from cosmos_cli.testing.check_lines import shown
 from madns_runtime.analysis.distribution import Distribution
 from madns_runtime.analysis.sampling import as_array
 
@@ -64,15 +65,6 @@ class ComparedFigure:
             "got": self.got,
             "passed": self.passed,
         }
-
-
-def shown(value: object) -> str:
-    """Return a figure for people."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, int | float):
-        return f"{value:.10g}"
-    return "none" if value is None else str(value)
 
 
 def compare_figures(

@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import typer
 
 from cosmos_cli.errors import InputError
-from cosmos_cli.testing.outcome import broken_checks, check_line
+from cosmos_cli.testing.check_lines import broken_checks, check_line
 from cosmos_cli.ui.foreign_text import clean_line, clean_text
 from madns_runtime.partial_file import write_whole
 

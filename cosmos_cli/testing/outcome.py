@@ -11,7 +11,8 @@ from cosmos_cli.errors import ExitCode
 from cosmos_cli.models.scenario_test import ExpectedOutcome
 from cosmos_cli.system.bounded_process import describe_exit
 from cosmos_cli.testing.case import SuiteCase
-from cosmos_cli.testing.figures import ComparedFigure, shown
+from cosmos_cli.testing.check_lines import broken_checks, check_line
+from cosmos_cli.testing.figures import ComparedFigure
 from cosmos_cli.testing.suite_process import ProcessResult
 
 ResultWord = Literal["passed", "failed", "interrupted"]
@@ -56,23 +57,6 @@ class CaseOutcome:
         }
 
 
-def broken_checks(document: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return the checks of a run.json that do not hold."""
-    checks = document.get("checks")
-    listed = checks if isinstance(checks, list) else []
-    return [c for c in listed if isinstance(c, Mapping) and c.get("passed") is False]
-
-
-def check_line(check: Mapping[str, Any]) -> str:
-    """Return a broken check in words: name, what came, the limit, the worst agent and when."""
-    unit = f" {check['unit']}" if check.get("unit") else ""
-    got = "not measured" if check.get("got") is None else f"{shown(check['got'])}{unit}"
-    whose = check.get("agent") or check.get("worst")
-    at = f" at {shown(check['t_s'])} s" if check.get("t_s") is not None else ""
-    who = f", worst: {whose}{at}" if whose else at
-    return f"{check.get('name')}: got {got}, limit {shown(check.get('limit'))}{unit}{who}"
-
-
 def judge_case(
     case: SuiteCase,
     result: ProcessResult,
@@ -114,13 +98,13 @@ def _reasons(
     case: SuiteCase, result: ProcessResult, figures: Sequence[ComparedFigure]
 ) -> list[str]:
     if result.is_too_long:
-        return [f"not done after {case.deadline_s:g} s (test.deadline_s), and ended"]
+        return [f"not done after {case.deadline_s:g} s (its deadline), and ended"]
     reasons = []
     code, expected = result.exit_code, case.expect.exit_code
     verdict = str(result.document.get("verdict") or "")
     if code != expected:
-        wanted = f", expected {expected}" if expected else ""
-        reasons.append(f"{verdict or describe_exit(code)} (exit code {code}{wanted})")
+        told = verdict or f"the run {describe_exit(code)} without a verdict"
+        reasons.append(f"expected exit code {expected}, got {code}: {told}" if expected else told)
     reasons += _unexpected(case.expect, result.document, verdict)
     return reasons + [f"baseline: {each.reason()}" for each in figures if not each.passed]
 

@@ -27,7 +27,7 @@ from cosmos_cli.evidence.tables import TableReader, open_tables
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.models.scenario_test import override_of
 from cosmos_cli.testing.case import deadline_of
-from cosmos_cli.testing.outcome import broken_checks, check_line
+from cosmos_cli.testing.check_lines import broken_checks, check_line
 from cosmos_cli.testing.suite import FOLDER, POLL_S
 from cosmos_cli.testing.suite_process import ProcessResult, SuiteProcess
 

@@ -1,0 +1,32 @@
+"""Broken checks and figures in words. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+
+def broken_checks(document: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the checks of a run.json that do not hold."""
+    checks = document.get("checks")
+    listed = checks if isinstance(checks, list) else []
+    return [c for c in listed if isinstance(c, Mapping) and c.get("passed") is False]
+
+
+def check_line(check: Mapping[str, Any]) -> str:
+    """Return a broken check in words: name, what came, the limit, the worst agent and when."""
+    unit = f" {check['unit']}" if check.get("unit") else ""
+    got = "not measured" if check.get("got") is None else f"{shown(check['got'])}{unit}"
+    whose = check.get("agent") or check.get("worst")
+    at = f" at {shown(check['t_s'])} s" if check.get("t_s") is not None else ""
+    who = f", worst: {whose}{at}" if whose else at
+    return f"{check.get('name')}: got {got}, limit {shown(check.get('limit'))}{unit}{who}"
+
+
+def shown(value: object) -> str:
+    """Return a figure for people."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int | float):
+        return f"{value:.10g}"
+    return "none" if value is None else str(value)

@@ -1,0 +1,130 @@
+"""Scenarios in files and folders, and the tests that are made of those that are meant."""
+
+import pytest
+
+from cosmos_cli.errors import InputError
+from cosmos_cli.testing.case import CaseSettings
+from cosmos_cli.testing.discovery import choose_cases, find_scenarios
+from cosmos_cli.testing.expression import parse_expression
+
+SCENARIO = """\
+name: {name}
+simulation: counter
+agents: {{count: 2, tick_hz: 10}}
+time: {{duration_s: 600, mode: {mode}}}
+test: {{set: {{time.duration_s: 5}}, tags: [{tag}]}}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for place, name, mode, tag in (
+        ("a.yaml", "alpha", "realtime", "quick"),
+        ("deep/b.yml", "beta", "lockstep", "quick"),
+        ("deep/c.yaml", "gamma", "lockstep", "long"),
+        (".hidden/d.yaml", "delta", "lockstep", "quick"),
+    ):
+        path = tmp_path / place
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(SCENARIO.format(name=name, mode=mode, tag=tag))
+    (tmp_path / "inventory.yaml").write_text("all: {hosts: {pi01: {}}}\n")
+    (tmp_path / "list.yaml").write_text("[1, 2]\n")
+    (tmp_path / "template.yml").write_text("{{ of: another program }}: [\n")
+    (tmp_path / "notes.txt").write_text("name: x\nsimulation: y\n")
+    (tmp_path / "deep/loop").symlink_to(tmp_path)
+    return tmp_path
+
+
+def chosen(found, expression="", seeds=(None,), **settings):
+    return choose_cases(
+        found,
+        CaseSettings(**settings),
+        seeds_of=lambda path: seeds,
+        is_meant=parse_expression(expression) if expression else lambda names: True,
+        warn=print,
+    )
+
+
+def test_a_folders_scenarios_are_found_and_what_is_none_is_counted(folder):
+    found = find_scenarios([folder])
+
+    assert [outline.name for outline in found.outlines] == ["alpha", "beta", "gamma"]
+    assert [path.name for path in found.others] == ["inventory.yaml", "list.yaml", "template.yml"]
+    assert found.faults == []
+
+
+def test_a_scenario_that_is_meant_twice_is_one_test(folder):
+    found = find_scenarios([folder / "a.yaml", folder, folder / "deep"])
+
+    assert [outline.name for outline in found.outlines] == ["alpha", "beta", "gamma"]
+
+
+def test_scenarios_lie_in_the_folder_of_that_name_or_here(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    assert len(find_scenarios([]).outlines) == 3
+    (folder / "scenarios").mkdir()
+    assert find_scenarios([]).outlines == []
+
+
+def test_missing_paths_are_told_together(folder):
+    with pytest.raises(InputError, match=r"x.yaml, .*y: no such file or folder"):
+        find_scenarios([folder, folder / "x.yaml", folder / "y"])
+
+
+def test_every_fault_of_every_scenario_that_is_meant_comes_at_once(folder):
+    (folder / "bad1.yaml").write_text("name: e\nsimulation: counter\nagents: [\n")
+    (folder / "bad2.yaml").write_text("name: f\nsimulation: counter\nagents: {count: 0}\n")
+    (folder / "bad3.yaml").write_text("name: g\nsimulation: counter\ntest: {tags: x}\n")
+    (folder / "bad4.yaml").write_text(SCENARIO.format(name="h", mode="sideways", tag="quick"))
+
+    with pytest.raises(InputError) as caught:
+        chosen(find_scenarios([folder]))
+    files = {fault.file.rpartition("/")[2] for fault in caught.value.faults}
+    assert files == {"bad1.yaml", "bad2.yaml", "bad3.yaml", "bad4.yaml"}
+
+
+def test_tests_are_chosen_by_name_file_and_tag(folder):
+    found = find_scenarios([folder])
+
+    def names(expression):
+        picked = chosen(found, expression)
+        assert len(picked.cases) + picked.deselected == 3
+        return [case.scenario_name for case in picked.cases]
+
+    assert names("quick") == ["alpha", "beta"]
+    assert names("quick and not alpha") == ["beta"]
+    assert names("c.yaml or ALPHA") == ["alpha", "gamma"]
+    assert names("nothing") == []
+
+
+def test_faults_of_scenarios_that_are_not_meant_do_not_matter(folder):
+    (folder / "bad.yaml").write_text(SCENARIO.format(name="h", mode="sideways", tag="broken"))
+
+    assert len(chosen(find_scenarios([folder]), "quick").cases) == 2
+
+
+def test_each_seed_is_a_test_with_its_own_settings(folder):
+    cases = chosen(find_scenarios([folder / "a.yaml"]), "seed=3 or seed=1", seeds=(1, 2, 3)).cases
+
+    assert [case.name.rpartition("/")[2] for case in cases] == ["a.yaml[seed=1]", "a.yaml[seed=3]"]
+    assert cases[1].arguments()[1:] == ["--set", "time.duration_s=5", "--set", "seed=3"]
+
+
+def test_at_full_length_nothing_is_shortened_but_real_time(folder):
+    settings = {"is_shortened": False, "realtime_s_max": 60.0}
+    alpha, beta, _ = chosen(find_scenarios([folder]), **settings).cases
+
+    assert alpha.overrides == ("time.duration_s=60.0",)
+    assert beta.overrides == ()
+    assert beta.deadline_s > 600  # from its length
+
+
+def test_a_deadline_is_the_tests_own_or_follows_from_its_length(folder):
+    path = folder / "a.yaml"
+    (shorter,) = chosen(find_scenarios([path])).cases
+    (longer,) = chosen(find_scenarios([path]), overrides=("time.duration_s=1000",)).cases
+    path.write_text(path.read_text().replace("set:", "deadline_s: 33, set:"))
+    (own,) = chosen(find_scenarios([path])).cases
+
+    assert longer.deadline_s - shorter.deadline_s == pytest.approx(995 * 1.5)
+    assert own.deadline_s == 33

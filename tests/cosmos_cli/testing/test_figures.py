@@ -1,0 +1,128 @@
+"""Figures of a run by the names of a baseline, and the baseline that is written anew."""
+
+import math
+
+import pytest
+import yaml
+from harness.synthetic_run import SyntheticRun
+
+from cosmos_cli.errors import InputError
+from cosmos_cli.evidence.tabulate import gather
+from cosmos_cli.models.baseline import read_baseline
+from cosmos_cli.testing.baseline_update import update_baseline
+from cosmos_cli.testing.figures import ComparedFigure, compare_figures
+
+BASELINE = """\
+# What the run of the ring comes to.
+figures:
+  ticks: {path: timing.ticks, expected: 400}   # of both agents
+  first check: {path: "checks[0].got", expected: 3}
+  status: {path: status, expected: complete}
+  trips:
+    stream: round_trips
+    field: round_trip_us
+    statistic: count
+    expected: 400
+  mean trip: {stream: round_trips, field: round_trip_us, statistic: mean, expected: 340, relative: 0.2}
+  one trip: {stream: round_trips, field: round_trip_us, statistic: rms, agents: [agent-02], expected: 340, tolerance: 60}
+  last packet: {stream: round_trips, field: packet, statistic: last, expected: 199}
+"""
+DOCUMENT = {"timing": {"ticks": 400}, "checks": [{"got": 3}], "status": "complete"}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    made = SyntheticRun(tmp_path_factory.mktemp("runs")).write()
+    gather(made.run, 10.0, lambda *told: None)
+    return made.run
+
+
+@pytest.fixture
+def baseline(tmp_path):
+    def write(text):
+        path = tmp_path / "b.yaml"
+        path.write_text(text)
+        return read_baseline(path)
+
+    return write
+
+
+def test_figures_of_run_json_and_of_streams_are_compared_within_their_tolerance(baseline, run):
+    compared = compare_figures(baseline(BASELINE), run, DOCUMENT)
+
+    assert {each.name: each.passed for each in compared} == dict.fromkeys(
+        ["ticks", "first check", "status", "trips", "mean trip", "one trip", "last packet"], True
+    )
+    assert {each.name: each.allowed for each in compared}["mean trip"] == pytest.approx(68)
+
+
+@pytest.mark.parametrize(
+    ("figure", "words"),
+    [
+        ("{path: timing.tics, expected: 1}", "run.json has no timing.tics: there is no tics"),
+        ("{path: timing, expected: 1}", "no single value"),
+        ("{path: 'checks[7].got', expected: 1}", "there is no 7"),
+        ("{stream: nil, field: x, statistic: mean, expected: 1}", "no stream nil; there are"),
+        ("{stream: ticks, field: x, statistic: mean, expected: 1}", "no field x in ticks; there"),
+        (
+            "{stream: ticks, field: missed, statistic: mean, agents: [x], expected: 1}",
+            "nobody of x recorded ticks",
+        ),
+        ("{path: timing.ticks}", "has no expected value: write it with cosmos test"),
+        ("{path: timing.ticks, expected: 399}", "expected 399, got 400"),
+        ("{path: timing.ticks, expected: '400'}", "expected 400, got 400"),
+        ("{path: timing.ticks, expected: true}", "expected true, got 400"),
+    ],
+)
+def test_what_does_not_hold_says_why(baseline, run, figure, words):
+    (compared,) = compare_figures(baseline(f"figures: {{a: {figure}}}"), run, DOCUMENT)
+
+    assert not compared.passed
+    assert words in compared.reason()
+
+
+@pytest.mark.parametrize("got", [math.nan, math.inf, None])
+def test_what_is_no_number_never_passes(got):
+    assert not ComparedFigure(name="a", expected=1.0, got=got, allowed=1e9).passed
+
+
+def test_new_values_are_written_and_nothing_else_is_touched(baseline):
+    text = BASELINE.replace("expected: 400}", "expected: 12}").replace("\n    expected: 400", "")
+    text = text.replace(", expected: 3}", "}").replace("expected: complete", 'expected: "a \\" b"')
+    found = baseline(text)
+    values = {"ticks": 400, "first check": 3, "status": "complete", "trips": 400, "mean trip": 1e-7}
+    compared = [
+        ComparedFigure(name=name, expected=figure.expected, got=values.get(name, figure.expected))
+        for name, figure in found.figures.items()
+    ]
+
+    assert update_baseline(found, compared) == 5
+    written = found.path.read_text()
+    assert "  ticks: {path: timing.ticks, expected: 400}   # of both agents\n" in written
+    assert '  first check: {expected: 3, path: "checks[0].got"}\n' in written
+    assert "    expected: 400\n    stream: round_trips\n" in written
+    assert written.startswith("# What the run of the ring comes to.\n")
+    before, after = yaml.safe_load(text)["figures"], yaml.safe_load(written)["figures"]
+    assert [*after] == [*before]
+    for name, figure in after.items():
+        assert figure.pop("expected") == pytest.approx(
+            values.get(name, found.figures[name].expected)
+        )
+        before[name].pop("expected", None)
+    assert after == before
+
+
+def test_values_within_their_tolerance_are_left(baseline):
+    found = baseline("figures: {a: {path: x, expected: 1.0, tolerance: 0.5}}")
+    close = ComparedFigure(name="a", expected=1.0, got=1.2, allowed=0.5)
+
+    assert update_baseline(found, [close]) == 0
+    assert "expected: 1.0" in found.path.read_text()
+
+
+def test_a_figure_without_a_value_is_refused_at_its_place(baseline):
+    found = baseline("figures: {a: {path: x}}")
+    missing = ComparedFigure(name="a", expected=None, got=None, why_none="run.json has no x")
+
+    with pytest.raises(InputError, match="b.yaml:1:11: figures.a: run.json has no x"):
+        update_baseline(found, [missing])

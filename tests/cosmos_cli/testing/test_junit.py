@@ -1,0 +1,93 @@
+"""Results as JUnit XML that other programs read."""
+
+from pathlib import Path
+
+import pytest
+from lxml import etree
+
+from cosmos_cli.errors import InputError
+from cosmos_cli.testing.junit import JunitCase, junit_case_of, junit_text, write_junit
+
+SCHEMA = etree.XMLSchema(etree.parse(Path(__file__).with_name("junit.xsd")))
+FOREIGN = "\x1b[31mred\x00\x07 <&> \ud800 \ufffe \u202e\n\ttab ]]> \U0001f680"
+
+
+def case(**more):
+    return JunitCase(**{"classname": "s.yaml", "name": "s", "seconds": 1.25, **more})
+
+
+def parsed(*cases):
+    text = junit_text(cases, seconds=3.5, started_utc="2026-01-02T03:04:05.678Z")
+    root = etree.fromstring(text)
+    SCHEMA.assertValid(root)
+    return root
+
+
+def test_is_valid_and_counts_what_it_holds():
+    root = parsed(
+        case(properties=(("seed", "3"),)),
+        case(name="b", failure="broken", details="broken\nat agent-07"),
+        case(name="c", skipped="interrupted"),
+    )
+
+    (suite,) = root
+    assert dict(suite.attrib) == {
+        "name": "cosmos",
+        "tests": "3",
+        "failures": "1",
+        "errors": "0",
+        "skipped": "1",
+        "time": "3.500",
+        "timestamp": "2026-01-02T03:04:05",
+    }
+    assert suite[0].find("properties/property").attrib == {"name": "seed", "value": "3"}
+    assert suite[1].find("failure").text == "broken\nat agent-07"
+    assert suite[2].find("skipped").get("message") == "interrupted"
+
+
+def test_what_somebody_else_said_is_cleaned_everywhere():
+    root = parsed(
+        case(
+            classname=FOREIGN,
+            name=FOREIGN,
+            failure=FOREIGN,
+            details=FOREIGN,
+            properties=((FOREIGN, FOREIGN),),
+        ),
+        case(skipped=FOREIGN),
+    )
+
+    text = etree.tostring(root, encoding="unicode")
+    assert "\\x1b[31mred\\x00\\x07 &lt;&amp;&gt;" in text
+    assert not set("\x1b\x00\x07\u202e\ufffe") & set(text)
+
+
+def test_of_a_megabyte_the_end_is_counted():
+    failure = parsed(case(failure="x" * 10**6, details="y" * 10**6)).find(
+        "testsuite/testcase/failure"
+    )
+
+    assert len(failure.text) <= 20_000
+    assert "characters more" in failure.text and "characters more" in failure.get("message")
+
+
+def test_of_no_test_it_is_valid_too():
+    assert parsed()[0].get("tests") == "0"
+
+
+def test_a_run_by_itself_is_a_test_too():
+    check = {"name": "drift", "limit": 1, "got": 2, "passed": False, "worst": "agent-07"}
+    document = {"scenario": "s", "exit_code": 4, "verdict": "CHECK BROKEN", "checks": [check]}
+    failure = parsed(junit_case_of(Path("s.yaml"), Path("/runs/1"), document))[0][0].find("failure")
+
+    assert failure.get("message") == "CHECK BROKEN"
+    assert "drift: got 2, limit 1, worst: agent-07" in failure.text
+    assert parsed(junit_case_of(Path("s"), Path("r"), {"exit_code": 0}))[0].get("failures") == "0"
+
+
+def test_folders_are_made_and_what_cannot_be_written_is_told(tmp_path):
+    write_junit(tmp_path / "a/b.xml", [case()], seconds=1.0, started_utc="2026-01-02T03:04:05Z")
+    SCHEMA.assertValid(etree.parse(tmp_path / "a/b.xml"))
+
+    with pytest.raises(InputError, match="--junit .*b.xml/c.xml: cannot be written"):
+        write_junit(tmp_path / "a/b.xml/c.xml", [], seconds=0.0, started_utc="")

@@ -1,0 +1,73 @@
+"""The judgement of a test: what its run came to beside what is expected."""
+
+import pytest
+from suite_cases import broken, make_case, make_result
+
+from cosmos_cli.models.scenario_test import ExpectedOutcome
+from cosmos_cli.testing.figures import ComparedFigure
+from cosmos_cli.testing.outcome import judge_case
+from cosmos_cli.testing.terminal import details
+
+
+def judged(expect=None, result=None, *, is_interrupted=False, figures=()):
+    case = make_case(expect=expect or ExpectedOutcome())
+    return judge_case(case, result or make_result(), is_interrupted=is_interrupted, figures=figures)
+
+
+@pytest.mark.parametrize(
+    ("expect", "result", "outcome"),
+    [
+        ({}, make_result(0), "passed"),
+        ({}, make_result(4, broken("a")), "failed"),
+        ({"exit_code": 4}, make_result(4, broken("a")), "passed"),
+        ({"exit_code": 4}, make_result(0), "failed"),
+        ({"exit_code": 4, "broken": ("a",)}, make_result(4, broken("a")), "passed"),
+        ({"exit_code": 4, "broken": ("a*",)}, make_result(4, broken("a1"), broken("a2")), "passed"),
+        ({"exit_code": 4, "broken": ("a",)}, make_result(4, broken("a"), broken("b")), "failed"),
+        ({"exit_code": 4, "broken": ("a", "b")}, make_result(4, broken("a")), "failed"),
+        ({"verdict": "hold"}, make_result(0), "passed"),
+        ({"verdict": "agent-07"}, make_result(0), "failed"),
+        ({}, make_result(-9, document={}), "failed"),
+        ({}, make_result(0, is_too_long=True), "failed"),
+        ({"exit_code": 130}, make_result(130, is_too_long=True), "failed"),
+    ],
+)
+def test_passes_with_what_is_expected_and_with_nothing_else(expect, result, outcome):
+    assert judged(ExpectedOutcome(**expect), result).outcome == outcome
+
+
+def test_a_failure_names_checks_worst_agent_run_and_the_command_that_repeats_it():
+    check = broken("drift", worst="agent-07", unit="m", t_s=12.5)
+    case = make_case("ring", overrides=("time.duration_s=20", "seed=3"), seed=3)
+    outcome = judge_case(
+        case,
+        make_result(4, check, directory="/runs/tests/0001-ring"),
+        is_interrupted=False,
+    )
+
+    told = details(outcome)
+    assert "  drift: got 2.5 m, limit 1 m, worst: agent-07 at 12.5 s" in told
+    assert "repeat it: cosmos run ring.yaml --set time.duration_s=20 --set seed=3" in told
+    assert "its run: /runs/tests/0001-ring" in told
+
+
+def test_the_scenarios_own_seed_is_in_the_command_that_repeats_it():
+    assert make_case(seed=11).repeat_command == "cosmos run s.yaml --set seed=11"
+
+
+def test_a_run_that_was_cut_by_ctrl_c_did_not_fail():
+    cut = make_result(130)
+    assert judged(result=cut, is_interrupted=True).outcome == "interrupted"
+    assert judged(result=cut).outcome == "failed"  # somebody ended that run alone
+    assert judged(result=make_result(0), is_interrupted=True).outcome == "passed"
+    assert judged(result=make_result(-9, document={}), is_interrupted=True).outcome == "interrupted"
+
+
+def test_a_figure_out_of_tolerance_fails_and_says_what_was_expected():
+    good = ComparedFigure(name="a", expected=1.0, got=1.05, allowed=0.1)
+    bad = ComparedFigure(name="b", expected=1.0, got=1.2, allowed=0.1)
+
+    assert judged(figures=[good]).outcome == "passed"
+    outcome = judged(figures=[good, bad])
+    assert outcome.outcome == "failed"
+    assert outcome.reasons == ("baseline: b: expected 1 within 0.1, got 1.2",)

@@ -1,0 +1,256 @@
+"""`cosmos test` as a person and a CI job meet it: results, kept evidence, deadlines, interruption."""
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from harness.cosmos_command import CosmosCommand
+from harness.waiting import wait_until
+from lxml import etree
+
+from cosmos_cli.app import run as run_here
+from madns_runtime.processes import list_processes
+
+pytestmark = pytest.mark.process
+
+SCHEMA = etree.XMLSchema(etree.parse(Path(__file__).with_name("junit.xsd")))
+
+
+@pytest.fixture
+def cosmos(tmp_path):
+    return CosmosCommand(tmp_path)
+
+
+def scenario(cosmos, name, *, duration_s=600, **test):
+    path = cosmos.folder / "scenarios" / f"{name}.yaml"
+    path.parent.mkdir(exist_ok=True)
+    content = {
+        "name": name,
+        "simulation": "counter",
+        "agents": {"count": 2, "tick_hz": 10},
+        "time": {"mode": "lockstep", "duration_s": duration_s},
+        "timeouts": {"agents_ready_s": 120, "silence_s": 30},
+        "test": {"set": {"time.duration_s": 5}, **test},
+    }
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def results(done):
+    document = json.loads(done.stdout)
+    assert document["exit_code"] == done.returncode, done.stderr
+    return document, {Path(each["scenario"]).stem: each for each in document["tests"]}
+
+
+def nobody_is_left(cosmos, monkeypatch):
+    monkeypatch.setenv("COSMOS_STATE_DIR", cosmos.environment["COSMOS_STATE_DIR"])
+    wait_until(lambda: not list_processes())
+
+
+def test_a_suite_tells_each_test_keeps_failures_and_runs_them_again(cosmos):
+    scenario(cosmos, "good", tags=["quick"])
+    scenario(cosmos, "bad", tags=["quick"], expect={"exit_code": 4, "broken": ["counter.*"]})
+    scenario(cosmos, "slow", tags=["slow"])
+    done = cosmos("test", "-k", "quick", "--junit", "out/junit.xml")
+
+    assert done.returncode == 1, done.stderr
+    lines = done.stdout.splitlines()
+    assert "collected 3 tests / 1 deselected, 2 selected (3 scenarios)" in done.stderr
+    assert [line.split()[1] for line in lines[:2]].count("PASSED") == 1
+    assert all(line.endswith(("[ 50%]", "[100%]")) for line in lines[:2])
+    assert "expected exit code 4, got 0: PASSED" in done.stdout
+    assert "expected counter.* to be broken: it held, or was not judged" in done.stdout
+    assert (
+        "repeat it: cosmos run scenarios/bad.yaml --set time.duration_s=5 --set seed=0"
+        in done.stdout
+    )
+    assert "1 failed, 1 passed, 1 deselected in" in lines[-1]
+    (kept,) = [path for path in (cosmos.runs / "tests").iterdir() if path.is_dir()]
+    assert kept.name.endswith("-bad")
+    assert [path.name for path in (cosmos.runs / "tests").glob("*.zst")] == [f"{kept.name}.tar.zst"]
+    junit = etree.parse(cosmos.folder / "out/junit.xml")
+    SCHEMA.assertValid(junit)
+    assert junit.getroot()[0].get("failures") == "1"
+
+    again, tests = results(cosmos("test", "--last-failed", "--json"))
+    assert list(tests) == ["bad"]
+    assert again["deselected"] == 2
+
+    text = cosmos.folder.joinpath("scenarios/bad.yaml").read_text()
+    cosmos.folder.joinpath("scenarios/bad.yaml").write_text(
+        text.replace("exit_code: 4", "exit_code: 0").replace(
+            "broken:\n    - counter.*", "verdict: hold"
+        )
+    )
+    mended, tests = results(cosmos("test", "--last-failed", "--json"))
+    assert (mended["exit_code"], tests["bad"]["outcome"]) == (0, "passed")
+    assert "nothing failed last time" in cosmos("test", "--last-failed", "-k", "none").stderr
+
+
+def test_a_seed_that_failed_is_run_again_alone(cosmos):
+    scenario(cosmos, "s", expect={"verdict": "nothing says this"})
+    document, _ = results(cosmos("test", "--seeds", "1..2", "--json"))
+    assert [(each["seed"], each["outcome"]) for each in document["tests"]] == [
+        (1, "failed"),
+        (2, "failed"),
+    ]
+    again, _ = results(cosmos("test", "--last-failed", "-k", "seed=2", "--json"))
+    assert [each["seed"] for each in again["tests"]] == [2]
+
+
+def test_baselines_are_written_and_hold_the_run_to_them(cosmos):
+    scenario(cosmos, "s", baseline="figures.yaml")
+    file = cosmos.folder / "scenarios/figures.yaml"
+    file.write_text(
+        "figures:\n"
+        "  # All ticks of both agents.\n"
+        "  ticks: {path: timing.ticks}\n"
+        "  packets: {stream: round_trips, field: packet, statistic: max, expected: 7}\n"
+    )
+
+    _, tests = results(cosmos("test", "--json"))
+    assert tests["s"]["reasons"] == [
+        "baseline: ticks: has no expected value: write it with cosmos test --update-baselines",
+        "baseline: packets: expected 7, got 49",
+    ]
+    written, _ = results(cosmos("test", "--update-baselines", "--json"))
+    assert written["exit_code"] == 0
+    assert file.read_text() == (
+        "figures:\n"
+        "  # All ticks of both agents.\n"
+        "  ticks: {expected: 100, path: timing.ticks}\n"
+        "  packets: {stream: round_trips, field: packet, statistic: max, expected: 49}\n"
+    )
+    held, tests = results(cosmos("test", "--json"))
+    assert (held["exit_code"], [each["passed"] for each in tests["s"]["figures"]]) == (
+        0,
+        [True] * 2,
+    )
+
+
+def test_a_run_beyond_its_deadline_is_ended_with_all_that_it_started(cosmos, monkeypatch):
+    scenario(cosmos, "endless", set={"time.duration_s": 1e7}, deadline_s=4)
+    scenario(cosmos, "short")
+    document, tests = results(cosmos("test", "--json"))
+
+    assert (document["passed"], document["failed"]) == (1, 1)
+    assert tests["endless"]["reasons"] == ["not done after 4 s (its deadline), and ended"]
+    nobody_is_left(cosmos, monkeypatch)
+
+
+def test_ctrl_c_ends_all_runs_cleanly_and_tells_what_was_found(cosmos, monkeypatch):
+    scenario(cosmos, "short", set={"time.duration_s": 1})
+    for name in ("a", "b", "c"):
+        scenario(cosmos, name, set={"time.duration_s": 1e7}, deadline_s=600)
+    with cosmos.start(
+        "test", "-j", "4", "-k", "not c.yaml", "--json", "--junit", "j.xml"
+    ) as process:
+        monkeypatch.setenv("COSMOS_STATE_DIR", cosmos.environment["COSMOS_STATE_DIR"])
+        wait_until(lambda: sum(entry.role == "host" for entry in list_processes()) >= 2)
+        wait_until(lambda: not any("short" in entry.run for entry in list_processes()))
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=120)
+
+    document = json.loads(out)
+    assert (process.returncode, document["exit_code"]) == (130, 130), err
+    ended = {Path(each["scenario"]).stem: each["outcome"] for each in document["tests"]}
+    assert {name: ended[name] for name in ("a", "b")} == dict.fromkeys("ab", "interrupted")
+    SCHEMA.assertValid(etree.parse(cosmos.folder / "j.xml"))
+    nobody_is_left(cosmos, monkeypatch)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("-k", "nothing"), "no tests: none of 1 scenarios is meant"),
+        (("-k", "and"), "-k:1:1: expected a word"),
+        (("--seeds", "5..1"), "--seeds: expected a range that goes up"),
+        (("none.yaml",), "none.yaml: no such file or folder"),
+        (("--set", "agents.count=0"), "agents.count: expected >= 1"),
+        (("--update-baselines", "--seeds", "1"), "leave out --seeds"),
+        (("empty",), "no tests: no scenarios there"),
+    ],
+)
+def test_what_cannot_be_meant_ends_with_2_and_starts_nothing(
+    cosmos, monkeypatch, capsys, words, told
+):
+    scenario(cosmos, "s")
+    (cosmos.folder / "empty").mkdir()
+    monkeypatch.chdir(cosmos.folder)
+    monkeypatch.setenv("COSMOS_RUNS", str(cosmos.runs))
+    code, said = run_here(["test", *words]), capsys.readouterr()
+
+    assert (code, said.out) == (2, "")
+    assert told in said.err
+    assert not (cosmos.runs / "tests").exists()
+
+
+def test_two_tests_do_not_write_one_baseline(cosmos):
+    for name in ("a", "b"):
+        scenario(cosmos, name, baseline="figures.yaml")
+    (cosmos.folder / "scenarios/figures.yaml").write_text("figures: {a: {path: seed}}\n")
+    done = cosmos("test", "--update-baselines")
+
+    assert done.returncode == 2
+    assert "each needs its own" in done.stderr
+
+
+def test_a_run_by_itself_writes_junit_xml_too(cosmos):
+    path = scenario(cosmos, "s")
+    done = cosmos("run", path, "--no-report", "--duration", "1", "--junit", "j.xml")
+
+    assert done.returncode == 0, done.stderr
+    junit = etree.parse(cosmos.folder / "j.xml")
+    SCHEMA.assertValid(junit)
+    assert junit.getroot()[0][0].get("name") == "s"
+    refused = cosmos("run", path, "--check", "--junit", "j.xml")
+    assert (refused.returncode, "leave out --check" in refused.stderr) == (2, True)
+
+
+EXAMPLE = """
+import numpy as np
+import pytest
+
+from cosmos_cli.errors import InputError
+from cosmos_cli.testing import run
+
+
+def test_arrays(tmp_path):
+    found = run("scenarios/s.yaml", {"agents.count": 3}, runs=tmp_path, time__duration_s=2)
+    assert found.passed and found.exit_code == 0, found.verdict
+    assert found.broken == []
+    table = found.table("round_trips", "packet")
+    assert sorted(table) == ["agent-01", "agent-02", "agent-03"]
+    assert table["agent-02"]["packet"].tolist() == list(range(20))
+    assert isinstance(table["agent-01"]["packet"], np.ndarray)
+    with pytest.raises(KeyError, match="no stream none; there are"):
+        found.table("none")
+    with pytest.raises(KeyError, match="no none in round_trips; there are"):
+        found.table("round_trips", "none")
+
+
+def test_refused(tmp_path):
+    with pytest.raises(InputError, match="agents.count: expected >= 1"):
+        run("scenarios/s.yaml", runs=tmp_path, agents__count=0)
+"""
+
+
+def test_from_pytest_a_run_gives_its_verdict_and_its_records_as_arrays(cosmos):
+    scenario(cosmos, "s")
+    (cosmos.folder / "test_mine.py").write_text(EXAMPLE)
+    words = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "test_mine.py"]
+    done = subprocess.run(
+        [sys.executable, *words],
+        cwd=cosmos.folder,
+        env=cosmos.environment,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "2 passed" in done.stdout
