@@ -16,7 +16,8 @@ from annotated_types import Ge, Le, MaxLen, MinLen
 from pydantic import Field, TypeAdapter, ValidationError
 
 from cosmos_cli.errors import Fault, InputError
-from cosmos_cli.models.document import KEY_FORM, Document, read_document
+from cosmos_cli.models.document import Document, read_document
+from cosmos_cli.models.overrides import KEY_FORM
 from cosmos_cli.models.text_forms import NonBlank
 from cosmos_cli.models.translate import faults_of
 from cosmos_cli.models.yaml_source import read_source

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import copy
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
 from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.baseline import Baseline, read_baseline
-from cosmos_cli.models.document import Document, parse_override
-from cosmos_cli.models.loading import ScenarioFile, load_scenario, open_document
+from cosmos_cli.models.document import Document
+from cosmos_cli.models.extending import read_scenario_source
+from cosmos_cli.models.loading import ScenarioFile, load_scenario
+from cosmos_cli.models.overrides import parse_override
 from cosmos_cli.models.scenario_test import ScenarioTest, faults_of_test, override_of
 from cosmos_cli.models.translate import faults_of
+from cosmos_cli.models.variables import substitute_variables
 
 SECTION = "test"
 
@@ -27,6 +32,10 @@ class ScenarioOutline:
     name: str
     test: ScenarioTest
     document: Document
+    root: Path
+    """The folder that travels with it, from which relative files are found."""
+    settings: Mapping[str, Any]
+    """`test.set` as it is written, variables and all."""
 
     def overrides(self, given: Sequence[str] = (), *, is_shortened: bool = True) -> list[str]:
         """
@@ -41,7 +50,7 @@ class ScenarioOutline:
         taken = [_steps(override) for override in given]
         own = [
             override
-            for override in self.test.overrides()
+            for override in self._own()
             if not any(_steps(override)[: len(steps)] == steps for steps in taken)
         ]
         return [*own, *given]
@@ -61,7 +70,7 @@ class ScenarioOutline:
         try:
             return load_scenario(self.path, overrides, warn=warn)
         except InputError as error:
-            own = {key: override_of(key, value) for key, value in self.test.set.items()}
+            own = dict(zip(self.settings, self._own(), strict=True))
             applied = {key for key, override in own.items() if override in overrides}
             faults = [self._placed(fault, applied) for fault in error.faults]
             raise InputError(faults=faults, omitted=error.omitted) from error
@@ -76,11 +85,14 @@ class ScenarioOutline:
         name = self.test.baseline
         if not name:
             return None
-        path = self.path.parent / name
+        path = self.root / name
         if not path.exists():
             text = f"{path}: no such file; write the names of the figures there: docs/ci.md"
             raise InputError(faults=[self.document.fault((SECTION, "baseline"), text)])
         return read_baseline(path)
+
+    def _own(self) -> list[str]:
+        return [override_of(key, value) for key, value in self.settings.items()]
 
     def _placed(self, fault: Fault, applied: set[str]) -> Fault:
         """Return a fault of --set KEY=VALUE at KEY of `test.set`, if it came from there."""
@@ -97,7 +109,11 @@ def read_outline(path: Path) -> ScenarioOutline:
     Raises:
         InputError: The file is no YAML, or the section is wrong.
     """
-    document = open_document(path)
+    source = read_scenario_source(path)
+    document = source.document
+    written = document.value.get(SECTION)
+    settings = copy.deepcopy(written.get("set")) if isinstance(written, dict) else None
+    substitute_variables(document)
     value = document.value.get(SECTION, {})
     try:
         test = _ADAPTER.validate_json(json.dumps(value), strict=True)
@@ -115,6 +131,8 @@ def read_outline(path: Path) -> ScenarioOutline:
         name=name if isinstance(name, str) and name else path.stem,
         test=test,
         document=document,
+        root=source.root,
+        settings=settings if isinstance(settings, dict) else {},
     )
 
 

@@ -10,7 +10,8 @@ from typing import Annotated, Any, Literal
 from annotated_types import Gt, Le, MaxLen
 from pydantic import Field
 
-from cosmos_cli.models.document import KEY_FORM, Path
+from cosmos_cli.models.document import Path
+from cosmos_cli.models.overrides import KEY_FORM
 from cosmos_cli.models.text_forms import like
 from madns_runtime.config import FORBID_EXTRA
 
@@ -68,10 +69,6 @@ class ScenarioTest:
     """The outcome that passes."""
     baseline: RelativeFile = ""
     """File of figures with tolerances, which the run is compared with."""
-
-    def overrides(self) -> list[str]:
-        """Return `set` as KEY=VALUE of --set."""
-        return [override_of(key, value) for key, value in self.set.items()]
 
 
 def override_of(key: str, value: Any) -> str:

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Final
 
 from cosmos_cli.errors import Fault, InputError
-from cosmos_cli.models.loading import open_document
+from cosmos_cli.models.document import read_document
 from cosmos_cli.models.scenario_outline import ScenarioOutline, is_scenario, read_outline
-from cosmos_cli.models.yaml_source import FILE_BYTES_MAX
+from cosmos_cli.models.yaml_source import FILE_BYTES_MAX, read_source
 from cosmos_cli.testing.case import CaseSettings, SuiteCase, make_cases
 from cosmos_cli.testing.expression import Matcher
 from madns_runtime.bounded_files import read_regular_file
@@ -75,7 +75,7 @@ def _files_below(folder: Path) -> list[tuple[Path, bool]]:
 
 def _add(found: FoundScenarios, file: Path, *, is_named: bool) -> None:
     try:
-        if not is_named and not is_scenario(open_document(file)):
+        if not is_named and not is_scenario(read_document(read_source(file))):
             found.others.append(file)
             return
         found.outlines.append(read_outline(file))

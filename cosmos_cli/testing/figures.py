@@ -13,7 +13,7 @@ from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.evidence.tables import TableReader, open_tables
 from cosmos_cli.models.agent_labels import AgentLabels
 from cosmos_cli.models.baseline import Baseline, BaselineFigure
-from cosmos_cli.models.document import parse_override
+from cosmos_cli.models.overrides import parse_override
 from cosmos_cli.testing.check_lines import shown
 from madns_runtime.analysis.distribution import Distribution
 from madns_runtime.analysis.sampling import as_array

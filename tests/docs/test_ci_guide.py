@@ -126,7 +126,9 @@ def test_expressions_name_what_github_knows():
     assert {one.partition(".")[0] for one in inside} <= {"github", "runner", "env", "matrix"}
     conditions = [each["if"] for each in (*JOB["jobs"].values(), *steps()) if "if" in each]
     for condition in conditions:
-        assert re.fullmatch(r"(always|failure|success)\(\)|github\.event_name [!=]= '\w+'", condition)
+        assert re.fullmatch(
+            r"(always|failure|success)\(\)|github\.event_name [!=]= '\w+'", condition
+        )
 
 
 def test_it_caches_packages_and_keeps_results_and_failed_runs():
@@ -134,7 +136,9 @@ def test_it_caches_packages_and_keeps_results_and_failed_runs():
         uses = {step["uses"].partition("@")[0]: step for step in job["steps"] if "uses" in step}
         assert uses["actions/setup-python"]["with"]["cache"] == "pip"
         kept = "".join(
-            step["with"]["path"] for step in job["steps"] if "upload-artifact" in step.get("uses", "")
+            step["with"]["path"]
+            for step in job["steps"]
+            if "upload-artifact" in step.get("uses", "")
         )
         assert "results/junit.xml" in kept and "runs/tests/" in kept
 
@@ -166,7 +170,9 @@ def test_the_guides_pytest_example_runs(tmp_path):
     (tmp_path / "ring.yaml").write_text(SCENARIO)
     (block,) = blocks(GUIDE, "python")
     (tmp_path / "test_ring.py").write_text(block)
-    done = run(f"{shlex.quote(sys.executable)} -m pytest -q -p no:cacheprovider test_ring.py", tmp_path)
+    done = run(
+        f"{shlex.quote(sys.executable)} -m pytest -q -p no:cacheprovider test_ring.py", tmp_path
+    )
 
     assert done.returncode == 0, done.stdout + done.stderr
     assert "1 passed" in done.stdout
