@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Gt, Le, MinLen
 
+from madns_runtime.agent_parameters import AgentParameters
 from madns_runtime.conditions.condition import Condition
 from madns_runtime.plain_values import from_mapping as from_mapping
 from madns_runtime.plain_values import to_mapping as to_mapping
@@ -288,6 +289,8 @@ class RunConfig:
     seed: Annotated[int, Ge(0), Le(SEED_MAX)] = 0
     parameters: Mapping[str, Any] = field(default_factory=dict)
     """The simulation's own, already validated, defaults filled in."""
+    agent_parameters: tuple[AgentParameters, ...] = ()
+    """The whole parameters of agents, by name, for which others hold."""
     conditions: tuple[Condition, ...] = ()
     """On recorded values, each evaluated by whoever records them."""
 

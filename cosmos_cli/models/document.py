@@ -59,8 +59,8 @@ class Document:
 
     def fault(self, path: Path, text: str, *, at_key: bool = False) -> Fault:
         """Return a fault at the place of *path*; of one that was not written, at the key above."""
-        place = self.place(path, at_key=at_key)
-        name = dotted(path if place.path is None else place.path)
+        place, known = self._found(path, at_key)
+        name = dotted(path if place.path is None else (*place.path, *path[len(known) :]))
         if place.override:
             return Fault(text=text, path=name, override=place.override)
         source = place.source or self.source
@@ -68,14 +68,18 @@ class Document:
 
     def place(self, path: Path, *, at_key: bool = False) -> SourcePlace:
         """Return the place of *path*; of one that was not written, of the key above."""
+        return self._found(path, at_key)[0]
+
+    def _found(self, path: Path, at_key: bool) -> tuple[SourcePlace, Path]:
+        """Return the place, and the path that it is of."""
         for length in range(len(path), 0, -1):
             part = path[:length]
             exact = self.key_places if at_key or length < len(path) else self.value_places
             other = self.value_places if exact is self.key_places else self.key_places
             place = exact.get(part) or other.get(part)
             if place is not None:
-                return place
-        return SourcePlace(1, 1)
+                return place, part
+        return SourcePlace(1, 1), ()
 
     def rename(self, path: Path, name: str) -> None:
         """Call the key at *path*, a scalar's, *name*: its value and places stay."""

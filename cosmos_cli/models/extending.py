@@ -172,8 +172,18 @@ def _cure(file: _File, scenario: _File) -> str:
 
 def merge_below(document: Document, base: Document) -> None:
     """Put *base* below *document*: what that says stays, and of mappings what it does not say comes from *base*."""
-    _Merge(document, base).mapping(document.value, base.value, ())
+    merge_mapping(document, base, base.value, ())
     document.faults += [fault for fault in base.faults if fault not in document.faults]
+
+
+def merge_mapping(
+    document: Document, base: Document, lower: dict[str, Any], path: ValuePath
+) -> None:
+    """Put *lower*, which has its places at *path* of *base*, below the mapping at *path* of *document*."""
+    upper: Any = document.value
+    for step in path:
+        upper = upper[step]
+    _Merge(document, base).mapping(upper, lower, path)
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,8 @@ from cosmos_cli.models.hardware import hardware_faults
 from cosmos_cli.models.overrides import apply_overrides
 from cosmos_cli.models.own_requirements import own_requirement_faults
 from cosmos_cli.models.place_uses import CURE, shared_places
-from cosmos_cli.models.plugin_answers import ask_plugin, ask_plugin_demand, fault_found_at
+from cosmos_cli.models.plugin_answers import ask_plugin, fault_found_at
+from cosmos_cli.models.plugin_demand import ask_plugin_demand
 from cosmos_cli.models.scenario import OF_AUTHORS, Scenario, cross_faults
 from cosmos_cli.models.translate import faults_of
 from cosmos_cli.models.variables import (
@@ -29,6 +30,7 @@ from cosmos_cli.models.variables import (
     texts_with_words,
 )
 from cosmos_cli.models.yaml_source import YamlSource
+from madns_runtime.agent_parameters import AgentParameters
 from madns_runtime.config import RunConfig, to_mapping
 from madns_runtime.plugin.api import DeclaredStream, Demand, PlaceUse
 
@@ -52,6 +54,8 @@ class ScenarioFile:
     scenario: Scenario
     parameters: Mapping[str, Any]
     """The simulation's, as a plain mapping, defaults filled in."""
+    agent_parameters: tuple[AgentParameters, ...] = ()
+    """Whole parameters of agents for which others hold."""
     has_demand: bool
     """Whether the simulation tells what it asks of host and network."""
     streams: tuple[DeclaredStream, ...] | None = None
@@ -95,7 +99,10 @@ class ScenarioFile:
     def run_config(self, run: str) -> RunConfig:
         """Return what host and agents of the run named *run* are told."""
         return self.scenario.run_config(
-            run=run, base_directory=self.base_directory, parameters=self.parameters
+            run=run,
+            base_directory=self.base_directory,
+            parameters=self.parameters,
+            agent_parameters=self.agent_parameters,
         )
 
     def to_written(self) -> dict[str, Any]:
@@ -108,7 +115,8 @@ class ScenarioFile:
         """Return the scenario as plain values, overrides applied and defaults filled in."""
         keys = (key for key in Scenario.model_fields if key not in OF_AUTHORS)
         values = {key: getattr(self.scenario, key) for key in keys}
-        return to_mapping(values | {"parameters": self.parameters})
+        own = {"parameters": self.parameters, "agent_parameters": self.agent_parameters}
+        return to_mapping(values | own)
 
 
 def load_scenario(
@@ -215,6 +223,7 @@ def _check(
         overrides=overrides,
         scenario=scenario,
         parameters=answers.parameters,
+        agent_parameters=answers.agent_parameters,
         has_demand=answers.has_demand,
         streams=answers.streams,
         labels=answers.labels or NO_LABELS,

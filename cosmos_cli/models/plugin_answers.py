@@ -7,9 +7,8 @@ Code that is not shipped with COSMoS is imported and asked in a process of its o
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,28 +16,27 @@ from pydantic import ValidationError
 
 from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault, InputError
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
+from cosmos_cli.models.agent_rules import RULES, refused_parameters, rule_document, select_agents
 from cosmos_cli.models.document import Document
 from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.overrides import parse_override
 from cosmos_cli.models.parameters import adapter_of
+from cosmos_cli.models.plugin_process import Tell, ask_apart
 from cosmos_cli.models.plugin_values import changed, is_same, not_sendable
 from cosmos_cli.models.separate_process import (
-    SeparateDefect,
     SeparateFailure,
-    work_separately,
 )
 from cosmos_cli.models.translate import faults_of
 from cosmos_cli.models.variables import judge_open_texts
-from madns_runtime import errors as runtime_errors
-from madns_runtime.config import Agents, Timeouts, from_mapping, to_mapping
-from madns_runtime.errors import ConfigurationError, MadnsError, MissingExtraError, PluginError
-from madns_runtime.plugin.api import DeclaredStream, Demand, DeviceUse, PlaceUse, Simulation
+from madns_runtime.agent_parameters import AgentParameters
+from madns_runtime.config import Agents, to_mapping
+from madns_runtime.errors import ConfigurationError, MadnsError, PluginError
+from madns_runtime.plugin.api import DeclaredStream, DeviceUse, PlaceUse, Simulation
 from madns_runtime.plugin.code_places import blame, place_of
 from madns_runtime.plugin.columns import unknown_columns
 from madns_runtime.plugin.isolation import said
 from madns_runtime.plugin.queries import (
     ask_check,
-    ask_demand,
     ask_device_uses,
     ask_labels,
     ask_place_uses,
@@ -46,17 +44,12 @@ from madns_runtime.plugin.queries import (
 )
 from madns_runtime.plugin.registry import (
     is_file,
-    is_shipped,
     parse_parameters,
     part_faults,
     resolve,
 )
 from madns_runtime.plugin.time_limit import PluginStopped, hold
 
-_CODE = re.compile(r"[\w./~-]+:[A-Za-z_]\w*")
-"""Form in which a parameter names code of one's own: guidance.py:Guidance, package.module:Class."""
-
-Tell = Callable[[str], None]
 T = TypeVar("T")
 
 
@@ -68,6 +61,8 @@ class PluginAnswers:
     parameters: dict[str, Any] | None
     """Parameters as a plain mapping, defaults filled in; None if they are faulty or nobody could be asked."""
     has_demand: bool = False
+    agent_parameters: tuple[AgentParameters, ...] = ()
+    """Whole parameters of agents for which others hold."""
     streams: tuple[DeclaredStream, ...] | None = None
     """Streams as it declares them; None if it declares none, or nobody could be asked."""
     labels: AgentLabels | None = NO_LABELS
@@ -105,87 +100,49 @@ def ask_plugin(
         return _Asking(document, agents, base_directory, tell).answers(spec, duration_s)
 
     try:
-        return _do(work, PluginAnswers, document, spec)
+        return ask_apart(work, PluginAnswers, document, spec)
     except SeparateFailure as failure:
         fault = document.fault(("simulation",), str(failure))
         return PluginAnswers(faults=(fault,), parameters=None)
 
 
-def ask_plugin_demand(
-    document: Document, parameters: Mapping[str, Any], agents: Agents, base_directory: Path
-) -> Demand:
-    """
-    Return what the simulation asks of host and network.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _OfParameters:
+    """What follows from one set of parameters."""
 
-    Args:
-        document: The scenario.
-        parameters: As `ask_plugin` returned them.
-        agents: Of the scenario.
-        base_directory: Its folder.
-
-    Raises:
-        PluginError: It raised, returned no proper Demand, or did not come to an end.
-        MissingExtraError: It needs an optional dependency that is not installed.
-    """
-    spec = str(document.value["simulation"])
-
-    def work(tell: Tell) -> Demand:
-        tell(f"importing {spec}")
-        simulation = resolve(spec, base_directory)
-        tell(f"demand() of {spec}")
-        return ask_demand(
-            str(simulation.demand),
-            base_directory,
-            parameters=parse_parameters(simulation, parameters),
-            agents=agents.count,
-            tick_hz=agents.tick_hz,
-        )
-
-    try:
-        return _do(work, Demand, document, spec)
-    except SeparateFailure as failure:
-        raise PluginError(str(failure)) from None
+    agents: tuple[str, ...] = ()
+    """For which it holds; empty for all others."""
+    parameters: dict[str, Any]
+    streams: tuple[DeclaredStream, ...] | None
+    device_uses: tuple[DeviceUse, ...]
+    place_uses: tuple[PlaceUse, ...]
 
 
-def _do(work: Callable[[Tell], T], kind: type[T], document: Document, spec: str) -> T:
-    """Return what *work* does: here if the simulation is shipped, else in a process of its own."""
-    if is_shipped(spec) and not _names_code(document.value.get("parameters")):
-        return work(lambda doing: None)
-
-    def guarded(tell: Tell) -> Mapping[str, Any]:
-        try:
-            return {"value": to_mapping(work(tell))}
-        except MissingExtraError as error:
-            return {"missing": [error.module, error.extra]}
-        except MadnsError as error:
-            return {"raised": [type(error).__name__, str(error)]}
-
-    try:
-        answer = work_separately(guarded, limit_s=_limit_s(document))
-    except SeparateDefect as defect:
-        raise RuntimeError(str(defect)) from None
-    if "missing" in answer:
-        raise MissingExtraError(*answer["missing"])
-    if "raised" in answer:
-        name, text = answer["raised"]
-        raise getattr(runtime_errors, name, PluginError)(text)
-    return from_mapping(kind, answer["value"])
-
-
-def _limit_s(document: Document) -> float:
-    """Return what the scenario gives its plug-in, as far as that can be told yet."""
-    timeouts = document.value.get("timeouts")
-    value = timeouts.get("loading_s") if isinstance(timeouts, dict) else None
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return float(value) if is_number and 0 < value <= 3600 else Timeouts().loading_s  # type: ignore[operator,arg-type]
-
-
-def _names_code(value: Any) -> bool:
-    if isinstance(value, str):
-        return _CODE.fullmatch(value) is not None
-    if isinstance(value, dict):
-        return any(map(_names_code, value.values()))
-    return isinstance(value, list) and any(map(_names_code, value))
+def with_rules(
+    found: PluginAnswers, own: _OfParameters, rules: Sequence[_OfParameters]
+) -> PluginAnswers:
+    """Return the answers of all sets of parameters together, each for its agents."""
+    ruled = {agent for rule in rules for agent in rule.agents}
+    streams = own.streams
+    for rule in rules:
+        known = {(each.role, each.name) for each in streams or ()}
+        more = [each for each in rule.streams or () if (each.role, each.name) not in known]
+        streams = None if streams is None else (*streams, *more)
+    return replace(
+        found,
+        agent_parameters=tuple(
+            AgentParameters(agents=rule.agents, parameters=rule.parameters) for rule in rules
+        ),
+        streams=streams,
+        device_uses=(
+            *(use for use in own.device_uses if use.agent not in ruled),
+            *(use for rule in rules for use in rule.device_uses if use.agent in rule.agents),
+        ),
+        place_uses=(
+            *(use for use in own.place_uses if use.agent not in ruled),
+            *(use for rule in rules for use in rule.place_uses if use.agent in rule.agents),
+        ),
+    )
 
 
 class _Asking:
@@ -201,31 +158,60 @@ class _Asking:
     def answers(self, spec: str, duration_s: float) -> PluginAnswers:
         """Return faults, parameters and whether there is a `demand`."""
         simulation = self._simulation(spec)
-        parameters = None if simulation is None else self._parameters(simulation)
-        streams: tuple[DeclaredStream, ...] | None = None
-        labels: AgentLabels | None = NO_LABELS
-        uses: tuple[DeviceUse, ...] = ()
-        places: tuple[PlaceUse, ...] = ()
-        if simulation is not None and parameters is not None and self._agents is not None:
-            self._check(simulation, parameters, self._agents, duration_s)
-            streams = self._streams(simulation, parameters, self._agents)
-            labels = self._labels(simulation, parameters, self._agents)
-            uses = self._uses(ask_device_uses, simulation.device_uses, parameters, self._agents)
-            places = self._uses(ask_place_uses, simulation.place_uses, parameters, self._agents)
-        elif simulation is not None and simulation.labels is not None:
-            labels = None
-        first = self._faults[:FAULTS_SHOWN_MAX]
-        return PluginAnswers(
-            faults=tuple(fault.clipped() for fault in first),
-            omitted=len(self._faults) - len(first),
+        if simulation is None:
+            return self._told(PluginAnswers(faults=(), parameters=None))
+        opened = judge_open_texts(self._document, simulation.placeholders)
+        self._faults += opened
+        parameters = self._parameters(simulation, opened)
+        found = PluginAnswers(
+            faults=(),
             parameters=None if parameters is None else to_mapping(parameters),
-            has_demand=simulation is not None and simulation.demand is not None,
-            streams=streams,
-            labels=labels,
-            device_uses=uses,
-            place_uses=places,
-            placeholders={} if simulation is None else simulation.placeholders,
+            has_demand=simulation.demand is not None,
+            labels=NO_LABELS if simulation.labels is None else None,
+            placeholders=simulation.placeholders,
         )
+        if parameters is not None and self._agents is not None:
+            found = replace(found, labels=self._labels(simulation, parameters, self._agents))
+            own = self._of(simulation, parameters, self._agents, duration_s)
+            rules = self._rules(simulation, self._agents, found.labels, duration_s)
+            found = with_rules(found, own, rules)
+        return self._told(found)
+
+    def _told(self, found: PluginAnswers) -> PluginAnswers:
+        first = self._faults[:FAULTS_SHOWN_MAX]
+        omitted = len(self._faults) - len(first)
+        return replace(found, faults=tuple(fault.clipped() for fault in first), omitted=omitted)
+
+    def _of(
+        self, simulation: Simulation, parameters: Any, agents: Agents, duration_s: float
+    ) -> _OfParameters:
+        """Ask all that follows from one set of parameters."""
+        self._check(simulation, parameters, agents, duration_s)
+        return _OfParameters(
+            parameters=to_mapping(parameters),
+            streams=self._streams(simulation, parameters, agents),
+            device_uses=self._uses(ask_device_uses, simulation.device_uses, parameters, agents),
+            place_uses=self._uses(ask_place_uses, simulation.place_uses, parameters, agents),
+        )
+
+    def _rules(
+        self, simulation: Simulation, agents: Agents, labels: AgentLabels | None, duration_s: float
+    ) -> list[_OfParameters]:
+        """Ask the same of the parameters that rules give some agents."""
+        given = self._document.value.get(RULES) or ()
+        names = agents.resolved_names()
+        chosen, faults = select_agents(self._document, names, labels)
+        self._faults += [*faults, *refused_parameters(self._document, simulation)]
+        found = []
+        for index in range(len(given)):
+            document = rule_document(self._document, index)
+            asking = _Asking(document, agents, self._base_directory, self._tell)
+            parameters = asking._parameters(simulation, ())
+            if parameters is not None:
+                one = asking._of(simulation, parameters, agents, duration_s)
+                found.append(replace(one, agents=chosen[index]))
+            self._faults += [fault for fault in asking._faults if fault not in self._faults]
+        return found
 
     def _blame(self, *texts: str) -> None:
         """Enter faults of the simulation itself."""
@@ -246,9 +232,8 @@ class _Asking:
         self._blame(*(part_faults(simulation, self._base_directory) if is_file(spec) else ()))
         return simulation
 
-    def _parameters(self, simulation: Simulation) -> Any:
-        opened = judge_open_texts(self._document, simulation.placeholders)
-        self._faults += opened
+    def _parameters(self, simulation: Simulation, opened: Sequence[Fault]) -> Any:
+        """Return the parameters; None if they have faults, and *opened* are those that are told already."""
         value = self._document.value.get("parameters", {})
         if not isinstance(value, Mapping):
             return None  # the model has said so already

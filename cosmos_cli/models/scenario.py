@@ -18,6 +18,7 @@ from cosmos_cli.models.placement import PlacementRule, claim_agents
 from cosmos_cli.models.planning import Planning
 from cosmos_cli.models.scenario_test import ScenarioTest, faults_of_test
 from cosmos_cli.models.text_forms import NAME_PATTERN, ScenarioRequirement
+from madns_runtime.agent_parameters import AgentParameters
 from madns_runtime.config import (
     SEED_MAX,
     Agents,
@@ -95,9 +96,16 @@ class Scenario(BaseModel):
     """The scenario as a test, for `cosmos test` alone."""
     parameters: dict[str, Any] = {}
     """The simulation's own settings."""
+    agent_parameters: tuple[AgentParameters, ...] = ()
+    """Rules for agents whose parameters differ: the first that names an agent holds for it."""
 
     def run_config(
-        self, *, run: str, base_directory: Path, parameters: Mapping[str, Any] | None = None
+        self,
+        *,
+        run: str,
+        base_directory: Path,
+        parameters: Mapping[str, Any] | None = None,
+        agent_parameters: tuple[AgentParameters, ...] = (),
     ) -> RunConfig:
         """
         Return what host and agents are told.
@@ -106,6 +114,7 @@ class Scenario(BaseModel):
             run: Name of the run, such as 0007-iridium10.
             base_directory: Folder of the scenario file.
             parameters: The simulation's parameters with defaults filled in; those of the file if None.
+            agent_parameters: Whole parameters of agents for which others hold.
         """
         return RunConfig(
             run=run,
@@ -125,6 +134,7 @@ class Scenario(BaseModel):
             on_agent_loss=self.on_agent_loss,
             seed=self.seed,
             parameters=dict(self.parameters if parameters is None else parameters),
+            agent_parameters=agent_parameters,
         )
 
 

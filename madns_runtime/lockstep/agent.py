@@ -115,7 +115,7 @@ class LockstepAgent:
         self.context = PeerContext(
             name=self.name,
             config=mates.config,
-            parameters=mates.program.parameters,
+            parameters=mates.program.parameters_of(self.name),
             journal=self.journal,
             now_s=mates.clock.now_s,
             send=self.send,

@@ -103,6 +103,7 @@ class LockstepHost:
             name=HOST,
             config=config,
             parameters=program.parameters,
+            agent_parameters=program.agent_parameters,
             journal=self._journal,
             now_s=clock.now_s,
             send=self._outbox.send,

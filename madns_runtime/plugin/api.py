@@ -92,7 +92,7 @@ class Context(Protocol):
     agents: tuple[str, ...]
     """Names of all agents of the run, in order."""
     parameters: Any
-    """An instance of the descriptor's parameters class."""
+    """An instance of the descriptor's parameters class: of an agent its own, at the host those of the scenario."""
     tick_hz: float
     duration_s: float
     base_directory: Path
@@ -160,6 +160,8 @@ class Context(Protocol):
 class HostContext(Context, Protocol):
     """The framework as the host's half sees it."""
 
+    agent_parameters: Mapping[str, Any]
+    """The `parameters` of each agent as its half sees them, by name: a scenario may give some agents their own."""
     workers: int
     """Workers of the executor, N_p: jobs that may be under way at once."""
     timer_lateness_s: float
@@ -334,6 +336,9 @@ class Simulation:
     """Words that the simulation itself replaces in texts of its parameters, as ${name}, by the dotted keys of the
     fields (globs; no indices of lists), such as {"flight.command": ("name",)}: there a scenario's variables leave
     them alone, and $${ is the simulation's to read."""
+    agent_parameters: tuple[str, ...] | None = None
+    """Names of the parameters that a scenario may change for some agents (`agent_parameters`); None: all of them. Those
+    that host and agents must have in common do not belong here."""
     columns: tuple[str, ...] = ()
     """Fields of the agents' declared streams, as "drive.speed_m_s", at most six: whoever watches a run is shown
     their newest values per agent."""

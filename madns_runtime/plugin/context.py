@@ -123,10 +123,12 @@ class JobContext(RunContext):
         half: HalfState,
         submit: Callable[..., int],
         wake: Callable[[float], None],
+        agent_parameters: Mapping[str, Any],
         **of_every_half: Any,
     ) -> None:
         super().__init__(**of_every_half)
         self._half = half
+        self.agent_parameters = agent_parameters
         self.submit = submit
         self.wake = wake
         self.enter = half.carrier.enter

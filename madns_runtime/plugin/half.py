@@ -11,7 +11,7 @@ import math
 import traceback
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -65,6 +65,12 @@ class RoleProgram:
     """Fields whose newest values are told."""
     life: int = 1
     """Number of this process of an agent."""
+    agent_parameters: Mapping[str, Any] = field(default_factory=dict)
+    """Parameters of each agent, parsed: one object for all that share them."""
+
+    def parameters_of(self, agent: str) -> Any:
+        """Return the parameters of an agent."""
+        return self.agent_parameters.get(agent, self.parameters)
 
     @classmethod
     def load(
@@ -97,6 +103,9 @@ class RoleProgram:
         make = load_half(descriptor, role, base)
         tell(f"making the parameters of {config.simulation}")
         parameters = parse_parameters(descriptor, config.parameters)
+        of_agents = dict.fromkeys(config.agents.resolved_names(), parameters)
+        for rule in reversed(config.agent_parameters):
+            of_agents |= dict.fromkeys(rule.agents, parse_parameters(descriptor, rule.parameters))
         has_medium = descriptor.medium is not None
         medium = None
         if descriptor.medium is not None and role == "host":
@@ -109,6 +118,7 @@ class RoleProgram:
             medium=medium,
             has_medium=has_medium,
             columns=descriptor.columns,
+            agent_parameters=of_agents,
         )
 
 

@@ -249,7 +249,7 @@ class AgentRunner:
         context = PeerContext(
             name=self.name,
             config=self._config,
-            parameters=self._program.parameters,
+            parameters=self._program.parameters_of(self.name),
             journal=self._journal,
             now_s=self._port.now_s,
             send=self._port.send,

@@ -128,6 +128,7 @@ class HostRuntime:
             name=HOST,
             config=config,
             parameters=program.parameters,
+            agent_parameters=program.agent_parameters,
             journal=self._journal,
             now_s=self._port.now_s,
             send=self._port.send,

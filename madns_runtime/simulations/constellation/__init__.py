@@ -33,6 +33,7 @@ simulation = Simulation(
         "flight.environment.*": _PROGRAM_WORDS,
         "flight.interface.transport.*": _WORDS,
     },
+    agent_parameters=(),  # `vehicles` and `flight` are lists of rules; all else host and agents have in common
     columns=("elements.a_m", "elements.e", "elements.mean_anomaly_deg"),
     medium=f"{_HERE}.host:radio_of",
     tabulate=f"{_HERE}.tabulation:tabulate_truth",

@@ -12,6 +12,7 @@ simulation = Simulation(
     agent="madns_runtime.simulations.counter.agent:CounterAgent",
     demand="madns_runtime.simulations.counter.demand:demand",
     streams="madns_runtime.simulations.counter.parameters:declared_streams",
+    agent_parameters=("service", "payload_bytes", "read_on_tick"),
     columns=("round_trips.round_trip_us",),
     figures="madns_runtime.simulations.counter.analysis:figures",
     document="madns_runtime.simulations.counter.analysis:document",

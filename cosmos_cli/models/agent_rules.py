@@ -1,0 +1,95 @@
+"""Rules that give some agents parameters of their own: whom they find, and what results of each."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+from cosmos_cli.errors import Fault
+from cosmos_cli.models.agent_labels import AgentLabels
+from cosmos_cli.models.document import Document, Path, did_you_mean, may_guess
+from cosmos_cli.models.extending import merge_mapping
+from madns_runtime.plugin.api import Simulation
+
+RULES: Final = "agent_parameters"
+
+
+def select_agents(
+    document: Document, names: Sequence[str], labels: AgentLabels | None
+) -> tuple[list[tuple[str, ...]], list[Fault]]:
+    """
+    Return the agents of each rule, of which the first that finds an agent holds for it, and the faults.
+
+    Args:
+        document: The scenario, its rules of the right form.
+        names: Of all agents.
+        labels: Their second names; None if they are not known, and then no rule holds.
+    """
+    rules: Sequence[Mapping[str, Any]] = document.value.get(RULES) or ()
+    if not rules or labels is None:
+        return [() for _ in rules], []
+    faults: list[Fault] = []
+    taken: dict[str, int] = {}
+    chosen = []
+    for index, rule in enumerate(rules):
+        fitting: dict[str, None] = {}
+        for place, pattern in enumerate(rule["agents"]):
+            found = labels.like(pattern, names)
+            fitting |= dict.fromkeys(found)
+            if not found:
+                known = (*names, *labels.names.values())
+                hint = did_you_mean(pattern, known) if may_guess(len(faults), len(known)) else ""
+                like = "like" if any(character in pattern for character in "*?[") else "named"
+                text = f"no agent is {like} {pattern}{hint if hint.endswith('?') else ''}"
+                faults.append(document.fault((RULES, index, "agents", place), text))
+        own = tuple(name for name in names if name in fitting and name not in taken)
+        if fitting and not own:
+            first = taken[next(iter(fitting))]
+            text = f"expected agents that no rule above finds, got those of {RULES}[{first}]: the first that fits holds"
+            faults.append(document.fault((RULES, index, "agents"), text))
+        taken |= dict.fromkeys(own, index)
+        chosen.append(own)
+    return chosen, faults
+
+
+def refused_parameters(document: Document, simulation: Simulation) -> Iterator[Fault]:
+    """Yield a fault for each parameter that the simulation lets no rule change."""
+    allowed = simulation.agent_parameters
+    if allowed is None:
+        return
+    known = {field.name for field in dataclasses.fields(simulation.parameters)}
+    cure = f"per agent are {', '.join(allowed)}"
+    if not allowed:
+        cure = "rules for agents, where it has them, are among its parameters"
+    for index, rule in enumerate(document.value.get(RULES) or ()):
+        for name in sorted(known.intersection(rule["parameters"]).difference(allowed)):
+            text = f"{name} holds for all agents of {simulation.name}: {cure}"
+            yield document.fault((RULES, index, "parameters", name), text, at_key=True)
+
+
+def rule_document(document: Document, index: int) -> Document:
+    """Return a document whose `parameters` are those of the rule at *index*, over those of all, with their places."""
+    above: Path = (RULES, index, "parameters")
+    value = {
+        **document.value,
+        "parameters": copy.deepcopy(document.value[RULES][index]["parameters"]),
+    }
+    own = Document(document.source, value=value)
+    for target, places in (
+        (own.value_places, document.value_places),
+        (own.key_places, document.key_places),
+    ):
+        for path, place in places.items():
+            if path[: len(above)] == above:
+                inner: Path = ("parameters", *path[len(above) :])
+                target[inner] = dataclasses.replace(place, path=place.path or path)
+            elif path[:1] != ("parameters",):
+                target[path] = place
+    for path, text in document.texts.items():
+        if path[: len(above)] == above:
+            own.texts[("parameters", *path[len(above) :])] = text
+    lower = copy.deepcopy(document.value.get("parameters") or {})
+    merge_mapping(own, document, lower, ("parameters",))
+    return own

@@ -1,0 +1,192 @@
+"""Parameters of some agents: which rule holds for whom, what results, and what is refused where."""
+
+import pytest
+
+from cosmos_cli.errors import InputError
+from cosmos_cli.models.loading import load_scenario
+from madns_runtime.config import RunConfig, from_mapping, to_mapping
+from madns_runtime.plugin.half import RoleProgram
+
+HEAD = "name: a\nsimulation: counter\nagents: {count: 4}\nparameters: {payload_bytes: 8, answer_hz: 5}\n"
+PLUGIN = """
+from dataclasses import dataclass, field
+from typing import Annotated
+from annotated_types import Gt
+from madns_runtime.plugin.api import AgentSimulation, DeclaredStream, Field, PlaceUse, Simulation
+
+@dataclass(frozen=True, kw_only=True)
+class Engine:
+    power_w: Annotated[float, Gt(0)] = 10.0
+    fuel: str = "none"
+
+@dataclass(frozen=True, kw_only=True)
+class Parameters:
+    mass_kg: float = 1.0
+    engine: Engine = Engine()
+    wheels: tuple[int, ...] = (1, 2)
+    port: int = 0
+    extra_stream: str = ""
+
+def check(parameters, agents, base_directory):
+    return ["engine.power_w: expected at most 100 a kg"] if parameters.engine.power_w > 100 * parameters.mass_kg else []
+
+def streams(parameters, agents):
+    names = ["drive", *([parameters.extra_stream] if parameters.extra_stream else [])]
+    return [DeclaredStream(role="agent", name=name, fields=(Field("x", ""),)) for name in names]
+
+def labels(parameters, agents, base_directory):
+    return {agent: f"CAR {number}" for number, agent in enumerate(agents)}
+
+def place_uses(parameters, agents, base_directory):
+    return [PlaceUse(agent=agent, field="parameters.port", place=f"port {parameters.port}") for agent in agents]
+
+class Agent(AgentSimulation):
+    pass
+
+simulation = Simulation(
+    name="p", parameters=Parameters, agent=":Agent", check=":check", streams=":streams", labels=":labels",
+    place_uses=":place_uses",
+)
+"""
+OWN = """\
+name: a
+simulation: ./plug.py:simulation
+agents: {count: 3, names: [agent-1, agent-2, agent-3]}
+parameters: {mass_kg: 2, engine: {power_w: 20, fuel: wood}}
+agent_parameters:
+"""
+
+
+@pytest.fixture
+def load(tmp_path):
+    (tmp_path / "plug.py").write_text(PLUGIN)
+
+    def load(text, *overrides):
+        path = tmp_path / "a.yaml"
+        path.write_text(text)
+        return load_scenario(path, overrides)
+
+    return load
+
+
+@pytest.fixture
+def refusal(load, tmp_path):
+    def refusal(text):
+        with pytest.raises(InputError) as caught:
+            load(text)
+        return str(caught.value).replace(f"{tmp_path}/", "")
+
+    return refusal
+
+
+def by_agent(found):
+    config = from_mapping(RunConfig, to_mapping(found.run_config("0001-a")))
+    program = RoleProgram.load(config, "agent")
+    return {name: program.parameters_of(name) for name in config.agents.resolved_names()}
+
+
+def test_the_first_rule_that_fits_an_agent_holds_for_it(load):
+    found = by_agent(
+        load(
+            HEAD
+            + "agent_parameters:\n"
+            + "  - {agents: [agent-02], parameters: {payload_bytes: 1}}\n"
+            + "  - {agents: ['agent-0[23]'], parameters: {service: sync}}\n"
+        )
+    )
+
+    assert [each.payload_bytes for each in found.values()] == [8, 1, 8, 8]
+    assert [each.service for each in found.values()] == ["best", "best", "sync", "best"]
+    assert {each.answer_hz for each in found.values()} == {5.0}
+
+
+@pytest.mark.process
+def test_mappings_of_a_rule_merge_and_lists_replace(load):
+    found = by_agent(
+        load(OWN + "  - {agents: [CAR 1], parameters: {engine: {power_w: 50}, wheels: [3]}}\n")
+    )
+
+    changed, other = found["agent-2"], found["agent-1"]
+    assert (changed.mass_kg, changed.engine.power_w, changed.engine.fuel) == (2, 50, "wood")
+    assert changed.wheels == (3,)
+    assert (other.engine.power_w, other.wheels) == (20, (1, 2))
+
+
+@pytest.mark.process
+def test_what_a_rule_makes_agents_declare_and_take_is_theirs(load):
+    found = load(OWN + "  - {agents: [agent-3], parameters: {port: 7, extra_stream: more}}\n")
+
+    assert [stream.name for stream in found.streams] == ["drive", "more"]
+    assert {use.agent: use.place for use in found.place_uses} == {
+        "agent-1": "port 0",
+        "agent-2": "port 0",
+        "agent-3": "port 7",
+    }
+
+
+def test_the_host_sees_the_parameters_of_all_and_those_of_each_agent(load):
+    found = load(
+        HEAD + "agent_parameters: [{agents: [agent-03], parameters: {payload_bytes: 1}}]\n"
+    )
+
+    program = RoleProgram.load(found.run_config("0001-a"), "host")
+
+    assert program.parameters.payload_bytes == 8
+    assert [each.payload_bytes for each in program.agent_parameters.values()] == [8, 8, 1, 8]
+
+
+def test_variables_hold_in_rules(load):
+    found = load(
+        HEAD
+        + "vars: {few: 2}\nagent_parameters:\n  - agents: ['agent-0${few}']\n    parameters: {payload_bytes: '${few}'}\n"
+    )
+
+    assert by_agent(found)["agent-02"].payload_bytes == 2
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("rules", "expected"),
+    [
+        ("  - {agents: [agnt-1], parameters: {}}\n", "a.yaml:6:15: agent_parameters[0].agents[0]: no agent is named agnt-1, did you mean agent-1?"),
+        ("  - {agents: ['x*'], parameters: {}}\n", "a.yaml:6:15: agent_parameters[0].agents[0]: no agent is like x*"),
+        ("  - {agents: [], parameters: {}}\n", "a.yaml:6:14: agent_parameters[0].agents: expected at least 1 items"),
+        ("  - {parameters: {}}\n", "agent_parameters[0].agents: missing"),
+        ("  - {agents: [agent-1]}\n", "agent_parameters[0].parameters: missing"),
+        ("  - {agents: [agent-1], parameters: {}, port: 1}\n", "a.yaml:6:41: agent_parameters[0].port: unknown key"),
+        (
+            "  - {agents: ['*'], parameters: {}}\n  - {agents: [agent-1], parameters: {}}\n",
+            "a.yaml:7:14: agent_parameters[1].agents: expected agents that no rule above finds, got those of agent_parameters[0]",
+        ),
+        ("  - {agents: [agent-1], parameters: {mass: 1}}\n", "a.yaml:6:38: agent_parameters[0].parameters.mass: unknown key, did you mean mass_kg?"),
+        (
+            "  - {agents: [agent-1], parameters: {engine: {power_w: -5}}}\n",
+            "a.yaml:6:56: agent_parameters[0].parameters.engine.power_w: expected > 0, got -5",
+        ),
+        (
+            "  - {agents: [agent-1], parameters: {engine: {power_w: 500}}}\n",
+            "a.yaml:6:56: agent_parameters[0].parameters.engine.power_w: expected at most 100 a kg",
+        ),
+        ("  - {agents: [agent-1], parameters: {port: '${x}'}}\n", "a.yaml:6:44: agent_parameters[0].parameters.port: no variable is named x"),
+    ],
+)  # fmt: skip
+def test_a_rule_that_cannot_hold_is_refused_with_its_place(refusal, rules, expected):
+    assert expected in refusal(OWN + rules)
+
+
+def test_what_host_and_agents_have_in_common_is_refused(refusal):
+    told = refusal(HEAD + "agent_parameters: [{agents: [agent-01], parameters: {answer_hz: 2}}]\n")
+
+    assert told.startswith(
+        "a.yaml:5:54: agent_parameters[0].parameters.answer_hz: answer_hz holds for all agents of counter: "
+        "per agent are service, payload_bytes, read_on_tick\n"
+    )
+
+
+@pytest.mark.process
+def test_a_fault_of_what_all_share_is_told_once(refusal):
+    told = refusal(
+        OWN.replace("fuel: wood", "fuel: 3") + "  - {agents: [agent-1], parameters: {port: 1}}\n"
+    )
+
+    assert told.count("fuel: expected a text") == 1
