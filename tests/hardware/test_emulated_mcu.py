@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import time
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from madns_runtime.errors import ConfigurationError, MachineError, PluginError
+from madns_runtime.hardware.drivers.qmp import MachineMonitor
 from madns_runtime.hardware.kind_registry import prepare
+from madns_runtime.timing import granted_clock
 from tests.hardware.driving import opened
 from tests.harness.firmware import build_firmware, needs_emulator
 from tests.harness.waiting import is_alive, wait_until
@@ -124,6 +128,36 @@ def test_frozen_emulator_is_named(image, monkeypatch):
 
         with pytest.raises(MachineError, match="answers nothing for 2 s"):
             wait_until(lambda: mcu.read() and False)
+
+
+def test_emulator_that_waits_for_a_processor_is_not_silent(monkeypatch):
+    """A busy machine is no fault of the emulator's; that it is stopped, or sleeps, is."""
+    here, there = socket.socketpair()
+    clock_s, delay_s, is_runnable = 0.0, 0.0, True
+    monkeypatch.setattr(granted_clock, "monotonic", lambda: clock_s)
+    monkeypatch.setattr(
+        granted_clock,
+        "GrantedClock",
+        partial(
+            granted_clock.GrantedClock,
+            read=lambda _roots: {
+                (7, 7): granted_clock.ThreadReading(is_runnable, clock_s - delay_s, delay_s)
+            },
+            clock=lambda: clock_s,
+        ),
+    )
+    with here, there:
+        monitor = MachineMonitor(here, lambda: [7])
+        monitor.command("query-status", lambda _answer: None)
+        for _ in range(200):
+            clock_s, delay_s = clock_s + 0.1, delay_s + 0.1
+            monitor.poll()
+        is_runnable = False
+
+        with pytest.raises(MachineError, match="answers nothing for 2 s"):
+            for _ in range(30):
+                clock_s += 0.1
+                monitor.poll()
 
 
 def test_emulator_ends_with_its_device(image):

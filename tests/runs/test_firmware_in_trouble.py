@@ -99,7 +99,7 @@ def assert_nobody_else_noticed(folder, document):
         assert (flight["answers"], flight["unanswered"]) == (DURATION_S * HZ, 0)
         assert set(flight["interface"]["faults"].values()) == {0}
         device = document["devices"][f"{agent}/mcu"]
-        assert (device["errors"], device["lost"], device["restarts"]) == (0, 0, 0)
+        assert (device["errors"], device["restarts"]) == (0, 0)
 
 
 def commanded_s(folder):
@@ -141,7 +141,7 @@ def test_flood_is_held_to_the_lines_rate_and_the_vehicle_flies_on(fly, frames):
     # Each byte is recorded as two digits.
     size = (folder / "devices" / TROUBLED / "mcu" / "received.jsonl").stat().st_size
     assert size <= 2.5 * bound
-    assert (device["errors"], device["lost"], device["restarts"]) == (0, 0, 0)
+    assert (device["errors"], device["restarts"]) == (0, 0)
     damaged = interface["answers_unasked"] if frames else interface["faults"]["corrupt"]
     assert damaged > 100
 

@@ -80,7 +80,7 @@ def test_firmware_reads_its_own_sensor_and_brakes_its_vehicle(cosmos):
         assert (flight["answers"], flight["unanswered"]) == (150, 0)
         assert set(faults_of(document, agent).values()) == {0}
         device = document["devices"][f"{agent}/mcu"]
-        assert (device["errors"], device["lost"], device["restarts"]) == (0, 0, 0)
+        assert (device["errors"], device["restarts"]) == (0, 0)
         rates = rates_deg_s(folder, agent)
         assert rates[0] == pytest.approx(8.0, abs=0.01)
         assert rates[-1] < 0.85 * rates[0]
@@ -94,17 +94,17 @@ def test_firmware_reads_its_own_sensor_and_brakes_its_vehicle(cosmos):
 @pytest.mark.timeout(600)
 def test_firmware_answers_every_tick_at_100_hz(cosmos):
     folder, document, err = run(
-        cosmos, "--duration", "20", "--set", "agents.count=1", "--set", "agents.tick_hz=100"
+        cosmos, "--duration", "20", "--set", "agents.count=3", "--set", "agents.tick_hz=100"
     )
 
     assert document["status"] == "complete", err
-    flight = document["simulation"]["agents"]["agent-01"]["flight"]
-    # A machine that is busy for half a second skips ticks; those that were sent are answered.
-    assert (flight["answers"], flight["unanswered"]) == (flight["ticks_sent"], 0)
-    assert flight["ticks_sent"] + flight["ticks_skipped"] == 2000
-    assert flight["ticks_sent"] >= 1000
-    assert set(faults_of(document, "agent-01").values()) == {0}
-    assert len(records(folder, "flight_answers", "agent-01")) == flight["answers"]
+    for agent in COMPUTERS:
+        flight = document["simulation"]["agents"][agent]["flight"]
+        # A machine that is busy for half a second skips ticks; those that were sent are answered.
+        assert (flight["answers"], flight["unanswered"]) == (flight["ticks_sent"], 0)
+        assert flight["ticks_sent"] + flight["ticks_skipped"] == 2000
+        assert set(faults_of(document, agent).values()) == {0}
+        assert len(records(folder, "flight_answers", agent)) == flight["answers"]
     report = (folder / "report.html").read_text()
     assert "Answers of flight software" in report and "Latency of the loop, ms" in report
 

@@ -86,7 +86,7 @@ class EmulatedMcu(Device):
         self._said = b""
         self._serial, far_serial = socket.socketpair()
         monitor, far_monitor = socket.socketpair()
-        self._monitor = MachineMonitor(monitor)
+        self._monitor = MachineMonitor(monitor, self._processes)
         with far_serial, far_monitor:
             self._start(program, far_serial.fileno(), far_monitor.fileno())
         self._serial.setblocking(False)
@@ -184,6 +184,9 @@ class EmulatedMcu(Device):
             raise MachineError(f"{p.program} cannot be started: {error}") from None
         assert self._process.stderr is not None
         os.set_blocking(self._process.stderr.fileno(), False)
+
+    def _processes(self) -> list[int]:
+        return [] if self._process is None else [self._process.pid]
 
     def _gather(self, now_s: float) -> Sample | None:
         """Take what the serial line brings, byte by byte as an emulated one does, and return it in pieces."""
