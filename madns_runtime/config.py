@@ -19,6 +19,7 @@ from madns_runtime.agent_parameters import AgentParameters
 from madns_runtime.conditions.condition import Condition
 from madns_runtime.plain_values import from_mapping as from_mapping
 from madns_runtime.plain_values import to_mapping as to_mapping
+from madns_runtime.timeline.entries import ScheduledEntry
 
 AGENTS_MAX = 5000
 RATE_HZ_MAX = 10_000
@@ -293,6 +294,8 @@ class RunConfig:
     """The whole parameters of agents, by name, for which others hold."""
     conditions: tuple[Condition, ...] = ()
     """On recorded values, each evaluated by whoever records them."""
+    timeline: tuple[ScheduledEntry, ...] = ()
+    """What is to happen, and when."""
 
     @property
     def longest_s(self) -> float:

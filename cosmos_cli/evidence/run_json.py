@@ -127,7 +127,7 @@ class Evidence:
             miss_ratio_max=self.config.deadline.max_miss_ratio,
             rtf_tolerance=self.config.time.rtf_tolerance,
             not_finite_max=self.config.recording.not_finite_max,
-            duration_s=self.config.time.duration_s,
+            duration_s=self._duration_s(self.config),
         )
 
     def _limits_before(self) -> CheckLimits:
@@ -219,7 +219,13 @@ class Evidence:
         """Return the ticks of each agent by the plan; None if it is lost."""
         if self.config is None:
             return None
-        return count_ticks(self.config.time.duration_s, self.config.agents.tick_hz)
+        return count_ticks(self._duration_s(self.config), self.config.agents.tick_hz)
+
+    def _duration_s(self, config: RunConfig) -> float:
+        """Return the simulated time that was to be run, s: a stop of the timeline, or live, shortens it."""
+        told = (self.result or {}).get("duration_s")
+        planned_s = config.time.duration_s
+        return min(float(told), planned_s) if is_number(told) and told > 0 else planned_s
 
     def _is_lockstep(self) -> bool:
         return self.config is not None and self.config.time.is_lockstep

@@ -22,6 +22,7 @@ from cosmos_cli.models.place_uses import CURE, shared_places
 from cosmos_cli.models.plugin_answers import ask_plugin, fault_found_at
 from cosmos_cli.models.plugin_demand import ask_plugin_demand
 from cosmos_cli.models.scenario import OF_AUTHORS, Scenario, cross_faults
+from cosmos_cli.models.timeline import NO_TIMELINE, ResolvedTimeline, resolve_timeline
 from cosmos_cli.models.translate import faults_of
 from cosmos_cli.models.variables import (
     author_override_faults,
@@ -64,6 +65,8 @@ class ScenarioFile:
     """Second names of the agents."""
     place_uses: tuple[PlaceUse, ...] = ()
     """What each agent takes of its machine for itself."""
+    timeline: ResolvedTimeline = NO_TIMELINE
+    """Its timeline among these agents and actions."""
     placeholders: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Words that the simulation replaces itself, by field."""
 
@@ -103,6 +106,7 @@ class ScenarioFile:
             base_directory=self.base_directory,
             parameters=self.parameters,
             agent_parameters=self.agent_parameters,
+            timeline=self.timeline.entries,
         )
 
     def to_written(self) -> dict[str, Any]:
@@ -212,6 +216,10 @@ def _check(
         document.fault(where, text)
         for where, text in cross_faults(scenario, skip=broken, labels=answers.labels)
     ]
+    timeline = NO_TIMELINE
+    if not broken - {"timeline"}:
+        timeline = resolve_timeline(document, scenario, answers.actions, answers.labels)
+    faults += timeline.faults
     if broken or answers.parameters is None or faults:
         told = _told_once(faults, document)
         raise InputError(faults=told, omitted=answers.omitted)
@@ -228,6 +236,7 @@ def _check(
         streams=answers.streams,
         labels=answers.labels or NO_LABELS,
         place_uses=answers.place_uses,
+        timeline=timeline,
         placeholders=answers.placeholders,
     )
 

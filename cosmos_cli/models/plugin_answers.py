@@ -26,6 +26,7 @@ from cosmos_cli.models.plugin_values import changed, is_same, not_sendable
 from cosmos_cli.models.separate_process import (
     SeparateFailure,
 )
+from cosmos_cli.models.timeline_actions import FRAMEWORK_ONLY, ActionAnswers, ask_actions
 from cosmos_cli.models.translate import faults_of
 from cosmos_cli.models.variables import judge_open_texts
 from madns_runtime.agent_parameters import AgentParameters
@@ -73,6 +74,8 @@ class PluginAnswers:
     """What each agent takes of its machine for itself; empty if nobody could be asked."""
     placeholders: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Words that it replaces itself, by field."""
+    actions: ActionAnswers = FRAMEWORK_ONLY
+    """Actions that a timeline may name, and the parameters of the entries of this one."""
     omitted: int = 0
     """Number of further faults."""
 
@@ -158,8 +161,10 @@ class _Asking:
     def answers(self, spec: str, duration_s: float) -> PluginAnswers:
         """Return faults, parameters and whether there is a `demand`."""
         simulation = self._simulation(spec)
+        actions, faults = ask_actions(self._document, simulation and simulation.actions)
+        self._faults += faults
         if simulation is None:
-            return self._told(PluginAnswers(faults=(), parameters=None))
+            return self._told(PluginAnswers(faults=(), parameters=None, actions=actions))
         opened = judge_open_texts(self._document, simulation.placeholders)
         self._faults += opened
         parameters = self._parameters(simulation, opened)
@@ -169,6 +174,7 @@ class _Asking:
             has_demand=simulation.demand is not None,
             labels=NO_LABELS if simulation.labels is None else None,
             placeholders=simulation.placeholders,
+            actions=actions,
         )
         if parameters is not None and self._agents is not None:
             found = replace(found, labels=self._labels(simulation, parameters, self._agents))

@@ -19,6 +19,7 @@ from cosmos_cli.models.planning import Planning
 from cosmos_cli.models.scenario_test import ScenarioTest, faults_of_test
 from cosmos_cli.models.text_forms import NAME_PATTERN, ScenarioRequirement
 from madns_runtime.agent_parameters import AgentParameters
+from cosmos_cli.models.timeline_rules import ENTRIES_MAX
 from madns_runtime.config import (
     SEED_MAX,
     Agents,
@@ -33,6 +34,7 @@ from madns_runtime.config import (
     Timeouts,
     TimeSettings,
 )
+from madns_runtime.timeline.entries import ScheduledEntry
 
 AGENT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 RESERVED_NAMES = ("host",)
@@ -90,6 +92,8 @@ class Scenario(BaseModel):
     """Python packages that the simulation needs on the agents' machines, as pip names them; or ./paths of wheels or of sources, which need no index."""
     placement: tuple[PlacementRule, ...] = ()
     """Machines of agents, rule by rule; the rest is spread evenly over all."""
+    timeline: Annotated[tuple[dict[str, Any], ...], Field(max_length=ENTRIES_MAX)] = ()
+    """What is to happen in the run, and when: actions of the framework, faults, and those that the simulation declares."""
     plan: Planning = Planning()
     """Terms of the inequalities of real time, for `cosmos plan` alone."""
     test: ScenarioTest = ScenarioTest()
@@ -106,6 +110,7 @@ class Scenario(BaseModel):
         base_directory: Path,
         parameters: Mapping[str, Any] | None = None,
         agent_parameters: tuple[AgentParameters, ...] = (),
+        timeline: tuple[ScheduledEntry, ...] = (),
     ) -> RunConfig:
         """
         Return what host and agents are told.
@@ -115,6 +120,7 @@ class Scenario(BaseModel):
             base_directory: Folder of the scenario file.
             parameters: The simulation's parameters with defaults filled in; those of the file if None.
             agent_parameters: Whole parameters of agents for which others hold.
+            timeline: Resolved among agents and actions.
         """
         return RunConfig(
             run=run,
@@ -135,6 +141,7 @@ class Scenario(BaseModel):
             seed=self.seed,
             parameters=dict(self.parameters if parameters is None else parameters),
             agent_parameters=agent_parameters,
+            timeline=timeline,
         )
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Final, Literal, get_args
+from typing import Final, get_args
 
 from madns_runtime.errors import ConfigurationError
+from madns_runtime.timeline.kinds import DeviceFaultWord
 
-FaultAction = Literal["freeze", "bias", "noise", "drop", "delay", "disconnect", "clear"]
-ACTIONS: Final[tuple[str, ...]] = get_args(FaultAction)
+ACTIONS: Final[tuple[str, ...]] = get_args(DeviceFaultWord)
 WITH_VALUE: Final = {
     "bias": "the number that is added to each element",
     "noise": "the standard deviation of what is added to each element",

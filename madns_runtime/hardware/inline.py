@@ -109,11 +109,21 @@ class InlineDevice:
                 continue
             self._count += 1
             sample = self._device.sample_at(due_s)
-            if sample is not None:
+            if sample is not None and not self._intake.faults.is_disconnected:
                 self._intake.take(sample, due_s if sample.handed_s is None else sample.handed_s)
         self._intake.tell_held(t_s)
         self._account.observe(self._page.status(self._limits, t_s), t_s)
         self._handed_s = t_s
+
+    def insert_fault(self, action: str, value: float | None) -> None:
+        """
+        Put a fault in force, or clear all; of one that is disconnected no sample is heard.
+
+        Raises:
+            ConfigurationError: There is no such fault, or its value is none.
+        """
+        self._intake.faults.insert(action, value)
+        self._intake.event("fault", self._handed_s, action=action, value=value)
 
     def _hear(self) -> None:
         """Take what the agent has handed over since the last time."""

@@ -13,7 +13,7 @@ from typing import Any
 
 from madns_runtime.conditions.tap import ConditionTap
 from madns_runtime.config import DeviceLaunch, RunConfig
-from madns_runtime.errors import PluginError
+from madns_runtime.errors import ConfigurationError, PluginError
 from madns_runtime.hardware.inline import InlineDevice
 from madns_runtime.hardware.kind_registry import prepare
 from madns_runtime.hardware.port import Hardware
@@ -23,13 +23,17 @@ from madns_runtime.lockstep.frames import POSITIONS, STEPPING, Sent
 from madns_runtime.lockstep.messages import Allowance, encode
 from madns_runtime.lockstep.recorder import open_journal
 from madns_runtime.medium.mailbox import Mailbox
+from madns_runtime.plain_values import from_mapping
+from madns_runtime.plugin.agent_actions import AgentActions
 from madns_runtime.plugin.api import HOST
 from madns_runtime.plugin.context import PeerContext, check_sending, describe_exception
 from madns_runtime.plugin.device_view import DeviceStatus
 from madns_runtime.plugin.half import Half, RoleProgram
 from madns_runtime.protocol.codec import encode_message
-from madns_runtime.protocol.messages import ConditionMet, Service, Transmission
+from madns_runtime.protocol.messages import ActionOrder, ConditionMet, Service, Transmission
 from madns_runtime.recording.newest_values import NewestValues
+from madns_runtime.timeline.action import ActionRefused
+from madns_runtime.timeline.kinds import DEVICE_FAULT, DeviceFault
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,6 +116,13 @@ class LockstepAgent:
             clock=mates.clock,
         )
         self.has_devices = bool(self.devices)
+        self.actions = AgentActions(
+            self.name,
+            mates.program.actions,
+            call=self.half.call,
+            journal=self.journal,
+            own={DEVICE_FAULT.word: self.devices.take_fault},
+        )
         self.context = PeerContext(
             name=self.name,
             config=mates.config,
@@ -210,6 +221,26 @@ class AgentDevices:
         for device in self._devices:
             _with_blame(device.name, "sample_at", device.advance, t_s)
         return self.hardware.changes()
+
+    def take_fault(self, order: ActionOrder) -> None:
+        """
+        Insert a fault around a device, or clear all of it.
+
+        Raises:
+            ActionRefused: There is no such device, or the fault is none.
+        """
+        fault = from_mapping(DeviceFault, order.parameters)
+        for device in self._devices:
+            if device.name != fault.device:
+                continue
+            word, value = ("clear", None) if order.is_end else (fault.fault, fault.value)
+            try:
+                device.insert_fault(word, value)
+            except ConfigurationError as error:
+                raise ActionRefused(str(error)) from None
+            return
+        known = ", ".join(each.name for each in self._devices) or "none"
+        raise ActionRefused(f"this agent uses no device {fault.device!r}; it uses {known}")
 
     def close(self) -> dict[str, Any]:
         """Close all, and return what the run came to, by device."""

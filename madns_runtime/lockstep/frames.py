@@ -49,8 +49,21 @@ FRAME_BYTES_MAX: Final = 1 << 30
 HEAD: Final = Struct("<I")
 
 # Positions: what a worker is doing, in memory that it shares with the host.
-IDLE, LOADING, SETTING_UP, RECEIVING, STEPPING, FINISHING, CLOSING, HEARING, REFUSED = range(9)
-METHODS: Final = ("", "", "setup", "receive", "step", "finish", "", "hear", "refused")
+IDLE, LOADING, SETTING_UP, RECEIVING, STEPPING, FINISHING, CLOSING, HEARING, REFUSED, ACTING = (
+    range(10)
+)
+METHODS: Final = (
+    "",
+    "",
+    "setup",
+    "receive",
+    "step",
+    "finish",
+    "",
+    "hear",
+    "refused",
+    "begin_action",
+)
 """The plug-in's method at each position; empty where the framework is at work."""
 POSITIONS: Final = 16
 

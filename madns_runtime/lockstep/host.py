@@ -25,6 +25,7 @@ from madns_runtime.lockstep.messages import Outbox, decode
 from madns_runtime.lockstep.partition import processors_here, share_out
 from madns_runtime.lockstep.recorder import open_journal
 from madns_runtime.lockstep.result import EarlyEnd, RunAccount
+from madns_runtime.lockstep.timeline import LockstepTimeline
 from madns_runtime.lockstep.workers import Workers
 from madns_runtime.medium.carrier import Carrier
 from madns_runtime.plugin.api import HOST
@@ -99,6 +100,15 @@ class LockstepHost:
             executor=executor,
             on_hang=self._leave_hanging,
         )
+        self._timeline = LockstepTimeline(
+            config=config,
+            program=program,
+            clock=clock,
+            journal=self._journal,
+            outbox=self._outbox,
+            call=self._guarded.call,
+        )
+        self._timeline.wait_for(conditions)
         self._context = JobContext(
             name=HOST,
             config=config,
@@ -148,6 +158,9 @@ class LockstepHost:
         duration_s, tick_hz = self._config.time.duration_s, self._config.agents.tick_hz
         for number in range(count_ticks(duration_s, tick_hz)):
             self._advance(number / tick_hz)
+            if self._timeline.is_stopped:
+                self._account.duration_s = duration_s = number / tick_hz
+                break
             self._absences.bring_back(number, self._settle)
             self._meeting.exchange((frames.TICK, number), self._outbox.boxes)
             self._account.ticks = number + 1
@@ -189,9 +202,15 @@ class LockstepHost:
 
     def _advance(self, t_s: float) -> None:
         """Let simulated time go on to *t_s*, and do all that the half wants done until then."""
-        while (next_s := self._half.next_s) is not None and next_s <= t_s:
+        while True:
+            next_s, is_action = self._timeline.next_s(self._half.next_s)
+            if next_s is None or next_s > t_s:
+                break
             self._clock.t_s = max(self._clock.t_s, next_s)
-            self._guarded.call_timer(self._clock.t_s)
+            if is_action:
+                self._timeline.run_due()
+            else:
+                self._guarded.call_timer(self._clock.t_s)
             self._meeting.serve()
         self._clock.t_s = t_s
         self._carrier.hand_over()

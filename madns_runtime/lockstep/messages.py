@@ -22,7 +22,13 @@ from madns_runtime.protocol.codec import (
 )
 from madns_runtime.protocol.datagram import BEST_BYTES_MAX
 from madns_runtime.protocol.link_settings import LinkLimits, SendQueueFull
-from madns_runtime.protocol.messages import Delivery, Service, SimulationData, TransmissionRefusal
+from madns_runtime.protocol.messages import (
+    ActionOrder,
+    Delivery,
+    Service,
+    SimulationData,
+    TransmissionRefusal,
+)
 from madns_runtime.protocol.sending import MESSAGES_QUEUED_MAX
 from madns_runtime.recording.run_journal import RunJournal
 
@@ -146,8 +152,8 @@ class Outbox:
         account.down[int(service)] += 1
         self._box_of[number].append((number, body))
 
-    def post(self, to: str, message: Delivery | TransmissionRefusal) -> bool:
-        """Send an agent what came of messages between agents."""
+    def post(self, to: str, message: Delivery | TransmissionRefusal | ActionOrder) -> bool:
+        """Send an agent what came of messages between agents, or an order of the timeline."""
         number, body = self._index[to], encode_message(message)
         if self._account.agents[number].is_lost:
             return False

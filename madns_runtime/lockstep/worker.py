@@ -14,18 +14,16 @@ import socket
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from time import monotonic
 from typing import Any, NoReturn
 
-from madns_runtime.config import DeviceLaunch, RunConfig
 from madns_runtime.errors import MadnsError
 from madns_runtime.faults.step_faults import StepFaults
 from madns_runtime.faults.words import KILL
 from madns_runtime.lockstep import frames
 from madns_runtime.lockstep.agent import Crewmates, LockstepAgent
+from madns_runtime.lockstep.assignment import Assignment
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.frames import POSITIONS, encode_frame
 from madns_runtime.lockstep.messages import decode
@@ -36,7 +34,7 @@ from madns_runtime.plugin.context import clean_text
 from madns_runtime.plugin.half import HalfFailed, RoleProgram
 from madns_runtime.processes import register
 from madns_runtime.protocol.codec import unpack
-from madns_runtime.protocol.messages import Delivery, TransmissionRefusal
+from madns_runtime.protocol.messages import ActionOrder, Delivery, TransmissionRefusal
 from madns_runtime.reactor.forking import leave_parent
 from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.watchdog import end_after_hang_up
@@ -47,20 +45,6 @@ HANG_GRACE_S = 2.0
 STACK_SIGNAL = signal.SIGUSR1
 """Makes a worker write where it is to standard error."""
 TERMINATED = "its process was ended by SIGTERM"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Assignment:
-    """The task of one worker."""
-
-    config: RunConfig
-    devices: tuple[DeviceLaunch, ...]
-    """Those of all agents."""
-    directory: Path
-    """The run directory."""
-    agents: range
-    position: memoryview
-    """One integer that the host reads: agent's index times POSITIONS, plus what is done with it."""
 
 
 class AgentFailed(Exception):
@@ -306,6 +290,10 @@ class Worker:
             if isinstance(message, Delivery):
                 agent.mailbox.add(message)
                 continue
+            if isinstance(message, ActionOrder):
+                self._position[0] = index * POSITIONS + frames.ACTING
+                self._act(agent, message)
+                continue
             is_refusal = isinstance(message, TransmissionRefusal)
             doing = frames.REFUSED if is_refusal else frames.RECEIVING
             self._position[0] = index * POSITIONS + doing
@@ -368,6 +356,12 @@ class Worker:
     def _call(self, agent: LockstepAgent, name: str, *arguments: Any) -> Any:
         try:
             return agent.half.call(name, *arguments)
+        except HalfFailed as failure:
+            raise AgentFailed(agent.index, str(failure)) from failure
+
+    def _act(self, agent: LockstepAgent, order: ActionOrder) -> None:
+        try:
+            agent.actions.take(order)
         except HalfFailed as failure:
             raise AgentFailed(agent.index, str(failure)) from failure
 

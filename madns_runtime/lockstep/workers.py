@@ -17,8 +17,9 @@ from typing import Any
 from madns_runtime.config import HostLaunch
 from madns_runtime.errors import PeerError
 from madns_runtime.lockstep import frames
+from madns_runtime.lockstep.assignment import Assignment
 from madns_runtime.lockstep.frames import METHODS, POSITIONS, FrameReader, encode_frame
-from madns_runtime.lockstep.worker import STACK_SIGNAL, Assignment, run_worker
+from madns_runtime.lockstep.worker import STACK_SIGNAL, run_worker
 from madns_runtime.lockstep.worker_line import READ_BYTES
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.timing.granted_clock import GrantedClock, GrantedLimit

@@ -29,6 +29,7 @@ from madns_runtime.plugin.returned_values import (
 )
 from madns_runtime.protocol.messages import Delivery, Service, Transmission, TransmissionRefusal
 from madns_runtime.recording.records import Field
+from madns_runtime.timeline.action import ActionKind, ActionRefused, TimelineAction
 
 if TYPE_CHECKING:
     import numpy as np  # 0.2 s of import time that `cosmos validate` has no use for
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 __all__ = [
     "EVERYBODY",
     "HOST",
+    "ActionKind",
+    "ActionRefused",
     "AgentContext",
     "AgentSimulation",
     "Check",
@@ -61,6 +64,7 @@ __all__ = [
     "Simulation",
     "Tabulated",
     "Tick",
+    "TimelineAction",
     "Transmission",
     "TransmissionRefusal",
 ]
@@ -258,6 +262,21 @@ class HostSimulation(Protocol):
     def agent_rejoined(self, agent: str) -> None:
         """*agent* runs again, from initial data given just before."""
 
+    def begin_action(self, action: TimelineAction) -> None:
+        """
+        Carry out an action of the timeline that the descriptor declares for this half.
+
+        Its parameters are an instance of the declared class.
+
+        Raises:
+            ActionRefused: It cannot take place now; the run goes on.
+            BlamedError: Always, where this is not overridden.
+        """
+        raise BlamedError(f"action {action.word}: {type(self).__name__} has no begin_action(action)")
+
+    def end_action(self, action: TimelineAction) -> None:
+        """Let what *action* did be over, if it lasts."""
+
     def finish(self) -> Mapping[str, Any]:
         """Return the summary; a list under "checks" is judged (see `Check`)."""
         return {}
@@ -293,6 +312,13 @@ class AgentSimulation(Protocol):
 
     def device_changed(self, device: str, status: DeviceStatus) -> None:
         """Take that a device's status has changed; right before the step of the first tick that finds it so."""
+
+    def begin_action(self, action: TimelineAction) -> None:
+        """Carry out a declared action on this agent, between two steps; otherwise as `HostSimulation.begin_action`."""
+        raise BlamedError(f"action {action.word}: {type(self).__name__} has no begin_action(action)")
+
+    def end_action(self, action: TimelineAction) -> None:
+        """Let what *action* did be over, if it lasts."""
 
     def finish(self) -> Mapping[str, Any]:
         """Return this agent's summary; a list under "checks" is judged (see `Check`)."""
@@ -339,6 +365,8 @@ class Simulation:
     agent_parameters: tuple[str, ...] | None = None
     """Names of the parameters that a scenario may change for some agents (`agent_parameters`); None: all of them. Those
     that host and agents must have in common do not belong here."""
+    actions: tuple[ActionKind, ...] = ()
+    """Actions that a timeline may name beside the framework's own; the half that each names is called."""
     columns: tuple[str, ...] = ()
     """Fields of the agents' declared streams, as "drive.speed_m_s", at most six: whoever watches a run is shown
     their newest values per agent."""

@@ -21,13 +21,14 @@ from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.medium.carrier import Carrier
 from madns_runtime.medium.outcomes import NO_MEDIUM, LinkOutcome
 from madns_runtime.plugin import time_limit, validation
-from madns_runtime.plugin.api import AgentSimulation
+from madns_runtime.plugin.api import AgentSimulation, HostSimulation
 from madns_runtime.plugin.context import clean_text, describe_exception
 from madns_runtime.plugin.executor import WORKER_DIED, JobFailed
 from madns_runtime.plugin.host_calls import HostCalls
 from madns_runtime.plugin.registry import Role, load_function, load_half, parse_parameters, resolve
 from madns_runtime.processes import own_age_s
 from madns_runtime.protocol.messages import Service, Transmission
+from madns_runtime.timeline.action import ActionKind, ActionRefused
 
 CHECKS: Final[Mapping[str, Callable[[Any], Any]]] = {
     "initial_data": validation.initial_data,
@@ -36,6 +37,7 @@ CHECKS: Final[Mapping[str, Callable[[Any], Any]]] = {
     "finish": validation.summary,
 }
 """Checks of what methods return, by method; values of other methods are not looked at."""
+ACTION_METHODS: Final = ("begin_action", "end_action")
 REPEATS_MAX: Final = 100_000
 """Calls of the timer, or jobs, at one simulated time; more means that the half never lets time go on."""
 
@@ -63,6 +65,8 @@ class RoleProgram:
     """Whether the simulation declares one."""
     columns: tuple[str, ...] = ()
     """Fields whose newest values are told."""
+    actions: tuple[ActionKind, ...] = ()
+    """What the simulation declares for timelines."""
     life: int = 1
     """Number of this process of an agent."""
     agent_parameters: Mapping[str, Any] = field(default_factory=dict)
@@ -119,6 +123,7 @@ class RoleProgram:
             has_medium=has_medium,
             columns=descriptor.columns,
             agent_parameters=of_agents,
+            actions=descriptor.actions,
         )
 
 
@@ -133,6 +138,8 @@ class Half:
     Raises:
         HalfFailed: It cannot be made.
     """
+
+    contract: type = AgentSimulation
 
     def __init__(self, make: Callable[[], Any], log: Callable[[str, str], None]) -> None:
         self._log = log
@@ -161,7 +168,9 @@ class Half:
         """
         try:
             value = (function or self._method(name))(*arguments)
-        except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
+        except BaseException as error:
+            if isinstance(error, ActionRefused) and name in ACTION_METHODS:
+                raise  # it says that it cannot, and the run goes on
             raise self.failure(name, error) from error
         check = CHECKS.get(name)
         if check is None:
@@ -172,9 +181,9 @@ class Half:
             raise HalfFailed(f"{self.name}.{name} returned {clean_text(str(error))}") from error
 
     def _method(self, name: str) -> Callable[..., Any]:
-        """Return a method; of an agent's half that does not inherit it, and lacks it, the one that it would inherit."""
+        """Return a method; of a half that does not inherit it, and lacks it, the one that it would inherit."""
         own: Callable[..., Any] | None = getattr(self.simulation, name, None)
-        return own or partial(getattr(AgentSimulation, name), self.simulation)
+        return own or partial(getattr(self.contract, name), self.simulation)
 
     def failure(self, name: str, error: BaseException) -> HalfFailed:
         """Return what to raise, or to tell, of an error that a method raised; its traceback is logged."""
@@ -197,6 +206,8 @@ class HostHalf(Half):
     Raises:
         HalfFailed: It cannot be made.
     """
+
+    contract = HostSimulation
 
     def __init__(
         self,

@@ -39,7 +39,9 @@ from madns_runtime.plugin.code_places import (
 )
 from madns_runtime.plugin.columns import shape_faults
 from madns_runtime.plugin.isolation import missing_extra, said
+from madns_runtime.plugin.parameter_kinds import kind_faults
 from madns_runtime.plugin.time_limit import PluginStopped, hold
+from madns_runtime.timeline.kinds import kind_texts
 
 GROUP = "madns.simulations"
 PARTS = (
@@ -334,6 +336,8 @@ def _checked(descriptor: Any, where: str, module: ModuleType) -> Simulation:
     if not (isinstance(parameters, type) and dataclasses.is_dataclass(parameters)):
         faults.append("parameters: expected a dataclass (the class itself)")
     faults += shape_faults(descriptor.columns)
+    faults += [f"actions: {text}" for text in kind_texts(descriptor.actions)]
+    faults += [f"actions: {text}" for each in descriptor.actions for text in _parameter_texts(each)]
     parts: dict[str, Any] = {}
     for part in PARTS:
         value = getattr(descriptor, part)
@@ -347,6 +351,14 @@ def _checked(descriptor: Any, where: str, module: ModuleType) -> Simulation:
     if faults:
         raise PluginError(f"{where}: {'; '.join(faults)}")
     return dataclasses.replace(descriptor, **parts)
+
+
+def _parameter_texts(action: Any) -> list[str]:
+    """Return what is wrong with the parameters of a declared action."""
+    kind: Any = getattr(action, "parameters", None)
+    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
+        return [f"{getattr(action, 'word', action)}.parameters: expected a dataclass (the class)"]
+    return [f"{action.word}.parameters: {text}" for text in kind_faults(kind)]
 
 
 def _contract_faults(half: Any, role: Role) -> list[str]:

@@ -37,7 +37,12 @@ LINGER_S = 0.5
 """Longest wait of the host at its end for its last acknowledgements to leave."""
 
 _NOT_THERE = (Phase.ABSENT, Phase.JOINING, Phase.STOPPED, Phase.LOST)
-_FRAMEWORKS_OWN = (messages.Delivery, messages.TransmissionRefusal, messages.FaultOrder)
+_FRAMEWORKS_OWN = (
+    messages.Delivery,
+    messages.TransmissionRefusal,
+    messages.FaultOrder,
+    messages.ActionOrder,
+)
 _ENDING = (HostState.BEGIN_SHUTDOWN, HostState.EMERGENCY_SHUTDOWN)
 _BEFORE_STOP = tuple(state for state in HOST_LIVE if state is not HostState.BEGIN_SHUTDOWN)
 _AWAITED = {
@@ -121,6 +126,12 @@ class HostSession:
             if peer.phase is Phase.SIMULATION_READY:
                 self._start_peer(peer, now_s)
         self._progress(now_s)
+
+    def end_at(self, end_host_s: float) -> None:
+        """Take the simulated time to be over at *end_host_s* on the host's clock: agents were told."""
+        self._end_host_s = end_host_s
+        if self.state is HostState.SIMULATION_START:
+            self._state_deadline_s = end_host_s + self._timeouts.complete_s
 
     def order_stop(self, now_s: float) -> None:
         """Tell every agent to flush its records and end."""

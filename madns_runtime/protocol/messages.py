@@ -196,6 +196,24 @@ class ConditionMet:
     """Simulated time of it."""
 
 
+@dataclass(frozen=True, slots=True)
+class ActionOrder:
+    """Host -> agent, RELIABLE: carry out an action of the timeline, or let what it did be over."""
+
+    KIND: ClassVar[int] = 19
+    number: int
+    """The action's in the run; -1 for what the framework orders by itself."""
+    word: str
+    parameters: Any
+    """A mapping."""
+    t_s: float
+    """Simulated time at which it was due; of a stop that at which the run is over."""
+    for_s: Any
+    """How long it lasts, s; None for no end."""
+    is_end: Any
+    """Whether what it did is to be over: true or false."""
+
+
 Message = (
     Hello
     | SimulationSetup
@@ -214,6 +232,7 @@ Message = (
     | TransmissionRefusal
     | FaultOrder
     | ConditionMet
+    | ActionOrder
 )
 
 MESSAGES: tuple[type[Message], ...] = get_args(Message)

@@ -16,7 +16,7 @@ from madns_runtime.plugin.context import PeerContext
 from madns_runtime.plugin.half import Half, HalfFailed, RoleProgram
 from madns_runtime.protocol import events as told
 from madns_runtime.protocol.codec import NO_DATA
-from madns_runtime.protocol.messages import Delivery, FaultOrder, TransmissionRefusal
+from madns_runtime.protocol.messages import ActionOrder, Delivery, FaultOrder, TransmissionRefusal
 from madns_runtime.protocol.states import AgentState
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.realtime.agent_calls import (
@@ -30,6 +30,7 @@ from madns_runtime.realtime.agent_calls import (
 from madns_runtime.realtime.agent_link import AgentPort
 from madns_runtime.realtime.agent_report import AgentReport
 from madns_runtime.realtime.loop_account import Span
+from madns_runtime.realtime.ordered_actions import OrderedActions
 from madns_runtime.realtime.packs import Pack
 from madns_runtime.realtime.process_port import ProcessPort
 from madns_runtime.realtime.process_records import ProcessRecords
@@ -133,6 +134,9 @@ class AgentRunner:
             ),
         )
         pack.add(ticks)
+        self._actions = OrderedActions(
+            seat, program.actions, self._journal, call=self._call, end_at=ticks.end_at
+        )
         self._report = AgentReport(
             port=self._port,
             records=self._records,
@@ -241,6 +245,8 @@ class AgentRunner:
             self._port.mailbox.add(message)
         elif isinstance(message, FaultOrder):
             self._hardware.order_fault(message)
+        elif isinstance(message, ActionOrder):
+            self._actions.take(message)
         elif self._takes_data:
             is_refusal = isinstance(message, TransmissionRefusal)
             self._call("refused" if is_refusal else "receive", message)
@@ -274,7 +280,7 @@ class AgentRunner:
         self._usage_timer.reschedule(monotonic() + self._config.health.period_s)
 
     def _ticks_over(self) -> None:
-        end_s = self._config.time.duration_s + DRAIN_S
+        end_s = self._ticks.duration_s + DRAIN_S
         self._end_timer.reschedule(self._port.local_s(end_s))
 
     def _step_failed(self, error: BaseException) -> None:
@@ -343,20 +349,13 @@ class AgentRunner:
     def _close_records(self) -> None:
         messages = self._session.link.counters.to_mapping()
         counts = self._journal.close(self._config.timeouts.shutdown_s)
-        records = {
-            **counts.to_mapping(),
-            "messages": messages,
-            "network": self._port.network(),
-            "loop": self._port.process.loop(),
-            "between_agents": self._port.mailbox.counts(),
-            "held_dropped": self._session.held_dropped_count,
-            "malformed": self._session.malformed_count,
-        }
+        records = self._report.last_counts(counts.to_mapping(), messages)
         self._session.records_closed(records, monotonic())
 
     def _close(self) -> None:
         self._is_closed = True
         self._cancel_timers()
+        self._actions.close()
         self._port.close()
         self._on_ended(self.name, self._outcome)
 

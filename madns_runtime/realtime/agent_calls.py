@@ -16,6 +16,7 @@ from madns_runtime.hardware.port import Hardware
 
 IDLE: Final = 0.0
 SETUP, STEP, RECEIVE, FINISH, HEAR, REFUSED, DEVICE_CHANGED = 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0
+BEGIN_ACTION, END_ACTION = 8.0, 9.0
 METHODS: Final = {
     SETUP: "setup",
     STEP: "step",
@@ -24,6 +25,8 @@ METHODS: Final = {
     HEAR: "hear",
     REFUSED: "refused",
     DEVICE_CHANGED: "device_changed",
+    BEGIN_ACTION: "begin_action",
+    END_ACTION: "end_action",
 }
 NUMBER_OF: Final = {method: number for number, method in METHODS.items()}
 METHOD, AGENT, T_S = 0, 1, 2

@@ -67,6 +67,20 @@ class AgentReport:
             "simulation": simulation or {},
         }
 
+    def last_counts(
+        self, records: Mapping[str, Any], messages: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """Return what the host is told once the records are closed, given their counts and the messages' before."""
+        return {
+            **records,
+            "messages": messages,
+            "network": self.port.network(),
+            "loop": self.port.process.loop(),
+            "between_agents": self.port.mailbox.counts(),
+            "held_dropped": self.port.session.held_dropped_count,
+            "malformed": self.port.session.malformed_count,
+        }
+
     def _real_time_factor(self) -> float | None:
         factor = self.factor.value()
         return None if factor is None else round(factor, 9)

@@ -40,9 +40,11 @@ from madns_runtime.reactor.scheduling import apply as apply_scheduling
 from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.watchdog import end_after_hang_up, extend
 from madns_runtime.realtime.announcements import Announcements
+from madns_runtime.realtime.half_timer import HalfTimer
 from madns_runtime.realtime.host_link import HostPort
 from madns_runtime.realtime.host_result import HostReport
 from madns_runtime.realtime.operator_orders import OperatorOrders
+from madns_runtime.realtime.timeline import HostTimeline
 from madns_runtime.realtime.unwatched_devices import UnwatchedDevices
 from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
@@ -124,6 +126,9 @@ class HostRuntime:
         )
         calls.t_s, calls.warn = self._port.t_s, partial(self._log, "warning")
         self._half = HostHalf(program, self._journal.say, carrier=self._port.carrier, calls=calls)
+        self._half_timer = HalfTimer(
+            self._reactor, self._port, half=self._half, guard=self._guard, pump=self._pump
+        )
         self._context = JobContext(
             name=HOST,
             config=config,
@@ -134,11 +139,21 @@ class HostRuntime:
             send=self._port.send,
             half=self._half,
             submit=self._jobs.submit,
-            wake=self._wake,
+            wake=self._half_timer.wake,
         )
         self._report = HostReport(config.time.duration_s, program.columns)
-        # Infinite is never: each timer is made once and moved.
-        self._plugin_timer = self._reactor.call_at(math.inf, self._plugin_due)
+        self._timeline = HostTimeline(
+            config=config,
+            program=program,
+            reactor=self._reactor,
+            port=self._port,
+            journal=self._journal,
+            report=self._report,
+            call=self._call,
+            pump=self._pump,
+        )
+        self._timeline.wait_for(self._conditions)
+        # Infinite is never: the timer is made once and moved.
         self._progress_timer = self._reactor.call_at(math.inf, self._progress)
         self._is_set_up = self._awaits_jobs = False
         self._takes_data = True
@@ -271,24 +286,8 @@ class HostRuntime:
         self._calls.is_counting = True
         self._call("start", -lead_s)
         self._half.begin_timer(-lead_s)
-        self._plugin_due()
-
-    def _plugin_due(self) -> None:
-        if not self._port.is_in(HostState.SIMULATION_START):
-            return
-        self._guard(self._half.call_timer, self._port.now_s())
-        self._arm_plugin_timer()
-        self._pump()
-
-    def _wake(self, t_s: float) -> None:
-        self._half.wake(t_s)
-        self._arm_plugin_timer()
-
-    def _arm_plugin_timer(self) -> None:
-        t0_s, next_s = self._port.t0_s, self._half.next_s
-        # Not before now: what waits in the sockets has its turn between two calls that are late.
-        due_s = math.inf if t0_s is None or next_s is None else max(t0_s + next_s, monotonic())
-        self._plugin_timer.reschedule(due_s)
+        self._half_timer.call()
+        self._timeline.begin()
 
     def _job_done(self, job: int, future: Future[Any]) -> None:
         if not self._takes_data:

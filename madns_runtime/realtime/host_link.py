@@ -127,6 +127,10 @@ class HostPort:
             due_s = min(due_s, t0_s + carrier_s)
         self._timer.reschedule(due_s)
 
+    def monotonic_s(self) -> float:
+        """Return the time of this machine's monotonic clock, s."""
+        return monotonic()
+
     def want_pump(self) -> None:
         """Note that something waits to be carried out."""
         self.must_pump = True

@@ -16,7 +16,7 @@ from madns_runtime.realtime.late_ticks import LateTicks
 from madns_runtime.realtime.loop_account import Span
 from madns_runtime.recording.recorder import Recorder
 from madns_runtime.timing.late_causes import Cause
-from madns_runtime.timing.rate import Pacer, RealTimeFactor
+from madns_runtime.timing.rate import Pacer, RealTimeFactor, count_ticks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,6 +59,9 @@ class PacedTicks:
         calls: TickCalls,
     ) -> None:
         self.period_s = 1.0 / config.agents.tick_hz
+        self._tick_hz = config.agents.tick_hz
+        self.duration_s = config.time.duration_s
+        """Simulated time of the run, s."""
         self.pacer = Pacer(
             tick_hz=config.agents.tick_hz,
             phase_s=phase_s,
@@ -86,6 +89,14 @@ class PacedTicks:
         self.late.started_s = monotonic()
         if self.pacer.is_over:
             self._calls.ended()
+
+    def end_at(self, t_s: float) -> None:
+        """Take simulated time *t_s* for the run's end, if it is none later, s."""
+        if t_s < self.duration_s:
+            self.duration_s = t_s
+            self.pacer.tick_count = min(self.pacer.tick_count, count_ticks(t_s, self._tick_hz))
+            if self.pacer.is_over and self._is_running():
+                self._calls.ended()
 
     def finish(self, now_s: float) -> None:
         """Close the account at simulated time *now_s*, s."""

@@ -8,7 +8,7 @@ from typing import Any, Literal, Protocol
 
 from madns_runtime.errors import MadnsError
 
-Lasting = Literal["never", "may", "must"]
+Lasting = Literal["never", "given", "may", "must"]
 TimeMode = Literal["realtime", "lockstep"]
 CarriedOutBy = Literal["framework", "host", "agent"]
 
@@ -33,7 +33,8 @@ class ActionKind:
     takes_agents: bool = True
     """Whether it acts on agents, which must then be named."""
     lasting: Lasting = "never"
-    """Whether it has an end: never (no for_s), may (without for_s until the end of the run), must (for_s is needed)."""
+    """Whether it has an end: never (no for_s), given (for as long as for_s says, without it over at once), may (without
+    for_s until the end of the run), must (for_s is needed)."""
     modes: tuple[TimeMode, ...] = ("realtime", "lockstep")
     """The values of time.mode in which it exists."""
     carried_out_by: CarriedOutBy = "host"

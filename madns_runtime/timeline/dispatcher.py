@@ -10,6 +10,7 @@ from madns_runtime.timeline.action import ActionHandler, ActionRefused, Timeline
 BEGAN: Final = "action_began"
 ENDED: Final = "action_ended"
 REFUSED: Final = "action_refused"
+T_S_DIGITS: Final = 6
 
 
 class Dispatcher:
@@ -57,7 +58,7 @@ class Dispatcher:
         """End one that is in force, due at *due_s*; return why that was refused, or ""."""
         if self._in_force.pop(action.number, None) is None:
             return f"{action.word} is not in force"
-        values = {**described(action, now_s), "due_s": due_s, "delay_s": now_s - due_s}
+        values = described(action, now_s, due_s)
         try:
             self._handlers[action.word].end(action)
         except ActionRefused as refusal:
@@ -67,13 +68,14 @@ class Dispatcher:
         return ""
 
 
-def described(action: TimelineAction, now_s: float) -> dict[str, Any]:
-    """Return the values by which an event tells of an action at *now_s*."""
+def described(action: TimelineAction, now_s: float, due_s: float | None = None) -> dict[str, Any]:
+    """Return the values by which an event tells of an action at *now_s*, due at *due_s* or at its begin."""
+    due_s = action.t_s if due_s is None else due_s
     return {
         "number": action.number,
         "action": action.word,
         "agents": list(action.agents),
         "parameters": dict(action.parameters),
-        "due_s": action.t_s,
-        "delay_s": now_s - action.t_s,
+        "due_s": round(due_s, T_S_DIGITS),
+        "delay_s": round(now_s - due_s, T_S_DIGITS),
     }

@@ -26,6 +26,7 @@ from madns_runtime.protocol.codec import (
 )
 from madns_runtime.protocol.messages import (
     MESSAGES,
+    ActionOrder,
     AgentStopped,
     ConditionMet,
     Delivery,
@@ -61,6 +62,14 @@ EXAMPLES = (
     Transmission(to="ground:A", number=7, sent_s=1.0, payload={"x": [1, None]}),
     Delivery(sender="b", sent_s=1.0, arrives_s=1.01, payload="text"),
     TransmissionRefusal(number=7, to="*", sent_s=1.0, reason="no_radio"),
+    ActionOrder(
+        number=3,
+        word="bias_sensor",
+        parameters={"sensor": "gnss"},
+        t_s=1.5,
+        for_s=None,
+        is_end=False,
+    ),
     FaultOrder(number=3, device="pi22/imu", action="bias", value=0.5),
     ConditionMet(number=3, t_s=1.5),
 )

@@ -1,0 +1,125 @@
+"""
+Actions that a scenario's timeline may name, and the parameters that its entries give them.
+
+Asked where the simulation is asked: the classes of the parameters are its own code.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import ValidationError
+
+from cosmos_cli.errors import Fault
+from cosmos_cli.models.document import Document, did_you_mean
+from cosmos_cli.models.parameters import adapter_of
+from cosmos_cli.models.timeline_rules import ENTRIES_MAX, RULE_KEYS, parameters_in
+from cosmos_cli.models.translate import faults_of
+from madns_runtime.config import to_mapping
+from madns_runtime.timeline.action import ActionKind, Lasting
+from madns_runtime.timeline.kinds import FRAMEWORK_ACTIONS, kinds_by_word
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KnownAction:
+    """A kind of action, without its code."""
+
+    word: str
+    summary: str
+    takes_agents: bool
+    lasting: Lasting
+    modes: tuple[str, ...]
+    parameters: tuple[str, ...]
+    """Names of its parameters."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActionAnswers:
+    """What is known of actions and of an entry's parameters."""
+
+    known: tuple[KnownAction, ...]
+    is_complete: bool
+    """Whether there are no others: the simulation could be asked for its own."""
+    parameters: tuple[dict[str, Any] | None, ...] = ()
+    """Of each entry, defaults filled in; None if they are faulty, or the action is not known."""
+
+
+FRAMEWORK_ONLY = ActionAnswers(known=(), is_complete=False)
+
+
+def known_action(kind: ActionKind) -> KnownAction:
+    """Return what may travel of a kind."""
+    return KnownAction(
+        word=kind.word,
+        summary=kind.summary,
+        takes_agents=kind.takes_agents,
+        lasting=kind.lasting,
+        modes=kind.modes,
+        parameters=tuple(field.name for field in dataclasses.fields(kind.parameters)),
+    )
+
+
+def ask_actions(
+    document: Document, declared: Sequence[ActionKind] | None
+) -> tuple[ActionAnswers, list[Fault]]:
+    """
+    Validate the parameters of a timeline's entries, and return the faults with what is known.
+
+    Args:
+        document: The scenario.
+        declared: Actions of its simulation; None if it could not be asked.
+    """
+    kinds = kinds_by_word(declared or ())
+    faults: list[Fault] = []
+    parameters = []
+    for place, entry in entries_of(document):
+        kind = None if entry is None else kinds.get(str(entry.get("action")))
+        found: dict[str, Any] | list[Fault] | None = None
+        if entry is not None and kind is not None:
+            found = _validated(document, place, parameters_in(entry), kind)
+        if isinstance(found, list):
+            faults += found
+            found = None
+        parameters.append(found)
+    known = [*FRAMEWORK_ACTIONS, *(declared or ())]
+    answers = ActionAnswers(
+        known=tuple(map(known_action, known)),
+        is_complete=declared is not None,
+        parameters=tuple(parameters),
+    )
+    return answers, faults
+
+
+def entries_of(document: Document) -> Iterator[tuple[int, Mapping[str, Any] | None]]:
+    """Yield the entries of a timeline with their places; None for what is no mapping."""
+    written = document.value.get("timeline")
+    for place, entry in enumerate(written if isinstance(written, list) else ()):
+        if place < ENTRIES_MAX:
+            yield place, entry if isinstance(entry, dict) else None
+
+
+def _validated(
+    document: Document, place: int, given: Mapping[str, Any], kind: ActionKind
+) -> dict[str, Any] | list[Fault]:
+    """Return an action's parameters, or the faults of what is given."""
+    own = [field.name for field in dataclasses.fields(kind.parameters)]
+    unknown = [key for key in given if key not in own]
+    faults = [
+        document.fault(
+            ("timeline", place, key),
+            f"unknown key{did_you_mean(key, (*own, *RULE_KEYS))}",
+            at_key=True,
+        )
+        for key in unknown
+    ]
+    rest = {key: value for key, value in given.items() if key in own}
+    try:
+        made = adapter_of(kind.parameters).validate_json(json.dumps(rest), strict=True)
+    except ValidationError as error:
+        errors = error.errors(include_url=False)
+        faults += faults_of(document, errors, kind.parameters, below=("timeline", place))
+    return faults or to_mapping(made)

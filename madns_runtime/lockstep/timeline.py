@@ -1,0 +1,97 @@
+"""The timeline of a lockstep run: its actions take place between two ticks, at their simulated time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from madns_runtime.conditions.reports import HostConditions, MetCondition
+from madns_runtime.config import RunConfig
+from madns_runtime.errors import MadnsError
+from madns_runtime.lockstep.clock import SimulatedClock
+from madns_runtime.lockstep.messages import Outbox
+from madns_runtime.plugin.action_handlers import (
+    AgentOrders,
+    Annotations,
+    Stops,
+    simulation_handlers,
+)
+from madns_runtime.plugin.half import RoleProgram
+from madns_runtime.protocol.messages import ActionOrder
+from madns_runtime.recording.run_journal import RunJournal
+from madns_runtime.timeline.action import ActionHandler
+from madns_runtime.timeline.dispatcher import Dispatcher
+from madns_runtime.timeline.kinds import ANNOTATE, DEVICE_FAULT, STOP, kinds_by_word
+from madns_runtime.timeline.runner import TimelineRunner
+
+
+class LockstepTimeline:
+    """
+    Carries out the timeline.
+
+    Args:
+        config: The run.
+        program: What the host's half declares.
+        clock: Simulated time.
+        journal: Of the host.
+        outbox: Of the host.
+        call: Calls a method of the host's half.
+    """
+
+    def __init__(  # noqa: PLR0913 - the collaborators of a seam, all keyword-only
+        self,
+        *,
+        config: RunConfig,
+        program: RoleProgram,
+        clock: SimulatedClock,
+        journal: RunJournal,
+        outbox: Outbox,
+        call: Callable[..., Any],
+    ) -> None:
+        self._config = config
+        self._clock = clock
+        self._outbox = outbox
+        self.is_stopped = False
+        """Whether the run ends with the tick under way."""
+        self.handlers: dict[str, ActionHandler] = {
+            ANNOTATE.word: Annotations(),
+            STOP.word: Stops(self._stop),
+            DEVICE_FAULT.word: AgentOrders(self._post),
+            **simulation_handlers(program.actions, call=call, post=self._post),
+        }
+        self.runner = TimelineRunner(
+            config.timeline,
+            kinds_by_word(program.actions),
+            Dispatcher(self.handlers, journal.event),
+            seed=config.seed,
+            duration_s=config.time.duration_s,
+        )
+
+    def wait_for(self, conditions: HostConditions) -> None:
+        """Have the actions begin that wait for conditions."""
+        for number in {e.condition for e in self._config.timeline if e.condition is not None}:
+            conditions.on_met(number, self._met)
+
+    def next_s(self, half_s: float | None) -> tuple[float | None, bool]:
+        """Return the time of what comes next, given when the half wants to be called, and whether it is an action."""
+        own_s = self.runner.next_s
+        if own_s is not None and (half_s is None or own_s <= half_s):
+            return own_s, True
+        return half_s, False
+
+    def run_due(self) -> None:
+        """Do what is due by now."""
+        self.runner.run_due(self._clock.t_s)
+
+    def _met(self, met: MetCondition) -> None:
+        self.runner.met(met.condition.number, met.t_s, self._clock.t_s)
+
+    def _stop(self) -> None:
+        self.is_stopped = True
+        self.runner.close()
+
+    def _post(self, agent: str, order: ActionOrder) -> bool:
+        try:
+            return self._outbox.post(agent, order)
+        except MadnsError:  # it takes nothing more before simulated time goes on
+            return False

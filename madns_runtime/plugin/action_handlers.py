@@ -1,0 +1,144 @@
+"""Handlers of a timeline's actions that both time modes share: the simulation's own, and what agents carry out."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from madns_runtime.plain_values import from_mapping
+from madns_runtime.protocol.messages import ActionOrder
+from madns_runtime.timeline.action import (
+    ActionHandler,
+    ActionKind,
+    ActionRefused,
+    TimelineAction,
+)
+
+AGENTS_TOLD_MAX = 20
+
+
+class Annotations:
+    """Handler of annotate: its begin and end are events, and that is all."""
+
+    def begin(self, action: TimelineAction) -> None:
+        """Do nothing more."""
+
+    def end(self, action: TimelineAction) -> None:
+        """Do nothing more."""
+
+
+class Stops:
+    """
+    Handler of stop.
+
+    Args:
+        stop: Ends the run's simulated time here.
+    """
+
+    def __init__(self, stop: Callable[[], None]) -> None:
+        self._stop = stop
+
+    def begin(self, action: TimelineAction) -> None:
+        """End the run's simulated time."""
+        self._stop()
+
+    def end(self, action: TimelineAction) -> None:
+        """Do nothing: there is no going on."""
+
+
+class HostHalfActions:
+    """
+    Handler of actions that the host's half of the simulation carries out.
+
+    Args:
+        kinds: Of the simulation, by word.
+        call: Calls a method of the half.
+    """
+
+    def __init__(self, kinds: Mapping[str, ActionKind], call: Callable[..., Any]) -> None:
+        self._kinds = kinds
+        self._call = call
+
+    def begin(self, action: TimelineAction) -> None:
+        """Call the half's begin_action."""
+        self._call("begin_action", with_instance(action, self._kinds[action.word]))
+
+    def end(self, action: TimelineAction) -> None:
+        """Call the half's end_action."""
+        self._call("end_action", with_instance(action, self._kinds[action.word]))
+
+
+class AgentOrders:
+    """
+    Handler of actions that agents carry out: each is sent an order at begin and end.
+
+    Args:
+        post: Sends an agent an order; False if it is not there.
+    """
+
+    def __init__(self, post: Callable[[str, ActionOrder], bool]) -> None:
+        self._post = post
+
+    def begin(self, action: TimelineAction) -> None:
+        """
+        Order it.
+
+        Raises:
+            ActionRefused: None of its agents is there.
+        """
+        self._order(action, is_end=False)
+
+    def end(self, action: TimelineAction) -> None:
+        """
+        Order its end.
+
+        Raises:
+            ActionRefused: None of its agents is there.
+        """
+        self._order(action, is_end=True)
+
+    def _order(self, action: TimelineAction, *, is_end: bool) -> None:
+        order = ActionOrder(
+            number=action.number,
+            word=action.word,
+            parameters=dict(action.parameters),
+            t_s=action.t_s,
+            for_s=action.for_s,
+            is_end=is_end,
+        )
+        # A list: each agent is sent to, whatever became of the one before.
+        sent = [self._post(agent, order) for agent in action.agents]
+        if not any(sent):
+            raise ActionRefused(f"not there at present: {_told(action.agents)}")
+
+
+def with_instance(action: TimelineAction, kind: ActionKind) -> TimelineAction:
+    """Return an action whose parameters are an instance of its kind's class."""
+    made: Any = from_mapping(kind.parameters, action.parameters, action.word)
+    return dataclasses.replace(action, parameters=made)
+
+
+def simulation_handlers(
+    declared: Sequence[ActionKind],
+    *,
+    call: Callable[..., Any],
+    post: Callable[[str, ActionOrder], bool],
+) -> dict[str, ActionHandler]:
+    """
+    Return the handlers of the actions that a simulation declares, by word.
+
+    Args:
+        declared: The actions.
+        call: Calls a method of the host's half.
+        post: Sends an agent an order; False if it is not there.
+    """
+    of_host = HostHalfActions({kind.word: kind for kind in declared}, call)
+    of_agents = AgentOrders(post)
+    return {kind.word: of_host if kind.carried_out_by == "host" else of_agents for kind in declared}
+
+
+def _told(agents: Sequence[str]) -> str:
+    shown = ", ".join(agents[:AGENTS_TOLD_MAX]) or "no agent"
+    more = len(agents) - AGENTS_TOLD_MAX
+    return f"{shown} and {more} more" if more > 0 else shown

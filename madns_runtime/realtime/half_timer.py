@@ -1,0 +1,60 @@
+"""The timer of the host's half in real time: called when simulated time has come to what it asked for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from time import monotonic
+from typing import Any
+
+from madns_runtime.plugin.half import HostHalf
+from madns_runtime.protocol.states import HostState
+from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.realtime.host_link import HostPort
+
+
+class HalfTimer:
+    """
+    Calls the half's timer.
+
+    Args:
+        reactor: The loop.
+        port: Knows simulated time.
+        half: The host's half.
+        guard: Calls what it is given; what that raises ends the run.
+        pump: Sends what waits.
+    """
+
+    def __init__(
+        self,
+        reactor: Reactor,
+        port: HostPort,
+        *,
+        half: HostHalf,
+        guard: Callable[..., Any],
+        pump: Callable[[], None],
+    ) -> None:
+        self._port = port
+        self._half = half
+        self._guard = guard
+        self._pump = pump
+        # Infinite is never: the timer is made once and moved.
+        self._timer = reactor.call_at(math.inf, self.call)
+
+    def call(self) -> None:
+        """Call it, now, if simulated time runs."""
+        if self._port.is_in(HostState.SIMULATION_START):
+            self._guard(self._half.call_timer, self._port.now_s())
+            self._arm()
+            self._pump()
+
+    def wake(self, t_s: float) -> None:
+        """Have it called at simulated time *t_s*, if not earlier."""
+        self._half.wake(t_s)
+        self._arm()
+
+    def _arm(self) -> None:
+        t0_s, next_s = self._port.t0_s, self._half.next_s
+        # Not before now: what waits in the sockets has its turn between two calls that are late.
+        due_s = math.inf if t0_s is None or next_s is None else max(t0_s + next_s, monotonic())
+        self._timer.reschedule(due_s)

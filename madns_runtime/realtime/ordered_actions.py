@@ -1,0 +1,93 @@
+"""Actions of the framework that a timeline orders of an agent in real time: a stop, load, faults of its devices."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+from madns_runtime.errors import ConfigurationError
+from madns_runtime.hardware.fault_actions import check_fault
+from madns_runtime.health.stress_process import (
+    end_stress_processes,
+    reap,
+    start_stress_processes,
+)
+from madns_runtime.plain_values import from_mapping
+from madns_runtime.plugin.agent_actions import AgentActions, OwnAction
+from madns_runtime.protocol.messages import ActionOrder
+from madns_runtime.realtime.agent_calls import LoopSeat
+from madns_runtime.recording.run_journal import RunJournal
+from madns_runtime.timeline.action import ActionKind, ActionRefused
+from madns_runtime.timeline.kinds import DEVICE_FAULT, STOP, STRESS, DeviceFault, Stress
+
+ORDERS_FROM: Final = 1_000_000
+"""Numbers of fault orders from here on are a timeline's: nobody waits for an answer."""
+
+
+class OrderedActions(AgentActions):
+    """
+    Carries them out.
+
+    Args:
+        seat: The agent, and the devices that it uses.
+        declared: Actions of the simulation.
+        journal: Of the agent.
+        call: Calls a method of the agent's half.
+        end_at: Ends the agent's simulated time at one that is to come, s.
+    """
+
+    def __init__(
+        self,
+        seat: LoopSeat,
+        declared: Sequence[ActionKind],
+        journal: RunJournal,
+        *,
+        call: Callable[..., Any],
+        end_at: Callable[[float], None],
+    ) -> None:
+        self._hardware = seat.hardware
+        self._end_at = end_at
+        self._stress: dict[int, tuple[subprocess.Popen[bytes], ...]] = {}
+        self._ended: list[subprocess.Popen[bytes]] = []
+        own: Mapping[str, OwnAction] = {
+            STOP.word: lambda order: self._end_at(order.t_s),
+            STRESS.word: self._load,
+            DEVICE_FAULT.word: self._device_fault,
+        }
+        super().__init__(seat.name, declared, call=call, journal=journal, own=own)
+
+    def close(self) -> None:
+        """End what goes on beside the agent."""
+        for number in list(self._stress):
+            self._end_load(number)
+        reap(self._ended)
+        self._ended.clear()
+
+    def _load(self, order: ActionOrder) -> None:
+        if order.is_end:
+            self._end_load(order.number)
+            return
+        workers = from_mapping(Stress, order.parameters).workers
+        try:
+            self._stress[order.number] = start_stress_processes(workers)
+        except OSError as error:
+            raise ActionRefused(f"no process can be started: {error.strerror}") from error
+
+    def _end_load(self, number: int) -> None:
+        processes = self._stress.pop(number, ())
+        end_stress_processes(processes)
+        self._ended += processes
+
+    def _device_fault(self, order: ActionOrder) -> None:
+        fault = from_mapping(DeviceFault, order.parameters)
+        device = self._hardware.get(fault.device)
+        if device is None:
+            known = ", ".join(self._hardware) or "none"
+            raise ActionRefused(f"this agent uses no device {fault.device!r}; it uses {known}")
+        word, value = ("clear", None) if order.is_end else (fault.fault, fault.value)
+        try:
+            check_fault(word, value)
+        except ConfigurationError as error:
+            raise ActionRefused(str(error)) from None
+        device.order_fault(ORDERS_FROM + order.number, word, value)

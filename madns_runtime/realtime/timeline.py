@@ -1,0 +1,124 @@
+"""The timeline of a run in real time: its actions take place at the host when their simulated time has come."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, Final
+
+from madns_runtime.conditions.reports import HostConditions, MetCondition
+from madns_runtime.config import RunConfig
+from madns_runtime.errors import MadnsError
+from madns_runtime.plugin.action_handlers import (
+    AgentOrders,
+    Annotations,
+    Stops,
+    simulation_handlers,
+)
+from madns_runtime.plugin.half import RoleProgram
+from madns_runtime.protocol.messages import ActionOrder, Service
+from madns_runtime.protocol.states import HostState
+from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.realtime.host_link import HostPort
+from madns_runtime.realtime.host_result import HostReport
+from madns_runtime.recording.run_journal import RunJournal
+from madns_runtime.timeline.action import ActionHandler
+from madns_runtime.timeline.dispatcher import Dispatcher
+from madns_runtime.timeline.kinds import ANNOTATE, DEVICE_FAULT, STOP, STRESS, kinds_by_word
+from madns_runtime.timeline.runner import TimelineRunner
+
+STOP_LEAD_S: Final = 0.25
+"""Every agent hears of a stop before its last tick, and all run the same ticks."""
+
+
+class HostTimeline:
+    """
+    Carries out the timeline.
+
+    Args:
+        config: The run.
+        program: What the host's half declares.
+        reactor: The loop.
+        port: Knows simulated time and the agents.
+        journal: Of the host.
+        report: Of the run; a stop shortens its duration.
+        call: Calls a method of the host's half.
+        pump: Sends what waits.
+    """
+
+    def __init__(  # noqa: PLR0913 - the collaborators of a seam, all keyword-only
+        self,
+        *,
+        config: RunConfig,
+        program: RoleProgram,
+        reactor: Reactor,
+        port: HostPort,
+        journal: RunJournal,
+        report: HostReport,
+        call: Callable[..., Any],
+        pump: Callable[[], None],
+    ) -> None:
+        self._config = config
+        self._port = port
+        self._report = report
+        self._pump = pump
+        self.handlers: dict[str, ActionHandler] = {
+            ANNOTATE.word: Annotations(),
+            STOP.word: Stops(self._stop),
+            STRESS.word: AgentOrders(self._post),
+            DEVICE_FAULT.word: AgentOrders(self._post),
+            **simulation_handlers(program.actions, call=call, post=self._post),
+        }
+        self.runner = TimelineRunner(
+            config.timeline,
+            kinds_by_word(program.actions),
+            Dispatcher(self.handlers, journal.event),
+            seed=config.seed,
+            duration_s=config.time.duration_s,
+        )
+        # Infinite is never: the timer is made once and moved; a run without a timeline has none to move.
+        self._timer = reactor.call_at(math.inf, self._due)
+
+    def wait_for(self, conditions: HostConditions) -> None:
+        """Have the actions begin that wait for conditions."""
+        for number in {e.condition for e in self._config.timeline if e.condition is not None}:
+            conditions.on_met(number, self._met)
+
+    def begin(self) -> None:
+        """Simulated time zero is set: wait for what is due first."""
+        self._arm()
+
+    def _arm(self) -> None:
+        next_s, t0_s = self.runner.next_s, self._port.t0_s
+        self._timer.reschedule(math.inf if next_s is None or t0_s is None else t0_s + next_s)
+
+    def _due(self) -> None:
+        if self._port.is_in(HostState.SIMULATION_START):
+            self.runner.run_due(self._port.now_s())
+            self._arm()
+            self._pump()
+
+    def _met(self, met: MetCondition) -> None:
+        if self._port.is_in(HostState.SIMULATION_START):
+            self.runner.met(met.condition.number, met.t_s, self._port.now_s())
+            self._arm()
+
+    def _stop(self) -> None:
+        tick_hz, now_s = self._config.agents.tick_hz, self._port.now_s()
+        end_s = math.ceil((max(now_s, 0.0) + STOP_LEAD_S) * tick_hz) / tick_hz
+        if end_s >= self._report.duration_s:
+            return
+        self._report.duration_s = end_s
+        self.runner.close()
+        for agent in self._config.agents.resolved_names():
+            self._post(agent, ActionOrder(-1, STOP.word, {}, end_s, None, is_end=False))
+        t0_s = self._port.t0_s
+        assert t0_s is not None, "actions begin once simulated time runs"
+        self._port.session.end_at(t0_s + end_s)
+
+    def _post(self, agent: str, order: ActionOrder) -> bool:
+        try:
+            self._port.must_pump = True
+            return self._port.session.send(agent, order, Service.RELIABLE, self._port.monotonic_s())
+        except MadnsError:  # it takes nothing
+            return False

@@ -1,0 +1,138 @@
+"""A timeline while its run goes on: what is due at a simulated time, what ends then, what was ordered. Pure."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from madns_runtime.timeline.action import ActionKind, TimelineAction
+from madns_runtime.timeline.dispatcher import Dispatcher
+from madns_runtime.timeline.entries import ScheduledEntry
+from madns_runtime.timeline.schedule import DueAction, schedule
+
+ORDERS_MAX: Final = 10_000
+"""Actions of one run that conditions begin or that are ordered live; more are refused."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OrderedAction:
+    """An action that is ordered while the run goes on."""
+
+    word: str
+    agents: tuple[str, ...] = ()
+    parameters: Mapping[str, Any]
+    for_s: float | None = None
+
+
+class TimelineRunner:
+    """
+    Begins and ends actions.
+
+    Args:
+        entries: Of the timeline.
+        kinds: By word, of all actions of this run.
+        dispatcher: To their handlers.
+        seed: The run's.
+        duration_s: The run's, s.
+    """
+
+    def __init__(
+        self,
+        entries: Sequence[ScheduledEntry],
+        kinds: Mapping[str, ActionKind],
+        dispatcher: Dispatcher,
+        *,
+        seed: int,
+        duration_s: float,
+    ) -> None:
+        self._entries = entries
+        self._kinds = kinds
+        self._dispatcher = dispatcher
+        self._due: tuple[DueAction, ...] = schedule(entries, seed=seed, duration_s=duration_s)
+        self._position = 0
+        self._ends: list[tuple[float, int, TimelineAction]] = []
+        self._count = self._ordered_count = 0
+        self._is_closed = False
+
+    @property
+    def next_s(self) -> float | None:
+        """Simulated time at which something is due; None if nothing is."""
+        times = [self._due[self._position].t_s] if self._position < len(self._due) else []
+        times += [self._ends[0][0]] if self._ends else []
+        return min(times, default=None)
+
+    @property
+    def in_force(self) -> tuple[TimelineAction, ...]:
+        """Actions that have begun and not ended."""
+        return self._dispatcher.in_force
+
+    def run_due(self, now_s: float) -> None:
+        """Do all that is due up to simulated time *now_s*, in the order of times; at one time what ends comes first."""
+        while (next_s := self.next_s) is not None and next_s <= now_s:
+            if self._ends and self._ends[0][0] <= next_s:
+                due_s, _, action = heapq.heappop(self._ends)
+                self._dispatcher.end(action, due_s, now_s)
+                continue
+            due = self._due[self._position]
+            self._position += 1
+            entry = self._entries[due.entry]
+            ordered = OrderedAction(
+                word=entry.action,
+                agents=due.agents,
+                parameters=entry.parameters,
+                for_s=entry.for_s,
+            )
+            self._begin(ordered, due.t_s, now_s)
+
+    def close(self) -> None:
+        """Let nothing more begin or end: the run's simulated time is over."""
+        self._position = len(self._due)
+        self._ends.clear()
+        self._is_closed = True
+
+    def met(self, condition: int, met_s: float, now_s: float) -> None:
+        """Begin, now, the actions that wait for a condition, which was met at *met_s*."""
+        for entry in self._entries:
+            if entry.condition == condition:
+                ordered = OrderedAction(
+                    word=entry.action,
+                    agents=entry.agents,
+                    parameters=entry.parameters,
+                    for_s=entry.for_s,
+                )
+                self.order(ordered, now_s, due_s=met_s)
+
+    def order(self, ordered: OrderedAction, now_s: float, *, due_s: float | None = None) -> str:
+        """
+        Begin an action now; return why it is refused, "" if it takes place.
+
+        Args:
+            ordered: What.
+            now_s: Simulated time, s.
+            due_s: When it should have begun; None for now.
+        """
+        if self._is_closed:
+            return "the run is ending"
+        if self._ordered_count >= ORDERS_MAX:
+            return f"at most {ORDERS_MAX} actions may be ordered in one run"
+        self._ordered_count += 1
+        return self._begin(ordered, now_s if due_s is None else due_s, now_s)
+
+    def _begin(self, ordered: OrderedAction, due_s: float, now_s: float) -> str:
+        action = TimelineAction(
+            number=self._count,
+            word=ordered.word,
+            agents=ordered.agents,
+            parameters=ordered.parameters,
+            t_s=due_s,
+            for_s=ordered.for_s,
+        )
+        self._count += 1
+        kind = self._kinds.get(ordered.word)
+        lasts = kind is not None and (ordered.for_s is not None or kind.lasting == "may")
+        refusal = self._dispatcher.begin(action, now_s, lasts=lasts)
+        if not refusal and lasts and ordered.for_s is not None and not self._is_closed:
+            heapq.heappush(self._ends, (max(due_s, now_s) + ordered.for_s, action.number, action))
+        return refusal

@@ -1,0 +1,143 @@
+"""Broken timelines: each fault is told at its place, with what was expected and what to do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from cosmos_cli.errors import InputError
+from cosmos_cli.models.loading import ScenarioFile, load_scenario
+
+HEAD = """\
+name: broken
+simulation: counter
+agents: {{count: 4, tick_hz: 10}}
+time: {{mode: {mode}, duration_s: 100}}
+hardware: {{devices: [{{name: gps, kind: synthetic, parameters: {{channels: [{{name: u}}]}}}}]}}
+timeline:
+"""
+DEVICE = 'at_s: 1, action: device_fault, agents: ["*"], '
+BROKEN = [
+    ("3", "timeline[0]", "expected a mapping, got 3"),
+    ("{at_s: 1}", "timeline[0].action", "missing; expected a text"),
+    ("{at_s: 1, action: 3}", "timeline[0].action", "expected a text"),
+    ("{at_s: 1, action: ''}", "timeline[0].action", "expected"),
+    ("{at_s: 1, action: anotate, text: a}", "timeline[0].action", "did you mean annotate?"),
+    ("{at_s: 1, action: explode}", "timeline[0].action", "known here: annotate, stop"),
+    ("{action: stop}", "timeline[0].action", "one of at_s, every_s"),
+    ("{at_s: 1, every_s: 2, action: stop}", "timeline[0].every_s", "got at_s as well"),
+    ("{at_s: 1, rate_per_h: 2, action: stop}", "timeline[0].rate_per_h", "got at_s as well"),
+    ("{at_s: -1, action: stop}", "timeline[0].at_s", "expected >= 0, got -1"),
+    ("{at_s: soon, action: stop}", "timeline[0].at_s", "expected a number, got 'soon'"),
+    ("{at_s: 100, action: stop}", "timeline[0].at_s", "the run is over then"),
+    ("{at_s: 1e9, action: stop}", "timeline[0].at_s", "less than time.duration_s (100)"),
+    ("{at: 1, action: stop}", "timeline[0].at", "unknown key, did you mean at_s?"),
+    ("{at_s: 1, from_s: 2, action: stop}", "timeline[0].from_s", "goes with every_s"),
+    ("{at_s: 1, to_s: 2, action: stop}", "timeline[0].to_s", "goes with every_s"),
+    ("{every_s: 0, action: annotate, text: a}", "timeline[0].every_s", "expected > 0, got 0"),
+    (
+        "{every_s: 5, from_s: 9, to_s: 3, action: annotate, text: a}",
+        "timeline[0].to_s",
+        "expected >= from_s (9), got 3",
+    ),
+    (
+        "{every_s: 5, from_s: 200, action: annotate, text: a}",
+        "timeline[0].from_s",
+        "the run is over then",
+    ),
+    (
+        "{every_s: 5, to_s: 200, action: annotate, text: a}",
+        "timeline[0].to_s",
+        "leave it out for the end",
+    ),
+    ("{every_s: 0.001, action: annotate, text: a}", "timeline", "make them rarer"),
+    ("{rate_per_h: 0, action: annotate, text: a}", "timeline[0].rate_per_h", "expected > 0"),
+    ("{rate_per_h: 1e9, action: annotate, text: a}", "timeline[0].rate_per_h", "expected <= 3600"),
+    ("{at_s: 1, action: annotate}", "timeline[0].text", "missing"),
+    ("{at_s: 1, action: annotate, text: ''}", "timeline[0].text", "at least 1"),
+    ("{at_s: 1, action: annotate, txt: a}", "timeline[0].txt", "did you mean text?"),
+    (
+        "{at_s: 1, action: annotate, text: a, agents: ['*']}",
+        "timeline[0].agents",
+        "acts on the whole run",
+    ),
+    ("{at_s: 1, action: annotate, text: a, for_s: 0}", "timeline[0].for_s", "expected > 0"),
+    ("{at_s: 1, action: stop, for_s: 3}", "timeline[0].for_s", "stop has no end"),
+    ("{" + DEVICE + "device: gps}", "timeline[0].fault", "missing"),
+    ("{" + DEVICE + "device: gps, fault: biass}", "timeline[0].fault", "did you mean bias?"),
+    ("{" + DEVICE + "device: gps, fault: bias}", "timeline[0].fault", "bias needs a value"),
+    ("{" + DEVICE + "device: gps, fault: drop, value: 2}", "timeline[0].value", "0 to 1"),
+    ("{" + DEVICE + "device: gps, fault: freeze, value: 2}", "timeline[0].value", "no value"),
+    ("{" + DEVICE + "device: gsp, fault: freeze}", "timeline[0].device", "did you mean gps?"),
+    (
+        "{at_s: 1, action: device_fault, device: gps, fault: freeze}",
+        "timeline[0].action",
+        "needs agents",
+    ),
+    (
+        "{at_s: 1, action: device_fault, agents: [agent-9], device: gps, fault: freeze}",
+        "timeline[0].agents[0]",
+        "no agent is named agent-9",
+    ),
+    (
+        '{at_s: 1, action: device_fault, agents: ["sat-*"], device: gps, fault: freeze}',
+        "timeline[0].agents[0]",
+        "no agent is named sat-*",
+    ),
+    (
+        '{at_s: 1, action: stress, agents: ["*"], for_s: 3}',
+        "timeline[0].action",
+        "time.mode realtime alone",
+    ),
+]
+
+
+def load(folder: Path, *entries: str, mode: str = "lockstep") -> ScenarioFile:
+    path = folder / "broken.yaml"
+    path.write_text(HEAD.format(mode=mode) + "".join(f"  - {entry}\n" for entry in entries))
+    return load_scenario(path)
+
+
+@pytest.mark.parametrize(("entry", "place", "words"), BROKEN)
+def test_a_broken_entry_is_refused_with_its_place_and_cure(
+    tmp_path: Path, entry: str, place: str, words: str
+) -> None:
+    with pytest.raises(InputError) as refused:
+        load(tmp_path, entry)
+
+    told = {fault.path: fault.text for fault in refused.value.faults}
+    assert place in told, told
+    assert words in told[place]
+    assert all(fault.line and fault.line >= 6 for fault in refused.value.faults)
+
+
+def test_all_entries_are_told_of_at_once(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as refused:
+        load(tmp_path, "{at_s: 1, action: anotate}", "{at_s: 1}", "4")
+
+    assert [fault.line for fault in refused.value.faults] == [7, 8, 9]
+
+
+def test_stress_needs_to_be_told_how_long(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as refused:
+        load(tmp_path, '{at_s: 1, action: stress, agents: ["*"]}', mode="realtime")
+
+    assert "needs for_s" in refused.value.faults[0].text
+
+
+def test_too_many_entries_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as refused:
+        load(tmp_path, *["{at_s: 1, action: stop}"] * 1001)
+
+    assert "at most 1000 items" in refused.value.faults[0].text
+
+
+def test_globs_become_names_and_defaults_are_filled_in(tmp_path: Path) -> None:
+    entry = '{every_s: 20, action: device_fault, agents: ["agent-0[12]"], device: gps, fault: freeze, for_s: 5}'
+
+    (found,) = load(tmp_path, entry).run_config("0001-x").timeline
+
+    assert found.agents == ("agent-01", "agent-02")
+    assert found.parameters == {"device": "gps", "fault": "freeze", "value": None}
+    assert (found.every_s, found.from_s, found.to_s, found.for_s) == (20.0, 0.0, None, 5.0)

@@ -1,0 +1,86 @@
+"""Whole runs with a timeline by the real command: what happens when, that it repeats, and how a stop ends a run."""
+
+import json
+
+import pytest
+import yaml
+from harness.cosmos_command import LOOSE, CosmosCommand
+
+pytestmark = pytest.mark.process
+
+ENTRIES = [
+    {"at_s": 1, "action": "annotate", "text": "warm", "for_s": 2},
+    {"every_s": 2, "from_s": 1, "to_s": 7, "action": "annotate", "text": "again"},
+    {"rate_per_h": 3000, "action": "annotate", "text": "chance"},
+    {"at_s": 6.05, "action": "stop"},
+]
+
+
+@pytest.fixture
+def cosmos(tmp_path):
+    return CosmosCommand(tmp_path)
+
+
+def written(folder, entries, *, mode="lockstep", duration_s=10):
+    path = folder / "timeline.yaml"
+    scenario = {
+        "name": "timeline",
+        "simulation": "counter",
+        "agents": {"count": 2, "tick_hz": 10},
+        "time": {"mode": mode, "duration_s": duration_s},
+        "deadline": {"max_miss_ratio": 1},
+        "timeline": entries,
+    }
+    path.write_text(yaml.safe_dump(scenario))
+    return path
+
+
+def actions(cosmos, result):
+    lines = (cosmos.directory(result) / "host" / "events.jsonl").read_text().splitlines()
+    events = [json.loads(line) for line in lines]
+    return [each for each in events if str(each.get("event")).startswith("action_")]
+
+
+def test_a_timeline_in_lockstep_repeats_to_the_bit_and_a_stop_completes_the_run(cosmos, tmp_path):
+    path = written(tmp_path, ENTRIES)
+
+    first, second = (cosmos.run(path, f"agents.per_process={number}") for number in (1, 2))
+    other = cosmos.run(path, "seed=9")
+
+    for code, result in (first, second):
+        assert (code, result["status"], result["duration_s"]) == (0, "complete", 6.1)
+        assert result["timing"]["ticks"] == 2 * 61
+        assert result["data"]["complete"]
+    assert first[1]["records_sha256"] == second[1]["records_sha256"] != other[1]["records_sha256"]
+    found = actions(cosmos, first[1])
+    assert [(e["t_s"], e["event"]) for e in found if e["parameters"] == {"text": "warm"}] == [
+        (1.0, "action_began"),
+        (3.0, "action_ended"),
+    ]
+    assert [e["t_s"] for e in found if e["parameters"] == {"text": "again"}] == [1.0, 3.0, 5.0]
+    assert any(e["parameters"] == {"text": "chance"} for e in found)
+    assert found[-1]["action"] == "stop"
+    assert all(e["delay_s"] == 0.0 for e in found)
+
+
+def test_a_stop_in_real_time_ends_all_agents_with_the_same_tick(cosmos, tmp_path):
+    path = written(
+        tmp_path,
+        [
+            {"at_s": 0.2, "action": "stress", "agents": ["agent-01"], "for_s": 0.3},
+            {"at_s": 1, "action": "stop"},
+        ],
+        mode="realtime",
+        duration_s=60,
+    )
+
+    code, result = cosmos.run(path, "agents.per_process=2", *LOOSE)
+
+    assert (code, result["status"]) == (0, "complete")
+    assert 1.3 <= result["duration_s"] < 30
+    found = [(e["event"], e["action"]) for e in actions(cosmos, result)]
+    assert found == [
+        ("action_began", "stress"),
+        ("action_ended", "stress"),
+        ("action_began", "stop"),
+    ]

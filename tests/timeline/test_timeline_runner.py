@@ -1,0 +1,95 @@
+"""A timeline while its run goes on, by simulated times alone."""
+
+from typing import Any
+
+from madns_runtime.timeline.action import ActionKind, TimelineAction
+from madns_runtime.timeline.dispatcher import Dispatcher
+from madns_runtime.timeline.entries import ScheduledEntry
+from madns_runtime.timeline.runner import OrderedAction, TimelineRunner
+
+KINDS = {
+    word: ActionKind(word=word, summary="", lasting=lasting)
+    for word, lasting in (("kill", "may"), ("annotate", "never"))
+}
+
+
+class Noting:
+    """A handler that notes what it does, and when it was due."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, str, float]] = []
+
+    def begin(self, action: TimelineAction) -> None:
+        self.calls.append(("begin", action.word, action.t_s))
+
+    def end(self, action: TimelineAction) -> None:
+        self.calls.append(("end", action.word, action.t_s))
+
+
+def a_runner(*entries: ScheduledEntry) -> tuple[TimelineRunner, Noting, list[dict[str, Any]]]:
+    handler, events = Noting(), list[dict[str, Any]]()
+    dispatcher = Dispatcher(
+        {"kill": handler, "annotate": handler},
+        lambda event, **values: events.append({"event": event, **values}),
+    )
+    return TimelineRunner(entries, KINDS, dispatcher, seed=1, duration_s=100.0), handler, events
+
+
+def test_what_lasts_ends_and_ends_come_before_begins() -> None:
+    runner, handler, events = a_runner(
+        ScheduledEntry(action="kill", at_s=10.0, for_s=5.0, agents=("a",)),
+        ScheduledEntry(action="annotate", at_s=15.0),
+    )
+
+    assert runner.next_s == 10.0
+    runner.run_due(9.9)
+    assert handler.calls == []
+    runner.run_due(10.0)
+    assert runner.next_s == 15.0
+    assert [action.word for action in runner.in_force] == ["kill"]
+    runner.run_due(20.0)
+
+    assert handler.calls == [
+        ("begin", "kill", 10.0),
+        ("end", "kill", 10.0),
+        ("begin", "annotate", 15.0),
+    ]
+    assert [(each["event"], each["number"], each["delay_s"]) for each in events] == [
+        ("action_began", 0, 0.0),
+        ("action_ended", 0, 5.0),
+        ("action_began", 1, 5.0),
+    ]
+    assert runner.next_s is None
+    assert runner.in_force == ()
+
+
+def test_without_for_s_an_action_is_in_force_until_the_end_of_the_run() -> None:
+    runner, _, events = a_runner(ScheduledEntry(action="kill", at_s=10.0, agents=("a",)))
+
+    runner.run_due(99.0)
+
+    assert runner.next_s is None
+    assert [action.word for action in runner.in_force] == ["kill"]
+    assert events[0]["lasts"] is True
+
+
+def test_a_condition_begins_what_waits_for_it_and_the_delay_is_recorded() -> None:
+    runner, handler, events = a_runner(
+        ScheduledEntry(action="kill", condition=3, for_s=2.0, agents=("a",)),
+        ScheduledEntry(action="annotate", condition=4),
+    )
+
+    runner.met(3, met_s=7.0, now_s=7.5)
+    runner.run_due(9.5)
+
+    assert handler.calls == [("begin", "kill", 7.0), ("end", "kill", 7.0)]
+    assert [each["delay_s"] for each in events] == [0.5, 0.0]
+
+
+def test_orders_take_place_at_once() -> None:
+    runner, handler, _ = a_runner()
+
+    refusal = runner.order(OrderedAction(word="kill", agents=("a",), parameters={}), 12.0)
+
+    assert refusal == ""
+    assert handler.calls == [("begin", "kill", 12.0)]
