@@ -161,7 +161,9 @@ class _Asking:
     def answers(self, spec: str, duration_s: float) -> PluginAnswers:
         """Return faults, parameters and whether there is a `demand`."""
         simulation = self._simulation(spec)
-        actions, faults = ask_actions(self._document, simulation and simulation.actions)
+        actions, faults = ask_actions(
+            self._document, None if simulation is None else simulation.actions
+        )
         self._faults += faults
         if simulation is None:
             return self._told(PluginAnswers(faults=(), parameters=None, actions=actions))

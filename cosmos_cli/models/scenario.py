@@ -18,8 +18,8 @@ from cosmos_cli.models.placement import PlacementRule, claim_agents
 from cosmos_cli.models.planning import Planning
 from cosmos_cli.models.scenario_test import ScenarioTest, faults_of_test
 from cosmos_cli.models.text_forms import NAME_PATTERN, ScenarioRequirement
-from madns_runtime.agent_parameters import AgentParameters
 from cosmos_cli.models.timeline_rules import ENTRIES_MAX
+from madns_runtime.agent_parameters import AgentParameters
 from madns_runtime.config import (
     SEED_MAX,
     Agents,

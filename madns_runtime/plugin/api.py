@@ -272,7 +272,9 @@ class HostSimulation(Protocol):
             ActionRefused: It cannot take place now; the run goes on.
             BlamedError: Always, where this is not overridden.
         """
-        raise BlamedError(f"action {action.word}: {type(self).__name__} has no begin_action(action)")
+        raise BlamedError(
+            f"action {action.word}: {type(self).__name__} has no begin_action(action)"
+        )
 
     def end_action(self, action: TimelineAction) -> None:
         """Let what *action* did be over, if it lasts."""
@@ -315,7 +317,9 @@ class AgentSimulation(Protocol):
 
     def begin_action(self, action: TimelineAction) -> None:
         """Carry out a declared action on this agent, between two steps; otherwise as `HostSimulation.begin_action`."""
-        raise BlamedError(f"action {action.word}: {type(self).__name__} has no begin_action(action)")
+        raise BlamedError(
+            f"action {action.word}: {type(self).__name__} has no begin_action(action)"
+        )
 
     def end_action(self, action: TimelineAction) -> None:
         """Let what *action* did be over, if it lasts."""
