@@ -11,6 +11,7 @@ from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.launch.access import chosen_access
 from cosmos_cli.launch.place_plan import place_notes
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
+from cosmos_cli.models.resolved import origins, resolved_lines
 from cosmos_cli.models.scenario_outline import check_test
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
 
@@ -24,6 +25,12 @@ READERS = {
 def validate(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Scenario files.")],
     set_: SetOption = None,
+    resolved: Annotated[
+        bool,
+        typer.Option(
+            "--resolved", help="Print what results, with defaults, and where each value came from."
+        ),
+    ] = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -43,10 +50,16 @@ def validate(
             found.append(scenario_file)
             for note in place_notes(scenario_file):
                 console.say(f"note: {note}")
+            if resolved:
+                console.data(f"# {path}: ok: {_summary(scenario_file)}")
+                console.data("\n".join(resolved_lines(scenario_file)))
+                continue
             console.data(f"{path}: ok: {_summary(scenario_file)}")
     if faults:
         raise InputError(faults=faults, omitted=omitted)
-    console.print_json({"valid": True, "scenarios": [_result(item) for item in found]})
+    console.print_json(
+        {"valid": True, "scenarios": [_result(item, is_resolved=resolved) for item in found]}
+    )
 
 
 def _summary(item: ScenarioFile) -> str:
@@ -57,9 +70,11 @@ def _summary(item: ScenarioFile) -> str:
     return f"{scenario.name}, {agents} of {scenario.simulation} {rate}{readers}"
 
 
-def _result(item: ScenarioFile) -> dict[str, object]:
+def _result(item: ScenarioFile, *, is_resolved: bool) -> dict[str, object]:
+    more = {"files": list(item.files), "origins": origins(item)} if is_resolved else {}
     return {
         "file": str(item.path),
         "access": chosen_access(item.scenario.recording),
         "scenario": item.to_mapping(),
+        **more,
     }

@@ -54,18 +54,33 @@ def select_agents(
     return chosen, faults
 
 
-def refused_parameters(document: Document, simulation: Simulation) -> Iterator[Fault]:
-    """Yield a fault for each parameter that the simulation lets no rule change."""
+def refused_parameters(
+    document: Document,
+    index: int,
+    simulation: Simulation,
+    *,
+    found: Mapping[str, Any],
+    of_all: Mapping[str, Any],
+) -> Iterator[Fault]:
+    """
+    Yield a fault for each parameter that a rule gives another value, and the simulation lets none.
+
+    Args:
+        document: The scenario.
+        index: Of the rule.
+        simulation: Its descriptor.
+        found: The parameters that result of the rule.
+        of_all: Those of all.
+    """
     allowed = simulation.agent_parameters
     if allowed is None:
         return
-    known = {field.name for field in dataclasses.fields(simulation.parameters)}
     cure = f"per agent are {', '.join(allowed)}"
     if not allowed:
         cure = "rules for agents, where it has them, are among its parameters"
-    for index, rule in enumerate(document.value.get(RULES) or ()):
-        for name in sorted(known.intersection(rule["parameters"]).difference(allowed)):
-            text = f"{name} holds for all agents of {simulation.name}: {cure}"
+    for name in document.value[RULES][index]["parameters"]:
+        if name not in allowed and found.get(name) != of_all.get(name):
+            text = f"holds for all agents of {simulation.name}: {cure}"
             yield document.fault((RULES, index, "parameters", name), text, at_key=True)
 
 

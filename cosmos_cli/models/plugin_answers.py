@@ -181,7 +181,7 @@ class _Asking:
         if parameters is not None and self._agents is not None:
             found = replace(found, labels=self._labels(simulation, parameters, self._agents))
             own = self._of(simulation, parameters, self._agents, duration_s)
-            rules = self._rules(simulation, self._agents, found.labels, duration_s)
+            rules = self._rules(simulation, self._agents, found, duration_s)
             found = with_rules(found, own, rules)
         return self._told(found)
 
@@ -203,13 +203,13 @@ class _Asking:
         )
 
     def _rules(
-        self, simulation: Simulation, agents: Agents, labels: AgentLabels | None, duration_s: float
+        self, simulation: Simulation, agents: Agents, of_all: PluginAnswers, duration_s: float
     ) -> list[_OfParameters]:
         """Ask the same of the parameters that rules give some agents."""
         given = self._document.value.get(RULES) or ()
         names = agents.resolved_names()
-        chosen, faults = select_agents(self._document, names, labels)
-        self._faults += [*faults, *refused_parameters(self._document, simulation)]
+        chosen, faults = select_agents(self._document, names, of_all.labels)
+        self._faults += faults
         found = []
         for index in range(len(given)):
             document = rule_document(self._document, index)
@@ -218,6 +218,13 @@ class _Asking:
             if parameters is not None:
                 one = asking._of(simulation, parameters, agents, duration_s)
                 found.append(replace(one, agents=chosen[index]))
+                self._faults += refused_parameters(
+                    self._document,
+                    index,
+                    simulation,
+                    found=one.parameters,
+                    of_all=of_all.parameters or {},
+                )
             self._faults += [fault for fault in asking._faults if fault not in self._faults]
         return found
 

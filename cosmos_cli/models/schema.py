@@ -22,6 +22,7 @@ from cosmos_cli.models.parameters import adapter_of
 from cosmos_cli.models.scenario import Scenario
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
+VARIABLE = r"\$\{"
 FILE_PATTERN = ":[A-Za-z_][A-Za-z_0-9]*$"
 
 
@@ -91,10 +92,13 @@ def scenario_schema(parameters: Mapping[str, type]) -> dict[str, Any]:
         "description": root["properties"]["simulation"]["description"],
         "anyOf": [{"enum": sorted(parameters)}, {"type": "string", "pattern": FILE_PATTERN}],
     }
+    whole = _taken_requirements(root, definitions)
     choices = [
         _choice(name, places[(name, "validation")], definitions) for name in sorted(parameters)
     ]
-    return {"$schema": DIALECT, **root, "allOf": choices, "$defs": definitions}
+    found = {**root, "allOf": [whole, *choices], "$defs": definitions}
+    _let_variables_stand(found)
+    return {"$schema": DIALECT, **found}
 
 
 def schema_text(parameters: Mapping[str, type]) -> str:
@@ -106,9 +110,49 @@ def _definition_of(place: Mapping[str, Any]) -> str:
     return str(place["$ref"]).rpartition("/")[2]
 
 
+def _taken_requirements(
+    root: dict[str, Any], definitions: Mapping[str, dict[str, Any]]
+) -> dict[str, Any]:
+    """Return the rule that keys must be there, of the scenario and its sections, unless it extends another."""
+    sections = {}
+    for name, section in root["properties"].items():
+        if "$ref" in section and (
+            required := definitions[_definition_of(section)].pop("required", None)
+        ):
+            sections[name] = {"required": required}
+    whole = {"required": root.pop("required"), "properties": sections}
+    return {"if": {"required": ["extends"]}, "then": {}, "else": whole}
+
+
+def _let_variables_stand(schema: Any) -> None:
+    """Let ${name} stand, below *schema*, for each number, list, choice, and text with a pattern."""
+    if isinstance(schema, list):
+        for item in schema:
+            _let_variables_stand(item)
+    if not isinstance(schema, dict):
+        return
+    for key, item in schema.items():
+        if key != "if":  # which tells simulations apart, not what may be written
+            _let_variables_stand(item)
+    kind = schema.get("type")
+    if kind in ("integer", "number", "boolean", "array"):
+        schema |= {"type": [kind, "string"], "pattern": VARIABLE}
+    elif kind == "string" and isinstance(schema.get("enum"), list):
+        found = {key: schema.pop(key) for key in ("type", "enum")}
+        schema["anyOf"] = [found, {"type": "string", "pattern": VARIABLE}]
+    elif kind == "string" and isinstance(schema.get("pattern"), str):
+        schema["pattern"] = f"(?:{schema['pattern']})|{VARIABLE}"
+
+
 def _choice(name: str, place: Mapping[str, Any], definitions: Mapping[str, Any]) -> dict[str, Any]:
     """Return the rule that this simulation's parameters are its own."""
-    then: dict[str, Any] = {"properties": {"parameters": place}}
-    if definitions[_definition_of(place)].get("required"):
-        then["required"] = ["parameters"]
+    then: dict[str, Any] = {
+        "properties": {
+            "parameters": place,
+            "agent_parameters": {"items": {"properties": {"parameters": place}}},
+        }
+    }
+    if required := definitions[_definition_of(place)].pop("required", None):
+        whole = {"required": ["parameters"], "properties": {"parameters": {"required": required}}}
+        then |= {"if": {"required": ["extends"]}, "then": {}, "else": whole}
     return {"if": {"properties": {"simulation": {"const": name}}}, "then": then}

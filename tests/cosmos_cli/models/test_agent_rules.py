@@ -178,8 +178,15 @@ def test_what_host_and_agents_have_in_common_is_refused(refusal):
     told = refusal(HEAD + "agent_parameters: [{agents: [agent-01], parameters: {answer_hz: 2}}]\n")
 
     assert told.startswith(
-        "a.yaml:5:54: agent_parameters[0].parameters.answer_hz: answer_hz holds for all agents of counter: "
+        "a.yaml:5:54: agent_parameters[0].parameters.answer_hz: holds for all agents of counter: "
         "per agent are service, payload_bytes, read_on_tick\n"
+    )
+
+
+def test_what_they_have_in_common_may_be_said_again(load):
+    load(
+        HEAD
+        + "agent_parameters: [{agents: [agent-01], parameters: {answer_hz: 5, payload_bytes: 1}}]\n"
     )
 
 

@@ -71,3 +71,41 @@ def test_descriptions_reach_the_schema(validator):
     assert agents["tick_hz"]["description"] == "Rate of every agent's loop, Hz."
     assert validator.schema["properties"]["seed"]["description"]
     assert validator.schema["additionalProperties"] is False
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        {"extends": "base.yaml"},
+        {"extends": "base.yaml", "root": "..", "agents": {"tick_hz": 5}},
+        {"extends": "base.yaml", "simulation": "constellation", "parameters": {"flight": None}},
+        {
+            "name": "a-${n}",
+            "simulation": "counter",
+            "vars": {"n": 2},
+            "seed": "${n}",
+            "time": {"mode": "${mode}"},
+            "agents": {"count": "${n}", "names": "${names}"},
+            "parameters": {"read_on_tick": "${x}", "service": "${service}"},
+            "agent_parameters": [{"agents": ["*"], "parameters": {"payload_bytes": 3}}],
+        },
+    ],
+)
+def test_extending_scenarios_and_variables_fulfil_the_schema(validator, value):
+    validator.validate(value)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"root": "../../.."},
+        {"vars": {"x": [1]}},
+        {"seed": "5"},
+        {"agent_parameters": [{"agents": ["*"], "parameters": {"payload_byte": 3}}]},
+        {"agent_parameters": [{"parameters": {}}]},
+    ],
+)
+def test_what_cannot_be_authored_does_not_fulfil_the_schema(validator, change):
+    value = {"name": "a", "simulation": "counter", "agents": {"count": 1}} | change
+
+    assert not validator.is_valid(value)

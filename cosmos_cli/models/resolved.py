@@ -1,0 +1,141 @@
+"""What results of a scenario, value by value, and where each came from: a file and line, --set, or a default."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+from cosmos_cli.models.document import Document, Path, SourcePlace, dotted
+from cosmos_cli.models.loading import ScenarioFile
+from cosmos_cli.models.variables import SECTION
+
+DEFAULT: Final = "default"
+COMMENT_COLUMN: Final = 44
+_RULES: Final = "agent_parameters"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Origin:
+    """Where a value came from."""
+
+    file: str = ""
+    line: int = 0
+    column: int = 0
+    override: str = ""
+    """KEY of --set KEY=VALUE."""
+    variables: tuple[tuple[str, Origin], ...] = ()
+    """Variables that it is made of, and where each of them came from."""
+
+    def __str__(self) -> str:
+        if self.override:
+            text = f"--set {self.override}"
+        else:
+            text = f"{self.file}:{self.line}" if self.file else DEFAULT
+        own = (f"${{{name}}} of {origin}" for name, origin in self.variables)
+        return ", ".join([text, *own])
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return it for --json."""
+        found: dict[str, Any] = {
+            "file": self.file or None,
+            "line": self.line or None,
+            "column": self.column or None,
+            "override": self.override or None,
+            "default": not (self.file or self.override),
+        }
+        if self.variables:
+            found["variables"] = {name: origin.to_mapping() for name, origin in self.variables}
+        return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResolvedValue:
+    """One value of what results: a scalar, or a list or mapping without anything inside that has a place of its own."""
+
+    path: Path
+    value: Any
+    origin: Origin
+
+
+def resolved_values(scenario: ScenarioFile) -> list[ResolvedValue]:
+    """Return all values of a scenario in the order of its sections."""
+    return list(_leaves(scenario.document, scenario.to_written(), ()))
+
+
+def resolved_lines(scenario: ScenarioFile) -> Iterator[str]:
+    """Yield what results as YAML, which is a scenario again, with the origin behind each value."""
+    yield from _lines(scenario.document, scenario.to_written(), (), "")
+
+
+def origins(scenario: ScenarioFile) -> dict[str, Any]:
+    """Return the origins of all values by dotted path, for --json."""
+    return {dotted(one.path): one.origin.to_mapping() for one in resolved_values(scenario)}
+
+
+def _is_leaf(value: Any) -> bool:
+    if isinstance(value, dict):
+        return not value
+    return not isinstance(value, list) or not any(isinstance(item, dict | list) for item in value)
+
+
+def _leaves(document: Document, value: Any, path: Path) -> Iterator[ResolvedValue]:
+    if path and _is_leaf(value):
+        yield ResolvedValue(path=path, value=value, origin=_origin(document, path))
+        return
+    items = value.items() if isinstance(value, dict) else enumerate(value)
+    for step, item in items:
+        yield from _leaves(document, item, (*path, step))
+
+
+def _lines(document: Document, value: Any, path: Path, indent: str) -> Iterator[str]:
+    items = value.items() if isinstance(value, dict) else enumerate(value)
+    for step, item in items:
+        inner = (*path, step)
+        head = f"{indent}- " if isinstance(step, int) else f"{indent}{_key(step)}: "
+        if _is_leaf(item):
+            text = f"{head}{json.dumps(item, ensure_ascii=False)}"
+            yield f"{text:<{COMMENT_COLUMN}}  # {_origin(document, inner)}"
+        else:
+            yield head.rstrip()
+            yield from _lines(document, item, inner, f"{indent}  ")
+
+
+def _key(key: str) -> str:
+    return key if key.replace("_", "").isalnum() and not key[0].isdigit() else json.dumps(key)
+
+
+def _origin(document: Document, path: Path) -> Origin:
+    if _is_written(document, path):
+        return _origin_at(document, document.place(path))
+    if path[0] == _RULES and path[2:3] == (
+        "parameters",
+    ):  # of all agents, as the rule says nothing
+        return _origin(document, path[2:])
+    return Origin()
+
+
+def _origin_at(document: Document, place: SourcePlace) -> Origin:
+    names = dict.fromkeys(place.variables)
+    variables = tuple((name, _origin_at(document, _plain(document, name))) for name in names)
+    if place.override:
+        return Origin(override=place.override, variables=variables)
+    source = place.source or document.source
+    return Origin(file=source.label, line=place.line, column=place.column, variables=variables)
+
+
+def _plain(document: Document, name: str) -> SourcePlace:
+    return document.place((SECTION, name))
+
+
+def _is_written(document: Document, path: Path) -> bool:
+    value: Any = document.value
+    for step in path:
+        if isinstance(value, list):
+            if not isinstance(step, int) or step >= len(value):
+                return False
+        elif not isinstance(value, dict) or step not in value:
+            return False
+        value = value[step]
+    return True

@@ -1,0 +1,84 @@
+"""What results of a scenario, and where each of its values came from."""
+
+import json
+
+import pytest
+import yaml
+
+from cosmos_cli.app import main
+from cosmos_cli.models.loading import load_scenario
+from cosmos_cli.models.resolved import origins, resolved_lines, resolved_values
+
+BASE = "name: base\nsimulation: counter\nvars: {rate: 5}\nagents: {count: 3, tick_hz: '${rate}'}\n"
+SCENARIO = """\
+extends: base.yaml
+name: a
+placement:
+  - {agents: [agent-01], machines: pi00}
+agent_parameters:
+  - {agents: ["agent-0[12]"], parameters: {payload_bytes: 4}}
+"""
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    (tmp_path / "base.yaml").write_text(BASE)
+    (tmp_path / "a.yaml").write_text(SCENARIO)
+    return load_scenario(tmp_path / "a.yaml", ["vars.rate=10", "time.duration_s=4"])
+
+
+def run(*arguments):
+    with pytest.raises(SystemExit) as caught:
+        main(list(arguments))
+    assert caught.value.code == 0
+
+
+def test_each_value_tells_its_file_and_line_the_option_or_that_it_is_a_default(scenario, tmp_path):
+    found = {one.path: one for one in resolved_values(scenario)}
+
+    def origin(*path):
+        return str(found[path].origin).replace(f"{tmp_path}/", "")
+
+    assert origin("name") == "a.yaml:2"
+    assert origin("agents", "count") == "base.yaml:4"
+    assert origin("agents", "tick_hz") == "base.yaml:4, ${rate} of --set vars.rate"
+    assert origin("time", "duration_s") == "--set time.duration_s"
+    assert origin("seed") == "default"
+    assert origin("placement", 0, "machines") == "a.yaml:4"
+    assert found["agents", "tick_hz"].value == 10
+
+
+def test_parameters_of_some_agents_tell_their_rule_and_the_rest_what_holds_for_all(
+    scenario, tmp_path
+):
+    found = origins(scenario)
+
+    assert found["agent_parameters[0].parameters.payload_bytes"]["line"] == 6
+    assert found["agent_parameters[0].parameters.service"]["default"] is True
+
+
+def test_what_is_printed_is_a_scenario_that_results_in_the_same(scenario, tmp_path):
+    path = tmp_path / "again.yaml"
+    path.write_text("\n".join(resolved_lines(scenario)))
+
+    assert load_scenario(path).to_mapping() == scenario.to_mapping()
+
+
+def test_the_command_prints_it_in_both_forms(tmp_path, scenario, capsys):
+    path = str(tmp_path / "a.yaml")
+
+    run("validate", "--resolved", path)
+    text = capsys.readouterr().out
+    run("validate", "--resolved", "--json", path)
+    (document,) = json.loads(capsys.readouterr().out)["scenarios"]
+
+    assert yaml.safe_load(text)["agents"]["tick_hz"] == 5
+    assert f"# {tmp_path}/base.yaml:4" in text
+    assert document["origins"]["agents.count"] == {
+        "file": f"{tmp_path}/base.yaml",
+        "line": 4,
+        "column": 17,
+        "override": None,
+        "default": False,
+    }
+    assert document["files"] == [path, f"{tmp_path}/base.yaml"]
