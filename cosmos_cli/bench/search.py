@@ -51,8 +51,3 @@ class CapacitySearch:
             self.held = count
         else:
             self.broken = count
-
-    @property
-    def is_bounded_by_largest(self) -> bool:
-        """Whether even the largest number that was to be tried kept the budget."""
-        return self.broken is None and self.held >= self.largest

@@ -17,6 +17,7 @@ from cosmos_cli.commands.fleet_command import (
     InventoryOption,
     LimitOption,
     fleet_of,
+    require_root,
 )
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.fleet.connection import Completed, Connection
@@ -97,12 +98,8 @@ def _task(line: str, *, is_root: bool, timeout_s: float) -> Callable[[Connection
     shell_line = as_root(watched(line)) if is_root else watched(line)
 
     def task(connection: Connection) -> Completed:
-        if is_root and not connection.target.may_become_root:
-            raise MachineFailure(
-                FailureKind.NO_SUDO,
-                "the inventory forbids to become root there (ansible_become: false)",
-                "leave out --sudo, or that machine with --limit",
-            )
+        if is_root:
+            require_root(connection.target, "leave out --sudo, or that machine with --limit")
         done = connection.run(shell_line, stdin=None, timeout_s=timeout_s)
         if is_root and done.stderr.rstrip().endswith(NO_SUDO_MARK.encode()):
             said = done.stderr.decode(errors="replace").replace(NO_SUDO_MARK, "").strip()

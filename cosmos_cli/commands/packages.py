@@ -19,6 +19,8 @@ from cosmos_cli.commands.fleet_command import (
     LimitOption,
     finish,
     fleet_of,
+    require_root,
+    without_this_computer,
 )
 from cosmos_cli.errors import InputError
 from cosmos_cli.fleet.connection import Connection
@@ -83,7 +85,7 @@ def packages(
     """
     console = Console(json=json, quiet=quiet)
     wanted = check_names(action, names or [])
-    fleet = _without_this_computer(console, fleet_of(inventory, limit, forks, accept_new_host_keys))
+    fleet = without_this_computer(console, fleet_of(inventory, limit, forks, accept_new_host_keys))
     start_s = time.monotonic()
     outcomes = _change(console, fleet, action, wanted, timeout_s=timeout_s, is_check=check)
     return finish(
@@ -120,14 +122,6 @@ def check_names(action: Action, names: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def _without_this_computer(console: Console, fleet: Fleet) -> Fleet:
-    """Leave out what is reached without a connection: its packages are its owner's affair."""
-    for target in fleet.targets:
-        if target.connection == "local":
-            console.say(f"{target.name}: left alone, it is this computer")
-    return fleet.elsewhere()
-
-
 def _change(
     console: Console,
     fleet: Fleet,
@@ -157,12 +151,8 @@ def _change(
 def _change_one(connection: Connection, arguments: dict[str, Any]) -> Changed:
     """Work on one machine; what is said meanwhile is a sign of life."""
     target, is_check = connection.target, bool(arguments["is_check"])
-    if not target.may_become_root and not is_check:
-        raise MachineFailure(
-            FailureKind.NO_SUDO,
-            "the inventory forbids to become root there (ansible_become: false)",
-            "leave that machine out with --limit",
-        )
+    if not is_check:
+        require_root(target, "leave that machine out with --limit")
     last: Changed = {}
     with Helper.start(connection, PARTS) as board:
         if not is_check:

@@ -17,6 +17,7 @@ from cosmos_cli.commands.fleet_command import (
     LimitOption,
     finish,
     fleet_of,
+    without_this_computer,
 )
 from cosmos_cli.errors import InputError
 from cosmos_cli.fleet.fleet import Fleet
@@ -63,9 +64,7 @@ def reboot(
     console = Console(json=json, quiet=quiet)
     fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
     own = [target.name for target in fleet.targets if target.connection == "local"]
-    for name in own:
-        console.say(f"{name}: left alone, it is this computer")
-    fleet = fleet.elsewhere()
+    fleet = without_this_computer(console, fleet)
     if fleet.targets and not yes:
         _ask(fleet)
     start_s = time.monotonic()

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from cosmos_cli.evidence.run_directory import RunDirectory, list_runs, runs_root
-from cosmos_cli.evidence.run_documents import fault_of
+from cosmos_cli.evidence.run_documents import fault_of, text_or_none
 from cosmos_cli.evidence.verdict import is_number
 from cosmos_cli.ui.console import Column, Console, JsonOption, QuietOption
 from madns_runtime.processes import list_processes
@@ -57,7 +57,7 @@ def _entry(run: RunDirectory, *, is_living: bool) -> dict[str, Any]:
     count, duration_s = agents.get("count") if isinstance(agents, dict) else None, None
     if is_number(document.get("duration_s")):
         duration_s = document["duration_s"]
-    status = _text(document.get("status")) or "unknown" if is_here else "packed"
+    status = text_or_none(document.get("status")) or "unknown" if is_here else "packed"
     if status == "running" and not is_living:
         status = "cut off"
     exit_code = document.get("exit_code")
@@ -68,13 +68,10 @@ def _entry(run: RunDirectory, *, is_living: bool) -> dict[str, Any]:
         "exit_code": exit_code if is_number(exit_code) else None,
         "agents": count if is_number(count) else None,
         "duration_s": duration_s,
-        "started_utc": _text(document.get("started_utc")),
-        "verdict": _text(document.get("verdict")) or (f"run.json: {fault}" if fault else None),
+        "started_utc": text_or_none(document.get("started_utc")),
+        "verdict": text_or_none(document.get("verdict"))
+        or (f"run.json: {fault}" if fault else None),
     }
-
-
-def _text(value: object) -> str | None:
-    return value if isinstance(value, str) else None
 
 
 def _row(entry: dict[str, Any]) -> list[str]:

@@ -18,11 +18,11 @@ from cosmos_cli.commands.fleet_command import (
     fleet_of,
 )
 from cosmos_cli.errors import ExitCode
-from cosmos_cli.fleet.fleet import machines_of
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.liveness import SilenceWatch
 from cosmos_cli.fleet.pool import BackgroundCall
 from cosmos_cli.fleet.retry_file import offer_retry
+from cosmos_cli.fleet.target import machines_of
 from cosmos_cli.provision import HELPER_PARTS, up_table
 from cosmos_cli.provision.udp_echo import Echo
 from cosmos_cli.provision.up_table import MachineResult, result_of

@@ -33,6 +33,11 @@ def read_object(path: Path) -> dict[str, Any]:
     return value
 
 
+def text_or_none(value: object) -> str | None:
+    """Return a text as it is; None for anything else."""
+    return value if isinstance(value, str) else None
+
+
 def fault_of(path: Path) -> str | None:
     """Say why a JSON file cannot be used; None if it can."""
     try:
@@ -103,11 +108,7 @@ def problems_of_run(listed: object) -> tuple[Problem, ...]:
     """Return what the run itself met, of the problems in a run.json; what is no problem is left out."""
     items = listed if isinstance(listed, list) else []
     return tuple(
-        Problem(text=str(item["text"]), machine=_name(item.get("machine")))
+        Problem(text=str(item["text"]), machine=text_or_none(item.get("machine")))
         for item in items
         if isinstance(item, Mapping) and "text" in item and item.get("step") == "run"
     )
-
-
-def _name(value: object) -> str | None:
-    return value if isinstance(value, str) else None

@@ -27,7 +27,7 @@ from cosmos_cli.evidence.remarks import (
     undeclared_remarks,
 )
 from cosmos_cli.evidence.run_directory import SCHEMA
-from cosmos_cli.evidence.run_documents import Problem
+from cosmos_cli.evidence.run_documents import Problem, text_or_none
 from cosmos_cli.evidence.statistics import TickStatistics, TickTotals, tick_totals, worst_sources
 from cosmos_cli.evidence.streams import StreamScan
 from cosmos_cli.evidence.tick_causes import (
@@ -147,9 +147,9 @@ class Evidence:
         messages = mapping_at(result, "messages")
         ticks_due = self._ticks_due()
         return RunFacts(
-            host_status=_text(result.get("status")),
-            who=_text(result.get("who")),
-            reason=_text(result.get("reason")),
+            host_status=text_or_none(result.get("status")),
+            who=text_or_none(result.get("who")),
+            reason=text_or_none(result.get("reason")),
             host_lost=self._host_lost(),
             interrupted=self.interrupted,
             lost_agents=self._lost(),
@@ -196,7 +196,7 @@ class Evidence:
         """Tell whether the host, or one of the agents whose loss ended the run, was on a machine that was lost."""
         if self._host_lost() is not None and self.result is None:
             return True
-        who = _text((self.result or {}).get("who"))
+        who = text_or_none((self.result or {}).get("who"))
         if who in self.devices:
             return True
         lost_machines = {p.machine for p in self.problems if p.machine and p.step == "run"}
@@ -356,10 +356,6 @@ def _last_resort(value: Any) -> Any:
 
 def _place_of(scan: StreamScan) -> str:
     return f"{scan.file.role}/{scan.file.source}/{scan.file.path.name}"
-
-
-def _text(value: object) -> str | None:
-    return value if isinstance(value, str) else None
 
 
 def _number(value: object) -> float | None:

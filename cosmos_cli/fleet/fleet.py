@@ -13,10 +13,9 @@ from cosmos_cli.fleet.connection import Connection, ConnectOptions
 from cosmos_cli.fleet.open_connection import connect
 from cosmos_cli.fleet.outcome import Outcome
 from cosmos_cli.fleet.pool import FORKS_DEFAULT, for_each
-from cosmos_cli.fleet.target import Target, target_of
+from cosmos_cli.fleet.target import Target, machines_of, target_of
 from cosmos_cli.fleet.target_cache import key_of, recall, remember
 from cosmos_cli.models.inventory_arguments import Given, sources_of
-from cosmos_cli.system.import_turn import IMPORT_TURN
 
 if TYPE_CHECKING:
     from cosmos_cli.models.inventory import Machine
@@ -130,16 +129,3 @@ def fleet_of(
         load=load,
         sources=sources_of(inventory),
     )
-
-
-def machines_of(inventory: Given, limit: str | None = None) -> tuple[Machine, ...]:
-    """
-    Return the machines of an inventory that are meant.
-
-    Raises:
-        InputError: With every fault found.
-    """
-    with IMPORT_TURN:
-        from cosmos_cli.models.inventory import load_machines  # takes 0.2 s to import
-
-    return load_machines(inventory, limit)

@@ -1,4 +1,4 @@
-"""Address of a machine and login there: what a connection needs of an inventory. Pure."""
+"""Address of a machine and login there: what a connection needs of an inventory."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, get_args
 
 from cosmos_cli.models.connection_kind import ConnectionKind
+from cosmos_cli.models.inventory_arguments import Given
+from cosmos_cli.system.import_turn import IMPORT_TURN
 
 if TYPE_CHECKING:
     # What reads a target from a plan needs no inventory, whose models take long to import.
@@ -85,3 +87,16 @@ def target_of(machine: Machine) -> Target:
         may_become_root=variables.may_become_root,
         root=variables.root,
     )
+
+
+def machines_of(inventory: Given, limit: str | None = None) -> tuple[Machine, ...]:
+    """
+    Return the machines of an inventory that are meant.
+
+    Raises:
+        InputError: With every fault found.
+    """
+    with IMPORT_TURN:
+        from cosmos_cli.models.inventory import load_machines  # takes 0.2 s to import
+
+    return load_machines(inventory, limit)

@@ -8,12 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from cosmos_cli.errors import Fault, InputError
-from cosmos_cli.launch.plan import LaunchPlan, make_plan
+from cosmos_cli.errors import InputError
+from cosmos_cli.launch.plan import LaunchPlan, fault_without_place, make_plan
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
 from cosmos_cli.models.device_kinds import DeviceQuestion, KindAnswer, ask_kinds
 from cosmos_cli.models.document import Path as ValuePath
-from cosmos_cli.models.document import dotted
 from cosmos_cli.models.hardware import agent_faults, device_faults
 from cosmos_cli.models.inventory.devices import MachineDevice, driven_devices
 from cosmos_cli.models.inventory.machine import Machine
@@ -119,7 +118,7 @@ class DevicePlanner:
         for index, device in enumerate(self.scenario.hardware.devices):
             self._give(("hardware", "devices", index), device)
         if self.faults:
-            where = fault_at if callable(fault_at) else _fault_without_place
+            where = fault_at if callable(fault_at) else fault_without_place
             raise InputError(faults=[where(path, text) for path, text in self.faults])
         return {machine: tuple(devices.values()) for machine, devices in self.found.items()}
 
@@ -309,7 +308,3 @@ class DevicePlanner:
             else "no machine there has one that can be driven"
         )
         return f"no machine with agents has a device {name!r} ({there}): list it in cosmos_devices, with its kind"
-
-
-def _fault_without_place(path: ValuePath, text: str) -> Fault:
-    return Fault(text=text, path=dotted(path))

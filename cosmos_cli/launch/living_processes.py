@@ -14,12 +14,11 @@ from cosmos_cli.collect.retrieval_state import asked_sources
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.run_index import remembered_runs
 from cosmos_cli.fleet.connection import ConnectOptions
-from cosmos_cli.fleet.fleet import machines_of
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
 from cosmos_cli.fleet.outcome import Outcome
 from cosmos_cli.fleet.pool import for_each
-from cosmos_cli.fleet.target import Target, target_of
+from cosmos_cli.fleet.target import Target, machines_of, target_of
 from cosmos_cli.launch.machines import PARTS
 from cosmos_cli.models.inventory_arguments import refuse_stray_limit
 from cosmos_cli.onboard.processes import RunEnding, run_directory

@@ -136,7 +136,7 @@ def make_plan(  # noqa: PLR0913 - labels and the place of faults are of the scen
         raise InputError("expected at least one machine, got none; check the inventory")
     if scenario.time.is_lockstep and (tuple(machines) != (LOOPBACK,) or host is not None):
         raise InputError(LOCKSTEP_IS_HERE)
-    dealer = _Dealer(machines, _host_of(machines, host), fault_at or _fault_without_place)
+    dealer = _Dealer(machines, _host_of(machines, host), fault_at or fault_without_place)
     names = scenario.agents.resolved_names()
     claims = claim_agents(names, scenario.placement, labels)
     dealer.faults += [dealer.fault_at(("placement", *path), text) for path, text in claims.faults]
@@ -305,7 +305,8 @@ def _host_of(machines: Sequence[Machine], name: str | None) -> Machine | None:
     raise InputError(f"host: no machine is named {name}{hint}")
 
 
-def _fault_without_place(path: ValuePath, text: str) -> Fault:
+def fault_without_place(path: ValuePath, text: str) -> Fault:
+    """Return a fault of a scenario that no file gives a line."""
     return Fault(text=text, path=dotted(path))
 
 

@@ -13,7 +13,6 @@ from madns_runtime.hardware.contract import Channel, DeviceKind, Needs
 from madns_runtime.hardware.gnss_messages import GnssMessage
 
 BaudRate = Literal[4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600]
-POSITION_M_MAX = 1e9
 UTC_S_MAX = 4_102_444_800.0
 """The end of 2099."""
 

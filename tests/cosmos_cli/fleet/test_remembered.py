@@ -27,9 +27,9 @@ def inventory(tmp_path):
 def reads(monkeypatch):
     """How often an inventory was read."""
     counted = []
-    read = fleet._machines
+    read = fleet.machines_of
     monkeypatch.setattr(
-        fleet, "_machines", lambda *arguments: (counted.append(1), read(*arguments))[1]
+        fleet, "machines_of", lambda *arguments: (counted.append(1), read(*arguments))[1]
     )
     return counted
 
@@ -110,15 +110,15 @@ def test_nothing_is_remembered_of_an_inventory_that_changes_while_it_is_read(
     inventory, monkeypatch
 ):
     text = inventory.read_text()
-    load = fleet._machines
+    load = fleet.machines_of
 
     def edit_and_load(*arguments):
         inventory.write_text(text.replace("10.0.0.1", "10.0.0.9"))
         return load(*arguments)
 
-    monkeypatch.setattr(fleet, "_machines", edit_and_load)
+    monkeypatch.setattr(fleet, "machines_of", edit_and_load)
     assert addresses(inventory) == ["10.0.0.9", "pi2"]
-    monkeypatch.setattr(fleet, "_machines", load)
+    monkeypatch.setattr(fleet, "machines_of", load)
     inventory.write_text(text)
 
     assert addresses(inventory) == ["10.0.0.1", "pi2"]
