@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from cosmos_cli import app
+from cosmos_cli.testing.discovery import find_scenarios
 
 pytestmark = pytest.mark.process
 
@@ -97,9 +98,26 @@ def test_make_has_the_readmes_two_targets():
         assert done.returncode == 0, done.stderr
 
 
-def test_every_shipped_scenario_is_valid(capsys):
-    for scenario in sorted((ROOT / "scenarios").glob("**/*.yaml")):
-        code, said = app.run(["validate", str(scenario)]), capsys.readouterr().err
+def test_every_shipped_scenario_that_no_quick_test_runs_is_valid(capsys):
+    others = [each for each in shipped() if "quick" not in each.test.tags]
+    assert {tag for each in others for tag in each.test.tags} >= {"emulator", "hardware"}
+    for scenario in others:
+        code, said = app.run(["validate", str(scenario.path)]), capsys.readouterr().err
         is_built = "scenarios/firmware/detumble builds it" not in said
         assert code == (0 if is_built else 2), said
         assert is_built or said.count("error") + said.count("no file") == 1, said
+
+
+def test_every_shipped_scenario_is_a_test_and_says_what_it_needs():
+    for scenario in shipped():
+        tags = set(scenario.test.tags)
+        assert tags & {"quick", "hardware", "emulator"}, scenario.path
+        assert ("quick" in tags) == (not tags & {"hardware", "emulator"}), scenario.path
+
+
+def shipped():
+    found = find_scenarios([ROOT / "scenarios"])
+    assert found.faults == []
+    assert len(found.outlines) >= 28
+    assert {path.parent.name for path in found.others} == {"baselines"}
+    return found.outlines

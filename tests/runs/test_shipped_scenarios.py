@@ -1,0 +1,52 @@
+"""The shipped scenarios as tests: shortened at every change, at full length each night."""
+
+import json
+from pathlib import Path
+
+import pytest
+from harness.cosmos_command import LOOSE, SCENARIOS, CosmosCommand
+
+pytestmark = pytest.mark.process
+
+QUICK_S = 900.0
+NIGHT_S = 5400.0
+
+
+def suite(folder, *words, patience_s):
+    """Run `cosmos test` on the shipped scenarios; return what came of each, by its file."""
+    loose = [part for setting in LOOSE for part in ("--set", setting)]
+    cosmos = CosmosCommand(folder)
+    done = cosmos(*("test", SCENARIOS, *words, *loose, "--json", "--quiet"), patience_s=patience_s)
+    document = json.loads(done.stdout)
+    failed = {
+        each["name"]: [*each["reasons"], *each["broken"]]
+        for each in document["tests"]
+        if each["outcome"] != "passed"
+    }
+    assert failed == {}, done.stderr
+    assert done.returncode == document["exit_code"] == 0
+    remarks_of_failures = list(cosmos.runs.rglob("run.json"))
+    assert remarks_of_failures == []  # what passed is cleared up
+    return {Path(each["scenario"]).stem: each for each in document["tests"]}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(QUICK_S + 60)
+def test_each_shipped_scenario_passes_shortened(tmp_path):
+    tests = suite(tmp_path, "-k", "quick", patience_s=QUICK_S)
+
+    assert len(tests) >= 25
+    assert all(figure["passed"] for figure in tests["hohmann5of10"]["figures"])
+    assert len(tests["hohmann5of10"]["figures"]) == 4
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(NIGHT_S + 60)
+def test_each_shipped_scenario_passes_at_full_length(tmp_path):
+    tests = suite(
+        tmp_path,
+        *("-k", "not hardware and not emulator", "--full-length", "--realtime-max", "360"),
+        patience_s=NIGHT_S,
+    )
+
+    assert len(tests) >= 25
