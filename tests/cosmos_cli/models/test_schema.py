@@ -31,9 +31,12 @@ def test_kept_schema_is_current():
     )
 
 
-@pytest.mark.parametrize(
-    "path", sorted((ROOT / "scenarios").glob("**/*.yaml")), ids=lambda p: p.name
-)
+SHIPPED = [
+    path for path in (ROOT / "scenarios").glob("**/*.yaml") if path.parent.name != "baselines"
+]
+
+
+@pytest.mark.parametrize("path", sorted(SHIPPED), ids=lambda p: p.name)
 def test_shipped_scenarios_fulfil_the_schema(validator, path):
     validator.validate(read_document(read_source(path)).value)
 
