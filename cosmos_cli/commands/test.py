@@ -134,6 +134,9 @@ def test(
     seconds = time.monotonic() - started_s
     remember_failed(result.outcomes)
     ordered = in_order(result.outcomes, chosen.cases)
+    if junit is not None:
+        cases = [junit_case(each) for each in ordered]
+        write_junit(junit, cases, seconds=seconds, started_utc=started_utc)
     for line in failure_lines(ordered):
         console.data(line)
     console.data(summary_line(result, deselected=chosen.deselected, seconds=seconds))
@@ -149,9 +152,6 @@ def test(
             "exit_code": int(result.exit_code),
         }
     )
-    if junit is not None:
-        cases = [junit_case(each) for each in ordered]
-        write_junit(junit, cases, seconds=seconds, started_utc=started_utc)
     return int(result.exit_code)
 
 

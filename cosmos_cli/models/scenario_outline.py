@@ -139,7 +139,7 @@ def read_outline(path: Path) -> ScenarioOutline:
 def is_scenario(document: Document) -> bool:
     """Tell whether a file of a folder means to be a scenario that can run, and no inventory, baseline or base of others."""
     value = document.value
-    return "name" in value and ("simulation" in value or "extends" in value)
+    return "extends" in value or ("name" in value and "simulation" in value)
 
 
 def check_test(path: Path, given: Sequence[str], warn: Callable[[str], None]) -> None:

@@ -27,6 +27,8 @@ from madns_runtime.processes import end_process
 CLEAN_END_S: Final = 60.0
 """For a run that was told to end, its records and its verdict included."""
 DOCUMENT_BYTES_MAX: Final = 256 * 1024 * 1024
+MACHINES: Final = ("COSMOS_INVENTORY", "COSMOS_LIMIT")
+"""Variables that would have it run on machines: a test runs on this computer."""
 WORDS_BYTES_MAX: Final = 16_384
 """Of what a run said on stderr, its end."""
 
@@ -84,6 +86,7 @@ class SuiteProcess:
             stdin=subprocess.DEVNULL,
             stdout=self._out,
             stderr=self._words,
+            env={name: value for name, value in os.environ.items() if name not in MACHINES},
             process_group=0,  # Ctrl-C comes once, by us
             preexec_fn=end_with_parent,  # noqa: PLW1509 - there is one thread
         )

@@ -27,15 +27,14 @@ def suite(folder, *words, patience_s):
     }
     assert failed == {}, done.stderr
     assert done.returncode == document["exit_code"] == 0
-    remarks_of_failures = list(cosmos.runs.rglob("run.json"))
-    assert remarks_of_failures == []  # what passed is cleared up
     return {Path(each["scenario"]).stem: each for each in document["tests"]}
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(QUICK_S + 60)
 def test_each_shipped_scenario_passes_shortened(tmp_path):
-    tests = suite(tmp_path, "-k", "quick", patience_s=QUICK_S)
+    # Kept, so that what they recorded is looked at, as that of every run here.
+    tests = suite(tmp_path, "-k", "quick", "--keep", patience_s=QUICK_S)
 
     assert len(tests) >= 25
     assert all(figure["passed"] for figure in tests["hohmann5of10"]["figures"])

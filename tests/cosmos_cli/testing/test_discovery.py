@@ -53,6 +53,20 @@ def test_a_folders_scenarios_are_found_and_what_is_none_is_counted(folder):
     assert found.faults == []
 
 
+def test_a_scenario_that_extends_another_has_what_that_says_and_its_own_test(folder):
+    (folder / "base.yaml").write_text(
+        "simulation: counter\nvars: {s: 7}\nagents: {count: 2, tick_hz: 10}\n"
+    )
+    (folder / "top.yaml").write_text(
+        "extends: base.yaml\nname: top\ntest: {set: {time.duration_s: '${s}'}, tags: [top]}\n"
+    )
+    found = find_scenarios([folder])
+    (case,) = chosen(found, "top").cases
+
+    assert "base.yaml" in [path.name for path in found.others]
+    assert case.work == 2 * 10 * 7
+
+
 def test_a_scenario_that_is_meant_twice_is_one_test(folder):
     found = find_scenarios([folder / "a.yaml", folder, folder / "deep"])
 
