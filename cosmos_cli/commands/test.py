@@ -133,10 +133,16 @@ def test(
     result = _run(console, chosen.cases, options)
     seconds = time.monotonic() - started_s
     remember_failed(result.outcomes)
-    ordered = in_order(result.outcomes, chosen.cases)
     if junit is not None:
-        cases = [junit_case(each) for each in ordered]
+        cases = [junit_case(each) for each in in_order(result.outcomes, chosen.cases)]
         write_junit(junit, cases, seconds=seconds, started_utc=started_utc)
+    _tell(console, result, chosen, seconds)
+    return int(result.exit_code)
+
+
+def _tell(console: Console, result: SuiteResult, chosen: ChosenCases, seconds: float) -> None:
+    """Print failures and the last line, or all of it as JSON."""
+    ordered = in_order(result.outcomes, chosen.cases)
     for line in failure_lines(ordered):
         console.data(line)
     console.data(summary_line(result, deselected=chosen.deselected, seconds=seconds))
@@ -152,7 +158,6 @@ def test(
             "exit_code": int(result.exit_code),
         }
     )
-    return int(result.exit_code)
 
 
 def _seeds_of(
