@@ -8,7 +8,7 @@ from harness.cosmos_command import LOOSE, SCENARIOS, CosmosCommand
 
 pytestmark = pytest.mark.process
 
-QUICK_S = 900.0
+QUICK_S = 1200.0
 NIGHT_S = 5400.0
 NIGHTLY = "not hardware and not emulator and not benchmark_1h and not benchmark_8h"
 """Six minutes of the latter two are benchmark_6min."""
