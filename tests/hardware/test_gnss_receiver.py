@@ -263,6 +263,7 @@ time: {duration_s: %g}
 hardware:
   armed: true
   stale_ratio: 1
+  lost: 1000
   stimulus_late: 1
   stimulus_underruns: 1000
   on_device_loss: continue
@@ -320,7 +321,7 @@ def fly(tmp_path, count, duration_s):
         except BaseException:
             process.kill()
             raise
-    assert process.returncode == 0, err
+    assert process.returncode == 0, (out, err)
     [folder] = cosmos.runs.glob("0001-receivers")
     return folder, {name: parsed(data) for name, data in computers.data.items()}
 

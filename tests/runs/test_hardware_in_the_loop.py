@@ -12,6 +12,8 @@ from harness.cosmos_command import LOOSE, SCENARIOS, CosmosCommand
 from harness.firmware import build_firmware, needs_emulator
 from harness.waiting import wait_until
 
+from madns_runtime.simulations.constellation.analysis import loop_latency
+
 pytestmark = [pytest.mark.process, needs_emulator]
 COMPUTERS = ("agent-01", "agent-02", "agent-03")
 MICROPYTHON = "/usr/share/firmware-microbit-micropython/firmware.hex"
@@ -107,6 +109,28 @@ def test_firmware_answers_every_tick_at_100_hz(cosmos):
         assert len(records(folder, "flight_answers", agent)) == flight["answers"]
     report = (folder / "report.html").read_text()
     assert "Answers of flight software" in report and "Latency of the loop, ms" in report
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(600)
+def test_sensor_of_a_computer_that_is_read_beside_it_is_scored_against_its_model(cosmos):
+    sensor = "{device: mcu.magnetometer_held, bias: [6e-5, 6e-5, 6e-5], model: {noise: 2.8e-8}}"
+    more = f"parameters.vehicles[0].sensors.magnetometer={sensor}"
+    _, document, err = run(cosmos, "--duration", "15", "--set", "agents.count=3", "--set", more)
+    told = cosmos("report", "last").stdout
+
+    assert document["status"] == "complete", err
+    for part in loop_latency.PARTS:
+        assert f"\n{part} " in told
+    scores = told.partition("magnetometer, field: prediction against measurement, T")[2]
+    rows = [line.split() for line in scores.splitlines()[2:5]]
+    assert [row[0] for row in rows] == list(COMPUTERS)
+    for _, count, predicted, measured, score, _ in rows:
+        assert int(count) > 50
+        assert float(predicted) == pytest.approx(2.8e-8 * math.sqrt(3), rel=0.3)
+        # The device holds each point of its stimulus for 50 ms, of which the model knows nothing.
+        assert float(score) == pytest.approx(float(measured) / float(predicted), rel=0.01)
+        assert float(score) > 1.5
 
 
 @pytest.mark.nightly
