@@ -11,6 +11,8 @@ import json
 import sys
 from pathlib import Path
 
+from scenario_fields import with_fields
+
 from madns_runtime.protocol.states import (
     AGENT_TABLE,
     HOST_TABLE,
@@ -59,7 +61,13 @@ def flight_messages() -> str:
     return json.dumps(message_schema(), indent=2) + "\n"
 
 
+def scenario_page() -> str:
+    """Return docs/scenarios.md: what was written, and tables of all keys."""
+    return with_fields((DOCS / "scenarios.md").read_text("utf-8"))
+
+
 PAGES = {
+    "scenarios.md": scenario_page,
     "states.md": states_page,
     "flight-messages.schema.json": flight_messages,
     "flight-packets.xtce.xml": xtce_text,
