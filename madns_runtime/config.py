@@ -275,7 +275,7 @@ class RunConfig:
     simulation: str
     """Registered name, module:attribute, or ./file.py:attribute beside the scenario."""
     base_directory: str
-    """Folder of the scenario file: relative files in parameters are found from here."""
+    """Root of the scenario, its folder if it names none: relative files in parameters are found from here."""
     agents: Agents
     time: TimeSettings = field(default_factory=TimeSettings)
     deadline: Deadline = field(default_factory=Deadline)

@@ -63,7 +63,7 @@ class Scenario(BaseModel):
     description: str = ""
     """Purpose of the scenario, in a sentence."""
     simulation: Annotated[str, Field(min_length=1)]
-    """A registered simulation, module:attribute, or ./file.py:attribute beside this file."""
+    """A registered simulation, module:attribute, or ./file.py:attribute from the scenario's root, its own folder if it names none."""
     agents: Agents
     """Number of agents, their names and their rate."""
     time: TimeSettings = TimeSettings()

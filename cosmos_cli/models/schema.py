@@ -155,4 +155,6 @@ def _choice(name: str, place: Mapping[str, Any], definitions: Mapping[str, Any])
     if required := definitions[_definition_of(place)].pop("required", None):
         whole = {"required": ["parameters"], "properties": {"parameters": {"required": required}}}
         then |= {"if": {"required": ["extends"]}, "then": {}, "else": whole}
-    return {"if": {"properties": {"simulation": {"const": name}}}, "then": then}
+    # What a base names is not known here: then no simulation's rule holds.
+    named = {"required": ["simulation"], "properties": {"simulation": {"const": name}}}
+    return {"if": named, "then": then}

@@ -100,7 +100,7 @@ class Context(Protocol):
     tick_hz: float
     duration_s: float
     base_directory: Path
-    """Folder of the scenario: relative files are found from here."""
+    """Root of the scenario, its folder if it names none: relative files are found from here."""
     random: np.random.Generator
     """Seeded from the run's seed and `name`."""
     is_lockstep: bool
