@@ -80,8 +80,12 @@ def find_missing(
         found.setdefault((scan.file.role, scan.file.source), []).append(scan)
     _check_source(faults, HOST, found.get((HOST, HOST), ()), expected.host_streams, result)
     for name in expected.agents:
-        own = found.get(("agent", name), ())
-        _check_source(faults, name, own, expected.agent_streams, mapping_at(agents, name))
+        own, agent = found.get(("agent", name), ()), mapping_at(agents, name)
+        if not _ended_on_purpose(agent):
+            _check_source(faults, name, own, expected.agent_streams, agent)
+        elif any(not is_excused(scan, agents) for scan in own):
+            kept = [scan for scan in own if not is_excused(scan, agents)]
+            _check_source(faults, name, kept, expected.agent_streams, agent)
     for name in expected.machines:
         own = found.get(("machine", name), ())
         _check_source(faults, name, own, expected.machine_streams, None)
@@ -93,6 +97,18 @@ def find_missing(
             faults[name] = ["not all of its records are here"]
     causes = {**unretrieved, **_reasons(agents)}
     return [_line(name, texts, causes.get(name)) for name, texts in faults.items() if texts]
+
+
+def is_excused(scan: StreamScan, agents: Mapping[str, Any]) -> bool:
+    """Tell whether what a file lacks was lost on purpose: its incarnation of an agent was ended by a fault."""
+    if scan.file.role != "agent":
+        return False
+    return scan.file.incarnation in _ended_on_purpose(mapping_at(agents, scan.file.source))
+
+
+def _ended_on_purpose(agent: Mapping[str, Any] | None) -> tuple[int, ...]:
+    ended = (agent or {}).get("ended_on_purpose")
+    return tuple(ended) if isinstance(ended, list | tuple) else ()
 
 
 def _has_agents(machine: object) -> bool:
@@ -111,7 +127,7 @@ def _check_source(
     if not scans:
         found.append("no records")
         return
-    lives = {scan.file.incarnation for scan in scans}
+    lives = {scan.file.incarnation for scan in scans} | set(_ended_on_purpose(summary))
     found.extend(f"no records of incarnation {n}" for n in range(1, max(lives)) if n not in lives)
     have = {scan.file.stream for scan in scans}
     paths = {scan.file.path.name for scan in scans}

@@ -9,7 +9,7 @@ from typing import Any
 
 import orjson
 
-from cosmos_cli.evidence.completeness import COUNT_MAX, ExpectedRecords, mapping_at
+from cosmos_cli.evidence.completeness import COUNT_MAX, ExpectedRecords, is_excused, mapping_at
 from cosmos_cli.evidence.datagrams import (
     SERVICES,
     datagram_account,
@@ -169,8 +169,8 @@ class Evidence:
             reliable_lost=_count(messages, "reliable", "lost"),
             sync_lost=_count(messages, "sync", "lost"),
             sync_deadlines_broken=_count(messages, "sync", "deadlines_broken"),
-            records_dropped=sum(scan.dropped for scan in self.scans),
-            records_truncated=sum(scan.truncated for scan in self.scans),
+            records_dropped=sum(scan.dropped for scan in self._judged_scans()),
+            records_truncated=sum(scan.truncated for scan in self._judged_scans()),
             records_not_finite=sum(scan.not_finite for scan in self.scans),
             worst=worst_sources(totals.agents, mapping_at(result, "agents"), self.scans),
             late_hint=causes.hint if causes else "",
@@ -184,6 +184,11 @@ class Evidence:
                 *flown_remarks(self.started),
             ),
         )
+
+    def _judged_scans(self) -> list[StreamScan]:
+        """Return the scans but those of agents' incarnations that were ended on purpose, which cut them."""
+        agents = mapping_at(self.result, "agents")
+        return [scan for scan in self.scans if not is_excused(scan, agents)]
 
     def _lateness_limit_s(self) -> float | None:
         return None if self.config is None else self.config.deadline.lateness_limit_s
@@ -269,6 +274,7 @@ class Evidence:
             "between_agents": dict(mapping_at(result, "between_agents")),
             "packets": packet_counts(mapping_at(self.result, "agents")),
             "datagrams": datagram_account(result),
+            "faults": dict(mapping_at(result, "faults")),
             "host_calls": dict(mapping_at(result, "host_calls")),
             "round_trip_ms": self.round_trip_ms,
             "clock": self.clock,
@@ -299,7 +305,14 @@ class Evidence:
             if self._is_restarted(name)
         }
         count = len(self.expected.agents) or len(self.ticks.agents)
-        return {"count": count, "lost": list(self._lost()), "incarnations": restarted}
+        on_purpose = (self.result or {}).get("lost_on_purpose")
+        intended = {"lost_on_purpose": list(on_purpose)} if isinstance(on_purpose, list) else {}
+        return {
+            "count": count,
+            "lost": list(self._lost()),
+            **intended,
+            "incarnations": restarted,
+        }
 
     def _messages(self) -> dict[str, Any]:
         twice = duplicates_by_service(mapping_at(self.result, "agents"))

@@ -22,7 +22,7 @@ from madns_runtime.errors import MessageTooLarge
 from madns_runtime.faults.late_messages import LateMessage, LateMessages
 from madns_runtime.faults.message_rules import DOWN, UP, Fate, MessageRule, MessageRules
 from madns_runtime.medium.outcomes import LOST, LinkOutcome
-from madns_runtime.protocol.codec import decode_data, encode_data
+from madns_runtime.protocol.codec import pack, unpack
 from madns_runtime.protocol.link_settings import SendQueueFull
 from madns_runtime.protocol.messages import Service, Transmission
 from madns_runtime.timeline.action import TimelineAction
@@ -41,7 +41,7 @@ class MessageSender(Protocol):
 class MessageEnds:
     """Where messages go on that a fault has let go."""
 
-    receive: Callable[[str, Any, Service], None]
+    receive: Callable[[str, Any], object]
     """Hands in what an agent sent."""
     send: MessageSender
     engage: Callable[[bool], None]
@@ -76,6 +76,7 @@ class MessageFaults:
         self._ends = ends
         self._counts: dict[str, Counter[str]] = {}
         self._between: Counter[str] = Counter()
+        self._is_passing_on = False
 
     # In force -------------------------------------------------------------------------------------
 
@@ -109,10 +110,10 @@ class MessageFaults:
     def take(self, agent: str, message: Any, service: Service) -> None:
         """Take what an agent sent; what no fault touches is handed in at once."""
         if isinstance(message, Transmission):  # the medium's: see `ways`
-            self._ends.receive(agent, message, service)
+            self._ends.receive(agent, message)
             return
         for _ in range(self._judge(LateMessage(agent, UP, int(service), message))):
-            self._ends.receive(agent, message, service)
+            self._ends.receive(agent, message)
 
     def send(self, to: str, message: Any, service: Service, deadline_s: float | None) -> bool:
         """
@@ -126,12 +127,24 @@ class MessageFaults:
         """
         if not self._rules.concern(to) and not len(self._late):
             return False
+        if self._is_passing_on:
+            return False
         # Whoever sent it may go on to change it.
-        kept = decode_data(encode_data(message))
+        kept = unpack(pack(message))
         copies = self._judge(LateMessage(to, DOWN, int(service), kept, deadline_s))
         if copies > 1:
-            self._ends.send(to, kept, service, deadline_s=deadline_s)
+            self._pass_on(to, kept, service, deadline_s)
         return copies == 0
+
+    def _pass_on(self, to: str, message: Any, service: Service, deadline_s: float | None) -> None:
+        """Send what no fault is to see again."""
+        self._is_passing_on = True
+        try:
+            self._ends.send(to, message, service, deadline_s=deadline_s)
+        except (SendQueueFull, MessageTooLarge):
+            self._counts[to]["not_sent"] += 1
+        finally:
+            self._is_passing_on = False
 
     def _judge(self, message: LateMessage) -> int:
         """Return how often a message is to go on now; one that is late is kept."""
@@ -171,16 +184,13 @@ class MessageFaults:
             counts = self._counts[agent]
             counts["released"] += 1
             if message.direction == UP:
-                self._ends.receive(agent, message.payload, service)
+                self._ends.receive(agent, message.payload)
                 continue
             deadline_s = message.deadline_s
             if deadline_s is not None and deadline_s < self._now_s():
                 counts["deadlines_broken"] += 1
                 deadline_s = None
-            try:
-                self._ends.send(agent, message.payload, service, deadline_s=deadline_s)
-            except (SendQueueFull, MessageTooLarge):
-                counts["not_sent"] += 1
+            self._pass_on(agent, message.payload, service, deadline_s)
         self._disengage()
 
     # Messages between agents ----------------------------------------------------------------------

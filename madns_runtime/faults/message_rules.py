@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from hashlib import blake2b
 from typing import Any, Final
 
-from madns_runtime.faults import words
 from madns_runtime.protocol.messages import Service
+from madns_runtime.timeline import fault_kinds as words
 
 UP: Final = -1
 """From an agent to the host's half, where an index of a receiver would stand."""

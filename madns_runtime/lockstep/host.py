@@ -34,7 +34,7 @@ from madns_runtime.plugin.executor import make_executor
 from madns_runtime.plugin.half import HostHalf, RoleProgram
 from madns_runtime.plugin.host_calls import HostCalls
 from madns_runtime.protocol.codec import pack
-from madns_runtime.protocol.messages import ConditionMet
+from madns_runtime.protocol.messages import ConditionMet, Service
 from madns_runtime.protocol.states import HostEvent, host_machine
 from madns_runtime.reactor.host_signals import heed_signals
 from madns_runtime.reactor.operator_link import tell_loading
@@ -46,6 +46,8 @@ from madns_runtime.timing.rate import count_ticks
 
 HANG_GRACE_S = 2.0
 """Beyond twice the time for shutdown: a host that hangs, without an operator, ends by force."""
+SERVICES = tuple(Service)
+"""By number."""
 DRAIN_ROUNDS_MAX = 16
 """Answers to answers that are handed out after the last tick."""
 
@@ -261,7 +263,7 @@ class LockstepHost:
             if isinstance(message, ConditionMet):
                 self._conditions.hear(names[number], message.number, message.t_s)
             else:
-                half.take(names[number], message)
+                half.take(names[number], message, SERVICES[service])
             self._meeting.serve()
 
     # Conditions -----------------------------------------------------------------------------------

@@ -21,6 +21,7 @@ from functools import partial
 from typing import Any
 
 from madns_runtime.config import Timeouts
+from madns_runtime.faults.message_faults import MessageFaults
 from madns_runtime.lockstep.barrier import STACK_HINT, Meeting
 from madns_runtime.lockstep.result import EarlyEnd
 from madns_runtime.lockstep.workers import WorkerProcess
@@ -28,6 +29,7 @@ from madns_runtime.plugin.api import HOST
 from madns_runtime.plugin.context import JobContext
 from madns_runtime.plugin.executor import JobRunner
 from madns_runtime.plugin.half import REPEATS_MAX, HalfFailed, HostHalf
+from madns_runtime.protocol.messages import Service
 from madns_runtime.timing.granted_clock import GrantedLimit
 
 LOOK_INTERVAL_S = 0.25
@@ -58,6 +60,7 @@ class LockstepHalf:
         self._timeouts = timeouts
         self._meeting = meeting
         self._on_hang = on_hang
+        self._faults: MessageFaults | None = None
         self._jobs = JobRunner(meeting.reactor, executor, self._job_done)
         self.close = self._jobs.close
         self._outstanding: deque[int] = deque()
@@ -116,15 +119,31 @@ class LockstepHalf:
         self._guard("setup", partial(self._half.set_up, context), limit_s)
         self._settle()
 
-    def take(self, agent: str, message: Any) -> None:
+    def take(self, agent: str, message: Any, service: Service) -> None:
         """
-        Hand in what an agent sent; see `HostHalf.take`.
+        Hand in what an agent sent, or show it to the faults in force; see `HostHalf.take`.
 
         Raises:
             RunEnds: As `call`.
         """
-        self._guard("receive", partial(self._half.take, agent, message))
+        if self._faults is not None:
+            self._faults.take(agent, message, service)
+        else:
+            self.take_now(agent, message)
+
+    def take_now(self, agent: str, message: Any) -> None:
+        """
+        Hand in what an agent sent, whatever faults are in force.
+
+        Raises:
+            RunEnds: As `call`.
+        """
+        self._guard("receive", partial(self._half.take_now, agent, message))
         self._settle()
+
+    def intercept(self, faults: MessageFaults | None) -> None:
+        """Show *faults* what agents send from now on, to the half and to each other; None: hand it in."""
+        self._faults = self._half.carrier.faults = faults
 
     def _guard(self, name: str, call: Callable[[], Any], limit_s: float | None = None) -> Any:
         self._under_way = (f"{self._half.name}.{name}", limit_s or self._timeouts.tick_s)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from madns_runtime.errors import MessageTooLarge
+from madns_runtime.faults.message_faults import MessageFaults
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.result import RunAccount
 from madns_runtime.plugin.context import check_sending
@@ -122,6 +123,8 @@ class Outbox:
         self.boxes: list[list[tuple[int, bytes]]] = [[] for _ in shares]
         """One per worker: the receiver, by index, and the body."""
         self._box_of = [self.boxes[number] for number, share in enumerate(shares) for _ in share]
+        self.faults: MessageFaults | None = None
+        """Who is shown what the host's half sends, while faults are in force."""
         self._index = {name: number for number, name in enumerate(account.names)}
         self._allowances = [Allowance() for _ in account.names]
         self._account = account
@@ -139,6 +142,8 @@ class Outbox:
         """Send to an agent's half; see `plugin.api.Context.send`."""
         is_running = self._account.began_s is not None
         check_sending(to, self._index, service, deadline_s, is_running=is_running)
+        if self.faults is not None and self.faults.send(to, message, service, deadline_s):
+            return
         number, t_s = self._index[to], self._clock.t_s
         if self._account.agents[number].is_lost:
             self._account.agents[number].not_sent += 1

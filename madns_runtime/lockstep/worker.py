@@ -20,7 +20,6 @@ from typing import Any, NoReturn
 
 from madns_runtime.errors import MadnsError
 from madns_runtime.faults.step_faults import StepFaults
-from madns_runtime.faults.words import KILL
 from madns_runtime.lockstep import frames
 from madns_runtime.lockstep.agent import Crewmates, LockstepAgent
 from madns_runtime.lockstep.assignment import Assignment
@@ -39,6 +38,7 @@ from madns_runtime.reactor.forking import leave_parent
 from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.watchdog import end_after_hang_up
 from madns_runtime.recording.newest_values import Value
+from madns_runtime.timeline.fault_kinds import KILL
 
 HANG_GRACE_S = 2.0
 """Beyond the time for shutdown: a worker that hangs in a plug-in ends by force when its host is gone."""

@@ -288,12 +288,7 @@ class AgentSession:
         match message:
             case messages.SimulationData(payload):
                 self._take_data(payload)
-            case (
-                messages.Delivery()
-                | messages.TransmissionRefusal()
-                | messages.FaultOrder()
-                | messages.ActionOrder()
-            ):
+            case _ if isinstance(message, messages.WITH_DATA):
                 self._take_data(message)
             case messages.Pong(t_agent_s, t_host_received_s, t_host_sent_s):
                 self.clock.add_exchange(t_agent_s, t_host_received_s, t_host_sent_s, now_s)

@@ -51,6 +51,7 @@ def _describe(cls: type[Message]) -> tuple[type[Message], tuple[str, ...], tuple
     accepted: dict[str, Any] = {
         "str": str,
         "int": int,
+        "bool": bool,
         "float": (float, int),
         "Mapping[str, Any]": dict,
         "Any": object,

@@ -7,6 +7,7 @@ from enum import Enum
 from typing import Any
 
 from madns_runtime.protocol.deadlines import BrokenDeadline
+from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.states import AgentState, HostState
 
 
@@ -79,6 +80,7 @@ class AgentDataReceived:
     agent: str
     payload: Any
     """A message's payload, or a Transmission or ConditionMet, which no payload is."""
+    service: Service = Service.RELIABLE
 
 
 @dataclass(frozen=True, slots=True)

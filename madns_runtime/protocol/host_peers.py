@@ -25,7 +25,7 @@ from madns_runtime.protocol.events import (
 )
 from madns_runtime.protocol.link import Link
 from madns_runtime.protocol.link_settings import PLUGIN_CHANNEL, LinkSettings
-from madns_runtime.protocol.messages import VERSION, Message, Pong, Service
+from madns_runtime.protocol.messages import VERSION, WITH_DATA, Message, Pong, Service
 from madns_runtime.protocol.silence_limits import Wakefulness, agent_silence_limit_s
 from madns_runtime.protocol.states import HOST_LIVE, HostState
 
@@ -90,6 +90,8 @@ class Roster:
         self.peers = {name: Peer(name=name, index=i) for i, name in enumerate(agents, start=1)}
         self.running: dict[bytes, Peer] = {}
         """Running agents by the prefix of their datagrams."""
+        self.awaits_returns = False
+        """Whether agents that are lost on purpose are to return: a run without any other goes on."""
         self._timeouts = timeouts
         self._events = events
         self._wakefulness = Wakefulness(timeouts.silence_s, now_s)
@@ -102,6 +104,24 @@ class Roster:
         """Return the names of agents that are neither lost nor in any of *phases*."""
         settled = (*phases, Phase.LOST)
         return tuple(name for name, peer in self.peers.items() if peer.phase not in settled)
+
+    def await_returns(self, are_due: bool) -> None:
+        """Note whether agents that are lost on purpose are to return."""
+        self.awaits_returns = are_due
+
+    @property
+    def are_all_lost(self) -> bool:
+        """Whether no agent is left, and none is to return."""
+        return not self.awaits_returns and not self.names_outside()
+
+    def are_settled(self, phase: Phase) -> bool:
+        """Tell whether every agent that is not lost is in *phase*, and one is, or none is to return."""
+        return not self.names_outside(phase) and not (self.awaits_returns and self.is_empty)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether every agent is lost now."""
+        return not self.names_outside()
 
     def move(self, peer: Peer, phase: Phase, reason: str | None = None) -> None:
         """Take note that an agent has reached a phase."""
@@ -176,6 +196,22 @@ class HostLinks:
         if peer.link is not None:
             peer.link.send_urgent(encode_message(message), service, now_s)
             self._dirty.add(peer.index)
+
+    def send_data(
+        self,
+        peer: Peer,
+        payload: Any,
+        service: Service,
+        *,
+        now_s: float,
+        deadline_s: float | None,
+    ) -> None:
+        """Queue a message of the half's, or one of the framework's that goes with them; nothing without a link."""
+        if peer.link is not None:
+            self.mark(peer)
+            is_message = isinstance(payload, WITH_DATA)
+            body = encode_message(payload) if is_message else encode_data(payload)
+            peer.link.send(body, service, now_s, channel=PLUGIN_CHANNEL, deadline_s=deadline_s)
 
     def seal_data(self, agent: str, payload: Any, now_s: float) -> tuple[bytes, Address] | None:
         """

@@ -20,14 +20,12 @@ from madns_runtime.protocol.codec import (
     MalformedMessage,
     decode_data,
     decode_message,
-    encode_data,
-    encode_message,
 )
 from madns_runtime.protocol.datagram import PREFIX_BYTES
 from madns_runtime.protocol.events import HostSessionEvent, Phase
 from madns_runtime.protocol.host_peers import Address, HostLinks, Peer, Roster
 from madns_runtime.protocol.link import Link
-from madns_runtime.protocol.link_settings import PLUGIN_CHANNEL, LinkSettings
+from madns_runtime.protocol.link_settings import LinkSettings
 from madns_runtime.protocol.messages import Message, Service
 from madns_runtime.protocol.states import HOST_LIVE, HostEvent, HostState, host_machine
 
@@ -37,12 +35,6 @@ LINGER_S = 0.5
 """Longest wait of the host at its end for its last acknowledgements to leave."""
 
 _NOT_THERE = (Phase.ABSENT, Phase.JOINING, Phase.STOPPED, Phase.LOST)
-_FRAMEWORKS_OWN = (
-    messages.Delivery,
-    messages.TransmissionRefusal,
-    messages.FaultOrder,
-    messages.ActionOrder,
-)
 _ENDING = (HostState.BEGIN_SHUTDOWN, HostState.EMERGENCY_SHUTDOWN)
 _BEFORE_STOP = tuple(state for state in HOST_LIVE if state is not HostState.BEGIN_SHUTDOWN)
 _AWAITED = {
@@ -78,6 +70,7 @@ class HostSession:
         self._roster = Roster(agents, timeouts, events=self._events, now_s=now_s)
         self.peers = self._roster.peers
         self.agents_in = self._roster.names_in
+        self.await_returns = self._roster.await_returns
         self._running = self._roster.running
         self._links = HostLinks(self.peers, wire, self._events)
         self.seal_data = self._links.seal_data
@@ -196,10 +189,7 @@ class HostSession:
         if peer.link is None or peer.phase in _NOT_THERE:
             peer.not_sent += 1
             return False
-        self._links.mark(peer)
-        is_message = isinstance(payload, _FRAMEWORKS_OWN)
-        body = encode_message(payload) if is_message else encode_data(payload)
-        peer.link.send(body, service, now_s, channel=PLUGIN_CHANNEL, deadline_s=deadline_s)
+        self._links.send_data(peer, payload, service, now_s=now_s, deadline_s=deadline_s)
         return True
 
     def receive_data(self, data: bytes, address: Address, now_s: float) -> tuple[str, Any] | None:
@@ -221,7 +211,7 @@ class HostSession:
         payload = decode_data(body)
         if payload is NO_DATA:
             self._links.mark(peer)
-            self._take(peer, body, now_s)
+            self._take(peer, body, now_s, Service.BEST)
             return None
         return peer.name, payload
 
@@ -234,7 +224,7 @@ class HostSession:
         if link is not peer.link:
             self._replace(peer, link, now_s)
         while (received := link.next_message()) is not None:
-            self._take(peer, received.body, now_s)
+            self._take(peer, received.body, now_s, received.service)
 
     def get_timer(self) -> float | None:
         """Return when `handle_timer` wants to be called, at the latest."""
@@ -265,15 +255,15 @@ class HostSession:
             # Its hello may come behind a ping, if the first datagram was lost.
             self._roster.move(peer, Phase.JOINING)
 
-    def _take(self, peer: Peer, body: bytes, now_s: float) -> None:
+    def _take(self, peer: Peer, body: bytes, now_s: float, service: Service) -> None:
         try:
             message = decode_message(body)
         except MalformedMessage:
             self.malformed_count += 1
         else:
-            self._receive(peer, message, now_s)
+            self._receive(peer, message, now_s, service)
 
-    def _receive(self, peer: Peer, message: Message, now_s: float) -> None:
+    def _receive(self, peer: Peer, message: Message, now_s: float, service: Service) -> None:
         match message:
             case messages.EmergencyShutdown(_, reason):
                 # It ends itself: that loses one member, and under abort the run.
@@ -286,7 +276,7 @@ class HostSession:
             case _ if peer.phase is Phase.LOST:
                 self._send_expelled(peer, now_s)
             case messages.SimulationData(payload):
-                self._events.append(told.AgentDataReceived(peer.name, payload))
+                self._events.append(told.AgentDataReceived(peer.name, payload, service))
             case messages.Transmission(sent_s=t_s) | messages.ConditionMet(t_s=t_s) if (
                 math.isfinite(t_s)
             ):
@@ -361,7 +351,7 @@ class HostSession:
             return
         is_live = self.state in HOST_LIVE
         self._roster.lose(reasons, is_live=is_live)
-        if is_live and (self._aborts or not self._roster.names_outside()):
+        if is_live and (self._aborts or self._roster.are_all_lost):
             self.emergency(", ".join(reasons), "; ".join(dict.fromkeys(reasons.values())), now_s)
         else:
             self._progress(now_s)
@@ -372,7 +362,7 @@ class HostSession:
         if state in _ENDING:
             if not self._roster.names_outside(Phase.STOPPED, Phase.ABSENT):
                 self._stop(now_s, ())
-        elif state in _AWAITED and not self._roster.names_outside(_AWAITED[state][1]):
+        elif state in _AWAITED and self._roster.are_settled(_AWAITED[state][1]):
             self._go_on(state, now_s)
 
     def _go_on(self, state: HostState, now_s: float) -> None:
@@ -403,7 +393,11 @@ class HostSession:
             word, phase = _AWAITED[state]
             self._state_deadline_s = now_s + self._timeouts.silence_s
             reason = f"no {word} in {waited_s:g} s"
-            self._lose(dict.fromkeys(self._roster.names_outside(phase), reason), now_s)
+            self._roster.awaits_returns = False
+            if late := self._roster.names_outside(phase):
+                self._lose(dict.fromkeys(late, reason), now_s)
+            else:
+                self.emergency(", ".join(self.peers), f"{reason}: none has returned", now_s)
         elif state is HostState.SIMULATION_SETUP:
             text = f"setup of the simulation took longer than {waited_s:g} s"
             self.emergency("host", text, now_s)

@@ -214,6 +214,18 @@ class ActionOrder:
     """Whether what it did is to be over: true or false."""
 
 
+@dataclass(frozen=True, slots=True)
+class AgentFault:
+    """Host -> agent: a fault of you or of your steps begins or ends; see `timeline.fault_kinds`."""
+
+    KIND: ClassVar[int] = 18
+    word: str
+    begins: bool
+    value: float
+    """The factor of slow; of kill and restart the time until the return, s, not a number for never."""
+    reason: str = ""
+
+
 Message = (
     Hello
     | SimulationSetup
@@ -233,6 +245,9 @@ Message = (
     | FaultOrder
     | ConditionMet
     | ActionOrder
+    | AgentFault
 )
 
 MESSAGES: tuple[type[Message], ...] = get_args(Message)
+WITH_DATA = (Delivery, TransmissionRefusal, FaultOrder, ActionOrder, AgentFault)
+"""Words of the framework that the host sends to a running agent as it sends its half's messages."""

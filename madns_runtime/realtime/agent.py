@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import Any, assert_never
@@ -16,7 +16,13 @@ from madns_runtime.plugin.context import PeerContext
 from madns_runtime.plugin.half import Half, HalfFailed, RoleProgram
 from madns_runtime.protocol import events as told
 from madns_runtime.protocol.codec import NO_DATA
-from madns_runtime.protocol.messages import ActionOrder, Delivery, FaultOrder, TransmissionRefusal
+from madns_runtime.protocol.messages import (
+    ActionOrder,
+    AgentFault,
+    Delivery,
+    FaultOrder,
+    TransmissionRefusal,
+)
 from madns_runtime.protocol.states import AgentState
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.realtime.agent_calls import (
@@ -27,8 +33,9 @@ from madns_runtime.realtime.agent_calls import (
     RECEIVE,
     LoopSeat,
 )
+from madns_runtime.realtime.agent_faults import AgentFaults
 from madns_runtime.realtime.agent_link import AgentPort
-from madns_runtime.realtime.agent_report import AgentReport
+from madns_runtime.realtime.agent_report import AgentOutcome, AgentReport
 from madns_runtime.realtime.loop_account import Span
 from madns_runtime.realtime.ordered_actions import OrderedActions
 from madns_runtime.realtime.packs import Pack
@@ -48,17 +55,6 @@ DRAIN_S = 0.1
 """After the last tick's period an agent listens this much longer for what is still under way."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AgentOutcome:
-    """End of an agent: how and why."""
-
-    as_ordered: bool
-    """By the host's order at the end of a run."""
-    reason: str = ""
-    may_restart: bool = False
-    """It failed by itself while the run may go on: another try makes sense."""
-
-
 class AgentRunner:
     """
     Runs one agent.
@@ -71,6 +67,7 @@ class AgentRunner:
         process: What it shares with the other agents of its process.
         pack: Whom it ticks with.
         on_ended: Called once, with how it ended.
+        on_killed: Called when a fault is to end it: with its name, why, and the time until its return, s.
 
     Raises:
         MachineError: It cannot record.
@@ -87,6 +84,7 @@ class AgentRunner:
         process: ProcessPort,
         pack: Pack,
         on_ended: Callable[[str, AgentOutcome], None],
+        on_killed: Callable[[str, str, float | None], None],
     ) -> None:
         self.name = name = seat.name
         self._calls, self._seat = seat.calls.page, seat.number
@@ -137,6 +135,7 @@ class AgentRunner:
         self._actions = OrderedActions(
             seat, program.actions, self._journal, call=self._call, end_at=ticks.end_at
         )
+        self._faults = AgentFaults(ticks, self._journal, killed=partial(on_killed, name))
         self._report = AgentReport(
             port=self._port,
             records=self._records,
@@ -247,6 +246,8 @@ class AgentRunner:
             self._hardware.order_fault(message)
         elif isinstance(message, ActionOrder):
             self._actions.take(message)
+        elif isinstance(message, AgentFault):
+            self._faults.take(message)
         elif self._takes_data:
             is_refusal = isinstance(message, TransmissionRefusal)
             self._call("refused" if is_refusal else "receive", message)
@@ -356,6 +357,7 @@ class AgentRunner:
         self._is_closed = True
         self._cancel_timers()
         self._actions.close()
+        self._pack.leave_out(self._ticks)
         self._port.close()
         self._on_ended(self.name, self._outcome)
 

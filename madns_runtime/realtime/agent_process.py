@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 from madns_runtime.config import AgentLaunch
 from madns_runtime.plugin.half import RoleProgram
@@ -12,11 +15,14 @@ from madns_runtime.reactor.operator_link import OPERATOR_SIDE_GONE
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import apply as apply_scheduling
 from madns_runtime.reactor.watchdog import end_after_hang_up
-from madns_runtime.realtime.agent import AgentOutcome, AgentRunner
+from madns_runtime.realtime.agent import AgentRunner
 from madns_runtime.realtime.agent_calls import LoopSeat
+from madns_runtime.realtime.agent_report import AgentOutcome
 from madns_runtime.realtime.packs import Pack, phase_of, split_into_packs
 from madns_runtime.realtime.process_port import ProcessPort
 
+RESTART_S = 0.2
+"""Least time from an agent's end by a fault to its return to the same process."""
 HANG_GRACE_S = 2.0
 """Beyond the time for shutdown: an agent that hangs in its plug-in ends itself, and leaves its stack."""
 
@@ -30,6 +36,7 @@ class AgentProcess:
         seats: This process's agents.
         program: What they run.
         life_fd: Closes when the supervisor is gone.
+        tell_killed: Tells the supervisor that a fault ends this process now, and the time until its return, s.
     """
 
     def __init__(
@@ -39,6 +46,7 @@ class AgentProcess:
         program: RoleProgram,
         *,
         life_fd: int,
+        tell_killed: Callable[[str, str, float | None], None],
     ) -> None:
         self._reactor = Reactor()
         self._supervisor_pid = os.getppid()
@@ -48,6 +56,15 @@ class AgentProcess:
         self._life_fd = life_fd
         self._runners: dict[str, AgentRunner] = {}
         self._outcomes: dict[str, AgentOutcome] = {}
+        self._tell_killed = tell_killed
+        self._dropped: dict[str, float | None] = {}
+        """Agents that a fault is ending, with the time until their return, s."""
+        self._away: set[str] = set()
+        """Those of them that have ended and will return."""
+        self._packs: dict[str, Pack] = {}
+        self._lives: dict[str, int] = {}
+        self._is_ending = False
+        self._grant: dict[str, Any] = {}
 
     def run(self) -> dict[str, AgentOutcome]:
         """Run every agent to its end, and return how each ended."""
@@ -61,32 +78,57 @@ class AgentProcess:
         for runner in runners:
             runner.start()
         # The recorders' threads run already and keep the normal policy; only the loop is raised.
-        grant = apply_scheduling(self._launch.config.scheduling, is_host=False).to_mapping()
+        self._grant = apply_scheduling(self._launch.config.scheduling, is_host=False).to_mapping()
         for runner in runners:
-            runner.set_scheduling(grant)
+            runner.set_scheduling(self._grant)
         reactor.run()
         reactor.close()
         return self._outcomes
 
     def _make_runners(self) -> list[AgentRunner]:
-        seats = {seat.name: seat for seat in self._seats}
-        process = ProcessPort(self._launch, self._reactor, len(seats))
-        runners = []
-        for number, names in enumerate(split_into_packs(list(seats))):
+        names_here = [seat.name for seat in self._seats]
+        self._process = process = ProcessPort(self._launch, self._reactor, len(names_here))
+        for number, names in enumerate(split_into_packs(names_here)):
             phase_s = phase_of(number, names, self._launch.config.agents)
             pack = Pack(phase_s, reactor=self._reactor, process=process)
-            for name in names:
-                runner = AgentRunner(
-                    seats[name],
-                    self._launch,
-                    self._program,
-                    reactor=self._reactor,
-                    process=process,
-                    pack=pack,
-                    on_ended=self._ended,
-                )
-                runners.append(runner)
-        return runners
+            self._packs |= dict.fromkeys(names, pack)
+        return [self._make_runner(seat) for seat in self._seats]
+
+    def _make_runner(self, seat: LoopSeat) -> AgentRunner:
+        life = self._lives.setdefault(seat.name, self._program.life)
+        return AgentRunner(
+            seat,
+            self._launch,
+            replace(self._program, life=life),
+            reactor=self._reactor,
+            process=self._process,
+            pack=self._packs[seat.name],
+            on_ended=self._ended,
+            on_killed=self._killed,
+        )
+
+    # Faults that end an agent ---------------------------------------------------------------------
+
+    def _killed(self, name: str, reason: str, after_s: float | None) -> None:
+        """End the process if it is the agent's alone, else drop the agent's half."""
+        if len(self._seats) == 1:
+            self._tell_killed(name, reason, after_s)
+            os.kill(os.getpid(), signal.SIGKILL)
+        self._dropped[name] = after_s
+        # In the loop's next turn: the order came with messages that others of the process share.
+        drop = partial(self._runners[name].emergency, reason)
+        self._reactor.call_at(self._reactor.now_s(), drop)
+
+    def _return(self, seat: LoopSeat) -> None:
+        """Make an agent anew that was dropped."""
+        if self._is_ending:
+            return
+        self._away.discard(seat.name)
+        self._process.awaited -= 1
+        self._lives[seat.name] += 1
+        self._runners[seat.name] = runner = self._make_runner(seat)
+        runner.start()
+        runner.set_scheduling(self._grant)
 
     def _life_ended(self) -> None:
         self._reactor.remove_reader(self._life_fd)
@@ -96,11 +138,27 @@ class AgentProcess:
             self._end(f"its supervisor (pid {self._supervisor_pid}) is gone")
 
     def _end(self, reason: str) -> None:
+        self._is_ending = True
+        self._process.awaited = 0
         for runner in list(self._runners.values()):
             runner.emergency(reason)
+        self._stop_if_done()
 
     def _ended(self, name: str, outcome: AgentOutcome) -> None:
         del self._runners[name]
         self._outcomes[name] = outcome
-        if not self._runners:
+        if name in self._dropped:
+            self._outcomes[name] = replace(outcome, as_ordered=True, may_restart=False)
+            after_s = self._dropped.pop(name)
+            if after_s is not None and not self._is_ending:
+                seat = next(seat for seat in self._seats if seat.name == name)
+                self._away.add(name)
+                self._process.awaited += 1
+                due_s = self._reactor.now_s() + max(after_s, RESTART_S)
+                self._reactor.call_at(due_s, partial(self._return, seat))
+        self._stop_if_done()
+
+    def _stop_if_done(self) -> None:
+        if not self._runners and (self._is_ending or not self._away):
+            self._process.close_if_unused()
             self._reactor.stop()

@@ -15,6 +15,17 @@ from madns_runtime.recording.newest_values import NewestValues
 from madns_runtime.timing.rate import Pacer, RealTimeFactor
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AgentOutcome:
+    """End of an agent: how and why."""
+
+    as_ordered: bool
+    """By the host's order at the end of a run."""
+    reason: str = ""
+    may_restart: bool = False
+    """It failed by itself while the run may go on: another try makes sense."""
+
+
 @dataclass(slots=True, kw_only=True)
 class AgentReport:
     """Reads what others keep; holds nothing of its own but what the kernel granted."""

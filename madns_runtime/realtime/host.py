@@ -25,7 +25,7 @@ from madns_runtime.plugin.host_calls import HostCalls
 from madns_runtime.protocol import events as told
 from madns_runtime.protocol.events import Phase
 from madns_runtime.protocol.host_peers import Address
-from madns_runtime.protocol.messages import ConditionMet
+from madns_runtime.protocol.messages import ConditionMet, Service
 from madns_runtime.protocol.states import HOST_LIVE, HostState
 from madns_runtime.reactor.host_signals import heed_signals
 from madns_runtime.reactor.operator_link import (
@@ -39,8 +39,10 @@ from madns_runtime.reactor.reattachment import way_back_of
 from madns_runtime.reactor.scheduling import apply as apply_scheduling
 from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.watchdog import end_after_hang_up, extend
+from madns_runtime.realtime.agent_losses import AgentLosses
 from madns_runtime.realtime.announcements import Announcements
 from madns_runtime.realtime.half_timer import HalfTimer
+from madns_runtime.realtime.host_faults import HostFaults
 from madns_runtime.realtime.host_link import HostPort
 from madns_runtime.realtime.host_result import HostReport
 from madns_runtime.realtime.operator_orders import OperatorOrders
@@ -50,6 +52,7 @@ from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
 from madns_runtime.recording.result_file import hand_over
 from madns_runtime.recording.run_journal import RunJournal
+from madns_runtime.timeline.fault_kinds import FAULT_WORDS
 from madns_runtime.timing.clock import utc_at_iso
 
 PROGRESS_INTERVAL_S = 0.5
@@ -57,6 +60,8 @@ HANG_UP_WAIT_S = 0.5
 """On a busy computer, from the end of a dead operator's line to an agent until the end of that to the host."""
 HANG_GRACE_S = 2.0
 """Beyond the time for shutdown: a loop that hangs in a plug-in, without an operator, ends by force."""
+
+BEST = Service.BEST
 
 
 class HostRuntime:
@@ -153,6 +158,23 @@ class HostRuntime:
             pump=self._pump,
         )
         self._timeline.wait_for(self._conditions)
+        self.faults = HostFaults(
+            config,
+            port=self._port,
+            half=self._half,
+            guard=self._guard,
+            reactor=self._reactor,
+            pump=self._pump,
+        )
+        self._losses = AgentLosses(
+            self._report,
+            self.faults,
+            announced=self._announced,
+            journal=self._journal,
+            call=self._call_of_loss,
+            now_s=self._port.now_s,
+        )
+        self._timeline.handlers.update(dict.fromkeys(FAULT_WORDS, self.faults))
         # Infinite is never: the timer is made once and moved.
         self._progress_timer = self._reactor.call_at(math.inf, self._progress)
         self._is_set_up = self._awaits_jobs = False
@@ -186,7 +208,7 @@ class HostRuntime:
     def _take_datagram(self, data: bytes, address: Address) -> None:
         message = self._session.receive_data(data, address, monotonic())
         if message is not None and self._takes_data:
-            self._call("receive", *message)
+            self._guard(self._half.take, *message, BEST)
             if not self._port.must_pump:
                 return
         self._pump()
@@ -214,9 +236,9 @@ class HostRuntime:
         match event:
             case told.AgentDataReceived(agent, ConditionMet(number, t_s)):
                 self._conditions.hear(agent, number, t_s)
-            case told.AgentDataReceived(agent, payload):
+            case told.AgentDataReceived(agent, payload, service):
                 if self._takes_data:
-                    self._guard(self._half.take, agent, payload)
+                    self._guard(self._half.take, agent, payload, service)
             case told.HostStateEntered(state):
                 self._announced.state(state)
             case told.AgentMoved(agent):
@@ -226,11 +248,11 @@ class HostRuntime:
             case told.AgentsSimulationReady():
                 self._start()
             case told.AgentLost(agent, reason):
-                self._agent_lost(agent, reason)
+                self._losses.lost(agent, reason, may_tell=self._is_set_up)
             case told.AgentRejoining(agent):
                 self._send_setup(agent)
             case told.AgentRejoined(agent):
-                self._agent_rejoined(agent)
+                self._losses.rejoined(agent)
             case told.AgentsComplete():
                 self._complete()
             case told.EmergencyDeclared(who, reason):
@@ -250,8 +272,7 @@ class HostRuntime:
         self._guard(self._half.set_up, self._context)
         self._is_set_up = True
         for agent in self._session.agents_in(Phase.LOST):
-            if agent in self._report.lost:  # else the word of it comes just behind
-                self._tell_lost(agent)
+            self._losses.tell(agent)  # or the word of it comes just behind
         self._awaits_jobs = True
         self._continue_setup()
 
@@ -326,22 +347,6 @@ class HostRuntime:
         self._report.records = {**counts.to_mapping(), "health": health}
         self._session.records_closed(now_s)
 
-    def _agent_lost(self, agent: str, reason: str) -> None:
-        self._report.lost[agent] = reason
-        self._log("error", f"{agent} is lost: {reason}")
-        if self._is_set_up:  # else it is told of as soon as it can take it
-            self._tell_lost(agent)
-
-    def _tell_lost(self, agent: str) -> None:
-        if self._takes_data and self._config.on_agent_loss == "continue":
-            self._call("agent_lost", agent, self._report.lost[agent])
-
-    def _agent_rejoined(self, agent: str) -> None:
-        self._log("info", f"{agent} has rejoined at t = {self._port.now_s():.2f} s")
-        self._journal.event("agent_rejoined", agent=agent)
-        if self._takes_data:
-            self._call("agent_rejoined", agent)
-
     # Towards the operator -----------------------------------------------------------------------
 
     def _command(self, command: Mapping[str, Any]) -> None:
@@ -375,7 +380,10 @@ class HostRuntime:
         self._devices.close()
         network = self._port.socket.counters()
         carried = self._port.carrier.to_mapping()
-        result = self._report.result(self._session, network=network, carried=carried)
+        result = self._report.result(
+            self._session, network=network, carried=carried, intended=self.faults.intended
+        )
+        result["faults"] = self.faults.to_mapping()
         result["host_calls"] = self._calls.to_mapping()
         code = hand_over(result, self._directory, self._operator)
         self._calls.close()
@@ -388,6 +396,12 @@ class HostRuntime:
     def _call(self, name: str, *arguments: Any) -> Any:
         """Call the plug-in; what it raises, or returns against its contract, ends the run by name."""
         return self._guard(self._half.call, name, *arguments)
+
+    def _call_of_loss(self, name: str, *arguments: Any) -> None:
+        if self._takes_data and (
+            name == "agent_rejoined" or self._config.on_agent_loss == "continue"
+        ):
+            self._call(name, *arguments)
 
     def _guard(self, call: Any, *arguments: Any) -> Any:
         try:

@@ -8,6 +8,7 @@ from time import monotonic
 from typing import Any
 
 from madns_runtime.config import HostLaunch
+from madns_runtime.faults.message_faults import MessageFaults
 from madns_runtime.medium.carrier import Carrier
 from madns_runtime.plugin.context import check_sending
 from madns_runtime.protocol.bundle import bundle_up, is_bundle, split
@@ -67,6 +68,8 @@ class HostPort:
         """Messages between agents."""
         self.t0_s: float | None = None
         """Simulated time zero on this machine's monotonic clock; None before it is set."""
+        self.faults: MessageFaults | None = None
+        """Who is shown what the host's half sends, while faults are in force."""
         self.must_pump = False
         """Whether something waits to be sent or carried out."""
         self._kept_for: Address | None = None
@@ -163,6 +166,8 @@ class HostPort:
         deadline_s: float | None = None,
     ) -> None:
         """Send to an agent's half; see `plugin.api.Context.send`."""
+        if self.faults is not None and self.faults.send(to, message, service, deadline_s):
+            return
         now_s = monotonic()
         if service is BEST and deadline_s is None:
             sealed = self.session.seal_data(to, message, now_s)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
+from madns_runtime.faults.intended_losses import IntendedLosses, of_intended
 from madns_runtime.medium.outcomes import between_agents
 from madns_runtime.protocol.events import Phase
 from madns_runtime.protocol.host_peers import Peer
@@ -25,6 +26,8 @@ class HostReport:
     """Fields of agents' streams whose newest values are told."""
     t0_utc: str | None = None
     lost: dict[str, str] = field(default_factory=dict)
+    intended_lost: dict[str, str] = field(default_factory=dict)
+    """Why agents were lost on purpose, the last time."""
     not_stopped: tuple[str, ...] = ()
     """Agents that gave no word that their records are closed."""
     simulation: Mapping[str, Any] = field(default_factory=dict)
@@ -90,6 +93,7 @@ class HostReport:
         *,
         network: Mapping[str, Any],
         carried: Mapping[str, Any] = MappingProxyType({}),
+        intended: IntendedLosses,
     ) -> dict[str, Any]:
         """
         Return the result as the operator's side expects it.
@@ -98,9 +102,16 @@ class HostReport:
             session: The run's.
             network: Counts of the host's socket.
             carried: The host's account of messages between agents.
+            intended: The losses that were ordered.
         """
+        overdue = intended.overdue(self.duration_s) if self._reason is None else {}
+        reasons = {**self.intended_lost, **overdue, **self.lost}
         agents = {
-            name: _agent_result(peer, self.lost.get(name)) for name, peer in session.peers.items()
+            name: {
+                **_agent_result(peer, reasons.get(name), intended.incarnations(name)),
+                **of_intended(intended, name),
+            }
+            for name, peer in session.peers.items()
         }
         ended = self.ending_status or "failed"
         status = "complete" if self._reason is None else ended
@@ -113,7 +124,8 @@ class HostReport:
             "completed_s": self.completed_s,
             "rtf": _worst_rtf(agents.values()),
             "agents": agents,
-            "lost": sorted(self.lost),
+            "lost": sorted({*self.lost, *overdue}),
+            "lost_on_purpose": intended.names(),
             "not_stopped": list(self.not_stopped),
             "network": network,
             "messages": _totals(agents.values()),
@@ -130,7 +142,9 @@ class HostReport:
         }
 
 
-def _agent_result(peer: Peer, loss_reason: str | None) -> dict[str, Any]:
+def _agent_result(
+    peer: Peer, loss_reason: str | None, ended_on_purpose: Sequence[int]
+) -> dict[str, Any]:
     summary = dict(peer.summary)
     simulation = summary.pop("simulation", {})
     records = dict(peer.records)
@@ -139,14 +153,23 @@ def _agent_result(peer: Peer, loss_reason: str | None) -> dict[str, Any]:
         "reason": loss_reason,
         "incarnations": len(peer.incarnations_seen),
         **summary,
-        "messages": _messages(peer, records.pop("messages", None), records.get("held_dropped", 0)),
+        "messages": _messages(
+            peer,
+            records.pop("messages", None),
+            records.get("held_dropped", 0),
+            ended_on_purpose=ended_on_purpose,
+        ),
         "records": records,
         "simulation": simulation,
     }
 
 
 def _messages(
-    peer: Peer, agent_side: Mapping[str, Any] | None, held_dropped: int
+    peer: Peer,
+    agent_side: Mapping[str, Any] | None,
+    held_dropped: int,
+    *,
+    ended_on_purpose: Sequence[int] = (),
 ) -> dict[str, Any]:
     """
     Join both ends' counters of an agent's link.
@@ -154,13 +177,19 @@ def _messages(
     The agent counts before its last word, the host after it. Without the agent's own count nobody
     knows what was lost: None, and a check on it does not hold. What came while the agent's half was
     being set up, and was too much to hold (*held_dropped*), never reached it: lost, of whichever class.
+    Deadlines that an end on purpose broke are told apart: nothing else could become of them.
     """
     host_side: Mapping[str, Any] = peer.link.counters.to_mapping() if peer.link else {}
     joined: dict[str, Any] = {
         service: _joined(service, host_side, agent_side) for service in SERVICES
     }
-    sides = (host_side, agent_side or {}, *peer.retired_counters)
-    joined["sync"]["deadlines_broken"] = sum(side.get("deadlines_broken", 0) for side in sides)
+    lives = (*peer.retired_counters, host_side)
+    broken = [side.get("deadlines_broken", 0) for side in lives]
+    excused = [count for life, count in enumerate(broken, start=1) if life in ended_on_purpose]
+    own = (agent_side or {}).get("deadlines_broken", 0)
+    joined["sync"]["deadlines_broken"] = own + sum(broken) - sum(excused)
+    if any(excused):
+        joined["sync"]["deadlines_broken_on_purpose"] = sum(excused)
     if joined["reliable"]["lost"] is not None:
         joined["reliable"]["lost"] += held_dropped
     joined["not_sent"] = peer.not_sent

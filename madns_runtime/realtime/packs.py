@@ -58,6 +58,10 @@ class Pack:
         """Take an agent in."""
         self._members.append(member)
 
+    def leave_out(self, member: PackMember) -> None:
+        """Tick without an agent that has ended."""
+        self._members = [other for other in self._members if other is not member]
+
     def arm(self) -> None:
         """Wake up for the earliest tick of any member."""
         earliest_s, first = math.inf, None

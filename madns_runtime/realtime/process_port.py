@@ -62,6 +62,9 @@ class ProcessPort:
         """Bytes that may be on their way to each agent unread, so that all together fit the socket's buffer."""
         self._reactor = reactor
         self._made = 0
+        self.awaited = 0
+        """Agents of the process that have ended and will return to it."""
+        self._is_open = False
         self._is_frozen = False
         self._takers: dict[int, Callable[[bytes], None]] = {}
         self._packets_max = PACKETS_BATCH_MAX if agents > 1 else 1
@@ -94,13 +97,20 @@ class ProcessPort:
 
     def listen(self, agent_index: int, take: Callable[[bytes], None]) -> None:
         """Hand the datagrams for an agent, by its index on the wire, to *take*."""
-        if not self._takers:
+        if not self._is_open:
+            self._is_open = True
             self._reactor.add_reader(self.socket.fileno(), self._readable)
         self._takers[agent_index] = take
 
     def leave(self, agent_index: int) -> None:
         """Listen for an agent no more; the last one closes the socket."""
-        if self._takers.pop(agent_index, None) is not None and not self._takers:
+        self._takers.pop(agent_index, None)
+        self.close_if_unused()
+
+    def close_if_unused(self) -> None:
+        """Close the socket of which no agent hears, unless one is to return."""
+        if not self._takers and not self.awaited and self._is_open:
+            self._is_open = False
             self._reactor.remove_reader(self.socket.fileno())
             self.socket.close()
             self.account.close()

@@ -32,9 +32,9 @@ from madns_runtime.reactor.operator_link import OPERATOR_GONE, OperatorLink, tel
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.reattachment import way_back_of
 from madns_runtime.reactor.scheduling import freeze_garbage, outlive_parent
-from madns_runtime.realtime.agent import AgentOutcome
 from madns_runtime.realtime.agent_calls import AgentCalls, LoopSeat
 from madns_runtime.realtime.agent_process import AgentProcess
+from madns_runtime.realtime.agent_report import AgentOutcome
 
 RESTART_DELAY_S = 0.2
 KILL_GRACE_S = 3.0
@@ -57,6 +57,10 @@ class SupervisedProcess:
     may_restart: bool = True
     """Permission to start it again: granted to a killed one, not to one that ended by order or with the run."""
     has_ended_well: bool = False
+    is_killed: bool = False
+    """Whether a fault has ended it on purpose."""
+    returns_after_s: float | None = None
+    """Time from then to its return, s; None for never."""
 
 
 class Supervisor:
@@ -158,6 +162,7 @@ class Supervisor:
                 ],
                 replace(self._program, life=incarnation),
                 life_fd=self._life_read_fd,
+                tell_killed=self._write_killed,
             )
             with register(
                 self._launch.config.run, "agent", ",".join(agents), self._launch.directory
@@ -189,6 +194,10 @@ class Supervisor:
             }
             os.write(self._reason_write_fd, orjson.dumps(told) + b"\n")
 
+    def _write_killed(self, agent: str, reason: str, after_s: float | None) -> None:
+        told = {"pid": os.getpid(), "agent": agent, "killed": reason, "returns_after_s": after_s}
+        os.write(self._reason_write_fd, orjson.dumps(told) + b"\n")
+
     def _read_outcomes(self) -> None:
         try:
             data = os.read(self._reason_read_fd, 65_536)
@@ -198,6 +207,9 @@ class Supervisor:
             told = orjson.loads(line)
             child = self._children.get(told["pid"])
             if child is None:
+                continue
+            if "killed" in told:
+                child.is_killed, child.returns_after_s = True, told["returns_after_s"]
                 continue
             if told["as_ordered"]:
                 child.has_ended_well = True
@@ -228,15 +240,8 @@ class Supervisor:
         signal_name = signal.Signals(-code).name if code < 0 else None
         how = _how(code, signal_name, child.reason, where=where)
         has_failed = code != 0 or not child.has_ended_well
-        will_restart = (
-            has_failed
-            and child.may_restart
-            and not self._is_ending
-            and not self._operator.is_silent  # a cut link: the operator will start them again
-            and self._launch.config.on_agent_loss == "continue"
-            and child.incarnation <= self._launch.config.agents.restarts_max
-        )
-        self._failed = self._failed or has_failed
+        will_restart = has_failed and not self._is_ending and self._may_restart(child)
+        self._failed = self._failed or (has_failed and not child.is_killed)
         if self._is_ending and code > 0 and child.reason is None:
             self._tell_killed(
                 child, f"; machines/{self._launch.machine}/stderr.txt shows where it hung"
@@ -257,8 +262,19 @@ class Supervisor:
             self._to_fork.append(child.agents)
             self._restart_soon(child)
 
+    def _may_restart(self, child: SupervisedProcess) -> bool:
+        """Tell whether a process that failed is started again: by a fault's own word, or by the scenario's."""
+        if child.is_killed:
+            return child.returns_after_s is not None
+        return (
+            child.may_restart
+            and not self._operator.is_silent  # a cut link: the operator will start them again
+            and self._launch.config.on_agent_loss == "continue"
+            and child.incarnation <= self._launch.config.agents.restarts_max
+        )
+
     def _restart_soon(self, child: SupervisedProcess) -> None:
-        due_s = self._reactor.now_s() + RESTART_DELAY_S
+        due_s = self._reactor.now_s() + max(child.returns_after_s or 0.0, RESTART_DELAY_S)
         self._reactor.call_at(due_s, partial(self._restart, child))
 
     def _restart(self, child: SupervisedProcess) -> None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from time import monotonic
+from time import monotonic, sleep
 from typing import Any
 
 from madns_runtime.config import RunConfig
+from madns_runtime.faults.step_faults import StepFaults
 from madns_runtime.plugin.api import Tick
 from madns_runtime.realtime.agent_calls import AGENT, IDLE, METHOD, STEP, T_S, LoopSeat
 from madns_runtime.realtime.agent_link import AgentPort
@@ -17,6 +18,9 @@ from madns_runtime.realtime.loop_account import Span
 from madns_runtime.recording.recorder import Recorder
 from madns_runtime.timing.late_causes import Cause
 from madns_runtime.timing.rate import Pacer, RealTimeFactor, count_ticks
+
+SLOWED_S_MAX = 1.0
+"""The most that a fault makes a step longer, s: the loop has its process's other work to do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,6 +83,7 @@ class PacedTicks:
         self._calls = calls
         # Called every tick: without a layer between.
         self._prepare, self._step, self._is_running = calls.prepare, calls.step, calls.is_running
+        self._faults = StepFaults()
         self.say_how_it_is = calls.say_how_it_is
         self._look = port.conditions.look if port.conditions.must_look else None
 
@@ -102,6 +107,25 @@ class PacedTicks:
         """Close the account at simulated time *now_s*, s."""
         self.pacer.finish(now_s)
         self.late.never_run(self.pacer.missed, monotonic())
+
+    def hinder(self, word: str, factor: float, *, begins: bool) -> StepFaults:
+        """Begin or end a fault of the steps, and return those in force: without any, steps cost what they did."""
+        faults, calls = self._faults, self._calls
+        (faults.begin if begins else faults.end)(word, factor)
+        self._step = self._hindered if faults.are_in_force else calls.step
+        # What comes between agents is heard with a step, in the next that is taken.
+        self._prepare = None if faults.is_hung else calls.prepare
+        return faults
+
+    def _hindered(self, tick: Tick) -> None:
+        """Take a step that faults let be taken, as slowly as they say: the loop is held up by it."""
+        faults = self._faults
+        if faults.is_hung:
+            faults.withheld += 1
+            return
+        began_s = monotonic()
+        self._calls.step(tick)
+        sleep(min((monotonic() - began_s) * (faults.factor - 1.0), SLOWED_S_MAX))
 
     def next_deadline_s(self) -> float:
         """Return the simulated time at which the next one is due, s; infinite while there is none."""

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal
 
 from annotated_types import Gt, Le
 
-from madns_runtime.timeline.action import ActionKind
+from madns_runtime.timeline.action import ActionKind, TimelineAction
 
 KILL: Final = "kill"
 RESTART: Final = "restart"
@@ -28,6 +28,7 @@ Traffic = Literal["all", "with_host", "between_agents"]
 Probability = Annotated[float, Gt(0.0), Le(1.0)]
 DELAY_S_MAX: Final = 3600.0
 Delay = Annotated[float, Gt(0.0), Le(DELAY_S_MAX)]
+MUST_CONTINUE: Final = "expected on_agent_loss: continue, got abort: the loss would end the run"
 _FORBID: Final[dict[str, Any]] = {"extra": "forbid"}
 
 
@@ -146,3 +147,21 @@ FAULT_KINDS: Final[tuple[ActionKind, ...]] = (
     ),
 )
 """Every fault of agents and of their messages, by which `timeline:` and `cosmos inject` know it."""
+FAULT_WORDS: Final = tuple(kind.word for kind in FAULT_KINDS)
+
+
+def killed_words(action: TimelineAction) -> str:
+    """Return why the agents of a kill or a restart are lost, in words."""
+    did = "restarted" if action.word == RESTART else "killed"
+    until = "" if action.for_s is None else f" for {action.for_s:g} s"
+    return f"{did} on purpose at t = {action.t_s:g} s{until}"
+
+
+def nobody_words(action: TimelineAction) -> str:
+    """Return why an action is refused of which no agent is there."""
+    return f"{', '.join(action.agents)}: not running, so there is nothing to {action.word}"
+
+
+def factor_of(action: TimelineAction) -> float:
+    """Return the factor of a fault of steps; 1 of one that has none."""
+    return float(action.parameters.get("factor", 1.0))

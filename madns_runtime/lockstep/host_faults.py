@@ -1,0 +1,120 @@
+"""Faults of a lockstep run, at its host: they begin and end between two ticks."""
+
+from __future__ import annotations
+
+from madns_runtime.config import RunConfig
+from madns_runtime.faults.message_faults import MessageEnds, MessageFaults
+from madns_runtime.lockstep.absences import RESTART_DELAY_S, Absences
+from madns_runtime.lockstep.clock import SimulatedClock
+from madns_runtime.lockstep.host_half import LockstepHalf
+from madns_runtime.lockstep.messages import Outbox
+from madns_runtime.lockstep.result import RunAccount
+from madns_runtime.timeline import fault_kinds as kinds
+from madns_runtime.timeline.action import ActionRefused, TimelineAction
+
+
+class LockstepFaults:
+    """
+    Carries out the faults of a run; a handler of `timeline.action.ActionHandler`.
+
+    Args:
+        config: The run.
+        account: Of the run.
+        absences: Whom the run goes on without.
+        half: The simulation's.
+        outbox: The host's messages.
+        clock: Simulated time.
+    """
+
+    def __init__(  # noqa: PLR0913 - the collaborators of a seam, all by name
+        self,
+        config: RunConfig,
+        *,
+        account: RunAccount,
+        absences: Absences,
+        half: LockstepHalf,
+        outbox: Outbox,
+        clock: SimulatedClock,
+    ) -> None:
+        self._goes_on = config.on_agent_loss == "continue"
+        self._account = account
+        self._absences = absences
+        self._half = half
+        self._outbox = outbox
+        self._clock = clock
+        self._messages = MessageFaults(
+            account.names,
+            config.seed,
+            now_s=clock.now_s,
+            ends=MessageEnds(
+                receive=half.take_now, send=outbox.send, engage=self._engage, held=_nothing
+            ),
+        )
+        self.to_mapping = self._messages.to_mapping
+        self._is_engaged = False
+
+    def begin(self, action: TimelineAction) -> None:
+        """
+        Put a fault in force.
+
+        Raises:
+            ActionRefused: The run does not go on without an agent, or none of them is there.
+            RunEnds: A worker hangs, or nobody is left.
+        """
+        if action.word in kinds.MESSAGE_FAULTS:
+            self._messages.begin(action)
+            return
+        there = [name for name in action.agents if not self._is_lost(name)]
+        if action.word in kinds.LOSSES and not self._goes_on:
+            raise ActionRefused(kinds.MUST_CONTINUE)
+        if not there:
+            raise ActionRefused(kinds.nobody_words(action))
+        if action.word in kinds.LOSSES:
+            self._kill(action, there)
+        else:
+            self._absences.order(action.word, kinds.factor_of(action), there, begins=True)
+
+    def end(self, action: TimelineAction) -> None:
+        """
+        Lift a fault; an agent that was killed returns by itself.
+
+        Raises:
+            RunEnds: A worker hangs.
+        """
+        if action.word in kinds.MESSAGE_FAULTS:
+            self._messages.end(action)
+        elif action.word not in kinds.LOSSES:
+            factor = kinds.factor_of(action)
+            self._absences.order(action.word, factor, action.agents, begins=False)
+
+    def release(self) -> None:
+        """
+        Let go on what faults have held back until now.
+
+        Raises:
+            RunEnds: The half raised.
+        """
+        if self._is_engaged:
+            self._messages.release()
+
+    def _kill(self, action: TimelineAction, agents: list[str]) -> None:
+        after_s = RESTART_DELAY_S if action.word == kinds.RESTART else action.for_s
+        why = kinds.killed_words(action)
+        returns_s = None if after_s is None else max(action.t_s, self._clock.t_s) + after_s
+        for agent in agents:
+            self._account.intended.order(agent, why, returns_s=returns_s)
+        self._absences.order(kinds.KILL, why, agents, begins=True)
+        self._absences.take()
+
+    def _is_lost(self, agent: str) -> bool:
+        return self._account.agents[self._account.names.index(agent)].is_lost
+
+    def _engage(self, is_on: bool) -> None:
+        self._is_engaged = is_on
+        messages = self._messages if is_on else None
+        self._half.intercept(messages)
+        self._outbox.faults = messages
+
+
+def _nothing() -> None:
+    """Do nothing: the host looks before each tick."""

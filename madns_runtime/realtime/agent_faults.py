@@ -1,0 +1,45 @@
+"""Faults that befall one agent in real time, as its own process carries them out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from madns_runtime.protocol.messages import AgentFault
+from madns_runtime.realtime.ticks import PacedTicks
+from madns_runtime.recording.run_journal import RunJournal
+from madns_runtime.timeline.fault_kinds import LOSSES
+
+
+class AgentFaults:
+    """
+    The faults of one agent.
+
+    Args:
+        ticks: Its ticks.
+        journal: Its own.
+        killed: Called when it is to end, with why, and the time until its return, s; None for never.
+    """
+
+    def __init__(
+        self,
+        ticks: PacedTicks,
+        journal: RunJournal,
+        *,
+        killed: Callable[[str, float | None], None],
+    ) -> None:
+        self._ticks = ticks
+        self._journal = journal
+        self._killed = killed
+
+    def take(self, order: AgentFault) -> None:
+        """Begin or end a fault."""
+        if order.word in LOSSES:
+            after_s = None if math.isnan(order.value) else order.value
+            self._journal.event("killed", reason=order.reason, returns_after_s=after_s)
+            self._killed(order.reason, after_s)
+            return
+        faults = self._ticks.hinder(order.word, order.value, begins=order.begins)
+        name = f"{order.word}_{'begins' if order.begins else 'ends'}"
+        told = {} if order.begins else {"ticks_withheld": faults.withheld}
+        self._journal.event(name, factor=order.value, **told)

@@ -1,0 +1,67 @@
+"""Agents that are lost in a run in real time, and that rejoin: what is noted and told of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from madns_runtime.realtime.announcements import Announcements
+from madns_runtime.realtime.host_faults import HostFaults
+from madns_runtime.realtime.host_result import HostReport
+from madns_runtime.recording.run_journal import RunJournal
+
+
+class AgentLosses:
+    """
+    Takes note of losses.
+
+    Args:
+        report: The host's account.
+        faults: Knows which of them were ordered.
+        announced: Tells the operator.
+        journal: The host's.
+        call: Calls the simulation's half, if it is to hear of losses.
+        now_s: Returns the simulated time, s.
+    """
+
+    def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
+        self,
+        report: HostReport,
+        faults: HostFaults,
+        *,
+        announced: Announcements,
+        journal: RunJournal,
+        call: Callable[..., Any],
+        now_s: Callable[[], float],
+    ) -> None:
+        self._report = report
+        self._faults = faults
+        self._announced = announced
+        self._journal = journal
+        self._call = call
+        self._now_s = now_s
+        self._reasons: dict[str, str] = {}
+
+    def lost(self, agent: str, reason: str, *, may_tell: bool) -> None:
+        """Note a loss, and tell the half of it if that can take it."""
+        if self._faults.lost(agent):
+            self._report.intended_lost[agent] = reason
+            self._announced.log("warning", f"{agent} is lost on purpose: {reason}")
+        else:
+            self._report.lost[agent] = reason
+            self._announced.log("error", f"{agent} is lost: {reason}")
+        self._reasons[agent] = reason
+        if may_tell:
+            self.tell(agent)
+
+    def tell(self, agent: str) -> None:
+        """Tell the half that an agent is lost, if it is."""
+        if agent in self._reasons:
+            self._call("agent_lost", agent, self._reasons[agent])
+
+    def rejoined(self, agent: str) -> None:
+        """Note a return, and tell the half of it."""
+        self._faults.returned(agent)
+        self._announced.log("info", f"{agent} has rejoined at t = {self._now_s():.2f} s")
+        self._journal.event("agent_rejoined", agent=agent)
+        self._call("agent_rejoined", agent)

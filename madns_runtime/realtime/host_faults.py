@@ -1,0 +1,139 @@
+"""Faults of a run in real time, at its host: what is ordered from agents, what befalls messages, who is lost by it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from time import monotonic
+from typing import Any
+
+from madns_runtime.config import RunConfig
+from madns_runtime.faults.intended_losses import IntendedLosses
+from madns_runtime.faults.message_faults import MessageEnds, MessageFaults
+from madns_runtime.plugin.half import HostHalf
+from madns_runtime.protocol.messages import AgentFault, Service
+from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.realtime.host_link import HostPort
+from madns_runtime.timeline import fault_kinds as words
+from madns_runtime.timeline.action import ActionRefused, TimelineAction
+
+
+class HostFaults:
+    """
+    Carries out the faults of a run; a handler of `timeline.action.ActionHandler`.
+
+    Args:
+        config: The run.
+        port: The host's way to its agents.
+        half: The simulation's.
+        guard: Calls the plug-in, and ends the run over what it raises.
+        reactor: The loop.
+        pump: Carries out and sends what is due.
+    """
+
+    def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
+        self,
+        config: RunConfig,
+        *,
+        port: HostPort,
+        half: HostHalf,
+        guard: Callable[..., Any],
+        reactor: Reactor,
+        pump: Callable[[], None],
+    ) -> None:
+        self.intended = IntendedLosses()
+        self._goes_on = config.on_agent_loss == "continue"
+        self._duration_s = config.time.duration_s
+        self._port = port
+        self._half = half
+        self._pump = pump
+        self._messages = MessageFaults(
+            config.agents.resolved_names(),
+            config.seed,
+            now_s=port.now_s,
+            ends=MessageEnds(
+                receive=lambda agent, message: guard(half.take_now, agent, message),
+                send=port.send,
+                engage=self._engage,
+                held=self._arm,
+            ),
+        )
+        self.to_mapping = self._messages.to_mapping
+        # Infinite is never: the timer is made once and moved.
+        self._timer = reactor.call_at(math.inf, self._due)
+
+    def begin(self, action: TimelineAction) -> None:
+        """
+        Put a fault in force.
+
+        Raises:
+            ActionRefused: The run does not go on without an agent, or none of them is there.
+        """
+        if action.word in words.MESSAGE_FAULTS:
+            self._messages.begin(action)
+        elif action.word in words.LOSSES:
+            self._kill(action)
+        elif not self._order(action, begins=True):
+            raise ActionRefused(words.nobody_words(action))
+
+    def end(self, action: TimelineAction) -> None:
+        """Lift a fault; an agent that was killed returns by itself."""
+        if action.word in words.MESSAGE_FAULTS:
+            self._messages.end(action)
+        elif action.word not in words.LOSSES:
+            self._order(action, begins=False)
+
+    # Agents ---------------------------------------------------------------------------------------
+
+    def _kill(self, action: TimelineAction) -> None:
+        if not self._goes_on:
+            raise ActionRefused(words.MUST_CONTINUE)
+        after_s = 0.0 if action.word == words.RESTART else action.for_s
+        returns_s = None if after_s is None else self._port.now_s() + after_s
+        why = words.killed_words(action)
+        value = math.nan if after_s is None else after_s
+        told = 0
+        for agent in action.agents:
+            if self._send(agent, AgentFault(action.word, True, value, why)):
+                self.intended.order(agent, why, returns_s=returns_s)
+                told += 1
+        self._port.session.await_returns(self.intended.are_expected(self._duration_s))
+        if not told:
+            raise ActionRefused(words.nobody_words(action))
+
+    def _order(self, action: TimelineAction, *, begins: bool) -> bool:
+        """Have agents begin or end a fault of their steps; return whether one of them is there."""
+        factor = words.factor_of(action)
+        orders = [self._send(a, AgentFault(action.word, begins, factor)) for a in action.agents]
+        return any(orders)
+
+    def _send(self, agent: str, order: AgentFault) -> bool:
+        is_there = self._port.session.send(agent, order, Service.SYNC, monotonic())
+        self._port.must_pump = True
+        return is_there
+
+    def lost(self, agent: str) -> bool:
+        """Note that an agent is lost, and tell whether that was ordered."""
+        incarnation = len(self._port.session.peers[agent].incarnations_seen)
+        return self.intended.take(agent, incarnation) is not None
+
+    def returned(self, agent: str) -> None:
+        """Note that an agent is back."""
+        self.intended.returned(agent)
+        self._port.session.await_returns(self.intended.are_expected(self._duration_s))
+
+    # Messages -------------------------------------------------------------------------------------
+
+    def _engage(self, is_on: bool) -> None:
+        messages = self._messages if is_on else None
+        self._half.intake = None if messages is None else messages.take
+        self._port.faults = self._half.carrier.faults = messages
+
+    def _arm(self) -> None:
+        next_s, t0_s = self._messages.next_s(), self._port.t0_s
+        self._timer.reschedule(math.inf if next_s is None or t0_s is None else t0_s + next_s)
+
+    def _due(self) -> None:
+        self._messages.release()
+        self._arm()
+        self._pump()
