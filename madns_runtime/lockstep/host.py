@@ -20,6 +20,7 @@ from madns_runtime.lockstep import frames
 from madns_runtime.lockstep.absences import Absences
 from madns_runtime.lockstep.barrier import Meeting, RunEnds
 from madns_runtime.lockstep.clock import SimulatedClock
+from madns_runtime.lockstep.host_faults import LockstepFaults
 from madns_runtime.lockstep.host_half import LockstepHalf
 from madns_runtime.lockstep.messages import Outbox, decode
 from madns_runtime.lockstep.partition import processors_here, share_out
@@ -41,6 +42,7 @@ from madns_runtime.reactor.operator_link import tell_loading
 from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.watchdog import end_after_hang_up
 from madns_runtime.recording.result_file import hand_over, leave
+from madns_runtime.timeline.fault_kinds import FAULT_WORDS
 from madns_runtime.timing.clock import utc_now_iso
 from madns_runtime.timing.rate import count_ticks
 
@@ -134,6 +136,15 @@ class LockstepHost:
             clock=clock,
             log=self._log,
         )
+        self._faults = LockstepFaults(
+            config,
+            account=account,
+            absences=self._absences,
+            half=self._guarded,
+            outbox=self._outbox,
+            clock=clock,
+        )
+        self._timeline.handlers.update(dict.fromkeys(FAULT_WORDS, self._faults))
         self._machine = host_machine()
 
     def run(self) -> int:
@@ -215,6 +226,7 @@ class LockstepHost:
                 self._guarded.call_timer(self._clock.t_s)
             self._meeting.serve()
         self._clock.t_s = t_s
+        self._faults.release()
         self._carrier.hand_over()
 
     def _drain(self) -> None:
@@ -303,6 +315,7 @@ class LockstepHost:
         self._fire(HostEvent.CLEANED_UP)
         self._account.records = self._journal.close().to_mapping()
         self._account.peer_messages = self._carrier.to_mapping()
+        self._account.faults = self._faults.to_mapping()
         self._fire(HostEvent.RECORDS_CLOSED)
         self._fire(HostEvent.SERVER_STOPPED)
 

@@ -127,6 +127,8 @@ class RunAccount:
     simulation: Mapping[str, Any] = field(default_factory=dict)
     peer_messages: Mapping[str, Any] = field(default_factory=dict)
     """The host's account of messages between agents."""
+    faults: Mapping[str, Any] = field(default_factory=dict)
+    """The account of faults of messages."""
     records: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -239,6 +241,7 @@ class RunAccount:
                 ),
             ),
             "refused": {},
+            "faults": dict(self.faults),
             "records": dict(self.records),
             "columns": list(self.columns),
             "simulation": dict(self.simulation),

@@ -98,49 +98,63 @@ class DownLink:
 
 FAULT_KINDS: Final[tuple[ActionKind, ...]] = (
     ActionKind(
+        carried_out_by="framework",
         word=KILL,
         summary="Ends the agents without a word; with for_s they return after it.",
         lasting="may",
     ),
-    ActionKind(word=RESTART, summary="Ends the agents without a word, and starts them anew."),
-    ActionKind(word=HANG, summary="Withholds the agents' steps.", lasting="may"),
     ActionKind(
+        carried_out_by="framework",
+        word=RESTART,
+        summary="Ends the agents without a word, and starts them anew.",
+    ),
+    ActionKind(
+        carried_out_by="framework", word=HANG, summary="Withholds the agents' steps.", lasting="may"
+    ),
+    ActionKind(
+        carried_out_by="framework",
         word=SLOW,
         summary="Makes the agents' steps take longer by a factor.",
         parameters=SlowSteps,
         lasting="may",
     ),
     ActionKind(
+        carried_out_by="framework",
         word=LOSE,
         summary="Loses messages of the agents by chance.",
         parameters=LostMessages,
         lasting="may",
     ),
     ActionKind(
+        carried_out_by="framework",
         word=DELAY,
         summary="Delivers messages of the agents later.",
         parameters=DelayedMessages,
         lasting="may",
     ),
     ActionKind(
+        carried_out_by="framework",
         word=REORDER,
         summary="Lets messages of the agents overtake each other.",
         parameters=ReorderedMessages,
         lasting="may",
     ),
     ActionKind(
+        carried_out_by="framework",
         word=DUPLICATE,
         summary="Delivers messages of the agents twice.",
         parameters=DuplicatedMessages,
         lasting="may",
     ),
     ActionKind(
+        carried_out_by="framework",
         word=LINK_DOWN,
         summary="Cuts the agents off from the host's half and from each other.",
         parameters=DownLink,
         lasting="may",
     ),
     ActionKind(
+        carried_out_by="framework",
         word=PARTITION,
         summary="Parts the agents from all others: neither side hears the other.",
         lasting="may",

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Final, Literal
 from annotated_types import Ge, Le, MaxLen, MinLen
 
 from madns_runtime.timeline.action import ActionKind
+from madns_runtime.timeline.fault_kinds import FAULT_KINDS
 
 DeviceFaultWord = Literal["freeze", "bias", "noise", "drop", "delay", "disconnect", "clear"]
 TEXT_CHARACTERS_MAX: Final = 200
@@ -84,7 +85,7 @@ DEVICE_FAULT: Final = ActionKind(
     lasting="may",
     carried_out_by="framework",
 )
-FRAMEWORK_ACTIONS: Final = (ANNOTATE, STOP, STRESS, DEVICE_FAULT)
+FRAMEWORK_ACTIONS: Final = (ANNOTATE, STOP, STRESS, DEVICE_FAULT, *FAULT_KINDS)
 
 
 def kinds_by_word(declared: Iterable[ActionKind] = ()) -> Mapping[str, ActionKind]:
