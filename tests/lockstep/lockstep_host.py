@@ -20,6 +20,7 @@ from madns_runtime.config import (
     TimeSettings,
     to_mapping,
 )
+from madns_runtime.timeline.entries import ScheduledEntry
 
 HERE = Path(__file__).parent
 PATIENCE_S = 60.0
@@ -40,13 +41,15 @@ class HostRun:
         timeouts: Timeouts | None = None,
         executor: str = "thread",
         restarts_max: int | None = None,
+        simulation: str = "./lockstep_simulation.py:simulation",
+        timeline: tuple[ScheduledEntry, ...] = (),
     ) -> None:
         """With *restarts_max* the run goes on without an agent that is lost."""
         self.folder = folder
         config = RunConfig(
             run=run,
             scenario="lockstep",
-            simulation="./lockstep_simulation.py:simulation",
+            simulation=simulation,
             base_directory=str(HERE),
             agents=Agents(
                 count=6, tick_hz=10.0, per_process=per_process, restarts_max=restarts_max or 0
@@ -56,7 +59,8 @@ class HostRun:
             timeouts=timeouts or Timeouts(shutdown_s=5.0),
             seed=seed,
             executor=ExecutorSettings(kind=executor, workers=2),
-            parameters={"fault": fault},
+            parameters={} if timeline else {"fault": fault},
+            timeline=timeline,
         )
         (folder / "host").mkdir(parents=True)
         launch = HostLaunch(
@@ -106,6 +110,11 @@ class HostRun:
         """Return the records of a stream of arrays."""
         lines = (self.folder / path).read_text().splitlines()
         return [value for line in lines if isinstance(value := json.loads(line), list)]
+
+    def events_of(self, who: str) -> list[dict[str, Any]]:
+        """Return what happened to the host, or to agents/NAME."""
+        lines = (self.folder / who / "events.jsonl").read_text().splitlines()
+        return [event for line in lines if "event" in (event := json.loads(line))]
 
     def _read(self) -> None:
         assert self.process.stdout is not None
