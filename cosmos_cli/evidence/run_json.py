@@ -97,8 +97,13 @@ class Evidence:
         names = tuple(dict.fromkeys((*self.expected.agents, *self.ticks.agents)))
         is_complete = self.result is not None and self.result.get("status") == "complete"
         due_each = self._ticks_due() if is_complete else None
+        lost = self._lost()
         return tick_totals(
-            self.ticks.agents, self._of_agents("ticks"), agents=names, due_each=due_each
+            self.ticks.agents,
+            self._of_agents("ticks"),
+            agents=names,
+            due_each=due_each,
+            excused=[name for name in self._lost_on_purpose() if name not in lost],
         )
 
     def _causes(self, totals: TickTotals) -> CauseTotals | None:
@@ -246,6 +251,10 @@ class Evidence:
         lost = (self.result or {}).get("lost")
         return tuple(map(str, lost)) if isinstance(lost, Sequence | Mapping) else ()
 
+    def _lost_on_purpose(self) -> tuple[str, ...]:
+        lost = (self.result or {}).get("lost_on_purpose")
+        return tuple(map(str, lost)) if isinstance(lost, list) else ()
+
     def _document(
         self, verdict: Verdict, totals: TickTotals, causes: CauseTotals | None
     ) -> dict[str, Any]:
@@ -305,12 +314,10 @@ class Evidence:
             if self._is_restarted(name)
         }
         count = len(self.expected.agents) or len(self.ticks.agents)
-        on_purpose = (self.result or {}).get("lost_on_purpose")
-        intended = {"lost_on_purpose": list(on_purpose)} if isinstance(on_purpose, list) else {}
         return {
             "count": count,
             "lost": list(self._lost()),
-            **intended,
+            "lost_on_purpose": list(self._lost_on_purpose()),
             "incarnations": restarted,
         }
 

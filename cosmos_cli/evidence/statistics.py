@@ -7,7 +7,7 @@ where it came from.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -147,6 +147,7 @@ def tick_totals(
     *,
     agents: Sequence[str],
     due_each: int | None,
+    excused: Collection[str] = (),
 ) -> TickTotals:
     """
     Count ticks so that nothing that is missing looks as if it had run.
@@ -157,13 +158,14 @@ def tick_totals(
         agents: All agents that should have ticked.
         due_each: Ticks that were due of each by the plan, if the run came to its end. An agent that
             rejoined counts only from then on, and one that died counts nothing.
+        excused: Agents that were away on purpose, and for no other reason: nothing was due of them then.
     """
     totals: dict[str, TickTotals] = {}
     for name in agents:
         own, seen = counters.get(name, {}), recorded.get(name)
         seen_run, seen_missed = (seen.run, seen.missed) if seen else (0, 0)
         totals[name] = TickTotals(
-            due=max(whole_count(own.get("due")), due_each or 0, seen_run + seen_missed),
+            due=max(_due(own, due_each, is_excused=name in excused), seen_run + seen_missed),
             run=max(whole_count(own.get("run")), seen_run),
             overrun_errors=max(whole_count(own.get("overrun_errors")), 0),
         )
@@ -173,6 +175,13 @@ def tick_totals(
         overrun_errors=sum(of.overrun_errors for of in totals.values()),
         agents=totals,
     )
+
+
+def _due(own: Mapping[str, Any], due_each: int | None, *, is_excused: bool) -> int:
+    """Return the ticks that were due of an agent by its own summary and the plan; of one excused, while it was there."""
+    if is_excused:
+        return whole_count(own.get("run")) + whole_count(own.get("missed"))
+    return max(whole_count(own.get("due")), due_each or 0)
 
 
 def _high_ms(samples_us: Distribution) -> dict[str, float]:

@@ -18,10 +18,12 @@ class StepFaults:
         self._hangs = 0
         self._factors: list[float] = []
         self.withheld = 0
-        """Ticks in which the agent was not stepped."""
+        """Ticks in which the agent was not stepped, since faults are in force."""
 
     def begin(self, word: str, factor: float = 1.0) -> None:
         """Put a fault in force: hang, or slow by *factor*."""
+        if not self.are_in_force:
+            self.withheld = 0
         if word == HANG:
             self._hangs += 1
         else:

@@ -90,7 +90,7 @@ def decode_message(body: bytes) -> Message:
         raise MalformedMessage(f"{cls.__name__}: expected a list of {len(names)} fields")
     for name, value, types in zip(names, values, accepted, strict=True):
         # True is an int to Python, but not to the sender.
-        if not isinstance(value, types) or (type(value) is bool and types is not object):
+        if not isinstance(value, types) or (type(value) is bool and types not in (object, bool)):
             raise MalformedMessage(
                 f"{cls.__name__}.{name}: a {type(value).__name__} does not belong here"
             )

@@ -250,7 +250,10 @@ def _totals(agents: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, int | No
 
 def _worst_rtf(agents: Iterable[Mapping[str, Any]]) -> float | None:
     """Return the real-time factor that is farthest from 1, of the agents that ran to the end."""
-    factors = [agent["rtf"] for agent in agents if agent.get("rtf") is not None]
+    told = [agent for agent in agents if agent.get("rtf") is not None]
+    # One that came back late in a run has too short a time for a rate of its own.
+    stayed = [agent for agent in told if "ended_on_purpose" not in agent]
+    factors = [agent["rtf"] for agent in stayed or told]
     return max(factors, key=lambda rtf: abs(rtf - 1.0)) if factors else None
 
 
