@@ -26,7 +26,7 @@ from madns_runtime.health.stress import start_stress, stop_stress
 from madns_runtime.partial_file import write_whole
 from madns_runtime.plugin.context import clean_text
 from madns_runtime.plugin.half import RoleProgram
-from madns_runtime.processes import register
+from madns_runtime.processes import Registration, register
 from madns_runtime.reactor.forking import leave_parent
 from madns_runtime.reactor.operator_link import OPERATOR_GONE, OperatorLink, tell_loading
 from madns_runtime.reactor.reactor import Reactor
@@ -154,19 +154,19 @@ class Supervisor:
         try:
             shared = self._devices.fds_of(agents)
             leave_parent(keep={self._life_read_fd, self._reason_write_fd, *shared})
-            process = AgentProcess(
-                self._launch,
-                [
-                    LoopSeat(name, number, calls, self._devices.hardware_of(name))
-                    for number, name in enumerate(agents)
-                ],
-                replace(self._program, life=incarnation),
-                life_fd=self._life_read_fd,
-                tell_killed=self._write_killed,
-            )
             with register(
                 self._launch.config.run, "agent", ",".join(agents), self._launch.directory
-            ):
+            ) as entry:
+                process = AgentProcess(
+                    self._launch,
+                    [
+                        LoopSeat(name, number, calls, self._devices.hardware_of(name))
+                        for number, name in enumerate(agents)
+                    ],
+                    replace(self._program, life=incarnation),
+                    life_fd=self._life_read_fd,
+                    tell_killed=partial(self._write_killed, entry),
+                )
                 outcomes = process.run()
             code = 0 if all(outcome.as_ordered for outcome in outcomes.values()) else 1
             self._write_outcomes(outcomes)
@@ -194,7 +194,11 @@ class Supervisor:
             }
             os.write(self._reason_write_fd, orjson.dumps(told) + b"\n")
 
-    def _write_killed(self, agent: str, reason: str, after_s: float | None) -> None:
+    def _write_killed(
+        self, entry: Registration, agent: str, reason: str, after_s: float | None
+    ) -> None:
+        """Leave word, as a child that ends without another."""
+        entry.remove()
         told = {"pid": os.getpid(), "agent": agent, "killed": reason, "returns_after_s": after_s}
         os.write(self._reason_write_fd, orjson.dumps(told) + b"\n")
 

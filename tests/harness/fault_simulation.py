@@ -56,6 +56,8 @@ class FaultAgent(AgentSimulation):
         context.open_stream("steps", (Field("t_s"), Field("tick", "", "int")))
 
     def step(self, tick):
+        if tick.index == 20 and self.context.name == self.context.parameters.dies:
+            raise ValueError("told to")
         self.context.record("steps", (tick.t_s, tick.index))
         self.context.send(HOST, ["up", tick.index], SERVICES[tick.index % 3])
         self.context.send("*", ["between", tick.index])
@@ -79,13 +81,16 @@ def medium(host, context):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NothingToSay:
-    """It has no parameters."""
+class Parameters:
+    """Settings."""
+
+    dies: str = ""
+    """An agent that raises in its twentieth tick."""
 
 
 simulation = Simulation(
     name="faults",
-    parameters=NothingToSay,
+    parameters=Parameters,
     host=":FaultHost",
     agent=":FaultAgent",
     medium=":medium",
