@@ -88,6 +88,7 @@ class MessageFaults:
                 word=action.word,
                 agents=frozenset(action.agents),
                 parameters=action.parameters,
+                until_s=math.inf if action.for_s is None else action.t_s + action.for_s,
             )
         )
         self._ends.engage(True)
@@ -156,7 +157,7 @@ class MessageFaults:
             if not must_wait:
                 return 1
         else:
-            fate = self._rules.of_host(agent, direction, service)
+            fate = self._rules.of_host(agent, direction, service, now_s)
         counts = self._counts.setdefault(agent, Counter())
         counts["seen"] += 1
         if fate.is_doubled and service == int(Service.BEST):

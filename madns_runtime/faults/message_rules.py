@@ -7,6 +7,7 @@ The same messages have the same fate in real time, in lockstep, and in whatever 
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -38,6 +39,8 @@ class MessageRule:
     word: str
     agents: frozenset[str]
     parameters: Mapping[str, Any]
+    until_s: float = math.inf
+    """Simulated time of its end, s: a message that is sent again after it comes through."""
 
     def is_of(self, traffic: str) -> bool:
         """Tell whether it concerns messages with_host, or between_agents."""
@@ -103,7 +106,7 @@ class MessageRules:
         """Tell whether a fault may touch messages between an agent and the host's half."""
         return agent in self._with_host
 
-    def of_host(self, agent: str, direction: int, service: int) -> Fate:
+    def of_host(self, agent: str, direction: int, service: int, now_s: float = 0.0) -> Fate:
         """
         Return the fate of the next message between an agent and the host's half.
 
@@ -111,12 +114,13 @@ class MessageRules:
             agent: The agent.
             direction: UP or DOWN.
             service: Its class of service: what is not BEST arrives, late.
+            now_s: Simulated time at which it is sent, s.
         """
         number = self._numbers[agent, direction] = self._numbers.get((agent, direction), 0) + 1
         fate, index = Fate(), self._index[agent]
         for rule in self._with_host[agent]:
             draw = _Draws(self._key, (rule.number, index, direction, number))
-            _apply(rule, fate, draw, is_best=service == _BEST)
+            _apply(rule, fate, draw, left_s=None if service == _BEST else rule.until_s - now_s)
         return fate
 
     def of_way(self, sender: str, receiver: str, number: int) -> Fate:
@@ -135,7 +139,7 @@ class MessageRules:
             if rule.word == words.PARTITION:
                 fate.is_lost = fate.is_lost or is_from != is_to
             elif is_from or is_to:
-                _apply(rule, fate, _Draws(self._key, (rule.number, *ends, number)), is_best=True)
+                _apply(rule, fate, _Draws(self._key, (rule.number, *ends, number)), left_s=None)
         return fate
 
     def up_again_s(self, agent: str, number: int) -> float:
@@ -170,18 +174,20 @@ class _Draws:
         return int.from_bytes(drawn, "little") / _CHANCES
 
 
-def _apply(rule: MessageRule, fate: Fate, draw: Callable[[], float], *, is_best: bool) -> None:
-    """Let one rule touch a message; one that must arrive is late where another is lost."""
-    value = rule.parameters
+def _apply(
+    rule: MessageRule, fate: Fate, draw: Callable[[], float], *, left_s: float | None
+) -> None:
+    """Let one rule touch a message; one that must arrive, in *left_s* at the latest, is late where another is lost."""
+    value, is_best = rule.parameters, left_s is None
     match rule.word:
         case words.LINK_DOWN:
             fate.is_lost = fate.is_lost or is_best
             fate.is_held = fate.is_held or not is_best
         case words.LOSE:
-            if is_best:
+            if left_s is None:
                 fate.is_lost = fate.is_lost or draw() < value["probability"]
             else:
-                fate.late_s += _resent_after_s(value["probability"], draw)
+                fate.late_s += _resent_after_s(value["probability"], draw, left_s)
         case words.DELAY:
             fate.late_s += value["delay_s"] + max(0.0, value["jitter_s"]) * draw()
         case words.REORDER:
@@ -193,11 +199,11 @@ def _apply(rule: MessageRule, fate: Fate, draw: Callable[[], float], *, is_best:
             pass
 
 
-def _resent_after_s(probability: float, draw: Callable[[], float]) -> float:
-    """Return how late a message is that is sent again until it comes through, s."""
+def _resent_after_s(probability: float, draw: Callable[[], float], left_s: float) -> float:
+    """Return how late a message is that is sent again until it comes through, at once after *left_s*, s."""
     late_s, wait_s = 0.0, RESEND_S
     for _ in range(RESENDS_MAX):
-        if draw() >= probability:
+        if late_s >= left_s or draw() >= probability:
             break
         late_s += wait_s * (0.5 + 0.5 * draw())
         wait_s = min(2.0 * wait_s, RESEND_S_MAX)

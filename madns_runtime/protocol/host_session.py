@@ -6,9 +6,9 @@ Owns a link per agent, the state machine, the roster and every deadline; its own
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Mapping, Sequence
+from math import isfinite
 from typing import Any, Literal
 
 from madns_runtime import __version__
@@ -277,8 +277,8 @@ class HostSession:
                 self._send_expelled(peer, now_s)
             case messages.SimulationData(payload):
                 self._events.append(told.AgentDataReceived(peer.name, payload, service))
-            case messages.Transmission(sent_s=t_s) | messages.ConditionMet(t_s=t_s) if (
-                math.isfinite(t_s)
+            case messages.Transmission(sent_s=t_s) | messages.ConditionMet(t_s=t_s) if isfinite(
+                t_s
             ):
                 self._events.append(told.AgentDataReceived(peer.name, message))
             case messages.Ping(t_agent_s, report):
@@ -300,8 +300,7 @@ class HostSession:
             reason = f"{hello.agent} runs MADNS {hello.runtime_version}, the host {__version__}"
             self._lose({peer.name: reason}, now_s)
             self._send_expelled(peer, now_s)
-            return
-        if self.state in (HostState.HOST_STARTUP, HostState.SIMULATION_SETUP):
+        elif self.state in (HostState.HOST_STARTUP, HostState.SIMULATION_SETUP):
             self._roster.move(peer, Phase.READY)
             self._progress(now_s)
         elif self.state in (HostState.HOST_SIMULATION_READY, HostState.SIMULATION_START):
@@ -394,9 +393,8 @@ class HostSession:
             self._state_deadline_s = now_s + self._timeouts.silence_s
             reason = f"no {word} in {waited_s:g} s"
             self._roster.awaits_returns = False
-            if late := self._roster.names_outside(phase):
-                self._lose(dict.fromkeys(late, reason), now_s)
-            else:
+            self._lose(dict.fromkeys(self._roster.names_outside(phase), reason), now_s)
+            if self._roster.is_empty:
                 self.emergency(", ".join(self.peers), f"{reason}: none has returned", now_s)
         elif state is HostState.SIMULATION_SETUP:
             text = f"setup of the simulation took longer than {waited_s:g} s"

@@ -42,7 +42,6 @@ from madns_runtime.reactor.watchdog import end_after_hang_up, extend
 from madns_runtime.realtime.agent_losses import AgentLosses
 from madns_runtime.realtime.announcements import Announcements
 from madns_runtime.realtime.half_timer import HalfTimer
-from madns_runtime.realtime.host_faults import HostFaults
 from madns_runtime.realtime.host_link import HostPort
 from madns_runtime.realtime.host_result import HostReport
 from madns_runtime.realtime.operator_orders import OperatorOrders
@@ -52,7 +51,6 @@ from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
 from madns_runtime.recording.result_file import hand_over
 from madns_runtime.recording.run_journal import RunJournal
-from madns_runtime.timeline.fault_kinds import FAULT_WORDS
 from madns_runtime.timing.clock import utc_at_iso
 
 PROGRESS_INTERVAL_S = 0.5
@@ -154,27 +152,19 @@ class HostRuntime:
             port=self._port,
             journal=self._journal,
             report=self._report,
-            call=self._call,
+            half=self._half,
+            guard=self._guard,
             pump=self._pump,
         )
         self._timeline.wait_for(self._conditions)
-        self.faults = HostFaults(
-            config,
-            port=self._port,
-            half=self._half,
-            guard=self._guard,
-            reactor=self._reactor,
-            pump=self._pump,
-        )
         self._losses = AgentLosses(
             self._report,
-            self.faults,
+            self._timeline.faults,
             announced=self._announced,
             journal=self._journal,
             call=self._call_of_loss,
             now_s=self._port.now_s,
         )
-        self._timeline.handlers.update(dict.fromkeys(FAULT_WORDS, self.faults))
         # Infinite is never: the timer is made once and moved.
         self._progress_timer = self._reactor.call_at(math.inf, self._progress)
         self._is_set_up = self._awaits_jobs = False
@@ -381,9 +371,9 @@ class HostRuntime:
         network = self._port.socket.counters()
         carried = self._port.carrier.to_mapping()
         result = self._report.result(
-            self._session, network=network, carried=carried, intended=self.faults.intended
+            self._session, network=network, carried=carried, intended=self._timeline.faults.intended
         )
-        result["faults"] = self.faults.to_mapping()
+        result["faults"] = self._timeline.faults.to_mapping()
         result["host_calls"] = self._calls.to_mapping()
         code = hand_over(result, self._directory, self._operator)
         self._calls.close()
@@ -398,9 +388,7 @@ class HostRuntime:
         return self._guard(self._half.call, name, *arguments)
 
     def _call_of_loss(self, name: str, *arguments: Any) -> None:
-        if self._takes_data and (
-            name == "agent_rejoined" or self._config.on_agent_loss == "continue"
-        ):
+        if self._takes_data and self._config.on_agent_loss == "continue":
             self._call(name, *arguments)
 
     def _guard(self, call: Any, *arguments: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final
 
 from madns_runtime.conditions.reports import HostConditions, MetCondition
@@ -15,15 +16,17 @@ from madns_runtime.plugin.action_handlers import (
     Stops,
     simulation_handlers,
 )
-from madns_runtime.plugin.half import RoleProgram
+from madns_runtime.plugin.half import HostHalf, RoleProgram
 from madns_runtime.protocol.messages import ActionOrder, Service
 from madns_runtime.protocol.states import HostState
 from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.realtime.host_faults import HostFaults
 from madns_runtime.realtime.host_link import HostPort
 from madns_runtime.realtime.host_result import HostReport
 from madns_runtime.recording.run_journal import RunJournal
 from madns_runtime.timeline.action import ActionHandler
 from madns_runtime.timeline.dispatcher import Dispatcher
+from madns_runtime.timeline.fault_kinds import FAULT_WORDS
 from madns_runtime.timeline.kinds import ANNOTATE, DEVICE_FAULT, STOP, STRESS, kinds_by_word
 from madns_runtime.timeline.runner import TimelineRunner
 
@@ -42,7 +45,8 @@ class HostTimeline:
         port: Knows simulated time and the agents.
         journal: Of the host.
         report: Of the run; a stop shortens its duration.
-        call: Calls a method of the host's half.
+        half: The simulation's.
+        guard: Calls it, and ends the run over what it raises.
         pump: Sends what waits.
     """
 
@@ -55,14 +59,20 @@ class HostTimeline:
         port: HostPort,
         journal: RunJournal,
         report: HostReport,
-        call: Callable[..., Any],
+        half: HostHalf,
+        guard: Callable[..., Any],
         pump: Callable[[], None],
     ) -> None:
         self._config = config
         self._port = port
         self._report = report
         self._pump = pump
+        self.faults = HostFaults(
+            config, port=port, half=half, guard=guard, reactor=reactor, pump=pump
+        )
+        call = partial(guard, half.call)
         self.handlers: dict[str, ActionHandler] = {
+            **dict.fromkeys(FAULT_WORDS, self.faults),
             ANNOTATE.word: Annotations(),
             STOP.word: Stops(self._stop),
             STRESS.word: AgentOrders(self._post),
