@@ -79,8 +79,7 @@ class HostSession:
         self._aborts = on_agent_loss == "abort"
         self._machine = host_machine()
         self._state_deadline_s = now_s + timeouts.agents_ready_s
-        self._entered_s = now_s
-        self._check_due_s = now_s
+        self._entered_s = self._check_due_s = now_s
         self._t0_host_s: float | None = None
         self._end_host_s = float("inf")
         self.refused = self._links.refused
@@ -228,9 +227,8 @@ class HostSession:
 
     def get_timer(self) -> float | None:
         """Return when `handle_timer` wants to be called, at the latest."""
-        if self.state is HostState.EXIT:
-            return None
-        return min(self._check_due_s, self._links.get_timer())
+        is_over = self.state is HostState.EXIT
+        return None if is_over else min(self._check_due_s, self._links.get_timer())
 
     def handle_timer(self, now_s: float) -> None:
         """Do what is due. Received datagrams must have been handed in before."""
@@ -397,8 +395,7 @@ class HostSession:
             if self._roster.is_empty:
                 self.emergency(", ".join(self.peers), f"{reason}: none has returned", now_s)
         elif state is HostState.SIMULATION_SETUP:
-            text = f"setup of the simulation took longer than {waited_s:g} s"
-            self.emergency("host", text, now_s)
+            self.emergency("host", f"setup of the simulation took over {waited_s:g} s", now_s)
         elif state in _ENDING:
             self._stop(now_s, self._roster.names_outside(Phase.STOPPED, Phase.ABSENT))
         elif state is HostState.WAITING_SERVER_STOP:
