@@ -20,6 +20,7 @@ from cosmos_cli.models.translate import faults_of
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.hardware.fault_actions import check_fault
 from madns_runtime.timeline.entries import ScheduledEntry
+from madns_runtime.timeline.fault_kinds import LOSSES, MUST_CONTINUE
 from madns_runtime.timeline.kinds import DEVICE_FAULT
 from madns_runtime.timeline.schedule import ACTIONS_MAX, count_expected
 
@@ -134,6 +135,8 @@ class _Placing:
             yield ("action",), f"{text}, got {mode}: leave it out there"
         if action.lasting == "never" and self.rule.for_s is not None:
             yield ("for_s",), f"{action.word} has no end: leave it out"
+        if action.word in LOSSES and self.scenario.on_agent_loss == "abort":
+            yield ("action",), f"{action.word}: {MUST_CONTINUE}; say on_agent_loss: continue"
         if action.lasting == "must" and self.rule.for_s is None:
             yield ("action",), f"{action.word} needs for_s: how long it lasts, s"
 
