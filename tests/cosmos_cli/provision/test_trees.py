@@ -468,3 +468,14 @@ def test_leftovers_of_makers_that_are_gone_are_removed(machine):
 
     assert not half_made.exists()
     assert fresh.exists()
+
+
+def test_of_a_scenario_with_a_root_above_it_all_of_the_root_is_sent(folder):
+    (folder / "base.yaml").write_text(SCENARIO)
+    (folder / "few").mkdir()
+    (folder / "few/few.yaml").write_text("extends: ../base.yaml\nroot: ..\nname: few\n")
+
+    tree = scenario_tree(load_scenario(folder / "few/few.yaml"))
+
+    assert {"base.yaml", "few/few.yaml"} <= set(paths(tree))
+    assert tree.hash == scenario_tree(load_scenario(folder / "base.yaml")).hash
