@@ -221,7 +221,9 @@ class ExternalFlight:
     def _await_last(self) -> None:
         """Count the answers to the last ticks; there is no tick any more in which they could be carried out."""
         began_s = monotonic()
-        is_owed = self._counts["answers"] > 0 and len(self._asked) < UNANSWERED_MAX
+        oldest_s = self._asked[0][0] if self._asked else math.inf
+        # Whoever has never answered, or is overdue, is not waited for.
+        is_owed = self._counts["answers"] > 0 and not self._is_late(oldest_s, self._present_s())
         wait_s = min(self._settings.answer_s, ExternalFlight.last_answers_s) if is_owed else 0.0
         with contextlib.suppress(BlamedError):  # whoever is gone answers no more
             self._account_for_last()
