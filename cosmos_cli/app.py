@@ -60,6 +60,7 @@ COMMANDS = (
     "logs",
     "runs",
     "collect",
+    "judge",
     "report",
     "diff",
     "rerun",

@@ -37,9 +37,15 @@ def mapping_at(mapping: Mapping[str, Any] | None, *keys: str) -> Mapping[str, An
     return value if isinstance(value, Mapping) else {}
 
 
+def written_name(field: str) -> str:
+    """Return the key of a dataclass's field: one that Python keeps for itself, such as `while`, ends with _ there."""
+    return field[:-1] if field.endswith("_") else field
+
+
 def _plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
+        fields = [each.name for each in dataclasses.fields(value) if each.init]
+        return {written_name(name): _plain(getattr(value, name)) for name in fields}
     if isinstance(value, Mapping):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -26,6 +26,7 @@ from cosmos_cli.collect.unread_files import find_unread, told_unread
 from cosmos_cli.errors import ExitCode, InputError, RunFailedError
 from cosmos_cli.evidence.completeness import HOST, ExpectedRecords, find_missing, mapping_at
 from cosmos_cli.evidence.devices import expected_devices, read_devices
+from cosmos_cli.evidence.expectations.of_run import judge_run, planned_expectations
 from cosmos_cli.evidence.manifest import build_manifest, pack_run
 from cosmos_cli.evidence.remarks import declared_streams
 from cosmos_cli.evidence.run_directory import RunDirectory, write_json
@@ -279,6 +280,7 @@ def _evidence(
         round_trip_ms=round_trip_statistics(tables),
         clock=clock_statistics(tables.get("clock")),
         missing=(*missing, *gathered.faults),
+        expectations=judge_run(run, tables, planned_expectations(plan)),
         declared=declared_streams(plan),
     )
 

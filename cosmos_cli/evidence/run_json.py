@@ -18,6 +18,7 @@ from cosmos_cli.evidence.datagrams import (
     packet_counts,
 )
 from cosmos_cli.evidence.devices import device_checks
+from cosmos_cli.evidence.expectations.judge import JudgedExpectations
 from cosmos_cli.evidence.flown_files import KEY as FLOWN
 from cosmos_cli.evidence.flown_files import flown_remarks
 from cosmos_cli.evidence.remarks import (
@@ -78,6 +79,8 @@ class Evidence:
     interrupted: bool = False
     problems: tuple[Problem, ...] = ()
     missing: tuple[str, ...] = ()
+    expectations: JudgedExpectations = JudgedExpectations()  # noqa: RUF009 - frozen
+    """Results of what the scenario expected."""
     declared: Declared | None = None
     """Streams that the simulation declared; None if it declared none."""
 
@@ -165,7 +168,7 @@ class Evidence:
                 if p.machine and p.step != "forgotten" and not p.is_of_data
             ),
             problems=tuple(p.text for p in self.problems if not p.machine),
-            missing=self.missing,
+            missing=self._gaps(),
             miss_ratio=totals.miss_ratio,
             overrun_ratio=totals.overrun_ratio,
             rtf=_number(result.get("rtf")),
@@ -180,6 +183,7 @@ class Evidence:
             worst=worst_sources(totals.agents, mapping_at(result, "agents"), self.scans),
             late_hint=causes.hint if causes else "",
             plugin_checks=(*self._device_checks(), *self._plugin_checks()),
+            expectations=self.expectations.results,
             remarks=(
                 *(causes.remarks(self._lateness_limit_s()) if causes else ()),
                 *affinity_remarks(mapping_at(result, "agents")),
@@ -187,6 +191,7 @@ class Evidence:
                 *long_call_remarks(mapping_at(result, "host_calls")),
                 *undeclared_remarks(self.declared, self.scans),
                 *flown_remarks(self.started),
+                *self.expectations.remarks(),
             ),
         )
 
@@ -194,6 +199,9 @@ class Evidence:
         """Return the scans but those of agents' incarnations that were ended on purpose, which cut them."""
         agents = mapping_at(self.result, "agents")
         return [scan for scan in self.scans if not is_excused(scan, agents)]
+
+    def _gaps(self) -> tuple[str, ...]:
+        return (*self.missing, *self.expectations.gaps())
 
     def _lateness_limit_s(self) -> float | None:
         return None if self.config is None else self.config.deadline.lateness_limit_s
@@ -289,9 +297,10 @@ class Evidence:
             "clock": self.clock,
             "records": self._records(),
             "records_sha256": self._records_sha256(),
-            "data": {"complete": not self.missing, "missing": list(self.missing)},
+            "data": {"complete": not self._gaps(), "missing": list(self._gaps())},
             "problems": [problem.to_mapping() for problem in self.problems],
             "checks": [check.to_mapping() for check in verdict.checks],
+            **self.expectations.document(),
             "remarks": list(verdict.remarks),
             "scheduling": result.get("scheduling", {}),
             "preempt_rt": self._preempt_rt(),

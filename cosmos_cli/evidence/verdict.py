@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, TypeGuard
 
 from cosmos_cli.errors import ExitCode
+from madns_runtime.conditions.reports import BROKEN
 
 ORDER = (
     "interrupted 130, ended by a lost machine 3, failed 1, a machine failed 3, data incomplete 5,"
@@ -35,6 +36,16 @@ class CheckResult:
     passed: bool
     worst: str | None = None
     """Source of this value, where it is one of many: an agent, the host, a stream."""
+    agent: str | None = None
+    """Of an expectation: the agent of this value, or host."""
+    t_s: float | None = None
+    """Simulated time of this value, s."""
+    unit: str | None = None
+    """Unit of limit and value; None for the framework's own checks and a simulation's."""
+    expected: str = ""
+    """What is expected, in words; empty for others than expectations."""
+    agents_broken: int = 0
+    """Agents that break it."""
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the check as run.json holds it."""
@@ -44,6 +55,16 @@ class CheckResult:
             "got": self.got,
             "passed": self.passed,
             "worst": self.worst,
+            **(self._of_expectation() if self.expected else {}),
+        }
+
+    def _of_expectation(self) -> dict[str, Any]:
+        return {
+            "agent": self.agent,
+            "t_s": self.t_s,
+            "unit": self.unit,
+            "expected": self.expected,
+            "agents_broken": self.agents_broken,
         }
 
 
@@ -104,6 +125,8 @@ class RunFacts:
     late_hint: str = ""
     """The dominant cause of missed and late ticks, with its cure; empty if none was."""
     plugin_checks: tuple[CheckResult, ...] = ()
+    expectations: tuple[CheckResult, ...] = ()
+    """Those of the scenario that were judged."""
     remarks: tuple[str, ...] = ()
     """Remarks that decide nothing, such as on processors that were refused."""
 
@@ -173,10 +196,10 @@ def _is_rate_judged(facts: RunFacts) -> bool:
 
 
 def run_status(facts: RunFacts) -> str:
-    """Return complete, failed, aborted or interrupted."""
+    """Return complete, failed, aborted, interrupted, or broken: ended by an expectation."""
     if facts.interrupted or facts.host_status == "interrupted":
         return "interrupted"
-    if facts.host_status in ("complete", "failed", "aborted"):
+    if facts.host_status in ("complete", "failed", "aborted", BROKEN):
         return facts.host_status
     return "failed"
 
@@ -194,7 +217,7 @@ def run_checks(facts: RunFacts, limits: CheckLimits) -> list[CheckResult]:
         at_most("records.not_finite", limits.not_finite_max, facts.records_not_finite),
     ]
     named = [replace(check, worst=facts.worst.get(check.name)) for check in checks]
-    return named + list(facts.plugin_checks)
+    return named + list(facts.plugin_checks) + list(facts.expectations)
 
 
 def _real_time_checks(facts: RunFacts, limits: CheckLimits) -> list[CheckResult]:
@@ -305,7 +328,7 @@ def _conclude(
         ):  # as by `cosmos down`, when there was no operator to ask
             return ExitCode.INTERRUPTED, f"INTERRUPTED: {blame}"
         return ExitCode.INTERRUPTED, f"INTERRUPTED by {facts.who or 'the operator'}"
-    if status != "complete":
+    if status not in ("complete", BROKEN):
         code = ExitCode.MACHINES if facts.is_ended_by_machine else ExitCode.RUN_FAILED
         return code, f"{status.upper()}: {blame}"
     if facts.machine_problems:
@@ -313,6 +336,10 @@ def _conclude(
     if facts.missing:
         return ExitCode.DATA_INCOMPLETE, f"DATA INCOMPLETE: {_listed(facts.missing)}"
     broken = [check for check in checks if not check.passed]
+    if status == BROKEN:
+        # What a run that ended early could not measure is told in its place, and is not the cause.
+        told = [_told(check) for check in broken if check.expected]
+        return ExitCode.BUDGET_BROKEN, f"CHECK BROKEN: {_listed([blame, *told])}"
     if broken:
         text = f"CHECK BROKEN: {_listed([_told(c) for c in broken])}"
         is_of_ticks = any(check.name.startswith(OF_TICKS) for check in broken)
@@ -325,9 +352,34 @@ def _conclude(
     return ExitCode.OK, f"PASSED: {len(checks)} checks hold"
 
 
+def conclusion_of_expectations(
+    results: Sequence[CheckResult], missing: Sequence[str]
+) -> tuple[ExitCode, str]:
+    """
+    Return exit code and verdict of a finished run that is judged by expectations alone.
+
+    Args:
+        results: Of those that were judged.
+        missing: Data that are missing, one line each.
+    """
+    if missing:
+        return ExitCode.DATA_INCOMPLETE, f"DATA INCOMPLETE: {_listed(missing)}"
+    broken = [result for result in results if not result.passed]
+    if broken:
+        return ExitCode.BUDGET_BROKEN, f"CHECK BROKEN: {_listed([_told(each) for each in broken])}"
+    return ExitCode.OK, f"PASSED: {len(results)} checks hold"
+
+
 def _told(check: CheckResult) -> str:
     got = "not measured" if check.got is None else f"{check.got:g}"
     whose = f" of {first_line(check.worst)}" if check.worst else ""
+    if check.expected:
+        unit = f" {check.unit}" if check.unit and check.got is not None else ""
+        when = "" if check.t_s is None else f" at {check.t_s:g} s"
+        more = f" and {check.agents_broken - 1} more" if check.agents_broken > 1 else ""
+        return (
+            f"{check.name} {got}{unit}{whose}{more}{when} (expected {first_line(check.expected)})"
+        )
     return f"{check.name} {got}{whose} (limit {check.limit:g})"
 
 

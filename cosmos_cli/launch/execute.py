@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from cosmos_cli.errors import CosmosError, ExitCode, InputError
+from cosmos_cli.evidence.expectations.of_run import EXPECTATIONS
 from cosmos_cli.evidence.run_directory import (
     RunDirectory,
     alone,
@@ -245,6 +246,8 @@ def _declared(scenario: ScenarioFile) -> dict[str, Any]:
     found: dict[str, Any] = {}
     if scenario.streams is not None:
         found["streams"] = [to_mapping(stream) for stream in scenario.streams]
+    if scenario.expectations:
+        found[EXPECTATIONS] = to_mapping({"": scenario.expectations})[""]
     if scenario.labels.names:
         found["labels"] = to_mapping(scenario.labels)
     return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,10 @@ from pydantic import ValidationError
 
 from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
+from cosmos_cli.models.checks import scenario_checks
 from cosmos_cli.models.document import Document, read_document
 from cosmos_cli.models.document import Path as ValuePath
+from cosmos_cli.models.expectation import Expectation, conditions_of_checks
 from cosmos_cli.models.extending import ScenarioSource, read_scenario_source
 from cosmos_cli.models.hardware import hardware_faults
 from cosmos_cli.models.overrides import apply_overrides
@@ -67,6 +69,8 @@ class ScenarioFile:
     """What each agent takes of its machine for itself."""
     timeline: ResolvedTimeline = NO_TIMELINE
     """Its timeline among these agents and actions."""
+    expectations: tuple[Expectation, ...] = ()
+    """What its checks expect of these agents and streams."""
     placeholders: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Words that the simulation replaces itself, by field."""
 
@@ -101,13 +105,14 @@ class ScenarioFile:
 
     def run_config(self, run: str) -> RunConfig:
         """Return what host and agents of the run named *run* are told."""
-        return self.scenario.run_config(
+        config = self.scenario.run_config(
             run=run,
             base_directory=self.base_directory,
             parameters=self.parameters,
             agent_parameters=self.agent_parameters,
             timeline=self.timeline.entries,
         )
+        return replace(config, conditions=conditions_of_checks(self.expectations))
 
     def to_written(self) -> dict[str, Any]:
         """Return the same as a scenario file holds it: what is no variable there is escaped."""
@@ -220,6 +225,8 @@ def _check(
     if not broken - {"timeline"}:
         timeline = resolve_timeline(document, scenario, answers.actions, answers.labels)
     faults += timeline.faults
+    checks = scenario_checks(scenario, answers, broken)
+    faults += [document.fault(("checks", *where), text) for where, text in checks.faults]
     if broken or answers.parameters is None or faults:
         told = _told_once(faults, document)
         raise InputError(faults=told, omitted=answers.omitted)
@@ -238,6 +245,7 @@ def _check(
         place_uses=answers.place_uses,
         timeline=timeline,
         placeholders=answers.placeholders,
+        expectations=checks.expectations,
     )
 
 

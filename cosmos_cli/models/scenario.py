@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
+from cosmos_cli.models.check_rules import CHECKS_MAX, CheckRule
 from cosmos_cli.models.placement import PlacementRule, claim_agents
 from cosmos_cli.models.planning import Planning
 from cosmos_cli.models.scenario_test import ScenarioTest, faults_of_test
@@ -94,6 +95,8 @@ class Scenario(BaseModel):
     """Machines of agents, rule by rule; the rest is spread evenly over all."""
     timeline: Annotated[tuple[dict[str, Any], ...], Field(max_length=ENTRIES_MAX)] = ()
     """What is to happen in the run, and when: actions of the framework, faults, and those that the simulation declares."""
+    checks: Annotated[tuple[CheckRule, ...], Field(max_length=CHECKS_MAX)] = ()
+    """Expectations of the recorded values, judged after the run beside the framework's own checks."""
     plan: Planning = Planning()
     """Terms of the inequalities of real time, for `cosmos plan` alone."""
     test: ScenarioTest = ScenarioTest()

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Union
 from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault
 from cosmos_cli.models.document import Document, Path, did_you_mean, kind_of
 from cosmos_cli.models.text_forms import NAME_PATTERN
+from madns_runtime.plain_values import written_name
 
 _EXPECTED = {
     "bool_type": "true or false",
@@ -275,4 +276,4 @@ def _fields(kind: Any) -> dict[str, Any]:
     else:
         names = list(getattr(kind, "model_fields", ()))
     hints = typing.get_type_hints(kind, include_extras=True) if names else {}
-    return {name: hints[name] for name in names}
+    return {written_name(name): hints[name] for name in names}

@@ -13,6 +13,7 @@ from cosmos_cli.evidence.simulation_calls import call_simulation
 from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.evidence.tables import no_tables, open_recorded_run
 from cosmos_cli.report.devices import device_sections, is_told_in_words
+from cosmos_cli.report.expectations import expectation_sections
 from cosmos_cli.report.health import health_blocks, process_blocks
 from cosmos_cli.report.second_names import with_second_names
 from cosmos_cli.report.tick_causes import cause_blocks
@@ -70,6 +71,7 @@ def build_sections(run: RunDirectory, document: Mapping[str, Any]) -> list[Secti
     drawn_sections = [s for s in (*before, *own, *unknown, *after) if s.blocks]
     return [
         *_gaps(run, recorded),
+        *with_second_names(expectation_sections(run, recorded), run_labels(run)),
         *with_second_names(drawn_sections, run_labels(run)),
         *device_sections(document, recorded),
         *_load_sections(document),

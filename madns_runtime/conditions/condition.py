@@ -87,6 +87,7 @@ class Condition:
     """Of the expectation or the entry of the timeline that it belongs to."""
     stream: str
     field: str
+    """Empty: each record counts as 1."""
     bounds: ValueBounds
     agents: tuple[str, ...] = ()
     """Names of those whose records count; of a stream of the host's half those that a field `agent` names, if it has one."""
@@ -104,9 +105,9 @@ class Condition:
     """Whether the run ends when it is met: an expectation is broken."""
 
     def is_at(self, t_s: float | None) -> bool:
-        """Tell whether a record of simulated time *t_s* counts; None: of before it ran."""
+        """Tell whether a record of simulated time *t_s* counts; None, before it runs, counts as 0."""
         if t_s is None or math.isnan(t_s):
-            return self.from_s is None and self.to_s is None
+            t_s = 0.0
         return (self.from_s is None or t_s >= self.from_s) and (
             self.to_s is None or t_s <= self.to_s
         )

@@ -75,7 +75,9 @@ class ConditionTap:
                 following = evaluators[who] = self._evaluators(who, named)
             t_s = when(read)
             for evaluator in following:
-                self._note(who, evaluator, evaluator.take(t_s, read(evaluator.condition.field)))
+                field = evaluator.condition.field
+                value = read(field) if field else 1.0
+                self._note(who, evaluator, evaluator.take(t_s, value))
 
         return take
 

@@ -94,6 +94,28 @@ def test_comparison_tells_of_cars_what_their_simulation_knows(cosmos, lockstep):
 
 
 @pytest.mark.process
+def test_cars_are_judged_by_expectations_of_what_they_and_the_road_record(cosmos, lockstep):
+    checks = """
+checks:
+  - {name: apart, stream: road, field: gap_m, above: 0}
+  - {name: drives, stream: drive, field: speed_m_s, agents: ["RING [12]"], statistic: mean, above: 3.6, unit: km/h}
+  - {name: rushes, stream: drive, field: speed_m_s, statistic: max, below: 1, unit: cm/s}
+"""
+    path = cosmos.folder / "judged.yaml"
+    path.write_text((HERE / "cars.yaml").read_text("utf-8") + checks, "utf-8")
+    wrong = cosmos.folder / "wrong.yaml"
+    wrong.write_text(path.read_text("utf-8").replace("gap_m,", "gap_km,"), "utf-8")
+
+    told = json.loads(cosmos("judge", lockstep["run"], "-s", path, "--json", code=4))
+    cosmos("judge", lockstep["run"], "-s", wrong, code=2)
+
+    apart, drives, rushes = told["checks"]
+    assert apart["passed"] and apart["got"] > 0 and apart["unit"] == "m"
+    assert drives["passed"] and drives["agent"] in ("agent-01", "agent-02")
+    assert not rushes["passed"] and rushes["agents_broken"] == 6
+
+
+@pytest.mark.process
 def test_cars_are_found_by_their_plates(cosmos, lockstep):
     by_name = cosmos("logs", lockstep["run"], "agent-02")
 

@@ -1,0 +1,140 @@
+"""`cosmos judge`: a finished run judged again by expectations, its own or those of a scenario file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from cosmos_cli.collect.finish import refuse_living
+from cosmos_cli.commands.runs import RunArgument, RunsOption
+from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.evidence.expectations.judge import JudgedExpectations
+from cosmos_cli.evidence.expectations.of_run import (
+    expectations_for,
+    judge_run,
+    planned_expectations,
+)
+from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
+from cosmos_cli.evidence.run_documents import fault_of_summary
+from cosmos_cli.evidence.run_search import find_run
+from cosmos_cli.evidence.tables import open_tables
+from cosmos_cli.evidence.verdict import conclusion_of_expectations
+from cosmos_cli.models.loading import load_scenario
+from cosmos_cli.report.cells import format_cell
+from cosmos_cli.ui.console import Column, Console, JsonOption, QuietOption
+from madns_runtime.processes import list_processes
+
+COLUMNS = (
+    Column("check"),
+    Column("got", is_number=True),
+    Column("limit", is_number=True),
+    Column("unit"),
+    Column(""),
+    Column("agent"),
+    Column("at s", is_number=True),
+    Column("expected"),
+)
+
+
+def judge(
+    run: RunArgument = "last",
+    scenario: Annotated[
+        Path | None,
+        typer.Option(
+            "-s", "--scenario", metavar="FILE", help="Judge by the checks of this scenario."
+        ),
+    ] = None,
+    folder: RunsOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """
+    Judge a finished run again by the expectations of its scenario, or of another.
+
+    Nothing of the run is changed. Ends with 0 if all hold, 4 if one is broken, and 5 if data of the run are missing
+    or none of the expectations could be judged.
+    """
+    console = Console(json=as_json, quiet=quiet)
+    found = find_run(runs_root(folder), run)
+    document = _collected(found)
+    if scenario is None:
+        expectations = planned_expectations(found.read_json(found.plan_json))
+        if not expectations:
+            raise InputError(
+                f"{found.name} had no checks; name a scenario that has: cosmos judge {found.name} -s FILE"
+            )
+    else:
+        file = load_scenario(scenario, warn=console.warn)
+        expectations = expectations_for(found, file)
+    judged = judge_run(found, open_tables(found.tables), expectations)
+    missing = (*_missing(document), *judged.gaps())
+    code, text = conclusion_of_expectations(judged.results, missing)
+    console.print_json(_told(found, judged, code, text, missing))
+    if not as_json:
+        _print(console, judged, missing)
+    (console.say if as_json else console.data)(f"{text} | {found.path}")
+    return int(code)
+
+
+def _collected(run: RunDirectory) -> Mapping[str, Any]:
+    refuse_living(run, list_processes())
+    document = run.read_json(run.run_json)
+    if document is None or document.get("status") == "running":
+        raise InputError(
+            f"{run.name} is not collected yet; do that with: cosmos collect {run.path}"
+        )
+    fault = fault_of_summary(document)
+    if fault is not None or run.read_config() is None:
+        what = f"{run.run_json}: {fault}" if fault else f"{run.plan_json}: not to be read"
+        raise InputError(f"{what}; make it anew with: cosmos collect {run.path}")
+    return document
+
+
+def _missing(document: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what is missing of the run's data, but for what its own expectations came to."""
+    data = document.get("data")
+    listed = data.get("missing") if isinstance(data, Mapping) else None
+    texts = listed if isinstance(listed, list) else []
+    return tuple(str(text) for text in texts if not str(text).startswith("checks: "))
+
+
+def _told(
+    run: RunDirectory,
+    judged: JudgedExpectations,
+    code: ExitCode,
+    text: str,
+    missing: Sequence[str],
+) -> dict[str, Any]:
+    return {
+        "run": run.name,
+        "verdict": text,
+        "exit_code": int(code),
+        "checks": [result.to_mapping() for result in judged.results],
+        "checks_not_judged": judged.told_not_judged(),
+        "missing": list(missing),
+    }
+
+
+def _print(console: Console, judged: JudgedExpectations, missing: Sequence[str]) -> None:
+    rows = [
+        [
+            result.name,
+            "not measured" if result.got is None else format_cell(result.got),
+            format_cell(result.limit),
+            result.unit or "",
+            "holds" if result.passed else "BROKEN",
+            result.agent or "",
+            "" if result.t_s is None else format_cell(result.t_s),
+            result.expected,
+        ]
+        for result in judged.results
+    ]
+    if rows:
+        console.table(COLUMNS, rows)
+    for remark in judged.remarks():
+        console.data(remark)
+    for line in missing:
+        console.data(f"missing: {line}")

@@ -1,0 +1,249 @@
+"""Statistics of one field of one agent, over batches of its records in order of recording. numpy alone."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from madns_runtime.conditions.condition import ValueBounds
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+P99 = 0.99
+OCCURRENCES_KEPT = 100_000
+"""Times of an event that are kept, the first ones; the others are counted."""
+
+
+Found = tuple[float | None, float | None]
+"""A statistic, and the simulated time of it, s; None where there is none."""
+
+
+class Accumulator(ABC):
+    """One statistic."""
+
+    def take(self, t_s: Floats, values: NDArray[Any]) -> None:
+        """Take a batch: times, s, and values, none of which is missing; shape (N,) each, N at least 1."""
+        self._take(t_s, values)
+
+    def result(self) -> Found:
+        """Return what all batches came to."""
+        return self._found_now()
+
+    @abstractmethod
+    def _take(self, t_s: Floats, values: NDArray[Any]) -> None: ...
+
+    @abstractmethod
+    def _found_now(self) -> Found: ...
+
+
+def holds(bounds: ValueBounds, values: NDArray[Any]) -> Flags:
+    """Tell of each value whether it lies within bounds; see `ValueBounds.holds`."""
+    if bounds.text is not None:
+        found: Flags = _are(values, bounds.text) != bounds.is_negated
+        return found
+    numbers = values.astype(np.float64)
+    within = np.ones(len(numbers), bool)
+    if bounds.low is not None:
+        within &= numbers >= bounds.low if bounds.is_closed else numbers > bounds.low
+    if bounds.high is not None:
+        within &= numbers <= bounds.high if bounds.is_closed else numbers < bounds.high
+    held: Flags = (within != bounds.is_negated) & ~np.isnan(numbers)
+    return held
+
+
+def excess(bounds: ValueBounds, values: Floats) -> Floats:
+    """Return how far values are beyond bounds; negative within."""
+    found = np.full(len(values), -np.inf)
+    if bounds.low is not None:
+        found = np.maximum(found, bounds.low - values)
+    if bounds.high is not None:
+        found = np.maximum(found, values - bounds.high)
+    return found
+
+
+class Worst(Accumulator):
+    """The value farthest beyond its bounds: of the greatest or least values, too."""
+
+    def __init__(self, bounds: ValueBounds) -> None:
+        self._bounds = bounds
+        self._excess = -math.inf
+        self._found: Found = (None, None)
+
+    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
+        numbers = values.astype(np.float64)
+        beyond = excess(self._bounds, numbers)
+        at = int(np.argmax(beyond))
+        if beyond[at] > self._excess or self._found[0] is None:
+            self._excess = float(beyond[at])
+            self._found = float(numbers[at]), float(t_s[at])
+
+    def _found_now(self) -> Found:
+        return self._found
+
+
+class Unlike(Accumulator):
+    """The number of texts that are not the one that is expected, and the time of the first."""
+
+    def __init__(self, bounds: ValueBounds) -> None:
+        self._bounds = bounds
+        self._count: int | None = None
+        self._first_s: float | None = None
+
+    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
+        unlike = np.flatnonzero(~holds(self._bounds, values))
+        self._count = (self._count or 0) + len(unlike)
+        if len(unlike) and self._first_s is None:
+            self._first_s = float(t_s[unlike[0]])
+
+    def _found_now(self) -> Found:
+        return self._count, self._first_s
+
+
+class Last(Accumulator):
+    """The last value; of a text, whether it is another than the one that is expected: 0 or 1."""
+
+    def __init__(self, bounds: ValueBounds) -> None:
+        self._bounds = bounds
+        self._found: Found = (None, None)
+
+    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
+        if self._bounds.text is not None:
+            value = float(not holds(self._bounds, values[-1:])[0])
+        else:
+            value = float(values[-1])
+        self._found = value, float(t_s[-1])
+
+    def _found_now(self) -> Found:
+        return self._found
+
+
+class Mean(Accumulator):
+    """The mean, or the root of the mean square."""
+
+    def __init__(self, power: int) -> None:
+        self._power = power
+        self._sum = 0.0
+        self._count = 0
+
+    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
+        self._sum += float(np.sum(values.astype(np.float64) ** self._power))
+        self._count += len(values)
+
+    def _found_now(self) -> Found:
+        if not self._count:
+            return None, None
+        mean = self._sum / self._count
+        return (mean if self._power == 1 else math.sqrt(mean)), None
+
+
+class Percentile99(Accumulator):
+    """
+    The least value that at least 99 % of all values do not exceed: exact.
+
+    Args:
+        records: The most that there may be: a hundredth of them is kept.
+    """
+
+    def __init__(self, records: int) -> None:
+        self._kept_max = records - math.ceil(P99 * records) + 1
+        self._kept: Floats = np.empty(0)
+        self._count = 0
+
+    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
+        self._count += len(values)
+        kept = np.concatenate((self._kept, values.astype(np.float64)))
+        if len(kept) > self._kept_max:
+            kept = np.partition(kept, len(kept) - self._kept_max)[-self._kept_max :]
+        self._kept = kept
+
+    def _found_now(self) -> Found:
+        if not self._count:
+            return None, None
+        from_top = self._count - math.ceil(P99 * self._count)
+        return float(np.sort(self._kept)[-1 - from_top]), None
+
+
+class Counted(Accumulator):
+    """
+    How many records there are, or hold.
+
+    Args:
+        when: Bounds of those that count; None for all.
+        per_s: What the number is divided by: 1, or a time, s, for a rate.
+    """
+
+    def __init__(self, when: ValueBounds | None, per_s: float = 1.0) -> None:
+        self._when = when
+        self._per_s = per_s
+        self._count = 0
+
+    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
+        held = len(values) if self._when is None else np.count_nonzero(holds(self._when, values))
+        self._count += int(held)
+
+    def _found_now(self) -> Found:
+        return (self._count / self._per_s if self._per_s > 0.0 else None), None
+
+
+class FirstTime(Accumulator):
+    """The earliest time at which the value lies within bounds."""
+
+    def __init__(self, when: ValueBounds) -> None:
+        self._when = when
+        self._first_s: float | None = None
+
+    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
+        held = t_s[holds(self._when, values)]
+        if len(held) and self._first_s is None:
+            self._first_s = float(held.min())
+
+    def _found_now(self) -> Found:
+        return self._first_s, self._first_s
+
+
+class Settled(Accumulator):
+    """The time from which on the value stays within bounds until its last record."""
+
+    def __init__(self, when: ValueBounds) -> None:
+        self._when = when
+        self._since_s: float | None = None
+
+    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
+        outside = np.flatnonzero(~holds(self._when, values))
+        if len(outside):
+            after = int(outside[-1]) + 1
+            self._since_s = float(t_s[after]) if after < len(t_s) else None
+        elif self._since_s is None:
+            self._since_s = float(t_s[0])
+
+    def _found_now(self) -> Found:
+        return self._since_s, self._since_s
+
+
+class Occurrences(Accumulator):
+    """The times of an event, in order of recording."""
+
+    def __init__(self, word: str) -> None:
+        self._word = word
+        self.count = 0
+        self.times_s: list[float] = []
+
+    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
+        found = t_s[_are(values, self._word)]
+        self.count += len(found)
+        self.times_s += found[: OCCURRENCES_KEPT - len(self.times_s)].tolist()
+
+    def _found_now(self) -> Found:
+        first_s = min(self.times_s, default=None)
+        return first_s, first_s
+
+
+def _are(values: NDArray[Any], text: str) -> Flags:
+    """Tell which values are this text; numbers never are."""
+    if values.dtype != object:
+        return np.zeros(len(values), bool)
+    return np.array(values == text, bool)

@@ -1,0 +1,75 @@
+"""Times at which a condition on another stream holds, for expectations that count only meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from cosmos_cli.evidence.expectations.accumulators import Flags, Floats, holds
+from cosmos_cli.evidence.expectations.records import Batch, RecordSource
+from cosmos_cli.models.expectation import HeldBounds, scaled
+from madns_runtime.conditions.condition import HOST
+from madns_runtime.units import conversion
+
+CHANGES_MAX = 1_000_000
+"""Changes of one agent between holding and not that are kept."""
+
+
+class TooManyChanges(Exception):
+    """A condition changes too often to be followed; the text says which."""
+
+
+class HeldTimes:
+    """
+    When a condition holds, by agent.
+
+    Args:
+        held: The condition.
+        source: Where its records come from.
+
+    Raises:
+        TooManyChanges: It changes more often than CHANGES_MAX times.
+    """
+
+    def __init__(self, held: HeldBounds, source: RecordSource) -> None:
+        self._changes: dict[str, list[tuple[Floats, Flags]]] = {}
+        self._counts: dict[str, int] = {}
+        factor = (
+            conversion(held.unit, source.unit_of(held.stream, held.field)) if held.unit else 1.0
+        )
+        if factor is not None:
+            bounds = scaled(held.bounds, factor)
+            for batch in self._batches(held, source):
+                self._add(batch, holds(bounds, batch.values), held)
+
+    def during(self, agent: str, t_s: Floats) -> Flags:
+        """Tell of each time whether the newest record of the condition until then holds."""
+        changes = self._changes.get(agent) or self._changes.get(HOST)
+        if not changes:
+            return np.zeros(len(t_s), bool)
+        if len(changes) > 1:
+            joined = tuple(np.concatenate(parts) for parts in zip(*changes, strict=True))
+            changes[:] = [(joined[0], joined[1])]
+        times, states = changes[0]
+        place = np.searchsorted(times, t_s, side="right") - 1
+        return (place >= 0) & states[np.maximum(place, 0)]
+
+    def _batches(self, held: HeldBounds, source: RecordSource) -> Iterator[Batch]:
+        for batch in source.batches(held.stream, (held.field,)):
+            if batch.has(held.field):
+                yield batch.of(held.field)
+
+    def _add(self, batch: Batch, states: Flags, held: HeldBounds) -> None:
+        if not len(states):
+            return
+        known = self._changes.setdefault(batch.agent, [])
+        before = known[-1][1][-1] if known else not states[0]
+        changed = np.flatnonzero(np.diff(states, prepend=before))
+        if len(changed):
+            known.append((batch.t_s[changed], states[changed]))
+        count = self._counts[batch.agent] = self._counts.get(batch.agent, 0) + len(changed)
+        if count > CHANGES_MAX:
+            raise TooManyChanges(
+                f"{held.stream}.{held.field} of {batch.agent} changes more than {CHANGES_MAX} times between holding and not"
+            )

@@ -1,0 +1,263 @@
+"""Judges expectations over a run's tables: one pass per stream, one result per expectation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosmos_cli.evidence.expectations.accumulators import (
+    Accumulator,
+    Counted,
+    FirstTime,
+    Last,
+    Mean,
+    Occurrences,
+    Percentile99,
+    Settled,
+    Unlike,
+    Worst,
+)
+from cosmos_cli.evidence.expectations.held_times import HeldTimes, TooManyChanges
+from cosmos_cli.evidence.expectations.outcomes import (
+    ExpectationOutcome,
+    outcome_of_event,
+    worst_result,
+)
+from cosmos_cli.evidence.expectations.records import Batch, RecordSource
+from cosmos_cli.evidence.verdict import CheckResult
+from cosmos_cli.models.expectation import Expectation, scaled
+from madns_runtime.analysis.tables import Tables
+from madns_runtime.conditions.condition import HOST, ValueBounds
+from madns_runtime.units import conversion
+
+OTHER_MODE = "its stream is recorded in real time alone, and this run was in lockstep"
+RATE_UNIT = "1/s"
+OF_NUMBERS = ("count", "rate")
+OF_TIMES = ("first_time", "settled")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JudgedExpectations:
+    """Results of a run's expectations."""
+
+    results: tuple[CheckResult, ...] = ()
+    """Of those that were judged, in their order."""
+    not_judged: Mapping[str, str] = field(default_factory=dict)
+    """By name of the others: why."""
+
+    def remarks(self) -> tuple[str, ...]:
+        """Return a remark per expectation that was not judged."""
+        return tuple(f"{name}: not judged: {why}" for name, why in self.not_judged.items())
+
+    def told_not_judged(self) -> list[dict[str, str]]:
+        """Return the same as run.json holds it."""
+        return [{"name": name, "why": why} for name, why in self.not_judged.items()]
+
+    def document(self) -> dict[str, Any]:
+        """Return the key of run.json that lists them; nothing if all were judged."""
+        return {"checks_not_judged": self.told_not_judged()} if self.not_judged else {}
+
+    def gaps(self) -> tuple[str, ...]:
+        """Return what is missing of a run none of whose expectations was judged."""
+        if self.results or not self.not_judged:
+            return ()
+        name, why = next(iter(self.not_judged.items()))
+        return (f"checks: none of {len(self.not_judged)} was judged, such as {name}: {why}",)
+
+
+def judge_expectations(
+    expectations: Sequence[Expectation], tables: Tables, *, is_lockstep: bool, duration_s: float
+) -> JudgedExpectations:
+    """
+    Judge expectations over all records.
+
+    Args:
+        expectations: Of the run, in their order.
+        tables: The run's.
+        is_lockstep: Its time mode.
+        duration_s: Its simulated time, s.
+    """
+    source = RecordSource(tables)
+    judged = [each for each in expectations if each.is_judged_in(is_lockstep=is_lockstep)]
+    followed = [_Followed(each, source, duration_s) for each in judged]
+    by_stream: dict[str, list[_Followed]] = {}
+    for each in followed:
+        by_stream.setdefault(each.expectation.stream, []).append(each)
+    for stream, own in by_stream.items():
+        fields = list(dict.fromkeys(each.expectation.field for each in own))
+        for batch in source.batches(stream, [name for name in fields if name]):
+            _give(batch, own)
+    times: dict[str, Mapping[str, ExpectationOutcome]] = {}
+    results = []
+    for each in followed:
+        outcomes = each.outcomes(times)
+        times[each.expectation.name] = outcomes
+        result = worst_result(each.expectation, outcomes, each.unit, duration_s=duration_s)
+        results.append(
+            result if source.has_time(each.expectation.stream) else replace(result, t_s=None)
+        )
+    return JudgedExpectations(
+        results=tuple(results),
+        not_judged={each.name: OTHER_MODE for each in expectations if each not in judged},
+    )
+
+
+def _give(batch: Batch, followed: Sequence[_Followed]) -> None:
+    """Give a batch to those that look at its agent; each field is cleaned once."""
+    clean: dict[str, Batch | None] = {}
+    for each in followed:
+        if not each.is_about(batch):
+            continue
+        name = each.expectation.field
+        if name not in clean:
+            clean[name] = batch.all() if not name else batch.of(name) if batch.has(name) else None
+        if (found := clean[name]) is not None:
+            each.take(found)
+
+
+class _Followed:
+    """One expectation on its way through the records."""
+
+    def __init__(self, expectation: Expectation, source: RecordSource, duration_s: float) -> None:
+        self.expectation = expectation
+        self._agents = frozenset(expectation.agents)
+        self._records = source.records_of(expectation.stream)
+        self._window_s = max(
+            0.0,
+            min(duration_s, duration_s if expectation.to_s is None else expectation.to_s)
+            - (expectation.from_s or 0.0),
+        )
+        self._has_stream = bool(source.tables_of(expectation.stream))
+        recorded = source.unit_of(expectation.stream, expectation.field)
+        factor = conversion(expectation.unit, recorded) if expectation.unit else 1.0
+        self._fault = None if factor is not None else f"{expectation.field} is in {recorded or '1'}"
+        self._factor = factor or 1.0
+        self.unit = self._unit(recorded)
+        self._accumulators: dict[str, Accumulator] = {}
+        self._held: HeldTimes | None = None
+        if expectation.meanwhile is not None:
+            try:
+                self._held = HeldTimes(expectation.meanwhile, source)
+            except TooManyChanges as error:
+                self._fault = str(error)
+
+    def _unit(self, recorded: str) -> str:
+        expectation = self.expectation
+        if expectation.event or expectation.statistic in OF_TIMES:
+            return "" if expectation.must == "not_occur" else "s"
+        if expectation.statistic in OF_NUMBERS:
+            return RATE_UNIT if expectation.statistic == "rate" else ""
+        return "" if expectation.bounds.text is not None else expectation.unit or recorded
+
+    def is_about(self, batch: Batch) -> bool:
+        """Tell whether a batch is of its agents."""
+        if batch.agent not in self._agents or self._fault is not None:
+            return False
+        return batch.is_of_host == (self.expectation.is_of_host or batch.agent == HOST)
+
+    def take(self, batch: Batch) -> None:
+        """Take a batch of records that have its field."""
+        expectation = self.expectation
+        wanted = np.ones(len(batch.t_s), bool)
+        if expectation.from_s is not None:
+            wanted &= batch.t_s >= expectation.from_s
+        if expectation.to_s is not None and not expectation.event:
+            wanted &= batch.t_s <= expectation.to_s
+        if self._held is not None:
+            wanted &= self._held.during(batch.agent, batch.t_s)
+        is_text = bool(expectation.event or _text_of(expectation))
+        values = batch.values
+        if values.dtype == object and not is_text and expectation.field:
+            wanted &= _are_numbers(values) | (expectation.statistic in OF_NUMBERS)
+        batch = batch.where(wanted)
+        if not len(batch.t_s):
+            return
+        accumulator = self._accumulators.get(batch.agent)
+        if accumulator is None:
+            accumulator = self._accumulators[batch.agent] = self._accumulator()
+        accumulator.take(batch.t_s, batch.values)
+
+    def _accumulator(self) -> Accumulator:  # noqa: PLR0911 - a table of what each statistic is
+        expectation = self.expectation
+        bounds = self._bounds()
+        if expectation.event:
+            return Occurrences(expectation.event)
+        when = None if expectation.when is None else scaled(expectation.when, self._factor)
+        match expectation.statistic:
+            case "last":
+                return Last(bounds)
+            case "mean" | "rms":
+                return Mean(1 if expectation.statistic == "mean" else 2)
+            case "p99":
+                return Percentile99(self._records)
+            case "count" | "rate":
+                per_s = self._window_s if expectation.statistic == "rate" else 1.0
+                return Counted(when, per_s)
+            case "first_time":
+                return FirstTime(when or bounds)
+            case "settled":
+                return Settled(when or bounds)
+            case "max":
+                return Worst(ValueBounds(high=0.0))
+            case "min":
+                return Worst(ValueBounds(low=0.0))
+            case _:
+                return Unlike(bounds) if bounds.text is not None else Worst(bounds)
+
+    def _bounds(self) -> ValueBounds:
+        """Return the bounds of the statistic in the unit of the records; times and numbers have their own."""
+        expectation = self.expectation
+        if expectation.statistic in (*OF_NUMBERS, *OF_TIMES):
+            return expectation.bounds
+        return scaled(expectation.bounds, self._factor)
+
+    def outcomes(
+        self, times: Mapping[str, Mapping[str, ExpectationOutcome]]
+    ) -> dict[str, ExpectationOutcome]:
+        """Return what each agent came to; *times* are those of the expectations before."""
+        expectation = self.expectation
+        after = times.get(expectation.after) if expectation.after else None
+        found = {}
+        for agent in expectation.agents:
+            accumulator = self._accumulators.get(agent)
+            if accumulator is None and self._may_be_none:
+                accumulator = self._accumulator()
+            found[agent] = self._outcome(agent, accumulator, after)
+        return found
+
+    @property
+    def _may_be_none(self) -> bool:
+        """Whether no record is an answer, too: of how many there are, and whether something happened."""
+        is_counted = bool(self.expectation.event) or self.expectation.statistic in OF_NUMBERS
+        return is_counted and self._has_stream and self._fault is None
+
+    def _outcome(
+        self,
+        agent: str,
+        accumulator: Accumulator | None,
+        after: Mapping[str, ExpectationOutcome] | None,
+    ) -> ExpectationOutcome:
+        expectation = self.expectation
+        if isinstance(accumulator, Occurrences):
+            return outcome_of_event(expectation, agent, accumulator, after)
+        got, t_s = (None, None) if accumulator is None else accumulator.result()
+        if got is None or not np.isfinite(got):
+            return ExpectationOutcome(got=None, t_s=t_s, passed=False, why=self._fault or "")
+        bounds = self._bounds()
+        passed = got == 0.0 if bounds.text is not None else bounds.holds(got)
+        is_value = expectation.statistic not in (*OF_NUMBERS, *OF_TIMES)
+        shown = got / self._factor if is_value and bounds.text is None else got
+        return ExpectationOutcome(got=shown, t_s=t_s, passed=passed)
+
+
+def _text_of(expectation: Expectation) -> bool:
+    bounds = expectation.when or expectation.bounds
+    return bounds.text is not None
+
+
+def _are_numbers(values: NDArray[Any]) -> NDArray[np.bool_]:
+    return np.array([isinstance(each, int | float) for each in values.tolist()], bool)

@@ -1,0 +1,82 @@
+"""The expectations of a run: kept in its plan, judged over its tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from cosmos_cli.errors import InputError
+from cosmos_cli.evidence.expectations.judge import JudgedExpectations, judge_expectations
+from cosmos_cli.evidence.remarks import declared_streams
+from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.table_labels import run_labels
+from cosmos_cli.models.checks import Surroundings, resolve_checks
+from cosmos_cli.models.expectation import Expectation
+from cosmos_cli.models.known_streams import KnownStreams
+from cosmos_cli.models.loading import ScenarioFile
+from madns_runtime.analysis.tables import Tables
+from madns_runtime.config import from_mapping
+from madns_runtime.errors import ConfigurationError
+
+EXPECTATIONS = "expectations"
+"""Key of plan.json."""
+
+
+def planned_expectations(plan: Mapping[str, Any] | None) -> tuple[Expectation, ...]:
+    """Return what a run's plan expects of it; what cannot be read is left out, as the plan's own fault is told."""
+    listed = (plan or {}).get(EXPECTATIONS)
+    found = []
+    for item in listed if isinstance(listed, list) else ():
+        try:
+            found.append(from_mapping(Expectation, item))
+        except ConfigurationError:
+            continue
+    return tuple(found)
+
+
+def judge_run(
+    run: RunDirectory, tables: Tables, expectations: Sequence[Expectation]
+) -> JudgedExpectations:
+    """Judge expectations over a gathered run's tables; none where its settings are lost."""
+    config = run.read_config()
+    if config is None or not expectations:
+        return JudgedExpectations()
+    return judge_expectations(
+        expectations,
+        tables,
+        is_lockstep=config.time.is_lockstep,
+        duration_s=config.time.duration_s,
+    )
+
+
+def expectations_for(run: RunDirectory, scenario: ScenarioFile) -> tuple[Expectation, ...]:
+    """
+    Return what the checks of a scenario file expect of a run, of its agents and streams.
+
+    Args:
+        run: A gathered run.
+        scenario: The file, which may be of another run or simulation.
+
+    Raises:
+        InputError: The file has no checks, or they name what the run does not have; every fault with its place.
+    """
+    config = run.read_config()
+    if config is None:
+        raise InputError(f"{run.plan_json}: not to be read: what {run.name} simulated is not known")
+    if not scenario.scenario.checks:
+        raise InputError(f"{scenario.path}: has no checks: nothing can be judged by it")
+    declared = declared_streams(run.read_json(run.plan_json))
+    around = Surroundings(
+        agents=config.agents.resolved_names(),
+        labels=run_labels(run),
+        streams=KnownStreams(None if declared is None else tuple(declared.values())),
+        duration_s=config.time.duration_s,
+    )
+    resolved = resolve_checks(scenario.scenario.checks, around)
+    if resolved.faults:
+        told = [
+            scenario.fault(("checks", *where), f"{text} (of {run.name})")
+            for where, text in resolved.faults
+        ]
+        raise InputError(faults=told)
+    return resolved.expectations

@@ -1,0 +1,110 @@
+"""What an expectation came to for each agent, and of these the one that is told. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from cosmos_cli.evidence.expectations.accumulators import Occurrences
+from cosmos_cli.evidence.verdict import CheckResult
+from cosmos_cli.models.expectation import Expectation
+from madns_runtime.conditions.condition import HOST
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExpectationOutcome:
+    """Of one agent."""
+
+    got: float | None
+    """None where there is none: it never came, or is not finite."""
+    t_s: float | None
+    """Simulated time of it, s."""
+    passed: bool
+    why: str = ""
+    """Why there is none, if that is known."""
+
+
+def outcome_of_event(
+    expectation: Expectation,
+    agent: str,
+    found: Occurrences,
+    after: Mapping[str, ExpectationOutcome] | None,
+) -> ExpectationOutcome:
+    """
+    Return whether an event occurred, or did not, as it must.
+
+    Args:
+        expectation: What must be.
+        agent: Whose event.
+        found: Times of it, from `from_s` on.
+        after: By agent: the times that it is to come after; None for none.
+    """
+    must_not = expectation.must == "not_occur"
+    begin_s, latest_s = -math.inf, expectation.to_s
+    if after is not None:
+        other = after.get(agent) or after.get(HOST)
+        if other is None or other.t_s is None:
+            return ExpectationOutcome(got=0.0 if must_not else None, t_s=None, passed=must_not)
+        begin_s = other.t_s
+        if expectation.within_s is not None:
+            end_s = begin_s + expectation.within_s
+            latest_s = end_s if latest_s is None else min(latest_s, end_s)
+    times_s = [each for each in found.times_s if each >= begin_s]
+    first_s = min(times_s, default=None)
+    if must_not:
+        wrong = [each for each in times_s if latest_s is None or each <= latest_s]
+        return ExpectationOutcome(got=len(wrong), t_s=min(wrong, default=None), passed=not wrong)
+    passed = first_s is not None and (latest_s is None or first_s <= latest_s)
+    return ExpectationOutcome(got=first_s, t_s=first_s, passed=passed)
+
+
+def worst_result(
+    expectation: Expectation,
+    outcomes: Mapping[str, ExpectationOutcome],
+    unit: str,
+    *,
+    duration_s: float,
+) -> CheckResult:
+    """Return the result of an expectation: that of the agent that breaks it most, or is nearest to it."""
+    agent = max(outcomes, key=lambda name: _badness(expectation, outcomes[name]))
+    worst = outcomes[agent]
+    broken = sum(not each.passed for each in outcomes.values())
+    return CheckResult(
+        name=expectation.name,
+        limit=_nearest_limit(expectation, worst.got, duration_s),
+        got=worst.got,
+        passed=worst.passed,
+        worst=agent,
+        agent=agent,
+        t_s=worst.t_s,
+        unit=unit,
+        expected=expectation.words + (f" ({worst.why})" if worst.why else ""),
+        agents_broken=broken,
+    )
+
+
+def _badness(expectation: Expectation, outcome: ExpectationOutcome) -> tuple[bool, float]:
+    if outcome.got is None:
+        return not outcome.passed, math.inf
+    if expectation.event:
+        sign = -1.0 if outcome.passed and expectation.must == "not_occur" else 1.0
+        return not outcome.passed, sign * outcome.got
+    bounds = expectation.bounds
+    if bounds.text is not None:
+        return not outcome.passed, outcome.got
+    low = -math.inf if bounds.low is None else bounds.low - outcome.got
+    high = -math.inf if bounds.high is None else outcome.got - bounds.high
+    return not outcome.passed, max(low, high)
+
+
+def _nearest_limit(expectation: Expectation, got: float | None, duration_s: float) -> float:
+    """Return the bound that is broken or nearest; of an event its latest time, or no occurrence, of a text none unlike it."""
+    bounds = expectation.bounds
+    if expectation.event and expectation.must == "occur":
+        return duration_s if expectation.to_s is None else expectation.to_s
+    if expectation.event or bounds.text is not None:
+        return 0.0
+    if bounds.low is None or bounds.high is None or got is None:
+        return next((each for each in (bounds.high, bounds.low) if each is not None), 0.0)
+    return bounds.low if got < (bounds.low + bounds.high) / 2 else bounds.high

@@ -1,0 +1,173 @@
+"""Records of a run as expectations look at them: by stream and agent, in batches, with the time of each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import orjson
+from numpy.typing import NDArray
+
+from cosmos_cli.evidence.expectations.accumulators import Floats
+from madns_runtime.analysis.tables import RecordedTable, Tables
+from madns_runtime.conditions.condition import AGENT, HOST, TIME
+from madns_runtime.recording.records import Field
+
+BATCH_RECORDS = 65_536
+DETAILS = "details"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Batch:
+    """Some records of one agent."""
+
+    agent: str
+    is_of_host: bool
+    """Whether the host's half recorded them, of this agent or of itself."""
+    t_s: Floats
+    columns: Mapping[str, NDArray[Any]]
+    values: NDArray[Any]
+    """Of the field that was chosen; else empty."""
+
+    def has(self, field: str) -> bool:
+        """Tell whether the records have a field."""
+        return field in self.columns
+
+    def of(self, field: str) -> Batch:
+        """Return the records that have a value of this field."""
+        values = self.columns[field]
+        if values.dtype == object:
+            there = np.array([each is not None and each == each for each in values.tolist()], bool)
+        else:
+            there = ~np.isnan(values.astype(np.float64))
+        return self._where(there, values)
+
+    def all(self) -> Batch:
+        """Return all records, whatever their fields hold."""
+        return replace(self, values=np.zeros(len(self.t_s)))
+
+    def where(self, is_wanted: NDArray[np.bool_]) -> Batch:
+        """Return some of the records that `of` or `all` returned."""
+        return self if is_wanted.all() else self._where(is_wanted, self.values)
+
+    def _where(self, wanted: NDArray[np.bool_], values: NDArray[Any]) -> Batch:
+        if wanted.all():
+            return replace(self, values=values)
+        return replace(self, t_s=self.t_s[wanted], columns={}, values=values[wanted])
+
+
+class RecordSource:
+    """
+    The records of a run.
+
+    Args:
+        tables: Of the run.
+    """
+
+    def __init__(self, tables: Tables) -> None:
+        self._tables = tables
+
+    def tables_of(self, stream: str) -> list[RecordedTable]:
+        """Return the tables of a stream: of the agents, of the host's half."""
+        found = (self._tables.get(stream), self._tables.get(f"{HOST}_{stream}"))
+        return [
+            table
+            for table, role in zip(found, ("agent", HOST), strict=True)
+            if table is not None and table.role == role
+        ]
+
+    def unit_of(self, stream: str, field: str) -> str:
+        """Return the unit of a field as it was recorded; empty where it was not."""
+        fields = (each for table in self.tables_of(stream) for each in table.fields)
+        return next((each.unit for each in fields if each.name == field), "")
+
+    def has_time(self, stream: str) -> bool:
+        """Tell whether records of a stream tell when they are of."""
+        tables = self.tables_of(stream)
+        return any(_time_field({each.name: each for each in table.fields}) for table in tables)
+
+    def records_of(self, stream: str) -> int:
+        """Return the number of records of a stream."""
+        return sum(table.rows for table in self.tables_of(stream))
+
+    def batches(self, stream: str, fields: Sequence[str]) -> Iterator[Batch]:
+        """Yield all records of a stream with those of *fields* that it has, of one agent each."""
+        for table in self.tables_of(stream):
+            present = {each.name: each for each in table.fields}
+            own = [name for name in fields if name in present]
+            beside = [name for name in fields if name not in present and table.has(DETAILS)]
+            time = _time_field(present)
+            about = present.get(AGENT) if table.role == HOST else None
+            has_agents = about is not None and about.kind == "str"
+            wanted = {*own, *filter(None, [time]), *([AGENT] if has_agents else [])}
+            names = list(wanted | ({DETAILS} if beside else set())) or [next(iter(present))]
+            for source in table.sources:
+                for columns in table.batches(source, names, BATCH_RECORDS):
+                    columns = _with_details(columns, beside)
+                    yield from _split(
+                        table, source, columns, _times(columns, time), has_agents=has_agents
+                    )
+
+
+def _split(
+    table: RecordedTable,
+    source: str,
+    columns: Mapping[str, NDArray[Any]],
+    t_s: Floats,
+    *,
+    has_agents: bool,
+) -> Iterator[Batch]:
+    is_of_host = table.role == HOST
+    whole = Batch(agent=source, is_of_host=is_of_host, t_s=t_s, columns=columns, values=np.empty(0))
+    yield whole
+    if not has_agents:
+        return
+    agents = columns[AGENT].astype(str)
+    names, inverse = np.unique(agents, return_inverse=True)
+    order = np.argsort(inverse, kind="stable")
+    ends = np.cumsum(np.bincount(inverse, minlength=len(names)))
+    for name, rows in zip(names.tolist(), np.split(order, ends[:-1]), strict=True):
+        yield replace(
+            whole,
+            agent=name,
+            t_s=t_s[rows],
+            columns={key: values[rows] for key, values in columns.items()},
+        )
+
+
+def _time_field(fields: Mapping[str, Field]) -> str | None:
+    """Return the field that tells a record's time: t_s, or else the first one in seconds."""
+    if TIME in fields:
+        return TIME
+    in_s = (each.name for each in fields.values() if each.unit == "s" and each.kind == "float")
+    return next(in_s, None)
+
+
+def _times(columns: Mapping[str, NDArray[Any]], time: str | None) -> Floats:
+    """Return the simulated time of each record, s: 0 of those from before it ran."""
+    if time is None:
+        return np.zeros(len(next(iter(columns.values()))))
+    values = columns[time]
+    numbers = values.astype(np.float64) if values.dtype != object else _floats(values)
+    return np.where(np.isnan(numbers), 0.0, numbers)
+
+
+def _floats(values: NDArray[Any]) -> Floats:
+    return np.array([np.nan if each is None else float(each) for each in values.tolist()])
+
+
+def _with_details(
+    columns: Mapping[str, NDArray[Any]], fields: Sequence[str]
+) -> Mapping[str, NDArray[Any]]:
+    """Return columns with those of *fields* that events carry beside their stream's own."""
+    if not fields:
+        return columns
+    details = [orjson.loads(text) if text else {} for text in columns[DETAILS].tolist()]
+    found = dict(columns)
+    for name in fields:
+        column = np.empty(len(details), dtype=object)
+        column[:] = [each.get(name) for each in details]
+        found[name] = column
+    return found

@@ -1,0 +1,301 @@
+"""The expectations of a scenario: what is wrong with them among its agents and streams, and what is judged. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
+from cosmos_cli.models.check_rules import OF_TIMES, CheckRule
+from cosmos_cli.models.document import did_you_mean
+from cosmos_cli.models.expectation import Expectation, HeldBounds
+from cosmos_cli.models.known_streams import REAL_TIME_ONLY, KnownStreams
+from cosmos_cli.models.plugin_answers import PluginAnswers
+from cosmos_cli.models.scenario import Scenario
+from cosmos_cli.models.value_rules import BoundsRule, RuleFault, words_at
+from madns_runtime.conditions.condition import HOST, ValueBounds
+from madns_runtime.recording.records import EVENTS, Field
+from madns_runtime.units import conversion
+
+EVENT_FIELD = "event"
+UNIT_CURE = "leave out unit, or write one that converts"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Surroundings:
+    """What checks are about."""
+
+    agents: tuple[str, ...]
+    labels: AgentLabels
+    streams: KnownStreams
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class ResolvedChecks:
+    """The expectations that are meant, and what is wrong."""
+
+    expectations: tuple[Expectation, ...]
+    faults: tuple[RuleFault, ...]
+    """Paths within the list of checks."""
+
+
+def resolve_checks(rules: Sequence[CheckRule], around: Surroundings) -> ResolvedChecks:
+    """
+    Return what is judged by the checks of a scenario.
+
+    Args:
+        rules: As they are written.
+        around: The agents and streams that they are about.
+    """
+    faults: list[RuleFault] = []
+    found: list[Expectation] = []
+    earlier: dict[str, CheckRule] = {}
+    for index, rule in enumerate(rules):
+        own = [*rule.own_faults(), *_faults_among(rule, earlier), *_Placing(rule, around).faults()]
+        faults += words_at((index,), iter(own))
+        earlier.setdefault(rule.name, rule)
+        if not own:
+            found.append(_Placing(rule, around).expectation())
+    return ResolvedChecks(tuple(found), tuple(faults))
+
+
+def scenario_checks(
+    scenario: Scenario, answers: PluginAnswers, broken: frozenset[str]
+) -> ResolvedChecks:
+    """
+    Return what the checks of a scenario expect; nothing while it is open what they are about.
+
+    Args:
+        scenario: The scenario.
+        answers: Of its simulation.
+        broken: Keys with faults of their own.
+    """
+    agents = scenario.agents.resolved_names()
+    is_open = answers.labels is None or answers.parameters is None
+    if is_open or broken.intersection(("checks", "agents", "time")):
+        return ResolvedChecks((), ())
+    around = Surroundings(
+        agents=agents,
+        labels=answers.labels or NO_LABELS,
+        streams=KnownStreams(answers.streams),
+        duration_s=scenario.time.duration_s,
+    )
+    return resolve_checks(scenario.checks, around)
+
+
+def _faults_among(rule: CheckRule, earlier: dict[str, CheckRule]) -> Iterator[RuleFault]:
+    if rule.name in earlier:
+        yield ("name",), f"expected unique names, got {rule.name!r} again"
+    if rule.after is None:
+        return
+    other = earlier.get(rule.after)
+    timed = [each.name for each in earlier.values() if _has_time(each)]
+    if other is None:
+        text = f"no check above is named {rule.after!r}{did_you_mean(rule.after, timed)}"
+        yield ("after",), text
+    elif not _has_time(other):
+        yield ("after",), f"{rule.after} has no time: expected an event or a first_time"
+
+
+def _has_time(rule: CheckRule) -> bool:
+    return rule.event is not None or rule.kind == "first_time"
+
+
+class _Placing:
+    """One rule among agents and streams."""
+
+    def __init__(self, rule: CheckRule, around: Surroundings) -> None:
+        self._rule, self._around = rule, around
+        self._stream = rule.stream or EVENTS.name
+        self._field = rule.field or (EVENT_FIELD if rule.event is not None else "")
+        self._roles = around.streams.roles(self._stream)
+
+    def faults(self) -> Iterator[RuleFault]:
+        rule, streams = self._rule, self._around.streams
+        yield from self._time_faults()
+        if fault := streams.stream_fault(self._stream):
+            yield ("stream",), fault
+            return
+        yield from self._agent_faults()
+        if not streams.has_time(self._stream):
+            yield from self._timeless_faults()
+        if self._field and (fault := streams.field_fault(self._stream, self._field)):
+            yield ("field",), fault
+        elif self._field:
+            yield from self._value_faults(streams.field(self._stream, self._field))
+        if rule.while_ is not None:
+            yield from words_at(("while",), self._while_faults(rule.while_))
+
+    def _time_faults(self) -> Iterator[RuleFault]:
+        rule, end_s = self._rule, self._around.duration_s
+        if rule.from_s is not None and rule.from_s >= end_s:
+            text = f"expected less than time.duration_s ({end_s:g}), got {rule.from_s:g}"
+            yield ("from_s",), f"{text}: nothing is recorded then"
+
+    def _timeless_faults(self) -> Iterator[RuleFault]:
+        rule = self._rule
+        text = f"records of stream {self._stream} tell no time"
+        for word in ("from_s", "to_s", "while_", "before_s", "after", "within_s"):
+            if getattr(rule, word) is not None:
+                yield (word.rstrip("_"),), f"{text}: leave this out"
+        if rule.kind in OF_TIMES:
+            yield ("statistic",), f"{text}: expected another than {rule.kind}"
+
+    def _agent_faults(self) -> Iterator[RuleFault]:
+        around, streams = self._around, self._around.streams
+        for place, pattern in enumerate(self._rule.agents):
+            path = ("agents", place)
+            if pattern == HOST:
+                if "host" not in self._roles:
+                    yield (
+                        path,
+                        f"stream {self._stream} is recorded by agents, not by the host's half",
+                    )
+            elif not around.labels.like(pattern, around.agents):
+                yield path, f"no agent is named {pattern}{did_you_mean(pattern, around.agents)}"
+            elif self._roles == {"host"} and not streams.names_agents(self._stream):
+                text = f"stream {self._stream} is recorded by the host's half and names no agent"
+                yield path, f"{text}: leave out agents"
+
+    def _value_faults(self, field: Field | None) -> Iterator[RuleFault]:
+        rule = self._rule
+        if rule.event is not None:
+            if field is not None and field.kind != "str":
+                yield ("field",), f"{field.name} holds no words: an event is a word of a text field"
+            return
+        is_statistic = rule.kind in (*OF_TIMES, "count", "rate")
+        bounded: BoundsRule | None = rule.when if is_statistic else rule
+        below = ("when",) if is_statistic else ()
+        if is_statistic and isinstance(rule.equals, str | bool):
+            yield ("equals",), f"a {rule.kind} is a number, got {rule.equals!r}"
+        if bounded is not None:
+            yield from words_at(below, _kind_faults(bounded, field))
+        if not is_statistic and isinstance(rule.equals, str) and rule.kind not in ("each", "last"):
+            yield ("statistic",), f"a text has no {rule.kind}: expected each or last"
+        elif field is not None and field.kind == "str" and rule.kind not in (
+            "each", "last", "count", "rate", *OF_TIMES,
+        ):  # fmt: skip
+            yield ("statistic",), f"{field.name} holds texts, which have no {rule.kind}"
+        yield from _unit_faults(rule.unit, field, must_know=rule.stop_when_broken)
+
+    def _while_faults(self, rule: BoundsRule) -> Iterator[RuleFault]:
+        streams = self._around.streams
+        stream, name = str(rule.stream), str(rule.field)  # type: ignore[attr-defined]
+        if fault := streams.stream_fault(stream):
+            yield ("stream",), fault
+        elif fault := streams.field_fault(stream, name):
+            yield ("field",), fault
+        else:
+            field = streams.field(stream, name)
+            yield from _kind_faults(rule, field)
+            yield from _unit_faults(rule.unit, field)  # type: ignore[attr-defined]
+
+    def expectation(self) -> Expectation:
+        rule, around = self._rule, self._around
+        is_of_host = (
+            self._roles == {"host"}
+            and around.streams.names_agents(self._stream)
+            and HOST not in rule.agents
+        )
+        field = around.streams.field(self._stream, self._field)
+        of = "" if field is None else field.unit
+        held = rule.while_
+        return Expectation(
+            name=rule.name,
+            words=_words(rule, self._stream, self._field, of),
+            stream=self._stream,
+            field=self._field,
+            agents=self._agents(is_of_host=is_of_host),
+            is_of_host=is_of_host,
+            statistic=rule.kind,
+            bounds=ValueBounds() if rule.event is not None else rule.bounds(),
+            unit=rule.unit,
+            when=None if rule.when is None else rule.when.bounds(),
+            from_s=rule.from_s,
+            to_s=_earliest(rule.to_s, rule.before_s),
+            meanwhile=None
+            if held is None
+            else HeldBounds(
+                stream=held.stream, field=held.field, bounds=held.bounds(), unit=held.unit
+            ),
+            event=rule.event or "",
+            must=rule.must or "occur",
+            after=rule.after or "",
+            within_s=rule.within_s,
+            only_realtime=self._stream in REAL_TIME_ONLY
+            or (held is not None and held.stream in REAL_TIME_ONLY),
+            stop_when_broken=rule.stop_when_broken,
+            unit_factor=(rule.unit and conversion(rule.unit, of)) or 1.0,
+        )
+
+    def _agents(self, *, is_of_host: bool) -> tuple[str, ...]:
+        rule, around = self._rule, self._around
+        if not rule.agents:
+            return around.agents if is_of_host or "agent" in self._roles else (HOST,)
+        chosen = around.labels.like_any(
+            [pattern for pattern in rule.agents if pattern != HOST], around.agents
+        )
+        return (*chosen, *([HOST] if HOST in rule.agents else []))
+
+
+def _earliest(*times_s: float | None) -> float | None:
+    return min((each for each in times_s if each is not None), default=None)
+
+
+def _kind_faults(rule: BoundsRule, field: Field | None) -> Iterator[RuleFault]:
+    """Yield what does not fit between bounds and the kind of a field."""
+    if field is None:
+        return
+    if field.kind == "str" and rule.word and not isinstance(rule.equals, str):
+        yield (rule.word,), f"{field.name} holds texts: expected equals and one of them"
+    elif field.kind != "str" and isinstance(rule.equals, str):
+        kind = "true or false" if field.kind == "bool" else "a number"
+        yield ("equals",), f"{field.name} holds no texts: expected {kind}, got {rule.equals!r}"
+    elif field.kind in ("float", "int") and isinstance(rule.equals, bool):
+        yield ("equals",), f"{field.name} holds numbers, got {str(rule.equals).lower()}"
+
+
+def _unit_faults(unit: str, field: Field | None, *, must_know: bool = False) -> Iterator[RuleFault]:
+    if not unit:
+        return
+    if field is None:
+        if must_know:
+            yield (
+                ("unit",),
+                "with stop_when_broken the field's unit must be declared: leave out unit",
+            )
+        return
+    if conversion(unit, field.unit) is None:
+        has = f"is in {field.unit}" if field.unit else "has no unit"
+        yield ("unit",), f"{field.name} {has}, got {unit!r:.40}: {UNIT_CURE}"
+
+
+def _words(rule: CheckRule, stream: str, field: str, unit: str) -> str:
+    """Return what a rule expects, as a person reads it."""
+    when = _times(rule)
+    if rule.event is not None:
+        must = "must not occur" if rule.must == "not_occur" else "must occur"
+        by = f" by {rule.before_s:g} s" if rule.before_s is not None else ""
+        within = f" within {rule.within_s:g} s" if rule.within_s is not None else ""
+        after = f"{within} after {rule.after}" if rule.after else ""
+        return f"{rule.event} in {stream} {must}{by}{after}{when}"
+    what = f"{stream}.{field}" if field else stream
+    own = rule.unit or unit
+    if rule.kind in OF_TIMES:
+        assert rule.when is not None
+        return f"{rule.kind} of {what} {rule.when.words(own)}: {rule.words('s')}{when}"
+    if rule.kind in ("count", "rate"):
+        counted = "" if rule.when is None else f" {rule.when.words(own)}"
+        return f"{rule.kind} of {what}{counted}: {rule.words('1/s' if rule.kind == 'rate' else '')}{when}"
+    statistic = "last" if rule.at_end else rule.kind
+    return f"{statistic} of {what} {rule.words(own)}{when}"
+
+
+def _times(rule: CheckRule) -> str:
+    text = "" if rule.from_s is None else f" from {rule.from_s:g} s"
+    text += "" if rule.to_s is None else f" to {rule.to_s:g} s"
+    if rule.while_ is None:
+        return text
+    held = rule.while_
+    return f"{text} while {held.stream}.{held.field} {held.words(held.unit)}"

@@ -1,0 +1,117 @@
+"""An expectation as it is judged: whose records, what of them, and the limit. A value that travels in plan.json. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from madns_runtime.conditions.condition import HOST, Condition, ValueBounds
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeldBounds:
+    """What has to hold meanwhile for a record to count."""
+
+    stream: str
+    field: str
+    bounds: ValueBounds
+    """In `unit`, or in the field's own."""
+    unit: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Expectation:
+    """One expectation of a run."""
+
+    name: str
+    words: str
+    """What is expected, such as `max of drive.error_m below 0.5 m`."""
+    stream: str
+    field: str = ""
+    """Empty for a count of records."""
+    agents: tuple[str, ...]
+    """Names; host for the records of the host's half."""
+    is_of_host: bool = False
+    """Whether the host's half records it of agents, which its field `agent` names."""
+    statistic: str = "each"
+    bounds: ValueBounds = ValueBounds()
+    """Of the statistic, in `unit`, s, or a number."""
+    unit: str = ""
+    """Unit of the values; the field's own if empty."""
+    when: ValueBounds | None = None
+    """Bounds of the value, in `unit`."""
+    from_s: float | None = None
+    to_s: float | None = None
+    meanwhile: HeldBounds | None = None
+    event: str = ""
+    """Word that a record holds in `field`; empty where values are judged."""
+    must: Literal["occur", "not_occur"] = "occur"
+    after: str = ""
+    within_s: float | None = None
+    only_realtime: bool = False
+    """Whether no run in lockstep records the stream."""
+    stop_when_broken: bool = False
+    unit_factor: float = 1.0
+    """Values in the field's declared unit that one of `unit` makes: for conditions in the run."""
+
+    def is_judged_in(self, *, is_lockstep: bool) -> bool:
+        """Tell whether runs of a time mode record what it is about."""
+        return not (self.only_realtime and is_lockstep)
+
+
+def conditions_of_checks(
+    expectations: Sequence[Expectation], first: int = 0
+) -> tuple[Condition, ...]:
+    """Return the conditions that break, in the run, expectations which it is to end with; numbers go up from *first*."""
+    found = [
+        condition for each in expectations if each.stop_when_broken for condition in _breaking(each)
+    ]
+    return tuple(replace(each, number=first + place) for place, each in enumerate(found))
+
+
+def _breaking(expectation: Expectation) -> Iterator[Condition]:
+    bounds, times = _broken_bounds(expectation)
+    condition = Condition(
+        number=0,
+        name=expectation.name,
+        stream=expectation.stream,
+        field=expectation.field,
+        bounds=bounds,
+        times=times,
+        from_s=expectation.from_s,
+        to_s=expectation.to_s,
+        ends_run=True,
+    )
+    if expectation.is_of_host:
+        yield replace(condition, agents=expectation.agents, is_of_host=True)
+        return
+    agents = tuple(name for name in expectation.agents if name != HOST)
+    if agents:
+        yield replace(condition, agents=agents)
+    if HOST in expectation.agents:
+        yield replace(condition, agents=(HOST,), is_of_host=True)
+
+
+def _broken_bounds(expectation: Expectation) -> tuple[ValueBounds, int]:
+    """Return the bounds of a value that breaks an expectation, in the field's unit, and in how many records."""
+    bounds, factor = expectation.bounds, expectation.unit_factor
+    if expectation.event:
+        return ValueBounds.equals(expectation.event), 1
+    if expectation.statistic == "count":
+        high = bounds.high or 0.0
+        times = math.floor(high) + 1 if bounds.is_closed else math.ceil(high)
+        counted = ValueBounds() if expectation.when is None else scaled(expectation.when, factor)
+        return counted, max(1, times)
+    if expectation.statistic == "max":
+        bounds = replace(bounds, low=None)
+    elif expectation.statistic == "min":
+        bounds = replace(bounds, high=None)
+    return scaled(bounds, factor).negated(), 1
+
+
+def scaled(bounds: ValueBounds, factor: float) -> ValueBounds:
+    """Return the bounds of values in another unit, *factor* of which make one of these."""
+    low, high = (None if each is None else each * factor for each in (bounds.low, bounds.high))
+    return replace(bounds, low=low, high=high)

@@ -1,0 +1,111 @@
+"""What a scenario says of a recorded value: which stream and field, and the bounds of it. Shared by checks and timeline."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated
+
+from annotated_types import Ge
+
+from cosmos_cli.models.text_forms import NonBlank
+from madns_runtime.conditions.condition import ValueBounds
+from madns_runtime.config import FORBID_EXTRA
+
+BOUND_WORDS = ("below", "above", "within", "equals")
+RulePath = tuple[str | int, ...]
+RuleFault = tuple[RulePath, str]
+"""The path within the rule, and what is wrong there."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoundsRule:
+    """Bounds of a value: one of below, above, within and equals."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    below: float | None = None
+    """Values less than this hold."""
+    above: float | None = None
+    """Values greater than this hold."""
+    within: tuple[float, float] | None = None
+    """Values from the first to the second hold, these included."""
+    equals: float | bool | str | None = None
+    """This number, truth value or text holds."""
+    tolerance: Annotated[float, Ge(0)] = 0.0
+    """How far from `equals` a number may be."""
+
+    @property
+    def word(self) -> str:
+        """The one of BOUND_WORDS that is given; empty if none is."""
+        return next((word for word in BOUND_WORDS if getattr(self, word) is not None), "")
+
+    def bounds(self, factor: float = 1.0) -> ValueBounds:
+        """Return the bounds of values in a unit, of which *factor* make one of the rule's."""
+        if self.below is not None:
+            return ValueBounds.below(self.below * factor)
+        if self.above is not None:
+            return ValueBounds.above(self.above * factor)
+        if self.within is not None:
+            return ValueBounds.within(self.within[0] * factor, self.within[1] * factor)
+        if isinstance(self.equals, str):
+            return ValueBounds.equals(self.equals)
+        return ValueBounds.equals(float(self.equals or 0.0) * factor, self.tolerance * factor)
+
+    def words(self, unit: str = "") -> str:
+        """Return the rule in words, such as `below 0.5 m`."""
+        behind = f" {unit}" if unit else ""
+        if self.within is not None:
+            return f"within {self.within[0]:g} and {self.within[1]:g}{behind}"
+        value = getattr(self, self.word or "below")
+        if isinstance(value, bool | str) or value is None:
+            return f"{self.word} {str(value).lower() if isinstance(value, bool) else value}"
+        around = f" within {self.tolerance:g}" if self.tolerance else ""
+        return f"{self.word} {value:g}{around}{behind}"
+
+    def bounds_faults(self) -> Iterator[RuleFault]:
+        """Yield what is wrong with the bounds by themselves."""
+        given = [word for word in BOUND_WORDS if getattr(self, word) is not None]
+        if not given:
+            yield (), f"expected a limit: one of {', '.join(BOUND_WORDS)}"
+        for word in given[1:]:
+            yield (word,), f"expected one limit, got {given[0]} as well: write two checks"
+        if self.within is not None and self.within[0] > self.within[1]:
+            low, high = self.within
+            yield ("within",), f"expected the lesser bound first, got [{low:g}, {high:g}]"
+        if self.tolerance and (self.equals is None or isinstance(self.equals, str | bool)):
+            yield ("tolerance",), "goes with equals and a number: leave it out"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldRule(BoundsRule):
+    """Bounds of a field of a stream."""
+
+    stream: NonBlank
+    """Stream whose records count."""
+    field: NonBlank
+    """Field of it."""
+    unit: str = ""
+    """Unit of the bounds; the field's own if not given."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AwaitedRule(FieldRule):
+    """What is waited for in the records of some agents."""
+
+    agents: tuple[NonBlank, ...] = ()
+    """Names, labels or globs of agents; host for the host's half. Not given: all who record it."""
+    for_s: Annotated[float, Ge(0)] = 0.0
+    """How long it must have held, s."""
+
+
+def words_at(path: RulePath, faults: Iterator[RuleFault]) -> Iterator[RuleFault]:
+    """Yield faults of a rule that stands below *path*."""
+    for inner, text in faults:
+        yield (*path, *inner), text
+
+
+def field_names(kind: type) -> tuple[str, ...]:
+    """Return the names of a rule's fields."""
+    return tuple(item.name for item in dataclasses.fields(kind))

@@ -1,0 +1,112 @@
+"""The report's chapter on expectations: what each came to, and its limit drawn in the field's figure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from cosmos_cli.evidence.expectations.of_run import planned_expectations
+from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.verdict import is_number
+from cosmos_cli.models.expectation import Expectation, scaled
+from madns_runtime.analysis.lines import grouped_lines
+from madns_runtime.analysis.tables import RecordedRun, RecordedTable
+from madns_runtime.analysis.values import Axis, Block, Heading, LimitLine, Section, TableBlock
+from madns_runtime.conditions.condition import AGENT, HOST, ValueBounds
+from madns_runtime.recording.records import Field
+from madns_runtime.units import conversion
+
+FIGURES_MAX = 12
+AGENTS_DRAWN_MAX = 20
+"""Agents of a figure, the one that is told in the result first."""
+OF_VALUES = ("each", "last", "max", "min", "mean", "rms", "p99")
+"""Statistics whose limit lies on the field's own axis; of others the bounds under `when` do."""
+HEADINGS = ("check", "got", "limit", "unit", "", "agent", "at t, s", "expected")
+NUMBERS = ("got", "limit", "at t, s")
+
+
+def expectation_sections(run: RunDirectory, recorded: RecordedRun) -> list[Section]:
+    """Return the chapter; none of a run that expected nothing."""
+    listed = recorded.document.get("checks")
+    results = {
+        str(check.get("name")): check
+        for check in (listed if isinstance(listed, list) else [])
+        if isinstance(check, Mapping) and check.get("expected")
+    }
+    if not results:
+        return []
+    table = TableBlock(
+        title="What was expected, and what came",
+        headings=[Heading(text=text, is_number=text in NUMBERS) for text in HEADINGS],
+        rows=[_row(check) for check in results.values()],
+        note="Of several agents the one that breaks the limit most, or is nearest to it.",
+    )
+    expectations = planned_expectations(run.read_json(run.plan_json))
+    drawn = list(_figures(expectations, results, recorded))
+    return [Section(title="Expectations", blocks=[table, *drawn[:FIGURES_MAX]])]
+
+
+def _row(check: Mapping[str, Any]) -> list[object]:
+    return [
+        check.get("name"),
+        check.get("got") if is_number(check.get("got")) else "not measured",
+        check.get("limit"),
+        check.get("unit") or "",
+        "holds" if check.get("passed") is True else "BROKEN",
+        check.get("agent") or "",
+        check.get("t_s"),
+        check.get("expected"),
+    ]
+
+
+def _figures(
+    expectations: Sequence[Expectation],
+    results: Mapping[str, Mapping[str, Any]],
+    recorded: RecordedRun,
+) -> Iterator[Block]:
+    for each in expectations:
+        result, table = results.get(each.name), _table(each, recorded)
+        if result is None or table is None or each.event:
+            continue
+        field = next((known for known in table.fields if known.name == each.field), None)
+        if field is not None and field.kind in ("float", "int"):
+            yield from _figure(each, result, table, field, recorded)
+
+
+def _table(expectation: Expectation, recorded: RecordedRun) -> RecordedTable | None:
+    is_host = expectation.is_of_host or expectation.agents == (HOST,)
+    return recorded.tables.get(f"{HOST}_{expectation.stream}" if is_host else expectation.stream)
+
+
+def _figure(
+    expectation: Expectation,
+    result: Mapping[str, Any],
+    table: RecordedTable,
+    field: Field,
+    recorded: RecordedRun,
+) -> list[Block]:
+    series, x = recorded.series(table, field.name)
+    worst = str(result.get(AGENT))
+    named = [worst, *(name for name in expectation.agents if name != worst)][:AGENTS_DRAWN_MAX]
+    return grouped_lines(
+        {name: series[name] for name in named if name in series},
+        title=f"{expectation.name}: {expectation.words}",
+        x=x,
+        y=Axis(unit=field.unit),
+        limits=_limits(expectation, field.unit),
+    )
+
+
+def _limits(expectation: Expectation, unit: str) -> list[LimitLine]:
+    is_value = expectation.statistic in OF_VALUES
+    bounds: ValueBounds | None = expectation.bounds if is_value else expectation.when
+    factor = conversion(expectation.unit, unit) if expectation.unit else 1.0
+    if bounds is None or factor is None:
+        return []
+    bounds = scaled(bounds, factor)
+    found = []
+    if bounds.high is not None:
+        found.append(LimitLine(value=bounds.high, name=expectation.name))
+    if bounds.low is not None:
+        found.append(LimitLine(value=bounds.low, name=expectation.name, is_least=True))
+    return found

@@ -1,0 +1,315 @@
+"""Expectations judged over all records: each statistic against numpy, events in order, units, and what is not there."""
+
+import math
+
+import numpy as np
+import pytest
+
+from cosmos_cli.evidence.expectations import records
+from cosmos_cli.evidence.expectations.judge import judge_expectations
+from cosmos_cli.evidence.verdict import conclusion_of_expectations
+from cosmos_cli.models.expectation import Expectation, HeldBounds
+from madns_runtime.conditions.condition import ValueBounds
+from madns_runtime.recording.records import Field
+
+DURATION_S = 100.0
+rng = np.random.default_rng(7)
+T_S = np.arange(0.0, 100.0, 0.01)
+DATA = {name: rng.normal(size=len(T_S)).cumsum() * 0.01 for name in ("a", "b")}
+
+
+class FakeTable:
+    """A table in memory."""
+
+    def __init__(self, name, fields, sources, role="agent"):
+        self.name, self.role, self.fields, self._sources = name, role, tuple(fields), sources
+
+    @property
+    def rows(self):
+        return sum(len(next(iter(columns.values()))) for columns in self._sources.values())
+
+    @property
+    def sources(self):
+        return tuple(self._sources)
+
+    def has(self, *names):
+        return set(names) <= {field.name for field in self.fields}
+
+    def batches(self, source, names, rows_max):
+        columns = self._sources[source]
+        for start in range(0, len(next(iter(columns.values()))), rows_max):
+            yield {name: columns[name][start : start + rows_max] for name in names}
+
+
+def objects(values):
+    column = np.empty(len(values), dtype=object)
+    column[:] = values
+    return column
+
+
+STATE = FakeTable(
+    "state",
+    (Field("t_s", "s"), Field("x_m", "m")),
+    {name: {"t_s": T_S, "x_m": values} for name, values in DATA.items()},
+)
+EVENTS = FakeTable(
+    "events",
+    (Field("t_s", "s"), Field("event", "", "str"), Field("details", "", "json")),
+    {
+        "a": {
+            "t_s": objects([None, 1.0, 5.0, 9.0]),
+            "event": objects(["start", "burn", "done", "burn"]),
+            "details": objects([None, '{"dv_m_s": 2.5}', None, '{"dv_m_s": 0.5}']),
+        },
+        "b": {
+            "t_s": objects([None, 6.0]),
+            "event": objects(["start", "done"]),
+            "details": objects([None, None]),
+        },
+    },
+)
+HOST = FakeTable(
+    "host_slots",
+    (Field("t_s", "s"), Field("agent", "", "str"), Field("error_deg", "deg")),
+    {
+        "host": {
+            "t_s": np.array([0.0, 0.0, 1.0, 1.0]),
+            "agent": objects(["a", "b", "a", "b"]),
+            "error_deg": np.array([1.0, -2.0, np.nan, -3.0]),
+        }
+    },
+    role="host",
+)
+TABLES = {"state": STATE, "events": EVENTS, "host_slots": HOST}
+
+
+def expect(**values):
+    given = {"name": "x", "words": "x", "stream": "state", "field": "x_m", "agents": ("a", "b")}
+    return Expectation(**(given | values))
+
+
+def judge(*expectations, tables=TABLES, is_lockstep=True):
+    return judge_expectations(expectations, tables, is_lockstep=is_lockstep, duration_s=DURATION_S)
+
+
+def result_of(**values):
+    (result,) = judge(expect(**values)).results
+    return result
+
+
+STATISTICS = {
+    "max": np.max,
+    "min": np.min,
+    "mean": np.mean,
+    "rms": lambda x: math.sqrt(np.mean(x**2)),
+    "p99": lambda x: np.quantile(x, 0.99, method="inverted_cdf"),
+    "last": lambda x: x[-1],
+    "count": len,
+    "rate": lambda x: len(x) / 50.0,
+}
+
+
+@pytest.mark.parametrize("rows", [7, 1000, 65_536])
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_a_statistic_is_that_of_all_records_in_its_time_however_they_are_read(
+    statistic, rows, monkeypatch
+):
+    monkeypatch.setattr(records, "BATCH_RECORDS", rows)
+
+    result = result_of(
+        statistic=statistic, bounds=ValueBounds.below(1e9), from_s=20.0, to_s=70.0, agents=("a",)
+    )
+
+    wanted = STATISTICS[statistic](DATA["a"][(T_S >= 20.0) & (T_S <= 70.0)])
+    assert result.got == pytest.approx(wanted, rel=1e-12)
+    assert result.passed
+
+
+@pytest.mark.parametrize("rows", [7, 65_536])
+def test_first_time_and_settled_are_times_of_records(rows, monkeypatch):
+    monkeypatch.setattr(records, "BATCH_RECORDS", rows)
+    high = float(np.median(DATA["a"]))
+    within = ValueBounds.below(high)
+    inside = DATA["a"] < high
+
+    first = result_of(
+        statistic="first_time", when=within, bounds=ValueBounds.below(99.0), agents=("a",)
+    )
+    settled = result_of(
+        statistic="settled", when=within, bounds=ValueBounds.below(99.0), agents=("a",)
+    )
+
+    assert first.got == T_S[inside][0]
+    outside = np.flatnonzero(~inside)
+    expected = None if outside[-1] + 1 == len(T_S) else T_S[outside[-1] + 1]
+    assert settled.got == expected
+    assert (first.unit, settled.unit) == ("s", "s")
+
+
+def test_the_worst_agent_is_told_with_its_time_in_the_unit_of_the_check():
+    worst = {name: np.abs(values).max() for name, values in DATA.items()}
+    agent = max(worst, key=worst.get)
+    at_s = T_S[np.abs(DATA[agent]).argmax()]
+
+    result = result_of(bounds=ValueBounds.within(-1.0, 1.0), unit="mm")
+
+    assert (result.agent, result.worst, result.t_s, result.unit) == (agent, agent, at_s, "mm")
+    assert abs(result.got) == pytest.approx(worst[agent] * 1000.0)
+    assert result.limit == math.copysign(1.0, result.got)
+    assert not result.passed
+    assert result.agents_broken == 2
+
+
+def test_a_limit_is_compared_as_strictly_as_it_says():
+    top = float(DATA["a"].max())
+
+    assert not result_of(bounds=ValueBounds.below(top), agents=("a",)).passed
+    assert result_of(bounds=ValueBounds(high=top), agents=("a",)).passed
+
+
+def test_records_count_only_while_a_condition_on_another_stream_holds(monkeypatch):
+    monkeypatch.setattr(records, "BATCH_RECORDS", 3)
+    mode = FakeTable(
+        "mode",
+        (Field("t_s", "s"), Field("mode", "", "str")),
+        {
+            "a": {
+                "t_s": np.array([10.0, 20.0, 30.0, 90.0]),
+                "mode": objects(["on", "on", "off", "on"]),
+            }
+        },
+    )
+    held = HeldBounds(stream="mode", field="mode", bounds=ValueBounds.equals("on"))
+
+    (result,) = judge(
+        expect(statistic="count", bounds=ValueBounds.above(0.0), meanwhile=held, agents=("a",)),
+        tables={**TABLES, "mode": mode},
+    ).results
+
+    wanted = ((T_S >= 10.0) & (T_S < 30.0)) | (T_S >= 90.0)
+    assert result.got == np.count_nonzero(wanted)
+
+
+def test_a_host_stream_is_judged_agent_by_agent_and_skips_what_is_not_there():
+    result = result_of(
+        stream="slots",
+        field="error_deg",
+        is_of_host=True,
+        statistic="min",
+        bounds=ValueBounds.above(-2.5),
+    )
+
+    assert (result.agent, result.got, result.t_s, result.passed) == ("b", -3.0, 1.0, False)
+    alone = result_of(
+        stream="slots",
+        field="error_deg",
+        is_of_host=True,
+        statistic="count",
+        bounds=ValueBounds.below(2.0),
+        agents=("a",),
+    )
+    assert (alone.got, alone.passed) == (1, True)
+
+
+def event(**values):
+    return result_of(**({"stream": "events", "field": "event", "event": "burn"} | values))
+
+
+def test_an_event_must_occur_in_each_agent_or_in_none():
+    assert not event().passed
+    assert (event().agent, event().got) == ("b", None)
+    there = event(agents=("a",))
+    assert (there.passed, there.got, there.t_s, there.limit) == (True, 1.0, 1.0, DURATION_S)
+    assert event(agents=("a",), to_s=0.5).passed is False
+    never = event(must="not_occur")
+    assert (never.passed, never.agent, never.got, never.t_s) == (False, "a", 2, 1.0)
+    assert event(must="not_occur", event="lost").passed
+    assert event(event="start").got == 0.0, "what comes before time runs counts as its begin"
+
+
+def test_events_are_judged_in_their_order_and_within_a_time():
+    done = expect(name="done", stream="events", field="event", event="done")
+    after = {
+        "name": "after",
+        "stream": "events",
+        "field": "event",
+        "event": "burn",
+        "after": "done",
+    }
+
+    late = judge(done, expect(**after, agents=("a",), within_s=3.0)).results[1]
+    timely = judge(done, expect(**after, agents=("a",), within_s=4.0)).results[1]
+    nothing = judge(done, expect(**after, agents=("b",))).results[1]
+
+    assert (late.passed, late.got) == (False, 9.0)
+    assert timely.passed
+    assert (nothing.passed, nothing.got) == (False, None)
+
+
+def test_what_events_carry_beside_their_fields_is_a_value_too():
+    result = result_of(
+        stream="events", field="dv_m_s", bounds=ValueBounds.below(2.0), agents=("a",)
+    )
+
+    assert (result.got, result.t_s, result.passed) == (2.5, 1.0, False)
+
+
+def test_texts_are_counted_that_are_not_the_one_expected():
+    result = result_of(
+        stream="events", field="event", bounds=ValueBounds.equals("burn"), agents=("a",)
+    )
+
+    assert (result.got, result.limit, result.t_s, result.passed) == (2, 0.0, 0.0, False)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"stream": "nowhere"},
+        {"field": "y_m"},
+        {"agents": ("a", "c")},
+        {"from_s": 99.999},
+        {"stream": "nowhere", "statistic": "count", "bounds": ValueBounds.below(9.0)},
+        {"stream": "nowhere", "event": "burn", "must": "not_occur"},
+        {"unit": "kg"},
+    ],
+)
+def test_what_never_came_is_broken(values):
+    result = result_of(**({"bounds": ValueBounds.below(1e9)} | values))
+
+    assert (result.got, result.passed) == (None, False)
+
+
+@pytest.mark.parametrize(
+    "statistic", ["each", "max", "min", "mean", "rms", "p99", "last", "settled"]
+)
+def test_nothing_but_nan_never_passes(statistic):
+    nan = {"a": {"t_s": T_S, "x_m": np.full(len(T_S), np.nan)}}
+    table = FakeTable("state", STATE.fields, nan)
+    when = ValueBounds.below(math.inf)
+
+    (result,) = judge(
+        expect(statistic=statistic, when=when, bounds=ValueBounds.below(1e9), agents=("a",)),
+        tables={"state": table},
+    ).results
+
+    assert (result.got, result.passed) == (None, False)
+
+
+def test_a_stream_of_the_other_time_mode_is_not_judged_and_a_run_without_any_judged_has_a_gap():
+    of_ticks = expect(name="ticks", stream="ticks", only_realtime=True)
+
+    lockstep = judge(of_ticks)
+    assert (lockstep.results, lockstep.gaps()) == (
+        (),
+        (
+            "checks: none of 1 was judged, such as ticks: its stream is recorded in real time alone,"
+            " and this run was in lockstep",
+        ),
+    )
+    assert conclusion_of_expectations((), lockstep.gaps())[0] == 5
+    assert judge(of_ticks, is_lockstep=False).results[0].passed is False
+    both = judge(of_ticks, expect(bounds=ValueBounds.below(1e9)))
+    assert [each.name for each in both.results] == ["x"]
+    assert both.gaps() == ()
+    assert both.remarks()[0].startswith("ticks: not judged: ")

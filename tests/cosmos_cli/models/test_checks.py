@@ -1,0 +1,175 @@
+"""Expectations of a scenario: what is wrong with one is told with its place, what was expected, and what was meant."""
+
+import re
+
+import pytest
+
+from cosmos_cli.errors import InputError
+from cosmos_cli.models.expectation import conditions_of_checks
+from cosmos_cli.models.loading import check_scenario
+from madns_runtime.conditions.condition import ValueBounds
+
+HEAD = """\
+name: broken
+simulation: counter
+agents: {count: 3, tick_hz: 20}
+time: {duration_s: 60}
+checks:
+"""
+FIRST_LINE = HEAD.count("\n") + 1
+PACKET = "name: a, stream: round_trips, field: packet"
+TICKS = "name: a, stream: ticks, field: lateness_us"
+START = "name: a, event: start"
+
+
+def load(*checks, folder):
+    text = HEAD + "".join(f"  - {{{check}}}\n" for check in checks)
+    return check_scenario(text, folder / "scenario.yaml")
+
+
+BROKEN = [
+    ("stream: ticks, field: margin_us, above: 0", "{stream", "missing"),
+    ("name: 7up, stream: ticks, field: margin_us, above: 0", "7up", "begins with a letter"),
+    ("name: agents.lost, stream: ticks, field: missed, below: 1", "agents.lost", "framework's own"),
+    ("name: a, stream: tics, field: margin_us, above: 0", "tics", "did you mean ticks?"),
+    ("name: a, stream: rounds, field: packet, above: 0", "rounds", "no stream 'rounds'"),
+    ("name: a, stream: health, field: cpu_percent, below: 90", "health", "no stream 'health'"),
+    ("name: a, stream: ticks, field: margn_us, above: 0", "margn_us", "did you mean margin_us?"),
+    ("name: a, stream: ticks, below: 1", "{name", "expected a field of stream ticks"),
+    ("name: a, below: 1", "{name", "expected a stream, or an event"),
+    (PACKET, "{name", "expected a limit: one of below, above, within, equals"),
+    (f"{PACKET}, below: 1, above: 0", "0}", "expected one limit, got below as well"),
+    (f"{PACKET}, below: fast", "fast", "expected a number"),
+    (f"{PACKET}, below: .nan", ".nan", "finite"),
+    (f"{PACKET}, within: [2, 1]", "[2", "the lesser bound first"),
+    (f"{PACKET}, within: [2]", "within", ""),
+    (f"{PACKET}, equals: three", "three", "holds no texts: expected a number"),
+    (f"{PACKET}, equals: true", "true", "holds numbers, got true"),
+    (f"{PACKET}, below: 3, tolerance: 1", "1}", "goes with equals and a number"),
+    (f"{PACKET}, equals: 3, tolerance: -1", "-1", "expected >= 0"),
+    (f"{PACKET}, below: 3, unit: m", "m}", "packet has no unit, got 'm'"),
+    (f"{TICKS}, below: 3, unit: km", "km", "is in us, got 'km': leave out unit, or write one"),
+    (f"{TICKS}, below: 3, unit: parsec", "parsec", "is in us, got 'parsec'"),
+    (f"{TICKS}, below: 3, agents: [agent-7]", "agent-7", "no agent is named agent-7"),
+    (f"{TICKS}, below: 3, agents: [agnt-02]", "agnt-02", "did you mean agent-02?"),
+    (f"{TICKS}, below: 3, agents: [host]", "host", "recorded by agents, not by the host's half"),
+    (f"{TICKS}, below: 3, from_s: 60", "60}", "expected less than time.duration_s (60), got 60"),
+    (f"{TICKS}, below: 3, from_s: 9, to_s: 8", "8}", "expected >= from_s (9), got 8"),
+    (f"{TICKS}, below: 3, from_s: -1", "-1", "expected >= 0"),
+    (f"{PACKET}, below: 3, from_s: 1", "1}", "tell no time"),
+    (f"{TICKS}, below: 3, statistic: median", "median", "expected each, last"),
+    (f"{TICKS}, below: 3, statistic: settled", "settled", "settled needs when"),
+    (f"{TICKS}, below: 3, statistic: mean, when: {{below: 3}}", "{below", "not with mean"),
+    (f"{TICKS}, below: 3, statistic: mean, at_end: true", "true", "expected statistic last"),
+    (f"{TICKS}, below: 3, statistic: first_time, when: {{}}", "{}", "expected a limit"),
+    ("name: a, stream: ticks, statistic: count, below: 3, unit: s", "s}", "a count has none"),
+    (f"{TICKS}, equals: true, statistic: count", "true", "a count is a number"),
+    ("name: a, stream: events, field: event, below: 3", "3}", "holds texts: expected equals"),
+    ("name: a, stream: events, field: event, equals: x, statistic: mean", "mean", "has no mean"),
+    (f"{TICKS}, below: 3, must: occur", "occur", "is of an event"),
+    (f"{TICKS}, below: 3, before_s: 3", "3}", "is of an event"),
+    (f"{START}, below: 3", "3}", "is of a field's values"),
+    (f"{START}, statistic: max", "max", "is of a field's values"),
+    (f"{START}, field: t_s", "t_s", "holds no words"),
+    (f"{START}, must: happen", "happen", "expected occur or not_occur"),
+    (f"{START}, within_s: 3", "3}", "name it under after"),
+    (f"{START}, after: b", "b}", "no check above is named 'b'"),
+    (f"{START}, from_s: 5, before_s: 3", "3}", "expected >= from_s (5), got 3"),
+    (f"{START}, stop_when_broken: true", "true", "goes with must: not_occur"),
+    (f"{TICKS}, below: 3, statistic: p99, stop_when_broken: true", "true", "is known at the end"),
+    (f"{TICKS}, above: 3, statistic: max, stop_when_broken: true", "true", "one record can break"),
+    (f"{TICKS}, below: 3, while: {{stream: tick, field: x, below: 1}}", "tick,", "did you mean tick"),
+    (f"{TICKS}, below: 3, while: {{stream: clock, field: x, below: 1}}", "x,", "has no field 'x'"),
+    (f"{TICKS}, below: 3, while: {{stream: clock, field: t_s}}", "{stream", "expected a limit"),
+    (f"{TICKS}, below: 3, whil: 3", "whil", "did you mean while?"),
+    (f"{TICKS}, below: 3, statistic: rate, while: {{stream: clock, field: t_s, below: 1}}", "{stream", "rate"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("check", "at", "told"), BROKEN)
+def test_a_broken_expectation_is_refused_with_place_and_cure(tmp_path, check, at, told):
+    with pytest.raises(InputError) as refused:
+        load(check, folder=tmp_path)
+
+    fault = next(each for each in refused.value.faults if told in each.text)
+    assert fault.line == FIRST_LINE
+    line = f"  - {{{check}}}"
+    assert fault.column and line[fault.column - 1 :].startswith(at), line[fault.column - 1 :]
+    assert re.search(rf"scenario.yaml:{FIRST_LINE}:\d+: checks", fault.render())
+
+
+def test_all_faults_are_told_at_once(tmp_path):
+    with pytest.raises(InputError) as refused:
+        load(
+            "name: a, stream: tics, field: margin_us, above: 0",
+            "name: a, stream: ticks, field: margin, above: 0, agents: [agent-9]",
+            "name: b, event: start, after: a",
+            folder=tmp_path,
+        )
+
+    places = [(each.line - FIRST_LINE, each.path) for each in refused.value.faults]
+    assert places == [
+        (0, "checks[0].stream"),
+        (1, "checks[1].name"),
+        (1, "checks[1].field"),
+        (1, "checks[1].agents[0]"),
+        (2, "checks[2].after"),
+    ]
+
+
+def test_more_checks_than_are_followed_are_refused(tmp_path):
+    many = [f"name: c{number}, event: start" for number in range(1001)]
+
+    with pytest.raises(InputError, match="at most 1000 items"):
+        load(*many, folder=tmp_path)
+
+
+def test_an_expectation_names_its_agents_and_says_itself_in_words(tmp_path):
+    scenario = load(
+        "name: a, stream: ticks, field: lateness_us, statistic: p99, below: 5, unit: ms, agents: ['*-0[12]']",
+        "name: b, event: state, agents: [host], before_s: 9",
+        "name: c, stream: round_trips, statistic: count, above: 3",
+        folder=tmp_path,
+    )
+
+    first, second, third = scenario.expectations
+    assert first.agents == ("agent-01", "agent-02")
+    assert first.words == "p99 of ticks.lateness_us below 5 ms"
+    assert first.only_realtime
+    assert (second.agents, second.to_s) == (("host",), 9.0)
+    assert second.words == "state in events must occur by 9 s"
+    assert third.agents == ("agent-01", "agent-02", "agent-03")
+
+
+@pytest.mark.parametrize(
+    ("check", "bounds", "times"),
+    [
+        (f"{TICKS}, below: 5, unit: ms", ValueBounds.below(5000.0).negated(), 1),
+        (f"{TICKS}, statistic: max, within: [1, 2]", ValueBounds(high=2.0).negated(), 1),
+        (f"{TICKS}, statistic: min, above: 1", ValueBounds.above(1.0).negated(), 1),
+        (
+            f"{TICKS}, statistic: count, below: 3, when: {{above: 2}}, unit: ms",
+            ValueBounds.above(2000.0),
+            3,
+        ),
+        (f"{TICKS}, statistic: count, within: [0, 3]", ValueBounds(), 4),
+        (f"{START}, must: not_occur", ValueBounds.equals("start"), 1),
+    ],
+)
+def test_an_expectation_that_ends_the_run_is_broken_by_one_condition(
+    tmp_path, check, bounds, times
+):
+    scenario = load(f"{check}, stop_when_broken: true", folder=tmp_path)
+
+    (condition,) = conditions_of_checks(scenario.expectations)
+    assert (condition.bounds, condition.times, condition.ends_run) == (bounds, times, True)
+    assert scenario.run_config("0001-x").conditions == (condition,)
+
+
+def test_checks_are_plain_values_that_a_scenario_can_be_written_from(tmp_path):
+    scenario = load(
+        f"{TICKS}, below: 3, while: {{stream: clock, field: t_s, above: 1}}", folder=tmp_path
+    )
+
+    (written,) = scenario.to_mapping()["checks"]
+    assert written["while"]["stream"] == "clock"

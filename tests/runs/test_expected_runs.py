@@ -1,0 +1,121 @@
+"""Runs that are judged by what their scenario expects, in both time modes, and those that end as soon as it is broken."""
+
+import json
+
+import pytest
+from harness.cosmos_command import LOOSE, CosmosCommand
+
+pytestmark = pytest.mark.process
+
+SCENARIO = """\
+name: expected
+simulation: counter
+agents: {count: 3, tick_hz: 20}
+time: {duration_s: 4, mode: MODE}
+on_agent_loss: abort
+"""
+STOPS = "{name: few, stream: round_trips, field: packet, below: 20, stop_when_broken: true}"
+LASTING = "{name: more, stream: round_trips, statistic: count, above: 1}"
+OF_TICKS = "{name: prompt, stream: ticks, field: lateness_us, statistic: p99, below: 60, unit: s}"
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Run the scenario with checks; return the exit code and run.json."""
+    cosmos = CosmosCommand(tmp_path)
+
+    def run(mode, *checks, settings=LOOSE, options=("--no-report",)):
+        path = tmp_path / "expected.yaml"
+        listed = "".join(f"  - {check}\n" for check in checks)
+        text = SCENARIO.replace("MODE", mode) + (f"checks:\n{listed}" if checks else "")
+        path.write_text(text, "utf-8")
+        return cosmos.run(path, *settings, options=options)
+
+    run.cosmos = cosmos
+    return run
+
+
+def of_name(document, name):
+    (check,) = [check for check in document["checks"] if check["name"] == name]
+    return check
+
+
+def test_a_lockstep_run_ends_at_the_tick_that_breaks_it_and_repeats_to_the_bit(run):
+    (code, first), (_, second) = run("lockstep", STOPS), run("lockstep", STOPS)
+
+    check = of_name(first, "few")
+    assert (code, first["status"], check["passed"], check["got"]) == (4, "broken", False, 20)
+    assert first["data"]["complete"]
+    assert first["verdict"].startswith("CHECK BROKEN: agent-01: expectation few is broken at t = 1")
+    assert first["records_sha256"] == second["records_sha256"]
+    events = (run.cosmos.directory(first) / "host" / "events.jsonl").read_text().splitlines()
+    met = [json.loads(line) for line in events if '"condition_met"' in line]
+    assert [each["agent"] for each in met] == ["agent-01", "agent-02", "agent-03"][: len(met)]
+    assert {each["delay_s"] for each in met} == {0.0}
+
+
+def test_a_run_in_real_time_ends_as_soon_as_the_host_has_heard(run):
+    code, document = run("realtime", STOPS)
+
+    check = of_name(document, "few")
+    assert (code, document["status"], check["passed"]) == (4, "broken", False)
+    assert 20 <= check["got"] < 80, "it did not go on to its end"
+    assert document["data"]["complete"]
+
+
+def test_records_are_the_same_with_checks_and_without(run):
+    bare, judged = run("lockstep"), run("lockstep", LASTING)
+    tapped = run("lockstep", STOPS.replace("below: 20", "below: 2000"))
+
+    assert [code for code, _ in (bare, judged, tapped)] == [0, 0, 0]
+    assert len({document["records_sha256"] for _, document in (bare, judged, tapped)}) == 1
+
+
+def test_what_a_time_mode_does_not_record_is_not_judged_and_alone_no_pass(run):
+    code, document = run("lockstep", LASTING, OF_TICKS)
+    alone, other = run("lockstep", OF_TICKS)
+
+    assert (code, document["checks_not_judged"][0]["name"]) == (0, "prompt")
+    assert any(text.startswith("prompt: not judged") for text in document["remarks"])
+    assert (alone, other["verdict"][:15]) == (5, "DATA INCOMPLETE")
+
+
+def test_a_finished_run_is_judged_by_expectations_it_did_not_have_and_again_after_collect(run):
+    code, document = run("realtime", OF_TICKS, options=())
+    cosmos, name = run.cosmos, document["run"]
+    page = (cosmos.directory(document) / "report.html").read_text("utf-8")
+    strict = cosmos.folder / "strict.yaml"
+    text = SCENARIO.replace("MODE", "realtime")
+    strict.write_text(
+        f"{text}checks:\n  - {{name: none, event: state, agents: ['*'], must: not_occur}}\n"
+    )
+    foreign = cosmos.folder / "foreign.yaml"
+    foreign.write_text(
+        f"{text.replace('count: 3', 'count: 9')}checks:\n"
+        "  - {name: ninth, event: state, agents: [agent-09]}\n"
+    )
+
+    again = cosmos("judge", name)
+    other = cosmos("judge", name, "-s", strict, "--json")
+    refused = cosmos("judge", name, "-s", foreign)
+    collected = cosmos("collect", name, "--json")
+
+    assert code == 0, document["verdict"]
+    check = of_name(document, "prompt")
+    assert (check["unit"], check["passed"], check["agents_broken"]) == ("s", True, 0)
+    assert "p99 of ticks.lateness_us below 60 s" in page and "Expectations" in page
+    assert (again.returncode, "PASSED: 1 checks hold" in again.stdout) == (0, True)
+    told = json.loads(other.stdout)
+    assert (other.returncode, told["exit_code"], told["checks"][0]["agents_broken"]) == (4, 4, 3)
+    assert refused.returncode == 2
+    assert "foreign.yaml:7:" in refused.stderr and "no agent is named agent-09" in refused.stderr
+    assert of_name(json.loads(collected.stdout), "prompt") == check
+
+
+def test_a_run_without_checks_is_judged_by_none(run):
+    _, document = run("lockstep")
+
+    refused = run.cosmos("judge", document["run"])
+
+    assert refused.returncode == 2
+    assert "had no checks; name a scenario that has" in refused.stderr
