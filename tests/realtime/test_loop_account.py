@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from madns_runtime.realtime import loop_account
 from madns_runtime.realtime.loop_account import NOBODY, LateTick, LoopAccount, Span
 from madns_runtime.timing.late_causes import Cause
 
@@ -16,8 +17,10 @@ ME, OTHER = 0, 1
 
 
 @pytest.fixture
-def loop():
-    """A loop that sleeps when it is told to, and its writer of records."""
+def loop(monkeypatch):
+    """A loop that sleeps when it is told to, and its writer of records; the machine is never busy."""
+    for count in ("waited_s", "stolen_s"):
+        monkeypatch.setattr(loop_account, count, float)
     reactor = SimpleNamespace(slept_s=0.0, last_sleep=(-9.0, -9.0))
     writer = SimpleNamespace(computed_s=0.0)
     writer.computed_within_s = lambda window: min(writer.computed_s, window[1] - window[0])

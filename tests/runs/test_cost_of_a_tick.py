@@ -83,3 +83,18 @@ def test_a_tick_of_the_counter_takes_forty_bytes_on_the_disk(evidence):
     )
 
     assert recorded / result["timing"]["ticks"] <= 40
+
+
+def test_an_agent_by_itself_waits_twice_per_tick_and_costs_five_system_calls(runs_folder):
+    cosmos = CosmosCommand(runs_folder)
+    settings = ("agents.count=2", f"agents.tick_hz={TICK_HZ}", f"time.duration_s={DURATION_S}")
+    code, result = cosmos.run("counter24.yaml", *LOOSE, *settings, "health.period_s=5")
+    assert code == 0, result["verdict"]
+    records, _, _ = agent_and_host((result, cosmos.directory(result)))
+
+    # Until the tick and until the answer; set the timer, wait, send, wait, receive. The rest is set-up, clock and end.
+    loop, network = records["loop"], records["network"]
+    calls = sum(loop.values()) + network["sent"] + network["received"] + network["empty_reads"]
+    ticks = DURATION_S * TICK_HZ
+    assert loop["waits"] <= 2.6 * ticks
+    assert calls <= 6.5 * ticks

@@ -1,0 +1,69 @@
+"""What benchmarks of real time make of what they measure; nothing is measured here."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+
+import scale  # noqa: E402 - behind the line that says where they are
+import soak  # noqa: E402
+import star  # noqa: E402
+import stars  # noqa: E402
+
+
+def test_a_shape_has_the_packs_and_the_phases_of_a_run():
+    packs = stars.Shape(24, 100, 12).packs()
+
+    assert [[size for size, _ in own] for own in packs] == [[6, 6], [6, 6]]
+    assert sorted(phase_s for own in packs for _, phase_s in own) == [0.0, 0.0025, 0.005, 0.0075]
+    assert {phase_s for own in stars.Shape(9, 10, 3, True).packs() for _, phase_s in own} == {0.0}
+
+
+def test_shapes_are_read_as_they_are_written():
+    assert star.shapes("24x100,93x200/47") == [stars.Shape(24, 100, 1), stars.Shape(93, 200, 47)]
+
+
+def test_lost_and_missed_are_what_is_not_there():
+    figures = stars.figures_of(10, np.array([100.0, 200.0]), np.array([1.0, 2.0, 3.0]))
+
+    assert (figures["due"], figures["missed"], figures["lost"]) == (10, 7, 1)
+    assert (figures["rtt_p50_us"], figures["late_max_us"]) == (150.0, 3.0)
+
+
+def test_the_median_of_pairs_is_of_each_figure_by_itself():
+    pairs = [{"cosmos": {"rtt_p50_us": value, "causes": {}}} for value in (3.0, 1.0, 2.0)]
+
+    assert star.median_of(pairs) == {"cosmos": {"rtt_p50_us": 2.0}}
+
+
+def test_a_histogram_of_all_threads_has_one_percentile():
+    text = "# /dev/cpu_dma_latency\n000003 000040\t000050\n000004 000009\t000000\n000090 000001\t000000\n"
+
+    assert scale.percentile_99(text) == 4.0
+
+
+@pytest.mark.parametrize(("got", "is_met"), [(1.0, True), (1.1, False), (float("nan"), False)])
+def test_a_claim_is_met_up_to_its_goal_and_never_by_what_was_not_measured(got, is_met):
+    assert scale.at_most("missed", got, 1.0).is_met is is_met
+
+
+@pytest.mark.parametrize(
+    ("values", "is_flat"),
+    [([9.0, 100.0, 109.0, 100.0], True), ([9.0, 100.0, 105.0, 130.0], False)],
+)
+def test_what_grows_behind_the_second_window_is_not_flat(values, is_flat):
+    assert soak.Figure("memory", values, 0.5).is_flat() is is_flat
+
+
+def test_messages_on_a_stream_are_taken_whole():
+    buffer = bytearray()
+    sent = [b"one", b"", b"three"]
+    taken = []
+    for byte in b"".join(stars.LENGTH.pack(len(each)) + each for each in sent) + b"\x05":
+        buffer.append(byte)
+        taken += stars.messages_in(buffer)
+
+    assert (taken, bytes(buffer)) == (sent, b"\x05")
