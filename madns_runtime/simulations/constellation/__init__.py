@@ -8,6 +8,7 @@ agent's board needs neither scipy nor sgp4.
 from __future__ import annotations
 
 from madns_runtime.plugin.api import Simulation
+from madns_runtime.simulations.constellation.actions import ACTIONS
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
 
 _HERE = "madns_runtime.simulations.constellation"
@@ -34,6 +35,7 @@ simulation = Simulation(
         "flight.interface.transport.*": _WORDS,
     },
     agent_parameters=(),  # `vehicles` and `flight` are lists of rules; all else host and agents have in common
+    actions=ACTIONS,
     columns=("elements.a_m", "elements.e", "elements.mean_anomaly_deg"),
     medium=f"{_HERE}.host:radio_of",
     tabulate=f"{_HERE}.tabulation:tabulate_truth",

@@ -14,7 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from madns_runtime.errors import BlamedError, PluginError
-from madns_runtime.plugin.api import AgentContext, AgentSimulation, Tick
+from madns_runtime.plugin.api import (
+    ActionRefused,
+    AgentContext,
+    AgentSimulation,
+    Tick,
+    TimelineAction,
+)
+from madns_runtime.simulations.constellation.actions import SensorFault
 from madns_runtime.simulations.constellation.messages import (
     CommandResult,
     Delivery,
@@ -186,6 +193,28 @@ class ConstellationAgent(AgentSimulation):
                 self._take_result(result)
         elif kind != CommandResult.KIND:
             raise PluginError(f"constellation: expected a segment, got {message!r:.200}")
+
+    def begin_action(self, action: TimelineAction) -> None:
+        """
+        Have a sensor fail.
+
+        Raises:
+            ActionRefused: This vehicle does not model it.
+        """
+        fault: SensorFault = action.parameters  # type: ignore[assignment]
+        sensors = self._sensors
+        refusal = (
+            "this vehicle has no sensors"
+            if sensors is None
+            else sensors.begin_failure(action.number, fault)
+        )
+        if refusal:
+            raise ActionRefused(refusal)
+
+    def end_action(self, action: TimelineAction) -> None:
+        """Have it work again."""
+        if self._sensors is not None:
+            self._sensors.end_failure(action.number)
 
     def hear(self, delivery: Delivery) -> None:
         """Take a message by radio; a broadcast also reaches those who fly nothing."""

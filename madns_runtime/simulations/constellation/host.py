@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from madns_runtime.errors import PluginError
-from madns_runtime.plugin.api import HostContext, HostSimulation
+from madns_runtime.plugin.api import HostContext, HostSimulation, TimelineAction
 from madns_runtime.simulations.constellation.equipment import Vehicle
+from madns_runtime.simulations.constellation.host_side.injected_failures import InjectedFailures
 from madns_runtime.simulations.constellation.host_side.maneuver_execution import Maneuvering
 from madns_runtime.simulations.constellation.host_side.model_health import (
     AttitudeSpacing,
@@ -30,6 +31,9 @@ from madns_runtime.simulations.constellation.messages import (
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
 from madns_runtime.simulations.constellation.truth.initial_states import InitialStates, load_fleet
+from madns_runtime.simulations.constellation.truth.maneuvers.actuator_failures import (
+    ActuatorFailures,
+)
 from madns_runtime.simulations.constellation.truth.maneuvers.effects import Timeline
 from madns_runtime.simulations.constellation.truth.maneuvers.rules import (
     ManeuverDesk,
@@ -105,6 +109,8 @@ class ConstellationHost(HostSimulation):
         )
         self._maneuvering = self._make_maneuvering(vehicles)
         self.radio = self._make_radio()
+        failures = self._maneuvering.failures if self._maneuvering else ActuatorFailures()
+        self._failures = InjectedFailures(failures, self._index, vehicles, self.radio)
         # Truth that came after its first sending was due.
         self._late_count, self._late_s_max = 0, 0.0
         windows = min(WINDOWS_FIRST, self._refills.windows)
@@ -153,6 +159,19 @@ class ConstellationHost(HostSimulation):
         if self._store.end > window:
             self._enter_late(window, now_s, "came")
             self._refills.submit_if_due(now_s)
+
+    def begin_action(self, action: TimelineAction) -> None:
+        """
+        Put a failure in force.
+
+        Raises:
+            ActionRefused: There is nothing that could fail so.
+        """
+        self._failures.begin(action)
+
+    def end_action(self, action: TimelineAction) -> None:
+        """Lift a failure."""
+        self._failures.end(action)
 
     def agent_lost(self, agent: str, reason: str) -> None:
         """Send it no more; its truth goes on."""

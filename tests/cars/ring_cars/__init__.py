@@ -10,6 +10,7 @@ the framework's medium, with delay, rate and loss. A car is one agent. It knows 
 from __future__ import annotations
 
 from madns_runtime.plugin.api import Simulation
+from ring_cars.actions import BRAKE
 from ring_cars.parameters import RingParameters
 
 simulation = Simulation(
@@ -20,6 +21,7 @@ simulation = Simulation(
     streams="ring_cars.streams:declared_streams",
     labels="ring_cars.streams:name_cars",
     label_column="car",
+    actions=(BRAKE,),
     columns=("drive.speed_m_s", "drive.heard_gap_m"),
     medium="ring_cars.host:v2v",
     figures="ring_cars.figures:figures",

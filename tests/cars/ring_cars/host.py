@@ -9,7 +9,7 @@ from dataclasses import asdict
 from typing import Any
 
 from madns_runtime.medium.links import LinkMedium
-from madns_runtime.plugin.api import Check, HostContext, HostSimulation
+from madns_runtime.plugin.api import Check, HostContext, HostSimulation, TimelineAction
 from ring_cars.streams import ROAD
 
 STEP_S = 0.05
@@ -31,6 +31,8 @@ class RingRoad(HostSimulation):
         self._speed_m_s = [0.0, *[self._parameters.speed_m_s] * (count - 1)]
         self._command_m_s2 = [0.0] * count
         self._refused = 0
+        self._braking: dict[int, float] = {}
+        """By car: how hard it brakes, m/s^2."""
         self._gap_m_min, self._closest = math.inf, ""
         self._steps = 0
         context.open_stream("road", ROAD)
@@ -63,6 +65,16 @@ class RingRoad(HostSimulation):
             return
         self._command_m_s2[self._cars.index(agent)] = max(-9.0, min(3.0, wanted))
 
+    def begin_action(self, action: TimelineAction) -> None:
+        """Have cars brake."""
+        for name in action.agents:
+            self._braking[self._cars.index(name)] = action.parameters.deceleration_m_s2
+
+    def end_action(self, action: TimelineAction) -> None:
+        """Let them drive on."""
+        for name in action.agents:
+            self._braking.pop(self._cars.index(name), None)
+
     def reach(self, sender: str, receiver: str, t_s: float) -> str | None:
         """Return why a car cannot hear another; None if it can. On a ring, the shorter way counts."""
         ring_m = self._parameters.ring_m
@@ -90,6 +102,8 @@ class RingRoad(HostSimulation):
 
     def _move(self) -> None:
         for car, command_m_s2 in enumerate(self._command_m_s2):
+            if car in self._braking:
+                command_m_s2 = -self._braking[car]  # noqa: PLW2901 - the driver is not asked
             before_m_s = self._speed_m_s[car]
             after_m_s = max(0.0, before_m_s + command_m_s2 * STEP_S)
             self._driven_m[car] += 0.5 * (before_m_s + after_m_s) * STEP_S

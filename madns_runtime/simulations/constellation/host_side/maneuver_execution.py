@@ -49,6 +49,8 @@ class Maneuvering:
         self._supply = supply
         self._refills = refills
         self._desk = desk
+        self.failures = desk.failures
+        """Of the vehicles' actuators."""
         self._waiting: list[tuple[float, int, Taken]] = []
         """Time at which each job is overtaken, and the job; also of those that are done."""
         self._pending: list[tuple[float, int, Taken]] = []

@@ -99,6 +99,10 @@ class RadioMedium:
         next_s = self._ground.next_s()
         return None if next_s is None else max(next_s, t_s + STEP_S)
 
+    def darken(self, station: str, *, is_dark: bool) -> bool:
+        """Have a ground station neither heard nor hear, or do both again; False if there is none of that name."""
+        return self._ground.darken(station, is_dark=is_dark)
+
     def finish(self) -> Mapping[str, Any]:
         """Return the accounts of those that there are."""
         channels = (TO_GROUND,) if self._crosslinks is None else (CROSSLINKS, TO_GROUND)

@@ -17,6 +17,9 @@ from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.messages import Command, CommandResult, CommandStatus
 from madns_runtime.simulations.constellation.parameters import Maneuvers
 from madns_runtime.simulations.constellation.thrust import Vector
+from madns_runtime.simulations.constellation.truth.maneuvers.actuator_failures import (
+    ActuatorFailures,
+)
 from madns_runtime.simulations.constellation.truth.maneuvers.actuators import (
     ActuatorRefusal,
     Burn,
@@ -169,6 +172,7 @@ class ManeuverDesk:
         timelines: Sequence[Timeline],
     ) -> None:
         self.account = ManeuverAccount()
+        self.failures = ActuatorFailures()
         self._rules = rules
         self._agents = agents
         self._vehicles = vehicles
@@ -238,6 +242,7 @@ class ManeuverDesk:
             number_fault(command)
             or self._rule_fault(vehicle, command)
             or vehicle_fault(command, self._vehicles[vehicle])
+            or self.failures.refusal(vehicle, command.kind)
         )
         if fault:
             return replace(refused, reason=fault)
@@ -269,7 +274,8 @@ class ManeuverDesk:
         described = self._vehicles[vehicle]
         random = chance_of(self._rules.seed, self._agents[vehicle], command.number)
         if command.kind == "delta_v" and described.thruster is not None:
-            return fire(described.thruster, self._tanks[vehicle], command.vector, random)
+            wanted = self.failures.given(vehicle, command.vector)
+            return fire(described.thruster, self._tanks[vehicle], wanted, random)
         if command.kind == "torque" and described.attitude is not None:
             momentum = self._timelines[vehicle].wheels_at(math.inf)
             wheels = described.attitude.wheels

@@ -102,6 +102,8 @@ class GroundSegment:
         self._uplinked_s: dict[int, float] = {}
         """By vehicle: when the newest uplink to it left."""
         self._uplinked: list[tuple[Transmission, LinkEvent]] = []
+        self.dark: set[int] = set()
+        """Stations that neither hear nor are heard at present."""
 
     def carry(self, sender: int, transmission: Transmission) -> list[LinkEvent]:
         """
@@ -126,7 +128,14 @@ class GroundSegment:
         state = self._truth.state(sender, sent_s)
         if state is None:
             return [attempt.failed("no_truth")]
-        return [self._downlink(attempt, stations, np.array((state,)))]
+        lit = [number for number in stations if number not in self.dark]
+        return [self._downlink(attempt, lit, np.array((state,)))]
+
+    def darken(self, station: str, *, is_dark: bool) -> bool:
+        """Have a station neither heard nor hear, or do both again; False if there is none of that name."""
+        numbers = {number for number, each in enumerate(self._stations) if each.name == station}
+        self.dark = self.dark | numbers if is_dark else self.dark - numbers
+        return bool(numbers)
 
     def contacts(self, t_s: float) -> list[Contact]:
         """Return the passes that began or ended until *t_s*, in order; each event once."""
@@ -216,7 +225,8 @@ class GroundSegment:
         """Look for passes, and let uplinks leave in those found."""
         for stretch in self._watch.look_ahead(t_s):
             for window in sorted(stretch.windows, key=lambda found: (found.rise_s, found.station)):
-                self._uplink(window, stretch)
+                if window.station not in self.dark:
+                    self._uplink(window, stretch)
 
     def _uplink(self, window: Window, stretch: ViewInterval) -> None:
         """Let what waits for a vehicle leave in this stretch of a pass, one after the other."""

@@ -11,6 +11,7 @@ import math
 from collections import deque
 
 from madns_runtime.plugin.api import AgentContext
+from madns_runtime.simulations.constellation.actions import SensorFault
 from madns_runtime.simulations.constellation.equipment import (
     Magnetometer,
     MagnetometerDevice,
@@ -36,6 +37,9 @@ from madns_runtime.simulations.constellation.vehicle.sensors.sensor_errors impor
     Errors,
     error_model,
     key_of,
+)
+from madns_runtime.simulations.constellation.vehicle.sensors.sensor_failures import (
+    SensorFailures,
 )
 from madns_runtime.simulations.constellation.vehicle.sensors.truth_beside import (
     TruthBeside,
@@ -82,6 +86,7 @@ class Sensor:
         """Measurements that never came: dropouts, and those for which there was no room."""
         self.blind = 0
         """Measurements with nothing to measure."""
+        self.failures = SensorFailures()
         self._measure = instrument.measure
         # Faster than that, its samples would be numbers that nobody measures.
         self._rate_hz = min(settings.rate_hz, step_hz or context.tick_hz)
@@ -111,6 +116,11 @@ class Sensor:
         if values is None:
             self.blind += 1
             return
+        if self.failures:
+            values = self.failures.altered(values)
+            if values is None:
+                self.dropped += 1
+                return
         self._pending.append((scene.t_s + self._latency_s, Reading(scene.t_s, values)))
 
     def counts(self) -> dict[str, int]:
@@ -223,6 +233,20 @@ class SensorSuite:
                 sensor.sample(self._scene)
         readings = {sensor.name: sensor.read(tick, t_s) for sensor in self._sensors}
         return {name: reading for name, reading in readings.items() if reading is not None}
+
+    def begin_failure(self, number: int, fault: SensorFault) -> str:
+        """Put a failure of a modelled sensor in force; return why it cannot be, or ""."""
+        for sensor in self._models:
+            if sensor.name == fault.sensor:
+                sensor.failures.begin(number, fault)
+                return ""
+        known = ", ".join(sensor.name for sensor in self._models) or "none"
+        return f"this vehicle models no {fault.sensor}; it models {known}"
+
+    def end_failure(self, number: int) -> None:
+        """Lift a failure."""
+        for sensor in self._models:
+            sensor.failures.end(number)
 
     def news(self) -> dict[str, list[Reading]]:
         """Return by sensor all that became known in the last step, oldest first."""

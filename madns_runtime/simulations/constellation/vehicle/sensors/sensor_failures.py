@@ -1,0 +1,42 @@
+"""A sensor that fails for a while: stuck, biased or dead. Pure."""
+
+from __future__ import annotations
+
+from madns_runtime.simulations.constellation.actions import SensorFault
+
+Measured = tuple[float, ...]
+
+
+class SensorFailures:
+    """The failures of one sensor; several may be in force at a time."""
+
+    def __init__(self) -> None:
+        self._failures: dict[int, SensorFault] = {}
+        self._last: Measured | None = None
+
+    def __bool__(self) -> bool:
+        return bool(self._failures)
+
+    def begin(self, number: int, fault: SensorFault) -> None:
+        """Put a failure in force."""
+        self._failures[number] = fault
+
+    def end(self, number: int) -> None:
+        """Lift a failure."""
+        self._failures.pop(number, None)
+        if not self._failures:
+            self._last = None
+
+    def altered(self, values: Measured) -> Measured | None:
+        """Return what a measurement becomes; None if none comes. A stuck one repeats the first since it stuck."""
+        kinds = {each.fault for each in self._failures.values()}
+        if "dead" in kinds:
+            return None
+        for each in self._failures.values():
+            if each.fault == "biased":
+                added = (*each.bias, *(0.0,) * (len(values) - len(each.bias)))
+                values = tuple(v + b for v, b in zip(values, added, strict=False))
+        if "stuck" not in kinds:
+            return values
+        self._last = values if self._last is None else self._last
+        return self._last
