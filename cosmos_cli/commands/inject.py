@@ -1,8 +1,11 @@
-"""`cosmos inject`: a fault around a device of a living run."""
+"""`cosmos inject`: an action of a timeline, or a fault around a device, in a living run."""
 
 from __future__ import annotations
 
-from typing import Annotated
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
@@ -10,44 +13,73 @@ from cosmos_cli.commands.runs import RunsOption
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import runs_root
 from cosmos_cli.evidence.run_search import find_run
-from cosmos_cli.launch.order_socket import order_fault
+from cosmos_cli.launch.order_socket import order_action, order_fault
+from cosmos_cli.models.overrides import parse_override
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
+from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.hardware.fault_actions import check_fault
+
+FOR_S = "for_s"
 
 
 def inject(
     run: Annotated[str, typer.Argument(metavar="RUN", help="Name, number or directory; or last.")],
     target: Annotated[
-        str, typer.Argument(metavar="DEVICE", help="Its full name, such as pi22/imu.")
-    ],
-    action: Annotated[
-        str,
+        str | None,
         typer.Argument(
-            metavar="ACTION", help="freeze, bias, noise, drop, delay, disconnect or clear."
+            metavar="[TARGET]",
+            help="An agent or a glob of agents, run for the whole run, or a device's full name such as pi22/imu.",
         ),
-    ],
-    value: Annotated[
-        float | None,
-        typer.Argument(metavar="[VALUE]", help="Of bias, noise, drop (0 to 1) and delay (s)."),
     ] = None,
+    action: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[ACTION]",
+            help="A word of the timeline; of a device freeze, bias, noise, drop, delay, disconnect or clear.",
+        ),
+    ] = None,
+    values: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[KEY=VALUE]...",
+            help="The action's parameters, and for_s; of a device the one value of bias, noise, drop (0 to 1) or delay (s).",
+        ),
+    ] = None,
+    listed: Annotated[
+        bool, typer.Option("--list", help="What may be ordered of this run, and what is in force.")
+    ] = False,
     folder: RunsOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> int:
     """
-    Insert a fault around a device of a living run, or clear all of it.
+    Have an action take place in a living run, by the same words as in a timeline, or insert a fault around a device.
 
-    What the device measures is frozen, biased, noisy, dropped or late, or it is unplugged; the device itself knows
-    nothing of it. Recorded in the run. Ends with 1 when the run refuses.
+    A device's fault freezes what it measures, biases it, makes it noisy, drops it or delays it, or unplugs it; the
+    device itself knows nothing of it. Recorded in the run. Ends with 1 when the run refuses.
     """
     console = Console(json=as_json, quiet=quiet)
-    try:
-        check_fault(action, value)
-    except ConfigurationError as error:
-        raise InputError(str(error)) from None
     found = find_run(runs_root(folder), run)
-    refusal = order_fault(found.path, found.name, (target, action, value))
+    if listed:
+        if target is not None:
+            raise InputError("--list lists all: leave out TARGET")
+        return _list(console, found.path, found.name)
+    if target is None or action is None:
+        raise InputError(
+            "expected TARGET and ACTION, such as agent-07 device_fault device=imu fault=freeze;"
+            " --list tells what there is"
+        )
+    value: float | None = None
+    parameters: dict[str, Any] = {}
+    if "/" in target:
+        value = _value(action, values or ())
+        refusal = order_fault(found.path, found.name, (target, action, value))
+    else:
+        parameters = _parameters(values or ())
+        for_s = parameters.pop(FOR_S, None)
+        order = {"target": target, "action": action, "parameters": parameters, FOR_S: for_s}
+        refusal = clean_line(str(order_action(found.path, found.name, order)["refusal"]))
     code = ExitCode.RUN_FAILED if refusal else ExitCode.OK
     console.data(f"{target} {action}: {f'refused: {refusal}' if refusal else 'in force'}")
     console.print_json(
@@ -56,8 +88,66 @@ def inject(
             "target": target,
             "action": action,
             "value": value,
+            "parameters": parameters,
             "refusal": refusal or None,
             "exit_code": int(code),
         }
     )
     return int(code)
+
+
+def _value(action: str, values: Sequence[str]) -> float | None:
+    """Return the value of a device's fault."""
+    if len(values) > 1:
+        raise InputError(f"expected one value of {action} at most, got {' '.join(values)}")
+    try:
+        value = float(values[0]) if values else None
+    except ValueError:
+        raise InputError(f"expected a number as value of {action}, got {values[0]!r}") from None
+    if value is not None and not math.isfinite(value):
+        raise InputError(f"expected a finite number as value of {action}, got {values[0]!r}")
+    try:
+        check_fault(action, value)
+    except ConfigurationError as error:
+        raise InputError(str(error)) from None
+    return value
+
+
+def _parameters(values: Sequence[str]) -> dict[str, Any]:
+    """Return KEY=VALUE pairs as a mapping; values are read as YAML."""
+    found: dict[str, Any] = {}
+    for each in values:
+        if "=" not in each:
+            raise InputError(f"expected KEY=VALUE, such as for_s=20, got {each!r}")
+        key, path, value = parse_override(each)
+        if len(path) > 1 or key in found:
+            raise InputError(f"expected each parameter once, and no dots, got {each!r}")
+        found[key] = value
+    return found
+
+
+def _list(console: Console, path: Path, name: str) -> int:
+    """Print what may be ordered of a run, and what is in force."""
+    answer = order_action(path, name, {"list": True})
+    for each in _mappings(answer.get("actions")):
+        given = [f"{key}=..." for key in each.get("parameters", ())]
+        given += ["for_s=..."] if each.get(FOR_S) != "never" else []
+        target = "AGENT" if each.get("takes_agents") else "run"
+        console.data(clean_line(f"{target} {each.get('action')} {' '.join(given)}".rstrip()))
+    for each in _mappings(answer.get("in_force")):
+        agents = ", ".join(map(str, each.get("agents", ()))) or "run"
+        since = f"since {each.get('since_s'):g} s" if each.get("since_s") is not None else ""
+        console.data(clean_line(f"in force: {each.get('action')} of {agents} {since}".rstrip()))
+    console.print_json(
+        {
+            "run": name,
+            "actions": answer.get("actions"),
+            "in_force": answer.get("in_force"),
+            "exit_code": 0,
+        }
+    )
+    return int(ExitCode.OK)
+
+
+def _mappings(value: Any) -> list[Mapping[str, Any]]:
+    return [each for each in value if isinstance(each, dict)] if isinstance(value, list) else []

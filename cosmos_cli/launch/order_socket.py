@@ -16,8 +16,10 @@ import orjson
 from cosmos_cli.errors import InputError, RunFailedError
 from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime import private_socket
-from madns_runtime.hardware.order_socket import LINE_BYTES_MAX, SOCKET_NAME, Fault
+from madns_runtime.hardware.action_socket import SOCKET_NAME as ACTIONS_SOCKET
+from madns_runtime.hardware.order_socket import SOCKET_NAME, Fault
 
+ANSWER_BYTES_MAX = 1 << 20
 ANSWER_S = 10.0
 """An order whose answer has not come by then is given up by who gave it."""
 
@@ -50,35 +52,63 @@ def order_fault(folder: Path, name: str, fault: Fault) -> str:
         InputError: Nobody of this run listens.
         RunFailedError: It does not answer in time.
     """
+    order = dict(zip(("target", "action", "value"), fault, strict=True))
+    why_not = "it has ended, has no devices, or its host runs on another computer"
+    return _refusal_in(_knock(folder / SOCKET_NAME, name, order, why_not))
+
+
+def order_action(folder: Path, name: str, order: Mapping[str, Any]) -> Mapping[str, Any]:
+    """
+    Hand the host of a living run an order of an action, or the question what there is (list: true); return its answer.
+
+    Args:
+        folder: The run directory.
+        name: The run's.
+        order: target, action, parameters and for_s, or list.
+
+    Raises:
+        InputError: Nobody of this run listens.
+        RunFailedError: It does not answer in time.
+    """
+    why_not = "it has not begun, has ended, or its host runs on another computer"
+    return _knock(folder / ACTIONS_SOCKET, name, order, why_not)
+
+
+def _knock(door: Path, name: str, order: Mapping[str, Any], why_not: str) -> Mapping[str, Any]:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as line:
         line.settimeout(ANSWER_S)
         try:
-            with private_socket.socket_address(folder.resolve(), SOCKET_NAME) as path:
+            with private_socket.socket_address(door.parent.resolve(), door.name) as path:
                 if not stat.S_ISSOCK(os.lstat(path).st_mode):
                     raise FileNotFoundError(path)
                 line.connect(path)
         except OSError:
-            raise InputError(
-                f"{name}: nobody of this run listens: it has ended, has no devices, or its host runs on another computer"
-            ) from None
+            raise InputError(f"{name}: nobody of this run listens: {why_not}") from None
         try:
-            return _ask(line, dict(zip(("target", "action", "value"), fault, strict=True)))
+            return _ask(line, order)
         except OSError as error:
             why = str(error.strerror or error)
             raise RunFailedError(f"{name}: it took no order: {why}") from None
 
 
-def _ask(line: socket.socket, order: Mapping[str, Any]) -> str:
+def _ask(line: socket.socket, order: Mapping[str, Any]) -> Mapping[str, Any]:
     deadline_s = monotonic() + ANSWER_S
     line.sendall(orjson.dumps(order) + b"\n")
     heard = b""
     while not heard.endswith(b"\n"):
         line.settimeout(max(0.001, deadline_s - monotonic()))
-        data = line.recv(LINE_BYTES_MAX)
+        data = line.recv(ANSWER_BYTES_MAX)
         heard += data
-        if not data or len(heard) > LINE_BYTES_MAX:
+        if not data or len(heard) > ANSWER_BYTES_MAX:
             raise ConnectionResetError("it closed the line; the run may be ending")
     try:
-        return clean_line(str(orjson.loads(heard)["refusal"]))
-    except (ValueError, KeyError, TypeError):
-        raise ConnectionResetError("its answer is none") from None
+        answer = orjson.loads(heard)
+    except ValueError:
+        answer = None
+    if not isinstance(answer, dict) or "refusal" not in answer:
+        raise ConnectionResetError("its answer is none")
+    return answer
+
+
+def _refusal_in(answer: Mapping[str, Any]) -> str:
+    return clean_line(str(answer["refusal"]))

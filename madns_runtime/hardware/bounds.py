@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import is_dataclass
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
-from annotated_types import Ge, Gt, Le, Lt, MinLen
+from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
 
 
 def bound_faults(value: Any, path: str) -> list[str]:
@@ -43,6 +43,8 @@ def _beyond(bound: Any, value: Any) -> str | None:
     """Return what a bound wants if a value does not keep it; None is let through: it is no value."""
     if isinstance(bound, MinLen):
         return f"at least {bound.min_length}" if len(value) < bound.min_length else None
+    if isinstance(bound, MaxLen):
+        return f"at most {bound.max_length}" if len(value) > bound.max_length else None
     if isinstance(bound, Ge):
         return None if value >= bound.ge else f"at least {bound.ge}"
     if isinstance(bound, Gt):

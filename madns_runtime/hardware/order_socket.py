@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 import orjson
 
@@ -38,41 +38,39 @@ class Readers(Protocol):
         """Call back no more."""
 
 
-class OrderSocket:
+class LineSocket:
     """
-    The side of who supervises the run: the operator, or the host of a run that goes on without one.
+    A socket whose visitors each say one line, and hear one.
 
     Args:
         folder: The run directory.
+        name: Of the socket there.
         loop: Of the process.
-        on_order: Called with a number and the fault that is ordered; `answer` tells what became of it.
+        on_line: Called with a visitor's number and its line; `tell` answers.
 
     Raises:
         OSError: It cannot be made there.
     """
 
     def __init__(
-        self,
-        folder: Path,
-        loop: Readers,
-        on_order: Callable[[int, Fault], None],
+        self, folder: Path, name: str, *, loop: Readers, on_line: Callable[[int, bytes], None]
     ) -> None:
-        self._folder = folder
+        self._path = folder / name
         self._loop = loop
-        self._on_order = on_order
+        self._on_line = on_line
         self._visitors: dict[int, socket.socket] = {}
         self._heard: dict[int, bytes] = {}
         self._hearing: set[int] = set()
         self._count = 0
-        self._listener = private_socket.listen(folder, SOCKET_NAME, VISITORS_MAX)
+        self._listener = private_socket.listen(folder, name, VISITORS_MAX)
         loop.add_reader(self._listener.fileno(), self._accept)
 
-    def answer(self, number: int, refusal: str) -> None:
-        """Tell who gave an order what became of it, and let them go."""
+    def tell(self, number: int, reply: Mapping[str, Any]) -> None:
+        """Answer a visitor, and let it go."""
         visitor = self._visitors.get(number)
         if visitor is not None:
             with contextlib.suppress(OSError):  # it has gone, or takes nothing
-                visitor.send(orjson.dumps({"refusal": refusal}) + b"\n")
+                visitor.send(orjson.dumps(reply) + b"\n")
             self._dismiss(number)
 
     def close(self) -> None:
@@ -82,7 +80,7 @@ class OrderSocket:
         self._loop.remove_reader(self._listener.fileno())
         self._listener.close()
         with contextlib.suppress(OSError):
-            (self._folder / SOCKET_NAME).unlink()
+            self._path.unlink()
 
     def _accept(self) -> None:
         visitor = private_socket.accept(self._listener)
@@ -108,7 +106,39 @@ class OrderSocket:
             self._dismiss(number)
         elif heard.endswith(b"\n"):
             self._stop_hearing(number)
-            self._obey(number, heard)
+            self._on_line(number, heard)
+
+    def _dismiss(self, number: int) -> None:
+        self._stop_hearing(number)
+        del self._heard[number]
+        self._visitors.pop(number).close()
+
+    def _stop_hearing(self, number: int) -> None:
+        if number in self._hearing:
+            self._hearing.remove(number)
+            self._loop.remove_reader(self._visitors[number].fileno())
+
+
+class OrderSocket(LineSocket):
+    """
+    The side of who supervises the run: the operator, or the host of a run that goes on without one.
+
+    Args:
+        folder: The run directory.
+        loop: Of the process.
+        on_order: Called with a number and the fault that is ordered; `answer` tells what became of it.
+
+    Raises:
+        OSError: It cannot be made there.
+    """
+
+    def __init__(self, folder: Path, loop: Readers, on_order: Callable[[int, Fault], None]) -> None:
+        self._on_order = on_order
+        super().__init__(folder, SOCKET_NAME, loop=loop, on_line=self._obey)
+
+    def answer(self, number: int, refusal: str) -> None:
+        """Tell who gave an order what became of it, and let them go."""
+        self.tell(number, {"refusal": refusal})
 
     def _obey(self, number: int, line: bytes) -> None:
         try:
@@ -120,16 +150,6 @@ class OrderSocket:
             self.answer(number, f"no order: {error}")
         else:
             self._on_order(number, fault)
-
-    def _dismiss(self, number: int) -> None:
-        self._stop_hearing(number)
-        del self._heard[number]
-        self._visitors.pop(number).close()
-
-    def _stop_hearing(self, number: int) -> None:
-        if number in self._hearing:
-            self._hearing.remove(number)
-            self._loop.remove_reader(self._visitors[number].fileno())
 
 
 def _number(value: object) -> float | None:

@@ -171,6 +171,7 @@ class LockstepHost:
         duration_s, tick_hz = self._config.time.duration_s, self._config.agents.tick_hz
         for number in range(count_ticks(duration_s, tick_hz)):
             self._advance(number / tick_hz)
+            self._timeline.take_orders()
             if self._timeline.is_stopped:
                 self._account.duration_s = duration_s = number / tick_hz
                 break
@@ -209,6 +210,7 @@ class LockstepHost:
         freeze_garbage()  # what set-up made stays: no collection walks it in mid-run
         self._account.t0_utc = utc_now_iso()
         self._account.began_s = monotonic()
+        self._timeline.open_door(self._directory.parent, self._meeting.reactor, self._log)
         self._guarded.call("start", self._clock.t_s)
         self._half.begin_timer(self._clock.t_s)
         self._guarded.call_timer(self._clock.t_s)
@@ -320,6 +322,7 @@ class LockstepHost:
         self._fire(HostEvent.SERVER_STOPPED)
 
     def _close(self) -> int:
+        self._timeline.close()
         code = hand_over(self._account.result(), self._directory, self._operator)
         self._calls.close()
         self._meeting.reactor.close()

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from madns_runtime.conditions.reports import HostConditions, MetCondition
 from madns_runtime.config import RunConfig
 from madns_runtime.errors import MadnsError
+from madns_runtime.hardware.action_socket import ActionSocket
+from madns_runtime.hardware.order_socket import Readers
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.messages import Outbox
 from madns_runtime.plugin.action_handlers import (
@@ -59,18 +62,47 @@ class LockstepTimeline:
             DEVICE_FAULT.word: AgentOrders(self._post),
             **simulation_handlers(program.actions, call=call, post=self._post),
         }
+        kinds = kinds_by_word(program.actions)
         self.runner = TimelineRunner(
             config.timeline,
-            kinds_by_word(program.actions),
+            kinds,
             Dispatcher(self.handlers, journal.event),
             seed=config.seed,
             duration_s=config.time.duration_s,
         )
+        self.kinds = {word: kind for word, kind in kinds.items() if word in self.handlers}
+        self._door: ActionSocket | None = None
 
     def wait_for(self, conditions: HostConditions) -> None:
         """Have the actions begin that wait for conditions."""
         for number in {e.condition for e in self._config.timeline if e.condition is not None}:
             conditions.on_met(number, self._met)
+
+    def open_door(self, folder: Path, loop: Readers, say: Callable[[str, str], None]) -> None:
+        """Take orders of actions in the run directory from now on; they are carried out before the next tick."""
+        try:
+            self._door = ActionSocket(
+                folder,
+                loop,
+                kinds=self.kinds,
+                agents=self._config.agents.resolved_names(),
+                begin=lambda order: self.runner.order(order, self._clock.t_s),
+                in_force=self.runner.told_in_force,
+                is_immediate=False,
+            )
+        except OSError as error:
+            say("warning", f"no action can be ordered in this run: {error}")
+
+    def take_orders(self) -> None:
+        """Carry out what was ordered."""
+        if self._door is not None:
+            self._door.carry_out()
+
+    def close(self) -> None:
+        """Take no more orders."""
+        if self._door is not None:
+            self._door.close()
+            self._door = None
 
     def next_s(self, half_s: float | None) -> tuple[float | None, bool]:
         """Return the time of what comes next, given when the half wants to be called, and whether it is an action."""

@@ -299,6 +299,7 @@ class HostRuntime:
         self._half.begin_timer(-lead_s)
         self._half_timer.call()
         self._timeline.begin()
+        self._timeline.open_door(self._directory.parent, self._reactor, self._log)
 
     def _job_done(self, job: int, future: Future[Any]) -> None:
         if not self._takes_data:
@@ -368,6 +369,7 @@ class HostRuntime:
 
     def _close(self) -> int:
         self._devices.close()
+        self._timeline.close()
         network = self._port.socket.counters()
         carried = self._port.carrier.to_mapping()
         result = self._report.result(

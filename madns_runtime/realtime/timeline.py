@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 from madns_runtime.conditions.reports import HostConditions, MetCondition
 from madns_runtime.config import RunConfig
 from madns_runtime.errors import MadnsError
+from madns_runtime.hardware.action_socket import ActionSocket
+from madns_runtime.hardware.order_socket import Readers
 from madns_runtime.plugin.action_handlers import (
     AgentOrders,
     Annotations,
@@ -28,7 +31,7 @@ from madns_runtime.timeline.action import ActionHandler
 from madns_runtime.timeline.dispatcher import Dispatcher
 from madns_runtime.timeline.fault_kinds import FAULT_WORDS
 from madns_runtime.timeline.kinds import ANNOTATE, DEVICE_FAULT, STOP, STRESS, kinds_by_word
-from madns_runtime.timeline.runner import TimelineRunner
+from madns_runtime.timeline.runner import OrderedAction, TimelineRunner
 
 STOP_LEAD_S: Final = 0.25
 """Every agent hears of a stop before its last tick, and all run the same ticks."""
@@ -71,6 +74,7 @@ class HostTimeline:
             config, port=port, half=half, guard=guard, reactor=reactor, pump=pump
         )
         call = partial(guard, half.call)
+        self._door: ActionSocket | None = None
         self.handlers: dict[str, ActionHandler] = {
             **dict.fromkeys(FAULT_WORDS, self.faults),
             ANNOTATE.word: Annotations(),
@@ -79,14 +83,16 @@ class HostTimeline:
             DEVICE_FAULT.word: AgentOrders(self._post),
             **simulation_handlers(program.actions, call=call, post=self._post),
         }
+        kinds = kinds_by_word(program.actions)
         self.runner = TimelineRunner(
             config.timeline,
-            kinds_by_word(program.actions),
+            kinds,
             Dispatcher(self.handlers, journal.event),
             seed=config.seed,
             duration_s=config.time.duration_s,
         )
-        # Infinite is never: the timer is made once and moved; a run without a timeline has none to move.
+        self.kinds = {word: kind for word, kind in kinds.items() if word in self.handlers}
+        # Infinite is never: the timer is made once and moved.
         self._timer = reactor.call_at(math.inf, self._due)
 
     def wait_for(self, conditions: HostConditions) -> None:
@@ -97,6 +103,34 @@ class HostTimeline:
     def begin(self) -> None:
         """Simulated time zero is set: wait for what is due first."""
         self._arm()
+
+    def open_door(self, folder: Path, loop: Readers, say: Callable[[str, str], None]) -> None:
+        """Take orders of actions in the run directory from now on."""
+        try:
+            self._door = ActionSocket(
+                folder,
+                loop,
+                kinds=self.kinds,
+                agents=self._config.agents.resolved_names(),
+                begin=self._order,
+                in_force=self.runner.told_in_force,
+            )
+        except OSError as error:
+            say("warning", f"no action can be ordered in this run: {error}")
+
+    def close(self) -> None:
+        """Take no more orders."""
+        if self._door is not None:
+            self._door.close()
+            self._door = None
+
+    def _order(self, order: OrderedAction) -> str:
+        if not self._port.is_in(HostState.SIMULATION_START) or self._port.now_s() < 0.0:
+            return "simulated time does not run at present"
+        refusal = self.runner.order(order, self._port.now_s())
+        self._arm()
+        self._pump()
+        return refusal
 
     def _arm(self) -> None:
         next_s, t0_s = self.runner.next_s, self._port.t0_s

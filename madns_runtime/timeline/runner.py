@@ -68,6 +68,20 @@ class TimelineRunner:
         """Actions that have begun and not ended."""
         return self._dispatcher.in_force
 
+    def told_in_force(self) -> list[dict[str, Any]]:
+        """Return what is in force in plain values."""
+        return [
+            {
+                "number": action.number,
+                "action": action.word,
+                "agents": list(action.agents),
+                "parameters": dict(action.parameters),
+                "since_s": action.t_s,
+                "for_s": action.for_s,
+            }
+            for action in self.in_force
+        ]
+
     def run_due(self, now_s: float) -> None:
         """Do all that is due up to simulated time *now_s*, in the order of times; at one time what ends comes first."""
         while (next_s := self.next_s) is not None and next_s <= now_s:

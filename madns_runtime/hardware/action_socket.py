@@ -1,0 +1,166 @@
+"""
+Actions ordered while a run goes on, by the words of its timeline: `cosmos inject` knocks at the host's own door.
+
+A unix socket of this user alone in the run directory. What is ordered is checked here as a scenario is before a run.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import orjson
+
+from madns_runtime.errors import ConfigurationError, MadnsError
+from madns_runtime.hardware.bounds import bound_faults
+from madns_runtime.hardware.order_socket import LineSocket, Readers
+from madns_runtime.plain_values import from_mapping, to_mapping
+from madns_runtime.timeline.action import ActionKind
+from madns_runtime.timeline.runner import OrderedAction
+
+SOCKET_NAME: Final = ".actions.sock"
+IN_FORCE_TOLD_MAX: Final = 100
+AGENTS_TOLD_MAX: Final = 20
+WHOLE_RUN: Final = "run"
+"""Target of an action that acts on no agents."""
+
+Begin = Callable[[OrderedAction], str]
+"""Begins an action and returns why it is refused, "" if it takes place."""
+
+
+class ActionSocket:
+    """
+    The door of one run.
+
+    Args:
+        folder: The run directory.
+        loop: Of the host.
+        kinds: Actions that this run carries out, by word.
+        agents: Names of all agents.
+        begin: Called with what is ordered.
+        in_force: Returns what is in force, in plain values.
+        is_immediate: Whether orders are carried out when they come; otherwise `carry_out` does it.
+
+    Raises:
+        OSError: It cannot be made there.
+    """
+
+    def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
+        self,
+        folder: Path,
+        loop: Readers,
+        *,
+        kinds: Mapping[str, ActionKind],
+        agents: Sequence[str],
+        begin: Begin,
+        in_force: Callable[[], Sequence[Mapping[str, Any]]],
+        is_immediate: bool = True,
+    ) -> None:
+        self._kinds = kinds
+        self._agents = agents
+        self._begin = begin
+        self._in_force = in_force
+        self._is_immediate = is_immediate
+        self._waiting: list[tuple[int, OrderedAction]] = []
+        self._door = LineSocket(folder, SOCKET_NAME, loop=loop, on_line=self._heard)
+
+    def carry_out(self) -> None:
+        """Carry out what was ordered since the last call."""
+        waiting, self._waiting = self._waiting, []
+        for number, order in waiting:
+            self._door.tell(number, {"refusal": self._begin(order)})
+
+    def close(self) -> None:
+        """Refuse what waits, and take no more orders."""
+        for number, _ in self._waiting:
+            self._door.tell(number, {"refusal": "the run is over"})
+        self._waiting.clear()
+        self._door.close()
+
+    def _heard(self, number: int, line: bytes) -> None:
+        try:
+            order = orjson.loads(line)
+            if not isinstance(order, dict):
+                raise ConfigurationError("no order")
+            if order.get("list"):
+                self._door.tell(number, self._listed())
+                return
+            self._waiting.append((number, self._parsed(order)))
+        except (ValueError, TypeError, MadnsError) as error:
+            self._door.tell(number, {"refusal": str(error)})
+            return
+        if self._is_immediate:
+            self.carry_out()
+
+    def _listed(self) -> dict[str, Any]:
+        actions = [
+            {
+                "action": kind.word,
+                "summary": kind.summary,
+                "takes_agents": kind.takes_agents,
+                "parameters": list(getattr(kind.parameters, "__dataclass_fields__", ())),
+                "for_s": kind.lasting,
+            }
+            for kind in self._kinds.values()
+        ]
+        in_force = list(self._in_force())
+        return {
+            "refusal": "",
+            "actions": actions,
+            "in_force": in_force[:IN_FORCE_TOLD_MAX],
+            "in_force_count": len(in_force),
+        }
+
+    def _parsed(self, order: Mapping[str, Any]) -> OrderedAction:
+        """
+        Return what is ordered.
+
+        Raises:
+            ConfigurationError: It is no action of this run, or its target, parameters or length do not fit.
+        """
+        word, target = str(order.get("action")), str(order.get("target"))
+        kind = self._kinds.get(word)
+        if kind is None:
+            raise ConfigurationError(
+                f"no action {word!r} in this run; there are {', '.join(self._kinds)}"
+            )
+        parameters = order.get("parameters")
+        given = dict(parameters) if isinstance(parameters, dict) else {}
+        made: Any = from_mapping(kind.parameters, given, word)
+        if faults := bound_faults(made, word):
+            raise ConfigurationError("; ".join(faults))
+        return OrderedAction(
+            word=word,
+            agents=self._chosen(kind, target),
+            parameters=to_mapping(made),
+            for_s=_length_s(kind, order.get("for_s")),
+        )
+
+    def _chosen(self, kind: ActionKind, target: str) -> tuple[str, ...]:
+        if not kind.takes_agents:
+            if target != WHOLE_RUN:
+                raise ConfigurationError(
+                    f"{kind.word} acts on the whole run: expected {WHOLE_RUN!r}, got {target!r}"
+                )
+            return ()
+        chosen = tuple(fnmatch.filter(self._agents, target))
+        if not chosen:
+            shown = ", ".join(self._agents[:AGENTS_TOLD_MAX])
+            raise ConfigurationError(f"no agent is named {target}; there are {shown}")
+        return chosen
+
+
+def _length_s(kind: ActionKind, for_s: Any) -> float | None:
+    if for_s is None:
+        if kind.lasting == "must":
+            raise ConfigurationError(f"{kind.word} needs for_s: how long it lasts, s")
+        return None
+    is_number = isinstance(for_s, int | float) and not isinstance(for_s, bool)
+    if not is_number or not math.isfinite(for_s) or for_s <= 0:
+        raise ConfigurationError(f"for_s: expected more than 0 s, got {for_s!r:.80}")
+    if kind.lasting == "never":
+        raise ConfigurationError(f"{kind.word} has no end: leave out for_s")
+    return float(for_s)

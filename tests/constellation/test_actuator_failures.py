@@ -1,0 +1,56 @@
+"""Failures that a timeline orders: what weak thrusters give, what failed wheels refuse, what faulty sensors measure."""
+
+import pytest
+
+from madns_runtime.simulations.constellation.actions import SensorFault
+from madns_runtime.simulations.constellation.truth.maneuvers.actuator_failures import (
+    WHEELS_FAILED,
+    ActuatorFailures,
+)
+from madns_runtime.simulations.constellation.vehicle.sensors.sensor_failures import SensorFailures
+
+
+def test_thrusters_give_their_share_until_the_failure_is_lifted():
+    failures = ActuatorFailures()
+    failures.weaken(1, {0: 0.5})
+    failures.weaken(2, {0: 0.5, 1: 0.0})
+
+    assert failures.given(0, (4.0, 0.0, -8.0)) == (1.0, 0.0, -2.0)
+    assert failures.given(1, (4.0, 0.0, 0.0)) == (0.0, 0.0, 0.0)
+    failures.lift(2)
+    assert failures.given(0, (4.0, 0.0, -8.0)) == (2.0, 0.0, -4.0)
+    failures.lift(1)
+    assert failures.given(0, (4.0, 0.0, -8.0)) == (4.0, 0.0, -8.0)
+
+
+def test_failed_wheels_refuse_torques_of_their_vehicle_alone():
+    failures = ActuatorFailures()
+    failures.fail_wheels(1, frozenset({2}))
+
+    assert failures.refusal(2, "torque") == WHEELS_FAILED
+    assert failures.refusal(2, "delta_v") == failures.refusal(1, "torque") == ""
+    failures.lift(1)
+    assert failures.refusal(2, "torque") == ""
+
+
+def test_a_biased_sensor_adds_to_its_first_values_and_a_dead_one_gives_none():
+    failures = SensorFailures()
+    assert not failures
+    failures.begin(1, SensorFault(sensor="gnss", fault="biased", bias=(500.0,)))
+
+    assert failures.altered((1.0, 2.0)) == (501.0, 2.0)
+    failures.begin(2, SensorFault(sensor="gnss", fault="dead"))
+    assert failures.altered((1.0, 2.0)) is None
+    failures.end(2)
+    failures.end(1)
+    assert not failures
+
+
+def test_a_stuck_sensor_repeats_what_it_measured_when_it_stuck_and_forgets_it_afterwards():
+    failures = SensorFailures()
+    failures.begin(1, SensorFault(sensor="gyro", fault="stuck"))
+
+    assert [failures.altered((float(n),)) for n in (1, 2, 3)] == [(1.0,)] * 3
+    failures.end(1)
+    failures.begin(2, SensorFault(sensor="gyro", fault="stuck"))
+    assert failures.altered((7.0,)) == pytest.approx((7.0,))

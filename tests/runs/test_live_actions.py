@@ -1,0 +1,80 @@
+"""Actions ordered while a run goes on, by the words of a timeline."""
+
+import json
+import time
+
+import pytest
+import yaml
+from harness.cosmos_command import CosmosCommand
+
+pytestmark = pytest.mark.process
+
+PATIENCE_S = 120.0
+REFUSED = [
+    (("run", "annotate"), "missing text"),
+    (("run", "annotate", "text=a", "txt=b"), "unknown txt"),
+    (("run", "annotate", "text=''"), "at least 1"),
+    (("run", "annotate", "text=a", "for_s=-1"), "more than 0 s"),
+    (("run", "stop", "for_s=3"), "has no end"),
+    (("agent-01", "stop"), "expected 'run', got 'agent-01'"),
+    (("agent-01", "explode"), "there are annotate, stop"),
+    (("car-*", "device_fault", "device=a", "fault=freeze"), "no agent is named car-*"),
+    (("agent-01", "device_fault", "device=a", "fault=melt"), "expected one of"),
+]
+
+
+def test_orders_are_taken_listed_refused_and_recorded_and_a_stop_completes_the_run(tmp_path):
+    cosmos = CosmosCommand(tmp_path)
+    scenario = {
+        "name": "live",
+        "simulation": "counter",
+        "agents": {"count": 2, "tick_hz": 10},
+        "time": {"mode": "lockstep", "duration_s": 1e7},
+    }
+    path = tmp_path / "live.yaml"
+    path.write_text(yaml.safe_dump(scenario))
+
+    def inject(*arguments):
+        done = cosmos("inject", "last", *arguments, "--json")
+        return done.returncode, json.loads(done.stdout) if done.stdout else done.stderr
+
+    with cosmos.start_run(path) as run:
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not list(cosmos.runs.glob("*/.actions.sock")):
+            assert time.monotonic() < deadline_s
+            time.sleep(0.1)
+        assert inject("run", "annotate", "text=hello", "for_s=1e7")[0] == 0
+        code, listed = inject("--list")
+        refusals = [(inject(*arguments), words) for arguments, words in REFUSED]
+        stopped, _ = inject("run", "stop")
+        out, _ = run.communicate(timeout=PATIENCE_S)
+
+    assert (code, stopped) == (0, 0)
+    assert {"annotate", "stop", "device_fault"} <= {each["action"] for each in listed["actions"]}
+    assert [each["parameters"] for each in listed["in_force"]] == [{"text": "hello"}]
+    for (code, answer), words in refusals:
+        assert code == 1, answer
+        assert words in answer["refusal"]
+    result = json.loads(out)
+    assert (result["exit_code"], result["status"]) == (0, "complete")
+    assert result["duration_s"] < 1e7
+    lines = (cosmos.directory(result) / "host" / "events.jsonl").read_text().splitlines()
+    found = [e["action"] for e in map(json.loads, lines) if e.get("event") == "action_began"]
+    assert found == ["annotate", "stop"]
+    assert not list(cosmos.runs.glob("*/.actions.sock"))
+
+
+def test_what_is_no_order_is_bad_input(tmp_path):
+    cosmos = CosmosCommand(tmp_path)
+    (tmp_path / "runs" / "0001-x").mkdir(parents=True)
+    (tmp_path / "runs" / "0001-x" / "run.json").write_text("{}")
+
+    for arguments in (
+        ("agent-01",),
+        ("--list",),
+        ("run", "annotate", "text"),
+        ("a/b", "bias", "x"),
+    ):
+        done = cosmos("inject", "0001-x", *arguments)
+        assert done.returncode == 2, (arguments, done)
+        assert done.stderr.startswith("error: ")
