@@ -17,6 +17,7 @@ from cosmos_cli.report.expectations import expectation_sections
 from cosmos_cli.report.health import health_blocks, process_blocks
 from cosmos_cli.report.second_names import with_second_names
 from cosmos_cli.report.tick_causes import cause_blocks
+from cosmos_cli.report.timeline import read_actions, timeline_sections, with_bands
 from cosmos_cli.report.timing import clock_blocks, tick_blocks
 from madns_runtime.analysis import chapters
 from madns_runtime.analysis.chapters import Chapter
@@ -68,11 +69,16 @@ def build_sections(run: RunDirectory, document: Mapping[str, Any]) -> list[Secti
         if name not in drawn and name not in TEXT_STREAMS and not is_told_in_words(name)
     }
     unknown = chapters.build_sections(others, recorded)
-    drawn_sections = [s for s in (*before, *own, *unknown, *after) if s.blocks]
+    actions = read_actions(run)
+    told = document.get("duration_s")
+    duration_s = float(told) if isinstance(told, int | float) else 0.0
+    found = with_bands((*before, *own, *unknown, *after), actions, duration_s)
+    drawn_sections = [section for section in found if section.blocks]
     return [
         *_gaps(run, recorded),
         *with_second_names(expectation_sections(run, recorded), run_labels(run)),
         *with_second_names(drawn_sections, run_labels(run)),
+        *timeline_sections(actions),
         *device_sections(document, recorded),
         *_load_sections(document),
         *_words(recorded.tables),

@@ -1,0 +1,156 @@
+"""What a run's timeline did, in its report: a table of the actions, and a band for each in figures over simulated time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import orjson
+
+from cosmos_cli.evidence.run_directory import RunDirectory
+from madns_runtime.analysis.values import (
+    SIMULATED_TIME,
+    EventBand,
+    Figure,
+    Heading,
+    Section,
+    TableBlock,
+)
+from madns_runtime.timeline.dispatcher import BEGAN, ENDED, REFUSED
+
+BANDS_MAX: Final = 40
+ROWS_MAX: Final = 100
+EVENTS_MAX: Final = 50_000
+AGENTS_TOLD_MAX: Final = 6
+LINE_BYTES_MAX: Final = 1 << 20
+INSTANT_SHARE: Final = 0.002
+"""Width of the band of an action that does not last, as a share of the run."""
+
+
+@dataclass(slots=True)
+class ActionTold:
+    """One action as the events tell of it."""
+
+    begin_s: float
+    word: str
+    agents: Sequence[str]
+    parameters: Mapping[str, Any]
+    delay_s: float | None
+    lasts: bool = False
+    end_s: float | None = None
+    refusal: str = ""
+
+    @property
+    def what(self) -> str:
+        """The action and its parameters, in words."""
+        given = [f"{key}={value}" for key, value in self.parameters.items() if value is not None]
+        return " ".join((self.word, *given))
+
+    @property
+    def whom(self) -> str:
+        """Its agents."""
+        shown = ", ".join(map(str, self.agents[:AGENTS_TOLD_MAX]))
+        more = len(self.agents) - AGENTS_TOLD_MAX
+        return f"{shown} and {more} more" if more > 0 else shown
+
+
+def read_actions(run: RunDirectory) -> list[ActionTold]:
+    """Return the actions that a run's host recorded, in order; none where its events cannot be read."""
+    found: dict[Any, ActionTold] = {}
+    for event in _events(run):
+        number, t_s = event.get("number"), event.get("t_s")
+        if not isinstance(t_s, int | float):
+            continue
+        if event.get("event") == ENDED and number in found:
+            found[number].end_s = float(t_s)
+        elif event.get("event") in (BEGAN, REFUSED) and number not in found:
+            agents, parameters = event.get("agents"), event.get("parameters")
+            found[number] = ActionTold(
+                begin_s=float(t_s),
+                word=str(event.get("action")),
+                agents=agents if isinstance(agents, list) else (),
+                parameters=parameters if isinstance(parameters, dict) else {},
+                delay_s=event.get("delay_s"),
+                lasts=bool(event.get("lasts")),
+                refusal=str(event.get("reason", "")),
+            )
+    return list(found.values())
+
+
+def _events(run: RunDirectory) -> Iterator[Mapping[str, Any]]:
+    try:
+        with (run.path / "host" / "events.jsonl").open("rb") as file:
+            for _ in range(EVENTS_MAX):
+                line = file.readline(LINE_BYTES_MAX)
+                if not line:
+                    return
+                if b'"action_' not in line:
+                    continue
+                try:
+                    event = orjson.loads(line)
+                except ValueError:
+                    continue
+                if isinstance(event, dict):
+                    yield event
+    except OSError:
+        return
+
+
+def with_bands(
+    sections: Sequence[Section], actions: Sequence[ActionTold], duration_s: float
+) -> list[Section]:
+    """Return sections whose figures over simulated time show when actions were in force."""
+    bands = [
+        EventBand(start=each.begin_s, end=_end_s(each, duration_s), name=each.what)
+        for each in actions
+        if not each.refusal
+    ][:BANDS_MAX]
+    if not bands:
+        return list(sections)
+    return [
+        replace(
+            section,
+            blocks=[
+                replace(block, events=(*block.events, *bands))
+                if isinstance(block, Figure) and block.x == SIMULATED_TIME
+                else block
+                for block in section.blocks
+            ],
+        )
+        for section in sections
+    ]
+
+
+def timeline_sections(actions: Sequence[ActionTold]) -> list[Section]:
+    """Return the chapter of a run's timeline; none where nothing was to happen."""
+    if not actions:
+        return []
+    heads = ("begin, s", "action", "agents", "end, s", "delay, s", "refused")
+    table = TableBlock(
+        title="Actions",
+        headings=[Heading(text=text, is_number=text.endswith(", s")) for text in heads],
+        rows=[
+            [each.begin_s, each.what, each.whom, each.end_s, each.delay_s, each.refusal]
+            for each in actions[:ROWS_MAX]
+        ],
+        note=_note(len(actions)),
+    )
+    return [Section(title="Timeline", blocks=[table])]
+
+
+def _note(count: int) -> str:
+    texts = []
+    if count > ROWS_MAX:
+        texts.append(f"The first {ROWS_MAX} of {count}.")
+    if count > BANDS_MAX:
+        texts.append(f"Figures show bands of the first {BANDS_MAX}.")
+    return " ".join(texts)
+
+
+def _end_s(action: ActionTold, duration_s: float) -> float:
+    if action.end_s is not None:
+        return action.end_s
+    if action.lasts:
+        return max(duration_s, action.begin_s)
+    return action.begin_s + INSTANT_SHARE * duration_s

@@ -1,0 +1,93 @@
+"""What a timeline did, as a report shows it: rows of a table, and bands in figures over simulated time."""
+
+import json
+from types import SimpleNamespace
+
+from cosmos_cli.report.timeline import read_actions, timeline_sections, with_bands
+from madns_runtime.analysis.values import (
+    Axis,
+    Figure,
+    FigureChoice,
+    Section,
+    Series,
+    TableBlock,
+)
+
+EVENTS = [
+    {"t_s": 0.0, "event": "state", "state": "SIMULATION_START"},
+    {
+        "t_s": 10.0,
+        "event": "action_began",
+        "number": 0,
+        "action": "sensor_fault",
+        "agents": ["a", "b"],
+        "parameters": {"sensor": "gnss", "fault": "dead", "value": None},
+        "delay_s": 0.5,
+        "lasts": True,
+    },
+    {"t_s": 30.0, "event": "action_ended", "number": 0, "action": "sensor_fault"},
+    {
+        "t_s": 40.0,
+        "event": "action_began",
+        "number": 1,
+        "action": "annotate",
+        "agents": [],
+        "parameters": {"text": "here"},
+        "delay_s": 0.0,
+        "lasts": False,
+    },
+    {
+        "t_s": 50.0,
+        "event": "action_refused",
+        "number": 2,
+        "action": "kill",
+        "agents": ["a"],
+        "parameters": {},
+        "reason": "not there",
+    },
+]
+
+
+def a_run(folder, events):
+    (folder / "host").mkdir()
+    lines = [json.dumps(event) for event in events]
+    (folder / "host" / "events.jsonl").write_text("\n".join([*lines, "{cut"]))
+    return SimpleNamespace(path=folder)
+
+
+def a_figure(**more):
+    return Figure(title="t", choices=[FigureChoice(marks=[Series(x=[0, 1], y=[0, 1])])], **more)
+
+
+def test_actions_are_rows_and_bands_in_figures_over_simulated_time_alone(tmp_path):
+    actions = read_actions(a_run(tmp_path, EVENTS))
+    over_time, other = a_figure(), a_figure(x=Axis(quantity="distance", unit="m"))
+
+    (section,) = with_bands([Section(title="s", blocks=[over_time, other])], actions, 100.0)
+    (told,) = timeline_sections(actions)
+
+    bands = [(band.start, band.end, band.name) for band in section.blocks[0].events]
+    assert bands == [
+        (10.0, 30.0, "sensor_fault sensor=gnss fault=dead"),
+        (40.0, 40.2, "annotate text=here"),
+    ]
+    assert section.blocks[1].events == ()
+    (table,) = told.blocks
+    assert isinstance(table, TableBlock)
+    assert [row[0] for row in table.rows] == [10.0, 40.0, 50.0]
+    assert table.rows[0][2:5] == ["a, b", 30.0, 0.5]
+    assert table.rows[2][-1] == "not there"
+
+
+def test_a_run_without_a_timeline_has_no_chapter_of_one(tmp_path):
+    actions = read_actions(a_run(tmp_path, EVENTS[:1]))
+    figure = a_figure()
+
+    (section,) = with_bands([Section(title="s", blocks=[figure])], actions, 100.0)
+
+    assert timeline_sections(actions) == []
+    assert section.blocks[0] is figure
+
+
+def test_events_that_cannot_be_read_tell_of_nothing(tmp_path):
+    assert read_actions(SimpleNamespace(path=tmp_path)) == []
