@@ -26,6 +26,7 @@ COUNTER = {
 }
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("number", range(2))
 def test_an_example_of_the_guide_is_accepted(tmp_path, number):
     scenario = COUNTER
