@@ -156,7 +156,6 @@ class HostRuntime:
             guard=self._guard,
             pump=self._pump,
         )
-        self._timeline.wait_for(self._conditions)
         self._losses = AgentLosses(
             self._report,
             self._timeline.faults,
@@ -298,8 +297,7 @@ class HostRuntime:
         self._call("start", -lead_s)
         self._half.begin_timer(-lead_s)
         self._half_timer.call()
-        self._timeline.begin()
-        self._timeline.open_door(self._directory.parent, self._reactor, self._log)
+        self._timeline.begin(self._conditions, self._directory.parent, self._log)
 
     def _job_done(self, job: int, future: Future[Any]) -> None:
         if not self._takes_data:

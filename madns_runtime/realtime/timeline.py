@@ -12,7 +12,6 @@ from madns_runtime.conditions.reports import HostConditions, MetCondition
 from madns_runtime.config import RunConfig
 from madns_runtime.errors import MadnsError
 from madns_runtime.hardware.action_socket import ActionSocket
-from madns_runtime.hardware.order_socket import Readers
 from madns_runtime.plugin.action_handlers import (
     AgentOrders,
     Annotations,
@@ -70,6 +69,7 @@ class HostTimeline:
         self._port = port
         self._report = report
         self._pump = pump
+        self._reactor = reactor
         self.faults = HostFaults(
             config, port=port, half=half, guard=guard, reactor=reactor, pump=pump
         )
@@ -95,21 +95,17 @@ class HostTimeline:
         # Infinite is never: the timer is made once and moved.
         self._timer = reactor.call_at(math.inf, self._due)
 
-    def wait_for(self, conditions: HostConditions) -> None:
-        """Have the actions begin that wait for conditions."""
+    def begin(
+        self, conditions: HostConditions, folder: Path, say: Callable[[str, str], None]
+    ) -> None:
+        """Simulated time zero is set: wait for what is due, for conditions, and for orders in the run directory."""
         for number in {e.condition for e in self._config.timeline if e.condition is not None}:
             conditions.on_met(number, self._met)
-
-    def begin(self) -> None:
-        """Simulated time zero is set: wait for what is due first."""
         self._arm()
-
-    def open_door(self, folder: Path, loop: Readers, say: Callable[[str, str], None]) -> None:
-        """Take orders of actions in the run directory from now on."""
         try:
             self._door = ActionSocket(
                 folder,
-                loop,
+                self._reactor,
                 kinds=self.kinds,
                 agents=self._config.agents.resolved_names(),
                 begin=self._order,

@@ -12,6 +12,7 @@ from madns_runtime.simulations.constellation.actions import ACTIONS
 from madns_runtime.timeline.kinds import FRAMEWORK_ACTIONS
 
 GUIDE = (ROOT / "docs" / "timeline.md").read_text("utf-8")
+FAULTS = (ROOT / "docs" / "faults.md").read_text("utf-8")
 EXAMPLES = re.findall(r"^```yaml\n(.*?)^```$", GUIDE, flags=re.MULTILINE | re.DOTALL)
 COUNTER = {
     "name": "guide",
@@ -42,6 +43,6 @@ def test_an_example_of_the_guide_is_accepted(tmp_path, number):
 
 def test_the_guide_has_every_action_of_the_framework_and_of_a_constellation():
     assert len(EXAMPLES) == 2
-    rows = set(re.findall(r"^\| `(\w+)` \|", GUIDE, flags=re.MULTILINE))
+    rows = set(re.findall(r"^\| `(\w+)` \|", GUIDE + FAULTS, flags=re.MULTILINE))
 
     assert {kind.word for kind in (*FRAMEWORK_ACTIONS, *ACTIONS)} - rows == set()
