@@ -108,7 +108,7 @@ def cosmos_run(scenario: str | Path, *settings: str) -> Iterator[CosmosRun]:
             cpu=cpu,
             pss_bytes=pss,
             start_s=t0_s - began_s,
-            end_s=ended_s - t0_s - result["duration_s"],
+            end_s=ended_s - t0_s - result["duration_s"] / (result["rtf"] or 1.0),
         )
 
 

@@ -178,7 +178,7 @@ def stress(length: Length) -> Iterator[Claim]:
 def size(length: Length) -> Iterator[Claim]:
     """Measure what an agent tick of ten satellites takes on disk."""
     with cosmos_run(
-        SCENARIOS / "iridium10.yaml", f"time.duration_s={max(60.0, length.seconds)}"
+        SCENARIOS / "iridium10.yaml", f"time.duration_s={max(180.0, length.seconds)}"
     ) as run:
         figures = run.figures()
         yield at_most("iridium10: recorded, bytes per agent tick", figures["bytes_per_tick"], 125)
@@ -200,6 +200,7 @@ def lockstep(length: Length) -> Iterator[Claim]:
             *hour,
             "parameters.record.state_hz=0.01",
             "parameters.record.elements_hz=0.01",
+            "parameters.flight.settings={commanded_s: 1e6, lead_s: 45}",
         ),
     }
     for name, goal in LOCKSTEP.items():
