@@ -170,14 +170,14 @@ class _Placing:
         if is_statistic and isinstance(rule.equals, str | bool):
             yield ("equals",), f"a {rule.kind} is a number, got {rule.equals!r}"
         if bounded is not None:
-            yield from words_at(below, _kind_faults(bounded, field))
+            yield from words_at(below, kind_faults(bounded, field))
         if not is_statistic and isinstance(rule.equals, str) and rule.kind not in ("each", "last"):
             yield ("statistic",), f"a text has no {rule.kind}: expected each or last"
         elif field is not None and field.kind == "str" and rule.kind not in (
             "each", "last", "count", "rate", *OF_TIMES,
         ):  # fmt: skip
             yield ("statistic",), f"{field.name} holds texts, which have no {rule.kind}"
-        yield from _unit_faults(rule.unit, field, must_know=rule.stop_when_broken)
+        yield from unit_faults(rule.unit, field, must_know=rule.stop_when_broken)
 
     def _while_faults(self, rule: BoundsRule) -> Iterator[RuleFault]:
         streams = self._around.streams
@@ -188,8 +188,8 @@ class _Placing:
             yield ("field",), fault
         else:
             field = streams.field(stream, name)
-            yield from _kind_faults(rule, field)
-            yield from _unit_faults(rule.unit, field)  # type: ignore[attr-defined]
+            yield from kind_faults(rule, field)
+            yield from unit_faults(rule.unit, field)  # type: ignore[attr-defined]
 
     def expectation(self) -> Expectation:
         rule, around = self._rule, self._around
@@ -243,7 +243,7 @@ def _earliest(*times_s: float | None) -> float | None:
     return min((each for each in times_s if each is not None), default=None)
 
 
-def _kind_faults(rule: BoundsRule, field: Field | None) -> Iterator[RuleFault]:
+def kind_faults(rule: BoundsRule, field: Field | None) -> Iterator[RuleFault]:
     """Yield what does not fit between bounds and the kind of a field."""
     if field is None:
         return
@@ -256,7 +256,8 @@ def _kind_faults(rule: BoundsRule, field: Field | None) -> Iterator[RuleFault]:
         yield ("equals",), f"{field.name} holds numbers, got {str(rule.equals).lower()}"
 
 
-def _unit_faults(unit: str, field: Field | None, *, must_know: bool = False) -> Iterator[RuleFault]:
+def unit_faults(unit: str, field: Field | None, *, must_know: bool = False) -> Iterator[RuleFault]:
+    """Yield what does not fit between a unit that is given and a field's; *must_know* if it is needed in the run."""
     if not unit:
         return
     if field is None:

@@ -18,6 +18,7 @@ from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.expectation import Expectation, conditions_of_checks
 from cosmos_cli.models.extending import ScenarioSource, read_scenario_source
 from cosmos_cli.models.hardware import hardware_faults
+from cosmos_cli.models.known_streams import KnownStreams
 from cosmos_cli.models.overrides import apply_overrides
 from cosmos_cli.models.own_requirements import own_requirement_faults
 from cosmos_cli.models.place_uses import CURE, shared_places
@@ -112,7 +113,9 @@ class ScenarioFile:
             agent_parameters=self.agent_parameters,
             timeline=self.timeline.entries,
         )
-        return replace(config, conditions=conditions_of_checks(self.expectations))
+        awaited = self.timeline.conditions
+        broken = conditions_of_checks(self.expectations, first=len(awaited))
+        return replace(config, conditions=(*awaited, *broken))
 
     def to_written(self) -> dict[str, Any]:
         """Return the same as a scenario file holds it: what is no variable there is escaped."""
@@ -223,7 +226,9 @@ def _check(
     ]
     timeline = NO_TIMELINE
     if not broken - {"timeline"}:
-        timeline = resolve_timeline(document, scenario, answers.actions, answers.labels)
+        timeline = resolve_timeline(
+            document, scenario, answers.actions, answers.labels, KnownStreams(answers.streams)
+        )
     faults += timeline.faults
     checks = scenario_checks(scenario, answers, broken)
     faults += [document.fault(("checks", *where), text) for where, text in checks.faults]

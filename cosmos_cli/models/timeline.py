@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
 from cosmos_cli.errors import Fault
 from cosmos_cli.models.agent_labels import AgentLabels
-from cosmos_cli.models.document import Document, did_you_mean
+from cosmos_cli.models.document import Document, did_you_mean, dotted
 from cosmos_cli.models.document import Path as ValuePath
+from cosmos_cli.models.known_streams import KnownStreams
 from cosmos_cli.models.scenario import Scenario, SectionFault
 from cosmos_cli.models.timeline_actions import ActionAnswers, KnownAction, entries_of
+from cosmos_cli.models.timeline_conditions import AwaitedCondition
 from cosmos_cli.models.timeline_rules import RULE_KEYS, TimelineRule
 from cosmos_cli.models.translate import faults_of
+from cosmos_cli.models.value_rules import words_at
+from madns_runtime.conditions.condition import Condition
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.hardware.fault_actions import check_fault
 from madns_runtime.timeline.entries import ScheduledEntry
@@ -34,6 +38,8 @@ class ResolvedTimeline:
 
     entries: tuple[ScheduledEntry, ...] = ()
     faults: tuple[Fault, ...] = ()
+    conditions: tuple[Condition, ...] = ()
+    """What entries wait for; their numbers are places here."""
     actions: tuple[KnownAction, ...] = ()
     """All that may be named in it."""
 
@@ -42,7 +48,11 @@ NO_TIMELINE = ResolvedTimeline()
 
 
 def resolve_timeline(
-    document: Document, scenario: Scenario, answers: ActionAnswers, labels: AgentLabels | None
+    document: Document,
+    scenario: Scenario,
+    answers: ActionAnswers,
+    labels: AgentLabels | None,
+    streams: KnownStreams,
 ) -> ResolvedTimeline:
     """
     Return a scenario's timeline among its agents and actions.
@@ -52,9 +62,11 @@ def resolve_timeline(
         scenario: What it says.
         answers: Actions that are known, and the parameters of each entry.
         labels: Second names of agents; None if they are not known, and then agents are not looked for.
+        streams: That conditions may name.
     """
     faults: list[Fault] = []
     entries: list[ScheduledEntry] = []
+    conditions: list[Condition] = []
     known = {action.word: action for action in answers.known}
     expected = 0.0
     for place, written in entries_of(document):
@@ -66,18 +78,24 @@ def resolve_timeline(
             continue
         placing = _Placing(rule, scenario, known.get(rule.action), answers, labels)
         found = list(placing.faults())
+        awaited = placing.awaited(streams)
+        if awaited is not None:
+            found += words_at(("when",), awaited.faults())
         faults += [document.fault((*path, *inner), text) for inner, text in found]
         given = answers.parameters[place] if place < len(answers.parameters) else None
         if found or given is None:
             continue
         entry = placing.entry(given)
+        if awaited is not None:
+            entry = replace(entry, condition=len(conditions))
+            conditions.append(awaited.condition(len(conditions), dotted(path)))
         faults += [document.fault((*path, *p), t) for p, t in _parameter_faults(scenario, entry)]
         entries.append(entry)
         expected += count_expected(entry, scenario.time.duration_s)
     if expected > EXPECTED_SHARE * ACTIONS_MAX:
         text = f"expected at most {EXPECTED_SHARE * ACTIONS_MAX:g} actions in a run, got some {expected:.0f}"
         faults.append(document.fault(("timeline",), f"{text}: make them rarer"))
-    return ResolvedTimeline(tuple(entries), tuple(faults), answers.known)
+    return ResolvedTimeline(tuple(entries), tuple(faults), tuple(conditions), answers.known)
 
 
 def _rule(
@@ -157,6 +175,14 @@ class _Placing:
                     ("agents", place),
                     f"no agent is named {pattern}{did_you_mean(pattern, names)}",
                 )
+
+    def awaited(self, streams: KnownStreams) -> AwaitedCondition | None:
+        """Return what it waits for, if it does and agents are known."""
+        names = self.scenario.agents.resolved_names()
+        if self.rule.when is None or self.labels is None:
+            return None
+        is_lockstep = self.scenario.time.is_lockstep
+        return AwaitedCondition(self.rule.when, streams, names, self.labels, is_lockstep)
 
     def entry(self, parameters: dict[str, Any]) -> ScheduledEntry:
         """Return what host and agents are told."""

@@ -10,11 +10,12 @@ from typing import Annotated, Any, Final
 from annotated_types import Ge, Gt, Le
 
 from cosmos_cli.models.text_forms import NonBlank
+from cosmos_cli.models.value_rules import AwaitedRule
 from madns_runtime.config import FORBID_EXTRA
 
 ENTRIES_MAX: Final = 1000
-RATE_PER_H_MAX: Final = 3600.0
-WHEN_WORDS: Final = ("at_s", "every_s", "rate_per_h")
+RATE_PER_H_MAX: Final = 3600
+WHEN_WORDS: Final = ("at_s", "every_s", "when", "rate_per_h")
 RuleFault = tuple[tuple[str | int, ...], str]
 """The path within the entry, and what is wrong there."""
 
@@ -33,6 +34,8 @@ class TimelineRule:
     """Simulated time, s: once."""
     every_s: Annotated[float, Gt(0)] | None = None
     """Period, s: at from_s, and again and again until to_s."""
+    when: AwaitedRule | None = None
+    """Once, when this first holds: of the first agent, or of the host's half."""
     rate_per_h: Annotated[float, Gt(0), Le(RATE_PER_H_MAX)] | None = None
     """By chance under the seed, so often an hour on average: each agent for itself, or the run."""
     from_s: Annotated[float, Ge(0)] | None = None

@@ -25,9 +25,9 @@ STEP_FAULTS: Final = (HANG, SLOW)
 MESSAGE_FAULTS: Final = (LOSE, DELAY, REORDER, DUPLICATE, LINK_DOWN, PARTITION)
 
 Traffic = Literal["all", "with_host", "between_agents"]
-Probability = Annotated[float, Gt(0.0), Le(1.0)]
-DELAY_S_MAX: Final = 3600.0
-Delay = Annotated[float, Gt(0.0), Le(DELAY_S_MAX)]
+Probability = Annotated[float, Gt(0), Le(1)]
+DELAY_S_MAX: Final = 3600
+Delay = Annotated[float, Gt(0), Le(DELAY_S_MAX)]
 MUST_CONTINUE: Final = "expected on_agent_loss: continue, got abort: the loss would end the run"
 _FORBID: Final[dict[str, Any]] = {"extra": "forbid"}
 
@@ -38,7 +38,7 @@ class SlowSteps:
 
     __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
 
-    factor: Annotated[float, Gt(1.0), Le(1000.0)]
+    factor: Annotated[float, Gt(1), Le(1000)]
     """How many times as long a step takes; in lockstep, where steps take no time, a step is taken in one of so many ticks."""
 
 

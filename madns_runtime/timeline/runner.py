@@ -55,6 +55,8 @@ class TimelineRunner:
         self._ends: list[tuple[float, int, TimelineAction]] = []
         self._count = self._ordered_count = 0
         self._is_closed = False
+        self._met: set[int] = set()
+        """Conditions that were met: by one agent, others do not count any more."""
 
     @property
     def next_s(self) -> float | None:
@@ -107,7 +109,10 @@ class TimelineRunner:
         self._is_closed = True
 
     def met(self, condition: int, met_s: float, now_s: float) -> None:
-        """Begin, now, the actions that wait for a condition, which was met at *met_s*."""
+        """Begin, now, the actions that wait for a condition, which was met at *met_s*; the first time alone."""
+        if condition in self._met:
+            return
+        self._met.add(condition)
         for entry in self._entries:
             if entry.condition == condition:
                 ordered = OrderedAction(

@@ -84,3 +84,41 @@ def test_a_stop_in_real_time_ends_all_agents_with_the_same_tick(cosmos, tmp_path
         ("action_ended", "stress"),
         ("action_began", "stop"),
     ]
+
+
+AWAITED = [
+    {
+        "when": {"stream": "round_trips", "field": "packet", "above": 20},
+        "action": "annotate",
+        "text": "twenty packets",
+    },
+    {
+        "when": {"stream": "round_trips", "field": "packet", "above": 30, "agents": ["agent-02"]},
+        "action": "stop",
+    },
+]
+
+
+def test_a_condition_begins_its_action_once_at_the_end_of_its_tick_in_lockstep(cosmos, tmp_path):
+    path = written(tmp_path, AWAITED)
+
+    first, second = (cosmos.run(path, f"agents.per_process={number}") for number in (1, 2))
+
+    assert (first[0], first[1]["records_sha256"]) == (0, second[1]["records_sha256"])
+    found = actions(cosmos, first[1])
+    assert [(each["action"], each["delay_s"]) for each in found] == [("annotate", 0), ("stop", 0)]
+    began_s = found[1]["t_s"]
+    assert 2.9 < began_s < 3.5
+    assert first[1]["duration_s"] == pytest.approx(began_s + 0.1)  # the tick under way is the last
+
+
+def test_a_condition_is_heard_of_in_real_time_and_the_delay_recorded(cosmos, tmp_path):
+    path = written(tmp_path, AWAITED, mode="realtime", duration_s=100)
+
+    code, result = cosmos.run(path, *LOOSE)
+
+    found = actions(cosmos, result)
+    assert (code, result["status"]) == (0, "complete")
+    assert [each["action"] for each in found] == ["annotate", "stop"]
+    assert all(0.0 <= each["delay_s"] < 60.0 for each in found)
+    assert result["duration_s"] < 100

@@ -80,6 +80,7 @@ def test_a_condition_begins_what_waits_for_it_and_the_delay_is_recorded() -> Non
     )
 
     runner.met(3, met_s=7.0, now_s=7.5)
+    runner.met(3, met_s=7.2, now_s=7.6)  # by another agent
     runner.run_due(9.5)
 
     assert handler.calls == [("begin", "kill", 7.0), ("end", "kill", 7.0)]

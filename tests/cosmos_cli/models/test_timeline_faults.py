@@ -18,7 +18,41 @@ hardware: {{devices: [{{name: gps, kind: synthetic, parameters: {{channels: [{{n
 timeline:
 """
 DEVICE = 'at_s: 1, action: device_fault, agents: ["*"], '
+WHEN = "{action: stop, when: {%s}}"
+BROKEN_WHEN = [
+    ("stream: round_trips, field: packet", "", "expected a limit: one of below"),
+    ("stream: round_trip, field: packet, above: 1", ".stream", "did you mean round_trips?"),
+    ("stream: round_trips, field: paket, above: 1", ".field", "did you mean packet?"),
+    ("stream: round_trips, above: 1", ".field", "missing"),
+    ("stream: round_trips, field: packet, above: 1, below: 3", ".above", "got below as well"),
+    ("stream: round_trips, field: packet, equals: a", ".equals", "holds no texts"),
+    ("stream: round_trips, field: packet, above: 1, unit: km", ".unit", "has no unit"),
+    ("stream: round_trips, field: packet, within: [3, 1]", ".within", "the lesser bound first"),
+    (
+        "stream: round_trips, field: packet, above: 1, agents: [car]",
+        ".agents[0]",
+        "no agent is named",
+    ),
+    (
+        "stream: round_trips, field: packet, above: 1, agents: [host]",
+        ".agents[0]",
+        "by agents alone",
+    ),
+    ("stream: round_trips, field: packet, above: 1, for_s: -1", ".for_s", "expected >= 0"),
+    (
+        "stream: ticks, field: margin_us, above: 1",
+        ".stream",
+        "is not recorded in time.mode lockstep",
+    ),
+]
 BROKEN = [
+    *((WHEN % words, f"timeline[0].when{place}", text) for words, place, text in BROKEN_WHEN),
+    ("{at_s: 1, action: stop, when: {}}", "timeline[0].when.stream", "missing"),
+    (
+        "{at_s: 1, action: stop, when: {stream: a, field: b}}",
+        "timeline[0].when",
+        "got at_s as well",
+    ),
     ("3", "timeline[0]", "expected a mapping, got 3"),
     ("{at_s: 1}", "timeline[0].action", "missing; expected a text"),
     ("{at_s: 1, action: 3}", "timeline[0].action", "expected a text"),
@@ -141,3 +175,20 @@ def test_globs_become_names_and_defaults_are_filled_in(tmp_path: Path) -> None:
     assert found.agents == ("agent-01", "agent-02")
     assert found.parameters == {"device": "gps", "fault": "freeze", "value": None}
     assert (found.every_s, found.from_s, found.to_s, found.for_s) == (20.0, 0.0, None, 5.0)
+
+
+def test_a_condition_travels_with_its_agents_and_in_the_unit_of_its_field(tmp_path: Path) -> None:
+    when = "{stream: round_trips, field: round_trip_us, above: 2, unit: ms, agents: [agent-02], for_s: 3}"
+
+    config = load(
+        tmp_path, "{at_s: 5, action: stop}", f"{{when: {when}, action: stop}}"
+    ).run_config("r")
+
+    (condition,) = config.conditions
+    assert [entry.condition for entry in config.timeline] == [None, 0]
+    assert (condition.number, condition.stream, condition.agents) == (
+        0,
+        "round_trips",
+        ("agent-02",),
+    )
+    assert (condition.bounds.low, condition.for_s) == (2000.0, 3.0)
