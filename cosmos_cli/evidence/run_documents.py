@@ -15,6 +15,8 @@ from madns_runtime.errors import ConfigurationError
 
 DOCUMENT_BYTES_MAX = 256 * 1024 * 1024
 """A host's result is some kilobytes an agent, a manifest some 200 bytes a file."""
+EXPECTATIONS = "expectations"
+"""Key of plan.json."""
 MISSING = "missing"
 Step = Literal["run", "collect", "forgotten"]
 

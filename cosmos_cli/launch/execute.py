@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from cosmos_cli.errors import CosmosError, ExitCode, InputError
-from cosmos_cli.evidence.expectations.of_run import EXPECTATIONS
 from cosmos_cli.evidence.run_directory import (
     RunDirectory,
     alone,
@@ -19,7 +18,7 @@ from cosmos_cli.evidence.run_directory import (
     create_run,
     discard_run,
 )
-from cosmos_cli.evidence.run_documents import Problem
+from cosmos_cli.evidence.run_documents import EXPECTATIONS, Problem
 from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.pool import FORKS_DEFAULT
 from cosmos_cli.launch.access import chosen_access, with_access

@@ -9,6 +9,7 @@ from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.expectations.judge import JudgedExpectations, judge_expectations
 from cosmos_cli.evidence.remarks import declared_streams
 from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.run_documents import EXPECTATIONS
 from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.models.checks import Surroundings, resolve_checks
 from cosmos_cli.models.expectation import Expectation
@@ -17,9 +18,6 @@ from cosmos_cli.models.loading import ScenarioFile
 from madns_runtime.analysis.tables import Tables
 from madns_runtime.config import from_mapping
 from madns_runtime.errors import ConfigurationError
-
-EXPECTATIONS = "expectations"
-"""Key of plan.json."""
 
 
 def planned_expectations(plan: Mapping[str, Any] | None) -> tuple[Expectation, ...]:

@@ -204,10 +204,12 @@ def test_the_schema_knows_every_kind(folder):
     fields = schema["$defs"]["Parameters"]["properties"]
 
     assert fields["table"]["format"] == "path"
-    assert schema["$defs"]["Colour"]["enum"] == ["red", "blue"]
+    assert schema["$defs"]["Colour"]["anyOf"][0]["enum"] == ["red", "blue"]
     assert fields["mode"]["enum"] == ["slow", "quick", 3]
     assert fields["position_m"]["prefixItems"][2]["type"] == "string"
-    assert "table" in schema["$defs"]["Parameters"]["required"]
+    # What a scenario must say that extends no other one.
+    whole = schema["allOf"][1]["then"]["else"]
+    assert "table" in whole["properties"]["parameters"]["required"]
 
 
 @pytest.mark.parametrize(
