@@ -48,6 +48,8 @@ from cosmos_cli.onboard.processes import words_of
 from cosmos_cli.report.html import write_report
 from cosmos_cli.ui.name_ranges import compact
 from cosmos_cli.ui.plural import counted
+from madns_runtime.hardware.action_socket import SOCKET_NAME as ACTIONS_SOCKET
+from madns_runtime.hardware.order_socket import SOCKET_NAME as ORDERS_SOCKET
 from madns_runtime.processes import ProcessEntry, list_processes
 
 PROCESSES_SHOWN_MAX = 3
@@ -112,6 +114,7 @@ def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; five a
         MachineError: A record stream cannot be read.
         RunFailedError: Not even run.json can be written.
     """
+    _remove_sockets(run)
     earlier = Earlier.read(run)
     unread = find_unread(run, earlier, bytes_max)
     changed = {**told_unread(run, unread), **earlier.changed_files(run, unread)}
@@ -145,6 +148,14 @@ def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; five a
         has_report=has_report,
         progress=progress,
     )
+
+
+def _remove_sockets(run: RunDirectory) -> None:
+    """Remove the sockets for orders that a killed process of the run left: nobody listens any more."""
+    for name in (ORDERS_SOCKET, ACTIONS_SOCKET):
+        with contextlib.suppress(OSError):
+            if (run.path / name).is_socket():
+                (run.path / name).unlink()
 
 
 def collect_run(
