@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from madns_runtime.faults.intended_losses import IntendedLosses
 from madns_runtime.protocol.counters import LinkCounters
 from madns_runtime.protocol.events import Phase
 from madns_runtime.protocol.host_peers import Peer
@@ -16,7 +17,7 @@ from madns_runtime.realtime.host_result import HostReport
 def result_of(**records: Any) -> dict[str, Any]:
     peer = Peer(name="agent-01", index=1, phase=Phase.STOPPED, records=records)
     session: Any = SimpleNamespace(peers={"agent-01": peer}, refused={}, malformed_count=0)
-    return HostReport(10.0).result(session, network={})
+    return HostReport(10.0).result(session, network={}, intended=IntendedLosses())
 
 
 def test_what_an_agent_could_not_hold_during_its_set_up_is_lost():
@@ -53,6 +54,6 @@ def test_deadlines_that_were_broken_before_an_agent_came_again_stay_counted():
     peer = Peer(name="agent-01", index=1, phase=Phase.STOPPED, retired_counters=[earlier])
     session: Any = SimpleNamespace(peers={"agent-01": peer}, refused={}, malformed_count=0)
 
-    result = HostReport(10.0).result(session, network={})
+    result = HostReport(10.0).result(session, network={}, intended=IntendedLosses())
 
     assert result["messages"]["sync"]["deadlines_broken"] == 2
