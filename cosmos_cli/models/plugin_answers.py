@@ -179,8 +179,8 @@ class _Asking:
             actions=actions,
         )
         if parameters is not None and self._agents is not None:
-            found = replace(found, labels=self._labels(simulation, parameters, self._agents))
             own = self._of(simulation, parameters, self._agents, duration_s)
+            found = replace(found, labels=self._labels(simulation, parameters, self._agents))
             rules = self._rules(simulation, self._agents, found, duration_s)
             found = with_rules(found, own, rules)
         return self._told(found)
