@@ -168,6 +168,11 @@ def test_three_ways_to_fly_are_compared_by_one_command(cosmos):
         assert 0.0 < hardware["attitude"][agent]["angle_deg_rms"] < 60.0
         assert hardware["attitude"][agent]["rate_deg_s_last_b"] < 7.0
     assert {"gyro"} == {one["sensor"] for one in hardware["measurements"]}
+    assert models["loop_us"] == {}
+    flown, answers = hardware["loop_us"]["reading to command"]
+    assert flown is None and answers["count"] > 500
+    assert 0.0 < answers["p50"] <= answers["p99"] <= answers["max"]
+    assert set(hardware["loop_us"]) == set(loop_latency.PARTS) - {"device to reading"}
 
 
 @pytest.mark.nightly

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from madns_runtime.analysis.distribution import Summary
 from madns_runtime.analysis.matching import Matched, match
 from madns_runtime.analysis.sampling import BinnedRms, Stretch, as_array, evenly
 from madns_runtime.analysis.tables import ComparedRun, ComparedStream, Key
@@ -24,12 +25,17 @@ from madns_runtime.simulations.constellation.analysis.attitudes import (
     AttitudeDifference,
     compare_attitudes,
 )
+from madns_runtime.simulations.constellation.analysis.loop_latency import loop_latencies
 from madns_runtime.simulations.constellation.analysis.measurement_errors import (
     MeasurementError,
     measurement_errors,
     rows_over_time,
 )
 from madns_runtime.simulations.constellation.analysis.orbits import state_fields
+from madns_runtime.simulations.constellation.analysis.predictions import (
+    PredictionScore,
+    prediction_scores,
+)
 from madns_runtime.simulations.constellation.analysis.slots import (
     TIME_S,
     TIMES_MAX,
@@ -43,6 +49,8 @@ POSITION = tuple(re.compile(rf"^{axis}(_[a-z0-9]+)??_m$") for axis in "xyz")
 VELOCITY = tuple(re.compile(rf"^v{axis}(_[a-z0-9]+)??_m_s$") for axis in "xyz")
 Slots = tuple[ControlRow, ...]
 Measured = dict[tuple[str, str], MeasurementError]
+Scores = dict[tuple[str, str, str, str], PredictionScore]
+"""By sensor, quantity, unit and agent."""
 TIME_DECIMALS = 6
 """Times nearer each other are one."""
 AXES = ("radial", "along", "normal")
@@ -92,6 +100,9 @@ class ConstellationDifference:
     slots: tuple[Slots, Slots] = ((), ())
     """Slot error by truth over time, of runs whose scenario says what a slot is."""
     measurements: tuple[Measured, Measured] = field(default_factory=lambda: ({}, {}))
+    loops: tuple[dict[str, Summary], dict[str, Summary]] = field(default_factory=lambda: ({}, {}))
+    """Latency of the loop through hardware, us, by its part."""
+    scores: tuple[Scores, Scores] = field(default_factory=lambda: ({}, {}))
     remarks: list[str] = field(default_factory=list)
 
     def all_positions(self) -> PositionDifference | None:
@@ -141,6 +152,8 @@ def compare_runs(a: ComparedRun, b: ComparedRun) -> ConstellationDifference:
             measurement_errors(a.streams, _tick_hz(a)),
             measurement_errors(b.streams, _tick_hz(b)),
         ),
+        loops=(loop_latencies(a.run), loop_latencies(b.run)),
+        scores=(prediction_scores(a.run), prediction_scores(b.run)),
         remarks=[] if epochs[0] == epochs[1] else [remark],
     )
 

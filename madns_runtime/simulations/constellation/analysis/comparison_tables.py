@@ -10,8 +10,10 @@ import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+from madns_runtime.analysis.distribution import Summary
 from madns_runtime.analysis.sampling import evenly
 from madns_runtime.analysis.values import Block, Heading, ReportRemark, TableBlock, headings
+from madns_runtime.simulations.constellation.analysis import loop_latency
 from madns_runtime.simulations.constellation.analysis.attitudes import (
     AttitudeDifference,
     total_attitude,
@@ -45,8 +47,12 @@ ATTITUDE_HEADINGS = (
     "end B",
 )
 ERROR_COLUMNS = {"measurements": "count", "rms": "rms", "max": "max"}
+SCORE_COLUMNS = {"predicted": "predicted", "measured": "measured", "score": "score"}
+LOOP_COLUMNS = {"count": "count", "p50": "p50", "p99": "p99", "max": "max"}
 EFFORT_COLUMNS = {"commands": "commands", "commanded": "commanded_m_s", "given": "given_m_s"}
 ESTIMATE_COLUMNS = {"rms": "rms_deg", "settled rms": "settled_rms_deg", "last": "last_deg"}
+SCORE_TOLD = ("measurements", "predicted", "measured", "score", "share_within")
+LOOP_TOLD = ("count", "p50", "p99", "max")
 POSITION_TOLD = ("count", "rms_m", "max_m", "max_t_s", "last_m")
 EFFORT_TOLD = ("commanded_m_s", "given_m_s", "commands")
 SLOT_ERROR_TOLD = ("rms_deg", "settled_rms_deg", "last_deg", "count")
@@ -64,6 +70,10 @@ def comparison_blocks(found: ConstellationDifference) -> list[Block]:
         blocks.append(_slots(found))
     if any(found.measurements):
         blocks.append(_measurements(found))
+    if any(found.scores):
+        blocks.append(_predictions(found))
+    if any(found.loops):
+        blocks.append(_loops(found))
     if any(total_effort(efforts).commands for efforts in found.efforts):
         blocks.append(_efforts(found))
     if any(found.slot_errors):
@@ -136,6 +146,40 @@ def _measurements(found: ConstellationDifference) -> TableBlock:
     )
 
 
+def _predictions(found: ConstellationDifference) -> TableBlock:
+    a, b = found.scores
+    keys = list(dict.fromkeys((*a, *b)))
+    texts = ("sensor", "quantity", "unit", "agent")
+    return TableBlock(
+        title="Prediction against measurement: errors of a sensor's model, and of its device, rms",
+        headings=[
+            *(Heading(text=text, is_number=False) for text in texts),
+            *_paired(SCORE_COLUMNS),
+        ],
+        rows=[[*key, *_pairs((a.get(key), b.get(key)), SCORE_COLUMNS)] for key in keys],
+        note="Against each run's own truth; score: measured over predicted.",
+    )
+
+
+def _loops(found: ConstellationDifference) -> TableBlock:
+    a, b = ({name: _in_ms(one) for name, one in parts.items()} for parts in found.loops)
+    return TableBlock(
+        title=loop_latency.TITLE,
+        headings=[Heading(text="part", is_number=False), *_paired(LOOP_COLUMNS)],
+        rows=[
+            [name, *_pairs((a.get(name), b.get(name)), LOOP_COLUMNS)]
+            for name in loop_latency.PARTS
+            if name in a or name in b
+        ],
+        note=f"{loop_latency.NOTE} Of all agents.",
+    )
+
+
+def _in_ms(one: Summary) -> Summary:
+    times = {name: getattr(one, name) / 1e3 for name in ("p50", "p99", "max")}
+    return dataclasses.replace(one, **times)
+
+
 def _efforts(found: ConstellationDifference) -> TableBlock:
     title = "Control: delta-v, m/s"
     table = _by_agent(title, found.efforts, EFFORT_COLUMNS, total_effort)
@@ -199,6 +243,12 @@ def to_document(found: ConstellationDifference) -> dict[str, Any]:
         "attitude": {name: one.told() for name, one in found.attitudes.items()},
         "slots": [[dataclasses.asdict(row) for row in rows] for rows in found.slots],
         "measurements": _measurements_told(found),
+        "predictions": _predictions_told(found),
+        "loop_us": {
+            part: [_told(parts.get(part), LOOP_TOLD) for parts in found.loops]
+            for part in loop_latency.PARTS
+            if any(part in parts for parts in found.loops)
+        },
         "control": _both_told(found.efforts, EFFORT_TOLD, total_effort),
         "estimates": _both_told(found.slot_errors, SLOT_ERROR_TOLD, total_slot_error)
         | {"over_time": [[_stretch(r, "deg") for r in rows] for rows in found.slot_over_time]},
@@ -237,6 +287,15 @@ def _measurements_told(found: ConstellationDifference) -> list[dict[str, Any]]:
             "unit": (a.get(key) or b[key]).unit,
             "errors": [_told(one.get(key), ("count", "rms", "max")) for one in (a, b)],
         }
+        for key in dict.fromkeys((*a, *b))
+    ]
+
+
+def _predictions_told(found: ConstellationDifference) -> list[dict[str, Any]]:
+    a, b = found.scores
+    return [
+        dict(zip(("sensor", "quantity", "unit", "agent"), key, strict=True))
+        | {"scores": [_told(one.get(key), SCORE_TOLD) for one in (a, b)]}
         for key in dict.fromkeys((*a, *b))
     ]
 

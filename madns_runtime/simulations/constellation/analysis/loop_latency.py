@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
-from madns_runtime.analysis.distribution import Distribution
+from madns_runtime.analysis.distribution import Distribution, Summary
 from madns_runtime.analysis.sampling import as_array
 from madns_runtime.analysis.tables import RecordedRun, RecordedTable
 from madns_runtime.analysis.values import (
@@ -30,39 +30,53 @@ from madns_runtime.analysis.values import (
 )
 from madns_runtime.plain_values import mapping_at
 
-DEVICE, MANEUVERS, ANSWER = "device_", "host_maneuvers", "answer_us"
+DEVICE, MANEUVERS, ANSWERS, ANSWER = "device_", "host_maneuvers", "flight_answers", "answer_us"
+TITLE = "Latency of the loop, ms"
+NOTE = "Command to truth is T_n + T_p: from the tick that commanded to the truth that holds it."
 PARTS = ("truth to device", "device to reading", "reading to command", "command to truth")
 BINS = 60
 
 
+def loop_latencies(run: RecordedRun) -> dict[str, Summary]:
+    """Return the latency of each part of the loop that was closed, us; nothing without answers of flight software."""
+    table = run.tables.get(ANSWERS)
+    return {} if table is None else _latencies(table, run)
+
+
 def loop_blocks(table: RecordedTable, run: RecordedRun) -> list[Block]:
     """Return the parts of the loop's latency as a table, and how long answers took as a histogram."""
-    if not table.rows or not table.has(ANSWER):
+    parts = _latencies(table, run)
+    if not parts:
         return []
-    answers = Distribution()
     samples = [as_array(columns[ANSWER]) for _, columns in table.each((ANSWER,))]
-    for one in samples:
-        answers.add(Distribution.of(one))
+    return [
+        TableBlock(
+            title=TITLE,
+            headings=headings("part", "count", "p50", "p99", "max"),
+            rows=[
+                [name, one.count, one.p50 / 1e3, one.p99 / 1e3, one.max / 1e3]
+                for name, one in parts.items()
+            ],
+            note=NOTE,
+        ),
+        _histogram(np.concatenate(samples) / 1e3),
+    ]
+
+
+def _latencies(answered: RecordedTable, run: RecordedRun) -> dict[str, Summary]:
+    if not answered.rows or not answered.has(ANSWER):
+        return {}
+    answers = Distribution()
+    for _, columns in answered.each((ANSWER,)):
+        answers.add(Distribution.of(as_array(columns[ANSWER])))
     parts = {
         PARTS[0]: _of_devices(run, "lateness_us", _stimulated(run)),
         PARTS[1]: _of_devices(run, "age_us", _measuring(run)),
         PARTS[2]: answers,
         PARTS[3]: _of_maneuvers(run),
     }
-    rows = [
-        [name, found.count, found.p50 / 1e3, found.p99 / 1e3, found.max / 1e3]
-        for name, part in parts.items()
-        if (found := part.summary()) is not None
-    ]
-    return [
-        TableBlock(
-            title="Latency of the loop, ms",
-            headings=headings("part", "count", "p50", "p99", "max"),
-            rows=rows,
-            note="Command to truth is T_n + T_p: from the tick that commanded to the truth that holds it.",
-        ),
-        _histogram(np.concatenate(samples) / 1e3),
-    ]
+    told = {name: part.summary() for name, part in parts.items()}
+    return {name: summary for name, summary in told.items() if summary is not None}
 
 
 def _histogram(answers_ms: Floats) -> Figure:
