@@ -28,9 +28,20 @@ CheckName = Annotated[
 ]
 Seconds = Annotated[float, Ge(0)]
 Statistic = Literal[
-    "each", "last", "max", "min", "mean", "rms", "p99", "count", "rate", "first_time", "settled"
+    "each",
+    "last",
+    "max",
+    "min",
+    "mean",
+    "rms",
+    "sd",
+    "p99",
+    "count",
+    "rate",
+    "first_time",
+    "settled",
 ]
-OF_VALUES = ("each", "last", "max", "min", "mean", "rms", "p99")
+OF_VALUES = ("each", "last", "max", "min", "mean", "rms", "sd", "p99")
 """Statistics in the field's unit."""
 OF_TIMES = ("first_time", "settled")
 """Statistics in s."""

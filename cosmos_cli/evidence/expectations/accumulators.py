@@ -140,6 +140,28 @@ class Mean(Accumulator):
         return (mean if self._power == 1 else math.sqrt(mean)), None
 
 
+class StandardDeviation(Accumulator):
+    """The root of the mean square of what differs from the mean (divided by N), by the means of batches: nothing cancels."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._mean = 0.0
+        self._squares = 0.0
+
+    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
+        numbers = values.astype(np.float64)
+        mean = float(np.mean(numbers))
+        count = self._count + len(numbers)
+        apart = mean - self._mean
+        self._squares += float(np.sum((numbers - mean) ** 2))
+        self._squares += apart**2 * self._count * len(numbers) / count
+        self._mean += apart * len(numbers) / count
+        self._count = count
+
+    def _found_now(self) -> Found:
+        return (math.sqrt(self._squares / self._count) if self._count else None), None
+
+
 class Percentile99(Accumulator):
     """
     The least value that at least 99 % of all values do not exceed: exact.

@@ -18,6 +18,7 @@ from cosmos_cli.evidence.expectations.accumulators import (
     Occurrences,
     Percentile99,
     Settled,
+    StandardDeviation,
     Unlike,
     Worst,
 )
@@ -192,6 +193,8 @@ class _Followed:
                 return Last(bounds)
             case "mean" | "rms":
                 return Mean(1 if expectation.statistic == "mean" else 2)
+            case "sd":
+                return StandardDeviation()
             case "p99":
                 return Percentile99(self._records)
             case "count" | "rate":

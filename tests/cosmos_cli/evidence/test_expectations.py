@@ -102,6 +102,7 @@ STATISTICS = {
     "min": np.min,
     "mean": np.mean,
     "rms": lambda x: math.sqrt(np.mean(x**2)),
+    "sd": np.std,
     "p99": lambda x: np.quantile(x, 0.99, method="inverted_cdf"),
     "last": lambda x: x[-1],
     "count": len,
@@ -281,7 +282,7 @@ def test_what_never_came_is_broken(values):
 
 
 @pytest.mark.parametrize(
-    "statistic", ["each", "max", "min", "mean", "rms", "p99", "last", "settled"]
+    "statistic", ["each", "max", "min", "mean", "rms", "sd", "p99", "last", "settled"]
 )
 def test_nothing_but_nan_never_passes(statistic):
     nan = {"a": {"t_s": T_S, "x_m": np.full(len(T_S), np.nan)}}
