@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -159,11 +159,18 @@ def check_test(path: Path, given: Sequence[str], warn: Callable[[str], None]) ->
         try:
             look()
         except InputError as error:
-            faults += error.faults
+            faults += map(_of_the_test, error.faults)
             omitted += error.omitted
     if faults:
         faults.sort(key=lambda fault: (bool(fault.override), fault.line or 0, fault.column or 0))
         raise InputError(faults=faults, omitted=omitted)
+
+
+def _of_the_test(fault: Fault) -> Fault:
+    """Return a fault that says that a test alone has it, where its place does not."""
+    if fault.path.startswith(SECTION):
+        return fault
+    return replace(fault, text=f"{fault.text} (of the scenario as its test.set changes it)")
 
 
 def with_seed(overrides: Sequence[str], seed: int | None) -> list[str]:

@@ -69,6 +69,17 @@ def test_broken_section_is_refused_at_its_place(scenario, test, told):
     assert told in rendered[0]
 
 
+def test_fault_that_only_the_test_has_says_so(tmp_path):
+    path = tmp_path / "s.yaml"
+    check = "{name: late, stream: round_trips, field: packet, from_s: 20, above: 1}"
+    path.write_text(f"{HEAD}test: {{set: {{time.duration_s: 5}}}}\nchecks:\n  - {check}\n")
+
+    (fault,) = faults(path)
+
+    assert fault.path == "checks[0].from_s"
+    assert fault.text.endswith("then (of the scenario as its test.set changes it)")
+
+
 def test_all_faults_of_the_section_come_at_once(scenario):
     path = scenario("{set: {x: 1, agents.count: 0}, baseline: none.yaml}")
 
