@@ -71,14 +71,14 @@ def _current_schema() -> str:
 
 def _schema_of(names: Sequence[str], tell: Callable[[str], None]) -> Mapping[str, str]:
     """Return the schema as `text`, or what is wrong with an installed simulation as `fault`."""
-    kinds = {}
+    simulations = {}
     for name in names:
         tell(f"importing {name}")
         try:
-            kinds[name] = resolve(name, Path()).parameters
+            simulations[name] = resolve(name, Path())
         except MadnsError as error:
             return {"fault": f"{name}: {error}"}
-    return {"text": schema_text(kinds)}
+    return {"text": schema_text(simulations)}
 
 
 def _check(path: Path, text: str) -> None:

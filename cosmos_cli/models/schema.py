@@ -20,6 +20,8 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 
 from cosmos_cli.models.parameters import adapter_of
 from cosmos_cli.models.scenario import Scenario
+from cosmos_cli.models.timeline_schema import entry_schema, timeline_inputs
+from madns_runtime.plugin.api import Simulation
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 VARIABLE = r"\$\{"
@@ -74,36 +76,46 @@ def _described(json_schema: JsonSchemaValue, cls: type) -> JsonSchemaValue:
     return json_schema
 
 
-def scenario_schema(parameters: Mapping[str, type]) -> dict[str, Any]:
+def scenario_schema(simulations: Mapping[str, Simulation]) -> dict[str, Any]:
     """
     Return the JSON Schema of a scenario.
 
     Args:
-        parameters: The parameters class of each registered simulation, by its name.
+        simulations: Those that are registered, by their names.
     """
+    known = sorted(simulations.items())
+    actions = {name: simulation.actions for name, simulation in known}
     inputs: list[tuple[str, Any, TypeAdapter[Any]]] = [
         ("", "validation", TypeAdapter(Scenario)),
-        *((name, "validation", adapter_of(kind)) for name, kind in sorted(parameters.items())),
+        *((name, "validation", adapter_of(each.parameters)) for name, each in known),
+        *timeline_inputs(actions),
     ]
     places, shared = TypeAdapter.json_schemas(inputs, schema_generator=_DescribedSchema)
     definitions = shared["$defs"]
-    root = definitions.pop(_definition_of(places[("", "validation")]))
+    root = definitions.pop(_definition_of(places["", "validation"]))
     root["properties"]["simulation"] = {
         "description": root["properties"]["simulation"]["description"],
-        "anyOf": [{"enum": sorted(parameters)}, {"type": "string", "pattern": FILE_PATTERN}],
+        "anyOf": [{"enum": sorted(simulations)}, {"type": "string", "pattern": FILE_PATTERN}],
     }
+    root["properties"]["timeline"]["items"] = entry_schema(places, definitions)
     whole = _taken_requirements(root, definitions)
     choices = [
-        _choice(name, places[(name, "validation")], definitions) for name in sorted(parameters)
+        _choice(
+            name,
+            places[name, "validation"],
+            definitions,
+            entry_schema(places, definitions, name, actions[name]),
+        )
+        for name in actions
     ]
     found = {**root, "allOf": [whole, *choices], "$defs": definitions}
     _let_variables_stand(found)
     return {"$schema": DIALECT, **found}
 
 
-def schema_text(parameters: Mapping[str, type]) -> str:
+def schema_text(simulations: Mapping[str, Simulation]) -> str:
     """Return the schema as it is kept in a file."""
-    return json.dumps(scenario_schema(parameters), indent=2, sort_keys=True) + "\n"
+    return json.dumps(scenario_schema(simulations), indent=2, sort_keys=True) + "\n"
 
 
 def _definition_of(place: Mapping[str, Any]) -> str:
@@ -144,12 +156,18 @@ def _let_variables_stand(schema: Any) -> None:
         schema["pattern"] = f"(?:{schema['pattern']})|{VARIABLE}"
 
 
-def _choice(name: str, place: Mapping[str, Any], definitions: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the rule that this simulation's parameters are its own."""
+def _choice(
+    name: str,
+    place: Mapping[str, Any],
+    definitions: Mapping[str, Any],
+    entry: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return the rule that this simulation's parameters and its actions are its own."""
     then: dict[str, Any] = {
         "properties": {
             "parameters": place,
             "agent_parameters": {"items": {"properties": {"parameters": place}}},
+            "timeline": {"items": entry},
         }
     }
     if required := definitions[_definition_of(place)].pop("required", None):

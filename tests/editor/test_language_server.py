@@ -85,6 +85,22 @@ def test_hover_shows_what_the_code_says_of_a_field(server, scenario):
     )
 
 
+def test_words_of_a_timeline_are_completed_explained_and_judged(server):
+    lines = f"{SCENARIO.replace(HEAD, '').split('parameters')[0].rstrip()}\ntimeline:\n"
+    good = lines + "  - {at_s: 1, action: kill, agents: [agent-01]}\n  - at_s: 2\n    action: \n"
+    path = _open(server, "timeline", good)
+    count = (HEAD + good).count("\n")
+    slip = _open(
+        server, "timeline_slip", lines + "  - {at_s: 1, action: fail_wheels, agents: ['*']}\n"
+    )
+
+    assert {"annotate", "hang", "partition"} <= labels(
+        server.at("completion", path, count, len("    action: ") + 1)
+    )
+    assert "Simulated time, s: once." in hover(server, path, count - 1, 6)
+    assert server.faults(slip) != []
+
+
 def test_a_scenario_with_variables_has_no_faults_there_and_a_slip_has_one(server):
     good = _open(
         server, "good", SCENARIO.replace(HEAD, "").rstrip() + " {payload_bytes: '${rate}'}\n"

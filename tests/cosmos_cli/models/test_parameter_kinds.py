@@ -200,7 +200,7 @@ def test_host_and_agents_get_the_typed_object(folder, mode):
 
 def test_the_schema_knows_every_kind(folder):
     simulation = resolve("./kinds.py:simulation", folder)
-    schema = scenario_schema({"kinds": simulation.parameters})
+    schema = scenario_schema({"kinds": simulation})
     fields = schema["$defs"]["Parameters"]["properties"]
 
     assert fields["table"]["format"] == "path"

@@ -71,7 +71,7 @@ def test_broken_section_is_refused_at_its_place(scenario, test, told):
 
 def test_fault_that_only_the_test_has_says_so(tmp_path):
     path = tmp_path / "s.yaml"
-    check = "{name: late, stream: round_trips, field: packet, from_s: 20, above: 1}"
+    check = "{name: late, stream: ticks, field: tick, from_s: 20, above: 1}"
     path.write_text(f"{HEAD}test: {{set: {{time.duration_s: 5}}}}\nchecks:\n  - {check}\n")
 
     (fault,) = faults(path)

@@ -23,12 +23,64 @@ def validator():
 
 def test_kept_schema_is_current():
     current = schema_text(
-        {name: resolve(name, ROOT).parameters for name in filter(is_shipped, registered_names())}
+        {name: resolve(name, ROOT) for name in filter(is_shipped, registered_names())}
     )
 
     assert KEPT.read_text() == current, (
         "write it with: cosmos schema -o scenarios/scenario.schema.json"
     )
+
+
+def timeline(entry, simulation="counter"):
+    scenario = {"name": "a", "simulation": simulation, "agents": {"count": 2}, "timeline": [entry]}
+    if simulation == "constellation":
+        scenario["parameters"] = {"satellites": {"elements": "data/ring93.csv"}}
+    return scenario
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"at_s": 1, "action": "annotate", "text": "now"},
+        {"every_s": 5, "to_s": "${end}", "action": "kill", "agents": ["agent-01"], "for_s": 2},
+        {"when": {"stream": "ticks", "field": "tick", "above": 3}, "action": "stop"},
+        {"at_s": 1, "action": "${what}", "agents": ["*"]},
+    ],
+    ids=str,
+)
+def test_schema_takes_entries_of_a_timeline(validator, entry):
+    validator.validate(timeline(entry))
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"at_s": 1, "action": "anotate", "text": "now"},
+        {"at_s": -1, "action": "stop"},
+        {"at_s": 1, "action": "annotate"},
+        {"at_s": 1, "action": "kill"},
+        {"at_s": 1, "action": "stress", "agents": ["*"], "workers": 1},
+        {"at_s": 1, "action": "stress", "agents": ["*"], "workers": 0, "for_s": 1},
+        {"at_s": 1, "action": "fail_wheels", "agents": ["*"]},
+        {"when": {"field": "tick", "above": 3}, "action": "stop"},
+    ],
+    ids=str,
+)
+def test_schema_refuses_entries_that_validate_refuses(validator, entry):
+    with pytest.raises(jsonschema.ValidationError):
+        validator.validate(timeline(entry))
+
+
+def test_schema_knows_the_actions_of_the_simulation_that_is_named(validator):
+    validator.validate(
+        timeline({"at_s": 1, "action": "fail_wheels", "agents": ["*"]}, "constellation")
+    )
+    with pytest.raises(jsonschema.ValidationError):
+        validator.validate(
+            timeline({"at_s": 1, "action": "weaken_thruster", "agents": ["*"]}, "constellation")
+        )
+    # Any word may be one of a simulation that nobody registered.
+    validator.validate(timeline({"at_s": 1, "action": "honk", "agents": ["*"]}, "./cars.py:cars"))
 
 
 SHIPPED = [
