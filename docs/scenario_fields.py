@@ -46,6 +46,8 @@ def _tables(schema: Mapping[str, Any]) -> Iterator[str]:
     )
     for key in Scenario.model_fields:
         yield from _below(schema["properties"][key], definitions, told)
+    yield "\n### Actions of a timeline\n\n"
+    yield from _actions(schema["properties"]["timeline"]["items"], schema["$defs"]["TimelineRule"])
     for name, definition in sorted(SIMULATIONS.items()):
         yield f"\n## Parameters of {name}\n"
         yield from _below({"$ref": f"#/$defs/{definition}"}, definitions, told)
@@ -61,6 +63,17 @@ def _below(schema: Any, definitions: Mapping[str, Any], told: set[str]) -> Itera
         yield f"\n### {name}\n\n{_line(found.get('description', ''))}\n\n"
         yield from _table(found.get("properties", {}), found.get("required", ()))
         yield from _below(found.get("properties", {}), definitions, told)
+
+
+def _actions(entry: Mapping[str, Any], rule: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the table of the framework's actions; a simulation's own are on the page of timelines."""
+    beside = {each["if"]["properties"]["action"]["const"]: each["then"] for each in entry["allOf"]}
+    yield "| action | beside it | |\n|---|---|---|\n"
+    for word in rule["properties"]["action"]["anyOf"]:
+        if "const" in word:
+            then = beside[word["const"]]
+            names = list(dict.fromkeys((*then.get("required", ()), *then.get("properties", ()))))
+            yield f"| {word['const']} | {', '.join(names)} | {_line(word['description'])} |\n"
 
 
 def _referred(schema: Any) -> Iterator[str]:
@@ -99,7 +112,9 @@ def _kind(schema: Mapping[str, Any]) -> str:
         if key in schema:
             return " or ".join(
                 dict.fromkeys(
-                    _kind(each) for each in schema[key] if each.get("pattern") != VARIABLE
+                    _kind(each)
+                    for each in schema[key]
+                    if (each.get("type"), each.get("pattern")) != ("string", VARIABLE)
                 )
             )
     if "enum" in schema or "const" in schema:

@@ -1,11 +1,13 @@
 """The reference of the scenario file: each of its examples is a scenario, and does what is said beside it."""
 
+import json
 import re
 from pathlib import Path
 
 import pytest
 import yaml
 from guides import ROOT, blocks
+from harness.cosmos_command import CosmosCommand
 
 from cosmos_cli.models.extending import FILES_MAX
 from cosmos_cli.models.loading import load_scenario
@@ -57,6 +59,21 @@ def test_examples_result_in_what_is_said(folder):
         ("agent-02", "agent-03", "agent-04"),
     ]
     assert f"at most {FILES_MAX} in a chain" in TEXT
+
+
+@pytest.mark.process
+@pytest.mark.timeout(400)
+def test_examples_run(folder):
+    cosmos = CosmosCommand(folder)
+    shortened = ("time.mode=lockstep", "time.duration_s=20", "checks=[]")
+    words = [part for setting in shortened for part in ("--set", setting)]
+
+    done = cosmos("test", ".", *words, "--json", "--quiet", patience_s=360)
+
+    document = json.loads(done.stdout)
+    assert done.returncode == 0, done.stderr
+    outcomes = {Path(each["scenario"]).name: each["outcome"] for each in document["tests"]}
+    assert outcomes == {Path(place_of(example)).name: "passed" for example in EXAMPLES}
 
 
 def test_every_key_of_a_scenario_has_its_row():
