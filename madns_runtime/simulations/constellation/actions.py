@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal
 
-from annotated_types import Ge, Le, MinLen
+from annotated_types import Ge, Gt, Le, MinLen
 
 from madns_runtime.timeline.action import ActionKind
 
@@ -13,6 +13,8 @@ SensorName = Literal[
     "gnss", "gyro", "accelerometer", "star_tracker", "sun_sensor", "clock", "magnetometer"
 ]
 BIAS_MAX: Final = 1e9
+THRUST_N_MAX: Final = 1e6
+Component = Annotated[float, Ge(-1e6), Le(1e6)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,6 +38,18 @@ class WeakThruster:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class StuckThruster:
+    """Parameters of stick_thruster_open."""
+
+    direction: tuple[Component, Component, Component] = (0.0, 1.0, 0.0)
+    """Direction of the push, in `frame`; its length does not matter."""
+    frame: Literal["inertial", "rtn", "body"] = "rtn"
+    """Frame of the direction: inertial, radial, along-track and normal, or of a vehicle with attitude body axes."""
+    thrust_n: Annotated[float, Gt(0), Le(THRUST_N_MAX)] | None = None
+    """Thrust, N; none for the thruster's own, which then must have one."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DarkStation:
     """Parameters of darken_station."""
 
@@ -56,6 +70,12 @@ WEAKEN_THRUSTER: Final = ActionKind(
     parameters=WeakThruster,
     lasting="may",
 )
+STICK_THRUSTER_OPEN: Final = ActionKind(
+    word="stick_thruster_open",
+    summary="Lets a thruster burn until flight software closes it off, its propellant is gone, or the action ends.",
+    parameters=StuckThruster,
+    lasting="may",
+)
 FAIL_WHEELS: Final = ActionKind(
     word="fail_wheels",
     summary="Has torques refused that are commanded meanwhile.",
@@ -68,4 +88,10 @@ DARKEN_STATION: Final = ActionKind(
     takes_agents=False,
     lasting="may",
 )
-ACTIONS: Final = (SENSOR_FAULT, WEAKEN_THRUSTER, FAIL_WHEELS, DARKEN_STATION)
+ACTIONS: Final = (
+    SENSOR_FAULT,
+    WEAKEN_THRUSTER,
+    STICK_THRUSTER_OPEN,
+    FAIL_WHEELS,
+    DARKEN_STATION,
+)

@@ -27,6 +27,7 @@ from madns_runtime.simulations.constellation.messages import (
     Delivery,
     Initial,
     Segment,
+    TankGauge,
     TransmissionRefusal,
 )
 from madns_runtime.simulations.constellation.orbit.constants import (
@@ -191,6 +192,8 @@ class ConstellationAgent(AgentSimulation):
                 self._recorded.hold_result(result)
             else:
                 self._take_result(result)
+        elif kind == TankGauge.KIND:
+            self._read_gauge(TankGauge.from_message(message))
         elif kind != CommandResult.KIND:
             raise PluginError(f"constellation: expected a segment, got {message!r:.200}")
 
@@ -243,6 +246,10 @@ class ConstellationAgent(AgentSimulation):
                 self._cockpit.read_gauges(result)
         elif self._cockpit is not None:
             self._cockpit.tell(result)
+
+    def _read_gauge(self, gauge: TankGauge) -> None:
+        if self._cockpit is not None:
+            self._cockpit.read_tank(gauge.propellant_kg)
 
     def _take_segment(self, segment: Segment) -> None:
         now_s = self._context.now_s()

@@ -31,9 +31,6 @@ from madns_runtime.simulations.constellation.messages import (
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
 from madns_runtime.simulations.constellation.truth.initial_states import InitialStates, load_fleet
-from madns_runtime.simulations.constellation.truth.maneuvers.actuator_failures import (
-    ActuatorFailures,
-)
 from madns_runtime.simulations.constellation.truth.maneuvers.effects import Timeline
 from madns_runtime.simulations.constellation.truth.maneuvers.rules import (
     ManeuverDesk,
@@ -107,10 +104,15 @@ class ConstellationHost(HostSimulation):
             spacing=self._spacing,
             is_recorded=parameters.record.truth,
         )
-        self._maneuvering = self._make_maneuvering(vehicles)
+        self._vehicles = vehicles
+        has_devices = any(vehicle.actuation for vehicle in vehicles)
+        self._maneuvering: Maneuvering | None = None
+        if has_devices or flight_rules(parameters):
+            self._maneuvering = self._make_maneuvering()
         self.radio = self._make_radio()
-        failures = self._maneuvering.failures if self._maneuvering else ActuatorFailures()
-        self._failures = InjectedFailures(failures, self._index, vehicles, self.radio)
+        self._failures = InjectedFailures(
+            self._maneuvering_now, self._index, vehicles=vehicles, radio=self.radio
+        )
         # Truth that came after its first sending was due.
         self._late_count, self._late_s_max = 0, 0.0
         windows = min(WINDOWS_FIRST, self._refills.windows)
@@ -233,12 +235,15 @@ class ConstellationHost(HostSimulation):
             "a longer segments.buffer_s helps, and more executor workers do with many vehicles",
         )
 
-    def _make_maneuvering(self, vehicles: list[Vehicle]) -> Maneuvering | None:
-        """Return who carries commands out; nobody without flight software or a device that commands."""
-        parameters, context = self._parameters, self._context
-        has_devices = any(vehicle.actuation for vehicle in vehicles)
-        if not has_devices and not flight_rules(parameters):
-            return None
+    def _maneuvering_now(self) -> Maneuvering:
+        """Return who changes truth, also where nobody commands but a timeline."""
+        if self._maneuvering is None:
+            self._maneuvering = self._make_maneuvering()
+        return self._maneuvering
+
+    def _make_maneuvering(self) -> Maneuvering:
+        """Return who carries commands out."""
+        parameters, context, vehicles = self._parameters, self._context, self._vehicles
         rules = Rules(
             settings=parameters.maneuvers,
             can_maneuver=parameters.propagator.can_maneuver,
@@ -251,7 +256,7 @@ class ConstellationHost(HostSimulation):
         desk = ManeuverDesk(rules, context.agents, vehicles, self._store.timelines)
         if rules.can_maneuver:
             self._supply.warm_up(self._fleet.states)
-        return Maneuvering(context, self._supply, self._refills, desk)
+        return Maneuvering(context, self._supply, self._refills, desk=desk, vehicles=vehicles)
 
     def _make_radio(self) -> RadioMedium | None:
         """Return who carries messages; nobody without flight software and radio."""

@@ -4,7 +4,7 @@ Messages between the two halves of the constellation, as dataclasses that become
 Pure. A mapping has the fields and "kind", the kind of message; a command's own kind is under "command".
 
     agent -> host    Command (SYNC, deadline: its time)
-    host -> agent    Initial, Segment, CommandResult
+    host -> agent    Initial, Segment, CommandResult, TankGauge
 
 What vehicles say to each other and to the ground travels as the framework's messages between agents do.
 """
@@ -35,6 +35,7 @@ __all__ = [
     "Initial",
     "Message",
     "Segment",
+    "TankGauge",
     "TransmissionRefusal",
     "is_for_ground",
 ]
@@ -184,6 +185,17 @@ class CommandResult(Message):
     """Propellant left after the command, kg."""
     wheels_n_m_s: Vector | None = None
     """Momentum of the wheels about body x, y, z after a torque that was executed, N m s; None for any other result."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TankGauge(Message):
+    """Reading of a tank's gauge that no command has caused: its vehicle's thruster is stuck open."""
+
+    KIND = "tank_gauge"
+
+    t_s: float
+    propellant_kg: float
+    """Left, kg."""
 
 
 def is_for_ground(to: str) -> bool:

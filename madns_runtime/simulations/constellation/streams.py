@@ -169,6 +169,16 @@ MANEUVERS = (
 """One record a command: at_s is T_m as commanded, executed_s as it became (none if refused); propagation_s
 is T_p, network_s T_n, slack_s (T_m - T_s) - (T_p + 2 T_n), for a finite burn with its beginning for T_m."""
 
+STUCK_THRUSTERS = (
+    Field("t_s", "s"),
+    Field("agent", "", "str"),
+    Field("state", "", "str"),
+    Field("dv_given_m_s", "m/s"),
+    Field("propellant_kg", "kg"),
+)
+"""One record per second while a thruster that is stuck open burns, and one at its end: state is open, closed (by flight
+software), empty or mended; dv_given_m_s what it has given since it stuck; there is none before the first."""
+
 INVARIANTS = (
     Field("t_s", "s"),
     Field("agent", "", "str"),
@@ -218,6 +228,7 @@ OF_HOST = {
     "truth": TRUTH,
     "invariants": INVARIANTS,
     "maneuvers": MANEUVERS,
+    "stuck_thrusters": STUCK_THRUSTERS,
     "links": LINKS,
     "contacts": CONTACTS,
 }

@@ -31,7 +31,8 @@ TRUTH = "truth"
 """Name of the reading that is the truth itself, when the scenario says input: truth. Its values are x, y, z, m,
 vx, vy, vz, m/s; for a rigid body also the quaternion, scalar last, and the body rates, rad/s."""
 MASS = "mass"
-"""Name of the reading that a tank gauge gives when a command was executed: mass, kg, and propellant, kg."""
+"""Name of the reading that a tank gauge gives when a command was executed, and once per second while a thruster is stuck
+open: mass, kg, and propellant, kg."""
 WHEELS = "wheels"
 """Name of the reading of the wheels' speeds when a torque was executed: momentum about body x, y, z, N m s."""
 
@@ -100,7 +101,11 @@ class FlightContext(Protocol):
     def delta_v(
         self, delta_v_m_s: Sequence[float], *, at_s: float, frame: CommandFrame = "rtn"
     ) -> int:
-        """Command a change of velocity and return the command's number; `command_result` tells what became of it."""
+        """
+        Command a change of velocity and return the command's number; `command_result` tells what became of it.
+
+        None, (0, 0, 0), closes off a thruster that is stuck open; of any other it is refused.
+        """
 
     def torque(self, torque_n_m: Sequence[float], *, at_s: float, duration_s: float) -> int:
         """Command a torque about the body axes and return the command's number."""

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from madns_runtime.plugin.api import ActionRefused, TimelineAction
 from madns_runtime.simulations.constellation.actions import (
     DARKEN_STATION,
     FAIL_WHEELS,
+    STICK_THRUSTER_OPEN,
     WEAKEN_THRUSTER,
     DarkStation,
-    WeakThruster,
 )
 from madns_runtime.simulations.constellation.equipment import Vehicle
+from madns_runtime.simulations.constellation.host_side.maneuver_execution import Maneuvering
 from madns_runtime.simulations.constellation.host_side.radio import RadioMedium
-from madns_runtime.simulations.constellation.truth.maneuvers.actuator_failures import (
-    ActuatorFailures,
-)
 
 
 class InjectedFailures:
@@ -24,7 +23,7 @@ class InjectedFailures:
     Puts failures in force, and lifts them.
 
     Args:
-        failures: Of the actuators.
+        maneuvering: Returns who changes truth.
         index: Number of each agent's vehicle.
         vehicles: What each is like.
         radio: Knows the ground stations; None without any.
@@ -32,12 +31,13 @@ class InjectedFailures:
 
     def __init__(
         self,
-        failures: ActuatorFailures,
+        maneuvering: Callable[[], Maneuvering],
         index: Mapping[str, int],
+        *,
         vehicles: Sequence[Vehicle],
         radio: RadioMedium | None,
     ) -> None:
-        self._failures = failures
+        self._maneuvering = maneuvering
         self._index = index
         self._vehicles = vehicles
         self._radio = radio
@@ -49,24 +49,29 @@ class InjectedFailures:
         Raises:
             ActionRefused: A vehicle has no such actuator, or there is no such station.
         """
+        given: Any = action.parameters
+        vehicles = [self._index[agent] for agent in action.agents]
         if action.word == DARKEN_STATION.word:
             self._darken(action, is_dark=True)
-            return
-        vehicles = [self._index[agent] for agent in action.agents]
-        if action.word == WEAKEN_THRUSTER.word:
+        elif action.word == WEAKEN_THRUSTER.word:
             self._need(action, vehicles, "thruster")
-            given: WeakThruster = action.parameters  # type: ignore[assignment]
-            self._failures.weaken(action.number, dict.fromkeys(vehicles, given.factor))
+            factors = dict.fromkeys(vehicles, given.factor)
+            self._maneuvering().failures.weaken(action.number, factors)
+        elif action.word == STICK_THRUSTER_OPEN.word:
+            self._need(action, vehicles, "thruster")
+            self._maneuvering().stuck.begin(action.number, vehicles, given)
         elif action.word == FAIL_WHEELS.word:
             self._need(action, vehicles, "attitude")
-            self._failures.fail_wheels(action.number, frozenset(vehicles))
+            self._maneuvering().failures.fail_wheels(action.number, frozenset(vehicles))
 
     def end(self, action: TimelineAction) -> None:
         """Lift a failure."""
         if action.word == DARKEN_STATION.word:
             self._darken(action, is_dark=False)
+        elif action.word == STICK_THRUSTER_OPEN.word:
+            self._maneuvering().stuck.end(action.number)
         else:
-            self._failures.lift(action.number)
+            self._maneuvering().failures.lift(action.number)
 
     def _need(self, action: TimelineAction, vehicles: Sequence[int], part: str) -> None:
         lacking = [

@@ -9,20 +9,22 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
 from madns_runtime.plugin.api import HostContext
 from madns_runtime.protocol.messages import Service
+from madns_runtime.simulations.constellation.equipment import Vehicle
+from madns_runtime.simulations.constellation.host_side.stuck_burns import StuckBurns
 from madns_runtime.simulations.constellation.host_side.truth_distribution import Refills
 from madns_runtime.simulations.constellation.host_side.truth_propagation import TruthSupply
 from madns_runtime.simulations.constellation.messages import LEAD_TICKS, Command
 from madns_runtime.simulations.constellation.streams import MANEUVERS
+from madns_runtime.simulations.constellation.truth.maneuvers.account import Times
 from madns_runtime.simulations.constellation.truth.maneuvers.rules import (
     ManeuverDesk,
     Taken,
-    Times,
 )
 
 URGENT_S = 0.5
@@ -40,10 +42,17 @@ class Maneuvering:
         supply: Whose truth is changed.
         refills: Who sends it.
         desk: Who decides.
+        vehicles: What they are like.
     """
 
     def __init__(
-        self, context: HostContext, supply: TruthSupply, refills: Refills, desk: ManeuverDesk
+        self,
+        context: HostContext,
+        supply: TruthSupply,
+        refills: Refills,
+        *,
+        desk: ManeuverDesk,
+        vehicles: Sequence[Vehicle],
     ) -> None:
         self._context = context
         self._supply = supply
@@ -51,6 +60,8 @@ class Maneuvering:
         self._desk = desk
         self.failures = desk.failures
         """Of the vehicles' actuators."""
+        self.stuck = StuckBurns(context, supply, refills, stuck=desk.stuck, vehicles=vehicles)
+        """Thrusters that are stuck open."""
         self._waiting: list[tuple[float, int, Taken]] = []
         """Time at which each job is overtaken, and the job; also of those that are done."""
         self._pending: list[tuple[float, int, Taken]] = []
@@ -80,8 +91,9 @@ class Maneuvering:
             taken = heapq.heappop(self._pending)[2]
             self._tell(self._desk.execute(taken), is_over=True)
         times_s = [heap[0][0] for heap in (self._waiting, self._pending) if heap]
-        if (settle_s := self._supply.remainders.timer(t_s)) is not None:
-            times_s.append(settle_s)
+        for next_s in (self.stuck.timer(t_s), self._supply.remainders.timer(t_s)):
+            if next_s is not None:
+                times_s.append(next_s)
         return min(times_s, default=None)
 
     def finish(self) -> Mapping[str, Any]:
@@ -101,6 +113,7 @@ class Maneuvering:
             "slack_s_min": account.slack_s_min if math.isfinite(account.slack_s_min) else None,
             "propagation_s_max": account.propagation_s_max,
             "network_s_max": account.network_s_max,
+            **self.stuck.finish(),
         }
 
     def _most_broken(self) -> str | None:

@@ -192,6 +192,13 @@ class Cockpit:
         """Let the next step read what a command of a device has changed."""
         self._gauges.append(result)
 
+    def read_tank(self, propellant_kg: float) -> None:
+        """Let the next step read the tank's gauge, which no command has changed."""
+        gauge = CommandResult(
+            number=-1, status="executed", at_s=math.nan, revision=-1, propellant_kg=propellant_kg
+        )
+        self._gauges.append(gauge)
+
     def tell(self, result: CommandResult) -> None:
         """Take what became of a command, to be told in the next tick."""
         self._results_dropped += len(self._results) == RESULTS_MAX

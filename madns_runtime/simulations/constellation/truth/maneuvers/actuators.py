@@ -72,8 +72,12 @@ class Tank:
 
     def book(self, burn: Burn) -> None:
         """Take a burn's propellant off."""
-        self.mass_kg -= burn.propellant_kg
-        self.propellant_kg = max(0.0, self.propellant_kg - burn.propellant_kg)
+        self.burn(burn.propellant_kg)
+
+    def burn(self, propellant_kg: float) -> None:
+        """Take propellant off; less than 0 gives back what was not burnt."""
+        self.mass_kg -= propellant_kg
+        self.propellant_kg = max(0.0, self.propellant_kg - propellant_kg)
 
 
 def chance_of(seed: int, agent: str, number: int) -> np.random.Generator:

@@ -78,6 +78,14 @@ class Timeline:
         effects = (*self.effects, effect)
         self.effects = tuple(sorted(effects, key=lambda e: (e.start_s, e.number)))
 
+    def exchange(self, effect: Effect, other: Effect | None) -> None:
+        """Put another effect in the place of one, or none; what truth holds of the arc stays."""
+        self.effects = tuple(
+            each
+            for one in self.effects
+            if (each := other if one.number == effect.number else one) is not None
+        )
+
     def from_time(self, t_s: float) -> tuple[Effect, ...]:
         """Return those that act at *t_s* or begin after it; what acts once at *t_s* is in its state already."""
         return tuple(e for e in self.effects if e.start_s > t_s or e.end_s > t_s)

@@ -9,14 +9,17 @@ agent are judged by its own ticks: they lie `phase_s` behind their nominal time,
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.messages import Command, CommandResult, CommandStatus
 from madns_runtime.simulations.constellation.parameters import Maneuvers
 from madns_runtime.simulations.constellation.thrust import Vector
+from madns_runtime.simulations.constellation.truth.maneuvers.account import (
+    ManeuverAccount,
+    Times,
+)
 from madns_runtime.simulations.constellation.truth.maneuvers.actuator_failures import (
     ActuatorFailures,
 )
@@ -44,6 +47,10 @@ from madns_runtime.simulations.constellation.truth.maneuvers.effects import (
     Timeline,
     snap,
     spin_rad_s_max,
+)
+from madns_runtime.simulations.constellation.truth.maneuvers.stuck_thrusters import (
+    StuckThrusters,
+    is_closure,
 )
 
 WAITING_MAX = 64
@@ -105,39 +112,6 @@ class Taken:
         )
 
 
-@dataclass(slots=True)
-class ManeuverAccount:
-    """Account of all commands, for the summary."""
-
-    commanded: int = 0
-    executed: int = 0
-    postponed: int = 0
-    refused: int = 0
-    inequality_broken: int = 0
-    """Commands for which it does not hold, and those that came too late by what the scenario allows."""
-    inequality_broken_by: Counter[int] = field(default_factory=Counter)
-    """The same by vehicle."""
-    slack_s_min: float = math.inf
-    propagation_s_max: float = 0.0
-    network_s_max: float = 0.0
-    delta_v_m_s: float = 0.0
-    """Sum of the magnitudes given by burns that are over."""
-    propellant_kg: float = 0.0
-    """Burnt by them."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Times:
-    """The synchronous inequality of one command, T_p + 2 T_n <= T_m - T_s."""
-
-    propagation_s: float | None
-    """T_p, measured: from hearing the command to handing out the truth that holds it; None if there is none."""
-    network_s: float
-    """T_n, measured: from the tick that commanded to hearing of it."""
-    slack_s: float
-    """(T_m - T_s) - (T_p + 2 T_n); T_m as commanded, of a burn its beginning; T_p as allowed if none was measured."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rules:
     """Rules that all vehicles' commands are judged by."""
@@ -178,6 +152,13 @@ class ManeuverDesk:
         self._vehicles = vehicles
         self._timelines = timelines
         self._tanks = [Tank(vehicle) for vehicle in vehicles]
+        self.stuck = StuckThrusters(
+            vehicles,
+            timelines,
+            self._tanks,
+            knot_s=rules.knot_s,
+            duration_s=rules.duration_s,
+        )
         self._taken = [0] * len(agents)
         self._waiting = [0] * len(agents)
 
@@ -194,6 +175,10 @@ class ManeuverDesk:
             self.account.refused += 1
             return taken
         self._timelines[vehicle].add(taken.effect)
+        if is_closure(command):
+            self.stuck.close(vehicle, taken.effect.start_s, "closed")
+            left_kg = self._tanks[vehicle].propellant_kg
+            taken = replace(taken, propellant_kg=left_kg, expected_kg=left_kg)
         self._taken[vehicle] += 1
         self._waiting[vehicle] += 1
         self.account.postponed += taken.status == "postponed"
@@ -221,6 +206,9 @@ class ManeuverDesk:
         self.account.executed += 1
         self.account.delta_v_m_s += taken.delta_v_m_s
         self.account.propellant_kg += taken.used_kg
+        if is_closure(taken.command):
+            # What was burnt until its time was not known when it was accepted.
+            taken = replace(taken, propellant_kg=self._tanks[taken.vehicle].propellant_kg)
         attitude, effect = self._vehicles[taken.vehicle].attitude, taken.effect
         has_wheels = attitude is not None and attitude.wheels is not None
         if effect is None or effect.kind != "torque" or not has_wheels:
@@ -243,10 +231,12 @@ class ManeuverDesk:
             or self._rule_fault(vehicle, command)
             or vehicle_fault(command, self._vehicles[vehicle])
             or self.failures.refusal(vehicle, command.kind)
+            or self.stuck.fault(vehicle, command)
         )
         if fault:
             return replace(refused, reason=fault)
-        given = self._given(vehicle, command)
+        is_stuck = command.kind == "delta_v" and vehicle in self.stuck.burns
+        given = None if is_stuck else self._given(vehicle, command)
         if isinstance(given, WheelTurn | Magnetisation):
             given = self._bearable(vehicle, command, given)
         if isinstance(given, ActuatorRefusal):
@@ -343,7 +333,7 @@ class ManeuverDesk:
             burnt=given.burnt if isinstance(given, Burn) else 0.0,
         )
         effect = self._abutting(refused.vehicle, effect)
-        if busy := self._busy(refused.vehicle, effect):
+        if not is_closure(command) and (busy := self._busy(refused.vehicle, effect)):
             return replace(refused, at_s=at_s, reason=busy)
         taken = replace(refused, status=status, at_s=at_s, reason="; ".join(reasons), effect=effect)
         return self._booked(taken, given)

@@ -1,0 +1,191 @@
+"""A thruster that is stuck open: truth moves, propellant drains, and flight software that notices it closes it off."""
+
+import math
+
+import numpy as np
+import pytest
+from constellation_fakes import Star, parameters, state_rows
+
+from madns_runtime.plugin.api import ActionRefused, TimelineAction
+from madns_runtime.simulations.constellation.actions import STICK_THRUSTER_OPEN, StuckThruster
+from madns_runtime.simulations.constellation.equipment import Thruster, Vehicle
+from madns_runtime.simulations.constellation.messages import Command
+from madns_runtime.simulations.constellation.truth.maneuvers.actuators import Tank, exhaust_m_s
+from madns_runtime.simulations.constellation.truth.maneuvers.effects import Effect, Timeline
+from madns_runtime.simulations.constellation.truth.maneuvers.stuck_thrusters import (
+    ARC_S,
+    StuckDirection,
+    StuckThrusters,
+)
+
+GUARD = '''
+class Guard:
+    """Closes its thruster off some seconds after the accelerometer has felt a thrust that nobody commanded."""
+
+    def setup(self, context):
+        self.context, self.felt_s, self.masses, self.told = context, None, [], []
+
+    def step(self, t_s, readings):
+        if "mass" in readings:
+            self.masses.append(readings["mass"].values[1])
+        felt = readings.get("accelerometer")
+        if self.felt_s is None and felt and max(map(abs, felt.values)) > 1e-3:
+            self.felt_s = t_s
+            wait_s = self.context.settings.get("wait_s")
+            if wait_s is not None:
+                self.context.delta_v((0.0, 0.0, 0.0), at_s=t_s + wait_s)
+        if self.context.settings.get("burn_s") == t_s:
+            self.context.delta_v((0.0, 0.01, 0.0), at_s=t_s + 1.0)
+
+    def command_result(self, result):
+        self.told.append(f"{result.status} {result.at_s:.2f} {result.propellant_kg:.4f} {result.reason}")
+
+    def finish(self):
+        return {"felt_s": self.felt_s, "masses": self.masses, "told": self.told}
+'''
+THRUSTER = {"isp_s": 220.0, "propellant_kg": 2.0, "thrust_n": 1.0}
+EXHAUST_M_S = 220.0 * 9.80665
+
+
+def action(agents=("agent-02",), for_s=None, **given):
+    return TimelineAction(
+        number=0,
+        word=STICK_THRUSTER_OPEN.word,
+        agents=agents,
+        parameters=StuckThruster(**given),
+        t_s=10.0,
+        for_s=for_s,
+    )
+
+
+@pytest.fixture
+def fly(tmp_path):
+    (tmp_path / "guard.py").write_text(GUARD)
+
+    def start(*, thruster=THRUSTER, **settings):
+        flight = {"software": "guard.py:Guard", "settings": settings}
+        sensors = {"accelerometer": {"rate_hz": 10.0}}
+        params = parameters(flight=flight, vehicles=[{"thruster": thruster, "sensors": sensors}])
+        return Star(params, 3, base_directory=tmp_path)
+
+    return start
+
+
+def stick(star, *, ends_s=None, until_s=60.0, **given):
+    star.run(10.0)
+    star.host.begin_action(action(**given))
+    if ends_s is not None:
+        star.run(ends_s, from_s=10.0)
+        star.host.end_action(action(**given))
+    star.run(until_s, from_s=ends_s or 10.0)
+    return star.host.finish()["maneuvers"]["stuck_thrusters"]["agent-02"]
+
+
+def test_truth_is_that_of_a_commanded_burn_of_the_same_length_and_thrust(fly):
+    stuck, burnt = fly(), fly()
+
+    (told,) = stick(stuck, ends_s=30.0)
+    given_m_s = -EXHAUST_M_S * math.log1p(-20.0 / EXHAUST_M_S / 100.0)
+    burnt.run(10.0)
+    middle_s = (told["from_s"] + told["to_s"]) / 2.0
+    command = Command(
+        number=0,
+        kind="delta_v",
+        commanded_s=9.0,
+        at_s=middle_s,
+        frame="rtn",
+        vector=(0.0, given_m_s, 0.0),
+    )
+    burnt.host.receive("agent-02", command.to_message())
+    burnt.run(60.0, from_s=10.0)
+
+    assert told["ended"] == "mended"
+    assert told["to_s"] - told["from_s"] == pytest.approx(20.0)
+    assert told["delta_v_m_s"] == pytest.approx(given_m_s, rel=1e-9)
+    assert told["propellant_left_kg"] == pytest.approx(2.0 - 20.0 / EXHAUST_M_S)
+    apart = state_rows(stuck, "agent-02")[-1] - state_rows(burnt, "agent-02")[-1]
+    # Of 8 m and 0.2 m/s: one direction for all of it there, and here one for each arc.
+    assert np.linalg.norm(apart[1:4]) < 0.02
+    assert np.linalg.norm(apart[4:7]) < 1e-3
+    assert stuck.underruns() == 0
+    others = [state_rows(star, "agent-01") for star in (stuck, burnt)]
+    assert np.array_equal(*others)
+
+
+def test_flight_software_feels_it_reads_its_tank_and_closes_it_off(fly):
+    star = fly(wait_s=15.0)
+
+    (told,) = stick(star)
+
+    flight = star.summaries()["agent-02"]["flight"]
+    assert told["from_s"] < flight["felt_s"] <= told["from_s"] + 0.3
+    assert (told["ended"], told["to_s"]) == ("closed", pytest.approx(flight["felt_s"] + 15.0))
+    left_kg = 2.0 - (told["to_s"] - told["from_s"]) / EXHAUST_M_S
+    assert [line.split()[0] for line in flight["told"]] == ["accepted", "executed"]
+    assert float(flight["told"][1].split()[2]) == pytest.approx(left_kg, abs=1e-4)
+    assert flight["masses"][0] == pytest.approx(2.0)
+    assert flight["masses"][-1] == pytest.approx(left_kg)
+    assert sorted(flight["masses"], reverse=True) == flight["masses"]
+    rows = star.context.records["stuck_thrusters"]
+    assert [row[2] for row in rows] == ["open"] * (len(rows) - 1) + ["closed"]
+    assert rows[-1][4] == pytest.approx(left_kg)
+
+
+def test_it_burns_until_the_propellant_is_gone(fly):
+    star = fly(thruster={**THRUSTER, "propellant_kg": 0.01})
+
+    (told,) = stick(star)
+
+    assert told["ended"] == "empty"
+    assert told["to_s"] - told["from_s"] == pytest.approx(0.01 * EXHAUST_M_S)
+    assert told["propellant_left_kg"] == 0.0
+    assert star.underruns() == 0
+
+
+def test_while_it_is_stuck_no_other_burn_is_taken_and_after_its_end_one_is(fly):
+    meanwhile, after = fly(burn_s=20.0), fly(burn_s=40.0)
+
+    for star in (meanwhile, after):
+        stick(star, ends_s=30.0)
+
+    (refused,) = meanwhile.summaries()["agent-02"]["flight"]["told"]
+    assert refused.startswith("refused")
+    assert refused.endswith("a change of velocity of 0 m/s closes it off")
+    told = after.summaries()["agent-02"]["flight"]["told"]
+    assert told[0].startswith("accepted")
+
+
+def test_a_thruster_without_thrust_needs_one_and_a_point_has_no_body_axes(fly):
+    star = fly(thruster={"isp_s": 220.0, "propellant_kg": 2.0})
+    star.run(1.0)
+
+    with pytest.raises(ActionRefused, match="give thrust_n"):
+        star.host.begin_action(action())
+    with pytest.raises(ActionRefused, match="body axes of a vehicle without attitude"):
+        star.host.begin_action(action(thrust_n=0.1, frame="body"))
+    star.host.begin_action(action(thrust_n=0.1))
+    with pytest.raises(ActionRefused, match="stuck open already"):
+        star.host.begin_action(action(thrust_n=0.1))
+
+
+def test_arcs_leave_room_for_a_burn_that_was_commanded_before():
+    vehicle = Vehicle(thruster=Thruster(isp_s=220.0, propellant_kg=2.0, thrust_n=1.0))
+    timeline, tank = Timeline(0.0), Tank(vehicle)
+    burn = Effect(
+        number=0, kind="thrust", at_s=16.0, start_s=14.0, end_s=18.5, vector=(0.0, 1.0, 0.0)
+    )
+    timeline.add(burn)
+    stuck = StuckThrusters([vehicle], [timeline], [tank], knot_s=1.0, duration_s=100.0)
+    push = StuckDirection(thrust_n=1.0, direction=(0.0, 1.0, 0.0), frame="rtn")
+
+    opened = stuck.open(0, push, 10.04)
+    for t_s in range(10, 25):
+        stuck.extend(opened, float(t_s))
+
+    edges = [(each.start_s, each.end_s) for each in timeline.effects]
+    assert edges == [(10.04, 14.0), (14.0, 18.5), (18.5, 23.0), (23.0, 28.0)]
+    assert edges[-1][1] - edges[-1][0] == ARC_S
+    burnt_kg = (3.96 + 4.5 + 5.0) / exhaust_m_s(vehicle.thruster)
+    assert tank.propellant_kg == pytest.approx(2.0 - burnt_kg)
+    assert stuck.close(0, 24.0, "closed") == 24.0
+    assert tank.propellant_kg == pytest.approx(2.0 - burnt_kg + 4.0 / exhaust_m_s(vehicle.thruster))
