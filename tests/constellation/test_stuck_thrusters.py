@@ -78,7 +78,9 @@ def stick(star, *, ends_s=None, until_s=60.0, **given):
         star.run(ends_s, from_s=10.0)
         star.host.end_action(action(**given))
     star.run(until_s, from_s=ends_s or 10.0)
-    return star.host.finish()["maneuvers"]["stuck_thrusters"]["agent-02"]
+    summary = star.host.finish()
+    assert [check["name"] for check in summary["checks"] if not check["passed"]] == []
+    return summary["maneuvers"]["stuck_thrusters"]["agent-02"]
 
 
 def test_truth_is_that_of_a_commanded_burn_of_the_same_length_and_thrust(fly):

@@ -62,6 +62,10 @@ class Conservation:
         agent = self._context.agents[vehicle]
         self._context.record("invariants", (end_s, agent, energy, momentum, momentum_z, *drifts))
 
+    def forget(self, vehicle: int) -> None:
+        """Compare with the next window's first knot from now on: what was a reference may have been burnt away."""
+        self._reference[vehicle] = None
+
     def _first_judged(self, vehicle: int, window: int, knots: int) -> int:
         """Return the first knot of the window that is compared; renews the reference after a maneuver."""
         store = self._store

@@ -159,6 +159,7 @@ class StuckBurns:
         """Have truth propagated anew from a time on, and sent."""
         if changed_s is None:
             return
+        self._refills.judge_anew(burn.vehicle)
         in_parts = not self._context.is_lockstep
         if self._supply.change(burn.vehicle, changed_s, in_parts=in_parts):
             self._refills.changed(burn.vehicle, changed_s, changed_s)

@@ -148,6 +148,10 @@ class Refills:
                 self._context.send(agent, later.to_message(), Service.RELIABLE)
             self.segments_sent += (urgent is not None) + (later is not None)
 
+    def judge_anew(self, vehicle: int) -> None:
+        """Compare a vehicle's truth with no time that was handed out before: it may have burnt since."""
+        self._conservation.forget(vehicle)
+
     def followed(self, vehicle: int, from_s: float) -> None:
         """Send the rest of a change, and record it."""
         until = self._recorded_until[vehicle]
