@@ -133,7 +133,12 @@ class AgentRunner:
         )
         pack.add(ticks)
         self._actions = OrderedActions(
-            seat, program.actions, self._journal, call=self._call, end_at=ticks.end_at
+            seat,
+            program.actions,
+            self._journal,
+            call=self._call,
+            end_at=ticks.end_at,
+            clock=process.clock,
         )
         self._faults = AgentFaults(ticks, self._journal, killed=partial(on_killed, name))
         self._report = AgentReport(

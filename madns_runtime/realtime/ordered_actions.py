@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
+from time import monotonic
 from typing import Any, Final
 
 from madns_runtime.errors import ConfigurationError
+from madns_runtime.faults.clock_faults import FaultableClock
 from madns_runtime.hardware.fault_actions import check_fault
 from madns_runtime.health.stress_process import (
     end_stress_processes,
@@ -19,7 +21,17 @@ from madns_runtime.protocol.messages import ActionOrder
 from madns_runtime.realtime.agent_calls import LoopSeat
 from madns_runtime.recording.run_journal import RunJournal
 from madns_runtime.timeline.action import ActionKind, ActionRefused
-from madns_runtime.timeline.kinds import DEVICE_FAULT, STOP, STRESS, DeviceFault, Stress
+from madns_runtime.timeline.kinds import (
+    DEVICE_FAULT,
+    DRIFT_CLOCK,
+    STEP_CLOCK,
+    STOP,
+    STRESS,
+    ClockDrift,
+    ClockStep,
+    DeviceFault,
+    Stress,
+)
 
 ORDERS_FROM: Final = 1_000_000
 """Numbers of fault orders from here on are a timeline's: nobody waits for an answer."""
@@ -35,9 +47,10 @@ class OrderedActions(AgentActions):
         journal: Of the agent.
         call: Calls a method of the agent's half.
         end_at: Ends the agent's simulated time at one that is to come, s.
+        clock: The process's estimate of the host's clock.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
         self,
         seat: LoopSeat,
         declared: Sequence[ActionKind],
@@ -45,14 +58,18 @@ class OrderedActions(AgentActions):
         *,
         call: Callable[..., Any],
         end_at: Callable[[float], None],
+        clock: FaultableClock,
     ) -> None:
         self._hardware = seat.hardware
         self._end_at = end_at
+        self._clock = clock
         self._stress: dict[int, tuple[subprocess.Popen[bytes], ...]] = {}
         self._ended: list[subprocess.Popen[bytes]] = []
         own: Mapping[str, OwnAction] = {
             STOP.word: lambda order: self._end_at(order.t_s),
             STRESS.word: self._load,
+            STEP_CLOCK.word: self._step_clock,
+            DRIFT_CLOCK.word: self._drift_clock,
             DEVICE_FAULT.word: self._device_fault,
         }
         super().__init__(seat.name, declared, call=call, journal=journal, own=own)
@@ -78,6 +95,19 @@ class OrderedActions(AgentActions):
         processes = self._stress.pop(number, ())
         end_stress_processes(processes)
         self._ended += processes
+
+    def _step_clock(self, order: ActionOrder) -> None:
+        by_ms = from_mapping(ClockStep, order.parameters).by_ms
+        if self._clock.step(order.number, by_ms * 1e-3, monotonic()):
+            self._journal.event("clock_stepped", number=order.number, by_ms=by_ms)
+
+    def _drift_clock(self, order: ActionOrder) -> None:
+        ppm = from_mapping(ClockDrift, order.parameters).ppm
+        if order.is_end:
+            if self._clock.end_drift(order.number, monotonic()):
+                self._journal.event("clock_drift_ends", number=order.number, ppm=ppm)
+        elif self._clock.drift(order.number, ppm, monotonic()):
+            self._journal.event("clock_drift_begins", number=order.number, ppm=ppm)
 
     def _device_fault(self, order: ActionOrder) -> None:
         fault = from_mapping(DeviceFault, order.parameters)

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from time import monotonic
 
 from madns_runtime.config import AgentLaunch
+from madns_runtime.faults.clock_faults import FaultableClock
 from madns_runtime.protocol.agent_session import PING_INTERVAL_S, PingPlan
 from madns_runtime.protocol.bundle import bundle_up, is_bundle, split
 from madns_runtime.protocol.datagram import agent_index_of
@@ -18,7 +19,6 @@ from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.udp import UdpSocket
 from madns_runtime.realtime.loop_account import NOBODY, LoopAccount, Span
 from madns_runtime.recording.writer_thread import WriterThread
-from madns_runtime.timing.clocksync import ClockEstimate
 from madns_runtime.timing.late_causes import Cause
 
 RECEIVE_BUFFER_BYTES = 1024 * 1024
@@ -53,7 +53,7 @@ class ProcessPort:
             launch.host_address, launch.host_port, receive_buffer_bytes=asked_bytes
         )
         self.agents = agents
-        self.clock = ClockEstimate()
+        self.clock = FaultableClock()
         self.writer = WriterThread(launch.config.recording)
         self.account = LoopAccount(reactor, self.writer, agents)
         # The kernel charges a small datagram with more than its bytes: half the buffer is kept for that.

@@ -29,7 +29,15 @@ from madns_runtime.recording.run_journal import RunJournal
 from madns_runtime.timeline.action import ActionHandler
 from madns_runtime.timeline.dispatcher import Dispatcher
 from madns_runtime.timeline.fault_kinds import FAULT_WORDS
-from madns_runtime.timeline.kinds import ANNOTATE, DEVICE_FAULT, STOP, STRESS, kinds_by_word
+from madns_runtime.timeline.kinds import (
+    ANNOTATE,
+    DEVICE_FAULT,
+    DRIFT_CLOCK,
+    STEP_CLOCK,
+    STOP,
+    STRESS,
+    kinds_by_word,
+)
 from madns_runtime.timeline.runner import OrderedAction, TimelineRunner
 
 STOP_LEAD_S: Final = 0.25
@@ -80,6 +88,8 @@ class HostTimeline:
             ANNOTATE.word: Annotations(),
             STOP.word: Stops(self._stop),
             STRESS.word: AgentOrders(self._post),
+            STEP_CLOCK.word: AgentOrders(self._post),
+            DRIFT_CLOCK.word: AgentOrders(self._post),
             DEVICE_FAULT.word: AgentOrders(self._post),
             **simulation_handlers(program.actions, call=call, post=self._post),
         }

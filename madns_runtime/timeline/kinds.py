@@ -14,6 +14,9 @@ from madns_runtime.timeline.fault_kinds import FAULT_KINDS
 
 DeviceFaultWord = Literal["freeze", "bias", "noise", "drop", "delay", "disconnect", "clear"]
 TEXT_CHARACTERS_MAX: Final = 200
+STEP_MS_MAX: Final = 10_000
+DRIFT_PPM_MAX: Final = 500
+"""What an estimate of the host's clock follows: two crystals differ by less, and a time service slews by so much."""
 FORBID_EXTRA: Final = {"extra": "forbid"}
 
 
@@ -35,6 +38,26 @@ class Stress:
 
     workers: Annotated[int, Ge(1), Le(64)] = 1
     """Processes that factorise primes on the agent's machine."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockStep:
+    """Parameters of step_clock."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    by_ms: Annotated[float, Ge(-STEP_MS_MAX), Le(STEP_MS_MAX)]
+    """By how much the clock is put forward, ms; below 0 back."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockDrift:
+    """Parameters of drift_clock."""
+
+    __pydantic_config__ = FORBID_EXTRA
+
+    ppm: Annotated[float, Ge(-DRIFT_PPM_MAX), Le(DRIFT_PPM_MAX)]
+    """By how much the clock runs faster, 1e-6; below 0 slower."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,6 +101,21 @@ STRESS: Final = ActionKind(
     modes=("realtime",),
     carried_out_by="framework",
 )
+STEP_CLOCK: Final = ActionKind(
+    word="step_clock",
+    summary="Puts the clock that an agent's process reads forward or back; its estimate of the host's has to find it.",
+    parameters=ClockStep,
+    modes=("realtime",),
+    carried_out_by="framework",
+)
+DRIFT_CLOCK: Final = ActionKind(
+    word="drift_clock",
+    summary="Lets the clock that an agent's process reads run faster or slower; its estimate of the host's has to follow.",
+    parameters=ClockDrift,
+    lasting="may",
+    modes=("realtime",),
+    carried_out_by="framework",
+)
 DEVICE_FAULT: Final = ActionKind(
     word="device_fault",
     summary="Inserts a fault around a device of each agent, as `cosmos inject` does; when it ends, all of the device's are cleared.",
@@ -85,7 +123,15 @@ DEVICE_FAULT: Final = ActionKind(
     lasting="may",
     carried_out_by="framework",
 )
-FRAMEWORK_ACTIONS: Final = (ANNOTATE, STOP, STRESS, DEVICE_FAULT, *FAULT_KINDS)
+FRAMEWORK_ACTIONS: Final = (
+    ANNOTATE,
+    STOP,
+    STRESS,
+    STEP_CLOCK,
+    DRIFT_CLOCK,
+    DEVICE_FAULT,
+    *FAULT_KINDS,
+)
 
 
 def kinds_by_word(declared: Iterable[ActionKind] = ()) -> Mapping[str, ActionKind]:

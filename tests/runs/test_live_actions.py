@@ -51,6 +51,8 @@ def test_orders_are_taken_listed_refused_and_recorded_and_a_stop_completes_the_r
 
     assert (code, stopped) == (0, 0)
     assert {"annotate", "stop", "device_fault"} <= {each["action"] for each in listed["actions"]}
+    # Of real time alone.
+    assert not {"stress", "step_clock", "drift_clock"} & {e["action"] for e in listed["actions"]}
     assert [each["parameters"] for each in listed["in_force"]] == [{"text": "hello"}]
     for (code, answer), words in refusals:
         assert code == 1, answer

@@ -86,6 +86,36 @@ def test_a_stop_in_real_time_ends_all_agents_with_the_same_tick(cosmos, tmp_path
     ]
 
 
+def test_a_clock_that_is_stepped_is_found_again_and_recorded(cosmos, tmp_path):
+    entries = [
+        {"at_s": 2, "action": "step_clock", "agents": ["*"], "by_ms": 150},
+        {"at_s": 3, "action": "drift_clock", "agents": ["agent-01"], "ppm": 300, "for_s": 1},
+    ]
+    path = written(tmp_path, entries, mode="realtime", duration_s=8)
+
+    code, result = cosmos.run(path, "agents.per_process=2", *LOOSE)
+
+    assert (code, result["status"]) == (0, "complete")
+    found = [(e["event"], e["action"]) for e in actions(cosmos, result)]
+    assert found == [
+        ("action_began", "step_clock"),
+        ("action_began", "drift_clock"),
+        ("action_ended", "drift_clock"),
+    ]
+    folder = cosmos.directory(result) / "agents"
+    told = [
+        json.loads(line).get("event")
+        for agent in sorted(folder.iterdir())
+        for line in (agent / "events.jsonl").read_text().splitlines()
+    ]
+    # Agents that share a process share its clock: it is put wrong once.
+    words = ("clock_stepped", "clock_drift_begins", "clock_drift_ends")
+    assert [told.count(word) for word in words] == [1, 1, 1]
+    rows = [json.loads(x) for x in (folder / "agent-01/clock.jsonl").read_text().splitlines()]
+    offsets_us = [row[1] for row in rows if isinstance(row, list)]
+    assert offsets_us[-1] - offsets_us[0] == pytest.approx(-150_000 - 300, abs=20_000)
+
+
 AWAITED = [
     {
         "when": {"stream": "round_trips", "field": "packet", "above": 20},

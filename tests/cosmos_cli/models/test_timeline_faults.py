@@ -124,6 +124,16 @@ BROKEN = [
         "timeline[0].action",
         "time.mode realtime alone",
     ),
+    (
+        '{at_s: 1, action: step_clock, agents: ["*"], by_ms: 50}',
+        "timeline[0].action",
+        "time.mode realtime alone",
+    ),
+    ('{at_s: 1, action: step_clock, agents: ["*"]}', "timeline[0].by_ms", "missing"),
+    ('{at_s: 1, action: step_clock, agents: ["*"], by_ms: 1e6}', "timeline[0].by_ms", "10000"),
+    ('{at_s: 1, action: drift_clock, agents: ["*"]}', "timeline[0].ppm", "missing"),
+    ('{at_s: 1, action: drift_clock, agents: ["*"], ppm: 900}', "timeline[0].ppm", "500"),
+    ("{at_s: 1, action: drift_clock, ppm: 90}", "timeline[0].action", "needs agents"),
 ]
 
 

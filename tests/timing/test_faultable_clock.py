@@ -1,0 +1,71 @@
+"""A local clock that is put wrong on purpose: the estimate of the host's clock is wrong with it, and finds it again."""
+
+import pytest
+
+from madns_runtime.faults.clock_faults import FaultableClock
+
+ROUND_TRIP_S = 0.001
+PING_S = 0.25
+HOST_AHEAD_S = 1000.0
+
+
+def fly(clock, from_s, until_s):
+    """Exchange every PING_S, and return how far the host's time was taken wrong after each, by time."""
+    errors = {}
+    for number in range(round(from_s / PING_S), round(until_s / PING_S)):
+        t_s = number * PING_S
+        middle_s = HOST_AHEAD_S + t_s + ROUND_TRIP_S / 2.0
+        assert clock.add_exchange(t_s, middle_s, middle_s, t_s + ROUND_TRIP_S)
+        at_s = t_s + PING_S / 2.0
+        errors[at_s] = clock.to_host_s(at_s) - (HOST_AHEAD_S + at_s)
+    return errors
+
+
+@pytest.fixture
+def clock():
+    clock = FaultableClock()
+    fly(clock, 0.0, 20.0)
+    return clock
+
+
+@pytest.mark.parametrize("by_s", [0.2, -0.2])
+def test_a_step_puts_host_time_off_by_as_much_until_exchanges_contradict_it(clock, by_s):
+    assert clock.step(1, by_s, 20.0)
+
+    assert clock.to_host_s(20.0) - HOST_AHEAD_S - 20.0 == pytest.approx(by_s, abs=1e-4)
+    errors = fly(clock, 20.0, 30.0)
+    assert clock.steps == 1
+    assert errors[20.125] == pytest.approx(by_s, abs=1e-3)
+    assert abs(errors[29.875]) < 1e-3
+    assert clock.offset_s(29.9) == pytest.approx(HOST_AHEAD_S - by_s, abs=1e-3)
+
+
+def test_host_and_local_time_are_each_others_inverse_while_a_clock_is_wrong(clock):
+    clock.step(1, 0.3, 20.0)
+    clock.drift(2, 400.0, 21.0)
+
+    for t_s in (21.0, 25.0, 80.0):
+        assert clock.to_local_s(clock.to_host_s(t_s)) == pytest.approx(t_s, abs=1e-9)
+
+
+def test_a_drift_is_followed_and_its_end_leaves_what_was_gained(clock):
+    clock.drift(1, 200.0, 20.0)
+    errors = fly(clock, 20.0, 140.0)
+
+    assert clock.drift_ppm == pytest.approx(-200.0, abs=20.0)
+    assert abs(errors[139.875]) < 1e-3
+    assert clock.end_drift(1, 140.0)
+    assert clock.wrong_s(200.0) == pytest.approx(200.0 + 120.0 * 200e-6)
+
+
+def test_one_action_puts_the_clock_of_agents_that_share_a_process_wrong_once(clock):
+    assert [clock.step(7, 0.1, 20.0), clock.step(7, 0.1, 20.0)] == [True, False]
+    assert [clock.drift(8, 100.0, 20.0), clock.drift(8, 100.0, 20.0)] == [True, False]
+    assert [clock.end_drift(8, 20.0), clock.end_drift(8, 20.0)] == [True, False]
+
+    assert clock.wrong_s(30.0) == pytest.approx(30.1)
+
+
+def test_a_clock_that_nobody_put_wrong_shows_the_time(clock):
+    assert clock.wrong_s(1234.5678) == 1234.5678
+    assert clock.steps == 0
