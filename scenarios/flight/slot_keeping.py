@@ -106,6 +106,7 @@ class SlotKeeping(FlightSoftware):
             "messages": self._ring.sent,
             "neighbours": len(self._ring.neighbours),
             "members": self._ring.members,
+            **({"entries_refused": self._ring.refused} if self._ring.settings.screens else {}),
         }
 
     def _command(self, t_s: float) -> None:

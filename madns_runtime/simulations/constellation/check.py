@@ -30,6 +30,7 @@ from madns_runtime.simulations.constellation.truth.satellite_selection import (
     SatelliteSelection,
     choose,
 )
+from madns_runtime.simulations.constellation.vehicles import rules_with_even_slots
 
 FIELD = "parameters.satellites.elements"
 AGE_DAYS_MAX = 366.0
@@ -75,6 +76,7 @@ def find_faults(  # noqa: PLR0913 - what a scenario is; see plugin.api.Simulatio
     faults += board_faults(parameters, pairs)
     faults += flight_faults(parameters, pairs, folder, is_lockstep=is_lockstep)
     faults += rate_faults(parameters, tick_hz)
+    faults += _slot_faults(parameters)
     if parameters.recorded_agents is not None and not is_lockstep:
         faults.append(
             "parameters.recorded_agents: expected time.mode lockstep: in real time results come when they come"
@@ -147,6 +149,25 @@ def _propagator_faults(parameters: ConstellationParameters, base_directory: Path
         f"parameters.propagator.kind: {propagator.kind} needs element sets, give satellites.elements; "
         "patterns and Keplerian elements need kind: scipy"
     ]
+
+
+def _slot_faults(parameters: ConstellationParameters) -> list[str]:
+    """Return why slot errors cannot be recorded."""
+    if parameters.record.slots_hz is None:
+        return []
+    rules = rules_with_even_slots(parameters)
+    if not rules:
+        return [
+            "parameters.record.slots_hz: expected flight software with settings {slots: even}, got none; "
+            "drop it, or let parameters.flight say so"
+        ]
+    spacings = {rule.settings.get("spacing_deg") for rule in rules}
+    if len(spacings) > 1:
+        told = ", ".join(sorted(map(str, spacings)))
+        return [
+            f"parameters.record.slots_hz: expected one spacing_deg in all settings with slots: even, got {told}"
+        ]
+    return []
 
 
 def _segment_faults(parameters: ConstellationParameters) -> list[str]:

@@ -22,6 +22,7 @@ from madns_runtime.simulations.constellation.host_side.model_health import (
     Conservation,
 )
 from madns_runtime.simulations.constellation.host_side.radio import RadioMedium
+from madns_runtime.simulations.constellation.host_side.slot_errors import SlotErrors
 from madns_runtime.simulations.constellation.host_side.truth_distribution import Refills
 from madns_runtime.simulations.constellation.host_side.truth_propagation import TruthSupply
 from madns_runtime.simulations.constellation.messages import (
@@ -110,6 +111,9 @@ class ConstellationHost(HostSimulation):
         if has_devices or flight_rules(parameters):
             self._maneuvering = self._make_maneuvering()
         self.radio = self._make_radio()
+        self._slots = None
+        if parameters.record.slots_hz is not None:
+            self._slots = SlotErrors(context, parameters, store, fleet.names)
         self._failures = InjectedFailures(
             self._maneuvering_now, self._index, vehicles=vehicles, radio=self.radio
         )
@@ -152,6 +156,8 @@ class ConstellationHost(HostSimulation):
         times_s.append(self._refills.timer(t_s))
         if self.radio is not None:
             times_s.append(self.radio.timer(t_s))
+        if self._slots is not None:
+            times_s.append(self._slots.timer(t_s))
         return min((time_s for time_s in times_s if time_s is not None), default=None)
 
     def result(self, job: int, value: Any) -> None:
@@ -178,10 +184,14 @@ class ConstellationHost(HostSimulation):
     def agent_lost(self, agent: str, reason: str) -> None:
         """Send it no more; its truth goes on."""
         self._refills.lost(self._index[agent])
+        if self._slots is not None:
+            self._slots.lost(self._index[agent])
 
     def agent_rejoined(self, agent: str) -> None:
         """Send again, and at once what became due while it set itself up."""
         self._refills.rejoined(self._index[agent])
+        if self._slots is not None:
+            self._slots.rejoined(self._index[agent])
 
     def finish(self) -> Mapping[str, Any]:
         """Return how well truth was computed and sent, and what was done to it."""

@@ -303,6 +303,9 @@ class RecordSettings:
     """Rate at which agents record their state, Hz; none for every tick."""
     elements_hz: Annotated[float, Gt(0), Le(1000)] = 1.0
     """Rate at which agents record their osculating elements, Hz; at most the tick rate."""
+    slots_hz: Annotated[float, Gt(0), Le(1)] | None = None
+    """Rate at which the host records slot errors by truth, Hz, of flight software whose settings say slots: even; none
+    for no record."""
     attitude_error_rad_max: Annotated[float, Gt(0)] = 1e-4
     """Most by which a rigid body's attitude between knots may be off, rad; a shorter segments.knot_s makes it less."""
     energy_drift_max: Annotated[float, Gt(0)] = 1e-9

@@ -191,6 +191,23 @@ INVARIANTS = (
 """One record a vehicle and window; drifts are relative to simulated time zero or to the end of the last
 maneuver, and missing where there is none in the window to compare with."""
 
+SLOTS = (
+    Field("t_s", "s"),
+    Field("satellites", "", "int"),
+    Field("slot_error_deg_rms", "deg"),
+    Field("slot_error_deg_max", "deg"),
+    Field("worst", "", "str"),
+)
+"""Slot errors by truth at one time, over the satellites whose agents live and fly software with even slots; null where
+nobody is left. worst is the agent with the largest."""
+
+SLOT_ERRORS = (
+    Field("t_s", "s"),
+    Field("agent", "", "str"),
+    Field("slot_error_deg", "deg"),
+)
+"""One record a satellite of those: how far it is ahead of its slot by truth, the common phase being that of all."""
+
 SAMPLE = (Field("tick", "", "int"), Field("t_s", "s"))
 """The first fields of every instrument: when it measured."""
 
@@ -231,6 +248,8 @@ OF_HOST = {
     "stuck_thrusters": STUCK_THRUSTERS,
     "links": LINKS,
     "contacts": CONTACTS,
+    "slots": SLOTS,
+    "slot_errors": SLOT_ERRORS,
 }
 OF_AGENTS = {
     "state": STATE,

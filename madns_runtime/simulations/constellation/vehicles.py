@@ -17,6 +17,8 @@ from madns_runtime.simulations.constellation.parameters import ConstellationPara
 
 GLOBS_KEPT = 1024
 """Lists of globs that are kept sorted out: each is asked for every agent."""
+EVEN_SLOTS = "even"
+"""Value of the setting slots of flight software that keeps its agents evenly spaced, in their order."""
 DEFAULT = Vehicle()
 """Description of a vehicle that no entry describes."""
 
@@ -52,6 +54,13 @@ def flight_rules(parameters: ConstellationParameters) -> tuple[FlightRule, ...]:
     flight = parameters.flight
     rules = flight if isinstance(flight, tuple) else () if flight is None else (flight,)
     return tuple(FlightClass(software=rule) if isinstance(rule, str) else rule for rule in rules)
+
+
+def rules_with_even_slots(parameters: ConstellationParameters) -> tuple[FlightRule, ...]:
+    """Return the rules of flight software whose settings give evenly spaced slots."""
+    return tuple(
+        rule for rule in flight_rules(parameters) if rule.settings.get("slots") == EVEN_SLOTS
+    )
 
 
 def fits(globs: Iterable[str], agent: str, satellite: str) -> bool:

@@ -21,6 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from madns_runtime.simulations.constellation.flight.entry_screening import EntryGate
+
 ENTRY = np.dtype(
     [("member", "<u2"), ("age", "<u2"), ("phase_rad", "<f4"), ("sma_m", "<f4"), ("first_m", "<f4")]
 )
@@ -66,9 +68,15 @@ class Gossip:
         count: Members, at most MEMBERS_MAX.
         index: One's own number.
         rounds_max: Age from which an entry is forgotten; more than news takes all the way.
+        gate: Judges entries that follow another; none for all are believed.
     """
 
-    def __init__(self, count: int, index: int, *, rounds_max: int) -> None:
+    def __init__(
+        self, count: int, index: int, *, rounds_max: int, gate: EntryGate | None = None
+    ) -> None:
+        self.refused = 0
+        """Entries that the gate did not believe."""
+        self._gate = gate
         self._index = index
         self._rounds_max = rounds_max
         self._rounds: Rounds = np.full(count, UNKNOWN, dtype=np.int64)
@@ -112,6 +120,8 @@ class Gossip:
         known[members] = np.maximum(known[members], rounds)
         # Nobody knows better than oneself where one is.
         is_news = (rounds > self._rounds[members]) & (members != self._index)
+        if self._gate is not None:
+            is_news &= self._believed(self._gate, heard, rounds, is_news)
         news, members = heard[is_news], members[is_news]
         self._note_change(members, rounds[is_news], news["sma_m"])
         self._rounds[members] = rounds[is_news]
@@ -144,6 +154,21 @@ class Gossip:
             change_m=self._change_m / max(self._changed_rounds, 1),
         )
 
+    def _believed(
+        self, gate: EntryGate, heard: NDArray[np.void], rounds: Rounds, is_news: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Return which entries follow what is known of their members, or are the first; count the others."""
+        members = heard["member"]
+        before = self._rounds[members]
+        follows = gate.accepts(
+            phases_rad=(self._phase_rad[members], heard["phase_rad"].astype(np.float64)),
+            smas_m=(self._sma_m[members], heard["sma_m"].astype(np.float64)),
+            rounds=rounds - before,
+        )
+        believed: NDArray[np.bool_] = follows | (before == UNKNOWN)
+        self.refused += int((is_news & ~believed).sum())
+        return believed
+
     def _note_change(self, members: Rounds, rounds: Rounds, smas_m: Floats) -> None:
         """Add how far members that were known before have moved up, and in how many rounds."""
         before = self._rounds[members]
@@ -167,18 +192,20 @@ class _Side:
     Args:
         names: The candidates.
         now: The round of the start; the nearest one has the benefit of the doubt.
+        patience: Rounds without a word, after which one is silent.
     """
 
-    def __init__(self, names: Sequence[str], now: int) -> None:
+    def __init__(self, names: Sequence[str], now: int, patience: int) -> None:
         self._names = tuple(names[:CANDIDATES_MAX])
         self._start = now
+        self._patience = patience
         self._asked = 0
 
     def choose(self, heard: Mapping[str, int], now: int) -> str | None:
         """Return whom to ask; None where there is nobody."""
         if not self._names:
             return None
-        since = now - SILENT_ROUNDS
+        since = now - self._patience
         nearest = next((name for name in self._names if heard.get(name, since) > since), None)
         if nearest is not None or self._start > since:
             self._asked = 0
@@ -195,12 +222,33 @@ class Neighbourhood:
         ahead: Those ahead, nearest first.
         behind: Those behind; in a small ring they may be the same.
         now: The round of the start.
+        patience: Rounds without a word, after which one is silent.
+        repairs: Whether others are asked in the place of one that is silent, and it is heard again when it speaks;
+            else it is left for good.
     """
 
-    def __init__(self, ahead: Sequence[str], behind: Sequence[str], *, now: int) -> None:
-        self._sides = (_Side(behind, now), _Side(ahead, now))
+    def __init__(
+        self,
+        ahead: Sequence[str],
+        behind: Sequence[str],
+        *,
+        now: int,
+        patience: int = SILENT_ROUNDS,
+        repairs: bool = True,
+    ) -> None:
+        self._patience = patience
+        self._left: set[str] | None = None if repairs else set()
+        if not repairs:
+            ahead, behind = ahead[:1], behind[:1]
+        self._nearest = frozenset((*ahead[:1], *behind[:1]))
+        self._start = now
+        self._sides = (_Side(behind, now, patience), _Side(ahead, now, patience))
         self._heard: dict[str, int] = {}
         self._asked_by: dict[str, int] = {}
+
+    def listens_to(self, name: str) -> bool:
+        """Tell whether what somebody says counts: everybody's does, where a ring is repaired."""
+        return self._left is None or (name in self._nearest and name not in self._left)
 
     def hear(self, name: str, asks: bool, now: int) -> None:
         """Note that somebody spoke, and whether it wants to be answered."""
@@ -210,9 +258,13 @@ class Neighbourhood:
 
     def choose(self, now: int) -> dict[str, bool]:
         """Return whom to speak to in this round, and whether to ask for an answer."""
+        since = now - self._patience
+        if self._left is not None:
+            if self._start <= since:
+                self._left |= {n for n in self._nearest if self._heard.get(n, since) <= since}
+            return {name: True for name in sorted(self._nearest - self._left)}
         chosen = (side.choose(self._heard, now) for side in self._sides)
         asked = {name: True for name in chosen if name is not None}
-        since = now - SILENT_ROUNDS
         return asked | {
             name: False
             for name, last in self._asked_by.items()

@@ -20,9 +20,16 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from madns_runtime.simulations.constellation.flight.api import TRUTH, FlightContext, Reading
+from madns_runtime.simulations.constellation.flight.entry_screening import (
+    SPREAD_M_MIN,
+    SPREAD_RAD_MIN,
+    EntryGate,
+    near_median,
+)
 from madns_runtime.simulations.constellation.flight.gossip import (
     CANDIDATES_MAX,
     MEMBERS_MAX,
+    SILENT_ROUNDS,
     Gossip,
     Known,
     Neighbourhood,
@@ -67,6 +74,13 @@ class RingSettings:
     """kept: angle between the planes of satellites that take each other for neighbours, deg."""
     sma_km: float = 5.0
     """kept: difference of their mean semi-major axes, km."""
+    patience_exchanges: float = SILENT_ROUNDS
+    """Without a word, after which a neighbour is silent."""
+    repairs: bool = True
+    """Whether others are asked in the place of a neighbour that is silent, and it is heard again when it speaks;
+    false: it is left for good, as a chain of fixed neighbours would, for comparison."""
+    screens: bool = False
+    """Whether entries that cannot be are refused, and members far from the median are left out: `entry_screening`."""
 
     @classmethod
     def from_mapping(cls, settings: Mapping[str, Any]) -> Self:
@@ -79,13 +93,23 @@ class RingSettings:
         slots = settings.get("slots", "even")
         if slots not in ("even", "kept"):
             raise ValueError(f"flight.settings.slots: expected even or kept, got {slots!r}")
-        known = [name for name in cls.__slots__ if name != "slots" and name in settings]
+        switches = {
+            name: _switch(settings, name) for name in ("repairs", "screens") if name in settings
+        }
+        known = [
+            name for name in cls.__slots__ if name in settings and name not in ("slots", *switches)
+        ]
         missing = {"altitude_km", "inclination_deg"} - set(known)
         if missing:
             raise ValueError(f"flight.settings: expected {' and '.join(sorted(missing))}")
-        found = cls(slots=slots, **{name: float(settings[name]) for name in known})
+        numbers: dict[str, Any] = {name: float(settings[name]) for name in known}
+        found = cls(slots=slots, **numbers, **switches)
         if found.exchange_s <= 0.0:
             raise ValueError(f"flight.settings.exchange_s: expected > 0, got {found.exchange_s:g}")
+        if found.patience_exchanges < 1.0:
+            raise ValueError(
+                f"flight.settings.patience_exchanges: expected >= 1, got {found.patience_exchanges:g}"
+            )
         if found.spacing_deg is not None and not 0.0 < found.spacing_deg <= FULL_TURN_DEG:
             raise ValueError(
                 f"flight.settings.spacing_deg: expected > 0 and <= 360, got {found.spacing_deg:g}"
@@ -144,7 +168,10 @@ class RingMember:
         self.slot_rad = context.index * self._spacing_rad(count)
         """Its slot, from the first one's; kept: its place at the start."""
         # News of the farthest one in a chain takes as many rounds as there are members, more where it is lost.
-        self._gossip = Gossip(count, context.index, rounds_max=2 * count + 24)
+        gate = None
+        if self.settings.screens:
+            gate = EntryGate(drift_rad_s_m=self._drift_rad_s_m, exchange_s=self.settings.exchange_s)
+        self._gossip = Gossip(count, context.index, rounds_max=2 * count + 24, gate=gate)
         self._neighbourhood: Neighbourhood | None = None
         self._spoken_to: tuple[str, ...] = ()
         # The newest message of each member, since the last exchange; and the first words of those in view.
@@ -155,6 +182,11 @@ class RingMember:
     def neighbours(self) -> tuple[str, ...]:
         """Neighbours of the last exchange."""
         return self._spoken_to
+
+    @property
+    def refused(self) -> int:
+        """Entries that were not believed."""
+        return self._gossip.refused
 
     def hear(self, message: Delivery) -> None:
         """Take a message by radio; one that is not of the ring's is none of its business."""
@@ -183,7 +215,8 @@ class RingMember:
         place_rad = wrapped(turned_rad - self.slot_rad)
         self._gossip.enter(now, place_rad, mean.a_m - self.design.a_m)
         for name, said in self._heard.items():
-            self._gossip.hear(name, said["round"], said["entries"], now)
+            if self._neighbourhood is None or self._neighbourhood.listens_to(name):
+                self._gossip.hear(name, said["round"], said["entries"], now)
         self._judge(place_rad, now)
         self._speak(mean, reading.t_s, now)
 
@@ -201,8 +234,11 @@ class RingMember:
         moved_rad = drift_rad_s * known.ages * self.settings.exchange_s
         ahead_rad = known.phases_rad + moved_rad - place_rad
         around_rad = (ahead_rad + math.pi) % math.tau - math.pi
-        self.slot_error_rad = -float(np.mean(around_rad))
         smas_m = known.smas_m + fallen_m if self._follows_sma else known.first_smas_m
+        if self.settings.screens:
+            around_rad = around_rad[near_median(around_rad, SPREAD_RAD_MIN)]
+            smas_m = smas_m[near_median(smas_m, SPREAD_M_MIN)]
+        self.slot_error_rad = -float(np.mean(around_rad))
         self.sma_ring_m = self.design.a_m + float(np.mean(smas_m))
 
     def _speak(self, mean: CircularElements, t_s: float, now: int) -> None:
@@ -248,11 +284,16 @@ class RingMember:
 
     def _neighbours_of(self, mean: CircularElements, t_s: float, now: int) -> Neighbourhood:
         """Return who may be one's neighbour on either side."""
+        chosen_by: dict[str, Any] = {
+            "now": now,
+            "patience": int(self.settings.patience_exchanges),
+            "repairs": self.settings.repairs,
+        }
         if self.settings.slots == "kept":
             beside = self._beside_in_plane(mean, t_s)
             ahead = [name for angle, name in sorted(beside) if angle >= 0.0]
             behind = [name for angle, name in sorted(beside, reverse=True) if angle < 0.0]
-            return Neighbourhood(ahead, behind, now=now)
+            return Neighbourhood(ahead, behind, **chosen_by)
         agents, index = self._context.agents, self._context.index
         # Half a ring at most: who is nearest one way round is not nearest the other way.
         reach = range(1, min(CANDIDATES_MAX, len(agents) // 2) + 1)
@@ -264,7 +305,7 @@ class RingMember:
         else:
             ahead = list(agents[index + 1 : index + 1 + CANDIDATES_MAX])
             behind = list(reversed(agents[max(0, index - CANDIDATES_MAX) : index]))
-        return Neighbourhood(ahead, behind, now=now)
+        return Neighbourhood(ahead, behind, **chosen_by)
 
     def _beside_in_plane(self, mean: CircularElements, t_s: float) -> list[tuple[float, str]]:
         """Return those who said hello in one's own plane and height, and how far ahead they are, rad."""
@@ -282,6 +323,19 @@ class RingMember:
 def position_reading(readings: Mapping[str, Reading]) -> Reading | None:
     """Return the newest position and velocity, from truth or GNSS, whichever the scenario gives."""
     return readings.get(TRUTH) or readings.get(GNSS)
+
+
+def _switch(settings: Mapping[str, Any], name: str) -> bool:
+    """
+    Return a setting that is true or false.
+
+    Raises:
+        ValueError: It is something else.
+    """
+    value = settings[name]
+    if not isinstance(value, bool):
+        raise ValueError(f"flight.settings.{name}: expected true or false, got {value!r}")
+    return value
 
 
 def _normal(mean: CircularElements) -> list[float]:
