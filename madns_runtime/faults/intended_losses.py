@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -28,6 +29,7 @@ class IntendedLosses:
 
     def __init__(self) -> None:
         self._absences: dict[str, _Absence] = {}
+        self._as_good_as_lost: set[str] = set()
 
     def order(self, agent: str, why: str, *, returns_s: float | None) -> None:
         """
@@ -41,6 +43,10 @@ class IntendedLosses:
         before = self._absences.get(agent)
         kept = before.incarnations if before else []
         self._absences[agent] = _Absence(why, returns_s, incarnations=kept)
+
+    def note(self, agents: Iterable[str]) -> None:
+        """Note that agents are as good as lost by an action of their simulation; they go on and are judged as ever."""
+        self._as_good_as_lost.update(agents)
 
     def take(self, agent: str, incarnation: int) -> str | None:
         """
@@ -89,7 +95,8 @@ class IntendedLosses:
 
     def names(self) -> list[str]:
         """Return the agents that were lost on purpose, also those that came back, sorted."""
-        return sorted(agent for agent, each in self._absences.items() if each.incarnations)
+        lost = {agent for agent, each in self._absences.items() if each.incarnations}
+        return sorted(lost | self._as_good_as_lost)
 
     def incarnations(self, agent: str) -> list[int]:
         """Return which of an agent's starts were ended on purpose, from 1."""

@@ -111,6 +111,7 @@ class LockstepHost:
             journal=self._journal,
             outbox=self._outbox,
             call=self._guarded.call,
+            intended=account.intended,
         )
         self._timeline.wait_for(conditions)
         self._context = JobContext(

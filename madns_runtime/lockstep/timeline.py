@@ -9,6 +9,7 @@ from typing import Any
 from madns_runtime.conditions.reports import HostConditions, MetCondition
 from madns_runtime.config import RunConfig
 from madns_runtime.errors import MadnsError
+from madns_runtime.faults.intended_losses import IntendedLosses
 from madns_runtime.hardware.action_socket import ActionSocket
 from madns_runtime.hardware.order_socket import Readers
 from madns_runtime.lockstep.clock import SimulatedClock
@@ -39,6 +40,7 @@ class LockstepTimeline:
         journal: Of the host.
         outbox: Of the host.
         call: Calls a method of the host's half.
+        intended: Where agents are noted that an action loses.
     """
 
     def __init__(  # noqa: PLR0913 - the collaborators of a seam, all keyword-only
@@ -50,6 +52,7 @@ class LockstepTimeline:
         journal: RunJournal,
         outbox: Outbox,
         call: Callable[..., Any],
+        intended: IntendedLosses,
     ) -> None:
         self._config = config
         self._clock = clock
@@ -60,7 +63,7 @@ class LockstepTimeline:
             ANNOTATE.word: Annotations(),
             STOP.word: Stops(self._stop),
             DEVICE_FAULT.word: AgentOrders(self._post),
-            **simulation_handlers(program.actions, call=call, post=self._post),
+            **simulation_handlers(program.actions, call=call, post=self._post, intended=intended),
         }
         kinds = kinds_by_word(program.actions)
         self.runner = TimelineRunner(

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from madns_runtime.faults.intended_losses import IntendedLosses
 from madns_runtime.plain_values import from_mapping
 from madns_runtime.protocol.messages import ActionOrder
 from madns_runtime.timeline.action import (
@@ -54,15 +55,22 @@ class HostHalfActions:
     Args:
         kinds: Of the simulation, by word.
         call: Calls a method of the half.
+        intended: Where agents are noted that an action loses.
     """
 
-    def __init__(self, kinds: Mapping[str, ActionKind], call: Callable[..., Any]) -> None:
+    def __init__(
+        self, kinds: Mapping[str, ActionKind], call: Callable[..., Any], intended: IntendedLosses
+    ) -> None:
         self._kinds = kinds
         self._call = call
+        self._intended = intended
 
     def begin(self, action: TimelineAction) -> None:
         """Call the half's begin_action."""
-        self._call("begin_action", with_instance(action, self._kinds[action.word]))
+        kind = self._kinds[action.word]
+        self._call("begin_action", with_instance(action, kind))
+        if kind.loses_agents:
+            self._intended.note(action.agents)
 
     def end(self, action: TimelineAction) -> None:
         """Call the half's end_action."""
@@ -124,6 +132,7 @@ def simulation_handlers(
     *,
     call: Callable[..., Any],
     post: Callable[[str, ActionOrder], bool],
+    intended: IntendedLosses,
 ) -> dict[str, ActionHandler]:
     """
     Return the handlers of the actions that a simulation declares, by word.
@@ -132,8 +141,9 @@ def simulation_handlers(
         declared: The actions.
         call: Calls a method of the host's half.
         post: Sends an agent an order; False if it is not there.
+        intended: Where agents are noted that an action loses.
     """
-    of_host = HostHalfActions({kind.word: kind for kind in declared}, call)
+    of_host = HostHalfActions({kind.word: kind for kind in declared}, call, intended)
     of_agents = AgentOrders(post)
     return {kind.word: of_host if kind.carried_out_by == "host" else of_agents for kind in declared}
 

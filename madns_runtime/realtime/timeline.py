@@ -91,7 +91,9 @@ class HostTimeline:
             STEP_CLOCK.word: AgentOrders(self._post),
             DRIFT_CLOCK.word: AgentOrders(self._post),
             DEVICE_FAULT.word: AgentOrders(self._post),
-            **simulation_handlers(program.actions, call=call, post=self._post),
+            **simulation_handlers(
+                program.actions, call=call, post=self._post, intended=self.faults.intended
+            ),
         }
         kinds = kinds_by_word(program.actions)
         self.runner = TimelineRunner(

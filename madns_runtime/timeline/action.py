@@ -39,6 +39,8 @@ class ActionKind:
     """The values of time.mode in which it exists."""
     carried_out_by: CarriedOutBy = "host"
     """Of a simulation's action: the half that is called. The framework's own are framework."""
+    loses_agents: bool = False
+    """Of a simulation's action: whether its agents are as good as lost by it, and told as lost on purpose."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

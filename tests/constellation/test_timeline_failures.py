@@ -1,6 +1,8 @@
 """Failures in whole lockstep runs: measurements change and truth does not, or truth does as the failure says."""
 
 import json
+import shutil
+import time
 
 import pytest
 import yaml
@@ -57,6 +59,142 @@ def test_a_biased_receiver_measures_beside_the_truth_which_stays_as_it_was(cosmo
     moved = {round(b[1]): round(b[2] - a[2], 3) for a, b in zip(*measured, strict=True)}
     assert {t_s for t_s, by_m in moved.items() if by_m == 500.0} == set(range(20, 40))
     assert {by_m for t_s, by_m in moved.items() if not 20 <= t_s < 40} == {0.0}
+
+
+PATIENCE_S = 120.0
+RADIO_ACTIONS = [
+    {"at_s": 20, "action": "telecommand", "agents": ["agent-01"], "text": "report"},
+    {
+        "at_s": 25,
+        "action": "telecommand",
+        "agents": ["IRIDIUM 5"],
+        "text": "report",
+        "station": "svalbard",
+    },
+    {"at_s": 30, "action": "lose_satellite", "agents": ["agent-02"], "for_s": 40},
+    {"at_s": 80, "action": "darken_station", "station": "svalbard", "for_s": 30},
+    {
+        "at_s": 90,
+        "action": "telecommand",
+        "agents": ["agent-01"],
+        "text": "report",
+        "station": "nowhere",
+    },
+]
+RISE_S = 45.525
+"""Of IRIDIUM 5, agent-04, over svalbard: tests/authorities/passes.json."""
+
+
+@pytest.fixture(scope="module")
+def passes(tmp_path_factory):
+    """The first minutes of the shipped scenario of ground passes with failures, and the same in other processes."""
+    folder = tmp_path_factory.mktemp("passes")
+    scenario = yaml.safe_load((SCENARIOS / "groundpass.yaml").read_text())
+    scenario["parameters"] |= {"uplinks": [], "record": {"state_hz": 1}}
+    scenario["parameters"]["flight"]["settings"] = {"status_s": 5, "beacon_s": 5}
+    for name in ("data", "flight"):
+        shutil.copytree(SCENARIOS / name, folder / name)
+    (folder / "passes.yaml").write_text(yaml.safe_dump(scenario | {"timeline": RADIO_ACTIONS}))
+    cosmos = CosmosCommand(folder)
+    runs = [
+        cosmos.run(folder / "passes.yaml", "time.duration_s=150", f"agents.per_process={number}")
+        for number in (1, 5)
+    ]
+    return cosmos.directory(runs[0][1]), [result for _, result in runs], [code for code, _ in runs]
+
+
+def named(path):
+    """Return a stream's records as mappings."""
+    head, *lines = map(json.loads, path.read_text().splitlines())
+    names = [field["name"] for field in head["fields"]]
+    return [dict(zip(names, line, strict=True)) for line in lines if isinstance(line, list)]
+
+
+def test_failures_of_radio_repeat_to_the_bit_and_break_nothing(passes):
+    _, results, codes = passes
+
+    assert codes == [0, 0]
+    assert results[0]["records_sha256"] == results[1]["records_sha256"]
+
+
+def test_downlinks_fail_for_want_of_contact_while_a_station_is_dark_and_no_longer(passes):
+    folder, _, _ = passes
+    down = [row for row in named(folder / "host/links.jsonl") if row["sender"] == "agent-04"]
+    seen = [row for row in down if row["to"].startswith("ground") and row["sent_s"] > RISE_S]
+
+    dark = [row["sent_s"] for row in seen if row["outcome"] == "no_contact"]
+    lit = [row["sent_s"] for row in seen if row["outcome"] == "delivered"]
+    assert len(dark) >= 5
+    assert len(lit) >= 10
+    assert all(80 <= t_s < 110 for t_s in dark)
+    assert not any(80 <= t_s < 110 for t_s in lit)
+
+
+def test_a_telecommand_comes_at_once_or_waits_for_its_stations_contact(passes):
+    folder, _, _ = passes
+
+    def heard(agent):
+        rows = named(folder / "agents" / agent / "messages.jsonl")
+        return [
+            (row["tick"], row["peer"])
+            for row in rows
+            if row["way"] == "received" and row["peer"].startswith("ground")
+        ]
+
+    assert heard("agent-01") == [(20, "ground")]
+    ((tick, station),) = heard("agent-04")
+    assert station == "ground:svalbard"
+    assert tick == 46
+    events = (folder / "host/events.jsonl").read_text().splitlines()
+    refused = [e for e in map(json.loads, events) if e.get("event") == "action_refused"]
+    assert [e["reason"] for e in refused] == ["no ground station named 'nowhere' in this scenario"]
+
+
+def test_a_lost_satellite_says_and_hears_nothing_and_comes_back(passes):
+    folder, results, _ = passes
+
+    ticks = [row["tick"] for row in named(folder / "agents/agent-02/messages.jsonl")]
+    assert not [tick for tick in ticks if 30 <= tick < 70]
+    assert min(ticks) < 30
+    assert max(ticks) >= 70
+    links = named(folder / "host/links.jsonl")
+    meanwhile = [row for row in links if 30 <= row["sent_s"] < 70 and row["to"] == "agent-02"]
+    assert {row["outcome"] for row in meanwhile} <= {"lost"}
+    assert any(
+        row["outcome"] == "delivered"
+        for row in links
+        if row["to"] == "agent-02" and row["sent_s"] < 30
+    )
+    states = named(folder / "agents/agent-02/state.jsonl")
+    assert [row["tick"] for row in states] == list(range(150))
+    agents = results[0]["agents"]
+    assert (agents["lost"], agents["lost_on_purpose"]) == ([], ["agent-02"])
+
+
+def test_a_living_run_lists_its_actions_and_takes_them_by_their_words(cosmos, tmp_path):
+    path = write(tmp_path, "living", [])
+
+    def inject(*arguments):
+        done = cosmos("inject", "last", *arguments, "--json")
+        assert done.returncode in (0, 1), done.stderr
+        return json.loads(done.stdout)
+
+    with cosmos.start_run(path, "time.duration_s=1e7") as run:
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not list(cosmos.runs.glob("*/.actions.sock")):
+            assert time.monotonic() < deadline_s
+            time.sleep(0.1)
+        inject("agent-01", "lose_satellite")
+        refused = inject("agent-01", "stick_thruster_open", "thrust_n=1")
+        listed = inject("--list")
+        inject("run", "stop")
+        out, _ = run.communicate(timeout=PATIENCE_S)
+
+    words = {each["action"] for each in listed["actions"]}
+    assert {"stick_thruster_open", "lose_satellite", "telecommand", "darken_station"} <= words
+    assert [each["action"] for each in listed["in_force"]] == ["lose_satellite"]
+    assert refused["refusal"] == "without a thruster in parameters.vehicles: agent-01"
+    assert json.loads(out)["agents"]["lost_on_purpose"] == ["agent-01"]
 
 
 def test_an_action_that_a_vehicle_cannot_carry_out_is_refused_on_record(cosmos, tmp_path):

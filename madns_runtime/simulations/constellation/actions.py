@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal
 
-from annotated_types import Ge, Gt, Le, MinLen
+from annotated_types import Ge, Gt, Le, MaxLen, MinLen
 
 from madns_runtime.timeline.action import ActionKind
 
@@ -14,6 +14,7 @@ SensorName = Literal[
 ]
 BIAS_MAX: Final = 1e9
 THRUST_N_MAX: Final = 1e6
+TEXT_CHARACTERS_MAX: Final = 4000
 Component = Annotated[float, Ge(-1e6), Le(1e6)]
 
 
@@ -57,6 +58,16 @@ class DarkStation:
     """Name of the ground station."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Telecommand:
+    """Parameters of telecommand."""
+
+    text: Annotated[str, MinLen(1), MaxLen(TEXT_CHARACTERS_MAX)]
+    """What flight software receives."""
+    station: Annotated[str, MinLen(1)] | None = None
+    """Ground station that sends it, in its next contact with the vehicle; none for at once, whatever is in view."""
+
+
 SENSOR_FAULT: Final = ActionKind(
     word="sensor_fault",
     summary="Has a sensor of each agent stuck, biased or dead; truth is as it was.",
@@ -88,10 +99,23 @@ DARKEN_STATION: Final = ActionKind(
     takes_agents=False,
     lasting="may",
 )
+LOSE_SATELLITE: Final = ActionKind(
+    word="lose_satellite",
+    summary="Has a satellite dead meanwhile: it neither flies software nor measures, sends or hears; its truth goes on.",
+    lasting="may",
+    loses_agents=True,
+)
+TELECOMMAND: Final = ActionKind(
+    word="telecommand",
+    summary="Sends flight software a text from the ground, at once or in the next contact with a station.",
+    parameters=Telecommand,
+)
 ACTIONS: Final = (
     SENSOR_FAULT,
     WEAKEN_THRUSTER,
     STICK_THRUSTER_OPEN,
     FAIL_WHEELS,
     DARKEN_STATION,
+    LOSE_SATELLITE,
+    TELECOMMAND,
 )

@@ -23,9 +23,12 @@ from madns_runtime.plugin.api import (
 )
 from madns_runtime.simulations.constellation.actions import SensorFault
 from madns_runtime.simulations.constellation.messages import (
+    GROUND,
     CommandResult,
     Delivery,
+    GroundText,
     Initial,
+    SatelliteLoss,
     Segment,
     TankGauge,
     TransmissionRefusal,
@@ -101,6 +104,8 @@ class ConstellationAgent(AgentSimulation):
             self._devices = DeviceCommands(context, vehicle, has_flight=has_flight)
         self._is_commanded = self._cockpit is not None or self._devices is not None
         self._phase_s = 0.0
+        self._is_lost = False
+        self._ticks_lost = self._messages_lost = 0
         self._flight_tick = 0
         self._has_early_steps = self._cockpit is not None and self._rate.steps_per_tick > 1
         self._has_begun = False
@@ -125,6 +130,9 @@ class ConstellationAgent(AgentSimulation):
         if self._recorded is not None:
             self._take_recorded(self._recorded, index)
         cockpit = self._cockpit
+        if self._is_lost:
+            cockpit = None
+            self._ticks_lost += 1
         if cockpit is not None:
             cockpit.phase_s = phase_s
             if self._has_early_steps:
@@ -139,7 +147,7 @@ class ConstellationAgent(AgentSimulation):
                 self._record_state(index, state)
             if index >= self._elements_tick:
                 self._record_elements(index, state)
-        if self._sensors is not None:
+        if self._sensors is not None and not self._is_lost:
             self._measure(index, t_s, state)
         if cockpit is not None and index >= self._flight_tick:
             # At the first tick at or after each of its times.
@@ -148,7 +156,7 @@ class ConstellationAgent(AgentSimulation):
             cockpit.step(index, t_s, state)
         if self._recorded is not None and cockpit is not None:
             self._recorded.commanded(index, cockpit.commands)
-        if self._devices is not None:
+        if self._devices is not None and not self._is_lost:
             self._devices.step(index, t_s, phase_s)
         if self._stimuli is not None:
             self._stimuli.step(t_s)
@@ -194,6 +202,10 @@ class ConstellationAgent(AgentSimulation):
                 self._take_result(result)
         elif kind == TankGauge.KIND:
             self._read_gauge(TankGauge.from_message(message))
+        elif kind == GroundText.KIND:
+            self._take_text(GroundText.from_message(message))
+        elif kind == SatelliteLoss.KIND:
+            self._is_lost = SatelliteLoss.from_message(message).is_lost
         elif kind != CommandResult.KIND:
             raise PluginError(f"constellation: expected a segment, got {message!r:.200}")
 
@@ -221,7 +233,9 @@ class ConstellationAgent(AgentSimulation):
 
     def hear(self, delivery: Delivery) -> None:
         """Take a message by radio; a broadcast also reaches those who fly nothing."""
-        if self._cockpit is not None:
+        if self._is_lost:
+            self._messages_lost += 1
+        elif self._cockpit is not None:
             self._cockpit.deliver(delivery)
 
     def refused(self, refusal: TransmissionRefusal) -> None:
@@ -247,8 +261,11 @@ class ConstellationAgent(AgentSimulation):
         elif self._cockpit is not None:
             self._cockpit.tell(result)
 
+    def _take_text(self, text: GroundText) -> None:
+        self.hear(Delivery(GROUND, text.t_s, text.t_s, text.text))
+
     def _read_gauge(self, gauge: TankGauge) -> None:
-        if self._cockpit is not None:
+        if self._cockpit is not None and not self._is_lost:
             self._cockpit.read_tank(gauge.propellant_kg)
 
     def _take_segment(self, segment: Segment) -> None:
@@ -291,6 +308,7 @@ class ConstellationAgent(AgentSimulation):
             **({} if self._sensors is None else {"sensors": self._sensors.summary()}),
             **({} if self._devices is None else {"actuation": self._devices.finish()}),
             **self._stimuli_summary(),
+            **self._loss_summary(),
             **({"told_early": self._recorded.overflown} if self._recorded else {}),
             **flown,
             **self._message_counts(),
@@ -300,6 +318,12 @@ class ConstellationAgent(AgentSimulation):
     def _stimuli_summary(self) -> dict[str, Any]:
         stimuli = self._stimuli
         return {} if stimuli is None else {"stimuli": stimuli.finish(self._context.now_s())}
+
+    def _loss_summary(self) -> dict[str, Any]:
+        """Return what the satellite did not do and hear while it was lost; empty if it never was."""
+        if not self._ticks_lost:
+            return {}
+        return {"while_lost": {"ticks": self._ticks_lost, "messages": self._messages_lost}}
 
     def _message_counts(self) -> dict[str, int]:
         """Return the counts of messages by radio; without flight software nobody heard them."""

@@ -115,7 +115,7 @@ class ConstellationHost(HostSimulation):
         if parameters.record.slots_hz is not None:
             self._slots = SlotErrors(context, parameters, store, fleet.names)
         self._failures = InjectedFailures(
-            self._maneuvering_now, self._index, vehicles=vehicles, radio=self.radio
+            self._maneuvering_now, context, vehicles=vehicles, radio=self.radio
         )
         # Truth that came after its first sending was due.
         self._late_count, self._late_s_max = 0, 0.0
@@ -192,6 +192,7 @@ class ConstellationHost(HostSimulation):
         self._refills.rejoined(self._index[agent])
         if self._slots is not None:
             self._slots.rejoined(self._index[agent])
+        self._failures.rejoined(agent)
 
     def finish(self) -> Mapping[str, Any]:
         """Return how well truth was computed and sent, and what was done to it."""

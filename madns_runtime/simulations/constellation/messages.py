@@ -4,7 +4,7 @@ Messages between the two halves of the constellation, as dataclasses that become
 Pure. A mapping has the fields and "kind", the kind of message; a command's own kind is under "command".
 
     agent -> host    Command (SYNC, deadline: its time)
-    host -> agent    Initial, Segment, CommandResult, TankGauge
+    host -> agent    Initial, Segment, CommandResult, TankGauge, GroundText, SatelliteLoss
 
 What vehicles say to each other and to the ground travels as the framework's messages between agents do.
 """
@@ -32,8 +32,10 @@ __all__ = [
     "CommandResult",
     "CommandStatus",
     "Delivery",
+    "GroundText",
     "Initial",
     "Message",
+    "SatelliteLoss",
     "Segment",
     "TankGauge",
     "TransmissionRefusal",
@@ -198,6 +200,25 @@ class TankGauge(Message):
     """Left, kg."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GroundText(Message):
+    """Text for flight software that comes at once, by no radio."""
+
+    KIND = "ground_text"
+
+    t_s: float
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SatelliteLoss(Message):
+    """Whether a satellite is lost from now on: it neither flies software nor measures, sends or hears."""
+
+    KIND = "satellite_loss"
+
+    is_lost: bool
+
+
 def is_for_ground(to: str) -> bool:
     """Return whether a message's receiver is any station, or one of them."""
     return to == GROUND or to.startswith(f"{GROUND}:")
@@ -282,6 +303,7 @@ def _thrust_numbers(thrust: Thrust) -> list[float]:
 _array = _exactly(np.ndarray)
 _WAYS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
     "Any": (_as_it_is, _as_it_is),
+    "bool": (_exactly(bool), _as_it_is),
     "int": (_exactly(int), _as_it_is),
     "float": (_number, _as_it_is),
     "float | None": (_or_none(_number), _as_it_is),

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from madns_runtime.plugin.api import ActionRefused, TimelineAction
+from madns_runtime.plugin.api import ActionRefused, HostContext, TimelineAction
+from madns_runtime.protocol.messages import Service
 from madns_runtime.simulations.constellation.actions import (
     DARKEN_STATION,
     FAIL_WHEELS,
+    LOSE_SATELLITE,
     STICK_THRUSTER_OPEN,
+    TELECOMMAND,
     WEAKEN_THRUSTER,
     DarkStation,
+    Telecommand,
 )
 from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.host_side.maneuver_execution import Maneuvering
 from madns_runtime.simulations.constellation.host_side.radio import RadioMedium
+from madns_runtime.simulations.constellation.messages import GroundText, SatelliteLoss
+from madns_runtime.simulations.constellation.parameters import Uplink
 
 
 class InjectedFailures:
@@ -24,7 +30,7 @@ class InjectedFailures:
 
     Args:
         maneuvering: Returns who changes truth.
-        index: Number of each agent's vehicle.
+        context: Through which agents are told.
         vehicles: What each is like.
         radio: Knows the ground stations; None without any.
     """
@@ -32,15 +38,18 @@ class InjectedFailures:
     def __init__(
         self,
         maneuvering: Callable[[], Maneuvering],
-        index: Mapping[str, int],
+        context: HostContext,
         *,
         vehicles: Sequence[Vehicle],
         radio: RadioMedium | None,
     ) -> None:
         self._maneuvering = maneuvering
-        self._index = index
+        self._context = context
+        self._index = {agent: number for number, agent in enumerate(context.agents)}
         self._vehicles = vehicles
         self._radio = radio
+        self._lost: dict[int, tuple[str, ...]] = {}
+        """By action the agents whose satellites are lost."""
 
     def begin(self, action: TimelineAction) -> None:
         """
@@ -53,6 +62,11 @@ class InjectedFailures:
         vehicles = [self._index[agent] for agent in action.agents]
         if action.word == DARKEN_STATION.word:
             self._darken(action, is_dark=True)
+        elif action.word == TELECOMMAND.word:
+            self._telecommand(action, given)
+        elif action.word == LOSE_SATELLITE.word:
+            self._lost[action.number] = action.agents
+            self._tell_losses(action.agents)
         elif action.word == WEAKEN_THRUSTER.word:
             self._need(action, vehicles, "thruster")
             factors = dict.fromkeys(vehicles, given.factor)
@@ -68,10 +82,40 @@ class InjectedFailures:
         """Lift a failure."""
         if action.word == DARKEN_STATION.word:
             self._darken(action, is_dark=False)
+        elif action.word == LOSE_SATELLITE.word:
+            self._tell_losses(self._lost.pop(action.number))
         elif action.word == STICK_THRUSTER_OPEN.word:
             self._maneuvering().stuck.end(action.number)
         else:
             self._maneuvering().failures.lift(action.number)
+
+    def rejoined(self, agent: str) -> None:
+        """Tell an agent that has returned what its satellite is."""
+        if agent in self._all_lost():
+            self._tell_losses((agent,))
+
+    def _all_lost(self) -> frozenset[str]:
+        return frozenset(agent for agents in self._lost.values() for agent in agents)
+
+    def _tell_losses(self, agents: Sequence[str]) -> None:
+        lost = self._all_lost()
+        if self._radio is not None:
+            self._radio.lost = lost
+        for agent in agents:
+            told = SatelliteLoss(is_lost=agent in lost).to_message()
+            self._context.send(agent, told, Service.RELIABLE)
+
+    def _telecommand(self, action: TimelineAction, given: Telecommand) -> None:
+        if given.station is None:
+            text = GroundText(t_s=self._context.now_s(), text=given.text).to_message()
+            for agent in action.agents:
+                self._context.send(agent, text, Service.RELIABLE)
+            return
+        now_s = self._context.now_s()
+        for agent in action.agents:
+            uplink = Uplink(at_s=now_s, to=agent, text=given.text)
+            if self._radio is None or not self._radio.uplink(uplink, given.station):
+                raise ActionRefused(f"no ground station named {given.station!r} in this scenario")
 
     def _need(self, action: TimelineAction, vehicles: Sequence[int], part: str) -> None:
         lacking = [

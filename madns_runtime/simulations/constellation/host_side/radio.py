@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime
 from typing import Any
 
@@ -10,7 +11,7 @@ from madns_runtime.errors import PluginError
 from madns_runtime.plugin.api import HostContext
 from madns_runtime.protocol.messages import Transmission
 from madns_runtime.simulations.constellation.messages import is_for_ground
-from madns_runtime.simulations.constellation.parameters import ConstellationParameters
+from madns_runtime.simulations.constellation.parameters import ConstellationParameters, Uplink
 from madns_runtime.simulations.constellation.streams import CONTACTS, LINKS
 from madns_runtime.simulations.constellation.truth.radio.channel import (
     CROSSLINKS,
@@ -68,6 +69,8 @@ class RadioMedium:
             random=context.random,
             truth=store,
         )
+        self.lost: frozenset[str] = frozenset()
+        """Agents whose satellites are lost: they hear nothing, and nobody is told."""
         context.open_stream("links", LINKS)
         context.open_stream("contacts", CONTACTS)
 
@@ -80,24 +83,30 @@ class RadioMedium:
         """
         vehicle = self._index[sender]
         if is_for_ground(transmission.to):
-            events = self._ground.carry(vehicle, transmission)
+            events: Sequence[LinkEvent] = self._ground.carry(vehicle, transmission)
         elif self._crosslinks is not None:
             events = self._crosslinks.carry(vehicle, transmission)
         else:
             to = transmission.to
             raise PluginError(f"constellation: {to!r} cannot be reached without crosslinks")
+        events = self._unheard(events)
         self._record(events)
         return events
 
     def timer(self, t_s: float) -> float | None:
         """Have uplinks sent, record passes, and return when to come back."""
-        for transmission, event in self._ground.uplinks(t_s):
+        for transmission, sent in self._ground.uplinks(t_s):
+            (event,) = self._unheard((sent,))
             self._record((event,))
             self._context.enter(event.sender, transmission, (event,))
         for contact in self._ground.contacts(t_s):
             self._context.record("contacts", contact.to_record())
         next_s = self._ground.next_s()
         return None if next_s is None else max(next_s, t_s + STEP_S)
+
+    def uplink(self, uplink: Uplink, station: str) -> bool:
+        """Let a message wait for a station's next contact with its vehicle; False if there is no such station."""
+        return self._ground.add_uplink(uplink, station)
 
     def darken(self, station: str, *, is_dark: bool) -> bool:
         """Have a ground station neither heard nor hear, or do both again; False if there is none of that name."""
@@ -109,6 +118,17 @@ class RadioMedium:
         counts = {name: self._context.account(name).to_mapping(OUTCOMES) for name in channels}
         counts[TO_GROUND].update(self._ground.summary())
         return counts
+
+    def _unheard(self, events: Sequence[LinkEvent]) -> Sequence[LinkEvent]:
+        """Return what becomes of messages where some receivers, or the sender, are lost."""
+        if not self.lost:
+            return events
+        return [
+            replace(event, outcome="lost", arrives_s=None)
+            if event.outcome == "delivered" and not self.lost.isdisjoint((event.to, event.sender))
+            else event
+            for event in events
+        ]
 
     def _record(self, events: Sequence[LinkEvent]) -> None:
         for event in events:

@@ -109,7 +109,7 @@ class VehicleContext:
         """Refusals that wait to be told."""
         self.refused: Counter[str] = Counter()
         """Messages refused, by reason: on board, where they never reach the radio, or by the host."""
-        self._has_refusals_stream = False
+        self._has_refusals_stream = self._has_heard = False
         self._estimate_names: tuple[str, ...] = ()
         if self._has_crosslinks or self._has_stations:
             context.open_stream("messages", streams.MESSAGES)
@@ -199,6 +199,10 @@ class VehicleContext:
 
     def record_received(self, tick: int, message: Delivery) -> None:
         """Record a message that flight software is about to hear."""
+        if not (self._has_crosslinks or self._has_stations or self._has_heard):
+            # A text that came by no radio.
+            self._context.open_stream("messages", streams.MESSAGES)
+        self._has_heard = True
         size = len(pack(message.payload))
         row = (tick, "received", message.sender, message.sent_s, message.arrives_s, size)
         self._context.record("messages", row)

@@ -9,7 +9,7 @@ so that what they carry is on its way before it is due.
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 
@@ -48,6 +48,8 @@ DOWNLINK_QUEUE_MAX = 256
 LOOKS_MAX = 1000
 """At the time that one message takes: SCAN_STEP_S apart, or further if it takes more than 10,000 s."""
 PREFIX = f"{GROUND}:"
+_Waiting = tuple[int, Uplink, int | None]
+"""A message for a vehicle: its number, itself, and the one station that may send it, None for any."""
 
 
 class GroundSegment:
@@ -95,8 +97,9 @@ class GroundSegment:
         self._watch = PassWatch(PassFinder(self._sites, truth), agents, names)
         self._chance = Chance(random)
         self._transmitters = [Transmitter(DOWNLINK_QUEUE_MAX) for _ in agents]
+        self._index = index
         self._uplinks = _uplink_queues(uplinks, index)
-        self._uplinks_waiting = len(uplinks)
+        self._uplinks_given = self._uplinks_waiting = len(uplinks)
         self._free_s: dict[tuple[int, int], float] = {}
         """By station and vehicle: when what the station says to it is said."""
         self._uplinked_s: dict[int, float] = {}
@@ -136,6 +139,17 @@ class GroundSegment:
         numbers = {number for number, each in enumerate(self._stations) if each.name == station}
         self.dark = self.dark | numbers if is_dark else self.dark - numbers
         return bool(numbers)
+
+    def add_uplink(self, uplink: Uplink, station: str) -> bool:
+        """Let another message wait, for one station's contact; False if there is none of that name."""
+        numbers = [number for number, each in enumerate(self._stations) if each.name == station]
+        if not numbers:
+            return False
+        queue = self._uplinks.setdefault(self._index[uplink.to], [])
+        queue.append((self._uplinks_given, uplink, numbers[0]))
+        self._uplinks_given += 1
+        self._uplinks_waiting += 1
+        return True
 
     def contacts(self, t_s: float) -> list[Contact]:
         """Return the passes that began or ended until *t_s*, in order; each event once."""
@@ -230,11 +244,11 @@ class GroundSegment:
 
     def _uplink(self, window: Window, stretch: ViewInterval) -> None:
         """Let what waits for a vehicle leave in this stretch of a pass, one after the other."""
-        queue = self._uplinks.get(window.vehicle)
+        queue = self._uplinks.get(window.vehicle, [])
         pair = window.station, window.vehicle
         ends_s = stretch.until_s if window.set_s is None else window.set_s
-        while queue:
-            number, uplink = queue[0]
+        for waiting in [each for each in queue if each[2] in (None, window.station)]:
+            number, uplink, _ = waiting
             begins_s = max(
                 stretch.from_s,
                 window.rise_s,
@@ -259,7 +273,7 @@ class GroundSegment:
                 return
             self._free_s[pair] = begins_s + duration_s
             self._uplinked_s[window.vehicle] = begins_s
-            queue.popleft()
+            queue.remove(waiting)
             self._uplinks_waiting -= 1
             self._uplinked.append((message, event))
 
@@ -300,9 +314,9 @@ def _faults(
 
 def _uplink_queues(
     uplinks: Sequence[Uplink], index: Mapping[str, int]
-) -> dict[int, deque[tuple[int, Uplink]]]:
+) -> dict[int, list[_Waiting]]:
     """Return by vehicle what waits for it, with its place in the scenario, in the order of its times."""
-    queues: dict[int, deque[tuple[int, Uplink]]] = {}
+    queues: dict[int, list[_Waiting]] = {}
     for number, uplink in sorted(enumerate(uplinks), key=lambda entry: entry[1].at_s):
-        queues.setdefault(index[uplink.to], deque()).append((number, uplink))
+        queues.setdefault(index[uplink.to], []).append((number, uplink, None))
     return queues
