@@ -88,6 +88,25 @@ def test_two_losses_end_with_the_later_one_and_who_rejoins_is_told(star):
     assert star.summaries()["agent-02"]["flight"]["steps"] == [20.0, 21.0]
 
 
+def test_who_is_lost_by_agent_or_satellite_has_no_slot(tmp_path):
+    (tmp_path / "listener.py").write_text(LISTENER)
+    flight = {"software": "listener.py:Listener", "settings": {"slots": "even"}}
+    star = Star(
+        parameters(flight=flight, record={"slots_hz": 1.0}), 3, base_directory=tmp_path, tick_hz=1.0
+    )
+
+    star.run(2.5)
+    star.host.begin_action(LOSS)
+    star.run(4.5, from_s=2.5)
+    star.host.agent_lost("agent-02", "killed")
+    star.host.end_action(LOSS)
+    star.run(6.5, from_s=4.5)
+    star.host.agent_rejoined("agent-02")
+    star.run(8.5, from_s=6.5)
+
+    assert [row[1] for row in star.context.records["slots"]] == [3, 3, 3, 2, 2, 2, 2, 3, 3]
+
+
 def test_a_text_from_the_ground_comes_at_once_without_radio_and_is_recorded(star):
     star.run(10.0)
     star.host.begin_action(action(TELECOMMAND, Telecommand(text="report")))

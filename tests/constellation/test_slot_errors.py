@@ -67,12 +67,11 @@ def test_slot_errors_are_those_that_the_report_works_out_afterwards():
 def test_who_is_lost_has_no_slot_until_it_is_back():
     context, slots = recorder([0.0, 90.0, 180.0, 270.0])
     slots.timer(0.0)
-    slots.lost(2)
+    slots.leave_out([2])
     slots.timer(100.0)
-    slots.rejoined(2)
+    slots.leave_out([])
     slots.timer(200.0)
-    for vehicle in range(4):
-        slots.lost(vehicle)
+    slots.leave_out(range(4))
     slots.timer(300.0)
 
     assert [row[1] for row in context.records["slots"]] == [4, 3, 4, 0]

@@ -111,6 +111,8 @@ class ConstellationHost(HostSimulation):
         if has_devices or flight_rules(parameters):
             self._maneuvering = self._make_maneuvering()
         self.radio = self._make_radio()
+        self._gone: set[str] = set()
+        """Agents that are lost, whatever their satellites."""
         self._slots = None
         if parameters.record.slots_hz is not None:
             self._slots = SlotErrors(context, parameters, store, fleet.names)
@@ -176,23 +178,25 @@ class ConstellationHost(HostSimulation):
             ActionRefused: There is nothing that could fail so.
         """
         self._failures.begin(action)
+        self._count_slots()
 
     def end_action(self, action: TimelineAction) -> None:
         """Lift a failure."""
         self._failures.end(action)
+        self._count_slots()
 
     def agent_lost(self, agent: str, reason: str) -> None:
         """Send it no more; its truth goes on."""
         self._refills.lost(self._index[agent])
-        if self._slots is not None:
-            self._slots.lost(self._index[agent])
+        self._gone.add(agent)
+        self._count_slots()
 
     def agent_rejoined(self, agent: str) -> None:
         """Send again, and at once what became due while it set itself up."""
         self._refills.rejoined(self._index[agent])
-        if self._slots is not None:
-            self._slots.rejoined(self._index[agent])
         self._failures.rejoined(agent)
+        self._gone.discard(agent)
+        self._count_slots()
 
     def finish(self) -> Mapping[str, Any]:
         """Return how well truth was computed and sent, and what was done to it."""
@@ -245,6 +249,12 @@ class ConstellationHost(HostSimulation):
             f"truth from {window * self._store.window_s:g} s on {what} {late_s:.3f} s too late; "
             "a longer segments.buffer_s helps, and more executor workers do with many vehicles",
         )
+
+    def _count_slots(self) -> None:
+        """Leave out of the slots whose agents or satellites are lost at present."""
+        if self._slots is not None:
+            lost = self._gone | self._failures.lost
+            self._slots.leave_out(self._index[agent] for agent in lost)
 
     def _maneuvering_now(self) -> Maneuvering:
         """Return who changes truth, also where nobody commands but a timeline."""

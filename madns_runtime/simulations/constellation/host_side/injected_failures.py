@@ -91,14 +91,16 @@ class InjectedFailures:
 
     def rejoined(self, agent: str) -> None:
         """Tell an agent that has returned what its satellite is."""
-        if agent in self._all_lost():
+        if agent in self.lost:
             self._tell_losses((agent,))
 
-    def _all_lost(self) -> frozenset[str]:
+    @property
+    def lost(self) -> frozenset[str]:
+        """Agents whose satellites are lost at present."""
         return frozenset(agent for agents in self._lost.values() for agent in agents)
 
     def _tell_losses(self, agents: Sequence[str]) -> None:
-        lost = self._all_lost()
+        lost = self.lost
         if self._radio is not None:
             self._radio.lost = lost
         for agent in agents:

@@ -9,7 +9,7 @@ leaves the record, and who comes back is in it again.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -67,13 +67,10 @@ class SlotErrors:
             self._next = math.floor(t_s / self._period_s + 1e-9) + 1
         return self._next * self._period_s
 
-    def lost(self, vehicle: int) -> None:
-        """Leave a vehicle out."""
-        self._lives[vehicle] = False
-
-    def rejoined(self, vehicle: int) -> None:
-        """Count a vehicle again."""
-        self._lives[vehicle] = True
+    def leave_out(self, vehicles: Iterable[int]) -> None:
+        """Count all vehicles from now on but these."""
+        self._lives[:] = True
+        self._lives[list(vehicles)] = False
 
     def _record(self, t_s: float) -> None:
         states = self._store.states(t_s)
