@@ -61,6 +61,27 @@ def test_a_biased_receiver_measures_beside_the_truth_which_stays_as_it_was(cosmo
     assert {by_m for t_s, by_m in moved.items() if not 20 <= t_s < 40} == {0.0}
 
 
+def test_a_stuck_thruster_repeats_to_the_bit_and_moves_its_vehicle_alone(cosmos, tmp_path):
+    stuck = {"at_s": 10, "action": "stick_thruster_open", "agents": ["agent-01"], "for_s": 30}
+    thruster = "{isp_s: 220, propellant_kg: 2, thrust_n: 1}"
+    vehicles = f"parameters.vehicles=[{{thruster: {thruster}}}]"
+    path = write(tmp_path, "stuck", [stuck])
+
+    runs = [cosmos.run(path, vehicles, f"agents.per_process={number}") for number in (1, 2)]
+    code, undisturbed = cosmos.run(write(tmp_path, "sound", []), vehicles)
+
+    assert [code, *(code for code, _ in runs)] == [0, 0, 0]
+    assert runs[0][1]["records_sha256"] == runs[1][1]["records_sha256"]
+    folders = [cosmos.directory(result) for result in (runs[0][1], undisturbed)]
+    ours, theirs = (rows(folder, "agent-01", "state") for folder in folders)
+    assert [one == other for one, other in zip(ours, theirs, strict=True)].index(False) == 11
+    assert rows(folders[0], "agent-02", "state") == rows(folders[1], "agent-02", "state")
+    lines = (folders[0] / "host/stuck_thrusters.jsonl").read_text().splitlines()
+    left_kg = [row[4] for row in map(json.loads, lines) if isinstance(row, list)]
+    assert left_kg[0] == 2.0
+    assert left_kg[-1] == pytest.approx(2.0 - 30.0 / (220 * 9.80665))
+
+
 PATIENCE_S = 120.0
 RADIO_ACTIONS = [
     {"at_s": 20, "action": "telecommand", "agents": ["agent-01"], "text": "report"},
