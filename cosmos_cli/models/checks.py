@@ -12,7 +12,7 @@ from cosmos_cli.models.expectation import Expectation, HeldBounds
 from cosmos_cli.models.known_streams import REAL_TIME_ONLY, KnownStreams
 from cosmos_cli.models.plugin_answers import PluginAnswers
 from cosmos_cli.models.scenario import Scenario
-from cosmos_cli.models.value_rules import BoundsRule, RuleFault, words_at
+from cosmos_cli.models.value_rules import BoundsRule, FieldRule, RuleFault, words_at
 from madns_runtime.conditions.condition import HOST, ValueBounds
 from madns_runtime.recording.records import EVENTS, Field
 from madns_runtime.units import conversion
@@ -179,9 +179,9 @@ class _Placing:
             yield ("statistic",), f"{field.name} holds texts, which have no {rule.kind}"
         yield from unit_faults(rule.unit, field, must_know=rule.stop_when_broken)
 
-    def _while_faults(self, rule: BoundsRule) -> Iterator[RuleFault]:
+    def _while_faults(self, rule: FieldRule) -> Iterator[RuleFault]:
         streams = self._around.streams
-        stream, name = str(rule.stream), str(rule.field)  # type: ignore[attr-defined]
+        stream, name = rule.stream, rule.field
         if fault := streams.stream_fault(stream):
             yield ("stream",), fault
         elif fault := streams.field_fault(stream, name):
@@ -189,7 +189,7 @@ class _Placing:
         else:
             field = streams.field(stream, name)
             yield from kind_faults(rule, field)
-            yield from unit_faults(rule.unit, field)  # type: ignore[attr-defined]
+            yield from unit_faults(rule.unit, field)
 
     def expectation(self) -> Expectation:
         rule, around = self._rule, self._around

@@ -54,8 +54,9 @@ def _limit_s(document: Document) -> float:
     """Return what the scenario gives its plug-in, as far as that can be told yet."""
     timeouts = document.value.get("timeouts")
     value = timeouts.get("loading_s") if isinstance(timeouts, dict) else None
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return float(value) if is_number and 0 < value <= 3600 else Timeouts().loading_s  # type: ignore[operator,arg-type]
+    if isinstance(value, int | float) and not isinstance(value, bool) and 0 < value <= 3600:
+        return float(value)
+    return Timeouts().loading_s
 
 
 def _names_code(value: Any) -> bool:

@@ -19,14 +19,13 @@ from madns_runtime.plugin.action_handlers import (
     Annotations,
     Stops,
     simulation_handlers,
+    timeline_runner,
 )
 from madns_runtime.plugin.half import RoleProgram
 from madns_runtime.protocol.messages import ActionOrder
 from madns_runtime.recording.run_journal import RunJournal
 from madns_runtime.timeline.action import ActionHandler
-from madns_runtime.timeline.dispatcher import Dispatcher
-from madns_runtime.timeline.kinds import ANNOTATE, DEVICE_FAULT, STOP, kinds_by_word
-from madns_runtime.timeline.runner import TimelineRunner
+from madns_runtime.timeline.kinds import ANNOTATE, DEVICE_FAULT, STOP
 
 
 class LockstepTimeline:
@@ -65,15 +64,9 @@ class LockstepTimeline:
             DEVICE_FAULT.word: AgentOrders(self._post),
             **simulation_handlers(program.actions, call=call, post=self._post, intended=intended),
         }
-        kinds = kinds_by_word(program.actions)
-        self.runner = TimelineRunner(
-            config.timeline,
-            kinds,
-            Dispatcher(self.handlers, journal.event),
-            seed=config.seed,
-            duration_s=config.time.duration_s,
+        self.runner, self.kinds = timeline_runner(
+            config, program.actions, self.handlers, journal.event
         )
-        self.kinds = {word: kind for word, kind in kinds.items() if word in self.handlers}
         self._door: ActionSocket | None = None
 
     def wait_for(self, conditions: HostConditions) -> None:

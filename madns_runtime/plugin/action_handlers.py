@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from madns_runtime.config import RunConfig
 from madns_runtime.faults.intended_losses import IntendedLosses
 from madns_runtime.plain_values import from_mapping
 from madns_runtime.protocol.messages import ActionOrder
@@ -15,6 +16,9 @@ from madns_runtime.timeline.action import (
     ActionRefused,
     TimelineAction,
 )
+from madns_runtime.timeline.dispatcher import Dispatcher
+from madns_runtime.timeline.kinds import kinds_by_word
+from madns_runtime.timeline.runner import TimelineRunner
 
 AGENTS_TOLD_MAX = 20
 
@@ -146,6 +150,32 @@ def simulation_handlers(
     of_host = HostHalfActions({kind.word: kind for kind in declared}, call, intended)
     of_agents = AgentOrders(post)
     return {kind.word: of_host if kind.carried_out_by == "host" else of_agents for kind in declared}
+
+
+def timeline_runner(
+    config: RunConfig,
+    declared: Sequence[ActionKind],
+    handlers: Mapping[str, ActionHandler],
+    record: Callable[..., None],
+) -> tuple[TimelineRunner, dict[str, ActionKind]]:
+    """
+    Return what begins and ends a run's actions, and the kinds that have a handler in its time mode, by word.
+
+    Args:
+        config: The run.
+        declared: The simulation's actions.
+        handlers: By word.
+        record: Writes an event.
+    """
+    kinds = kinds_by_word(declared)
+    runner = TimelineRunner(
+        config.timeline,
+        kinds,
+        Dispatcher(handlers, record),
+        seed=config.seed,
+        duration_s=config.time.duration_s,
+    )
+    return runner, {word: kind for word, kind in kinds.items() if word in handlers}
 
 
 def _told(agents: Sequence[str]) -> str:

@@ -17,6 +17,7 @@ from madns_runtime.plugin.action_handlers import (
     Annotations,
     Stops,
     simulation_handlers,
+    timeline_runner,
 )
 from madns_runtime.plugin.half import HostHalf, RoleProgram
 from madns_runtime.protocol.messages import ActionOrder, Service
@@ -27,7 +28,6 @@ from madns_runtime.realtime.host_link import HostPort
 from madns_runtime.realtime.host_result import HostReport
 from madns_runtime.recording.run_journal import RunJournal
 from madns_runtime.timeline.action import ActionHandler
-from madns_runtime.timeline.dispatcher import Dispatcher
 from madns_runtime.timeline.fault_kinds import FAULT_WORDS
 from madns_runtime.timeline.kinds import (
     ANNOTATE,
@@ -36,9 +36,8 @@ from madns_runtime.timeline.kinds import (
     STEP_CLOCK,
     STOP,
     STRESS,
-    kinds_by_word,
 )
-from madns_runtime.timeline.runner import OrderedAction, TimelineRunner
+from madns_runtime.timeline.runner import OrderedAction
 
 STOP_LEAD_S: Final = 0.25
 """Every agent hears of a stop before its last tick, and all run the same ticks."""
@@ -95,15 +94,9 @@ class HostTimeline:
                 program.actions, call=call, post=self._post, intended=self.faults.intended
             ),
         }
-        kinds = kinds_by_word(program.actions)
-        self.runner = TimelineRunner(
-            config.timeline,
-            kinds,
-            Dispatcher(self.handlers, journal.event),
-            seed=config.seed,
-            duration_s=config.time.duration_s,
+        self.runner, self.kinds = timeline_runner(
+            config, program.actions, self.handlers, journal.event
         )
-        self.kinds = {word: kind for word, kind in kinds.items() if word in self.handlers}
         # Infinite is never: the timer is made once and moved.
         self._timer = reactor.call_at(math.inf, self._due)
 
