@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cosmos_cli.models.scenario import Scenario
-from cosmos_cli.models.schema import VARIABLE
+from cosmos_cli.models.variables import VARIABLE
 
 SCHEMA = Path(__file__).parents[1] / "scenarios" / "scenario.schema.json"
 BEGIN = "<!-- Generated from here on by `python docs/generate.py`; edit the docstrings of the fields. -->\n"

@@ -21,10 +21,10 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from cosmos_cli.models.parameters import adapter_of
 from cosmos_cli.models.scenario import Scenario
 from cosmos_cli.models.timeline_schema import entry_schema, timeline_inputs
+from cosmos_cli.models.variables import VARIABLE
 from madns_runtime.plugin.api import Simulation
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
-VARIABLE = r"\$\{"
 FILE_PATTERN = ":[A-Za-z_][A-Za-z_0-9]*$"
 
 
@@ -152,7 +152,7 @@ def _let_variables_stand(schema: Any) -> None:
     elif kind == "string" and isinstance(schema.get("enum"), list):
         found = {key: schema.pop(key) for key in ("type", "enum")}
         schema["anyOf"] = [found, {"type": "string", "pattern": VARIABLE}]
-    elif kind == "string" and isinstance(schema.get("pattern"), str):
+    elif kind == "string" and schema.get("pattern", VARIABLE) != VARIABLE:
         schema["pattern"] = f"(?:{schema['pattern']})|{VARIABLE}"
 
 

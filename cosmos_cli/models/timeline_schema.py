@@ -9,11 +9,11 @@ from pydantic import TypeAdapter
 
 from cosmos_cli.models.parameters import adapter_of
 from cosmos_cli.models.timeline_rules import TimelineRule
+from cosmos_cli.models.variables import VARIABLE
 from madns_runtime.timeline.action import ActionKind, NoParameters
 from madns_runtime.timeline.kinds import FRAMEWORK_ACTIONS
 
 ENTRY = "timeline"
-_VARIABLE = {"type": "string", "pattern": r"\$\{"}
 Inputs = list[tuple[str, Any, TypeAdapter[Any]]]
 
 
@@ -53,7 +53,9 @@ def entry_schema(
         for kind in dict.fromkeys((*FRAMEWORK_ACTIONS, *kinds))
     ]
     if owner:
-        own = {"properties": {"action": {"anyOf": [*words, _VARIABLE]}}}
+        own = {
+            "properties": {"action": {"anyOf": [*words, {"type": "string", "pattern": VARIABLE}]}}
+        }
         return {**own, "allOf": rules} if rules else own
     place = places[ENTRY, "validation"]
     entry = definitions[str(place["$ref"]).rpartition("/")[2]]

@@ -24,6 +24,8 @@ VARIABLES_MAX: Final = 1000
 REFERENCES_MAX: Final = 16
 """Variables that are made of each other, one behind the other."""
 TEXT_CHARACTERS_MAX: Final = 20_000
+VARIABLE: Final = r"\$\{"
+"""The pattern, in a JSON Schema, of a text in which a variable stands."""
 AGENT_WORD: Final = "name"
 """In devices' settings it stands for the name of whoever drives the device."""
 _PLACEHOLDER: Final = re.compile(r"\$(\$?)\{([^{}]*)\}?")

@@ -98,7 +98,9 @@ def assert_nobody_else_noticed(folder, document):
     assert document["records"]["dropped"] == 0
     for agent in SOUND:
         flight = flight_of(document, agent)
-        assert (flight["answers"], flight["unanswered"]) == (DURATION_S * HZ, 0)
+        assert (flight["answers"], flight["unanswered"]) == (flight["ticks_sent"], 0)
+        # Of a tick that a busy machine let the agent miss, its computer hears nothing.
+        assert flight["ticks_sent"] >= DURATION_S * HZ - document["timing"]["missed"]
         assert set(flight["interface"]["faults"].values()) == {0}
         device = document["devices"][f"{agent}/mcu"]
         assert (device["errors"], device["restarts"]) == (0, 0)
