@@ -21,6 +21,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -249,6 +250,8 @@ TRANSPORTS = {
 
 def bare_star(shape: Shape, seconds: float, transport: str = "udp") -> dict[str, float]:
     """Run one echo process and the pinging ones; return their figures."""
+    if transport == "zeromq" and find_spec("zmq") is None:
+        raise SystemExit("the star over ZeroMQ needs pyzmq: pip install pyzmq")
     way, packs = TRANSPORTS[transport], shape.packs()
     server = socket.socket(socket.AF_INET, way.kind)
     server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, shape.receive_buffer_bytes)
@@ -275,8 +278,9 @@ def bare_star(shape: Shape, seconds: float, transport: str = "udp") -> dict[str,
         ]
         time.sleep(max(0.0, pace.t0_s + seconds * 0.7 - time.monotonic()))
         pss = [pss_bytes(pid) for pid in children]
-        for pid in (*children, echo):
-            os.waitpid(pid, 0)
+        failed = [pid for pid in (*children, echo) if os.waitpid(pid, 0)[1] != 0]
+        if failed:
+            raise SystemExit(f"{len(failed)} processes of the star over {transport} failed")
         loaded = [np.load(Path(directory, f"{i}.npz")) for i in range(len(children))]
         return {
             **figures_of(
@@ -319,11 +323,13 @@ def fork(work: Callable[[], None]) -> int:
     pid = os.fork()
     if pid:
         return pid
+    code = 1
     try:
         take_fifo()
         work()
+        code = 0
     finally:
-        os._exit(0)
+        os._exit(code)
 
 
 def take_fifo() -> None:
