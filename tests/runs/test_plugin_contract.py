@@ -81,7 +81,7 @@ class A(AgentSimulation):
     def step(self, tick):
         if self.evil == "exit" and self.context.name == "agent-01" and tick.index == 3:
             os._exit(0)
-        if self.evil == "crash" and self.context.name == "agent-01" and tick.index == 3:
+        if self.evil == "crash" and self.context.name == "agent-01" and tick.index >= 3:
             os.kill(os.getpid(), signal.SIGSEGV)
         if self.evil == "text" and tick.index == 3:
             raise ValueError("\\udcff" + "x" * 100_000)
@@ -146,7 +146,9 @@ def test_an_agent_that_is_killed_in_a_call_is_told_with_the_call(tmp_path):
     result = run(tmp_path, "crash", "agents.per_process=2")
 
     assert result["exit_code"] == 1
-    assert "killed by SIGSEGV in the step of agent-01 at t = 0.15 s" in result["reason"]
+    # A busy machine may miss the tick at 0.15 s: then it is killed in the next.
+    told = r"killed by SIGSEGV in the step of agent-01 at t = 0\.\d+ s"
+    assert re.search(told, result["reason"])
 
 
 @pytest.mark.parametrize("mode", ["realtime", "lockstep"])
