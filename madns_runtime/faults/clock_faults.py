@@ -92,9 +92,7 @@ class FaultableClock(ClockEstimate):
 
     def to_host_s(self, local_s: float) -> float:
         """Return what is taken for the host's time, s."""
-        return super().to_host_s(
-            local_s + (self._error_s + (local_s - self._anchor_s) * self._rate)
-        )
+        return super().to_host_s(self.wrong_s(local_s))
 
     def to_local_s(self, host_s: float) -> float:
         """Return the real local time at which the host's clock is taken to show *host_s*."""

@@ -72,6 +72,8 @@ class FakeContext:
             self.deadlines.append((service, deadline_s))
 
     def open_stream(self, name, fields):
+        # An agent that rejoins opens its streams anew; the host's half lives as long as the run.
+        assert self.name != "host" or name not in self.streams, f"{name}: declared twice"
         self.streams[name] = tuple(fields)
 
     def record(self, stream, values):

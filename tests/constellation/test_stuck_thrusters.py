@@ -1,6 +1,7 @@
 """A thruster that is stuck open: truth moves, propellant drains, and flight software that notices it closes it off."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -155,6 +156,21 @@ def test_while_it_is_stuck_no_other_burn_is_taken_and_after_its_end_one_is(fly):
     assert refused.endswith("a change of velocity of 0 m/s closes it off")
     told = after.summaries()["agent-02"]["flight"]["told"]
     assert told[0].startswith("accepted")
+
+
+def test_one_may_stick_in_the_moment_in_which_another_is_mended(fly):
+    star = fly()
+    star.run(10.0)
+    first, second = action(), replace(action(agents=("agent-03",)), number=1, t_s=20.0)
+    star.host.begin_action(first)
+    star.run(20.0, from_s=10.0)
+
+    star.host.end_action(first)
+    star.host.begin_action(second)
+    star.run(30.0, from_s=20.0)
+    stuck = star.host.finish()["maneuvers"]["stuck_thrusters"]
+
+    assert [stuck[name][0]["ended"] for name in ("agent-02", "agent-03")] == ["mended", "open"]
 
 
 def test_a_thruster_without_thrust_needs_one_and_a_point_has_no_body_axes(fly):

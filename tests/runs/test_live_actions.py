@@ -1,11 +1,11 @@
 """Actions ordered while a run goes on, by the words of a timeline."""
 
 import json
-import time
 
 import pytest
 import yaml
 from harness.cosmos_command import CosmosCommand
+from harness.waiting import wait_until
 
 pytestmark = pytest.mark.process
 
@@ -39,10 +39,7 @@ def test_orders_are_taken_listed_refused_and_recorded_and_a_stop_completes_the_r
         return done.returncode, json.loads(done.stdout) if done.stdout else done.stderr
 
     with cosmos.start_run(path) as run:
-        deadline_s = time.monotonic() + PATIENCE_S
-        while not list(cosmos.runs.glob("*/.actions.sock")):
-            assert time.monotonic() < deadline_s
-            time.sleep(0.1)
+        wait_until(lambda: list(cosmos.runs.glob("*/.actions.sock")), "the run's door", process=run)
         assert inject("run", "annotate", "text=hello", "for_s=1e7")[0] == 0
         code, listed = inject("--list")
         refusals = [(inject(*arguments), words) for arguments, words in REFUSED]

@@ -79,7 +79,7 @@ class StuckBurns:
                 "the scenario's propagator starts from no other states than its own"
             )
         pushes = {vehicle: self._push(vehicle, given) for vehicle in vehicles}
-        if not self._by_failure and not self._ended:
+        if not self._burns and not self._ended:  # nothing has burnt yet, not even until just now
             self._context.open_stream(STREAM, STUCK_THRUSTERS)
         now_s = self._context.now_s()
         begins_s = now_s + self._lead_s
