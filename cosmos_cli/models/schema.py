@@ -20,7 +20,11 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 
 from cosmos_cli.models.parameters import adapter_of
 from cosmos_cli.models.scenario import Scenario
-from cosmos_cli.models.timeline_schema import entry_schema, timeline_inputs
+from cosmos_cli.models.timeline_schema import (
+    entry_schema,
+    own_entry_schema,
+    timeline_inputs,
+)
 from cosmos_cli.models.variables import VARIABLE
 from madns_runtime.plugin.api import Simulation
 
@@ -104,7 +108,7 @@ def scenario_schema(simulations: Mapping[str, Simulation]) -> dict[str, Any]:
             name,
             places[name, "validation"],
             definitions,
-            entry_schema(places, definitions, name, actions[name]),
+            own_entry_schema(places, definitions, name, actions[name]),
         )
         for name in actions
     ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from pydantic import TypeAdapter
@@ -14,6 +14,8 @@ from madns_runtime.timeline.action import ActionKind, NoParameters
 from madns_runtime.timeline.kinds import FRAMEWORK_ACTIONS
 
 ENTRY = "timeline"
+Places = Mapping[tuple[str, Any], Mapping[str, Any]]
+Definitions = dict[str, dict[str, Any]]
 Inputs = list[tuple[str, Any, TypeAdapter[Any]]]
 
 
@@ -31,45 +33,40 @@ def timeline_inputs(actions: Mapping[str, Iterable[ActionKind]]) -> Inputs:
     ]
 
 
-def entry_schema(
-    places: Mapping[tuple[str, Any], Mapping[str, Any]],
-    definitions: dict[str, dict[str, Any]],
-    owner: str = "",
-    actions: Iterable[ActionKind] = (),
-) -> dict[str, Any]:
+def entry_schema(places: Places, definitions: Definitions) -> dict[str, Any]:
     """
-    Return the schema of one entry.
+    Return the schema of an entry, with the framework's actions: of a simulation that nobody registered any word may be one.
 
     Args:
         places: Where pydantic put what `timeline_inputs` asked for.
         definitions: The schema's; those of parameters are taken, since theirs are not an entry's only keys.
-        owner: A simulation, whose words join the framework's; empty for these alone.
-        actions: Its own.
     """
-    kinds = tuple(actions) if owner else FRAMEWORK_ACTIONS
-    rules = [_rule(kind, places, definitions, owner) for kind in kinds]
-    words = [
-        {"const": kind.word, "description": kind.summary}
-        for kind in dict.fromkeys((*FRAMEWORK_ACTIONS, *kinds))
-    ]
-    if owner:
-        own = {
-            "properties": {"action": {"anyOf": [*words, {"type": "string", "pattern": VARIABLE}]}}
-        }
-        return {**own, "allOf": rules} if rules else own
     place = places[ENTRY, "validation"]
     entry = definitions[str(place["$ref"]).rpartition("/")[2]]
     entry.pop("additionalProperties", None)
-    # Of a simulation that nobody registered, any word may be one.
-    entry["properties"]["action"]["anyOf"] = [*words, {"type": "string"}]
+    entry["properties"]["action"]["anyOf"] = [*_words(FRAMEWORK_ACTIONS), {"type": "string"}]
+    rules = [_rule(kind, places, definitions) for kind in FRAMEWORK_ACTIONS]
     return {**place, "allOf": rules}
+
+
+def own_entry_schema(
+    places: Places, definitions: Definitions, owner: str, actions: Sequence[ActionKind]
+) -> dict[str, Any]:
+    """Return what holds of an entry besides where *owner* is the simulation: its actions join the framework's."""
+    known = [*_words(FRAMEWORK_ACTIONS), *_words(actions), {"type": "string", "pattern": VARIABLE}]
+    rules = [_rule(kind, places, definitions, owner) for kind in actions]
+    return {"properties": {"action": {"anyOf": known}}, **({"allOf": rules} if rules else {})}
+
+
+def _words(kinds: Iterable[ActionKind]) -> list[dict[str, Any]]:
+    return [{"const": kind.word, "description": kind.summary} for kind in kinds]
 
 
 def _rule(
     kind: ActionKind,
-    places: Mapping[tuple[str, Any], Mapping[str, Any]],
-    definitions: dict[str, dict[str, Any]],
-    owner: str,
+    places: Places,
+    definitions: Definitions,
+    owner: str = "",
 ) -> dict[str, Any]:
     """Return what stands beside the word of an action."""
     required = ["agents"] if kind.takes_agents else []
