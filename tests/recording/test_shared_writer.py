@@ -30,25 +30,25 @@ def written(directory):
 
 
 def writers():
-    return [thread for thread in threading.enumerate() if thread.name == "recorder"]
+    return {thread for thread in threading.enumerate() if thread.name == "recorder"}
 
 
 def test_all_recorders_of_a_process_share_a_thread(tmp_path):
-    before = len(writers())
+    earlier = writers()
     thread = WriterThread(Recording())
     recorders = [recorder_in(tmp_path / str(number), thread) for number in range(20)]
     for number, recorder in enumerate(recorders):
         recorder.start()
         recorder.record("numbers", (number,))
 
-    assert len(writers()) == before + 1
+    assert len(writers() - earlier) == 1
 
     for number, recorder in enumerate(recorders):
         counts = recorder.close()
         assert counts.streams["numbers"].written == 1
         assert written(tmp_path / str(number))[1] == [number]
         assert "end" in written(tmp_path / str(number))[-1]
-    wait_until(lambda: len(writers()) == before, "end of the thread")
+    wait_until(lambda: not writers() - earlier, "end of the thread")
 
 
 def test_who_goes_on_is_written_after_another_has_closed(tmp_path):
