@@ -334,10 +334,8 @@ def test_flight_computer_of_a_board_that_was_lost_is_started_anew_with_it(fleet:
     assert document["status"] == "complete"
     assert document["agents"]["incarnations"] == {"agent-01": 2, "agent-02": 2}
     assert "MACHINES FAILED: pi01: machine pi01 is lost" in fleet.verdict
-    lost = next(check for check in document["checks"] if check["name"] == "hardware.lost")
-    # Not an exact number: on a busy machine an emulator may also be silent for longer than it may.
-    assert lost["got"] >= 1
-    assert lost["worst"] == "agent-01/mcu"
+    # Not exactly once: on a busy machine an emulator may also be silent for longer than it may.
+    assert document["devices"]["agent-01/mcu"]["lost"] >= 1
     opened = fleet.directory.glob("devices/agent-01/mcu/events*.jsonl")
     assert [path.read_text().count('"event":"opened"') for path in opened] == [1, 1]
     assert_returned(fleet.directory, "agent-01")
