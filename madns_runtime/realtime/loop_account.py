@@ -20,6 +20,8 @@ STOLEN_INTERVAL_S = 0.02
 """The kernel counts what was stolen in steps of 10 ms, and is not asked more often, however many ticks are late."""
 WAITED_INTERVAL_S = 0.001
 """What the loop waited for a processor is counted in nanoseconds and read more quickly."""
+TOGETHER_S = 1e-6
+"""Deadlines of one pack differ by roundings."""
 NOBODY = -1
 """The agent of a span that is of none in particular."""
 
@@ -43,6 +45,38 @@ class LateTick(NamedTuple):
     started_s: float
     """When the agent began to run, s of the local clock."""
     period_s: float
+
+
+class _Steps(NamedTuple):
+    """An agent's steps within a window."""
+
+    within_s: float
+    """Of all together, what lies within it, s."""
+    longest_s: float
+    """The longest of them, whole, s."""
+
+    def cause_within(self, period_s: float) -> Cause:
+        """Return what an agent's own steps are as a cause: too long for its period, or late themselves."""
+        return Cause.TICK_BEFORE if self.longest_s < period_s else Cause.STEP
+
+
+NO_STEPS = _Steps(0.0, 0.0)
+
+
+class _Looked(NamedTuple):
+    """What was at work between a deadline, of one agent or of some that are due together, and a begin."""
+
+    due_s: float
+    began_s: float
+    filled_s: Mapping[Cause, float]
+    """How much of the window each cause filled, but for steps, s."""
+    steps: Mapping[int, _Steps]
+    """By agent."""
+
+    def steps_of(self, agent: int) -> tuple[_Steps, float]:
+        """Return an agent's own steps, and for how long those of others took, s."""
+        own = self.steps.get(agent, NO_STEPS)
+        return own, sum(each.within_s for each in self.steps.values()) - own.within_s
 
 
 class _Mark(NamedTuple):
@@ -82,6 +116,8 @@ class LoopAccount:
         self._collection_began_s = math.nan
         self._mark = _Mark.now(reactor)
         self._before = self._mark
+        self._looked: _Looked | None = None
+        """What the newest late tick of those begun together has met."""
         self._stolen = KernelCount(stolen_s, STOLEN_INTERVAL_S)
         self._waited = KernelCount(waited_s, WAITED_INTERVAL_S)
         gc.callbacks.append(self._collecting)
@@ -93,6 +129,7 @@ class LoopAccount:
     def begin_ticks(self, now_s: float) -> None:
         """Note how much of its time the loop has slept and computed until now, as ticks are begun."""
         self._before, self._mark = self._mark, _Mark(now_s, thread_time(), self._reactor.slept_s)
+        self._looked = None
 
     def look(self) -> None:
         """Read the kernel's counts, so that a late tick is charged with what it met alone: called now and then."""
@@ -100,14 +137,43 @@ class LoopAccount:
         self._waited.read()
 
     def explain(self, late: LateTick) -> Cause:
-        """Return the cause of a late tick, right after its step."""
-        explained_s = monotonic()
+        """
+        Return the cause of a late tick, right after its step.
+
+        Agents that tick together and were due together are late by the same: what the first of them met is
+        looked at once, and of each other only what came since. Looking is work of the loop too, and done for
+        each of them it would make the next ticks late.
+        """
+        looked = self._looked
+        if looked is None or abs(looked.due_s - late.due_s) > TOGETHER_S:
+            looked = self._looked = self._look_at(late)
+        filled_s = dict(looked.filled_s)
+        own, others = looked.steps_of(late.agent)
+        filled_s[own.cause_within(late.period_s)] = own.within_s
+        filled_s[Cause.OTHER_AGENT] = others + max(0.0, late.began_s - looked.began_s)
+        filled_s[Cause.START] = overlap_s(late.due_s, late.started_s, (late.due_s, late.began_s))
+        return name_cause(late.began_s - late.due_s, filled_s)
+
+    def _look_at(self, late: LateTick) -> _Looked:
+        """Return what was at work between a late tick's deadline and its begin."""
+        looking_s = monotonic()
         window = late.due_s, late.began_s
-        filled_s = self._spans_within(late)
-        filled_s[Cause.START] = overlap_s(late.due_s, late.started_s, window)
+        filled_s: dict[Cause, float] = {}
+        steps: dict[int, _Steps] = {}
+        for cause, agent, begin_s, end_s in reversed(self._spans):
+            if end_s < late.due_s:
+                break  # they end one after the other
+            within_s = overlap_s(begin_s, end_s, window)
+            if cause is Cause.STEP:
+                before = steps.get(agent, NO_STEPS)
+                steps[agent] = _Steps(
+                    before.within_s + within_s, max(before.longest_s, end_s - begin_s)
+                )
+            else:
+                filled_s[cause] = filled_s.get(cause, 0.0) + within_s
         overslept_s = overlap_s(*self._reactor.last_sleep, window)
         awake_s = late.began_s - late.due_s - overslept_s
-        kept_off_s = min(self._kept_off_s(explained_s - late.began_s), awake_s)
+        kept_off_s = min(self._kept_off_s(looking_s - late.began_s), awake_s)
         self.look()
         stolen_since_s = self._stolen.grown_since(self._before.at_s)
         waited_since_s = self._waited.grown_since(self._before.at_s)
@@ -116,24 +182,8 @@ class LoopAccount:
         if stolen_since_s > waited_since_s or math.isinf(waited_since_s):
             filled_s[Cause.STOLEN] = min(absent_s, stolen_since_s)
         filled_s[Cause.RECORDING] = min(absent_s, self._writer.computed_within_s(window))
-        cause = name_cause(late.began_s - late.due_s, filled_s)
-        self.add(Span(Cause.HOUSEKEEPING, late.agent, explained_s, monotonic()))
-        return cause
-
-    def _spans_within(self, late: LateTick) -> dict[Cause, float]:
-        """Return how long each cause was at work in a late tick's window, s."""
-        window = late.due_s, late.began_s
-        filled_s = dict.fromkeys(Cause, 0.0)
-        for cause, agent, begin_s, end_s in reversed(self._spans):
-            if end_s < late.due_s:
-                break  # they end one after the other
-            what = cause
-            if cause is Cause.STEP and agent != late.agent:
-                what = Cause.OTHER_AGENT
-            elif cause is Cause.STEP and end_s - begin_s < late.period_s:
-                what = Cause.TICK_BEFORE
-            filled_s[what] += overlap_s(begin_s, end_s, window)
-        return filled_s
+        self.add(Span(Cause.HOUSEKEEPING, NOBODY, looking_s, monotonic()))
+        return _Looked(late.due_s, late.began_s, filled_s, steps)
 
     def _kept_off_s(self, own_step_s: float) -> float:
         """

@@ -84,6 +84,40 @@ def test_what_nobody_timed_is_unexplained(loop):
     assert loop.account.explain(late) is Cause.UNEXPLAINED
 
 
+def test_agents_of_a_pack_are_looked_at_once_and_each_has_its_own_cause(loop, monkeypatch):
+    looks = []
+    monkeypatch.setattr(loop.account, "look", lambda: looks.append(1))
+    first = late_by(0.008)
+    loop.account.add(Span(Cause.STEP, OTHER, first.began_s - 0.009, first.began_s))
+    loop.account.begin_ticks(first.began_s)
+
+    causes = [loop.account.explain(first._replace(agent=agent)) for agent in (ME, OTHER, ME)]
+
+    assert causes == [Cause.OTHER_AGENT, Cause.TICK_BEFORE, Cause.OTHER_AGENT]
+    assert len(looks) == 1
+
+
+def test_what_a_pack_did_since_its_first_is_of_other_agents(loop):
+    first = late_by(0.001)
+    loop.reactor.last_sleep = (first.due_s - 0.001, first.began_s)
+    loop.account.begin_ticks(first.began_s)
+    after_a_step = first._replace(agent=OTHER, began_s=first.began_s + 0.005)
+
+    assert loop.account.explain(first) is Cause.WAKE_UP
+    assert loop.account.explain(after_a_step) is Cause.OTHER_AGENT
+
+
+def test_another_wake_up_is_looked_at_anew(loop):
+    late = late_by(0.008)
+    loop.account.begin_ticks(late.began_s)
+    assert loop.account.explain(late) is Cause.UNEXPLAINED
+
+    loop.account.add(Span(Cause.RECEIVING, NOBODY, late.due_s, late.began_s))
+    loop.account.begin_ticks(late.began_s)
+
+    assert loop.account.explain(late) is Cause.RECEIVING
+
+
 def test_collections_are_noted_until_the_account_is_closed():
     reactor = SimpleNamespace(slept_s=0.0, last_sleep=(-9.0, -9.0))
     account = LoopAccount(reactor, SimpleNamespace(), agents=1)
