@@ -8,7 +8,7 @@ from cosmos_cli.errors import Fault
 from cosmos_cli.models.agent_labels import AgentLabels
 from cosmos_cli.models.device_kinds import KindAnswer
 from cosmos_cli.models.document import Document, did_you_mean
-from cosmos_cli.models.plugin_answers import fault_found_at
+from cosmos_cli.models.fault_place import fault_found_at
 from cosmos_cli.models.scenario import Scenario
 from madns_runtime.hardware.contract import Channel
 from madns_runtime.hardware.units import unit_fault

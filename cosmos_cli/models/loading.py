@@ -17,12 +17,13 @@ from cosmos_cli.models.document import Document, read_document
 from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.expectation import Expectation, conditions_of_checks
 from cosmos_cli.models.extending import ScenarioSource, read_scenario_source
+from cosmos_cli.models.fault_place import fault_found_at
 from cosmos_cli.models.hardware import hardware_faults
 from cosmos_cli.models.known_streams import KnownStreams
 from cosmos_cli.models.overrides import apply_overrides
 from cosmos_cli.models.own_requirements import own_requirement_faults
 from cosmos_cli.models.place_uses import CURE, shared_places
-from cosmos_cli.models.plugin_answers import ask_plugin, fault_found_at
+from cosmos_cli.models.plugin_answers import ask_plugin
 from cosmos_cli.models.plugin_demand import ask_plugin_demand
 from cosmos_cli.models.scenario import OF_AUTHORS, Scenario, cross_faults
 from cosmos_cli.models.timeline import NO_TIMELINE, ResolvedTimeline, resolve_timeline

@@ -14,19 +14,21 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault, InputError
+from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
 from cosmos_cli.models.agent_rules import RULES, refused_parameters, rule_document, select_agents
 from cosmos_cli.models.document import Document
-from cosmos_cli.models.document import Path as ValuePath
-from cosmos_cli.models.overrides import parse_override
+from cosmos_cli.models.fault_place import fault_found_at
 from cosmos_cli.models.parameters import adapter_of
 from cosmos_cli.models.plugin_process import Tell, ask_apart
 from cosmos_cli.models.plugin_values import changed, is_same, not_sendable
-from cosmos_cli.models.separate_process import (
-    SeparateFailure,
+from cosmos_cli.models.separate_process import SeparateFailure
+from cosmos_cli.models.timeline_actions import (
+    FRAMEWORK_ONLY,
+    ActionAnswers,
+    WrittenAction,
+    ask_actions,
 )
-from cosmos_cli.models.timeline_actions import FRAMEWORK_ONLY, ActionAnswers, ask_actions
 from cosmos_cli.models.translate import faults_of
 from cosmos_cli.models.variables import judge_open_texts
 from madns_runtime.agent_parameters import AgentParameters
@@ -38,6 +40,7 @@ from madns_runtime.plugin.columns import unknown_columns
 from madns_runtime.plugin.isolation import said
 from madns_runtime.plugin.queries import (
     ask_check,
+    ask_check_actions,
     ask_device_uses,
     ask_labels,
     ask_place_uses,
@@ -161,7 +164,7 @@ class _Asking:
     def answers(self, spec: str, duration_s: float) -> PluginAnswers:
         """Return faults, parameters and whether there is a `demand`."""
         simulation = self._simulation(spec)
-        actions, faults = ask_actions(
+        actions, own_actions, faults = ask_actions(
             self._document, None if simulation is None else simulation.actions
         )
         self._faults += faults
@@ -183,6 +186,7 @@ class _Asking:
             found = replace(found, labels=self._labels(simulation, parameters, self._agents))
             rules = self._rules(simulation, self._agents, found, duration_s)
             found = with_rules(found, own, rules)
+            self._check_actions(simulation, parameters, own_actions, found.labels)
         return self._told(found)
 
     def _told(self, found: PluginAnswers) -> PluginAnswers:
@@ -306,6 +310,36 @@ class _Asking:
         else:
             self._faults += [fault_found_at(self._document, text) for text in texts]
 
+    def _check_actions(
+        self,
+        simulation: Simulation,
+        parameters: Any,
+        written: Sequence[WrittenAction],
+        labels: AgentLabels | None,
+    ) -> None:
+        """Ask the simulation what is wrong with its own actions of the timeline, among agents that are known."""
+        where = simulation.check_actions
+        if where is None or labels is None or self._agents is None or not written:
+            return
+        names = self._agents.resolved_names()
+        self._tell(f"check_actions() of {simulation.name}")
+        try:
+            texts = ask_check_actions(
+                where,
+                self._base_directory,
+                parameters=parameters,
+                actions=tuple(
+                    each.planned(tuple(labels.like_any(each.agents, names))) for each in written
+                ),
+                agents=names,
+            )
+        except PluginError as error:
+            self._blame(str(error))
+        else:
+            self._faults += [
+                fault_found_at(self._document, text, section="timeline") for text in texts
+            ]
+
     def _streams(
         self, simulation: Simulation, parameters: Any, agents: Agents
     ) -> tuple[DeclaredStream, ...] | None:
@@ -358,20 +392,6 @@ class _Asking:
 def _place(kind: type) -> str:
     """Return where a class of parameters stands, and its name: for a fault alone, as its file is read for it."""
     return f"{place_of(kind)}: {kind.__name__}"
-
-
-def fault_found_at(document: Document, text: str) -> Fault:
-    """Return a fault at the place of `dotted.name: what is wrong`; the name may leave out `parameters.`."""
-    name, colon, message = text.partition(":")
-    path: ValuePath = ("parameters",)
-    if not colon or " " in name:
-        return document.fault(path, text, at_key=True)
-    try:
-        steps = parse_override(f"{name}=")[1]
-    except InputError:
-        return document.fault(path, text, at_key=True)
-    path = steps if steps[:1] == path else path + steps
-    return document.fault(path, message.strip())
 
 
 def _is_lockstep(document: Document) -> bool:

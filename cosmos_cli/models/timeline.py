@@ -11,6 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from cosmos_cli.errors import Fault
 from cosmos_cli.models.agent_labels import AgentLabels
+from cosmos_cli.models.device_uses import named_agents
 from cosmos_cli.models.document import Document, did_you_mean, dotted
 from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.known_streams import KnownStreams
@@ -89,7 +90,8 @@ def resolve_timeline(
         if awaited is not None:
             entry = replace(entry, condition=len(conditions))
             conditions.append(awaited.condition(len(conditions), dotted(path)))
-        faults += [document.fault((*path, *p), t) for p, t in _parameter_faults(scenario, entry)]
+        device_faults = _device_faults(scenario, entry, rule.agents, labels)
+        faults += [document.fault((*path, *inner), text) for inner, text in device_faults]
         entries.append(entry)
         expected += count_expected(entry, scenario.time.duration_s)
     if expected > EXPECTED_SHARE * ACTIONS_MAX:
@@ -201,8 +203,10 @@ class _Placing:
         )
 
 
-def _parameter_faults(scenario: Scenario, entry: ScheduledEntry) -> Iterator[SectionFault]:
-    """Yield what does not fit between a device's fault and the run's devices."""
+def _device_faults(
+    scenario: Scenario, entry: ScheduledEntry, patterns: Sequence[str], labels: AgentLabels | None
+) -> Iterator[SectionFault]:
+    """Yield what does not fit between a device's fault and the devices of its agents."""
     if entry.action != DEVICE_FAULT.word:
         return
     fault, value = str(entry.parameters["fault"]), entry.parameters["value"]
@@ -215,6 +219,22 @@ def _parameter_faults(scenario: Scenario, entry: ScheduledEntry) -> Iterator[Sec
     if device not in names:
         hint = did_you_mean(device, names) if names else "; there is none under hardware"
         yield ("device",), f"no device {device!r} in this scenario{hint}"
+    elif labels is not None:
+        agents = scenario.agents.resolved_names()
+        users = labels.like_any(_patterns_of_users(scenario, device), agents)
+        for place, pattern in enumerate(patterns):
+            if not set(users).intersection(labels.like(pattern, agents)):
+                told = named_agents(users) or "no agent"
+                text = f"expected an agent that uses device {device} ({told}), got {pattern}"
+                yield ("agents", place), text
+
+
+def _patterns_of_users(scenario: Scenario, device: str) -> list[str]:
+    """Return names, labels and globs of the agents that may use a device."""
+    hardware = scenario.hardware
+    uses = [use.agents for use in hardware.use if device in use.devices]
+    own = [each.agents for each in hardware.devices if each.name == device]
+    return [pattern for patterns in (*uses, *own) for pattern in patterns]
 
 
 def device_names(scenario: Scenario) -> Sequence[str]:

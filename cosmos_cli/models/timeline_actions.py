@@ -20,7 +20,7 @@ from cosmos_cli.models.parameters import adapter_of
 from cosmos_cli.models.timeline_rules import ENTRIES_MAX, RULE_KEYS, parameters_in
 from cosmos_cli.models.translate import faults_of
 from madns_runtime.config import to_mapping
-from madns_runtime.timeline.action import ActionKind, Lasting
+from madns_runtime.timeline.action import ActionKind, Lasting, PlannedAction
 from madns_runtime.timeline.kinds import FRAMEWORK_ACTIONS, kinds_by_word
 
 
@@ -48,6 +48,27 @@ class ActionAnswers:
     """Of each entry, defaults filled in; None if they are faulty, or the action is not known."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WrittenAction:
+    """An entry of the simulation's own actions whose parameters are right."""
+
+    place: int
+    word: str
+    agents: tuple[str, ...]
+    """As they are written: names, labels and globs."""
+    parameters: Any
+    """An instance of its kind's class."""
+
+    def planned(self, agents: tuple[str, ...]) -> PlannedAction:
+        """Return it as the simulation is asked about it, with the agents that are meant."""
+        return PlannedAction(
+            place=f"timeline[{self.place}]",
+            word=self.word,
+            agents=agents,
+            parameters=self.parameters,
+        )
+
+
 FRAMEWORK_ONLY = ActionAnswers(known=(), is_complete=False)
 
 
@@ -65,9 +86,9 @@ def known_action(kind: ActionKind) -> KnownAction:
 
 def ask_actions(
     document: Document, declared: Sequence[ActionKind] | None
-) -> tuple[ActionAnswers, list[Fault]]:
+) -> tuple[ActionAnswers, tuple[WrittenAction, ...], list[Fault]]:
     """
-    Validate the parameters of a timeline's entries, and return the faults with what is known.
+    Validate the parameters of a timeline's entries; return what is known, the simulation's own entries, and the faults.
 
     Args:
         document: The scenario.
@@ -76,22 +97,28 @@ def ask_actions(
     kinds = kinds_by_word(declared or ())
     faults: list[Fault] = []
     parameters = []
+    own: list[WrittenAction] = []
     for place, entry in entries_of(document):
         kind = None if entry is None else kinds.get(str(entry.get("action")))
-        found: dict[str, Any] | list[Fault] | None = None
+        made: Any = None
         if entry is not None and kind is not None:
-            found = _validated(document, place, parameters_in(entry), kind)
-        if isinstance(found, list):
-            faults += found
-            found = None
-        parameters.append(found)
+            made = _validated(document, place, parameters_in(entry), kind)
+            if isinstance(made, list):
+                faults += made
+                made = None
+            elif kind not in FRAMEWORK_ACTIONS:
+                agents = _texts(entry.get("agents"))
+                own.append(
+                    WrittenAction(place=place, word=kind.word, agents=agents, parameters=made)
+                )
+        parameters.append(None if made is None else to_mapping(made))
     known = [*FRAMEWORK_ACTIONS, *(declared or ())]
     answers = ActionAnswers(
         known=tuple(map(known_action, known)),
         is_complete=declared is not None,
         parameters=tuple(parameters),
     )
-    return answers, faults
+    return answers, tuple(own), faults
 
 
 def entries_of(document: Document) -> Iterator[tuple[int, Mapping[str, Any] | None]]:
@@ -102,10 +129,8 @@ def entries_of(document: Document) -> Iterator[tuple[int, Mapping[str, Any] | No
             yield place, entry if isinstance(entry, dict) else None
 
 
-def _validated(
-    document: Document, place: int, given: Mapping[str, Any], kind: ActionKind
-) -> dict[str, Any] | list[Fault]:
-    """Return an action's parameters, or the faults of what is given."""
+def _validated(document: Document, place: int, given: Mapping[str, Any], kind: ActionKind) -> Any:
+    """Return an instance of an action's parameters, or a list of the faults of what is given."""
     own = [field.name for field in dataclasses.fields(kind.parameters)]
     unknown = [key for key in given if key not in own]
     faults = [
@@ -122,4 +147,8 @@ def _validated(
     except ValidationError as error:
         errors = error.errors(include_url=False)
         faults += faults_of(document, errors, kind.parameters, below=("timeline", place))
-    return faults or to_mapping(made)
+    return faults or made
+
+
+def _texts(given: Any) -> tuple[str, ...]:
+    return tuple(each for each in given if isinstance(each, str)) if isinstance(given, list) else ()

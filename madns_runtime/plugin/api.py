@@ -29,7 +29,7 @@ from madns_runtime.plugin.returned_values import (
 )
 from madns_runtime.protocol.messages import Delivery, Service, Transmission, TransmissionRefusal
 from madns_runtime.recording.records import Field
-from madns_runtime.timeline.action import ActionKind, ActionRefused, TimelineAction
+from madns_runtime.timeline.action import ActionKind, ActionRefused, PlannedAction, TimelineAction
 
 if TYPE_CHECKING:
     import numpy as np  # 0.2 s of import time that `cosmos validate` has no use for
@@ -48,6 +48,7 @@ __all__ = [
     "DeviceStatus",
     "DeviceUse",
     "PlaceUse",
+    "PlannedAction",
     "DeviceView",
     "Demand",
     "Field",
@@ -347,6 +348,9 @@ class Simulation:
     such as a missing file, each starting with the dotted parameter name and a colon. A fourth parameter
     called names is given the agents' names, a fifth called duration_s the run's simulated duration,
     a sixth called is_lockstep whether simulated time waits for everybody, a seventh called tick_hz the ticks' rate."""
+    check_actions: str | None = None
+    """module:function of (parameters, actions: tuple[PlannedAction, ...], agents: tuple[str, ...], base_directory: Path)
+    -> list[str]: faults in a timeline's entries of its own `actions`, each starting with place and parameter and a colon."""
     streams: str | None = None
     """module:function of (parameters, agents: tuple[str, ...]) -> sequence of `DeclaredStream`: all that either
     half may open. What a run recorded otherwise is a remark in its run.json; None if nothing is declared."""

@@ -15,7 +15,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from madns_runtime.errors import PluginError
-from madns_runtime.plugin.api import DeclaredStream, Demand, DeviceUse, Flow, PlaceUse, Rerun
+from madns_runtime.plugin.api import (
+    DeclaredStream,
+    Demand,
+    DeviceUse,
+    Flow,
+    PlaceUse,
+    PlannedAction,
+    Rerun,
+)
 from madns_runtime.plugin.code_places import place_of
 from madns_runtime.plugin.isolation import call_plugin
 from madns_runtime.plugin.registry import load_function
@@ -66,10 +74,40 @@ def ask_check(  # noqa: PLR0913 - what a scenario is; all but two by name
     arguments = [parameters, agents, base_directory]
     more = dict(zip(CHECK_MORE, (names, duration_s, is_lockstep, tick_hz), strict=True))
     arguments += [value for _, value in zip(_more_taken(function), more.values(), strict=False)]
-    found = call_plugin("check", function, *arguments, finish=_unfolded)
+    return _asked_texts("check", function, arguments)
+
+
+def ask_check_actions(
+    where: str,
+    base_directory: Path,
+    *,
+    parameters: Any,
+    actions: tuple[PlannedAction, ...],
+    agents: tuple[str, ...],
+) -> list[str]:
+    """
+    Return the faults that a simulation's `check_actions` finds in a timeline.
+
+    Args:
+        where: module:function.
+        base_directory: Folder of the scenario.
+        parameters: An instance of the simulation's parameters.
+        actions: Entries of the timeline whose words the simulation declares.
+        agents: Names of all agents.
+
+    Raises:
+        PluginError: It cannot be found, raised, or did not return a list of texts.
+        MissingExtraError: It needs an optional dependency that is not installed.
+    """
+    function = load_function(where, base_directory)
+    return _asked_texts("check_actions", function, [parameters, actions, agents, base_directory])
+
+
+def _asked_texts(name: str, function: Callable[..., Any], arguments: list[Any]) -> list[str]:
+    found = call_plugin(name, function, *arguments, finish=_unfolded)
     if not isinstance(found, list) or not all(isinstance(text, str) for text in found):
         raise PluginError(
-            f"{place_of(function)}: check() must return a list of texts, empty if nothing is wrong;"
+            f"{place_of(function)}: {name}() must return a list of texts, empty if nothing is wrong;"
             f" got {_shown(found)}"
         )
     return found

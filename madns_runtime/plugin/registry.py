@@ -49,6 +49,7 @@ PARTS = (
     "host",
     "demand",
     "check",
+    "check_actions",
     "streams",
     "labels",
     "device_uses",

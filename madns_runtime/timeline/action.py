@@ -60,6 +60,19 @@ class TimelineAction:
     """How long it lasts, s; None for one that has no end, or none before the run's."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedAction:
+    """An entry of a scenario's timeline before the run, for a simulation that is asked what is wrong with it."""
+
+    place: str
+    """Where it stands, such as timeline[3]."""
+    word: str
+    agents: tuple[str, ...]
+    """Names of the agents that it acts on, in order."""
+    parameters: Any
+    """An instance of its kind's class."""
+
+
 class ActionRefused(MadnsError):
     """An action cannot take place now; the text says why. The run goes on, and records it."""
 

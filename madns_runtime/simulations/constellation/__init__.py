@@ -23,6 +23,7 @@ simulation = Simulation(
     agent=f"{_HERE}.agent:ConstellationAgent",
     demand=f"{_HERE}.demand:estimate_demand",
     check=f"{_HERE}.check:find_faults",
+    check_actions=f"{_HERE}.check_actions:find_action_faults",
     streams=f"{_HERE}.streams:declared_streams",
     labels=f"{_HERE}.check:name_satellites",
     device_uses=f"{_HERE}.check:device_uses",

@@ -14,7 +14,10 @@ name: broken
 simulation: counter
 agents: {{count: 4, tick_hz: 10}}
 time: {{mode: {mode}, duration_s: 100}}
-hardware: {{devices: [{{name: gps, kind: synthetic, parameters: {{channels: [{{name: u}}]}}}}]}}
+hardware:
+  devices:
+    - {{name: gps, kind: synthetic, parameters: {{channels: [{{name: u}}]}}}}
+    - {{name: imu, kind: synthetic, agents: [agent-02, agent-03], parameters: {{channels: [{{name: w}}]}}}}
 timeline:
 """
 DEVICE = 'at_s: 1, action: device_fault, agents: ["*"], '
@@ -120,6 +123,11 @@ BROKEN = [
         "no agent is named sat-*",
     ),
     (
+        "{at_s: 1, action: device_fault, agents: [agent-02, agent-01], device: imu, fault: freeze}",
+        "timeline[0].agents[1]",
+        "expected an agent that uses device imu (agent-02, agent-03), got agent-01",
+    ),
+    (
         '{at_s: 1, action: stress, agents: ["*"], for_s: 3}',
         "timeline[0].action",
         "time.mode realtime alone",
@@ -160,7 +168,7 @@ def test_all_entries_are_told_of_at_once(tmp_path: Path) -> None:
     with pytest.raises(InputError) as refused:
         load(tmp_path, "{at_s: 1, action: anotate}", "{at_s: 1}", "4")
 
-    assert [fault.line for fault in refused.value.faults] == [7, 8, 9]
+    assert [fault.line for fault in refused.value.faults] == [10, 11, 12]
 
 
 def test_stress_needs_to_be_told_how_long(tmp_path: Path) -> None:
