@@ -60,6 +60,7 @@ def judge(
     console = Console(json=as_json, quiet=quiet)
     found = find_run(runs_root(folder), run)
     document = _collected(found)
+    tables = open_tables(found.tables)
     if scenario is None:
         expectations = planned_expectations(found.read_json(found.plan_json))
         if not expectations:
@@ -68,8 +69,8 @@ def judge(
             )
     else:
         file = load_scenario(scenario, warn=console.warn)
-        expectations = expectations_for(found, file)
-    judged = judge_run(found, open_tables(found.tables), expectations)
+        expectations = expectations_for(found, file, tables)
+    judged = judge_run(found, tables, expectations)
     missing = (*_missing(document), *judged.gaps())
     code, text = conclusion_of_expectations(judged.results, missing)
     console.print_json(_told(found, judged, code, text, missing))

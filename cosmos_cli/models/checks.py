@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
 from cosmos_cli.models.check_rules import OF_TIMES, CheckRule
+from cosmos_cli.models.device_uses import named_agents
 from cosmos_cli.models.document import did_you_mean
-from cosmos_cli.models.expectation import Expectation, HeldBounds
+from cosmos_cli.models.expectation import Expectation, HeldBounds, owner_of
 from cosmos_cli.models.known_streams import REAL_TIME_ONLY, KnownStreams
 from cosmos_cli.models.plugin_answers import PluginAnswers
 from cosmos_cli.models.scenario import Scenario
@@ -61,7 +62,7 @@ def resolve_checks(rules: Sequence[CheckRule], around: Surroundings) -> Resolved
 
 
 def scenario_checks(
-    scenario: Scenario, answers: PluginAnswers, broken: frozenset[str]
+    scenario: Scenario, answers: PluginAnswers, streams: KnownStreams, broken: frozenset[str]
 ) -> ResolvedChecks:
     """
     Return what the checks of a scenario expect; nothing while it is open what they are about.
@@ -69,6 +70,7 @@ def scenario_checks(
     Args:
         scenario: The scenario.
         answers: Of its simulation.
+        streams: That it, its devices and the framework record.
         broken: Keys with faults of their own.
     """
     agents = scenario.agents.resolved_names()
@@ -78,7 +80,7 @@ def scenario_checks(
     around = Surroundings(
         agents=agents,
         labels=answers.labels or NO_LABELS,
-        streams=KnownStreams(answers.streams),
+        streams=streams,
         duration_s=scenario.time.duration_s,
     )
     return resolve_checks(scenario.checks, around)
@@ -110,6 +112,7 @@ class _Placing:
         self._stream = rule.stream or EVENTS.name
         self._field = rule.field or (EVENT_FIELD if rule.event is not None else "")
         self._roles = around.streams.roles(self._stream)
+        self._is_apart = around.streams.is_apart(self._stream)
 
     def faults(self) -> Iterator[RuleFault]:
         rule, streams = self._rule, self._around.streams
@@ -117,7 +120,7 @@ class _Placing:
         if fault := streams.stream_fault(self._stream):
             yield ("stream",), fault
             return
-        yield from self._agent_faults()
+        yield from self._apart_faults() if self._is_apart else self._agent_faults()
         if not streams.has_time(self._stream):
             yield from self._timeless_faults()
         if self._field and (fault := streams.field_fault(self._stream, self._field)):
@@ -158,6 +161,37 @@ class _Placing:
                 text = f"stream {self._stream} is recorded by the host's half and names no agent"
                 yield path, f"{text}: leave out agents"
 
+    def _apart_faults(self) -> Iterator[RuleFault]:
+        """Yield what is wrong with whose records of machines or devices are meant."""
+        stream, around = self._stream, self._around
+        sources = around.streams.sources(stream)
+        for place, pattern in enumerate(self._rule.agents):
+            path = ("agents", place)
+            if self._roles == {"machine"}:
+                if pattern != HOST:
+                    text = (
+                        f"stream {stream} is recorded per machine: leave out agents for all of them"
+                    )
+                    yield path, f"{text}, or write [host] for the host's computer alone"
+            elif sources is None:
+                text = (
+                    f"stream {stream} is of a device of an inventory, in which its machines stand"
+                )
+                yield path, f"{text}: leave out agents"
+            elif not around.labels.like(pattern, around.agents):
+                yield path, f"no agent is named {pattern}{did_you_mean(pattern, around.agents)}"
+            elif not self._devices([pattern]):
+                yield path, f"{pattern} does not use what records {stream}: {named_agents(sources)}"
+        if self._rule.stop_when_broken:
+            yield ("stop_when_broken",), around.streams.apart_fault(stream) or ""
+
+    def _devices(self, patterns: Sequence[str]) -> tuple[str, ...]:
+        """Return the full names of the devices of some agents that record the stream."""
+        around = self._around
+        agents = set(around.labels.like_any(patterns, around.agents))
+        sources = around.streams.sources(self._stream) or ()
+        return tuple(name for name in sources if owner_of(name) in agents)
+
     def _value_faults(self, field: Field | None) -> Iterator[RuleFault]:
         rule = self._rule
         if rule.event is not None:
@@ -186,10 +220,28 @@ class _Placing:
             yield ("stream",), fault
         elif fault := streams.field_fault(stream, name):
             yield ("field",), fault
+        elif not streams.has_time(stream):
+            text = f"records of stream {stream} tell no simulated time: name another"
+            yield ("stream",), text
+        elif fault := self._unlike_fault(stream):
+            yield ("stream",), fault
         else:
             field = streams.field(stream, name)
             yield from kind_faults(rule, field)
             yield from unit_faults(rule.unit, field)
+
+    def _unlike_fault(self, held: str) -> str | None:
+        """Return why it is not known whose records of the stream under `while` go with those that are judged."""
+        streams = self._around.streams
+        if streams.roles(held) == {"host"} and not streams.names_agents(held):
+            return None
+        if held == self._stream:
+            return None
+        for stream in (held, self._stream):
+            if streams.is_apart(stream) and streams.sources(stream) is None:
+                text = f"stream {stream} is of a device of an inventory, whose agents are not known here"
+                return f"{text}: give while a stream that the host's half records"
+        return None
 
     def expectation(self) -> Expectation:
         rule, around = self._rule, self._around
@@ -231,6 +283,10 @@ class _Placing:
 
     def _agents(self, *, is_of_host: bool) -> tuple[str, ...]:
         rule, around = self._rule, self._around
+        if self._is_apart:
+            if not rule.agents:
+                return around.streams.sources(self._stream) or ()
+            return (HOST,) if HOST in rule.agents else self._devices(rule.agents)
         if not rule.agents:
             return around.agents if is_of_host or "agent" in self._roles else (HOST,)
         chosen = around.labels.like_any(

@@ -32,7 +32,8 @@ class Expectation:
     field: str = ""
     """Empty for a count of records."""
     agents: tuple[str, ...]
-    """Names; host for the records of the host's half."""
+    """Names; host for the records of the host's half; of a device's stream full names of devices, such as agent-02/imu.
+    Empty: of all machines or devices that recorded it."""
     is_of_host: bool = False
     """Whether the host's half records it of agents, which its field `agent` names."""
     statistic: str = "each"
@@ -109,6 +110,11 @@ def _broken_bounds(expectation: Expectation) -> tuple[ValueBounds, int]:
     elif expectation.statistic == "min":
         bounds = replace(bounds, high=None)
     return scaled(bounds, factor).negated(), 1
+
+
+def owner_of(name: str) -> str:
+    """Return the agent, or the machine, of a device's full name; of any other name itself."""
+    return name.partition("/")[0]
 
 
 def scaled(bounds: ValueBounds, factor: float) -> ValueBounds:

@@ -11,6 +11,7 @@ from cosmos_cli.models.device_kinds import DeviceQuestion, KindAnswer, ask_kinds
 from cosmos_cli.models.device_uses import use_faults
 from cosmos_cli.models.document import Document, did_you_mean
 from cosmos_cli.models.document import Path as ValuePath
+from cosmos_cli.models.known_streams import KnownDevice, channel_fields
 from cosmos_cli.models.scenario import Scenario, SectionFault
 from madns_runtime.config import ScenarioDevice
 from madns_runtime.plugin.api import DeviceUse
@@ -28,9 +29,9 @@ def hardware_faults(
     *,
     labels: AgentLabels | None,
     uses: Sequence[DeviceUse] = (),
-) -> list[Fault]:
+) -> tuple[list[Fault], tuple[KnownDevice, ...]]:
     """
-    Return what is wrong with a scenario's section `hardware`.
+    Return what is wrong with a scenario's section `hardware`, and the devices whose streams rules may name.
 
     Args:
         document: The scenario's.
@@ -65,7 +66,26 @@ def hardware_faults(
     if labels is not None:
         found += _agents(scenario, labels)
         faults += use_faults(document, scenario, labels, answers, uses)
-    return faults + [document.fault(path, text) for path, text in found]
+    faults += [document.fault(path, text) for path, text in found]
+    return faults, _known_devices(scenario, labels, answers)
+
+
+def _known_devices(
+    scenario: Scenario, labels: AgentLabels | None, answers: Sequence[KindAnswer]
+) -> tuple[KnownDevice, ...]:
+    names = scenario.agents.resolved_names()
+    own = [
+        KnownDevice(
+            name=device.name,
+            sources=None
+            if labels is None
+            else tuple(f"{agent}/{device.name}" for agent in labels.like_any(device.agents, names)),
+            streams=channel_fields(answer.channels) if answer.channels else None,
+        )
+        for device, answer in zip(scenario.hardware.devices, answers, strict=True)
+    ]
+    listed = dict.fromkeys(name for use in scenario.hardware.use for name in use.devices)
+    return (*own, *(KnownDevice(name=name, sources=None, streams=None) for name in listed))
 
 
 def device_faults(

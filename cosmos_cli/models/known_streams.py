@@ -1,55 +1,137 @@
-"""Streams that a scenario's rules may name: those that its simulation declares, and the framework's own. Pure."""
+"""Streams that a scenario's rules may name: its simulation's, its devices' and the framework's own. Pure."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 from cosmos_cli.models.document import did_you_mean
 from madns_runtime.conditions.condition import AGENT, TICK, TIME
+from madns_runtime.hardware.contract import Channel
+from madns_runtime.hardware.records import DEVICE_CLOCK, DEVICE_STATE, schema_of
 from madns_runtime.plugin.api import DeclaredStream
-from madns_runtime.recording.records import CLOCK, EVENTS, LATE_TICKS, PROCESS, TICKS, Field
-
-REAL_TIME_ONLY = tuple(schema.name for schema in (TICKS, LATE_TICKS, CLOCK, PROCESS))
-"""Framework streams that no run in lockstep records: no time passes there that could be late."""
-FRAMEWORK = tuple(
-    DeclaredStream(role="agent", name=schema.name, fields=schema.fields)
-    for schema in (TICKS, LATE_TICKS, CLOCK, PROCESS)
-) + tuple(
-    DeclaredStream(role=role, name=EVENTS.name, fields=EVENTS.fields, is_open=True)
-    for role in ("agent", "host")
+from madns_runtime.recording.records import (
+    CLOCK,
+    EVENTS,
+    HEALTH,
+    LATE_TICKS,
+    LOG,
+    PROCESS,
+    TICKS,
+    Field,
 )
+
+REAL_TIME_ONLY = tuple(schema.name for schema in (TICKS, LATE_TICKS, CLOCK, PROCESS, HEALTH))
+"""Framework streams that no run in lockstep records: no time passes there that could be late."""
 NOT_A_VALUE = ("json", "packed")
+Role = Literal["agent", "host", "machine", "device"]
+APART: tuple[Role, ...] = ("machine", "device")
+"""Who records in a process of its own, which no condition is evaluated in."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KnownStream:
+    """A stream, and who records it."""
+
+    role: Role
+    name: str
+    fields: tuple[Field, ...]
+    is_open: bool = False
+    """Whether further fields may follow these, known only in the run."""
+    sources: tuple[str, ...] | None = None
+    """Full names of the devices that record it; None if they are not known, or it is of no device."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KnownDevice:
+    """A device of some agents, or of machines."""
+
+    name: str
+    """By which agents know it, such as imu."""
+    sources: tuple[str, ...] | None
+    """Full names of all of this name, such as agent-02/imu; None for one of an inventory, whose machines are not known."""
+    streams: Mapping[str, tuple[Field, ...]] | None
+    """Fields by channel; None if its channels are not known."""
+
+    def known_streams(self) -> list[KnownStream]:
+        """Return all that it records: its channels, and its own state."""
+        own = {schema.name: schema.fields for schema in (DEVICE_STATE, DEVICE_CLOCK, EVENTS, LOG)}
+        return [
+            KnownStream(
+                role="device",
+                name=f"{self.name}.{name}",
+                fields=fields,
+                is_open=name == EVENTS.name,
+                sources=self.sources,
+            )
+            for name, fields in {**(self.streams or {}), **own}.items()
+        ]
+
+
+FRAMEWORK = (
+    *(
+        KnownStream(role="agent", name=schema.name, fields=schema.fields)
+        for schema in (TICKS, LATE_TICKS, CLOCK, PROCESS)
+    ),
+    *(
+        KnownStream(role=role, name=schema.name, fields=schema.fields, is_open=schema is EVENTS)
+        for schema in (EVENTS, LOG)
+        for role in ("agent", "host")
+    ),
+    KnownStream(role="machine", name=HEALTH.name, fields=HEALTH.fields),
+)
+
+
+def channel_fields(channels: Iterable[Channel]) -> dict[str, tuple[Field, ...]]:
+    """Return the fields of what a device records of its channels, by channel."""
+    return {channel.name: schema_of(channel).fields for channel in channels}
+
+
 class KnownStreams:
     """
     Streams by name and who records them.
 
     Args:
         declared: By the simulation; None if it declares none, and then any other name may be one.
+        devices: That agents use.
     """
 
-    declared: tuple[DeclaredStream, ...] | None
+    def __init__(
+        self, declared: Sequence[DeclaredStream] | None, devices: Sequence[KnownDevice] = ()
+    ) -> None:
+        self._is_declared = declared is not None
+        self._channels_open = {each.name for each in devices if each.streams is None}
+        self._streams: dict[str, list[KnownStream]] = {}
+        own = [
+            KnownStream(role=each.role, name=each.name, fields=each.fields, is_open=each.is_open)
+            for each in declared or ()
+        ]
+        of_devices = [stream for device in devices for stream in device.known_streams()]
+        for stream in (*FRAMEWORK, *own, *of_devices):
+            self._streams.setdefault(stream.name, []).append(stream)
+        self._devices = {each.name for each in devices}
 
-    @property
-    def is_complete(self) -> bool:
-        """Whether every stream is known."""
-        return self.declared is not None
-
-    def of(self, name: str) -> list[DeclaredStream]:
-        """Return the streams of a name: of the agents, of the host's half, or one of each."""
-        return [each for each in (*FRAMEWORK, *(self.declared or ())) if each.name == name]
-
-    def names(self) -> list[str]:
-        """Return all names."""
-        return list(dict.fromkeys(each.name for each in (*FRAMEWORK, *(self.declared or ()))))
+    def of(self, name: str) -> list[KnownStream]:
+        """Return the streams of a name: of the agents, of the host's half, or one of each; or of machines or devices."""
+        found = self._streams.get(name)
+        if found is None and self._device_of(name) in self._channels_open:
+            return [KnownStream(role="device", name=name, fields=(), is_open=True)]
+        return found or []
 
     def stream_fault(self, name: str) -> str | None:
         """Return what is wrong with a stream's name; None if it may be one."""
-        if self.of(name) or not self.is_complete:
+        is_of_device = self._device_of(name) in self._devices
+        if self.of(name) or not (self._is_declared or is_of_device):
             return None
-        return f"no stream {name!r} is recorded{did_you_mean(name, self.names())}"
+        if name in self._devices:
+            known = [each for each in self._streams if self._device_of(each) == name]
+            told = ", ".join(known) or f"{name}.CHANNEL"
+            return f"{name} is a device: expected a channel of it, such as {told}"
+        return f"no stream {name!r} is recorded{did_you_mean(name, list(self._streams))}"
+
+    def _device_of(self, stream: str) -> str:
+        return stream.rpartition(".")[0]
 
     def field_fault(self, stream: str, name: str) -> str | None:
         """Return what is wrong with a field's name; None if the stream has, or may have, a value of that name."""
@@ -72,6 +154,7 @@ class KnownStreams:
     def has_time(self, stream: str) -> bool:
         """Tell whether records of a stream tell when they are of: t_s, a tick of an agent, or else a field in s."""
         found = self.of(stream)
+        timed = [each for each in found if each.role != "machine"]  # health has clocks of its own
         return not found or any(
             each.is_open
             or any(
@@ -80,12 +163,33 @@ class KnownStreams:
                 or (field.unit == "s" and field.kind == "float")
                 for field in each.fields
             )
-            for each in found
+            for each in timed
         )
 
     def roles(self, stream: str) -> set[str]:
         """Return who records a stream: agent, host or both; of one that is not known, agents."""
         return {each.role for each in self.of(stream)} or {"agent"}
+
+    def is_apart(self, stream: str) -> bool:
+        """Tell whether a stream is recorded in processes of machines or devices alone."""
+        return self.roles(stream) <= set(APART)
+
+    def apart_fault(self, stream: str) -> str | None:
+        """Return why nothing can wait for a value of a stream in the run; None if it can."""
+        if not self.is_apart(stream):
+            return None
+        whose = "a machine" if self.roles(stream) == {"machine"} else "a device"
+        return (
+            f"stream {stream} is recorded by {whose} and not by agents, so nothing acts on it in the run:"
+            " name a stream of the simulation that has the value"
+        )
+
+    def sources(self, stream: str) -> tuple[str, ...] | None:
+        """Return the full names of the devices that record a stream; None if they are not known."""
+        found = [each.sources for each in self.of(stream) if each.role == "device"]
+        if not found or any(each is None for each in found):
+            return None
+        return tuple(dict.fromkeys(name for each in found for name in each or ()))
 
     def names_agents(self, stream: str) -> bool:
         """Tell whether a stream of the host's half says in each record which agent it is about."""

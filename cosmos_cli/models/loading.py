@@ -19,7 +19,7 @@ from cosmos_cli.models.expectation import Expectation, conditions_of_checks
 from cosmos_cli.models.extending import ScenarioSource, read_scenario_source
 from cosmos_cli.models.fault_place import fault_found_at
 from cosmos_cli.models.hardware import hardware_faults
-from cosmos_cli.models.known_streams import KnownStreams
+from cosmos_cli.models.known_streams import KnownDevice, KnownStreams
 from cosmos_cli.models.overrides import apply_overrides
 from cosmos_cli.models.own_requirements import own_requirement_faults
 from cosmos_cli.models.place_uses import CURE, shared_places
@@ -211,10 +211,12 @@ def _check(
     ]
     answers = ask_plugin(document, agents, base_directory, duration_s=duration_s)
     faults += answers.faults
+    devices: tuple[KnownDevice, ...] = ()
     if not broken:
-        faults += hardware_faults(
+        device_faults, devices = hardware_faults(
             document, scenario, base_directory, labels=answers.labels, uses=answers.device_uses
         )
+        faults += device_faults
         if scenario.time.is_lockstep:  # all on this computer
             names = scenario.agents.resolved_names()
             faults += [
@@ -225,13 +227,12 @@ def _check(
         document.fault(where, text)
         for where, text in cross_faults(scenario, skip=broken, labels=answers.labels)
     ]
+    streams = KnownStreams(answers.streams, devices)
     timeline = NO_TIMELINE
     if not broken - {"timeline"}:
-        timeline = resolve_timeline(
-            document, scenario, answers.actions, answers.labels, KnownStreams(answers.streams)
-        )
+        timeline = resolve_timeline(document, scenario, answers.actions, answers.labels, streams)
     faults += timeline.faults
-    checks = scenario_checks(scenario, answers, broken)
+    checks = scenario_checks(scenario, answers, streams, broken)
     faults += [document.fault(("checks", *where), text) for where, text in checks.faults]
     if broken or answers.parameters is None or faults:
         told = _told_once(faults, document)

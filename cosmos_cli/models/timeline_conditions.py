@@ -32,6 +32,9 @@ class AwaitedCondition:
         if fault := streams.stream_fault(rule.stream):
             yield ("stream",), fault
             return
+        if fault := streams.apart_fault(rule.stream):
+            yield ("stream",), fault
+            return
         if self.is_lockstep and rule.stream in REAL_TIME_ONLY:
             yield ("stream",), f"stream {rule.stream} is not recorded in time.mode lockstep"
         yield from self._agent_faults()

@@ -75,7 +75,9 @@ def _figures(
 
 def _table(expectation: Expectation, recorded: RecordedRun) -> RecordedTable | None:
     is_host = expectation.is_of_host or expectation.agents == (HOST,)
-    return recorded.tables.get(f"{HOST}_{expectation.stream}" if is_host else expectation.stream)
+    before = (f"{HOST}_",) if is_host else ("", "machine_", "device_")
+    found = (recorded.tables.get(f"{each}{expectation.stream}") for each in before)
+    return next((table for table in found if table is not None), None)
 
 
 def _figure(
@@ -87,7 +89,8 @@ def _figure(
 ) -> list[Block]:
     series, x = recorded.series(table, field.name)
     worst = str(result.get(AGENT))
-    named = [worst, *(name for name in expectation.agents if name != worst)][:AGENTS_DRAWN_MAX]
+    names = expectation.agents or table.sources
+    named = [worst, *(name for name in names if name != worst)][:AGENTS_DRAWN_MAX]
     return grouped_lines(
         {name: series[name] for name in named if name in series},
         title=f"{expectation.name}: {expectation.words}",

@@ -16,6 +16,10 @@ on_agent_loss: abort
 """
 STOPS = "{name: few, stream: round_trips, field: packet, below: 20, stop_when_broken: true}"
 LASTING = "{name: more, stream: round_trips, statistic: count, above: 1}"
+OF_HEALTH = "{name: room, stream: health, field: ram_percent, below: 100}"
+OF_LOG = (
+    "{name: calm, stream: log, field: level, event: critical, agents: [host, '*'], must: not_occur}"
+)
 OF_TICKS = "{name: prompt, stream: ticks, field: lateness_us, statistic: p99, below: 60, unit: s}"
 
 
@@ -81,7 +85,7 @@ def test_what_a_time_mode_does_not_record_is_not_judged_and_alone_no_pass(run):
 
 
 def test_a_finished_run_is_judged_by_expectations_it_did_not_have_and_again_after_collect(run):
-    code, document = run("realtime", OF_TICKS, options=())
+    code, document = run("realtime", OF_TICKS, OF_HEALTH, OF_LOG, options=())
     cosmos, name = run.cosmos, document["run"]
     page = (cosmos.directory(document) / "report.html").read_text("utf-8")
     strict = cosmos.folder / "strict.yaml"
@@ -104,7 +108,11 @@ def test_a_finished_run_is_judged_by_expectations_it_did_not_have_and_again_afte
     check = of_name(document, "prompt")
     assert (check["unit"], check["passed"], check["agents_broken"]) == ("s", True, 0)
     assert "p99 of ticks.lateness_us below 60 s" in page and "Expectations" in page
-    assert (again.returncode, "PASSED: 1 checks hold" in again.stdout) == (0, True)
+    assert (again.returncode, "PASSED: 3 checks hold" in again.stdout) == (0, True)
+    assert (of_name(document, "room")["agent"], of_name(document, "room")["unit"]) == (
+        "loopback",
+        "%",
+    )
     told = json.loads(other.stdout)
     assert (other.returncode, told["exit_code"], told["checks"][0]["agents_broken"]) == (4, 4, 3)
     assert refused.returncode == 2
@@ -119,3 +127,46 @@ def test_a_run_without_checks_is_judged_by_none(run):
 
     assert refused.returncode == 2
     assert "had no checks; name a scenario that has" in refused.stderr
+
+
+DEVICES = """\
+hardware:
+  devices:
+    - {name: imu, kind: synthetic, agents: [agent-02, agent-03], rate_hz: 5, parameters: PARAMETERS}
+"""
+PARAMETERS = "{channels: [{name: gyro, unit: rad/s, elements: [{shape: sine, amplitude: 2}, {}]}]}"
+OF_DEVICES = (
+    "{name: turns, stream: imu.gyro, field: gyro_1, statistic: max, above: 60, unit: deg/s}",
+    "{name: slow, stream: imu.gyro, field: gyro_1, agents: [agent-03], below: 1}",
+    "{name: samples, stream: imu.gyro, statistic: count, within: [20, 20]}",
+    "{name: opened, stream: imu.events, event: opened}",
+    "{name: after, agents: [agent-02], event: end, after: opened}",
+)
+
+
+def test_what_devices_measure_is_judged_by_their_full_names_and_judged_again(run, tmp_path):
+    hardware = DEVICES.replace("PARAMETERS", PARAMETERS)
+    path = tmp_path / "devices.yaml"
+    listed = "".join(f"  - {check}\n" for check in OF_DEVICES)
+    path.write_text(f"{SCENARIO.replace('MODE', 'lockstep')}{hardware}checks:\n{listed}")
+
+    code, document = run.cosmos.run(path, options=())
+    again = run.cosmos("judge", document["run"], "-s", path, "--json")
+
+    assert code == 4
+    of_expected = [check for check in document["checks"] if check.get("expected")]
+    found = {check["name"]: (check["agent"], check["passed"]) for check in of_expected}
+    assert found == {
+        "turns": ("agent-02/imu", True),
+        "slow": ("agent-03/imu", False),
+        "samples": ("agent-02/imu", True),
+        "opened": ("agent-02/imu", True),
+        "after": ("agent-02", True),
+    }
+    assert of_name(document, "turns")["got"] == pytest.approx(114.6, abs=6.0)
+    told = json.loads(again.stdout)["checks"]
+    assert [(each["name"], each["got"]) for each in told] == [
+        (each["name"], each["got"]) for each in of_expected
+    ]
+    page = (run.cosmos.directory(document) / "report.html").read_text("utf-8")
+    assert "max of imu.gyro.gyro_1 above 60 deg/s" in page

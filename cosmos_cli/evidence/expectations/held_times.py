@@ -8,7 +8,7 @@ import numpy as np
 
 from cosmos_cli.evidence.expectations.accumulators import Flags, Floats, holds
 from cosmos_cli.evidence.expectations.records import Batch, RecordSource
-from cosmos_cli.models.expectation import HeldBounds, scaled
+from cosmos_cli.models.expectation import HeldBounds, owner_of, scaled
 from madns_runtime.conditions.condition import HOST
 from madns_runtime.units import conversion
 
@@ -45,7 +45,7 @@ class HeldTimes:
 
     def during(self, agent: str, t_s: Floats) -> Flags:
         """Tell of each time whether the newest record of the condition until then holds."""
-        changes = self._changes.get(agent) or self._changes.get(HOST)
+        changes = self._changes.get(owner_of(agent)) or self._changes.get(HOST)
         if not changes:
             return np.zeros(len(t_s), bool)
         if len(changes) > 1:
@@ -63,12 +63,13 @@ class HeldTimes:
     def _add(self, batch: Batch, states: Flags, held: HeldBounds) -> None:
         if not len(states):
             return
-        known = self._changes.setdefault(batch.agent, [])
+        agent = owner_of(batch.agent)
+        known = self._changes.setdefault(agent, [])
         before = known[-1][1][-1] if known else not states[0]
         changed = np.flatnonzero(np.diff(states, prepend=before))
         if len(changed):
             known.append((batch.t_s[changed], states[changed]))
-        count = self._counts[batch.agent] = self._counts.get(batch.agent, 0) + len(changed)
+        count = self._counts[agent] = self._counts.get(agent, 0) + len(changed)
         if count > CHANGES_MAX:
             raise TooManyChanges(
                 f"{held.stream}.{held.field} of {batch.agent} changes more than {CHANGES_MAX} times between holding and not"

@@ -37,6 +37,8 @@ from madns_runtime.units import conversion
 
 OTHER_MODE = "its stream is recorded in real time alone, and this run was in lockstep"
 RATE_UNIT = "1/s"
+NOBODY = ""
+"""Stands for the machines or devices that should have recorded a stream, and of which there is none."""
 OF_NUMBERS = ("count", "rate")
 OF_TIMES = ("first_time", "settled")
 
@@ -125,7 +127,8 @@ class _Followed:
 
     def __init__(self, expectation: Expectation, source: RecordSource, duration_s: float) -> None:
         self.expectation = expectation
-        self._agents = frozenset(expectation.agents)
+        self._names = expectation.agents or source.sources_apart(expectation.stream)
+        self._agents = frozenset(self._names)
         self._records = source.records_of(expectation.stream)
         self._window_s = max(
             0.0,
@@ -225,7 +228,7 @@ class _Followed:
         expectation = self.expectation
         after = times.get(expectation.after) if expectation.after else None
         found = {}
-        for agent in expectation.agents:
+        for agent in self._names or (NOBODY,):
             accumulator = self._accumulators.get(agent)
             if accumulator is None and self._may_be_none:
                 accumulator = self._accumulator()

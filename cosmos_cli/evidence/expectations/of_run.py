@@ -13,9 +13,9 @@ from cosmos_cli.evidence.run_documents import EXPECTATIONS
 from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.models.checks import Surroundings, resolve_checks
 from cosmos_cli.models.expectation import Expectation
-from cosmos_cli.models.known_streams import KnownStreams
+from cosmos_cli.models.known_streams import KnownDevice, KnownStreams
 from cosmos_cli.models.loading import ScenarioFile
-from madns_runtime.analysis.tables import Tables
+from madns_runtime.analysis.tables import RecordedTable, Tables
 from madns_runtime.config import from_mapping
 from madns_runtime.errors import ConfigurationError
 
@@ -47,12 +47,32 @@ def judge_run(
     )
 
 
-def expectations_for(run: RunDirectory, scenario: ScenarioFile) -> tuple[Expectation, ...]:
+def recorded_devices(tables: Tables) -> tuple[KnownDevice, ...]:
+    """Return the devices whose records a run has, by their tables."""
+    found: dict[str, dict[str, RecordedTable]] = {}
+    for table in tables.values():
+        if table.role == "device":
+            device, _, channel = table.name.removeprefix("device_").rpartition(".")
+            found.setdefault(device, {})[channel] = table
+    return tuple(
+        KnownDevice(
+            name=device,
+            sources=tuple(dict.fromkeys(name for each in own.values() for name in each.sources)),
+            streams={channel: table.fields for channel, table in own.items()},
+        )
+        for device, own in found.items()
+    )
+
+
+def expectations_for(
+    run: RunDirectory, scenario: ScenarioFile, tables: Tables
+) -> tuple[Expectation, ...]:
     """
     Return what the checks of a scenario file expect of a run, of its agents and streams.
 
     Args:
         run: A gathered run.
+        tables: Of it.
         scenario: The file, which may be of another run or simulation.
 
     Raises:
@@ -67,7 +87,9 @@ def expectations_for(run: RunDirectory, scenario: ScenarioFile) -> tuple[Expecta
     around = Surroundings(
         agents=config.agents.resolved_names(),
         labels=run_labels(run),
-        streams=KnownStreams(None if declared is None else tuple(declared.values())),
+        streams=KnownStreams(
+            None if declared is None else tuple(declared.values()), recorded_devices(tables)
+        ),
         duration_s=config.time.duration_s,
     )
     resolved = resolve_checks(scenario.scenario.checks, around)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from cosmos_cli.evidence.expectations.accumulators import Occurrences
 from cosmos_cli.evidence.verdict import CheckResult
-from cosmos_cli.models.expectation import Expectation
+from cosmos_cli.models.expectation import Expectation, owner_of
 from madns_runtime.conditions.condition import HOST
 
 
@@ -43,7 +43,7 @@ def outcome_of_event(
     must_not = expectation.must == "not_occur"
     begin_s, latest_s = -math.inf, expectation.to_s
     if after is not None:
-        other = after.get(agent) or after.get(HOST)
+        other = after.get(agent) or _of_owner(after, agent) or after.get(HOST)
         if other is None or other.t_s is None:
             return ExpectationOutcome(got=0.0 if must_not else None, t_s=None, passed=must_not)
         begin_s = other.t_s
@@ -57,6 +57,12 @@ def outcome_of_event(
         return ExpectationOutcome(got=len(wrong), t_s=min(wrong, default=None), passed=not wrong)
     passed = first_s is not None and (latest_s is None or first_s <= latest_s)
     return ExpectationOutcome(got=first_s, t_s=first_s, passed=passed)
+
+
+def _of_owner(outcomes: Mapping[str, ExpectationOutcome], name: str) -> ExpectationOutcome | None:
+    """Return what an agent came to, or its one device, for a device or for an agent."""
+    own = [each for other, each in outcomes.items() if owner_of(other) == owner_of(name)]
+    return own[0] if len(own) == 1 else None
 
 
 def worst_result(

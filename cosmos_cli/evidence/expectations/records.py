@@ -13,10 +13,17 @@ from numpy.typing import NDArray
 from cosmos_cli.evidence.expectations.accumulators import Floats
 from madns_runtime.analysis.tables import RecordedTable, Tables
 from madns_runtime.conditions.condition import AGENT, HOST, TIME
-from madns_runtime.recording.records import Field
+from madns_runtime.recording.records import HEALTH, Field
 
 BATCH_RECORDS = 65_536
 DETAILS = "details"
+TABLE_NAMES = (
+    ("agent", ""),
+    (HOST, f"{HOST}_"),
+    ("machine", "machine_"),
+    ("device", "device_"),
+)
+"""Who records, and what the names of their tables begin with."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,13 +77,14 @@ class RecordSource:
         self._tables = tables
 
     def tables_of(self, stream: str) -> list[RecordedTable]:
-        """Return the tables of a stream: of the agents, of the host's half."""
-        found = (self._tables.get(stream), self._tables.get(f"{HOST}_{stream}"))
-        return [
-            table
-            for table, role in zip(found, ("agent", HOST), strict=True)
-            if table is not None and table.role == role
-        ]
+        """Return the tables of a stream: of agents, of the host's half, of machines, of devices."""
+        found = ((role, self._tables.get(f"{before}{stream}")) for role, before in TABLE_NAMES)
+        return [table for role, table in found if table is not None and table.role == role]
+
+    def sources_apart(self, stream: str) -> tuple[str, ...]:
+        """Return the machines or devices that recorded a stream."""
+        found = (table for table in self.tables_of(stream) if table.role in ("machine", "device"))
+        return tuple(source for table in found for source in table.sources)
 
     def unit_of(self, stream: str, field: str) -> str:
         """Return the unit of a field as it was recorded; empty where it was not."""
@@ -86,7 +94,7 @@ class RecordSource:
     def has_time(self, stream: str) -> bool:
         """Tell whether records of a stream tell when they are of."""
         tables = self.tables_of(stream)
-        return any(_time_field({each.name: each for each in table.fields}) for table in tables)
+        return any(_time_field(stream, table.fields) for table in tables)
 
     def records_of(self, stream: str) -> int:
         """Return the number of records of a stream."""
@@ -98,7 +106,7 @@ class RecordSource:
             present = {each.name: each for each in table.fields}
             own = [name for name in fields if name in present]
             beside = [name for name in fields if name not in present and table.has(DETAILS)]
-            time = _time_field(present)
+            time = _time_field(stream, table.fields)
             about = present.get(AGENT) if table.role == HOST else None
             has_agents = about is not None and about.kind == "str"
             wanted = {*own, *filter(None, [time]), *([AGENT] if has_agents else [])}
@@ -137,12 +145,13 @@ def _split(
         )
 
 
-def _time_field(fields: Mapping[str, Field]) -> str | None:
-    """Return the field that tells a record's time: t_s, or else the first one in seconds."""
-    if TIME in fields:
+def _time_field(stream: str, fields: Sequence[Field]) -> str | None:
+    """Return the field that tells a record's simulated time: t_s, or else the first one in seconds; None of health."""
+    if any(each.name == TIME for each in fields):
         return TIME
-    in_s = (each.name for each in fields.values() if each.unit == "s" and each.kind == "float")
-    return next(in_s, None)
+    if stream == HEALTH.name:
+        return None
+    return next((each.name for each in fields if each.unit == "s" and each.kind == "float"), None)
 
 
 def _times(columns: Mapping[str, NDArray[Any]], time: str | None) -> Floats:

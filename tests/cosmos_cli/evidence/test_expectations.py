@@ -314,3 +314,77 @@ def test_a_stream_of_the_other_time_mode_is_not_judged_and_a_run_without_any_jud
     assert [each.name for each in both.results] == ["x"]
     assert both.gaps() == ()
     assert both.remarks()[0].startswith("ticks: not judged: ")
+
+
+GYRO = FakeTable(
+    "device_imu.gyro",
+    (Field("t_s", "s"), Field("gyro", "rad/s")),
+    {
+        "a/imu": {"t_s": np.array([1.0, 2.0, 6.0]), "gyro": np.array([0.5, -0.5, 2.0])},
+        "pi2/imu": {"t_s": np.array([1.0, 2.0]), "gyro": np.array([0.0, 3.0])},
+    },
+    role="device",
+)
+HEALTH = FakeTable(
+    "machine_health",
+    (Field("monotonic_s", "s"), Field("cpu_percent", "%")),
+    {"pi1": {"monotonic_s": np.array([900.0]), "cpu_percent": np.array([40.0])}},
+    role="machine",
+)
+
+
+def test_records_of_devices_and_machines_are_judged_of_all_who_recorded_them_or_of_those_named():
+    tables = {**TABLES, "device_imu.gyro": GYRO, "machine_health": HEALTH}
+    of_gyro = {"stream": "imu.gyro", "field": "gyro", "bounds": ValueBounds.below(2.5)}
+    held = HeldBounds(stream="imu.gyro", field="gyro", bounds=ValueBounds.above(0.0))
+
+    results = judge(
+        expect(name="all", agents=(), **of_gyro),
+        expect(name="own", agents=("a/imu",), **of_gyro),
+        expect(
+            name="cpu",
+            stream="health",
+            field="cpu_percent",
+            agents=(),
+            bounds=ValueBounds.below(9.0),
+        ),
+        expect(
+            name="none", stream="gps.fix", field="fix", agents=(), bounds=ValueBounds.below(9.0)
+        ),
+        expect(name="held", agents=("a",), statistic="count", field="", meanwhile=held),
+        tables=tables,
+    ).results
+
+    assert [(each.name, each.agent, each.got, each.t_s, each.passed) for each in results[:4]] == [
+        ("all", "pi2/imu", 3.0, 2.0, False),
+        ("own", "a/imu", 2.0, 6.0, True),
+        ("cpu", "pi1", 40.0, None, False),
+        ("none", "", None, None, False),
+    ]
+    assert results[4].got == np.count_nonzero(((T_S >= 1.0) & (T_S < 2.0)) | (T_S >= 6.0))
+
+
+def test_an_event_of_an_agent_may_come_after_one_of_its_device():
+    events = FakeTable(
+        "device_imu.events",
+        EVENTS.fields,
+        {
+            "a/imu": {
+                "t_s": np.array([4.0]),
+                "event": objects(["lost"]),
+                "details": objects([None]),
+            }
+        },
+        role="device",
+    )
+    lost = expect(name="lost", stream="imu.events", field="event", event="lost", agents=("a/imu",))
+    done = {"stream": "events", "field": "event", "event": "done", "agents": ("a",)}
+
+    results = judge(
+        lost,
+        expect(name="soon", after="lost", within_s=2.0, **done),
+        expect(name="sooner", after="lost", within_s=0.5, **done),
+        tables={**TABLES, "device_imu.events": events},
+    ).results
+
+    assert [(each.got, each.passed) for each in results] == [(4.0, True), (5.0, True), (5.0, False)]

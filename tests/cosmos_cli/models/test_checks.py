@@ -14,11 +14,18 @@ name: broken
 simulation: counter
 agents: {count: 3, tick_hz: 20}
 time: {duration_s: 60}
+hardware:
+  use: [{devices: [gps]}]
+  devices:
+    - {name: imu, kind: synthetic, agents: [agent-02], parameters: {channels: [{name: gyro, unit: rad/s}]}}
 checks:
 """
 FIRST_LINE = HEAD.count("\n") + 1
 PACKET = "name: a, stream: round_trips, field: packet"
 TICKS = "name: a, stream: ticks, field: lateness_us"
+HEALTH = "name: a, stream: health, field: cpu_percent"
+GYRO = "name: a, stream: imu.gyro, field: gyro"
+FIX = "name: a, stream: gps.fix, field: fix"
 START = "name: a, event: start"
 
 
@@ -33,7 +40,23 @@ BROKEN = [
     ("name: agents.lost, stream: ticks, field: missed, below: 1", "agents.lost", "framework's own"),
     ("name: a, stream: tics, field: margin_us, above: 0", "tics", "did you mean ticks?"),
     ("name: a, stream: rounds, field: packet, above: 0", "rounds", "no stream 'rounds'"),
-    ("name: a, stream: health, field: cpu_percent, below: 90", "health", "no stream 'health'"),
+    (f"{HEALTH}, below: 90, agents: [agent-01]", "agent-01", "recorded per machine: leave out"),
+    (f"{HEALTH}, below: 90, from_s: 3", "3}", "health tell no time"),
+    (f"{HEALTH}, below: 90, stop_when_broken: true", "true", "recorded by a machine and not by"),
+    ("name: a, stream: health, field: ram_percnt, below: 90", "ram_percnt", "did you mean ram_percent?"),
+    ("name: a, stream: log, field: levl, equals: error", "levl", "did you mean level?"),
+    ("name: a, stream: imu, field: gyro, below: 1", "imu", "such as imu.gyro, imu.device_state"),
+    ("name: a, stream: imu.giro, field: gyro, below: 1", "imu.giro", "did you mean imu.gyro?"),
+    ("name: a, stream: mu.gyro, field: gyro, below: 1", "mu.gyro", "did you mean imu.gyro?"),
+    ("name: a, stream: imu.gyro, field: gyro_x, below: 1", "gyro_x", "did you mean gyro?"),
+    (f"{GYRO}, below: 1, unit: deg", "deg", "gyro is in rad/s, got 'deg'"),
+    (f"{GYRO}, below: 1, agents: [agent-01]", "agent-01", "does not use what records imu.gyro: agent-02/imu"),
+    (f"{GYRO}, below: 1, agents: [agent-2]", "agent-2", "did you mean agent-02?"),
+    (f"{GYRO}, below: 1, stop_when_broken: true", "true", "recorded by a device and not by agents"),
+    (f"{FIX}, below: 1, agents: [agent-01]", "agent-01", "of a device of an inventory"),
+    (f"{FIX}, below: 1, while: {{stream: clock, field: t_s, below: 1}}", "clock", "the host's half"),
+    (f"{TICKS}, below: 3, while: {{stream: gps.fix, field: fix, below: 1}}", "gps.fix", "the host's half"),
+    (f"{TICKS}, below: 3, while: {{stream: health, field: cpu_percent, below: 1}}", "health", "no simulated time"),
     ("name: a, stream: ticks, field: margn_us, above: 0", "margn_us", "did you mean margin_us?"),
     ("name: a, stream: ticks, below: 1", "{name", "expected a field of stream ticks"),
     ("name: a, below: 1", "{name", "expected a stream, or an event"),
@@ -139,6 +162,26 @@ def test_an_expectation_names_its_agents_and_says_itself_in_words(tmp_path):
     assert (second.agents, second.to_s) == (("host",), 9.0)
     assert second.words == "state in events must occur by 9 s"
     assert third.agents == ("agent-01", "agent-02", "agent-03")
+
+
+def test_streams_of_devices_logs_and_machines_are_known(tmp_path):
+    scenario = load(
+        f"{GYRO}, below: 90, unit: deg/s, while: {{stream: imu.device_state, field: errors, below: 1}}",
+        "name: b, stream: log, event: error, field: level, must: not_occur",
+        "name: c, stream: health, field: core_temperature_c, below: 80",
+        "name: d, stream: health, field: cpu_percent, agents: [host], below: 80",
+        "name: e, stream: gps.fix, field: anything, below: 80, unit: m",
+        folder=tmp_path,
+    )
+
+    found = [(each.agents, each.only_realtime) for each in scenario.expectations]
+    assert found == [
+        (("agent-02/imu",), False),
+        (("agent-01", "agent-02", "agent-03"), False),
+        ((), True),
+        (("host",), True),
+        ((), False),
+    ]
 
 
 @pytest.mark.parametrize(

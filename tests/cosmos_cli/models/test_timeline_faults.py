@@ -42,6 +42,8 @@ BROKEN_WHEN = [
         "by agents alone",
     ),
     ("stream: round_trips, field: packet, above: 1, for_s: -1", ".for_s", "expected >= 0"),
+    ("stream: imu.w, field: w, above: 1", ".stream", "recorded by a device and not by agents"),
+    ("stream: health, field: ram_percent, above: 1", ".stream", "name a stream of the simulation"),
     (
         "stream: ticks, field: margin_us, above: 1",
         ".stream",
