@@ -1,5 +1,5 @@
 """
-What a tick costs, in counts that no other work on the machine changes much: waits, system calls, bytes.
+What a tick costs, in counts that no other work on the machine changes much: waits, system calls, allocations, bytes.
 
 A busy machine only lowers how many replies arrive together; the limits leave room for that, and not for a
 wake-up, a call or a field more per agent.
@@ -7,6 +7,7 @@ wake-up, a call or a field more per agent.
 
 import orjson
 import pytest
+from harness.allocations import COMPILER, Allocations
 from harness.cosmos_command import LOOSE, CosmosCommand
 
 pytestmark = pytest.mark.process
@@ -98,3 +99,26 @@ def test_an_agent_by_itself_waits_twice_per_tick_and_costs_five_system_calls(run
     ticks = DURATION_S * TICK_HZ
     assert loop["waits"] <= 2.6 * ticks
     assert calls <= 6.5 * ticks
+
+
+@pytest.mark.skipif(COMPILER is None, reason="no C compiler (Debian: gcc) to count allocations by")
+def test_a_tick_makes_so_many_allocations_and_no_more(tmp_path):
+    agents, lengths_s = 8, (2, 6)
+    made = []
+    for duration_s in lengths_s:
+        folder = tmp_path / f"{duration_s}"
+        folder.mkdir()
+        allocations = Allocations(folder)
+        cosmos = CosmosCommand(folder, **allocations.environment)
+        settings = (f"agents.count={agents}", f"agents.per_process={agents}", "health.period_s=60")
+        rate = (f"agents.tick_hz={TICK_HZ}", f"time.duration_s={duration_s}")
+        code, result = cosmos.run("counter24.yaml", *LOOSE, *settings, *rate)
+        assert code == 0, result["verdict"]
+        events = cosmos.directory(result) / "agents" / "agent-01" / "events.jsonl"
+        lines = map(orjson.loads, events.read_bytes().splitlines()[1:])
+        pid = next(line["pid"] for line in lines if line.get("event") == "start")
+        made.append((allocations.of(pid), result["timing"]["ticks"] - result["timing"]["missed"]))
+    (before, ticks_before), (after, ticks_after) = made
+
+    # Step, message there and back, two records and the account of it; what set-up made is taken off.
+    assert 20 < (after - before) / (ticks_after - ticks_before) <= 150
