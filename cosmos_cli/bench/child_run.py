@@ -46,6 +46,20 @@ class ChildRunOutcome:
         return str(self.document.get("run") or "")
 
 
+def run_arguments(
+    *,
+    inventory: Sequence[str] | None,
+    limit: str | None,
+    host: str | None,
+    settings: Sequence[str] = (),
+) -> list[str]:
+    """Return options of a command as arguments of the `cosmos run` that it starts."""
+    arguments = [word for each in inventory or () for word in ("--inventory", each)]
+    arguments += ["--limit", limit] if limit else []
+    arguments += ["--host", host] if host else []
+    return [*arguments, *(word for each in settings for word in ("--set", each))]
+
+
 def run_child(
     arguments: Sequence[str], *, limit_s: float, is_quiet: bool, verb: str = "run"
 ) -> ChildRunOutcome:

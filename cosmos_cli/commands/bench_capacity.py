@@ -18,6 +18,7 @@ from cosmos_cli.bench.capacity import (
     CapacityTrials,
     find_capacity,
 )
+from cosmos_cli.bench.child_run import run_arguments
 from cosmos_cli.bench.prediction import CapacityPrediction, predict
 from cosmos_cli.commands.fleet_command import (
     HostOption,
@@ -25,6 +26,7 @@ from cosmos_cli.commands.fleet_command import (
     SomeInventoryOption,
     some_machines,
 )
+from cosmos_cli.commands.run_arguments import RunsOption
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import runs_root
 from cosmos_cli.models.loading import load_scenario
@@ -36,70 +38,73 @@ MINUTES_MAX = 24 * 60.0
 SECONDS_MAX = 3600.0
 
 
+ScenarioArgument = Annotated[
+    Path | None,
+    typer.Argument(metavar="[SCENARIO]", help="What agents do; default: they count with the host."),
+]
+RateOption = Annotated[
+    float,
+    typer.Option(
+        "--hz", metavar="HZ", min=0.1, max=RATE_HZ_MAX, help="Ticks per second of each agent."
+    ),
+]
+BudgetOption = Annotated[
+    float,
+    typer.Option(min=0.0, max=1.0, help="Budget: largest share of ticks that may be missed."),
+]
+SecondsOption = Annotated[
+    float,
+    typer.Option("--seconds", metavar="S", min=1.0, max=SECONDS_MAX, help="Of each trial, s."),
+]
+PerProcessOption = Annotated[
+    int, typer.Option("--per-process", metavar="N", min=1, help="Agents in one process.")
+]
+FirstOption = Annotated[
+    int,
+    typer.Option("--first", metavar="N", min=1, max=AGENTS_MAX, help="Agents of the first trial."),
+]
+LargestOption = Annotated[
+    int,
+    typer.Option("--largest", metavar="N", min=1, max=AGENTS_MAX, help="More are not tried."),
+]
+ResolutionOption = Annotated[
+    float,
+    typer.Option(
+        min=0.0, max=1.0, help="Ends when what breaks is within this share above what holds."
+    ),
+]
+TriesOption = Annotated[
+    int,
+    typer.Option(
+        min=1,
+        max=10,
+        help="Runs that must break the budget before a number counts as too large.",
+    ),
+]
+MinutesOption = Annotated[
+    float,
+    typer.Option(
+        metavar="M", min=0.1, max=MINUTES_MAX, help="No trial begins after so many minutes."
+    ),
+]
+
+
 def capacity(
-    scenario: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[SCENARIO]", help="What agents do; default: they count with the host."
-        ),
-    ] = None,
-    hz: Annotated[
-        float,
-        typer.Option(
-            "--hz", metavar="HZ", min=0.1, max=RATE_HZ_MAX, help="Ticks per second of each agent."
-        ),
-    ] = 100.0,
-    max_miss_ratio: Annotated[
-        float,
-        typer.Option(min=0.0, max=1.0, help="Budget: largest share of ticks that may be missed."),
-    ] = 1e-3,
+    scenario: ScenarioArgument = None,
+    hz: RateOption = 100.0,
+    max_miss_ratio: BudgetOption = 1e-3,
     inventory: SomeInventoryOption = None,
     limit: LimitOption = None,
     host: HostOption = None,
-    seconds: Annotated[
-        float,
-        typer.Option("--seconds", metavar="S", min=1.0, max=SECONDS_MAX, help="Of each trial, s."),
-    ] = 10.0,
-    per_process: Annotated[
-        int, typer.Option("--per-process", metavar="N", min=1, help="Agents in one process.")
-    ] = 1,
-    first: Annotated[
-        int,
-        typer.Option(
-            "--first", metavar="N", min=1, max=AGENTS_MAX, help="Agents of the first trial."
-        ),
-    ] = FIRST_DEFAULT,
-    largest: Annotated[
-        int,
-        typer.Option("--largest", metavar="N", min=1, max=AGENTS_MAX, help="More are not tried."),
-    ] = AGENTS_MAX,
-    resolution: Annotated[
-        float,
-        typer.Option(
-            min=0.0, max=1.0, help="Ends when what breaks is within this share above what holds."
-        ),
-    ] = 0.05,
-    tries: Annotated[
-        int,
-        typer.Option(
-            min=1,
-            max=10,
-            help="Runs that must break the budget before a number counts as too large.",
-        ),
-    ] = 1,
-    minutes: Annotated[
-        float,
-        typer.Option(
-            metavar="M", min=0.1, max=MINUTES_MAX, help="No trial begins after so many minutes."
-        ),
-    ] = MINUTES_DEFAULT,
+    seconds: SecondsOption = 10.0,
+    per_process: PerProcessOption = 1,
+    first: FirstOption = FIRST_DEFAULT,
+    largest: LargestOption = AGENTS_MAX,
+    resolution: ResolutionOption = 0.05,
+    tries: TriesOption = 1,
+    minutes: MinutesOption = MINUTES_DEFAULT,
     set_: SetOption = None,
-    runs: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR", envvar="COSMOS_RUNS", help="Folder of all runs; default: ./runs."
-        ),
-    ] = None,
+    runs: RunsOption = None,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> int:
@@ -125,32 +130,15 @@ def capacity(
         end_s=time.monotonic() + minutes * 60,
         is_machines_fault=any(machine.connection != "local" for machine in machines),
     )
-    _refuse_own_settings(set_ or (), trials)
-    options = ["--runs", str(runs_root(runs))]
-    options += [word for each in inventory or () for word in ("--inventory", each)]
-    options += ["--limit", limit] if limit else []
-    options += ["--host", host] if host else []
-    options += [word for each in set_ or () for word in ("--set", each)]
-    settings = [*(set_ or ()), *trials.overrides(first)]
-    checked = load_scenario(scenario or SCENARIO, settings, warn=console.warn)
+    settings = set_ or ()
+    _refuse_own_settings(settings, trials)
+    own = trials.overrides(first)
+    checked = load_scenario(scenario or SCENARIO, [*settings, *own], warn=console.warn)
     predicted = predict(checked, machines)
+    options = run_arguments(inventory=inventory, limit=limit, host=host, settings=settings)
+    options += ["--runs", str(runs_root(runs))]
     found = find_capacity(trials, checked.path, options, console.say)
-    console.table(COLUMNS, [trial.row() for trial in found.trials])
-    console.data(_verdict(found, trials, predicted))
-    console.print_json(
-        {
-            "hz": hz,
-            "max_miss_ratio": max_miss_ratio,
-            "seconds": seconds,
-            "per_process": per_process,
-            "agents": found.search.held,
-            "broken_at": found.search.broken,
-            "predicted": asdict(predicted) if predicted else None,
-            "stopped_by": found.stopped_by or None,
-            "trials": [trial.to_mapping() for trial in found.trials],
-            "exit_code": int(found.exit_code),
-        }
-    )
+    _show(console, found, trials, predicted)
     return int(found.exit_code)
 
 
@@ -159,6 +147,31 @@ def _refuse_own_settings(given: Sequence[str], trials: CapacityTrials) -> None:
     for each in given:
         if each.partition("=")[0].strip() in own:
             raise InputError(f"--set {each}: trials set that themselves; use the command's options")
+
+
+def _show(
+    console: Console,
+    found: CapacityFound,
+    trials: CapacityTrials,
+    predicted: CapacityPrediction | None,
+) -> None:
+    """Print the trials and what they came to."""
+    console.table(COLUMNS, [trial.row() for trial in found.trials])
+    console.data(_verdict(found, trials, predicted))
+    console.print_json(
+        {
+            "hz": trials.hz,
+            "max_miss_ratio": trials.max_miss_ratio,
+            "seconds": trials.seconds,
+            "per_process": trials.per_process,
+            "agents": found.search.held,
+            "broken_at": found.search.broken,
+            "predicted": asdict(predicted) if predicted else None,
+            "stopped_by": found.stopped_by or None,
+            "trials": [trial.to_mapping() for trial in found.trials],
+            "exit_code": int(found.exit_code),
+        }
+    )
 
 
 def _verdict(

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from cosmos_cli.bench.child_run import run_arguments
 from cosmos_cli.bench.suite import SUMMARY, run_suite, suite_exit_code, suite_files
 from cosmos_cli.commands.fleet_command import (
     HostOption,
@@ -15,6 +16,7 @@ from cosmos_cli.commands.fleet_command import (
     SomeInventoryOption,
     some_machines,
 )
+from cosmos_cli.commands.run_arguments import RunsOption
 from cosmos_cli.evidence.run_directory import runs_root
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
@@ -44,12 +46,7 @@ def suite(
     limit: LimitOption = None,
     host: HostOption = None,
     set_: SetOption = None,
-    runs: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR", envvar="COSMOS_RUNS", help="Folder of all runs; default: ./runs."
-        ),
-    ] = None,
+    runs: RunsOption = None,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> int:
@@ -64,10 +61,7 @@ def suite(
     settings = list(set_ or ())
     settings += [] if minutes is None else [f"time.duration_s={minutes * 60!r}"]
     scenarios = [load_scenario(path, settings, warn=console.warn) for path in suite_files(files)]
-    options = [word for each in inventory or () for word in ("--inventory", each)]
-    options += ["--limit", limit] if limit else []
-    options += ["--host", host] if host else []
-    options += [word for each in settings for word in ("--set", each)]
+    options = run_arguments(inventory=inventory, limit=limit, host=host, settings=settings)
     total_s = sum(each.scenario.time.duration_s for each in scenarios)
     console.say(f"{counted(len(scenarios), 'run')} of {total_s / 60:.3g} minutes together")
     start_s = time.monotonic()

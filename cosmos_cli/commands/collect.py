@@ -13,7 +13,7 @@ from cosmos_cli.collect.retrieval_state import NONE, forget, forgotten_problems
 from cosmos_cli.collect.retrieve import Retrieval, problems_of
 from cosmos_cli.collect.size_bound import parse_size
 from cosmos_cli.commands.fleet_command import FORKS_DEFAULT, AcceptHostKeysOption, ForksOption
-from cosmos_cli.commands.runs import RunArgument, RunsOption
+from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import RunDirectory, alone, runs_root
 from cosmos_cli.evidence.run_documents import Problem

@@ -89,39 +89,45 @@ class _Wish:
         return InputError(f"devices {self.action}".rstrip() + f": {text}")
 
 
+WordsArgument = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="[test [NAME] | record NAME DIRECTORY | verify KIND | calibrate DEVICE [SENSOR...]]",
+        help="test: sample devices and show rate, jitter, age and errors;"
+        " record: write what the kind playback plays; verify: put the driver of a kind, or ./file.py:NAME, through"
+        " what befalls it in runs; calibrate: find bias and scale of gyro, accelerometer, magnetometer, step by step."
+        " Else: list kinds, or with -i what hangs where.",
+    ),
+]
+SecondsOption = Annotated[
+    float,
+    typer.Option("--seconds", metavar="S", min=0.1, max=SECONDS_MAX, help="How long, s."),
+]
+WriteOption = Annotated[
+    bool,
+    typer.Option(
+        "--write",
+        help="test: put out the safe value of outputs, where the inventory says outputs: true;"
+        " verify: move outputs to their limits and back.",
+    ),
+]
+ParametersOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--parameters",
+        metavar="FILE|KEY=VALUE",
+        help="verify: parameters of the kind; port=pty lets a pseudo-terminal stand in for a line.",
+    ),
+]
+
+
 def devices(
-    words: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="[test [NAME] | record NAME DIRECTORY | verify KIND | calibrate DEVICE [SENSOR...]]",
-            help="test: sample devices and show rate, jitter, age and errors;"
-            " record: write what the kind playback plays; verify: put the driver of a kind, or ./file.py:NAME, through"
-            " what befalls it in runs; calibrate: find bias and scale of gyro, accelerometer, magnetometer, step by step."
-            " Else: list kinds, or with -i what hangs where.",
-        ),
-    ] = None,
+    words: WordsArgument = None,
     inventory: SomeInventoryOption = None,
     limit: LimitOption = None,
-    seconds: Annotated[
-        float,
-        typer.Option("--seconds", metavar="S", min=0.1, max=SECONDS_MAX, help="How long, s."),
-    ] = SECONDS,
-    write: Annotated[
-        bool,
-        typer.Option(
-            "--write",
-            help="test: put out the safe value of outputs, where the inventory says outputs: true;"
-            " verify: move outputs to their limits and back.",
-        ),
-    ] = False,
-    parameters: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--parameters",
-            metavar="FILE|KEY=VALUE",
-            help="verify: parameters of the kind; port=pty lets a pseudo-terminal stand in for a line.",
-        ),
-    ] = None,
+    seconds: SecondsOption = SECONDS,
+    write: WriteOption = False,
+    parameters: ParametersOption = None,
     from_: FromOption = None,
     channel: ChannelOption = None,
     field_ut: FieldOption = None,

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from cosmos_cli.commands.runs import RunsOption
+from cosmos_cli.commands.run_arguments import RunsOption
 from cosmos_cli.diff.compare import Comparison, Selection, compare
 from cosmos_cli.diff.document import several_documents, to_document
 from cosmos_cli.diff.side import check_comparable, open_side

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from cosmos_cli.commands.runs import RunsOption
+from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import runs_root
 from cosmos_cli.evidence.run_search import find_run
@@ -23,32 +23,38 @@ from madns_runtime.hardware.fault_actions import check_fault
 FOR_S = "for_s"
 
 
+TargetArgument = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="[TARGET]",
+        help="An agent or a glob of agents, run for the whole run, or a device's full name such as pi22/imu.",
+    ),
+]
+ActionArgument = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="[ACTION]",
+        help="A word of the timeline; of a device freeze, bias, noise, drop, delay, disconnect or clear.",
+    ),
+]
+ValuesArgument = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="[KEY=VALUE]...",
+        help="The action's parameters, and for_s; of a device the one value of bias, noise, drop (0 to 1) or delay (s).",
+    ),
+]
+ListOption = Annotated[
+    bool, typer.Option("--list", help="What may be ordered of this run, and what is in force.")
+]
+
+
 def inject(
-    run: Annotated[str, typer.Argument(metavar="RUN", help="Name, number or directory; or last.")],
-    target: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="[TARGET]",
-            help="An agent or a glob of agents, run for the whole run, or a device's full name such as pi22/imu.",
-        ),
-    ] = None,
-    action: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="[ACTION]",
-            help="A word of the timeline; of a device freeze, bias, noise, drop, delay, disconnect or clear.",
-        ),
-    ] = None,
-    values: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="[KEY=VALUE]...",
-            help="The action's parameters, and for_s; of a device the one value of bias, noise, drop (0 to 1) or delay (s).",
-        ),
-    ] = None,
-    listed: Annotated[
-        bool, typer.Option("--list", help="What may be ordered of this run, and what is in force.")
-    ] = False,
+    run: RunArgument,
+    target: TargetArgument = None,
+    action: ActionArgument = None,
+    values: ValuesArgument = None,
+    listed: ListOption = False,
     folder: RunsOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,

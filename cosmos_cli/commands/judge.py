@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from cosmos_cli.collect.finish import refuse_living
-from cosmos_cli.commands.runs import RunArgument, RunsOption
+from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.expectations.judge import JudgedExpectations
 from cosmos_cli.evidence.expectations.of_run import (

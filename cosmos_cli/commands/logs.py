@@ -11,7 +11,7 @@ import typer
 from cosmos_cli.collect.log_follower import LogFollower, sources_elsewhere
 from cosmos_cli.collect.machine_sources import HOST, RecordingMachines
 from cosmos_cli.commands.fleet_command import AcceptHostKeysOption
-from cosmos_cli.commands.runs import RunArgument, RunsOption
+from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
 from cosmos_cli.evidence.run_log import LogLine, LogReading, in_order
@@ -37,28 +37,30 @@ class LogLevel(StrEnum):
     CRITICAL = "critical"
 
 
+SourceArgument = Annotated[
+    str | None,
+    typer.Argument(metavar="[AGENT]", help="An agent, host, or a machine; default: all."),
+]
+FollowOption = Annotated[bool, typer.Option("--follow", "-f", help="Go on until the run ends.")]
+LevelOption = Annotated[LogLevel, typer.Option("--level", help="The least loud that is shown.")]
+LinesOption = Annotated[
+    int | None,
+    typer.Option(
+        *("--lines", "-n"),
+        min=0,
+        max=LINES_MAX,
+        metavar="N",
+        help="The last N lines; default: 10000, with --follow all.",
+    ),
+]
+
+
 def logs(
     run: RunArgument = "last",
-    source: Annotated[
-        str | None,
-        typer.Argument(metavar="[AGENT]", help="An agent, host, or a machine; default: all."),
-    ] = None,
-    follow: Annotated[
-        bool, typer.Option("--follow", "-f", help="Go on until the run ends.")
-    ] = False,
-    level: Annotated[
-        LogLevel, typer.Option("--level", help="The least loud that is shown.")
-    ] = LogLevel.DEBUG,
-    lines: Annotated[
-        int | None,
-        typer.Option(
-            *("--lines", "-n"),
-            min=0,
-            max=LINES_MAX,
-            metavar="N",
-            help="The last N lines; default: 10000, with --follow all.",
-        ),
-    ] = None,
+    source: SourceArgument = None,
+    follow: FollowOption = False,
+    level: LevelOption = LogLevel.DEBUG,
+    lines: LinesOption = None,
     folder: RunsOption = None,
     accept_new_host_keys: AcceptHostKeysOption = False,
     as_json: JsonOption = False,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cosmos_cli.commands.runs import RunArgument, RunsOption
+from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import runs_root
 from cosmos_cli.evidence.run_documents import fault_of_summary

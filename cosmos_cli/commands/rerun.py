@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from cosmos_cli.commands.runs import RunsOption
+from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.diff.compare import Selection, compare
 from cosmos_cli.diff.side import open_side
 from cosmos_cli.errors import ExitCode, InputError
@@ -34,9 +34,7 @@ FAILED = (ExitCode.RUN_FAILED, ExitCode.MACHINES, ExitCode.INTERRUPTED)
 
 
 def rerun(
-    run: Annotated[
-        str, typer.Argument(metavar="RUN", help="Number, name or path of a run, or: last.")
-    ],
+    run: RunArgument,
     as_recorded: Annotated[
         bool,
         typer.Option(

@@ -19,6 +19,7 @@ from cosmos_cli.commands.fleet_command import (
     SomeInventoryOption,
     some_machines,
 )
+from cosmos_cli.commands.run_arguments import RunsOption
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import runs_root, utc_now
 from cosmos_cli.fleet.connection import ConnectOptions
@@ -47,12 +48,7 @@ def run(
             "--duration", metavar="S", help="Simulated time, s; as --set time.duration_s."
         ),
     ] = None,
-    runs: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR", envvar="COSMOS_RUNS", help="Folder of all runs; default: ./runs."
-        ),
-    ] = None,
+    runs: RunsOption = None,
     check: Annotated[
         bool,
         typer.Option("--check", help="Say what the run would meet, and change nothing."),

@@ -3,25 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
-
+from cosmos_cli.commands.run_arguments import RunsOption
 from cosmos_cli.evidence.run_directory import RunDirectory, list_runs, runs_root
 from cosmos_cli.evidence.run_documents import fault_of, text_or_none
 from cosmos_cli.evidence.verdict import is_number
 from cosmos_cli.ui.console import Column, Console, JsonOption, QuietOption
 from madns_runtime.processes import list_processes
 
-RunArgument = Annotated[
-    str, typer.Argument(metavar="RUN", help="Number, name or path of a run, or: last.")
-]
-RunsOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--runs", metavar="DIRECTORY", help="Folder of all runs; else COSMOS_RUNS or ./runs."
-    ),
-]
 COLUMNS = (
     Column("run"),
     Column("status"),

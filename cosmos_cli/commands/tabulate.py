@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cosmos_cli.collect.host_tables import NAME, layout_with, tabulated, times_of, write_table
-from cosmos_cli.commands.runs import RunArgument, RunsOption
+from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import alone, runs_root
 from cosmos_cli.evidence.run_search import find_run

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from cosmos_cli.commands.run_arguments import RunsOption
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import runs_root, utc_now
 from cosmos_cli.testing.case import CaseSettings, SuiteCase
@@ -33,76 +34,78 @@ JOBS_MAX = 256
 SECONDS_MAX = 86_400.0 * 30
 
 
+PathsArgument = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        metavar="[PATH]...", help="Scenarios, or folders of them; default: ./scenarios, or ."
+    ),
+]
+ExpressionOption = Annotated[
+    str,
+    typer.Option(
+        "-k",
+        metavar="EXPR",
+        help="Only tests whose name, file or tags match, as in 'quick and not hohmann'.",
+    ),
+]
+JobsOption = Annotated[
+    int,
+    typer.Option(
+        "-j",
+        "--jobs",
+        metavar="N",
+        min=0,
+        max=JOBS_MAX,
+        help="Scenarios in lockstep beside each other; 0 for one per processor.",
+    ),
+]
+LastFailedOption = Annotated[
+    bool, typer.Option("--last-failed", help="Only what failed last time; all if nothing did.")
+]
+SeedsOption = Annotated[
+    str | None,
+    typer.Option(metavar="SEEDS", help="Run each with these seeds: 1..20, or 1,5,9."),
+]
+FullLengthOption = Annotated[
+    bool, typer.Option("--full-length", help="Leave out what test.set changes, and baselines.")
+]
+RealtimeMaxOption = Annotated[
+    float | None,
+    typer.Option(
+        "--realtime-max",
+        metavar="S",
+        min=0.1,
+        max=SECONDS_MAX,
+        help="Longest simulated time of a scenario in real time, s.",
+    ),
+]
+UpdateBaselinesOption = Annotated[
+    bool, typer.Option("--update-baselines", help="Write what comes as what baselines expect.")
+]
+KeepOption = Annotated[bool, typer.Option("--keep", help="Keep the runs of tests that pass, too.")]
+
+
 def test(
-    paths: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            metavar="[PATH]...", help="Scenarios, or folders of them; default: ./scenarios, or ."
-        ),
-    ] = None,
-    expression: Annotated[
-        str,
-        typer.Option(
-            "-k",
-            metavar="EXPR",
-            help="Only tests whose name, file or tags match, as in 'quick and not hohmann'.",
-        ),
-    ] = "",
-    jobs: Annotated[
-        int,
-        typer.Option(
-            "-j",
-            "--jobs",
-            metavar="N",
-            min=0,
-            max=JOBS_MAX,
-            help="Scenarios in lockstep beside each other; 0 for one per processor.",
-        ),
-    ] = 0,
-    last_failed: Annotated[
-        bool, typer.Option("--last-failed", help="Only what failed last time; all if nothing did.")
-    ] = False,
-    seeds: Annotated[
-        str | None,
-        typer.Option(metavar="SEEDS", help="Run each with these seeds: 1..20, or 1,5,9."),
-    ] = None,
+    paths: PathsArgument = None,
+    expression: ExpressionOption = "",
+    jobs: JobsOption = 0,
+    last_failed: LastFailedOption = False,
+    seeds: SeedsOption = None,
     set_: SetOption = None,
-    full_length: Annotated[
-        bool, typer.Option("--full-length", help="Leave out what test.set changes, and baselines.")
-    ] = False,
-    realtime_s_max: Annotated[
-        float | None,
-        typer.Option(
-            "--realtime-max",
-            metavar="S",
-            min=0.1,
-            max=SECONDS_MAX,
-            help="Longest simulated time of a scenario in real time, s.",
-        ),
-    ] = None,
+    full_length: FullLengthOption = False,
+    realtime_s_max: RealtimeMaxOption = None,
     junit: JunitOption = None,
-    update_baselines: Annotated[
-        bool,
-        typer.Option("--update-baselines", help="Write what comes as what baselines expect."),
-    ] = False,
-    keep: Annotated[
-        bool, typer.Option("--keep", help="Keep the runs of tests that pass, too.")
-    ] = False,
-    runs: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            envvar="COSMOS_RUNS",
-            help="Folder of all runs, tests are in tests there; default: ./runs.",
-        ),
-    ] = None,
+    update_baselines: UpdateBaselinesOption = False,
+    keep: KeepOption = False,
+    runs: RunsOption = None,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> int:
     """
     Run scenarios as tests: each shortened by its `test.set`, judged by its verdict, `test.expect` and `test.baseline`.
 
-    Ends with 0 if all passed, 1 if one failed, 2 if a scenario is wrong or none is meant, 130 if interrupted.
+    Their runs lie in `tests` of the folder of runs. Ends with 0 if all passed, 1 if one failed, 2 if a scenario is wrong
+    or none is meant, 130 if interrupted.
     """
     console = Console(json=json, quiet=quiet)
     if update_baselines and (seeds or full_length):

@@ -21,7 +21,7 @@ from cosmos_cli.commands.fleet_command import (
     failure_teller,
     fleet_of,
 )
-from cosmos_cli.commands.runs import RunsOption
+from cosmos_cli.commands.run_arguments import RunsOption
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.evidence.run_directory import runs_root
 from cosmos_cli.fleet.connection import Connection
