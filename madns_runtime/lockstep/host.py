@@ -42,7 +42,6 @@ from madns_runtime.reactor.operator_link import tell_loading
 from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.watchdog import end_after_hang_up
 from madns_runtime.recording.result_file import hand_over, leave
-from madns_runtime.timeline.fault_kinds import FAULT_WORDS
 from madns_runtime.timing.clock import utc_now_iso
 from madns_runtime.timing.rate import count_ticks
 
@@ -73,7 +72,9 @@ class LockstepHost:
         shares = share_out(config.agents, processors_here())
         # Everything that forks comes before every thread; workers load their half at the same time.
         self._crew = Workers(launch, self._directory.parent, shares)
-        program = RoleProgram.load(config, "host", tell=partial(tell_loading, fds[1]))
+        self._program = program = RoleProgram.load(
+            config, "host", tell=partial(tell_loading, fds[1])
+        )
         self._calls = calls = HostCalls(launch.session_hex)
         executor = make_executor(config.executor)
         self._clock = clock = SimulatedClock(-config.timeouts.start_lead_s)
@@ -104,28 +105,6 @@ class LockstepHost:
             executor=executor,
             on_hang=self._leave_hanging,
         )
-        self._timeline = LockstepTimeline(
-            config=config,
-            program=program,
-            clock=clock,
-            journal=self._journal,
-            outbox=self._outbox,
-            call=self._guarded.call,
-            intended=account.intended,
-        )
-        self._timeline.wait_for(conditions)
-        self._context = JobContext(
-            name=HOST,
-            config=config,
-            parameters=program.parameters,
-            agent_parameters=program.agent_parameters,
-            journal=self._journal,
-            now_s=clock.now_s,
-            send=self._outbox.send,
-            half=self._half,
-            submit=self._guarded.submit,
-            wake=self._half.wake,
-        )
         self._absences = Absences(
             config,
             account=account,
@@ -145,7 +124,17 @@ class LockstepHost:
             outbox=self._outbox,
             clock=clock,
         )
-        self._timeline.handlers.update(dict.fromkeys(FAULT_WORDS, self._faults))
+        self._timeline = LockstepTimeline(
+            config=config,
+            program=program,
+            clock=clock,
+            journal=self._journal,
+            outbox=self._outbox,
+            call=self._guarded.call,
+            faults=self._faults,
+            intended=account.intended,
+        )
+        self._timeline.wait_for(conditions)
         self._machine = host_machine()
 
     def run(self) -> int:
@@ -192,7 +181,19 @@ class LockstepHost:
         self._account.set_states("ready")
         self._fire(HostEvent.AGENTS_READY)
         limit_s = timeouts.host_setup_s
-        self._guarded.set_up(self._context, limit_s)
+        context = JobContext(
+            name=HOST,
+            config=self._config,
+            parameters=self._program.parameters,
+            agent_parameters=self._program.agent_parameters,
+            journal=self._journal,
+            now_s=self._clock.now_s,
+            send=self._outbox.send,
+            half=self._half,
+            submit=self._guarded.submit,
+            wake=self._half.wake,
+        )
+        self._guarded.set_up(context, limit_s)
         initial = []
         for number, name in enumerate(self._names):
             data = self._guarded.call("initial_data", name, limit_s=limit_s)

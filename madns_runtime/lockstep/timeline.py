@@ -14,18 +14,12 @@ from madns_runtime.hardware.action_socket import ActionSocket
 from madns_runtime.hardware.order_socket import Readers
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.messages import Outbox
-from madns_runtime.plugin.action_handlers import (
-    AgentOrders,
-    Annotations,
-    Stops,
-    simulation_handlers,
-    timeline_runner,
-)
+from madns_runtime.plugin.action_handlers import timeline_runner
 from madns_runtime.plugin.half import RoleProgram
 from madns_runtime.protocol.messages import ActionOrder
 from madns_runtime.recording.run_journal import RunJournal
 from madns_runtime.timeline.action import ActionHandler
-from madns_runtime.timeline.kinds import ANNOTATE, DEVICE_FAULT, STOP
+from madns_runtime.timeline.fault_kinds import FAULT_WORDS
 
 
 class LockstepTimeline:
@@ -39,6 +33,7 @@ class LockstepTimeline:
         journal: Of the host.
         outbox: Of the host.
         call: Calls a method of the host's half.
+        faults: Carries out faults of agents and messages.
         intended: Where agents are noted that an action loses.
     """
 
@@ -51,6 +46,7 @@ class LockstepTimeline:
         journal: RunJournal,
         outbox: Outbox,
         call: Callable[..., Any],
+        faults: ActionHandler,
         intended: IntendedLosses,
     ) -> None:
         self._config = config
@@ -58,14 +54,15 @@ class LockstepTimeline:
         self._outbox = outbox
         self.is_stopped = False
         """Whether the run ends with the tick under way."""
-        self.handlers: dict[str, ActionHandler] = {
-            ANNOTATE.word: Annotations(),
-            STOP.word: Stops(self._stop),
-            DEVICE_FAULT.word: AgentOrders(self._post),
-            **simulation_handlers(program.actions, call=call, post=self._post, intended=intended),
-        }
         self.runner, self.kinds = timeline_runner(
-            config, program.actions, self.handlers, journal.event
+            config,
+            program.actions,
+            dict.fromkeys(FAULT_WORDS, faults),
+            record=journal.event,
+            call=call,
+            post=self._post,
+            stop=self._stop,
+            intended=intended,
         )
         self._door: ActionSocket | None = None
 

@@ -17,7 +17,7 @@ from madns_runtime.timeline.action import (
     TimelineAction,
 )
 from madns_runtime.timeline.dispatcher import Dispatcher
-from madns_runtime.timeline.kinds import kinds_by_word
+from madns_runtime.timeline.kinds import ANNOTATE, DEVICE_FAULT, STOP, kinds_by_word
 from madns_runtime.timeline.runner import TimelineRunner
 
 AGENTS_TOLD_MAX = 20
@@ -131,32 +131,16 @@ def with_instance(action: TimelineAction, kind: ActionKind) -> TimelineAction:
     return dataclasses.replace(action, parameters=made)
 
 
-def simulation_handlers(
-    declared: Sequence[ActionKind],
-    *,
-    call: Callable[..., Any],
-    post: Callable[[str, ActionOrder], bool],
-    intended: IntendedLosses,
-) -> dict[str, ActionHandler]:
-    """
-    Return the handlers of the actions that a simulation declares, by word.
-
-    Args:
-        declared: The actions.
-        call: Calls a method of the host's half.
-        post: Sends an agent an order; False if it is not there.
-        intended: Where agents are noted that an action loses.
-    """
-    of_host = HostHalfActions({kind.word: kind for kind in declared}, call, intended)
-    of_agents = AgentOrders(post)
-    return {kind.word: of_host if kind.carried_out_by == "host" else of_agents for kind in declared}
-
-
-def timeline_runner(
+def timeline_runner(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
     config: RunConfig,
     declared: Sequence[ActionKind],
-    handlers: Mapping[str, ActionHandler],
+    own: Mapping[str, ActionHandler],
+    *,
     record: Callable[..., None],
+    call: Callable[..., Any],
+    post: Callable[[str, ActionOrder], bool],
+    stop: Callable[[], None],
+    intended: IntendedLosses,
 ) -> tuple[TimelineRunner, dict[str, ActionKind]]:
     """
     Return what begins and ends a run's actions, and the kinds that have a handler in its time mode, by word.
@@ -164,10 +148,23 @@ def timeline_runner(
     Args:
         config: The run.
         declared: The simulation's actions.
-        handlers: By word.
+        own: Handlers that this time mode has beside those of both, by word.
         record: Writes an event.
+        call: Calls a method of the host's half.
+        post: Sends an agent an order; False if it is not there.
+        stop: Ends the run's simulated time here.
+        intended: Where agents are noted that an action loses.
     """
     kinds = kinds_by_word(declared)
+    of_host = HostHalfActions({kind.word: kind for kind in declared}, call, intended)
+    of_agents = AgentOrders(post)
+    handlers = {
+        ANNOTATE.word: Annotations(),
+        STOP.word: Stops(stop),
+        DEVICE_FAULT.word: of_agents,
+        **own,
+        **{kind.word: of_host if kind.carried_out_by == "host" else of_agents for kind in declared},
+    }
     runner = TimelineRunner(
         config.timeline,
         kinds,

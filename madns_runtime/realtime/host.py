@@ -79,7 +79,9 @@ class HostRuntime:
         self._config = config = launch.config
         self._launch, self._line_fd = launch, fds[0]
         self._directory = Path(launch.directory)
-        program = RoleProgram.load(config, "host", tell=partial(tell_loading, fds[1]))
+        self._program = program = RoleProgram.load(
+            config, "host", tell=partial(tell_loading, fds[1])
+        )
         self._calls = calls = HostCalls(launch.session_hex)
         self._sampler = start_sampler(
             self._directory,
@@ -131,18 +133,6 @@ class HostRuntime:
         self._half = HostHalf(program, self._journal.say, carrier=self._port.carrier, calls=calls)
         self._half_timer = HalfTimer(
             self._reactor, self._port, half=self._half, guard=self._guard, pump=self._pump
-        )
-        self._context = JobContext(
-            name=HOST,
-            config=config,
-            parameters=program.parameters,
-            agent_parameters=program.agent_parameters,
-            journal=self._journal,
-            now_s=self._port.now_s,
-            send=self._port.send,
-            half=self._half,
-            submit=self._jobs.submit,
-            wake=self._half_timer.wake,
         )
         self._report = HostReport(config.time.duration_s, program.columns)
         self._timeline = HostTimeline(
@@ -258,7 +248,19 @@ class HostRuntime:
     def _set_up(self) -> None:
         if not self._port.is_in(HostState.SIMULATION_SETUP):
             return  # an agent's last words came right behind its hello
-        self._guard(self._half.set_up, self._context)
+        context = JobContext(
+            name=HOST,
+            config=self._config,
+            parameters=self._program.parameters,
+            agent_parameters=self._program.agent_parameters,
+            journal=self._journal,
+            now_s=self._port.now_s,
+            send=self._port.send,
+            half=self._half,
+            submit=self._jobs.submit,
+            wake=self._half_timer.wake,
+        )
+        self._guard(self._half.set_up, context)
         self._is_set_up = True
         for agent in self._session.agents_in(Phase.LOST):
             self._losses.tell(agent)  # or the word of it comes just behind

@@ -12,13 +12,7 @@ from madns_runtime.conditions.reports import HostConditions, MetCondition
 from madns_runtime.config import RunConfig
 from madns_runtime.errors import MadnsError
 from madns_runtime.hardware.action_socket import ActionSocket
-from madns_runtime.plugin.action_handlers import (
-    AgentOrders,
-    Annotations,
-    Stops,
-    simulation_handlers,
-    timeline_runner,
-)
+from madns_runtime.plugin.action_handlers import AgentOrders, timeline_runner
 from madns_runtime.plugin.half import HostHalf, RoleProgram
 from madns_runtime.protocol.messages import ActionOrder, Service
 from madns_runtime.protocol.states import HostState
@@ -27,16 +21,8 @@ from madns_runtime.realtime.host_faults import HostFaults
 from madns_runtime.realtime.host_link import HostPort
 from madns_runtime.realtime.host_result import HostReport
 from madns_runtime.recording.run_journal import RunJournal
-from madns_runtime.timeline.action import ActionHandler
 from madns_runtime.timeline.fault_kinds import FAULT_WORDS
-from madns_runtime.timeline.kinds import (
-    ANNOTATE,
-    DEVICE_FAULT,
-    DRIFT_CLOCK,
-    STEP_CLOCK,
-    STOP,
-    STRESS,
-)
+from madns_runtime.timeline.kinds import DRIFT_CLOCK, STEP_CLOCK, STOP, STRESS
 from madns_runtime.timeline.runner import OrderedAction
 
 STOP_LEAD_S: Final = 0.25
@@ -80,22 +66,20 @@ class HostTimeline:
         self.faults = HostFaults(
             config, port=port, half=half, guard=guard, reactor=reactor, pump=pump
         )
-        call = partial(guard, half.call)
         self._door: ActionSocket | None = None
-        self.handlers: dict[str, ActionHandler] = {
-            **dict.fromkeys(FAULT_WORDS, self.faults),
-            ANNOTATE.word: Annotations(),
-            STOP.word: Stops(self._stop),
-            STRESS.word: AgentOrders(self._post),
-            STEP_CLOCK.word: AgentOrders(self._post),
-            DRIFT_CLOCK.word: AgentOrders(self._post),
-            DEVICE_FAULT.word: AgentOrders(self._post),
-            **simulation_handlers(
-                program.actions, call=call, post=self._post, intended=self.faults.intended
-            ),
-        }
+        of_agents = (STRESS.word, STEP_CLOCK.word, DRIFT_CLOCK.word)
         self.runner, self.kinds = timeline_runner(
-            config, program.actions, self.handlers, journal.event
+            config,
+            program.actions,
+            {
+                **dict.fromkeys(FAULT_WORDS, self.faults),
+                **dict.fromkeys(of_agents, AgentOrders(self._post)),
+            },
+            record=journal.event,
+            call=partial(guard, half.call),
+            post=self._post,
+            stop=self._stop,
+            intended=self.faults.intended,
         )
         # Infinite is never: the timer is made once and moved.
         self._timer = reactor.call_at(math.inf, self._due)
