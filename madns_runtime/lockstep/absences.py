@@ -6,16 +6,9 @@ import heapq
 from collections.abc import Callable, Iterable
 from typing import Any, Final
 
-from madns_runtime.config import RunConfig
 from madns_runtime.lockstep import frames
-from madns_runtime.lockstep.barrier import Meeting
-from madns_runtime.lockstep.clock import SimulatedClock
-from madns_runtime.lockstep.host_half import LockstepHalf
-from madns_runtime.lockstep.messages import Outbox
-from madns_runtime.lockstep.result import RunAccount
-from madns_runtime.lockstep.workers import Workers
+from madns_runtime.lockstep.host_core import LockstepCore
 from madns_runtime.protocol.codec import pack
-from madns_runtime.recording.run_journal import RunJournal
 
 RESTART_DELAY_S: Final = 0.2
 """From the loss of an agent that agents.restarts_max gives another start to its return, s of simulated time."""
@@ -27,41 +20,23 @@ class Absences:
     The agents that are away.
 
     Args:
-        config: The run.
-        account: Where losses are counted.
-        crew: The workers.
-        meeting: Where they are told and awaited.
-        outbox: The host's messages.
-        half: The simulation's, which hears of losses and returns.
-        journal: The host's.
-        clock: Simulated time.
+        core: Of the host.
         log: Takes level and text.
     """
 
-    def __init__(  # noqa: PLR0913 - the collaborators of a seam, all by name
-        self,
-        config: RunConfig,
-        *,
-        account: RunAccount,
-        crew: Workers,
-        meeting: Meeting,
-        outbox: Outbox,
-        half: LockstepHalf,
-        journal: RunJournal,
-        clock: SimulatedClock,
-        log: Callable[[str, str], None],
-    ) -> None:
+    def __init__(self, core: LockstepCore, log: Callable[[str, str], None]) -> None:
+        config = core.config
         self._restarts_max = config.agents.restarts_max
         self._tick_hz = config.agents.tick_hz
         self._duration_s = config.time.duration_s
         self._goes_on = config.on_agent_loss == "continue"
-        self._account = account
-        self._crew = crew
-        self._meeting = meeting
-        self._outbox = outbox
-        self._half = half
-        self._journal = journal
-        self._clock = clock
+        self._account = core.account
+        self._crew = core.crew
+        self._meeting = core.meeting
+        self._outbox = core.outbox
+        self._half = core.half
+        self._journal = core.journal
+        self._clock = core.clock
         self._log = log
         self._returns: list[tuple[float, int]] = []
         """Simulated time, s, and agent, by index: a heap."""

@@ -20,6 +20,7 @@ from madns_runtime.lockstep import frames
 from madns_runtime.lockstep.absences import Absences
 from madns_runtime.lockstep.barrier import Meeting, RunEnds
 from madns_runtime.lockstep.clock import SimulatedClock
+from madns_runtime.lockstep.host_core import LockstepCore
 from madns_runtime.lockstep.host_faults import LockstepFaults
 from madns_runtime.lockstep.host_half import LockstepHalf
 from madns_runtime.lockstep.messages import Outbox, decode
@@ -105,35 +106,19 @@ class LockstepHost:
             executor=executor,
             on_hang=self._leave_hanging,
         )
-        self._absences = Absences(
-            config,
+        core = LockstepCore(
+            config=config,
             account=account,
+            clock=clock,
             crew=self._crew,
             meeting=self._meeting,
             outbox=self._outbox,
             half=self._guarded,
             journal=self._journal,
-            clock=clock,
-            log=self._log,
         )
-        self._faults = LockstepFaults(
-            config,
-            account=account,
-            absences=self._absences,
-            half=self._guarded,
-            outbox=self._outbox,
-            clock=clock,
-        )
-        self._timeline = LockstepTimeline(
-            config=config,
-            program=program,
-            clock=clock,
-            journal=self._journal,
-            outbox=self._outbox,
-            call=self._guarded.call,
-            faults=self._faults,
-            intended=account.intended,
-        )
+        self._absences = Absences(core, self._log)
+        self._faults = LockstepFaults(core, self._absences)
+        self._timeline = LockstepTimeline(core, program, self._faults)
         self._timeline.wait_for(conditions)
         self._machine = host_machine()
 

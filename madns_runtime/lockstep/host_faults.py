@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from madns_runtime.config import RunConfig
 from madns_runtime.faults.message_faults import MessageEnds, MessageFaults
 from madns_runtime.lockstep.absences import RESTART_DELAY_S, Absences
-from madns_runtime.lockstep.clock import SimulatedClock
-from madns_runtime.lockstep.host_half import LockstepHalf
-from madns_runtime.lockstep.messages import Outbox
-from madns_runtime.lockstep.result import RunAccount
+from madns_runtime.lockstep.host_core import LockstepCore
 from madns_runtime.timeline import fault_kinds as kinds
 from madns_runtime.timeline.action import ActionRefused, TimelineAction
 
@@ -18,36 +14,26 @@ class LockstepFaults:
     Carries out the faults of a run; a handler of `timeline.action.ActionHandler`.
 
     Args:
-        config: The run.
-        account: Of the run.
+        core: Of the host.
         absences: Whom the run goes on without.
-        half: The simulation's.
-        outbox: The host's messages.
-        clock: Simulated time.
     """
 
-    def __init__(  # noqa: PLR0913 - the collaborators of a seam, all by name
-        self,
-        config: RunConfig,
-        *,
-        account: RunAccount,
-        absences: Absences,
-        half: LockstepHalf,
-        outbox: Outbox,
-        clock: SimulatedClock,
-    ) -> None:
-        self._goes_on = config.on_agent_loss == "continue"
-        self._account = account
+    def __init__(self, core: LockstepCore, absences: Absences) -> None:
+        self._goes_on = core.config.on_agent_loss == "continue"
+        self._account = core.account
         self._absences = absences
-        self._half = half
-        self._outbox = outbox
-        self._clock = clock
+        self._half = core.half
+        self._outbox = core.outbox
+        self._clock = core.clock
         self._messages = MessageFaults(
-            account.names,
-            config.seed,
-            now_s=clock.now_s,
+            core.account.names,
+            core.config.seed,
+            now_s=core.clock.now_s,
             ends=MessageEnds(
-                receive=half.take_now, send=outbox.send, engage=self._engage, held=_nothing
+                receive=core.half.take_now,
+                send=core.outbox.send,
+                engage=self._engage,
+                held=_nothing,
             ),
         )
         self.to_mapping = self._messages.to_mapping

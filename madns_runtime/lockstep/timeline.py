@@ -4,20 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from madns_runtime.conditions.reports import HostConditions, MetCondition
-from madns_runtime.config import RunConfig
 from madns_runtime.errors import MadnsError
-from madns_runtime.faults.intended_losses import IntendedLosses
 from madns_runtime.hardware.action_socket import ActionSocket
 from madns_runtime.hardware.order_socket import Readers
-from madns_runtime.lockstep.clock import SimulatedClock
-from madns_runtime.lockstep.messages import Outbox
+from madns_runtime.lockstep.host_core import LockstepCore
 from madns_runtime.plugin.action_handlers import timeline_runner
 from madns_runtime.plugin.half import RoleProgram
 from madns_runtime.protocol.messages import ActionOrder
-from madns_runtime.recording.run_journal import RunJournal
 from madns_runtime.timeline.action import ActionHandler
 from madns_runtime.timeline.fault_kinds import FAULT_WORDS
 
@@ -27,42 +22,26 @@ class LockstepTimeline:
     Carries out the timeline.
 
     Args:
-        config: The run.
+        core: Of the host.
         program: What the host's half declares.
-        clock: Simulated time.
-        journal: Of the host.
-        outbox: Of the host.
-        call: Calls a method of the host's half.
         faults: Carries out faults of agents and messages.
-        intended: Where agents are noted that an action loses.
     """
 
-    def __init__(  # noqa: PLR0913 - the collaborators of a seam, all keyword-only
-        self,
-        *,
-        config: RunConfig,
-        program: RoleProgram,
-        clock: SimulatedClock,
-        journal: RunJournal,
-        outbox: Outbox,
-        call: Callable[..., Any],
-        faults: ActionHandler,
-        intended: IntendedLosses,
-    ) -> None:
-        self._config = config
-        self._clock = clock
-        self._outbox = outbox
+    def __init__(self, core: LockstepCore, program: RoleProgram, faults: ActionHandler) -> None:
+        self._config = core.config
+        self._clock = core.clock
+        self._outbox = core.outbox
         self.is_stopped = False
         """Whether the run ends with the tick under way."""
         self.runner, self.kinds = timeline_runner(
-            config,
+            core.config,
             program.actions,
             dict.fromkeys(FAULT_WORDS, faults),
-            record=journal.event,
-            call=call,
+            record=core.journal.event,
+            call=core.half.call,
             post=self._post,
             stop=self._stop,
-            intended=intended,
+            intended=core.account.intended,
         )
         self._door: ActionSocket | None = None
 

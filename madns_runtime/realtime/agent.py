@@ -116,21 +116,7 @@ class AgentRunner:
         self._receive = half.simulation.receive  # called often: without a layer between
         self._spans = process.account.add
         self._pack = pack
-        self._ticks = ticks = PacedTicks(
-            seat,
-            config,
-            pack.phase_s,
-            port=self._port,
-            recorder=recorder,
-            calls=TickCalls(
-                prepare=self._prepare_tick if program.has_medium or seat.hardware else None,
-                step=half.simulation.step,
-                failed=self._step_failed,
-                ended=self._ticks_over,
-                is_running=self._is_running,
-                say_how_it_is=self._say_how_it_is,
-            ),
-        )
+        self._ticks = ticks = self._make_ticks(seat, recorder)
         pack.add(ticks)
         self._actions = OrderedActions(
             seat,
@@ -144,9 +130,7 @@ class AgentRunner:
         self._report = AgentReport(
             port=self._port,
             records=self._records,
-            pacer=ticks.pacer,
-            factor=ticks.factor,
-            late=ticks.late,
+            ticks=ticks,
             columns=NewestValues(recorder, program.columns),
             devices=seat.hardware if launch.is_detached else NO_HARDWARE,
         )
@@ -156,6 +140,20 @@ class AgentRunner:
         self._outcome = AgentOutcome(as_ordered=False, reason="did not end")
         self._is_closed = False
         self._takes_data = True
+
+    def _make_ticks(self, seat: LoopSeat, recorder: Recorder) -> PacedTicks:
+        has_inputs = self._program.has_medium or self._has_devices
+        calls = TickCalls(
+            prepare=self._prepare_tick if has_inputs else None,
+            step=self._half.simulation.step,
+            failed=self._step_failed,
+            ended=self._ticks_over,
+            is_running=self._is_running,
+            say_how_it_is=self._say_how_it_is,
+        )
+        return PacedTicks(
+            seat, self._config, self._pack.phase_s, port=self._port, recorder=recorder, calls=calls
+        )
 
     def start(self) -> None:
         """Begin: says hello at once."""

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from typing import Any
 
 from madns_runtime.realtime.announcements import Announcements
+from madns_runtime.realtime.host_core import RealtimeCore
 from madns_runtime.realtime.host_faults import HostFaults
 from madns_runtime.realtime.host_result import HostReport
-from madns_runtime.recording.run_journal import RunJournal
 
 
 class AgentLosses:
@@ -16,30 +16,28 @@ class AgentLosses:
     Takes note of losses.
 
     Args:
+        core: Of the host.
         report: The host's account.
         faults: Knows which of them were ordered.
         announced: Tells the operator.
-        journal: The host's.
         call: Calls the simulation's half, if it is to hear of losses.
-        now_s: Returns the simulated time, s.
     """
 
-    def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
+    def __init__(
         self,
+        core: RealtimeCore,
         report: HostReport,
-        faults: HostFaults,
         *,
+        faults: HostFaults,
         announced: Announcements,
-        journal: RunJournal,
         call: Callable[..., Any],
-        now_s: Callable[[], float],
     ) -> None:
         self._report = report
         self._faults = faults
         self._announced = announced
-        self._journal = journal
+        self._journal = core.journal
         self._call = call
-        self._now_s = now_s
+        self._now_s = core.port.now_s
         self._reasons: dict[str, str] = {}
 
     def lost(self, agent: str, reason: str, *, may_tell: bool) -> None:

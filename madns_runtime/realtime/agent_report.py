@@ -9,10 +9,9 @@ from typing import Any
 
 from madns_runtime.hardware.port import Hardware
 from madns_runtime.realtime.agent_link import AgentPort
-from madns_runtime.realtime.late_ticks import LateTicks
 from madns_runtime.realtime.process_records import ProcessRecords
+from madns_runtime.realtime.ticks import PacedTicks
 from madns_runtime.recording.newest_values import NewestValues
-from madns_runtime.timing.rate import Pacer, RealTimeFactor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,9 +31,7 @@ class AgentReport:
 
     port: AgentPort
     records: ProcessRecords
-    pacer: Pacer
-    factor: RealTimeFactor
-    late: LateTicks
+    ticks: PacedTicks
     columns: NewestValues
     devices: Hardware
     """Devices that no operator hears of: the host hears of them by pings."""
@@ -45,7 +42,7 @@ class AgentReport:
         """Return what a ping tells of the agent."""
         report = self.records.report()
         if self.port.t0_host_s is not None:
-            ticks = self.pacer.summary()
+            ticks = self.ticks.pacer.summary()
             report.update(
                 ticks=ticks["run"],
                 missed=ticks["missed"],
@@ -62,7 +59,7 @@ class AgentReport:
         """Return what the host is told at the end; *simulation* is the summary of the agent's half."""
         clock, now_s = self.port.session.clock, monotonic()
         return {
-            "ticks": {**self.pacer.summary(), "causes": self.late.counts()},
+            "ticks": {**self.ticks.pacer.summary(), "causes": self.ticks.late.counts()},
             "rtf": self._real_time_factor(),
             "clock": {
                 "offset_us": clock.offset_s(now_s) * 1e6,
@@ -93,5 +90,5 @@ class AgentReport:
         }
 
     def _real_time_factor(self) -> float | None:
-        factor = self.factor.value()
+        factor = self.ticks.factor.value()
         return None if factor is None else round(factor, 9)

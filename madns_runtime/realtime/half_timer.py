@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from time import monotonic
-from typing import Any
 
-from madns_runtime.plugin.half import HostHalf
 from madns_runtime.protocol.states import HostState
-from madns_runtime.reactor.reactor import Reactor
-from madns_runtime.realtime.host_link import HostPort
+from madns_runtime.realtime.host_core import RealtimeCore
 
 
 class HalfTimer:
@@ -18,28 +14,16 @@ class HalfTimer:
     Calls the half's timer.
 
     Args:
-        reactor: The loop.
-        port: Knows simulated time.
-        half: The host's half.
-        guard: Calls what it is given; what that raises ends the run.
-        pump: Sends what waits.
+        core: Of the host.
     """
 
-    def __init__(
-        self,
-        reactor: Reactor,
-        port: HostPort,
-        *,
-        half: HostHalf,
-        guard: Callable[..., Any],
-        pump: Callable[[], None],
-    ) -> None:
-        self._port = port
-        self._half = half
-        self._guard = guard
-        self._pump = pump
+    def __init__(self, core: RealtimeCore) -> None:
+        self._port = core.port
+        self._half = core.half
+        self._guard = core.guard
+        self._pump = core.pump
         # Infinite is never: the timer is made once and moved.
-        self._timer = reactor.call_at(math.inf, self.call)
+        self._timer = core.reactor.call_at(math.inf, self.call)
 
     def call(self) -> None:
         """Call it, now, if simulated time runs."""

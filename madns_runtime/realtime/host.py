@@ -42,6 +42,7 @@ from madns_runtime.reactor.watchdog import end_after_hang_up, extend
 from madns_runtime.realtime.agent_losses import AgentLosses
 from madns_runtime.realtime.announcements import Announcements
 from madns_runtime.realtime.half_timer import HalfTimer
+from madns_runtime.realtime.host_core import RealtimeCore
 from madns_runtime.realtime.host_link import HostPort
 from madns_runtime.realtime.host_result import HostReport
 from madns_runtime.realtime.operator_orders import OperatorOrders
@@ -93,16 +94,7 @@ class HostRuntime:
         executor = make_executor(config.executor)  # both fork: before every thread
         self._reactor = Reactor()
         self._jobs = JobRunner(self._reactor, executor, self._job_done)
-        self._operator = OperatorLink(
-            self._reactor,
-            fds,
-            on_command=self._command,
-            on_gone=self._operator_gone,
-            pending=pending,
-            is_detached=launch.is_detached,
-            way_back=way_back_of(launch, self._directory),
-            on_attached=self._watch_line,
-        )
+        self._operator = self._open_line(fds, pending)
         self._port = HostPort(launch, reactor=self._reactor, on_due=self._session_due)
         self._session = self._port.session
         files = RecordFiles(self._directory, run=config.run, source=HOST)
@@ -121,43 +113,45 @@ class HostRuntime:
         self._orders = OperatorOrders(
             self._session, self._journal, end=self._end, refuse=self._operator.refuse
         )
-        self._devices = UnwatchedDevices(
-            launch,
-            self._reactor,
-            session=self._session,
-            journal=self._journal,
-            end=self._end,
-            pump=self._pump,
-        )
         calls.t_s, calls.warn = self._port.t_s, partial(self._log, "warning")
         self._half = HostHalf(program, self._journal.say, carrier=self._port.carrier, calls=calls)
-        self._half_timer = HalfTimer(
-            self._reactor, self._port, half=self._half, guard=self._guard, pump=self._pump
-        )
-        self._report = HostReport(config.time.duration_s, program.columns)
-        self._timeline = HostTimeline(
-            config=config,
-            program=program,
+        core = RealtimeCore(
+            launch=launch,
             reactor=self._reactor,
             port=self._port,
             journal=self._journal,
-            report=self._report,
             half=self._half,
             guard=self._guard,
             pump=self._pump,
+            end=self._end,
         )
+        self._devices = UnwatchedDevices(core)
+        self._half_timer = HalfTimer(core)
+        self._report = HostReport(config.time.duration_s, program.columns)
+        self._timeline = HostTimeline(core, program, self._report)
         self._losses = AgentLosses(
+            core,
             self._report,
-            self._timeline.faults,
+            faults=self._timeline.faults,
             announced=self._announced,
-            journal=self._journal,
             call=self._call_of_loss,
-            now_s=self._port.now_s,
         )
         # Infinite is never: the timer is made once and moved.
         self._progress_timer = self._reactor.call_at(math.inf, self._progress)
         self._is_set_up = self._awaits_jobs = False
         self._takes_data = True
+
+    def _open_line(self, fds: tuple[int, int], pending: bytes) -> OperatorLink:
+        return OperatorLink(
+            self._reactor,
+            fds,
+            on_command=self._command,
+            on_gone=self._operator_gone,
+            pending=pending,
+            is_detached=self._launch.is_detached,
+            way_back=way_back_of(self._launch, self._directory),
+            on_attached=self._watch_line,
+        )
 
     def run(self) -> int:
         """Run to the end and return the process's exit code."""

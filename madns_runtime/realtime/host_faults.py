@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from time import monotonic
-from typing import Any
 
-from madns_runtime.config import RunConfig
 from madns_runtime.faults.intended_losses import IntendedLosses
 from madns_runtime.faults.message_faults import MessageEnds, MessageFaults
-from madns_runtime.plugin.half import HostHalf
 from madns_runtime.protocol.messages import AgentFault, Service
-from madns_runtime.reactor.reactor import Reactor
-from madns_runtime.realtime.host_link import HostPort
+from madns_runtime.realtime.host_core import RealtimeCore
 from madns_runtime.timeline import fault_kinds as words
 from madns_runtime.timeline.action import ActionRefused, TimelineAction
 
@@ -23,30 +18,17 @@ class HostFaults:
     Carries out the faults of a run; a handler of `timeline.action.ActionHandler`.
 
     Args:
-        config: The run.
-        port: The host's way to its agents.
-        half: The simulation's.
-        guard: Calls the plug-in, and ends the run over what it raises.
-        reactor: The loop.
-        pump: Carries out and sends what is due.
+        core: Of the host.
     """
 
-    def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
-        self,
-        config: RunConfig,
-        *,
-        port: HostPort,
-        half: HostHalf,
-        guard: Callable[..., Any],
-        reactor: Reactor,
-        pump: Callable[[], None],
-    ) -> None:
+    def __init__(self, core: RealtimeCore) -> None:
+        config, port, half, guard = core.launch.config, core.port, core.half, core.guard
         self.intended = IntendedLosses()
         self._goes_on = config.on_agent_loss == "continue"
         self._duration_s = config.time.duration_s
         self._port = port
         self._half = half
-        self._pump = pump
+        self._pump = core.pump
         self._messages = MessageFaults(
             config.agents.resolved_names(),
             config.seed,
@@ -60,7 +42,7 @@ class HostFaults:
         )
         self.to_mapping = self._messages.to_mapping
         # Infinite is never: the timer is made once and moved.
-        self._timer = reactor.call_at(math.inf, self._due)
+        self._timer = core.reactor.call_at(math.inf, self._due)
 
     def begin(self, action: TimelineAction) -> None:
         """

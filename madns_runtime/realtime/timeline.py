@@ -6,21 +6,18 @@ import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from madns_runtime.conditions.reports import HostConditions, MetCondition
-from madns_runtime.config import RunConfig
 from madns_runtime.errors import MadnsError
 from madns_runtime.hardware.action_socket import ActionSocket
 from madns_runtime.plugin.action_handlers import AgentOrders, timeline_runner
-from madns_runtime.plugin.half import HostHalf, RoleProgram
+from madns_runtime.plugin.half import RoleProgram
 from madns_runtime.protocol.messages import ActionOrder, Service
 from madns_runtime.protocol.states import HostState
-from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.realtime.host_core import RealtimeCore
 from madns_runtime.realtime.host_faults import HostFaults
-from madns_runtime.realtime.host_link import HostPort
 from madns_runtime.realtime.host_result import HostReport
-from madns_runtime.recording.run_journal import RunJournal
 from madns_runtime.timeline.fault_kinds import FAULT_WORDS
 from madns_runtime.timeline.kinds import DRIFT_CLOCK, STEP_CLOCK, STOP, STRESS
 from madns_runtime.timeline.runner import OrderedAction
@@ -34,38 +31,18 @@ class HostTimeline:
     Carries out the timeline.
 
     Args:
-        config: The run.
+        core: Of the host.
         program: What the host's half declares.
-        reactor: The loop.
-        port: Knows simulated time and the agents.
-        journal: Of the host.
         report: Of the run; a stop shortens its duration.
-        half: The simulation's.
-        guard: Calls it, and ends the run over what it raises.
-        pump: Sends what waits.
     """
 
-    def __init__(  # noqa: PLR0913 - the collaborators of a seam, all keyword-only
-        self,
-        *,
-        config: RunConfig,
-        program: RoleProgram,
-        reactor: Reactor,
-        port: HostPort,
-        journal: RunJournal,
-        report: HostReport,
-        half: HostHalf,
-        guard: Callable[..., Any],
-        pump: Callable[[], None],
-    ) -> None:
-        self._config = config
-        self._port = port
+    def __init__(self, core: RealtimeCore, program: RoleProgram, report: HostReport) -> None:
+        self._config = config = core.launch.config
+        self._port = core.port
         self._report = report
-        self._pump = pump
-        self._reactor = reactor
-        self.faults = HostFaults(
-            config, port=port, half=half, guard=guard, reactor=reactor, pump=pump
-        )
+        self._pump = core.pump
+        self._reactor = core.reactor
+        self.faults = HostFaults(core)
         self._door: ActionSocket | None = None
         of_agents = (STRESS.word, STEP_CLOCK.word, DRIFT_CLOCK.word)
         self.runner, self.kinds = timeline_runner(
@@ -75,14 +52,14 @@ class HostTimeline:
                 **dict.fromkeys(FAULT_WORDS, self.faults),
                 **dict.fromkeys(of_agents, AgentOrders(self._post)),
             },
-            record=journal.event,
-            call=partial(guard, half.call),
+            record=core.journal.event,
+            call=partial(core.guard, core.half.call),
             post=self._post,
             stop=self._stop,
             intended=self.faults.intended,
         )
         # Infinite is never: the timer is made once and moved.
-        self._timer = reactor.call_at(math.inf, self._due)
+        self._timer = core.reactor.call_at(math.inf, self._due)
 
     def begin(
         self, conditions: HostConditions, folder: Path, say: Callable[[str, str], None]

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 from typing import Final
 
-from madns_runtime.config import HostLaunch
 from madns_runtime.errors import MadnsError
 from madns_runtime.hardware.order_socket import Fault, OrderSocket
 from madns_runtime.plugin.context import clean_text
-from madns_runtime.protocol.host_session import HostSession
 from madns_runtime.protocol.messages import FaultOrder, Service
-from madns_runtime.reactor.reactor import Reactor
-from madns_runtime.recording.run_journal import RunJournal
+from madns_runtime.realtime.host_core import RealtimeCore
 
 ANSWER_S: Final = 5.0
 """An agent that has not answered an order by then is not waited for."""
@@ -41,28 +37,15 @@ class UnwatchedDevices:
     Agents that use a device tell of its losses and of answers to orders in the report of their pings.
 
     Args:
-        launch: The run.
-        reactor: The host's loop.
-        session: Of the run.
-        journal: Of the host.
-        end: Ends the run, given who ends it, why, and the status.
-        pump: Sends what waits.
+        core: Of the host.
     """
 
-    def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
-        self,
-        launch: HostLaunch,
-        reactor: Reactor,
-        *,
-        session: HostSession,
-        journal: RunJournal,
-        end: Callable[[str, str, str], None],
-        pump: Callable[[], None],
-    ) -> None:
-        self._session = session
-        self._journal = journal
-        self._end = end
-        self._pump = pump
+    def __init__(self, core: RealtimeCore) -> None:
+        launch, reactor = core.launch, core.reactor
+        self._session = core.port.session
+        self._journal = core.journal
+        self._end = core.end
+        self._pump = core.pump
         self._does_abort = launch.config.hardware.on_device_loss == "abort"
         self._users = {each.full_name: each.users for each in launch.devices}
         self._told: set[tuple[str, str]] = set()
@@ -75,7 +58,7 @@ class UnwatchedDevices:
         try:
             self._door = OrderSocket(Path(launch.directory).parent, reactor, self._ordered)
         except OSError as error:
-            journal.say("warning", f"no fault can be inserted in this run: {error}")
+            core.journal.say("warning", f"no fault can be inserted in this run: {error}")
 
     def look(self) -> None:
         """Take what the agents' newest pings say."""

@@ -77,99 +77,102 @@ def test_what_fits_together_has_no_faults(folder, rest):
     assert faults(folder, **rest) == []
 
 
+FAULTS_OF_THE_BOARD = [
+    ({"flight": "guidance.py"}, "flight: expected file.py:Class or module:Class"),
+    ({"flight": "missing.py:G"}, "flight: no such file: .*missing.py"),
+    (
+        {"flight": "guidance.py:guidance"},
+        "flight: .*guidance.py has no class 'guidance'; it has Guidance, Other",
+    ),
+    ({"flight": {"software": "broken.py:G"}}, "flight.software: .*broken.py:2: "),
+    (
+        {"flight": "peeping.py:G"},
+        r"flight: .*peeping.py:4: expected no import of madns_runtime\..*\.vehicle.truth_buffer:",
+    ),
+    ({"flight": {"software": "no_such_module:G"}}, r"flight.software: no module .*\.py:G"),
+    (
+        {"flight": {"software": "guidance.py:Guidance", "agents": ["agent-03"]}},
+        "flight.agents: 'agent-03' fits no agent and no satellite, such as agent-01",
+    ),
+    ({"flight": {"command": ["program"]}}, "flight.command: .*program is not executable"),
+    ({"flight": {"command": ["bin/no"]}}, "flight.command: no program 'bin/no' in"),
+    ({"flight": {"command": ["no-such-prg"]}}, "flight.command: no program .* or on PATH"),
+    (
+        {"propagator": {"kind": "custom", "implementation": "missing.py:P"}},
+        "propagator.implementation: no such file",
+    ),
+    (
+        {"propagator": {"kind": "numba", "forces": ["j2"]}},
+        "propagator.forces: expected two_body among them",
+    ),
+    (
+        {
+            "propagator": {"kind": "basilisk"},
+            "vehicles": [
+                {"agents": ["agent-01"], "attitude": {"inertia_kg_m2": [1, 1, 1]}},
+                {
+                    "attitude": {
+                        "inertia_kg_m2": [1, 1, 1],
+                        "wheels": {"torque_n_m_max": 0.1, "momentum_n_m_s_max": 1},
+                    }
+                },
+            ],
+        },
+        r"vehicles\[1\].attitude.wheels: basilisk does rigid bodies without wheels only",
+    ),
+    (
+        {
+            "segments": {"knot_s": 2},
+            "vehicles": [{"attitude": {"inertia_kg_m2": [1, 1, 1], "rates_deg_s": [0, 90, 1]}}],
+        },
+        r"vehicles\[0\].attitude.rates_deg_s: expected less than half a turn .* got 180.0\d* deg",
+    ),
+    ({"vehicles": [{}, {"agents": ["X*"]}]}, r"vehicles\[1\].agents: 'X\*' fits no agent"),
+    (
+        {"vehicles": [{"sensors": {"gyro": {}}}]},
+        r"vehicles\[0\].sensors.gyro: needs a vehicle with attitude",
+    ),
+    (
+        {"vehicles": [{"sensors": {"star_tracker": {}}}]},
+        r"vehicles\[0\].sensors.star_tracker: needs a vehicle with attitude",
+    ),
+    (
+        {"vehicles": [{"sensors": {"clock": {"rate_hz": 100, "latency_s": 1000}}}]},
+        r"vehicles\[0\].sensors.clock.latency_s: expected at most 10000 measurements",
+    ),
+    (
+        {"vehicles": [{"mass_kg": 5, "thruster": {"isp_s": 220, "propellant_kg": 5}}]},
+        r"vehicles\[0\].thruster.propellant_kg: expected less than",
+    ),
+    (
+        {"vehicles": [{"ballistic_m2_kg_range": [0.02, 0.03]}]},
+        r"vehicles\[0\].ballistic_m2_kg_range: expected smallest and largest",
+    ),
+    (
+        {"vehicles": [{"attitude": {"inertia_kg_m2": [1, 1, 2.1]}}]},
+        r"vehicles\[0\].attitude.inertia_kg_m2: no body",
+    ),
+    (
+        {"stations": [{"name": "A", "latitude_deg": 0, "longitude_deg": 0}] * 2},
+        r"stations\[1\].name: expected every name once, got 'A' again",
+    ),
+    (
+        {"uplinks": [{"at_s": 0, "to": "agent-01", "text": "x"}]},
+        "uplinks: need parameters.stations",
+    ),
+    (
+        {
+            "stations": [{"name": "A", "latitude_deg": 0, "longitude_deg": 0}],
+            "uplinks": [{"at_s": 0, "to": "agent-1", "text": "x"}],
+        },
+        r"uplinks\[0\].to: no agent and no satellite is called 'agent-1'",
+    ),
+]
+
+
 @pytest.mark.parametrize(
     ("rest", "fault"),
-    [
-        ({"flight": "guidance.py"}, "flight: expected file.py:Class or module:Class"),
-        ({"flight": "missing.py:G"}, "flight: no such file: .*missing.py"),
-        (
-            {"flight": "guidance.py:guidance"},
-            "flight: .*guidance.py has no class 'guidance'; it has Guidance, Other",
-        ),
-        ({"flight": {"software": "broken.py:G"}}, "flight.software: .*broken.py:2: "),
-        (
-            {"flight": "peeping.py:G"},
-            r"flight: .*peeping.py:4: expected no import of madns_runtime\..*\.vehicle.truth_buffer:",
-        ),
-        ({"flight": {"software": "no_such_module:G"}}, r"flight.software: no module .*\.py:G"),
-        (
-            {"flight": {"software": "guidance.py:Guidance", "agents": ["agent-03"]}},
-            "flight.agents: 'agent-03' fits no agent and no satellite, such as agent-01",
-        ),
-        ({"flight": {"command": ["program"]}}, "flight.command: .*program is not executable"),
-        ({"flight": {"command": ["bin/no"]}}, "flight.command: no program 'bin/no' in"),
-        ({"flight": {"command": ["no-such-prg"]}}, "flight.command: no program .* or on PATH"),
-        (
-            {"propagator": {"kind": "custom", "implementation": "missing.py:P"}},
-            "propagator.implementation: no such file",
-        ),
-        (
-            {"propagator": {"kind": "numba", "forces": ["j2"]}},
-            "propagator.forces: expected two_body among them",
-        ),
-        (
-            {
-                "propagator": {"kind": "basilisk"},
-                "vehicles": [
-                    {"agents": ["agent-01"], "attitude": {"inertia_kg_m2": [1, 1, 1]}},
-                    {
-                        "attitude": {
-                            "inertia_kg_m2": [1, 1, 1],
-                            "wheels": {"torque_n_m_max": 0.1, "momentum_n_m_s_max": 1},
-                        }
-                    },
-                ],
-            },
-            r"vehicles\[1\].attitude.wheels: basilisk does rigid bodies without wheels only",
-        ),
-        (
-            {
-                "segments": {"knot_s": 2},
-                "vehicles": [{"attitude": {"inertia_kg_m2": [1, 1, 1], "rates_deg_s": [0, 90, 1]}}],
-            },
-            r"vehicles\[0\].attitude.rates_deg_s: expected less than half a turn .* got 180.0\d* deg",
-        ),
-        ({"vehicles": [{}, {"agents": ["X*"]}]}, r"vehicles\[1\].agents: 'X\*' fits no agent"),
-        (
-            {"vehicles": [{"sensors": {"gyro": {}}}]},
-            r"vehicles\[0\].sensors.gyro: needs a vehicle with attitude",
-        ),
-        (
-            {"vehicles": [{"sensors": {"star_tracker": {}}}]},
-            r"vehicles\[0\].sensors.star_tracker: needs a vehicle with attitude",
-        ),
-        (
-            {"vehicles": [{"sensors": {"clock": {"rate_hz": 100, "latency_s": 1000}}}]},
-            r"vehicles\[0\].sensors.clock.latency_s: expected at most 10000 measurements",
-        ),
-        (
-            {"vehicles": [{"mass_kg": 5, "thruster": {"isp_s": 220, "propellant_kg": 5}}]},
-            r"vehicles\[0\].thruster.propellant_kg: expected less than",
-        ),
-        (
-            {"vehicles": [{"ballistic_m2_kg_range": [0.02, 0.03]}]},
-            r"vehicles\[0\].ballistic_m2_kg_range: expected smallest and largest",
-        ),
-        (
-            {"vehicles": [{"attitude": {"inertia_kg_m2": [1, 1, 2.1]}}]},
-            r"vehicles\[0\].attitude.inertia_kg_m2: no body",
-        ),
-        (
-            {"stations": [{"name": "A", "latitude_deg": 0, "longitude_deg": 0}] * 2},
-            r"stations\[1\].name: expected every name once, got 'A' again",
-        ),
-        (
-            {"uplinks": [{"at_s": 0, "to": "agent-01", "text": "x"}]},
-            "uplinks: need parameters.stations",
-        ),
-        (
-            {
-                "stations": [{"name": "A", "latitude_deg": 0, "longitude_deg": 0}],
-                "uplinks": [{"at_s": 0, "to": "agent-1", "text": "x"}],
-            },
-            r"uplinks\[0\].to: no agent and no satellite is called 'agent-1'",
-        ),
-    ],
+    FAULTS_OF_THE_BOARD,
 )
 def test_faults_of_the_board_are_named_by_parameter(folder, rest, fault):
     found = faults(folder, **rest)

@@ -89,70 +89,73 @@ def orbit(**values):
     return {"keplerian": [{"name": "A", "a_km": 7000.0} | values]}
 
 
+FAULTS_OF_PARAMETERS = [
+    ({"satellites": {"elements": "data/no.tle"}}, 1, "satellites.elements: .*no such file"),
+    ({"satellites": IRIDIUM}, 11, "satellites.elements: .*each of 11 agents, got 10"),
+    (
+        {"satellites": {**IRIDIUM, "names": ["IRIDIUM 99"]}},
+        1,
+        "satellites.names: 'IRIDIUM 99' is not in the file",
+    ),
+    (
+        {"satellites": {**IRIDIUM, "names": ["iridium 8"]}},
+        1,
+        "satellites.names: 'iridium 8' is not in the file; it has IRIDIUM 8$",
+    ),
+    (
+        {"satellites": {**IRIDIUM, "names": ["IRIDIUM 8", "IRIDIUM 8"]}},
+        1,
+        "satellites.names: expected every name once",
+    ),
+    ({"satellites": {**IRIDIUM, "names": ["IRIDIUM 8"]}}, 2, "satellites.names: .*got 1"),
+    (
+        {"satellites": {**WALKER, "walker": "86.4:66-6-2"}},
+        1,
+        "satellites.walker: .*86.4:66/6/2",
+    ),
+    ({"satellites": {**WALKER, "walker": "86.4:66/5/2"}}, 1, "satellites.walker: .*evenly"),
+    ({"satellites": {**WALKER, "walker": "86.4:66/6/6"}}, 1, "satellites.walker: .*phasing"),
+    ({"satellites": {**WALKER, "walker": "200:66/6/2"}}, 1, "satellites.walker: .*inclination"),
+    ({"satellites": WALKER}, 67, "satellites.walker: .*67 agents, got 66"),
+    ({"satellites": KEPLERIAN}, 3, "satellites.keplerian: .*3 agents, got 2"),
+    ({"satellites": orbit(altitude_km=500.0)}, 1, r"keplerian\[0\]: .*either"),
+    ({"satellites": orbit(a_km=None)}, 1, r"keplerian\[0\]: .*either"),
+    ({"satellites": orbit(e=0.5)}, 1, r"keplerian\[0\]: perigee lies 2878\.1 km below"),
+    (
+        {"satellites": {"keplerian": KEPLERIAN["keplerian"] * 2}},
+        1,
+        "satellites.keplerian: expected every name once",
+    ),
+    ({"satellites": WALKER, "propagator": {"kind": "sgp4"}}, 1, "propagator.kind: sgp4 needs"),
+    (
+        {"satellites": WALKER, "propagator": {"kind": "scipy", "forces": ["j2"]}},
+        1,
+        "propagator.forces: expected two_body",
+    ),
+    (
+        {"satellites": WALKER, "propagator": {"kind": "scipy", "forces": ["two_body"] * 2}},
+        1,
+        "propagator.forces: expected every force once",
+    ),
+    ({"satellites": WALKER, "segments": {"knot_s": 3.0}}, 1, "segments.knot_s: .*whole number"),
+    (
+        {"satellites": WALKER, "segments": {"knot_s": 30.0}},
+        1,
+        "segments.knot_s: .*whole number",
+    ),
+    (
+        {"satellites": WALKER, "segments": {"knot_s": 0.01, "buffer_s": 3600.0}},
+        1,
+        "segments.buffer_s: .*at most",
+    ),
+    ({"satellites": WALKER, "epoch_utc": "2017-03-07 12:00"}, 1, "epoch_utc: .*12:00:00Z"),
+    ({"satellites": WALKER, "epoch_utc": "noon"}, 1, "epoch_utc: .*'noon'"),
+]
+
+
 @pytest.mark.parametrize(
     ("mapping", "agents", "fault"),
-    [
-        ({"satellites": {"elements": "data/no.tle"}}, 1, "satellites.elements: .*no such file"),
-        ({"satellites": IRIDIUM}, 11, "satellites.elements: .*each of 11 agents, got 10"),
-        (
-            {"satellites": {**IRIDIUM, "names": ["IRIDIUM 99"]}},
-            1,
-            "satellites.names: 'IRIDIUM 99' is not in the file",
-        ),
-        (
-            {"satellites": {**IRIDIUM, "names": ["iridium 8"]}},
-            1,
-            "satellites.names: 'iridium 8' is not in the file; it has IRIDIUM 8$",
-        ),
-        (
-            {"satellites": {**IRIDIUM, "names": ["IRIDIUM 8", "IRIDIUM 8"]}},
-            1,
-            "satellites.names: expected every name once",
-        ),
-        ({"satellites": {**IRIDIUM, "names": ["IRIDIUM 8"]}}, 2, "satellites.names: .*got 1"),
-        (
-            {"satellites": {**WALKER, "walker": "86.4:66-6-2"}},
-            1,
-            "satellites.walker: .*86.4:66/6/2",
-        ),
-        ({"satellites": {**WALKER, "walker": "86.4:66/5/2"}}, 1, "satellites.walker: .*evenly"),
-        ({"satellites": {**WALKER, "walker": "86.4:66/6/6"}}, 1, "satellites.walker: .*phasing"),
-        ({"satellites": {**WALKER, "walker": "200:66/6/2"}}, 1, "satellites.walker: .*inclination"),
-        ({"satellites": WALKER}, 67, "satellites.walker: .*67 agents, got 66"),
-        ({"satellites": KEPLERIAN}, 3, "satellites.keplerian: .*3 agents, got 2"),
-        ({"satellites": orbit(altitude_km=500.0)}, 1, r"keplerian\[0\]: .*either"),
-        ({"satellites": orbit(a_km=None)}, 1, r"keplerian\[0\]: .*either"),
-        ({"satellites": orbit(e=0.5)}, 1, r"keplerian\[0\]: perigee lies 2878\.1 km below"),
-        (
-            {"satellites": {"keplerian": KEPLERIAN["keplerian"] * 2}},
-            1,
-            "satellites.keplerian: expected every name once",
-        ),
-        ({"satellites": WALKER, "propagator": {"kind": "sgp4"}}, 1, "propagator.kind: sgp4 needs"),
-        (
-            {"satellites": WALKER, "propagator": {"kind": "scipy", "forces": ["j2"]}},
-            1,
-            "propagator.forces: expected two_body",
-        ),
-        (
-            {"satellites": WALKER, "propagator": {"kind": "scipy", "forces": ["two_body"] * 2}},
-            1,
-            "propagator.forces: expected every force once",
-        ),
-        ({"satellites": WALKER, "segments": {"knot_s": 3.0}}, 1, "segments.knot_s: .*whole number"),
-        (
-            {"satellites": WALKER, "segments": {"knot_s": 30.0}},
-            1,
-            "segments.knot_s: .*whole number",
-        ),
-        (
-            {"satellites": WALKER, "segments": {"knot_s": 0.01, "buffer_s": 3600.0}},
-            1,
-            "segments.buffer_s: .*at most",
-        ),
-        ({"satellites": WALKER, "epoch_utc": "2017-03-07 12:00"}, 1, "epoch_utc: .*12:00:00Z"),
-        ({"satellites": WALKER, "epoch_utc": "noon"}, 1, "epoch_utc: .*'noon'"),
-    ],
+    FAULTS_OF_PARAMETERS,
 )
 def test_faults_are_named_by_parameter(mapping, agents, fault):
     faults = find_faults(parameters(**mapping), agents, SCENARIOS)

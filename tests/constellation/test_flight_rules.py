@@ -104,86 +104,85 @@ def read_scenario_faults(tmp_path, change, **rest):
     return list(dict.fromkeys(f"{fault.path}: {fault.text}" for fault in faults))
 
 
-@pytest.mark.parametrize(
-    ("flight", "words"),
-    [
-        (["guidance.py:G", "none.py:G"], "parameters.flight[1]: no such file"),
-        ([program(), program(agents=["x*"])], "parameters.flight[1].agents: 'x*' fits no agent"),
-        (program(agents=["x*"]), "parameters.flight.agents: 'x*' fits no agent"),
-        ([{"command": ["no-such"]}], "parameters.flight[0].command: no program 'no-such'"),
-        (
-            {"command": [sys.executable, "${nmae}"]},
-            "parameters.flight.command[1]: expected one of ${name}, ${index}, ${satellite}, "
-            "${address}, got ${nmae}; $${ stands for ${ itself",
-        ),
-        (program(environment={"A": "${pty}"}), "parameters.flight.environment.A: expected one of"),
-        ({"interface": {}}, "parameters.flight.interface.transport: stdio is that of a program"),
-        (
-            {"interface": {"transport": TCP, "protocol": "morse"}},
-            "parameters.flight.interface.protocol: expected json_lines, frames, space_packets or "
-            "file.py:Class, got 'morse'",
-        ),
-        (
-            [{"interface": {"transport": {"kind": "unix", "path": "${pty}"}}}],
-            "parameters.flight[0].interface.transport.path: expected one of ${name}",
-        ),
-        (
-            {"interface": {"transport": {"kind": "udp", "local": "4000"}}},
-            "parameters.flight.interface.transport.local: expected HOST:PORT, got '4000'",
-        ),
-        (
-            {"interface": {"transport": {"kind": "tcp", "address": "mcu:99999"}}},
-            "parameters.flight.interface.transport.address: expected a port of at most 65535",
-        ),
-        (
-            {"interface": {"transport": {"kind": "tcp", "address": "mcu:0"}}},
-            "parameters.flight.interface.transport.address: expected the port that the software",
-        ),
-        (
-            program(interface={"protocol": "frames"}, settings={"a" * 33: 1.0}),
-            "parameters.flight.settings: expected names of at most 32 bytes",
-        ),
-        (
-            program(interface={"protocol": "space_packets"}, settings={"way": "x" * 49}),
-            "parameters.flight.settings.way: expected a text of at most 48 bytes",
-        ),
-        (
+FAULTS_OF_FLIGHT = [
+    (["guidance.py:G", "none.py:G"], "parameters.flight[1]: no such file"),
+    ([program(), program(agents=["x*"])], "parameters.flight[1].agents: 'x*' fits no agent"),
+    (program(agents=["x*"]), "parameters.flight.agents: 'x*' fits no agent"),
+    ([{"command": ["no-such"]}], "parameters.flight[0].command: no program 'no-such'"),
+    (
+        {"command": [sys.executable, "${nmae}"]},
+        "parameters.flight.command[1]: expected one of ${name}, ${index}, ${satellite}, "
+        "${address}, got ${nmae}; $${ stands for ${ itself",
+    ),
+    (program(environment={"A": "${pty}"}), "parameters.flight.environment.A: expected one of"),
+    ({"interface": {}}, "parameters.flight.interface.transport: stdio is that of a program"),
+    (
+        {"interface": {"transport": TCP, "protocol": "morse"}},
+        "parameters.flight.interface.protocol: expected json_lines, frames, space_packets or "
+        "file.py:Class, got 'morse'",
+    ),
+    (
+        [{"interface": {"transport": {"kind": "unix", "path": "${pty}"}}}],
+        "parameters.flight[0].interface.transport.path: expected one of ${name}",
+    ),
+    (
+        {"interface": {"transport": {"kind": "udp", "local": "4000"}}},
+        "parameters.flight.interface.transport.local: expected HOST:PORT, got '4000'",
+    ),
+    (
+        {"interface": {"transport": {"kind": "tcp", "address": "mcu:99999"}}},
+        "parameters.flight.interface.transport.address: expected a port of at most 65535",
+    ),
+    (
+        {"interface": {"transport": {"kind": "tcp", "address": "mcu:0"}}},
+        "parameters.flight.interface.transport.address: expected the port that the software",
+    ),
+    (
+        program(interface={"protocol": "frames"}, settings={"a" * 33: 1.0}),
+        "parameters.flight.settings: expected names of at most 32 bytes",
+    ),
+    (
+        program(interface={"protocol": "space_packets"}, settings={"way": "x" * 49}),
+        "parameters.flight.settings.way: expected a text of at most 48 bytes",
+    ),
+    (
+        {"interface": {"transport": {"kind": "udp", "local": "127.0.0.1:4", "remote": "[::1]:5"}}},
+        "parameters.flight.interface.transport.remote: expected an address of IPv4 as local, "
+        "127.0.0.1:4, is, got [::1]:5 of IPv6",
+    ),
+    (
+        [
             {
                 "interface": {
-                    "transport": {"kind": "udp", "local": "127.0.0.1:4", "remote": "[::1]:5"}
-                }
-            },
-            "parameters.flight.interface.transport.remote: expected an address of IPv4 as local, "
-            "127.0.0.1:4, is, got [::1]:5 of IPv6",
-        ),
-        (
-            [
-                {
-                    "interface": {
-                        "transport": {
-                            "kind": "udp",
-                            "local": "[::]:0",
-                            "remote": "10.0.0.${index}:5",
-                        }
+                    "transport": {
+                        "kind": "udp",
+                        "local": "[::]:0",
+                        "remote": "10.0.0.${index}:5",
                     }
                 }
-            ],
-            "parameters.flight[0].interface.transport.remote: expected an address of IPv6 as local",
-        ),
-        (
-            {"interface": {"transport": {"kind": "unix", "path": "/" + "x" * 107}}},
-            "parameters.flight.interface.transport.path: expected a path of at most 107 bytes",
-        ),
-        (
-            {"interface": {"transport": {"kind": "unix", "path": "/" + "x" * 99 + "${name}"}}},
-            "parameters.flight.interface.transport.path: expected a path of at most 107 bytes, which "
-            "is all that a socket's may have, got 108: /",
-        ),
-        (
-            {"interface": {"transport": {"kind": "tcp", "address": "mcu:7${index}999"}}},
-            "parameters.flight.interface.transport.address: expected a port of at most 65535",
-        ),
-    ],
+            }
+        ],
+        "parameters.flight[0].interface.transport.remote: expected an address of IPv6 as local",
+    ),
+    (
+        {"interface": {"transport": {"kind": "unix", "path": "/" + "x" * 107}}},
+        "parameters.flight.interface.transport.path: expected a path of at most 107 bytes",
+    ),
+    (
+        {"interface": {"transport": {"kind": "unix", "path": "/" + "x" * 99 + "${name}"}}},
+        "parameters.flight.interface.transport.path: expected a path of at most 107 bytes, which "
+        "is all that a socket's may have, got 108: /",
+    ),
+    (
+        {"interface": {"transport": {"kind": "tcp", "address": "mcu:7${index}999"}}},
+        "parameters.flight.interface.transport.address: expected a port of at most 65535",
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("flight", "words"),
+    FAULTS_OF_FLIGHT,
 )
 def test_faults_name_their_rule(tmp_path, flight, words):
     (fault,) = faults(tmp_path, flight)

@@ -14,11 +14,16 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = ("cosmos_cli", "madns_runtime")
 LATE_IMPORTS_MAX = 40
 """Imports inside functions in both packages: start-up time that is worth one each."""
+FUNCTION_LINES_MAX = 70
+MODULE_LINES_MAX = 400
 FILES = sorted(
     path
     for package in PACKAGES
     for path in (ROOT / package).rglob("*.py")
     if "templates" not in path.parts
+)
+WITH_TESTS = sorted(
+    path for folder in ("tests", "benchmarks", "docs", "scenarios") for path in (ROOT / folder).rglob("*.py")
 )
 # Names that did not tell what stood there: nobody finds anything at them again.
 GONE = """
@@ -74,6 +79,34 @@ def test_no_two_public_classes_share_a_name():
 
     assert len(places) > 500
     assert {name: found for name, found in places.items() if len(found) > 1} == {}
+
+
+def functions_of(file):
+    """Yield (name, lines) of each function, from its first decorator to its end."""
+    for node in ast.walk(tree_of(file)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            first = min(each.lineno for each in (node, *node.decorator_list))
+            yield node.name, node.end_lineno - first + 1
+
+
+def test_functions_fit_a_screen():
+    everywhere = [*FILES, *WITH_TESTS]
+    lengths = [
+        (str(file.relative_to(ROOT)), *found) for file in everywhere for found in functions_of(file)
+    ]
+
+    assert len(lengths) > 5000
+    assert [each for each in lengths if each[-1] > FUNCTION_LINES_MAX] == []
+
+
+def test_modules_are_no_longer_than_a_subject_needs():
+    lengths = {
+        str(file.relative_to(ROOT)): file.read_text(encoding="utf-8").count("\n")
+        for file in [*FILES, *(ROOT / "benchmarks").rglob("*.py")]
+    }
+
+    assert len(lengths) > 400
+    assert {name: lines for name, lines in lengths.items() if lines > MODULE_LINES_MAX} == {}
 
 
 def circles(graph):

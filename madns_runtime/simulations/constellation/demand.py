@@ -96,12 +96,28 @@ def estimate_demand(
         buffer_bytes=2 * intervals * segment.states[0].nbytes,
         step_s=STEP_S,
     )
-    is_commanded = any(vehicle.actuation for vehicle in parameters.vehicles)
-    is_commanded = is_commanded or bool(flight_rules(parameters))
-    if not is_commanded or not parameters.propagator.can_maneuver:
+    if not _is_commanded(parameters) or not parameters.propagator.can_maneuver:
         return demand
     sync_bytes, sync_s, rest_bytes = _maneuver(fleet.states[0], knot_s, 3 * intervals, propagation)
-    more = [
+    return replace(
+        demand,
+        flows=(*demand.flows, *_maneuvers(sync_bytes, rest_bytes)),
+        sync_bytes=sync_bytes,
+        sync_compute_s=sync_s,
+        sync_rate_hz=COMMANDS_HZ,
+        lead_s=shortest_lead_s(parameters.maneuvers, tick_hz),
+    )
+
+
+def _is_commanded(parameters: ConstellationParameters) -> bool:
+    """Tell whether anything gives commands that may change truth."""
+    has_actuators = any(vehicle.actuation for vehicle in parameters.vehicles)
+    return has_actuators or bool(flight_rules(parameters))
+
+
+def _maneuvers(sync_bytes: int, rest_bytes: int) -> list[Flow]:
+    """Return what commands cost beside what is sent before their time: *rest_bytes* of truth follow each."""
+    flows = [
         Flow(name="results of commands", message_bytes=REPORT_BYTES, rate_hz=2.0 * COMMANDS_HZ),
         *_acknowledged("maneuvers", sync_bytes + rest_bytes, COMMANDS_HZ),
     ]
@@ -112,15 +128,8 @@ def estimate_demand(
             rate_hz=COMMANDS_HZ,
             within_s=URGENT_S,
         )
-        more.append(rest)
-    return replace(
-        demand,
-        flows=(*demand.flows, *more),
-        sync_bytes=sync_bytes,
-        sync_compute_s=sync_s,
-        sync_rate_hz=COMMANDS_HZ,
-        lead_s=shortest_lead_s(parameters.maneuvers, tick_hz),
-    )
+        flows.append(rest)
+    return flows
 
 
 def _acknowledged(what: str, message_bytes: int, rate_hz: float) -> list[Flow]:

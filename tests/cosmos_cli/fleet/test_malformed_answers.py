@@ -56,6 +56,7 @@ NOT_TRIED = {
 }
 SEEDS = 40
 ROUND_TRIPS = {"address": "127.0.0.1", "port": 9, "nonce_hex": "00" * 16, "count": 2}
+WAKE_UPS = {"count": 2, "rate_hz": 100.0, "policy": "normal", "priority": 1}
 A_TREE = {"hash": EMPTY, "label": "l", "files": [["a", EMPTY, 0o444]]}
 
 
@@ -119,17 +120,11 @@ def questions(root: Path) -> dict[str, dict]:
             "runs": f"{own}/runs",
             "state": state,
             "environments": f"{own}/environments",
-            "wake_ups": {"count": 2, "rate_hz": 100.0, "policy": "normal", "priority": 1},
+            "wake_ups": WAKE_UPS,
             "round_trips": ROUND_TRIPS,
         },
         "round_trips": ROUND_TRIPS,
-        "timing_floor": {
-            "count": 2,
-            "rate_hz": 100.0,
-            "policy": "normal",
-            "priority": 1,
-            "link": None,
-        },
+        "timing_floor": {**WAKE_UPS, "link": None},
         "root_content": {"root": own, "state": state},
         "release": {**where, "manifest_sha256": "unknown"},
         "discard": {**where, "shown": {}},

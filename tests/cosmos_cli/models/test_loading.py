@@ -136,93 +136,96 @@ def test_missing_keys_are_placed_at_what_lacks_them(see):
     )
 
 
+MISTAKES = [
+    ("agents: {count: 0}", "a.yaml:3:17: agents.count: expected >= 1, got 0"),
+    ("agents: {count: 1e4}", "a.yaml:3:17: agents.count: expected <= 5000, got 1e4"),
+    ("agents: {count: '3'}", "a.yaml:3:17: agents.count: expected a whole number, got '3'"),
+    ("agents: {count: yes}", "a.yaml:3:17: agents.count: expected a whole number, got 'yes'"),
+    ("agents: {count: true}", "a.yaml:3:17: agents.count: expected a whole number, got true"),
+    ("agents: {count: }", "a.yaml:3:17: agents.count: expected a whole number, got nothing"),
+    ("agents: 3", "a.yaml:3:9: agents: expected a mapping, got 3"),
+    ("agents: [3]", "a.yaml:3:9: agents: expected a mapping, got a list"),
+    (
+        "agents: {count: 3, phase: stagered}",
+        "a.yaml:3:27: agents.phase: expected staggered or aligned, got 'stagered', "
+        "did you mean staggered?",
+    ),
+    (
+        "agents: {count: 3, names: [a, 2, c]}",
+        "a.yaml:3:31: agents.names[1]: expected a text, got 2",
+    ),
+    (
+        "agents: {count: 3, names: abc}",
+        "a.yaml:3:27: agents.names: expected a list, got 'abc'",
+    ),
+    (
+        "agents: {count: 3, tick_hz: 12:30}",
+        "a.yaml:3:29: agents.tick_hz: expected a number, got '12:30'",
+    ),
+    (
+        "agents: {count: 3, xyz: 1}",
+        "a.yaml:3:20: agents.xyz: unknown key; known here: count, tick_hz, names, phase, "
+        "per_process, restarts_max",
+    ),
+    (
+        "agents: {count: 3, names: [a, b]}",
+        "a.yaml:3:27: agents.names: expected 3 names (agents.count), got 2",
+    ),
+    (
+        "agents: {count: 3, names: [a, Host, c]}",
+        "a.yaml:3:31: agents.names[1]: 'Host' is reserved; give the agent another name",
+    ),
+    (
+        "agents: {count: 3, names: [a, b, A]}",
+        "a.yaml:3:34: agents.names[2]: expected unique names, got 'A' again (first at [0])",
+    ),
+    (
+        "agents: {count: 1, names: [../x]}",
+        "a.yaml:3:28: agents.names[0]: expected letters, digits, '.', '_' or '-' "
+        "(a folder is named after the agent), got '../x'",
+    ),
+    (
+        "agents: {count: 3, per_process: 4}",
+        "a.yaml:3:33: agents.per_process: expected <= agents.count (3), got 4",
+    ),
+    (
+        "agents: {count: 3, restarts_max: 2}",
+        "a.yaml:3:34: agents.restarts_max: expected 0 with on_agent_loss: abort, got 2; "
+        "say on_agent_loss: continue",
+    ),
+    (
+        "on_agent_loss: continue\nagents: {count: 3, restarts_max: 2, per_process: 3}",
+        "a.yaml:4:34: agents.restarts_max: expected 0 with agents.per_process: 3, got 2: "
+        "an agent that shares its process cannot be started again alone",
+    ),
+    (
+        "agents: {count: 3}\nexecutor: {address: 'tcp://a:8786'}",
+        "a.yaml:4:21: executor.address: expected nothing with executor.kind process; "
+        "say kind: dask",
+    ),
+    (
+        "agents: {count: 3}\nseed: 9223372036854775808",
+        "a.yaml:4:7: seed: expected a whole number from -2^63 to 2^63 - 1, got 9223372036854775808:"
+        " write one that need not be whole such as 1e20, and a text in quotes",
+    ),
+    (
+        "agents: {count: 3}\ntime: {duration_s: 4e8}",
+        "a.yaml:4:20: time.duration_s: expected <= 315576000, got 4e8",
+    ),
+    (
+        "agents: {count: 3, tick_hz: .nan}",
+        "a.yaml:3:29: agents.tick_hz: expected a finite number, got .nan",
+    ),
+    (
+        "agents: {count: 3, tick_hz: 0.01}",
+        "a.yaml:1:1: time.duration_s: expected at least one tick (100 s at 0.01 Hz), got 60",
+    ),
+]
+
+
 @pytest.mark.parametrize(
     ("line", "shown"),
-    [
-        ("agents: {count: 0}", "a.yaml:3:17: agents.count: expected >= 1, got 0"),
-        ("agents: {count: 1e4}", "a.yaml:3:17: agents.count: expected <= 5000, got 1e4"),
-        ("agents: {count: '3'}", "a.yaml:3:17: agents.count: expected a whole number, got '3'"),
-        ("agents: {count: yes}", "a.yaml:3:17: agents.count: expected a whole number, got 'yes'"),
-        ("agents: {count: true}", "a.yaml:3:17: agents.count: expected a whole number, got true"),
-        ("agents: {count: }", "a.yaml:3:17: agents.count: expected a whole number, got nothing"),
-        ("agents: 3", "a.yaml:3:9: agents: expected a mapping, got 3"),
-        ("agents: [3]", "a.yaml:3:9: agents: expected a mapping, got a list"),
-        (
-            "agents: {count: 3, phase: stagered}",
-            "a.yaml:3:27: agents.phase: expected staggered or aligned, got 'stagered', "
-            "did you mean staggered?",
-        ),
-        (
-            "agents: {count: 3, names: [a, 2, c]}",
-            "a.yaml:3:31: agents.names[1]: expected a text, got 2",
-        ),
-        (
-            "agents: {count: 3, names: abc}",
-            "a.yaml:3:27: agents.names: expected a list, got 'abc'",
-        ),
-        (
-            "agents: {count: 3, tick_hz: 12:30}",
-            "a.yaml:3:29: agents.tick_hz: expected a number, got '12:30'",
-        ),
-        (
-            "agents: {count: 3, xyz: 1}",
-            "a.yaml:3:20: agents.xyz: unknown key; known here: count, tick_hz, names, phase, "
-            "per_process, restarts_max",
-        ),
-        (
-            "agents: {count: 3, names: [a, b]}",
-            "a.yaml:3:27: agents.names: expected 3 names (agents.count), got 2",
-        ),
-        (
-            "agents: {count: 3, names: [a, Host, c]}",
-            "a.yaml:3:31: agents.names[1]: 'Host' is reserved; give the agent another name",
-        ),
-        (
-            "agents: {count: 3, names: [a, b, A]}",
-            "a.yaml:3:34: agents.names[2]: expected unique names, got 'A' again (first at [0])",
-        ),
-        (
-            "agents: {count: 1, names: [../x]}",
-            "a.yaml:3:28: agents.names[0]: expected letters, digits, '.', '_' or '-' "
-            "(a folder is named after the agent), got '../x'",
-        ),
-        (
-            "agents: {count: 3, per_process: 4}",
-            "a.yaml:3:33: agents.per_process: expected <= agents.count (3), got 4",
-        ),
-        (
-            "agents: {count: 3, restarts_max: 2}",
-            "a.yaml:3:34: agents.restarts_max: expected 0 with on_agent_loss: abort, got 2; "
-            "say on_agent_loss: continue",
-        ),
-        (
-            "on_agent_loss: continue\nagents: {count: 3, restarts_max: 2, per_process: 3}",
-            "a.yaml:4:34: agents.restarts_max: expected 0 with agents.per_process: 3, got 2: "
-            "an agent that shares its process cannot be started again alone",
-        ),
-        (
-            "agents: {count: 3}\nexecutor: {address: 'tcp://a:8786'}",
-            "a.yaml:4:21: executor.address: expected nothing with executor.kind process; "
-            "say kind: dask",
-        ),
-        (
-            "agents: {count: 3}\nseed: 9223372036854775808",
-            "a.yaml:4:7: seed: expected a whole number from -2^63 to 2^63 - 1, got 9223372036854775808:"
-            " write one that need not be whole such as 1e20, and a text in quotes",
-        ),
-        (
-            "agents: {count: 3}\ntime: {duration_s: 4e8}",
-            "a.yaml:4:20: time.duration_s: expected <= 315576000, got 4e8",
-        ),
-        (
-            "agents: {count: 3, tick_hz: .nan}",
-            "a.yaml:3:29: agents.tick_hz: expected a finite number, got .nan",
-        ),
-        (
-            "agents: {count: 3, tick_hz: 0.01}",
-            "a.yaml:1:1: time.duration_s: expected at least one tick (100 s at 0.01 Hz), got 60",
-        ),
-    ],
+    MISTAKES,
 )
 def test_each_mistake_has_its_sentence(see, line, shown):
     text = f"name: a\nsimulation: counter\n{line}\n"
