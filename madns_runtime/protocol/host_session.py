@@ -15,15 +15,11 @@ from madns_runtime import __version__
 from madns_runtime.config import Timeouts
 from madns_runtime.protocol import events as told
 from madns_runtime.protocol import messages
-from madns_runtime.protocol.codec import (
-    NO_DATA,
-    MalformedMessage,
-    decode_data,
-    decode_message,
-)
+from madns_runtime.protocol.codec import NO_DATA, MalformedMessage, decode_data, decode_message
 from madns_runtime.protocol.datagram import PREFIX_BYTES
 from madns_runtime.protocol.events import HostSessionEvent, Phase
 from madns_runtime.protocol.host_peers import Address, HostLinks, Peer, Roster
+from madns_runtime.protocol.host_waits import AWAITED, ENDING, StateWait
 from madns_runtime.protocol.link import Link
 from madns_runtime.protocol.link_settings import LinkSettings
 from madns_runtime.protocol.messages import Message, Service
@@ -35,14 +31,7 @@ LINGER_S = 0.5
 """Longest wait of the host at its end for its last acknowledgements to leave."""
 
 _NOT_THERE = (Phase.ABSENT, Phase.JOINING, Phase.STOPPED, Phase.LOST)
-_ENDING = (HostState.BEGIN_SHUTDOWN, HostState.EMERGENCY_SHUTDOWN)
 _BEFORE_STOP = tuple(state for state in HOST_LIVE if state is not HostState.BEGIN_SHUTDOWN)
-_AWAITED = {
-    HostState.HOST_STARTUP: ("AGENT_READY", Phase.READY),
-    HostState.HOST_SIMULATION_READY: ("AGENT_SIMULATION_READY", Phase.SIMULATION_READY),
-    HostState.SIMULATION_START: ("SIMULATION_COMPLETE", Phase.COMPLETE),
-}
-"""Word of every agent that a state waits for, and the phase that it brings them to."""
 
 
 class HostSession:
@@ -78,8 +67,8 @@ class HostSession:
         self._timeouts = timeouts
         self._aborts = on_agent_loss == "abort"
         self._machine = host_machine()
-        self._state_deadline_s = now_s + timeouts.agents_ready_s
-        self._entered_s = self._check_due_s = now_s
+        self._wait = StateWait(now_s, timeouts.agents_ready_s)
+        self._check_due_s = now_s
         self._t0_host_s: float | None = None
         self._end_host_s = float("inf")
         self.refused = self._links.refused
@@ -93,7 +82,7 @@ class HostSession:
     def setup_finished(self, initial: Mapping[str, Any], now_s: float) -> None:
         """Send each agent its initial data (by name); their readiness is awaited."""
         self._fire(HostEvent.SETUP_FINISHED)
-        self._enter(now_s, self._timeouts.agent_setup_s)
+        self._wait.begin(now_s, self._timeouts.agent_setup_s)
         for name, data in initial.items():
             if self.peers[name].phase is Phase.READY:
                 self.send_setup(name, data, now_s)
@@ -113,7 +102,7 @@ class HostSession:
         self._fire(HostEvent.AGENTS_SIMULATION_READY)
         self._t0_host_s = t0_host_s
         self._end_host_s = t0_host_s + duration_s
-        self._enter(now_s, t0_host_s - now_s + duration_s + self._timeouts.complete_s)
+        self._wait.begin(now_s, t0_host_s - now_s + duration_s + self._timeouts.complete_s)
         for peer in self.peers.values():
             if peer.phase is Phase.SIMULATION_READY:
                 self._start_peer(peer, now_s)
@@ -123,12 +112,12 @@ class HostSession:
         """Take the simulated time to be over at *end_host_s* on the host's clock: agents were told."""
         self._end_host_s = end_host_s
         if self.state is HostState.SIMULATION_START:
-            self._state_deadline_s = end_host_s + self._timeouts.complete_s
+            self._wait.until_s = end_host_s + self._timeouts.complete_s
 
     def order_stop(self, now_s: float) -> None:
         """Tell every agent to flush its records and end."""
         self._fire(HostEvent.STOP_ORDERED)
-        self._enter(now_s, self._timeouts.shutdown_s)
+        self._wait.begin(now_s, self._timeouts.shutdown_s)
         for peer in self.peers.values():
             if peer.phase is Phase.COMPLETE:
                 # Behind whatever the host's half has sent: RELIABLE, so that it overtakes nothing.
@@ -140,7 +129,7 @@ class HostSession:
         if not self._machine.allows(HostEvent.EMERGENCY):
             return
         self._fire(HostEvent.EMERGENCY)
-        self._enter(now_s, self._timeouts.shutdown_s)
+        self._wait.begin(now_s, self._timeouts.shutdown_s)
         self._events.append(told.EmergencyDeclared(who, reason))
         for peer in self.peers.values():
             if peer.link is not None and peer.phase is not Phase.STOPPED:
@@ -166,7 +155,7 @@ class HostSession:
     def records_closed(self, now_s: float) -> None:
         """The host's records are on disk; the session lingers for its last acknowledgements."""
         self._fire(HostEvent.RECORDS_CLOSED)
-        self._enter(now_s, LINGER_S)
+        self._wait.begin(now_s, LINGER_S)
 
     def send(
         self,
@@ -338,10 +327,6 @@ class HostSession:
     def _fire(self, event: HostEvent) -> None:
         self._events.append(told.HostStateEntered(self._machine.fire(event)))
 
-    def _enter(self, now_s: float, deadline_s: float) -> None:
-        self._entered_s = now_s
-        self._state_deadline_s = now_s + deadline_s
-
     def _lose(self, reasons: Mapping[str, str], now_s: float) -> None:
         """Take agents, by name, for lost: an emergency, unless the run may lose them and some are left."""
         if not reasons:
@@ -356,39 +341,39 @@ class HostSession:
     def _progress(self, now_s: float) -> None:
         """Move on when nobody is waited for any more."""
         state = self.state
-        if state in _ENDING:
+        if state in ENDING:
             if not self._roster.names_outside(Phase.STOPPED, Phase.ABSENT):
                 self._stop(now_s, ())
-        elif state in _AWAITED and self._roster.are_settled(_AWAITED[state][1]):
+        elif state in AWAITED and self._roster.are_settled(AWAITED[state][1]):
             self._go_on(state, now_s)
 
     def _go_on(self, state: HostState, now_s: float) -> None:
         """Take the step that every agent was awaited for."""
         if state is HostState.HOST_STARTUP:
             self._fire(HostEvent.AGENTS_READY)
-            self._enter(now_s, self._timeouts.host_setup_s)
+            self._wait.begin(now_s, self._timeouts.host_setup_s)
             self._events.append(told.AgentsReady())
         elif state is HostState.HOST_SIMULATION_READY:
             self._events.append(told.AgentsSimulationReady())
         else:
             self._fire(HostEvent.AGENTS_COMPLETE)
-            self._enter(now_s, self._timeouts.shutdown_s)
+            self._wait.begin(now_s, self._timeouts.shutdown_s)
             self._events.append(told.AgentsComplete())
 
     def _stop(self, now_s: float, missing: tuple[str, ...]) -> None:
         self._fire(HostEvent.AGENTS_STOPPED)
-        self._enter(now_s, self._timeouts.shutdown_s)
+        self._wait.begin(now_s, self._timeouts.shutdown_s)
         self._events.append(told.AgentsStopped(missing))
 
     def _check_state_deadline(self, now_s: float) -> None:
         """End a wait that is over: whoever did not answer is lost, all of them named at once."""
-        if now_s < self._state_deadline_s:
+        if not self._wait.is_over(now_s):
             return
         state = self.state
-        waited_s = round(now_s - self._entered_s, 1)
-        if state in _AWAITED:
-            word, phase = _AWAITED[state]
-            self._state_deadline_s = now_s + self._timeouts.silence_s
+        waited_s = self._wait.lasted_s(now_s)
+        if state in AWAITED:
+            word, phase = AWAITED[state]
+            self._wait.until_s = now_s + self._timeouts.silence_s
             reason = f"no {word} in {waited_s:g} s"
             self._roster.awaits_returns = False
             self._lose(dict.fromkeys(self._roster.names_outside(phase), reason), now_s)
@@ -396,7 +381,7 @@ class HostSession:
                 self.emergency(", ".join(self.peers), f"{reason}: none has returned", now_s)
         elif state is HostState.SIMULATION_SETUP:
             self.emergency("host", f"setup of the simulation took over {waited_s:g} s", now_s)
-        elif state in _ENDING:
+        elif state in ENDING:
             self._stop(now_s, self._roster.names_outside(Phase.STOPPED, Phase.ABSENT))
         elif state is HostState.WAITING_SERVER_STOP:
             self._fire(HostEvent.SERVER_STOPPED)

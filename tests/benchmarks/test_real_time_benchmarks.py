@@ -11,6 +11,7 @@ sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 import scale  # noqa: E402 - behind the line that says where they are
 import soak  # noqa: E402
 import star  # noqa: E402
+import star_transports  # noqa: E402
 import stars  # noqa: E402
 
 
@@ -62,8 +63,8 @@ def test_messages_on_a_stream_are_taken_whole():
     buffer = bytearray()
     sent = [b"one", b"", b"three"]
     taken = []
-    for byte in b"".join(stars.LENGTH.pack(len(each)) + each for each in sent) + b"\x05":
+    for byte in b"".join(star_transports.LENGTH.pack(len(each)) + each for each in sent) + b"\x05":
         buffer.append(byte)
-        taken += stars.messages_in(buffer)
+        taken += star_transports.messages_in(buffer)
 
     assert (taken, bytes(buffer)) == (sent, b"\x05")

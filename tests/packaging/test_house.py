@@ -23,7 +23,9 @@ FILES = sorted(
     if "templates" not in path.parts
 )
 WITH_TESTS = sorted(
-    path for folder in ("tests", "benchmarks", "docs", "scenarios") for path in (ROOT / folder).rglob("*.py")
+    path
+    for folder in ("tests", "benchmarks", "docs", "scenarios")
+    for path in (ROOT / folder).rglob("*.py")
 )
 # Names that did not tell what stood there: nobody finds anything at them again.
 GONE = """

@@ -43,11 +43,14 @@ def test_orders_are_taken_listed_refused_and_recorded_and_a_stop_completes_the_r
         assert inject("run", "annotate", "text=hello", "for_s=1e7")[0] == 0
         code, listed = inject("--list")
         refusals = [(inject(*arguments), words) for arguments, words in REFUSED]
+        slowed = inject("agent-0*", "slow", "factor=2", "for_s=10")
         stopped, _ = inject("run", "stop")
         out, _ = run.communicate(timeout=PATIENCE_S)
 
-    assert (code, stopped) == (0, 0)
-    assert {"annotate", "stop", "device_fault"} <= {each["action"] for each in listed["actions"]}
+    assert (code, slowed[0], stopped) == (0, 0, 0), slowed
+    assert {"annotate", "stop", "device_fault", "slow", "kill"} <= {
+        each["action"] for each in listed["actions"]
+    }
     # Of real time alone.
     assert not {"stress", "step_clock", "drift_clock"} & {e["action"] for e in listed["actions"]}
     assert [each["parameters"] for each in listed["in_force"]] == [{"text": "hello"}]
@@ -59,7 +62,7 @@ def test_orders_are_taken_listed_refused_and_recorded_and_a_stop_completes_the_r
     assert result["duration_s"] < 1e7
     lines = (cosmos.directory(result) / "host" / "events.jsonl").read_text().splitlines()
     found = [e["action"] for e in map(json.loads, lines) if e.get("event") == "action_began"]
-    assert found == ["annotate", "stop"]
+    assert found == ["annotate", "slow", "stop"]
     assert not list(cosmos.runs.glob("*/.actions.sock"))
 
 
