@@ -236,10 +236,26 @@ def cause_of(result: dict[str, Any]) -> str:
 
 
 def counts(shape: Shape) -> tuple[float, float]:
-    """Return system calls per agent tick, and returns of epoll_wait per pack and period, of one process."""
+    """
+    Return system calls per agent tick, and returns of epoll_wait per pack and period, of one process.
+
+    Between two runs of different lengths: what start and end take is in both.
+    """
+    (calls, waits), (more_calls, more_waits) = (
+        calls_and_waits(shape, seconds) for seconds in (SECONDS_MIN, 2 * SECONDS_MIN)
+    )
+    periods = SECONDS_MIN * shape.hz
+    return (
+        (more_calls - calls) / (shape.agents * periods),
+        (more_waits - waits) / (len(shape.packs()[0]) * periods),
+    )
+
+
+def calls_and_waits(shape: Shape, seconds: float) -> tuple[int, int]:
+    """Return how many system calls and returns of epoll_wait one process took over a run."""
     text = (
         f"name: counts\nsimulation: counter\nagents: {{count: {shape.agents}, tick_hz: {shape.hz}, "
-        f"per_process: {shape.per_process}}}\ntime: {{duration_s: {SECONDS_MIN}}}\n"
+        f"per_process: {shape.per_process}}}\ntime: {{duration_s: {seconds}}}\n"
         "deadline: {max_miss_ratio: 1}\n"
     )
     with cosmos_run(text) as run:
@@ -247,8 +263,7 @@ def counts(shape: Shape) -> tuple[float, float]:
         records = next(iter(host["agents"].values()))["records"]
     loop, network = records["loop"], records["network"]
     calls = sum(loop.values()) + sum(network[k] for k in ("sent", "received", "empty_reads"))
-    periods = SECONDS_MIN * shape.hz
-    return calls / (shape.agents * periods), loop["waits"] / (len(shape.packs()[0]) * periods)
+    return calls, loop["waits"]
 
 
 def cyclictest(shape: Shape, seconds: float) -> float:

@@ -7,6 +7,7 @@ deadline. The composition root feeds it and carries out what its events say.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -62,6 +63,18 @@ class PingPlan:
     delay_s: float = 0.0
     """From the start to the first of one that does not bring the clock up."""
     interval_s: float = PING_INTERVAL_S
+
+    def next_s(self, started_s: float, now_s: float) -> float:
+        """
+        Return when to ping after a ping at *now_s*: in the agent's own place within the interval.
+
+        Counted from the start, so that agents that all pinged at once, as after set-up, do not go on doing so:
+        pings of a whole pack take more than a packet, and their answers a wake-up more.
+        """
+        first_s = started_s + self.delay_s
+        return first_s + self.interval_s * max(
+            0, math.ceil((now_s - first_s) / self.interval_s + 0.5)
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -347,7 +360,10 @@ class AgentSession:
     def _ping(self, now_s: float) -> None:
         is_first = self._pings_closely > 0
         self._pings_closely -= is_first
-        self.ping_due_s = now_s + (PING_INTERVAL_FIRST_S if is_first else self._pings.interval_s)
+        if self._pings_closely:
+            self.ping_due_s = now_s + PING_INTERVAL_FIRST_S
+        else:
+            self.ping_due_s = self._pings.next_s(self._started_s, now_s)
         report: Mapping[str, Any] = {}
         if now_s >= self._report_due_s:
             report = self._report()

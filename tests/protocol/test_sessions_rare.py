@@ -256,7 +256,7 @@ def test_word_out_of_turn_moves_no_agent_and_holds_up_no_wait(word):
 
 def test_agents_silent_at_once_are_all_lost_and_named():
     w = world(count=3)
-    w.run_for(1.5)
+    w.run_for(1.6)  # no ping is on its way
     w.host.peers["agent-2"].heard_s = w.host.peers["agent-3"].heard_s = w.now_s - 2.6
     w.frozen.update(("agent-2", "agent-3"))
 
