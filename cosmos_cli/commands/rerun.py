@@ -16,7 +16,9 @@ from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import runs_root
 from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.launch.execute import Detached, RunOptions, execute
+from cosmos_cli.rerun.actions import action_remarks
 from cosmos_cli.rerun.device_comparison import compare_devices
+from cosmos_cli.rerun.expectations import compare_expectations
 from cosmos_cli.rerun.flown_software import recorded_software, software_remarks, version_remarks
 from cosmos_cli.rerun.outcome import RerunOutcome, print_outcome
 from cosmos_cli.rerun.recorded_run import (
@@ -56,7 +58,7 @@ def rerun(
     """
     Fly a recorded run again without its hardware: in lockstep, each device played back from its records.
 
-    Today's software flies where it can be stepped, and what of it differs from what was flown is named. Ends with 0 when all that is compared is the same, with 1 when
+    Its checks are judged on the rerun too, and its timeline takes place again. Today's software flies where it can be stepped, and what of it differs from what was flown is named. Ends with 0 when all that is compared is the same, with 1 when
     something differs, with 2 when the run cannot be flown again.
     """
     if as_recorded and as_recorded_from is not None:
@@ -104,6 +106,7 @@ def _fly(
         return RerunOutcome(
             devices=compare_devices(recorded, summary.run.path),
             streams=compare(before, after, Selection(), progress),
-            remarks=remarks,
+            remarks=(*remarks, *action_remarks(recorded.run, summary.run, flown.left_out)),
             unlike=flown.unlike,
+            expectations=compare_expectations(recorded.run, summary.run),
         )

@@ -14,6 +14,7 @@ from cosmos_cli.diff.document import to_document
 from cosmos_cli.diff.fields import FieldDifference
 from cosmos_cli.diff.stream import StreamDifference
 from cosmos_cli.rerun.device_comparison import SAME_TIME_S, ChannelComparison
+from cosmos_cli.rerun.expectations import ExpectationComparison
 from cosmos_cli.ui.console import Column, Console
 from cosmos_cli.ui.plural import counted
 from madns_runtime.analysis.sampling import as_array
@@ -33,6 +34,20 @@ class RerunOutcome:
     remarks: Sequence[str]
     unlike: Sequence[str]
     """Streams of the simulation that are not compared."""
+    expectations: Sequence[ExpectationComparison] = ()
+    """Checks that were judged in both runs."""
+
+    @property
+    def differing_expectations(self) -> list[ExpectationComparison]:
+        """Checks that hold in one run alone, but for those on what is not compared."""
+        return [
+            each
+            for each in self.expectations
+            if not each.is_same
+            and not self._is_unlike(each.stream)
+            and not self._is_unlike(f"{each.stream}.{each.field}")
+            and not any(fnmatchcase(f"device.{each.stream}", glob) for glob in self.unlike)
+        ]
 
     @property
     def differing(self) -> list[StreamDifference]:
@@ -66,6 +81,7 @@ class RerunOutcome:
         return (
             not self.differing_channels
             and not self.differing
+            and not self.differing_expectations
             and not self.alone
             and not self.streams.missing
         )
@@ -134,6 +150,7 @@ class RerunOutcome:
                 {**asdict(each), "same": each.is_same, "judged": self.is_judged(each)}
                 for each in self.devices
             ],
+            "checks": [{**asdict(each), "same": each.is_same} for each in self.expectations],
             "not_compared": list(self.unlike),
             "diff": to_document(self.streams),
         }
@@ -156,6 +173,9 @@ def print_outcome(console: Console, found: RerunOutcome) -> None:
         console.data(f"{one.table}: {'; '.join(found.differences_of(one))}")
     for text in found.alone[:STREAMS_SHOWN_MAX]:
         console.data(text)
+    for check in found.expectations:
+        if not check.is_same:
+            console.data(check.words)
     console.data(verdict_of(found))
 
 
@@ -171,6 +191,7 @@ def verdict_of(found: RerunOutcome) -> str:
         return f"SAME: {both}"
     names = [each.name for each in found.differing_channels]
     names += [one.table for one in found.differing] + found.alone
+    names += [f"check {each.name}" for each in found.differing_expectations]
     names += ["missing data"] * bool(found.streams.missing)
     return f"DIFFERENT: in {', '.join(names[:STREAMS_SHOWN_MAX])} ({both})"
 

@@ -16,6 +16,7 @@ from cosmos_cli.models.device_kinds import DeviceQuestion, KindAnswer, ask_kinds
 from cosmos_cli.models.loading import ScenarioFile, check_scenario
 from cosmos_cli.models.scenario import Scenario
 from cosmos_cli.models.separate_process import SeparateDefect, SeparateFailure, work_separately
+from cosmos_cli.rerun.carried_over import ATTEMPTS_MAX, CarriedOver, carried_over
 from cosmos_cli.rerun.recorded_run import FlownRun, UsedDevice
 from madns_runtime.config import RunConfig, ScenarioDevice, to_mapping
 from madns_runtime.errors import MadnsError
@@ -36,6 +37,8 @@ class RerunScenario:
     remarks: tuple[str, ...]
     unlike: tuple[str, ...]
     """Streams of the simulation that tell of computers and networks: they are not compared."""
+    left_out: tuple[str, ...] = ()
+    """Words of actions that are not carried over."""
 
 
 def make_rerun(recorded: FlownRun) -> RerunScenario:
@@ -56,14 +59,36 @@ def make_rerun(recorded: FlownRun) -> RerunScenario:
         for name, agent in recorded.agents.items()
         if agent.missed
     ]
-    values = _values(recorded, told["parameters"], remarks)
-    text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
-    head = f"# {recorded.run.name}, flown again in lockstep with its devices played back.\n"
-    scenario = check_scenario(head + text, recorded.folder / f"{recorded.run.name}-rerun.yaml")
+    carried = carried_over(recorded)
+    values = _values(recorded, told["parameters"], carried, remarks)
+    scenario = _checked(recorded, values, carried)
     return RerunScenario(
         scenario=scenario,
-        remarks=tuple(dict.fromkeys(remarks)),
+        remarks=tuple(dict.fromkeys([*remarks, *carried.remarks])),
+        left_out=tuple(carried.left_out),
         unlike=() if config.time.is_lockstep else tuple(told["unlike"]),
+    )
+
+
+def _checked(recorded: FlownRun, values: Mapping[str, Any], carried: CarriedOver) -> ScenarioFile:
+    """
+    Return the scenario without those entries and checks that lockstep, or today's simulation, refuses.
+
+    Raises:
+        InputError: It has other faults.
+    """
+    head = f"# {recorded.run.name}, flown again in lockstep with its devices played back.\n"
+    path = recorded.folder / f"{recorded.run.name}-rerun.yaml"
+    for _ in range(ATTEMPTS_MAX):
+        whole = {**values, **carried.values()}
+        text = yaml.safe_dump(whole, sort_keys=False, allow_unicode=True)
+        try:
+            return check_scenario(head + text, path)
+        except InputError as refused:
+            if not carried.leave_out(refused):
+                raise
+    raise InputError(
+        f"{recorded.run.name}: its checks and its timeline do not go together any more"
     )
 
 
@@ -113,22 +138,24 @@ def _ask_simulation(config: RunConfig, run: Path) -> Mapping[str, Any]:
 
 
 def _values(
-    recorded: FlownRun, parameters: Mapping[str, Any], remarks: list[str]
+    recorded: FlownRun, parameters: Mapping[str, Any], carried: CarriedOver, remarks: list[str]
 ) -> dict[str, Any]:
-    """Return the scenario as plain values."""
+    """Return the scenario as plain values, without what is carried over."""
     config = recorded.config
     agents = dataclasses.replace(config.agents, restarts_max=0)
     time = dataclasses.replace(config.time, mode="lockstep")
-    if config.on_agent_loss != "abort":
+    loss = "continue" if carried.loses_agents else "abort"
+    if config.on_agent_loss != loss:
         remarks.append("on_agent_loss: abort, as its losses are not flown again")
     hardware = dataclasses.replace(config.hardware, use=(), devices=_devices(recorded, remarks))
     values = {
         **{key: getattr(config, key) for key in Scenario.model_fields if hasattr(config, key)},
+        "timeline": [],
         "name": config.scenario,
         "agents": agents,
         "time": time,
         "hardware": hardware,
-        "on_agent_loss": "abort",
+        "on_agent_loss": loss,
         "parameters": dict(parameters),
     }
     plain: dict[str, Any] = json.loads(json.dumps(to_mapping(values)))

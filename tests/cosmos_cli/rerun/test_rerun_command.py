@@ -69,6 +69,14 @@ parameters:
       sensors: {gyro: {device: imu.gyro}, magnetometer: {noise: 1e-8}}
       stimuli: [{source: magnetic_field, channel: imu.coil, scale: 1.0e+4, rate_hz: 20}]
   flight: brake.py:Brake
+timeline:
+  - {at_s: 0.5, action: device_fault, agents: [agent-01], device: imu, fault: bias, value: 1.0e-3, for_s: 0.3}
+  - {at_s: 1.0, action: annotate, text: halfway}
+  - {when: {stream: ticks, field: tick, above: 5}, action: annotate, text: of real time alone}
+checks:
+  - {name: turns, stream: imu.gyro, field: gyro_x, within: [-1, 1]}
+  - {name: prompt, stream: ticks, field: lateness_us, below: 60, unit: s}
+  - {name: halfway, event: action_began, agents: [host], before_s: 1.5}
 """
 EVEN = """
 name: even
@@ -81,6 +89,14 @@ hardware:
       kind: synthetic
       rate_hz: 30
       parameters: {channels: [{name: value, elements: [{shape: sine, amplitude: 1.0, noise: 0.1}]}]}
+on_agent_loss: continue
+timeline:
+  - {at_s: 0.2, action: device_fault, agents: ["*"], device: gps, fault: bias, value: 3, for_s: 0.5}
+  - {when: {stream: round_trips, field: packet, above: 20}, action: hang, agents: [agent-01], for_s: 0.2}
+  - {at_s: 1.2, action: kill, agents: [agent-02], for_s: 0.2}
+checks:
+  - {name: shifted, stream: gps.value, field: value, statistic: max, below: 3}
+  - {name: hung, event: hang_begins, agents: [agent-01]}
 """
 
 
@@ -125,8 +141,13 @@ def test_a_lockstep_run_with_devices_is_the_same_again(tmp_path):
 
     assert code == 0, err
     assert "even.yaml" in document["flown"]["files"]
-    assert told["same"]
-    value = channels(told)["agent-02/gps.value"]
+    assert told["same"], told["diff"]
+    assert document["exit_code"] == 4 and [e["passed"] for e in told["checks"]] == [False, True]
+    assert told["checks"][0]["got"] == told["checks"][0]["rerun_got"] > 3
+    assert told["remarks"] == [
+        "timeline[0] (device_fault): device_fault is in the samples on record, and not inserted again"
+    ]
+    value = channels(told)["agent-01/gps.value"]
     assert (value["compared"], value["different"], value["left_out"]) == (60, 0, 0)
 
 
@@ -148,6 +169,14 @@ def test_a_run_in_real_time_has_the_same_samples_commands_and_truth_in_lockstep(
         assert tables["commands"]["matched"] >= 20
         assert tables["commands"]["identical"]
     assert told["rerun"] != told["run"]
+    checks = {each["name"]: each for each in told["checks"]}
+    assert list(checks) == ["turns", "halfway"]
+    assert all(each["same"] and each["rerun_passed"] for each in checks.values())
+    assert checks["turns"]["got"] == pytest.approx(checks["turns"]["rerun_got"], abs=1e-3)
+    assert [text for text in told["remarks"] if text.startswith("timeline")] == [
+        "timeline[0] (device_fault): device_fault is in the samples on record, and not inserted again",
+        "timeline[2] (annotate): left out: stream ticks is not recorded in time.mode lockstep",
+    ]
 
 
 def test_a_change_of_the_flight_software_is_found_and_its_copy_is_not(braked, tmp_path):
