@@ -376,7 +376,8 @@ def _plain(document: Mapping[str, Any]) -> dict[str, Any]:
     data = orjson.dumps(
         document, default=_last_resort, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_NON_STR_KEYS
     )
-    return orjson.loads(data)  # type: ignore[no-any-return]
+    plain: dict[str, Any] = orjson.loads(data)
+    return plain
 
 
 def _last_resort(value: Any) -> Any:

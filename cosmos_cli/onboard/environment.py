@@ -214,7 +214,7 @@ class Builder:
         if not os.path.exists(entry_points):
             return
         entries = configparser.ConfigParser(delimiters=("=",), interpolation=None)
-        entries.optionxform = str  # type: ignore[method-assign,assignment]
+        entries.optionxform = str  # type: ignore[method-assign,assignment]  # as its documentation has it
         entries.read(entry_points, encoding="utf-8")
         for section in ("console_scripts", "gui_scripts"):
             for name, value in entries.items(section) if entries.has_section(section) else ():

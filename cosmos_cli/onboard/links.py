@@ -77,8 +77,8 @@ def read_text(path: str) -> str | None:
 
 def read_number(path: str, base: int = 10) -> int | None:
     """Return the number in a file of the kernel; None where there is none."""
-    with contextlib.suppress(TypeError, ValueError):
-        return int(read_text(path), base)  # type: ignore[arg-type]
+    with contextlib.suppress(ValueError):
+        return int(read_text(path) or "", base)
     return None
 
 

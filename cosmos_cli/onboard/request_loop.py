@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator, Mapping
 TYPE_CHECKING = False  # to import typing and dataclasses takes longer than most that is done here
 if TYPE_CHECKING:
     import subprocess
-    from typing import Any, BinaryIO, TypeAlias
+    from typing import IO, Any, BinaryIO, TypeAlias
 
     Handler = Callable[["VerbRequest"], Any]
 
@@ -136,7 +136,7 @@ class PatientInput(io.RawIOBase):
         return os.readv(self._descriptor, [buffer])
 
 
-def read_frame(stream: BinaryIO) -> tuple[dict[str, Any], bytes] | None:
+def read_frame(stream: IO[bytes]) -> tuple[dict[str, Any], bytes] | None:
     """Return header and body of the next frame; None at the end, also one in the midst of a frame."""
     line = stream.readline(HEADER_BYTES_MAX)
     if not line.endswith(b"\n"):
@@ -149,7 +149,7 @@ def read_frame(stream: BinaryIO) -> tuple[dict[str, Any], bytes] | None:
     return (header, body) if len(body) == size else None
 
 
-def write_frame(stream: BinaryIO, header: Mapping[str, Any], body: bytes = b"") -> None:
+def write_frame(stream: IO[bytes], header: Mapping[str, Any], body: bytes = b"") -> None:
     """Write one frame and flush it."""
     line = json.dumps({**header, "body": len(body)}, separators=(",", ":")).encode() + b"\n"
     stream.write(line)
@@ -171,8 +171,8 @@ class Rooted:
         process = self._process or self._start()
         assert process.stdin is not None and process.stdout is not None
         with contextlib.suppress(BrokenPipeError):  # nor will there be an answer
-            write_frame(process.stdin, header, body)  # type: ignore[arg-type]
-        while (frame := read_frame(process.stdout)) is not None:  # type: ignore[arg-type]
+            write_frame(process.stdin, header, body)
+        while (frame := read_frame(process.stdout)) is not None:
             write_frame(out, *frame)
             if not frame[0].get("part"):
                 return
@@ -210,7 +210,7 @@ class Rooted:
             process.stdin.write(self._package)
             process.stdin.flush()
         assert process.stdout is not None
-        if read_frame(process.stdout) is None:  # type: ignore[arg-type]
+        if read_frame(process.stdout) is None:
             raise HelperRefusal("lost", "what runs there as root ended before it began")
         self._process = process
         return process

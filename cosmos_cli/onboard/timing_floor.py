@@ -162,7 +162,8 @@ class _Loop:
         self._epoll = select.epoll()
         self._epoll.register(self._timer.fd, select.EPOLLIN | select.EPOLLET)
         self._epoll.register(client.fileno(), select.EPOLLIN)
-        self._under_way: dict[int, float] = {}
+        self._under_way: dict[int | None, float] = {}
+        """When each was sent, by number, s; none has None, which stands for what is no answer."""
         self._sent = 0
         self._lateness_s: list[float] = []
         self._trips_s: list[float] = []
@@ -215,7 +216,7 @@ class _Loop:
             while True:
                 data = self._client.recv(RECEIVE_BYTES)
                 now_s = time.monotonic()
-                sent_s = self._under_way.pop(self._codec.decode(data), None)  # type: ignore[arg-type]
+                sent_s = self._under_way.pop(self._codec.decode(data), None)
                 if sent_s is not None:
                     self._trips_s.append(now_s - sent_s)
 
@@ -226,7 +227,7 @@ class _Timer:
     def __init__(self) -> None:
         self._set_ns = getattr(os, "timerfd_settime_ns", None)
         if self._set_ns is not None:
-            self.fd = int(getattr(os, "timerfd_create")(CLOCK_MONOTONIC, flags=NON_BLOCKING))  # noqa: B009
+            self.fd = int(getattr(os, "timerfd_create")(CLOCK_MONOTONIC, flags=NON_BLOCKING))  # noqa: B009 - since Python 3.13
             return
         self._libc = ctypes.CDLL(None, use_errno=True)
         self.fd = int(self._libc.timerfd_create(CLOCK_MONOTONIC, NON_BLOCKING))

@@ -200,7 +200,7 @@ def open_standard_streams() -> None:
     if streams.stdout is None:
         streams.stdout = ClosedOutput()
     if streams.stderr is None:
-        streams.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
+        streams.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115 - as long as the process
     if isinstance(streams.stdout, io.TextIOWrapper):
         # As Python itself has it for stderr: under a locale that has no word for a letter it is shown as an escape.
         streams.stdout.reconfigure(errors="backslashreplace")

@@ -68,7 +68,7 @@ class ConditionTap:
             if isinstance(record, Mapping):
                 read: Callable[[str], Any] = record.get
             else:
-                read = lambda name: record[places[name]] if name in places else None  # noqa: E731
+                read = lambda name: record[places[name]] if name in places else None  # noqa: E731 - one of two
             who = str(read(AGENT)) if has_agents else self._source
             if (following := evaluators.get(who)) is None:
                 named = [each for each in own if who in each.agents]

@@ -136,7 +136,7 @@ def fork_child(main: ChildMain, *, nice: int = 0) -> ChildProcess:
             )
         os.write(report_write, report)
         code = 0
-    except Exception as error:  # noqa: BLE001  the child's only way to say what befell it
+    except Exception as error:  # noqa: BLE001 - the child's only way to say what befell it
         text = f"{type(error).__name__}: {error}"[:1000]
         os.write(report_write, orjson.dumps({"errors": [text]}))
     finally:

@@ -131,11 +131,11 @@ def ask_demand(
         MissingExtraError: It needs an optional dependency that is not installed.
     """
     function = load_function(where, base_directory)
-    demand = call_plugin("demand", function, parameters, agents, tick_hz, base_directory)
+    demand: Demand = call_plugin("demand", function, parameters, agents, tick_hz, base_directory)
     fault = _demand_fault(demand)
     if fault:
         raise PluginError(f"{place_of(function)}: demand() {fault}")
-    return demand  # type: ignore[no-any-return]
+    return demand
 
 
 def ask_streams(
@@ -271,13 +271,12 @@ def ask_rerun(
     """
     function = load_function(where, base_directory)
     found = call_plugin("rerun", function, parameters, agents, run)
-    is_proper = isinstance(found, Rerun) and _are_texts(found.remarks) and _are_texts(found.unlike)
-    if not is_proper:
-        raise PluginError(
-            f"{place_of(function)}: rerun() must return a Rerun of madns_runtime.plugin.api,"
-            f" got {_shown(found)}"
-        )
-    return found  # type: ignore[no-any-return]
+    if isinstance(found, Rerun) and _are_texts(found.remarks) and _are_texts(found.unlike):
+        return found
+    raise PluginError(
+        f"{place_of(function)}: rerun() must return a Rerun of madns_runtime.plugin.api,"
+        f" got {_shown(found)}"
+    )
 
 
 def _are_texts(given: Any) -> bool:

@@ -133,11 +133,12 @@ def load_half(descriptor: Simulation, role: Role, base_directory: Path) -> Calla
     where = descriptor.host if role == "host" else descriptor.agent
     if where is None:
         return IdleHost
+    half: Callable[[], Any]
     _, half = load_object(where, base_directory)
     faults = _contract_faults(half, role)
     if faults:
         raise PluginError(f"{told_place(where, half)}: {'; '.join(faults)}")
-    return half  # type: ignore[no-any-return]
+    return half
 
 
 def load_function(where: str, base_directory: Path) -> Callable[..., Any]:
@@ -148,12 +149,13 @@ def load_function(where: str, base_directory: Path) -> Callable[..., Any]:
         PluginError: It cannot be found or is no function.
         MissingExtraError: It needs an optional dependency that is not installed.
     """
+    function: Callable[..., Any]
     _, function = load_object(where, base_directory)
     if not callable(function):
         raise PluginError(
             f"{told_place(where)}: expected a function, got {type(function).__name__}"
         )
-    return function  # type: ignore[no-any-return]
+    return function
 
 
 def part_faults(descriptor: Simulation, base_directory: Path) -> list[str]:

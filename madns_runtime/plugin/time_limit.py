@@ -14,10 +14,10 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from time import monotonic
 from types import FrameType
-from typing import Any, Final
+from typing import Final, NoReturn
 
 LIMIT_S_DEFAULT: Final = 60.0
 LOOKS: Final = 20
@@ -109,7 +109,7 @@ def _alarm(limit_s: float, wall_limit_s: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, signal.SIG_DFL if earlier is None else earlier)
 
 
-os_exit: Callable[[int], Any] = os._exit
+os_exit = os._exit
 """The true one."""
 
 
@@ -118,14 +118,14 @@ def _exit_refused() -> Iterator[None]:
     """Let `os._exit` raise meanwhile; a process that was forked meanwhile may end as it likes."""
     pid, is_over = os.getpid(), False
 
-    def refuse(status: int) -> None:
+    def refuse(status: int) -> NoReturn:
         if is_over or os.getpid() != pid:  # a plug-in may have kept this function
             os_exit(status)
         raise PluginStopped(f"it called os._exit({status!r})")
 
-    os._exit = refuse  # type: ignore[assignment]
+    os._exit = refuse
     try:
         yield
     finally:
         is_over = True
-        os._exit = os_exit  # type: ignore[assignment]
+        os._exit = os_exit

@@ -137,7 +137,7 @@ class AgentPort:
 
     def at(self, local_s: float) -> float:
         """Return the simulated time when this machine's monotonic clock shows *local_s*, s; it must have begun."""
-        return self.session.clock.to_host_s(local_s) - self.t0_host_s  # type: ignore[operator]
+        return self.session.clock.to_host_s(local_s) - self.t0_host_s  # type: ignore[operator]  # each tick
 
     def t_s(self) -> float | None:
         """Return the simulated time, s; None before it runs."""

@@ -201,13 +201,13 @@ class _Decoder:
         if joints != len(line_ends) - 1 or block.count(b"[") != joints + 1:
             return None
         try:
-            numbers = orjson.loads(block.replace(b"]\n[", b","))
+            numbers: list[float | int | None] = orjson.loads(block.replace(b"]\n[", b","))
         except orjson.JSONDecodeError:
             return None
         if len(numbers) != self.width * len(line_ends):
             return None
         self.state.records += len(line_ends)
-        return numbers  # type: ignore[no-any-return]
+        return numbers
 
     def _decode_whole(self, block: bytes) -> list[Any] | None:
         if self._type is dict or b"\n{" in block or not block.endswith(b"\n"):

@@ -111,6 +111,20 @@ def test_modules_are_no_longer_than_a_subject_needs():
     assert {name: lines for name, lines in lengths.items() if lines > MODULE_LINES_MAX} == {}
 
 
+@pytest.mark.parametrize("told", ["type: ignore", "noqa: "])
+def test_what_checkers_are_told_to_ignore_has_its_reason_beside_it(told):
+    found = [
+        (f"{file.relative_to(ROOT)}:{number}", line.strip())
+        for file in FILES
+        for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1)
+        if f"# {told}" in line
+    ]
+
+    assert len(found) > 10
+    reason = re.compile(r"# (type: ignore\[[\w, -]+\]  # |noqa: [A-Z0-9, ]+ - )\w")
+    assert [each for each in found if not reason.search(each[1])] == []
+
+
 def circles(graph):
     """Groups of modules each of which imports the others, directly or not (Tarjan's algorithm)."""
     order, low, on_stack, stack, found = {}, {}, set(), [], []

@@ -214,14 +214,14 @@ class _Agent(AgentSSH):
         pipe.settimeout(AGENT_TIMEOUT_S)
         try:
             pipe.connect(path)
-            self._connect(pipe)  # type: ignore[attr-defined]
+            self._connect(pipe)  # type: ignore[attr-defined]  # private, in no stub
         except BaseException:
             pipe.close()
             raise
 
     def _send_message(self, message: Any) -> Any:
         with self._asking:
-            return super()._send_message(message)  # type: ignore[misc]
+            return super()._send_message(message)  # type: ignore[misc]  # private, in no stub
 
 
 def agent_keys(path: str | None) -> tuple[AgentKey, ...]:

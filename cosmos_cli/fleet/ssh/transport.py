@@ -46,17 +46,17 @@ logging.getLogger("paramiko").setLevel(logging.CRITICAL)
 logging.getLogger("paramiko").addHandler(logging.NullHandler())
 
 
-def _request(channel: Channel, message: Message) -> None:
+def _request(channel: Any, message: Message) -> None:
     """Take note of the signal that ended a command; leave every other request to paramiko."""
     if message.get_text() == "exit-signal":
         message.get_boolean()
         number = signal.Signals.__members__.get(f"SIG{message.get_text()}")
         if number is not None:
-            channel.signal_number = int(number)  # type: ignore[attr-defined]
+            channel.signal_number = int(number)
         return
     message.rewind()
     message.get_int()
-    Channel._handle_request(channel, message)  # type: ignore[attr-defined]
+    Channel._handle_request(channel, message)  # type: ignore[attr-defined]  # private, in no stub
 
 
 def _read_bounded(read_all: Callable[..., bytes], count: int, check_rekey: bool = False) -> bytes:
@@ -75,13 +75,13 @@ class SshTransport(Transport):
     """
 
     _channel_handler_table: ClassVar[Any] = {
-        **Transport._channel_handler_table,  # type: ignore[attr-defined]
+        **Transport._channel_handler_table,  # type: ignore[attr-defined]  # private, in no stub
         MSG_CHANNEL_REQUEST: _request,
     }
 
     def __init__(self, wire: SshSocket) -> None:
         super().__init__(
-            wire,  # type: ignore[arg-type]
+            wire,  # type: ignore[arg-type]  # has those methods of a socket that paramiko calls
             default_window_size=WINDOW_BYTES,
             default_max_packet_size=PACKET_BYTES,
         )
@@ -93,7 +93,8 @@ class SshTransport(Transport):
         self._news = threading.Condition()
         self._asked = 0
         self._answered = 0
-        handlers: dict[int, Callable[[Message], None]] = self._handler_table  # type: ignore[attr-defined]
+        paramikos: Any = self
+        handlers: dict[int, Callable[[Message], None]] = paramikos._handler_table
         for kind in (MSG_REQUEST_SUCCESS, MSG_REQUEST_FAILURE):
             handlers[kind] = functools.partial(self._count_answer, handlers[kind])
 
@@ -138,7 +139,7 @@ class SshTransport(Transport):
         message = Message()
         message.add_byte(cMSG_CHANNEL_REQUEST)
         message.add(channel.remote_chanid, "exec", True, command)
-        self._send_user_message(message)  # type: ignore[attr-defined]
+        self._send_user_message(message)  # type: ignore[attr-defined]  # private, in no stub
         return channel
 
     def gives_sign(self, *, timeout_s: float) -> bool:
@@ -169,7 +170,7 @@ class SshTransport(Transport):
         message.add_byte(cMSG_GLOBAL_REQUEST)
         message.add("keepalive@openssh.com", True)
         with contextlib.suppress(SSHException, OSError, EOFError):  # then it is not active any more
-            self._send_user_message(message)  # type: ignore[attr-defined]
+            self._send_user_message(message)  # type: ignore[attr-defined]  # private, in no stub
 
     def _count_answer(self, handle: Callable[[Message], None], message: Message) -> None:
         handle(message)

@@ -216,7 +216,7 @@ class ConstellationAgent(AgentSimulation):
         Raises:
             ActionRefused: This vehicle does not model it.
         """
-        fault: SensorFault = action.parameters  # type: ignore[assignment]
+        fault: SensorFault = action.parameters  # type: ignore[assignment]  # an instance of its kind's class
         sensors = self._sensors
         refusal = (
             "this vehicle has no sensors"

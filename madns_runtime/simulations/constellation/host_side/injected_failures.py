@@ -130,6 +130,6 @@ class InjectedFailures:
             raise ActionRefused(f"without {named} in parameters.vehicles: {', '.join(lacking)}")
 
     def _darken(self, action: TimelineAction, *, is_dark: bool) -> None:
-        given: DarkStation = action.parameters  # type: ignore[assignment]
+        given: DarkStation = action.parameters  # type: ignore[assignment]  # an instance of its kind's class
         if self._radio is None or not self._radio.darken(given.station, is_dark=is_dark):
             raise ActionRefused(f"no ground station named {given.station!r} in this scenario")
