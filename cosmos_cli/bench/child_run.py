@@ -12,15 +12,15 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from types import FrameType
+from functools import partial
 from typing import Any
 
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.system.parent_death import end_with_parent
+from cosmos_cli.system.stop_signals import stop_signals_noted
 
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CLEAN_END_S = 120.0
 """For the shutdown of a run that was told to end, records and verdict included."""
 LAST_LINES_MAX = 3
@@ -85,7 +85,7 @@ def run_child(
         preexec_fn=end_with_parent,  # noqa: PLW1509 - there is one thread
     ) as process:
         try:
-            with _forwarded(process) as stops:
+            with stop_signals_noted(partial(_send_on, process)) as stops:
                 out, words, is_too_long = _communicate(process, limit_s)
         except BaseException:
             process.kill()
@@ -118,22 +118,9 @@ def _communicate(
         return *process.communicate(), True
 
 
-@contextlib.contextmanager
-def _forwarded(process: subprocess.Popen[bytes]) -> Iterator[list[int]]:
-    """Send stop signals on to the run; yields those that came."""
-    came: list[int] = []
-
-    def forward(number: int, frame: FrameType | None) -> None:
-        came.append(number)
-        with contextlib.suppress(ProcessLookupError):
-            process.send_signal(number)
-
-    before = {number: signal.signal(number, forward) for number in STOP_SIGNALS}
-    try:
-        yield came
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+def _send_on(process: subprocess.Popen[bytes], number: int) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        process.send_signal(number)
 
 
 def _document(out: bytes) -> Mapping[str, Any]:

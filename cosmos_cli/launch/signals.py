@@ -11,7 +11,7 @@ import signal
 import socket
 from types import FrameType, TracebackType
 
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+from cosmos_cli.system.stop_signals import STOP_SIGNALS
 
 
 class OperatorSignals:

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import FrameType
 from typing import Final
 
 from cosmos_cli.errors import ExitCode, RunFailedError
 from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.system.stop_signals import stop_signals_noted
 from cosmos_cli.testing.baseline_update import update_baseline
 from cosmos_cli.testing.case import SuiteCase
 from cosmos_cli.testing.figures import ComparedFigure, compare_figures
@@ -28,7 +27,6 @@ from cosmos_cli.testing.suite_process import ProcessResult, SuiteProcess
 FOLDER: Final = "tests"
 """Of the runs of tests, in the folder of all runs."""
 POLL_S: Final = 0.05
-STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,7 +76,7 @@ def run_cases(
     """
     suite = _Suite(cases, options, tell)
     try:
-        with _stop_signals() as stops:
+        with stop_signals_noted() as stops:
             suite.run(stops)
     finally:
         suite.end_all()
@@ -169,22 +167,6 @@ def _forget(run: RunDirectory) -> None:
     shutil.rmtree(run.path, ignore_errors=True)
     with contextlib.suppress(OSError):
         run.bundle.unlink()
-
-
-@contextlib.contextmanager
-def _stop_signals() -> Iterator[list[int]]:
-    """Yield the stop signals that came, as they come."""
-    came: list[int] = []
-
-    def note(number: int, frame: FrameType | None) -> None:
-        came.append(number)
-
-    before = {number: signal.signal(number, note) for number in STOP_SIGNALS}
-    try:
-        yield came
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def check_folder(runs: Path) -> None:

@@ -21,7 +21,6 @@ LINK_DOWN: Final = "link_down"
 PARTITION: Final = "partition"
 
 LOSSES: Final = (KILL, RESTART)
-STEP_FAULTS: Final = (HANG, SLOW)
 MESSAGE_FAULTS: Final = (LOSE, DELAY, REORDER, DUPLICATE, LINK_DOWN, PARTITION)
 
 Traffic = Literal["all", "with_host", "between_agents"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal
@@ -72,11 +71,6 @@ class DeviceFault:
     """What happens to its samples."""
     value: Annotated[float, Ge(-1e12), Le(1e12)] | None = None
     """Of bias and noise, in the channel's unit; of drop the share of samples, 0 to 1; of delay seconds."""
-
-    @property
-    def value_or_nan(self) -> float:
-        """The value; not a number where there is none."""
-        return math.nan if self.value is None else self.value
 
 
 ANNOTATE: Final = ActionKind(
