@@ -14,7 +14,7 @@ from typing import Any
 
 from cosmos_cli.errors import InputError, MachinesError
 from cosmos_cli.launch.device_needs import missing_here
-from cosmos_cli.models.device_kinds import DeviceQuestion, ask_kinds
+from cosmos_cli.models.device_kinds import DeviceQuestion, KindAnswer, ask_kinds
 from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.inventory.devices import MachineDevice, driven_devices
 from cosmos_cli.system.bounded_process import describe_exit, run_bounded
@@ -28,8 +28,8 @@ USER = "cosmos-devices"
 TALK_SHOWN_MAX = 2000
 
 
-def missing_for(machine: Machine, device: MachineDevice) -> list[str]:
-    """Return what a device of this computer needs and is not here, each with its cure."""
+def _ask_kind(machine: Machine, device: MachineDevice) -> KindAnswer:
+    """Ask a device's kind about its parameters."""
     question = DeviceQuestion(
         path=(),
         kind=device.kind,
@@ -37,6 +37,12 @@ def missing_for(machine: Machine, device: MachineDevice) -> list[str]:
         base_directory=machine.devices_folder,
     )
     (answer,) = ask_kinds([question])
+    return answer
+
+
+def missing_for(machine: Machine, device: MachineDevice) -> list[str]:
+    """Return what a device of this computer needs and is not here, each with its cure."""
+    answer = _ask_kind(machine, device)
     if answer.faults:  # its needs are not known then
         return [f"{answer.faults[0].text}: mend it in the inventory"]
     return list(missing_here(answer.needs))
@@ -54,13 +60,7 @@ def launch_of(machine: Machine, device: MachineDevice, *, writes: bool) -> Devic
     Raises:
         InputError: Its kind refuses its parameters.
     """
-    question = DeviceQuestion(
-        path=(),
-        kind=device.kind,
-        parameters=device.parameters,
-        base_directory=machine.devices_folder,
-    )
-    (answer,) = ask_kinds([question])
+    answer = _ask_kind(machine, device)
     if answer.faults:
         raise InputError(f"{machine.name}/{device.name}: {answer.faults[0].text}")
     return DeviceLaunch(
