@@ -204,6 +204,15 @@ class DevicePort:
         if not messages.send(self._end, [messages.FAULT, number, action, value]):
             self._answered(number, f"{self.full_name}: its process does not listen")
 
+    def losses(self) -> dict[str, int]:
+        """Return the counts of what found no room on its way from or to the device; empty where nothing was lost."""
+        counts = {
+            "frames_dropped": self.frames_dropped,
+            "writes_lost": self.writes_lost,
+            "points_lost": self.points_lost,
+        }
+        return {name: count for name, count in counts.items() if count}
+
     def answers(self) -> list[tuple[int, str]]:
         """Return the newest orders' numbers, each with the reason of its refusal, else empty."""
         if self._orders:
@@ -296,6 +305,10 @@ class Hardware(Mapping[str, DevicePort]):
         answers = [answer for port in self._ports.values() for answer in port.answers()]
         told: dict[str, Any] = {"lost_device": lost[0]} if lost else {}
         return {**told, "fault_answers": answers} if answers else told
+
+    def losses(self) -> dict[str, dict[str, int]]:
+        """Return the devices with which something found no room, by full name, and counts of what; see `DevicePort.losses`."""
+        return {port.full_name: lost for port in self._ports.values() if (lost := port.losses())}
 
     def tell_time(self, local_s: float, t_s: float, rate: float) -> None:
         """Tell all devices what simulated time it is."""

@@ -352,6 +352,7 @@ class AgentRunner:
 
     def _close_records(self) -> None:
         messages = self._session.link.counters.to_mapping()
+        self._records.device_losses(self._hardware.losses())
         counts = self._journal.close(self._config.timeouts.shutdown_s)
         records = self._report.last_counts(counts.to_mapping(), messages)
         self._session.records_closed(records, monotonic())

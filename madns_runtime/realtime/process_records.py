@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from madns_runtime.health.probe import ProcessUsage
@@ -27,6 +28,7 @@ class ProcessRecords:
     """
 
     def __init__(self, journal: RunJournal) -> None:
+        self._journal = journal
         self._recorder = journal.recorder
         self._t_s = journal.t_s
         for schema in (TICKS, LATE_TICKS, CLOCK, PROCESS):
@@ -61,6 +63,13 @@ class ProcessRecords:
         self._recorder.record(
             PROCESS.name, self._usage.read(None if t_s is None else round(t_s, 3))
         )
+
+    def device_losses(self, losses: Mapping[str, Mapping[str, int]]) -> None:
+        """Tell what devices, by name, and the agent had no room for, by kind."""
+        for device, counts in losses.items():
+            self._journal.event("device_losses", device=device, **counts)
+            told = ", ".join(f"{name} {count}" for name, count in counts.items())
+            self._journal.say("warning", f"device {device}: there was no room for all: {told}")
 
     def report(self) -> dict[str, Any]:
         """Return what a ping tells of the records: how many were dropped, and the disk's trouble."""

@@ -1,0 +1,90 @@
+"""A device as its agent sees it: what finds no room is counted and told."""
+
+import json
+import socket
+
+import pytest
+
+from madns_runtime.config import Recording
+from madns_runtime.hardware import messages, port
+from madns_runtime.hardware.contract import Channel
+from madns_runtime.hardware.page import DevicePage
+from madns_runtime.hardware.port import DevicePort, Hardware
+from madns_runtime.hardware.status import StatusLimits
+from madns_runtime.realtime.process_records import ProcessRecords
+from madns_runtime.recording.record_files import RecordFiles
+from madns_runtime.recording.recorder import Recorder
+from madns_runtime.recording.run_journal import RunJournal
+
+CHANNELS = (
+    Channel(name="received", is_frame=True),
+    Channel(name="sent", is_frame=True, direction="out", passing="queue"),
+    Channel(name="level", direction="out"),
+)
+WRITES_MAX = 100_000
+"""More than any socket holds."""
+
+
+@pytest.fixture
+def device(monkeypatch):
+    monkeypatch.setattr(port, "FRAMES_MAX", 2)
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.setblocking(False)
+    made = DevicePort(
+        "pi22/line",
+        CHANNELS,
+        shared=(DevicePage([CHANNELS[0]]), ours),
+        limits=StatusLimits.of(0.1, 1.0),
+        now_s=lambda: 0.0,
+    )
+    with ours, theirs:
+        yield made, theirs
+
+
+def test_frames_that_nobody_takes_are_counted(device):
+    made, theirs = device
+    for number in range(5):
+        assert messages.send(theirs, [messages.FRAME, "received", number, 0.0, b"x"])
+
+    assert [each.number for each in made.frames("received")] == [3, 4]
+    assert made.losses() == {"frames_dropped": 3}
+
+
+def test_what_a_device_has_no_room_for_is_counted(device):
+    made, _ = device
+    for _ in range(WRITES_MAX):
+        made.write("sent", b"x" * 1000)
+        if made.writes_lost:
+            break
+    for number in range(port.PACKS_MAX + 3):
+        made.play("level", [(float(number), 1.0), (number + 0.5, 2.0)], from_s=float(number))
+
+    assert made.losses() == {"writes_lost": 1, "points_lost": 6}
+    assert Hardware({"line": made}).losses() == {"pi22/line": made.losses()}
+
+
+def test_a_device_with_room_for_all_tells_nothing(device):
+    made, _ = device
+    made.write("sent", b"x")
+
+    assert Hardware({"line": made}).losses() == {}
+
+
+def test_losses_are_an_event_and_a_warning_of_the_agent(tmp_path):
+    recorder = Recorder(RecordFiles(tmp_path, run="r", source="agent-01"), Recording())
+    journal = RunJournal(recorder, 5, t_s=lambda: 1.0)
+    records = ProcessRecords(journal)
+    recorder.start()
+
+    records.device_losses({"pi22/line": {"writes_lost": 7}})
+    journal.close()
+
+    (told,) = [line for line in lines_of(tmp_path / "events.jsonl") if "device_losses" in str(line)]
+    assert (told["device"], told["writes_lost"]) == ("pi22/line", 7)
+    assert "device pi22/line: there was no room for all: writes_lost 7" in str(
+        lines_of(tmp_path / "log.jsonl")
+    )
+
+
+def lines_of(path):
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
