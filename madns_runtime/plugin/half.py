@@ -232,6 +232,7 @@ class HostHalf(Half):
         began_s = self._calls.begin("__init__")
         super().__init__(program.make, log)
         self._calls.end("__init__", began_s)
+        self._receive = self._method("receive")
 
     def set_up(self, context: Any) -> None:
         """
@@ -269,7 +270,14 @@ class HostHalf(Half):
             HalfFailed: As there.
         """
         if not isinstance(message, Transmission):
-            self.call("receive", agent, message)
+            # As `call` has it, for what comes with every tick of every agent.
+            began_s = self._calls.begin("receive")
+            try:
+                self._receive(agent, message)
+            except BaseException as error:
+                raise self.failure("receive", error) from error
+            finally:
+                self._calls.end("receive", began_s)
             return
         outcomes: Any = (LinkOutcome(to=message.to, outcome=NO_MEDIUM),)
         if self.carrier.medium is not None:
