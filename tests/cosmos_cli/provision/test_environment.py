@@ -277,6 +277,16 @@ def test_damage_is_noticed_and_the_environment_built_anew(machine, house, navlib
     assert python(machine, environment, "import nav_lib; print(nav_lib.version)") == "1.2"
 
 
+@contextlib.contextmanager
+def living_run(machine, environment):
+    """A process of an environment that waits for a line: it has begun, so that the kernel tells what it runs."""
+    command = [machine.layout.python(environment.key), "-c", "input('begun')"]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen(command, **pipes) as process:
+        assert process.stdout.read(len("begun")) == b"begun"
+        yield process
+
+
 def test_what_a_package_adds_for_itself_holds_up_no_run(machine, house, navlib):
     environment = house.environment(navlib)
     install(machine, environment)
@@ -285,8 +295,7 @@ def test_what_a_package_adds_for_itself_holds_up_no_run(machine, house, navlib):
     (site / "__pycache__/numba.nbi").write_bytes(b"x")
     with_compiled = is_whole(machine, environment, is_strict=True)
     (site / "cache.bin").write_bytes(b"x")
-    command = [machine.layout.python(environment.key), "-c", "input()"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+    with living_run(machine, environment) as process:
         under_a_run = is_whole(machine, environment, is_strict=True)
         process.communicate(b"\n", timeout=120)
 
@@ -313,8 +322,7 @@ def test_modules_come_compiled_and_a_change_of_what_is_compiled_is_found(machine
 def test_damaged_environment_of_a_living_run_is_left_alone(machine, house, navlib):
     environment = house.environment(navlib)
     install(machine, environment)
-    command = [machine.layout.python(environment.key), "-c", "input()"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+    with living_run(machine, environment) as process:
         file = next(top_of(machine, environment).rglob("nav_lib/__init__.py"))
         file.write_text("")
         before = snapshot(top_of(machine, environment))
@@ -488,8 +496,7 @@ def test_prune_spares_the_wanted_the_newest_and_the_used(machine, house, tmp_pat
         compiled.touch()
     wanted, used = environments[0], environments[1]
     request = installed_request(machine.layout, trees=[], environments=[wanted.key])
-    command = [machine.layout.python(used.key), "-c", "input()"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+    with living_run(machine, used) as process:
         with machine.board() as board:
             foretold = ask_installed(board, request).prunable
             removed = board.call("prune_installed", request).value

@@ -353,10 +353,13 @@ def test_files_that_a_living_run_adds_do_not_break_its_tree(folder, machine):
         send_tree(board, machine.layout, tree)
     top = machine.layout.tree(tree.hash)
     with subprocess.Popen(
-        [sys.executable, "-c", "input()"],
+        [sys.executable, "-c", "input('begun')"],
         env={"COSMOS_BASE_DIRECTORY": top},
         stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
     ) as process:
+        # From now on the kernel tells what it runs.
+        assert process.stdout.read(len("begun")) == b"begun"
         (Path(top) / "notes.txt").write_text("x")
         assert is_whole(machine, tree)
         (Path(top) / "flight.py").unlink()
