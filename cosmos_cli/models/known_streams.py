@@ -9,7 +9,7 @@ from typing import Literal
 from cosmos_cli.models.document import did_you_mean
 from madns_runtime.conditions.condition import AGENT, TICK, TIME
 from madns_runtime.hardware.contract import Channel
-from madns_runtime.hardware.records import DEVICE_CLOCK, DEVICE_STATE, schema_of
+from madns_runtime.hardware.stream_schemas import DEVICE_CLOCK, DEVICE_STATE, schema_of
 from madns_runtime.plugin.api import DeclaredStream
 from madns_runtime.recording.records import (
     CLOCK,

@@ -8,26 +8,9 @@ from time import monotonic
 from typing import Any
 
 from madns_runtime.hardware.contract import Channel
-from madns_runtime.recording.records import Field, StreamSchema
+from madns_runtime.hardware.stream_schemas import DEVICE_CLOCK, DEVICE_STATE, schema_of
 from madns_runtime.recording.run_journal import RunJournal
 from madns_runtime.timing.clock import utc_at_iso
-
-DEVICE_CLOCK = StreamSchema(
-    "device_clock", (Field("t_s", "s"), Field("offset_us", "us"), Field("drift_ppm", "1e-6"))
-)
-"""The machine's clock minus the device's, and how much faster the device's runs."""
-
-DEVICE_STATE = StreamSchema(
-    "device_state",
-    (
-        Field("t_s", "s"),
-        Field("samples", "", "int"),
-        Field("errors", "", "int"),
-        Field("late_us_max", "us", "int"),
-        Field("details", "", "json"),
-    ),
-)
-"""Once per second: samples and errors so far, the latest start of a read since, and what the driver tells."""
 
 
 class SimulatedTime:
@@ -124,18 +107,3 @@ class DeviceRecords:
     def close(self, timeout_s: float) -> Mapping[str, Any]:
         """Close the streams, and return the counts of their records."""
         return self.journal.close(timeout_s).to_mapping()
-
-
-def schema_of(channel: Channel) -> StreamSchema:
-    """Return the stream of a channel: of an input with number and age, of an output with its lateness."""
-    values: tuple[Field, ...]
-    head: tuple[Field, ...]
-    if channel.is_frame:
-        values = (Field("bytes", "", "int"), Field("data", "", "str"))
-    else:
-        values = tuple(Field(name, channel.unit) for name in channel.column_names())
-    if channel.direction == "in":
-        head = (Field("t_s", "s"), Field("number", "", "int"), Field("age_us", "us", "int"))
-    else:
-        head = (Field("t_s", "s"), Field("lateness_us", "us", "int"))
-    return StreamSchema(channel.name, (*head, *values))

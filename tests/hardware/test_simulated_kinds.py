@@ -12,7 +12,8 @@ from madns_runtime.config import Agents, RunConfig
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware.contract import Sample
 from madns_runtime.hardware.kind_registry import prepare
-from madns_runtime.hardware.records import DeviceRecords, schema_of
+from madns_runtime.hardware.records import DeviceRecords
+from madns_runtime.hardware.stream_schemas import schema_of
 from madns_runtime.recording.reader import read_stream
 from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder

@@ -7,7 +7,7 @@ from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.report.build import build_sections
 from madns_runtime.analysis.values import Figure, ReportRemark, TableBlock
 from madns_runtime.hardware.contract import Channel
-from madns_runtime.hardware.records import schema_of
+from madns_runtime.hardware.stream_schemas import schema_of
 from madns_runtime.recording.records import StreamSchema
 from madns_runtime.simulations.counter.parameters import DEVICE_SAMPLES
 
