@@ -101,6 +101,6 @@ class FaultableClock(ClockEstimate):
 
     def _settle_error(self, now_s: float) -> None:
         # Only from now on, in the place of the method: a right clock is read often, without a layer between.
-        self.to_host_s = self._to_host_s_when_wrong  # type: ignore[method-assign]
+        self.to_host_s = self._to_host_s_when_wrong  # type: ignore[method-assign]  # meant: see above
         self._error_s += (now_s - self._anchor_s) * self._rate
         self._anchor_s = now_s
