@@ -106,6 +106,7 @@ def test_detached_run_goes_on_on_boards_and_is_ended_by_its_number(tower: RunTow
 
     listed = json.loads(tower.cosmos("ps", "--json").stdout)
     refused = tower.cosmos("collect", number)
+    elsewhere = tower.cosmos("inject", number, "agent-01", "hang", "for_s=0.1")
     ended = tower.cosmos("down", number)
     collected = tower.cosmos("collect", number)
 
@@ -114,6 +115,8 @@ def test_detached_run_goes_on_on_boards_and_is_ended_by_its_number(tower: RunTow
     assert {("pi01", "host"), ("pi02", "supervisor"), ("pi03", "agent")} <= roles
     assert run["directory"] == str(tower.directory)
     assert refused.returncode == 2
+    assert elsewhere.returncode == 2
+    assert "its host runs on another computer" in elsewhere.stderr
     assert (ended.returncode, ended.stdout.count("ended")) == (0, 1), ended.stdout + ended.stderr
     assert collected.returncode == 0, collected.stderr
     assert tower.document["status"] == "interrupted"
@@ -143,6 +146,7 @@ def test_board_that_is_cut_off_ends_the_run_by_name_and_is_collected_later(
 ) -> None:
     tower.start()
     tower.wait_until_running()
+    ordered = tower.cosmos("inject", "last", "agent-01", "hang", "for_s=0.1", "--json")
     tower.tower.fault("pi02", fault)
 
     code = tower.finish()
@@ -150,6 +154,9 @@ def test_board_that_is_cut_off_ends_the_run_by_name_and_is_collected_later(
 
     # Who notices first, its host or its operator, is chance; each says it in words of its own.
     text = "machine pi02 is lost: "
+    assert ordered.returncode == 0, ordered.stdout + ordered.stderr
+    orders = (tower.directory / "host/events.jsonl").read_text()
+    assert '"event":"action_began"' in orders
     assert code == 3, tower.talk
     assert any(problem.startswith(text) for problem in tower.problems("pi02"))
     assert tower.document["status"] == "failed"

@@ -6,6 +6,7 @@ import time
 
 import pytest
 from harness.cosmos_command import SCENARIOS, CosmosCommand
+from harness.waiting import wait_until
 
 from cosmos_cli.evidence.run_directory import RunDirectory
 from madns_runtime.processes import list_processes
@@ -130,14 +131,19 @@ def test_it_ends_within_seconds_of_its_killed_operator(cosmos, monkeypatch):
     assert json.loads(result.read_text())["reason"] == "the operator's process is gone"
 
 
-def test_it_goes_on_without_its_operator_and_ends_by_down(cosmos, monkeypatch):
+def test_it_goes_on_without_its_operator_takes_orders_and_ends_by_down(cosmos, monkeypatch):
     endless = ("--set", "time.duration_s=300000", "--detach")
     left = cosmos("run", SCENARIOS / "counter24.yaml", *LOCKSTEP, *endless)
     shown = cosmos("ps").stdout
+    wait_until(lambda: list(cosmos.runs.glob("*/.actions.sock")), "the run's door")
+    ordered = cosmos("inject", "last", "agent-01", "hang", "--json")
+    in_force = json.loads(cosmos("inject", "last", "--list", "--json").stdout)["in_force"]
     down = cosmos("down", "--all")
 
     assert left.returncode == 0, left.stderr
     assert "24 agents" in shown
+    assert ordered.returncode == 0, ordered.stdout + ordered.stderr
+    assert [(each["action"], each["agents"]) for each in in_force] == [("hang", ["agent-01"])]
     assert down.returncode == 0
     assert nobody_is_left(cosmos, monkeypatch)
 
