@@ -31,6 +31,9 @@ LIFE_LINE_S = 30.0
 """A supervisor that hears no ping for this long ends by itself (`madns_runtime.reactor.operator_link`)."""
 UNANSWERED_MAX = 64
 CHECK_INTERVAL_S = 0.25
+LOOK_S_MAX = 2 * CHECK_INTERVAL_S
+"""Of the time between two looks no more counts: an operator that did not look was itself kept from it, and what came
+meanwhile waits to be read."""
 RETURN_INTERVAL_S = 2.0
 """Between two tries to reach a lost machine again."""
 RETURN_TRIES_MAX = 2000
@@ -41,8 +44,8 @@ class Pulse:
     """
     Questions to one process, and the time at which it was last heard.
 
-    Only what was asked and not answered counts as silence, so that an operator that was itself stopped
-    for a while blames nobody.
+    Only what was asked and not answered counts as silence, in time in which the operator looked (`WatchedTime`):
+    one that was itself stopped for a while, also with a question under way, blames nobody.
     """
 
     def __init__(self) -> None:
@@ -87,6 +90,24 @@ class Pulse:
     def is_lost(self, now_s: float) -> bool:
         """Tell whether it has been silent for too long."""
         return self.silent_s(now_s) >= SILENCE_S
+
+
+class WatchedTime:
+    """The time in which somebody looked, s."""
+
+    def __init__(self) -> None:
+        self._counted_s = 0.0
+        self._looked_s = -math.inf
+
+    def at(self, now_s: float) -> float:
+        """Return it at a moment after the newest look."""
+        return self._counted_s + min(now_s - self._looked_s, LOOK_S_MAX)
+
+    def look(self, now_s: float) -> float:
+        """Return it now, and count from here."""
+        self._counted_s = self.at(now_s)
+        self._looked_s = now_s
+        return self._counted_s
 
 
 @dataclass(slots=True)
@@ -138,6 +159,7 @@ class MachineWatch:
         lost: Callable[[str, str], None],
     ) -> None:
         self._watched = {name: _Watched() for name in machines}
+        self._time = WatchedTime()
         self._children = children
         self._agenda = agenda
         self._wait_s = timeouts.silence_s
@@ -171,7 +193,7 @@ class MachineWatch:
         watched = self._watched.get(machine or "")
         if watched is None or child not in watched.pulses:
             return
-        took_s = watched.pulses[child].pong(number, self._agenda.now_s)
+        took_s = watched.pulses[child].pong(number, self._time.at(self._agenda.now_s))
         if took_s >= SLOW_S and child != HOST:
             text = f"{machine} answered only after {took_s:.1f} s; is its link or its processor overloaded?"
             self._agenda.say(text, "warning")
@@ -182,12 +204,14 @@ class MachineWatch:
 
     def check(self) -> Iterator[tuple[str, str | None]]:
         """Ask for signs of life; yield a machine that is silent, or a machine and a child that hangs beside a host."""
+        now_s = self._time.look(self._agenda.now_s)
         for name, watched in self._watched.items():
             if not watched.is_lost and watched.pulses:
-                yield from self._check_machine(name, watched)
+                yield from self._check_machine(name, watched, now_s)
 
-    def _check_machine(self, name: str, watched: _Watched) -> Iterator[tuple[str, str | None]]:
-        now_s = self._agenda.now_s
+    def _check_machine(
+        self, name: str, watched: _Watched, now_s: float
+    ) -> Iterator[tuple[str, str | None]]:
         for child, pulse in watched.pulses.items():
             if pulse.is_due(now_s):
                 self._agenda.do(Send(child, ping(pulse.ping(now_s))))

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from cosmos_cli.launch.machine_watch import PING_INTERVAL_S, SILENCE_S, Pulse
+from cosmos_cli.launch.machine_watch import (
+    LOOK_S_MAX,
+    PING_INTERVAL_S,
+    SILENCE_S,
+    Pulse,
+    WatchedTime,
+)
 
 STEP_S = 0.25
 """How often the operator looks."""
@@ -74,3 +80,24 @@ def test_operator_that_was_stopped_itself_blames_nobody() -> None:
     assert not pulse.is_lost(3600.0)
     pulse.ping(3600.0)
     assert not pulse.is_lost(3600.0 + SILENCE_S - PING_INTERVAL_S - 0.01)
+
+
+def test_operator_that_was_stopped_with_a_question_under_way_blames_nobody() -> None:
+    pulse, time = Pulse(), WatchedTime()
+    pulse.pong(pulse.ping(time.look(0.0)), time.at(0.0))
+    number = pulse.ping(time.look(1.0))
+
+    # The answer waits to be read; the check is first.
+    assert not pulse.is_lost(time.look(61.0))
+    assert pulse.pong(number, time.at(61.01)) <= LOOK_S_MAX + 0.011
+
+
+def test_silence_counts_in_full_while_the_operator_looks() -> None:
+    pulse, time = Pulse(), WatchedTime()
+    pulse.pong(pulse.ping(time.look(0.0)), time.at(0.0))
+    pulse.ping(time.look(STEP_S))
+    now_s = STEP_S
+    while not pulse.is_lost(time.look(now_s)):
+        now_s += STEP_S
+
+    assert SILENCE_S <= now_s <= 3.0
