@@ -160,7 +160,8 @@ class LoopAccount:
         window = late.due_s, late.began_s
         filled_s: dict[Cause, float] = {}
         steps: dict[int, _Steps] = {}
-        for cause, agent, begin_s, end_s in reversed(self._spans):
+        # A copy: Python's collector may begin meanwhile, and its span is added then and there.
+        for cause, agent, begin_s, end_s in reversed(tuple(self._spans)):
             if end_s < late.due_s:
                 break  # they end one after the other
             within_s = overlap_s(begin_s, end_s, window)

@@ -118,6 +118,22 @@ def test_another_wake_up_is_looked_at_anew(loop):
     assert loop.account.explain(late) is Cause.RECEIVING
 
 
+def test_a_collection_while_spans_are_looked_at_is_noted_and_disturbs_nothing(loop, monkeypatch):
+    late = late_by(0.008)
+    for _ in range(3):
+        loop.account.add(Span(Cause.RECEIVING, NOBODY, late.due_s, late.began_s))
+    overlap_s = loop_account.overlap_s
+
+    def collect_first(*arguments):
+        gc.collect()
+        return overlap_s(*arguments)
+
+    monkeypatch.setattr(loop_account, "overlap_s", collect_first)
+
+    assert loop.account.explain(late) is Cause.RECEIVING
+    assert any(span.cause is Cause.GARBAGE for span in loop.account._spans)
+
+
 def test_collections_are_noted_until_the_account_is_closed():
     reactor = SimpleNamespace(slept_s=0.0, last_sleep=(-9.0, -9.0))
     account = LoopAccount(reactor, SimpleNamespace(), agents=1)
