@@ -15,7 +15,7 @@ from cosmos_cli.models.separate_process import SeparateDefect, work_separately
 from madns_runtime import errors as runtime_errors
 from madns_runtime.config import Timeouts, from_mapping, to_mapping
 from madns_runtime.errors import MadnsError, MissingExtraError, PluginError
-from madns_runtime.plugin.registry import is_shipped
+from madns_runtime.plugin.registry import import_asked, is_shipped
 
 _CODE = re.compile(r"[\w./~-]+:[A-Za-z_]\w*")
 """Form in which a parameter names code of one's own: guidance.py:Guidance, package.module:Class."""
@@ -27,8 +27,10 @@ T = TypeVar("T")
 def ask_apart(work: Callable[[Tell], T], kind: type[T], document: Document, spec: str) -> T:
     """Return what *work* does: here if the simulation is shipped, else in a process of its own."""
     settings = [document.value.get(key) for key in ("parameters", "agent_parameters")]
-    if is_shipped(spec) and not _names_code(settings):
-        return work(lambda doing: None)
+    if is_shipped(spec):
+        if not _names_code(settings):
+            return work(lambda doing: None)
+        import_asked(spec)  # here once, in place of once in each fork
 
     def guarded(tell: Tell) -> Mapping[str, Any]:
         try:
