@@ -4,7 +4,7 @@ Two hundred faults of twenty kinds, inserted on purpose, and what became of the 
     python benchmarks/faults.py [--each 10] [--kinds kill,hang] [--seed 1] [-i INVENTORY] [--json]
 
 Each kind is one run of twelve agents in real time, on loopback or on the machines of an inventory (such as a virtual
-tower's), with one fault of it after the other. A fault is survived if the run is complete and nobody is lost whom
+tower's, where signals go by `cosmos exec`), with one fault of it after the other. A fault is survived if the run is complete and nobody is lost whom
 no fault named; named if the host's events, or its verdict, say whom it befell; the seconds until then are of the
 run's own events. Bytes unaccounted are those of record files that neither the manifest nor a loss that is named
 explains. A run that has not ended in time is a hang; a process of it that lives on, or a file half written, is a
@@ -31,14 +31,15 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-
-from madns_runtime.processes import read_start_ticks
+from agent_processes import COSMOS, BoardProcesses, LocalProcesses
 
 ROOT = Path(__file__).parents[1]
 SIMULATION = ROOT / "tests/harness/fault_simulation.py"
 AGENTS = 12
 """Two of them are never touched: a run that has lost everybody ends."""
 FIRST_S, EVERY_S, FOR_S = 2.0, 1.5, 1.0
+EVERY_ON_BOARDS_S = 3.0
+"""Between signals that are sent by a login."""
 AFTER_S = 6.0
 """From the last fault to the end of a run: whoever was ended is back."""
 PATIENCE_S = 120.0
@@ -122,13 +123,11 @@ def main() -> int:
     parser.add_argument("--each", type=int, default=10, help="faults of each kind")
     parser.add_argument("--kinds", default="", help="names of kinds, comma-separated; all of them")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("-i", "--inventory", help="run on its machines; signals are left out")
+    parser.add_argument("-i", "--inventory", help="run on its machines")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     wanted = options.kinds.split(",") if options.kinds else [kind.name for kind in KINDS]
     kinds = [kind for kind in KINDS if kind.name in wanted]
-    if options.inventory:
-        kinds = [kind for kind in kinds if kind.number is None]
     outcomes = []
     with tempfile.TemporaryDirectory(prefix="faults-") as folder:
         for kind in kinds:
@@ -148,7 +147,9 @@ class FaultRun:
 
     def __init__(self, kind: FaultKind, folder: Path, options: argparse.Namespace) -> None:
         self.kind, self.folder, self.options = kind, folder, options
-        self.times_s = [FIRST_S + EVERY_S * number for number in range(options.each)]
+        is_login = kind.number is not None and options.inventory is not None
+        self.every_s = EVERY_ON_BOARDS_S if is_login else EVERY_S
+        self.times_s = [FIRST_S + self.every_s * number for number in range(options.each)]
         self.victims = [f"agent-{1 + number % AGENTS:02}" for number in range(options.each)]
         self.duration_s = self.times_s[-1] + FOR_S + AFTER_S
         folder.mkdir(parents=True)
@@ -157,6 +158,11 @@ class FaultRun:
             "COSMOS_RUNS": str(folder / "runs"),
             "COSMOS_STATE_DIR": str(folder / "state"),
         }
+        self.processes = (
+            BoardProcesses(options.inventory, self.environment)
+            if options.inventory
+            else LocalProcesses(folder / "state/processes")
+        )
         self.sent_utc: list[float] = []
 
     def scenario(self) -> dict[str, Any]:
@@ -189,15 +195,7 @@ class FaultRun:
         (self.folder / SIMULATION.name).write_text(SIMULATION.read_text())
         path = self.folder / "faults.yaml"
         path.write_text(yaml.safe_dump(self.scenario()))
-        command = [
-            sys.executable,
-            "-m",
-            "cosmos_cli.start",
-            "run",
-            str(path),
-            "--no-report",
-            "--json",
-        ]
+        command = [*COSMOS, "run", str(path), "--no-report", "--json"]
         command += ["-i", self.options.inventory] if self.options.inventory else []
         process = subprocess.Popen(
             command,
@@ -236,7 +234,8 @@ class FaultRun:
             seconds=tuple(seconds),
             bytes_unaccounted=unaccounted(run, result) if result["run"] else 0,
             hangs=hangs,
-            leftovers=len(list(self._leftovers())),
+            leftovers=len(self.processes.living(str(result["run"])))
+            + len(list(self.folder.rglob("*.part"))),
             verdict=str(result.get("verdict")),
         )
 
@@ -265,35 +264,14 @@ class FaultRun:
 
     def _signal_agents(self) -> None:
         """Send the agents' processes their signals, each in its time."""
-        began_s = time.monotonic()
-        while not self._pid_of(self.victims[-1]) and time.monotonic() - began_s < PATIENCE_S:
-            time.sleep(0.1)
+        assert self.kind.number is not None
+        self.processes.await_agents(self.victims, PATIENCE_S)
         began_s = time.monotonic() + FIRST_S
         for number, agent in enumerate(self.victims):
-            time.sleep(max(0.0, began_s + EVERY_S * number - time.monotonic()))
-            if pid := self._pid_of(agent):
-                self.sent_utc.append(time.time_ns() * 1e-9)
-                assert self.kind.number is not None
-                os.kill(pid, self.kind.number)
-
-    def _pid_of(self, agent: str) -> int | None:
-        for entry in self._register():
-            if entry.get("role") == "agent" and entry.get("name") == agent:
-                return int(entry["pid"])
-        return None
-
-    def _register(self) -> Iterator[dict[str, Any]]:
-        for path in sorted((self.folder / "state/processes").glob("*.json"), reverse=True):
-            try:
-                yield json.loads(path.read_text())
-            except (OSError, ValueError):
-                continue
-
-    def _leftovers(self) -> Iterator[str]:
-        for entry in self._register():
-            if read_start_ticks(int(entry["pid"])) == entry["start_ticks"]:
-                yield str(entry.get("name"))
-        yield from (str(path) for path in self.folder.rglob("*.part"))
+            time.sleep(max(0.0, began_s + self.every_s * number - time.monotonic()))
+            now_utc = time.time_ns() * 1e-9
+            if self.processes.signal(agent, self.kind.number):
+                self.sent_utc.append(now_utc)
 
 
 def is_word_of(event: Mapping[str, Any], agent: str, kind: FaultKind) -> bool:
