@@ -86,7 +86,7 @@ class HostConditions:
         )
         """For the recorder of the host's half."""
         self.unknown_count = 0
-        """Reports of conditions that the run does not have."""
+        """Reports of conditions that the run does not have: messages that nobody can have meant."""
 
     def on_met(self, number: int, call: OnMet) -> None:
         """Have *call* called each time that an agent, or the host's half, meets the condition of this number."""

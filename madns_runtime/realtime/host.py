@@ -369,6 +369,7 @@ class HostRuntime:
         result = self._report.result(
             self._session, network=network, carried=carried, intended=self._timeline.faults.intended
         )
+        result["malformed_messages"] += self._conditions.unknown_count
         result["faults"] = self._timeline.faults.to_mapping()
         result["host_calls"] = self._calls.to_mapping()
         code = hand_over(result, self._directory, self._operator)
