@@ -74,14 +74,27 @@ def origins(scenario: ScenarioFile) -> dict[str, Any]:
     return {dotted(one.path): one.origin.to_mapping() for one in resolved_values(scenario)}
 
 
-def _is_leaf(value: Any) -> bool:
+def _is_leaf(document: Document, value: Any, path: Path) -> bool:
+    """Tell whether a value stands in one line: all in it came from where it itself did."""
     if isinstance(value, dict):
         return not value
-    return not isinstance(value, list) or not any(isinstance(item, dict | list) for item in value)
+    if not isinstance(value, list):
+        return True
+    return not any(
+        isinstance(item, dict | list) or _has_own_origin(document, (*path, index))
+        for index, item in enumerate(value)
+    )
+
+
+def _has_own_origin(document: Document, path: Path) -> bool:
+    """Tell whether an item of a list is of --set or made of variables, which its list is not."""
+    place = document.value_places.get(path)
+    above = document.place(path[:-1])
+    return place is not None and bool(place.variables or place.override != above.override)
 
 
 def _leaves(document: Document, value: Any, path: Path) -> Iterator[ResolvedValue]:
-    if path and _is_leaf(value):
+    if path and _is_leaf(document, value, path):
         yield ResolvedValue(path=path, value=value, origin=_origin(document, path))
         return
     items = value.items() if isinstance(value, dict) else enumerate(value)
@@ -94,7 +107,7 @@ def _lines(document: Document, value: Any, path: Path, indent: str) -> Iterator[
     for step, item in items:
         inner = (*path, step)
         head = f"{indent}- " if isinstance(step, int) else f"{indent}{_key(step)}: "
-        if _is_leaf(item):
+        if _is_leaf(document, item, inner):
             text = f"{head}{json.dumps(item, ensure_ascii=False)}"
             yield f"{text:<{COMMENT_COLUMN}}  # {_origin(document, inner)}"
         else:

@@ -48,6 +48,25 @@ def test_each_value_tells_its_file_and_line_the_option_or_that_it_is_a_default(s
     assert found["agents", "tick_hz"].value == 10
 
 
+def test_an_item_of_a_list_tells_its_variable_or_option_where_the_list_has_another(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text(
+        "name: a\nsimulation: counter\nvars: {tower: upper}\n"
+        "agents: {count: 3, names: ['${tower}-1', b, c]}\n"
+        "test: {tags: [quick, slow]}\n"
+    )
+    scenario = load_scenario(path, ["agents.names[2]=spare"])
+    found = {one.path: str(one.origin) for one in resolved_values(scenario)}
+    again = tmp_path / "again.yaml"
+    again.write_text("\n".join(resolved_lines(scenario)))
+
+    assert found["agents", "names", 0] == f"{path}:4, ${{tower}} of {path}:3"
+    assert found["agents", "names", 1] == f"{path}:4"
+    assert found["agents", "names", 2] == "--set agents.names[2]"
+    assert found["test", "tags"] == f"{path}:5"
+    assert load_scenario(again).to_mapping() == scenario.to_mapping()
+
+
 def test_parameters_of_some_agents_tell_their_rule_and_the_rest_what_holds_for_all(
     scenario, tmp_path
 ):
