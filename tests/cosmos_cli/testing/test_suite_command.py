@@ -245,6 +245,7 @@ def test_arrays(tmp_path):
     assert found.passed and found.exit_code == 0, found.verdict
     assert found.broken == []
     table = found.table("round_trips", "packet")
+    assert table["agent-01"]["packet"].dtype == np.int64
     assert sorted(table) == ["agent-01", "agent-02", "agent-03"]
     assert table["agent-02"]["packet"].tolist() == list(range(20))
     assert isinstance(table["agent-01"]["packet"], np.ndarray)
@@ -254,7 +255,15 @@ def test_arrays(tmp_path):
         found.table("round_trips", "none")
 
 
+def test_settings_of_numpy_and_paths(tmp_path):
+    found = run("scenarios/s.yaml", runs=str(tmp_path), description=tmp_path, time__duration_s=np.float64(1), agents={"count": np.int64(3)})
+    assert found.document["timing"]["ticks"] == 30
+    assert str(tmp_path) in (found.directory.path / "scenario.yaml").read_text()
+
+
 def test_refused(tmp_path):
+    with pytest.raises(InputError, match="--set agents.count: expected a text, a number.* got set"):
+        run("scenarios/s.yaml", runs=tmp_path, agents__count={3})
     with pytest.raises(InputError, match="agents.count: expected >= 1"):
         run("scenarios/s.yaml", runs=tmp_path, agents__count=0)
 """
@@ -274,4 +283,4 @@ def test_from_pytest_a_run_gives_its_verdict_and_its_records_as_arrays(cosmos):
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "2 passed" in done.stdout
+    assert "3 passed" in done.stdout
