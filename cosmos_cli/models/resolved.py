@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
@@ -65,8 +66,16 @@ def resolved_values(scenario: ScenarioFile) -> list[ResolvedValue]:
 
 
 def resolved_lines(scenario: ScenarioFile) -> Iterator[str]:
-    """Yield what results as YAML, which is a scenario again, with the origin behind each value."""
-    yield from _lines(scenario.document, scenario.to_written(), (), "")
+    """Yield what results as YAML, which beside the file is a scenario again, with the origin behind each value."""
+    document, root = scenario.document, relative_root(scenario)
+    if root != os.curdir:
+        yield _line("root: ", root, _origin_at(document, document.place(("root",))))
+    yield from _lines(document, scenario.to_written(), (), "")
+
+
+def relative_root(scenario: ScenarioFile) -> str:
+    """Return the folder that travels with a scenario, from the scenario's own."""
+    return os.path.relpath(scenario.root, scenario.path.resolve().parent)
 
 
 def origins(scenario: ScenarioFile) -> dict[str, Any]:
@@ -108,11 +117,14 @@ def _lines(document: Document, value: Any, path: Path, indent: str) -> Iterator[
         inner = (*path, step)
         head = f"{indent}- " if isinstance(step, int) else f"{indent}{_key(step)}: "
         if _is_leaf(document, item, inner):
-            text = f"{head}{json.dumps(item, ensure_ascii=False)}"
-            yield f"{text:<{COMMENT_COLUMN}}  # {_origin(document, inner)}"
+            yield _line(head, item, _origin(document, inner))
         else:
             yield head.rstrip()
             yield from _lines(document, item, inner, f"{indent}  ")
+
+
+def _line(head: str, value: Any, origin: Origin) -> str:
+    return f"{f'{head}{json.dumps(value, ensure_ascii=False)}':<{COMMENT_COLUMN}}  # {origin}"
 
 
 def _key(key: str) -> str:

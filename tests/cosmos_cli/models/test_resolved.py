@@ -101,3 +101,36 @@ def test_the_command_prints_it_in_both_forms(tmp_path, scenario, capsys):
         "default": False,
     }
     assert document["files"] == [path, f"{tmp_path}/base.yaml"]
+
+
+@pytest.mark.parametrize("says_root", ["few/few.yaml", "base.yaml", "nobody"])
+def test_a_root_above_is_told_so_that_what_is_printed_finds_its_files(tmp_path, says_root):
+    (tmp_path / "few").mkdir()
+    files = {
+        "base.yaml": "simulation: counter\nagents: {count: 2}\nrequirements: [./wheels]\n",
+        "few/few.yaml": "extends: ../base.yaml\nname: few\n",
+        "few/own.yaml": "name: own\nsimulation: counter\nagents: {count: 2}\n",
+    }
+    for name, text in files.items():
+        root = (
+            {"few/few.yaml": "root: ..\n", "base.yaml": "root: .\n"}[name]
+            if name == says_root
+            else ""
+        )
+        (tmp_path / name).write_text(text + root)
+    wheels = tmp_path / "wheels"
+    wheels.mkdir()
+    (wheels / "pyproject.toml").touch()
+    if says_root == "nobody":
+        lines = list(resolved_lines(load_scenario(tmp_path / "few/own.yaml")))
+        assert not any(line.startswith("root") for line in lines)
+        return
+    scenario = load_scenario(tmp_path / "few/few.yaml")
+    again = tmp_path / "few/again.yaml"
+    again.write_text("\n".join(resolved_lines(scenario)))
+
+    line = again.read_text().partition("\n")[0]
+    assert line.startswith('root: ".."') and line.endswith(
+        f"{says_root}:{3 if 'few' in says_root else 4}"
+    )
+    assert load_scenario(again).root == scenario.root == tmp_path
