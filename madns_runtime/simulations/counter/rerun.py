@@ -12,8 +12,6 @@ UNLIKE: Final = ("round_trips.round_trip_us", "answer_round_trips", "device_samp
 """Times of messages, and the host's streams, whose records stand in the order in which messages came."""
 
 
-def for_rerun(
-    parameters: CounterParameters, agents: tuple[str, ...], run_directory: Path
-) -> Rerun:
+def for_rerun(parameters: CounterParameters, agents: tuple[str, ...], run_directory: Path) -> Rerun:
     """Return the same parameters, and what depends on the network."""
     return Rerun(parameters=parameters, unlike=UNLIKE)
