@@ -153,5 +153,6 @@ def choose_cases(
 
 
 def _names(outline: ScenarioOutline, seed: int | None) -> list[str]:
-    names = [outline.name, outline.path.name, *outline.test.tags]
-    return [name.lower() for name in (*names, *([f"seed={seed}"] if seed is not None else []))]
+    mark = "" if seed is None else f"[seed={seed}]"
+    names = [f"{outline.name}{mark}", f"{outline.path.name}{mark}", *outline.test.tags]
+    return [name.lower() for name in names]

@@ -134,6 +134,8 @@ def test_each_seed_is_a_test_with_its_own_settings(folder):
     cases = chosen(find_scenarios([folder / "a.yaml"]), "seed=3 or seed=1", seeds=(1, 2, 3)).cases
 
     assert [case.name.rpartition("/")[2] for case in cases] == ["a.yaml[seed=1]", "a.yaml[seed=3]"]
+    many = chosen(find_scenarios([folder / "a.yaml"]), "a.yaml[seed=1]", seeds=(1, 10, 21)).cases
+    assert [case.seed for case in many] == [1]
     assert cases[1].arguments()[1:] == ["--set", "time.duration_s=5", "--set", "seed=3"]
 
 
