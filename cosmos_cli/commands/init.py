@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import keyword
 import re
+import shlex
 import sys
 from enum import StrEnum
 from importlib.metadata import packages_distributions
@@ -58,8 +59,8 @@ def init(
     _check_module(name, template)
     paths = write_new(render(template.value, name), directory)
     folder = directory / name if is_package else directory
-    scenario = folder / f"{name}.yaml"
-    following = [f"pip install -e {folder}"] if is_package else []
+    scenario = shlex.quote(str(folder / f"{name}.yaml"))
+    following = [shlex.join(["pip", "install", "-e", str(folder)])] if is_package else []
     following += [f"cosmos validate {scenario}", f"cosmos run {scenario}"]
     for path in paths:
         console.data(str(path))

@@ -347,6 +347,14 @@ def test_a_file_that_would_hide_a_module_is_not_written(cosmos, template):
     assert cosmos("init", "json")[0] == 0  # of a scenario alone Python imports nothing
 
 
+def test_init_tells_commands_that_a_shell_takes_as_they_stand(cosmos):
+    _, _, err = cosmos("init", "rover", "--template", "package", "-d", "my box")
+
+    assert (
+        "next: pip install -e 'my box/rover'; then cosmos validate 'my box/rover/rover.yaml'" in err
+    )
+
+
 def test_init_overwrites_nothing(cosmos):
     Path("rover.py").write_text("mine\n")
 

@@ -43,14 +43,15 @@ def test_a_failure_names_checks_worst_agent_run_and_the_command_that_repeats_it(
     case = make_case("ring", overrides=("time.duration_s=20", "seed=3"), seed=3)
     outcome = judge_case(
         case,
-        make_result(4, check, directory="/runs/tests/0001-ring"),
+        make_result(4, check, directory="/my runs/tests/0001-ring"),
         is_interrupted=False,
     )
 
     told = details(outcome)
     assert "  drift: got 2.5 m, limit 1 m, worst: agent-07 at 12.5 s" in told
     assert "repeat it: cosmos run ring.yaml --set time.duration_s=20 --set seed=3" in told
-    assert "its run: /runs/tests/0001-ring" in told
+    assert "its run: /my runs/tests/0001-ring" in told
+    assert "its figures: cosmos report '/my runs/tests/0001-ring'" in told
 
 
 def test_the_scenarios_own_seed_is_in_the_command_that_repeats_it():
