@@ -75,7 +75,7 @@ def run_child(
     Raises:
         InputError: The run refused its input; with its words.
     """
-    command = [sys.executable, "-m", "cosmos_cli.start", verb, *arguments, "--json"]
+    command = [sys.executable, "-P", "-m", "cosmos_cli.start", verb, *arguments, "--json"]
     with subprocess.Popen(
         [*command, "--quiet"] if is_quiet else command,
         stdin=subprocess.DEVNULL,

@@ -89,7 +89,7 @@ def _findings(order: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the findings; a verification that ends without any is one itself."""
     try:
         ended = subprocess.run(
-            [sys.executable, "-m", "madns_runtime.hardware.verification"],
+            [sys.executable, "-P", "-m", "madns_runtime.hardware.verification"],
             input=json.dumps(order),
             capture_output=True,
             text=True,

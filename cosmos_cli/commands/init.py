@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import keyword
 import re
+import shlex
 import sys
 from enum import StrEnum
+from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import Annotated
 
@@ -54,12 +56,11 @@ def init(
             f"NAME: expected lower-case letters, digits and hyphens, at most 64, got {name!r}"
         )
     is_package = template is Template.package
-    if is_package:
-        _check_module(name)
+    _check_module(name, template)
     paths = write_new(render(template.value, name), directory)
     folder = directory / name if is_package else directory
-    scenario = folder / f"{name}.yaml"
-    following = [f"pip install -e {folder}"] if is_package else []
+    scenario = shlex.quote(str(folder / f"{name}.yaml"))
+    following = [shlex.join(["pip", "install", "-e", str(folder)])] if is_package else []
     following += [f"cosmos validate {scenario}", f"cosmos run {scenario}"]
     for path in paths:
         console.data(str(path))
@@ -67,18 +68,24 @@ def init(
     console.print_json({"files": [str(path) for path in paths], "next": following})
 
 
-def _check_module(name: str) -> None:
+def _check_module(name: str, template: Template) -> None:
     """
-    See that a package and a simulation can be called so.
+    See that what Python imports can be called so, and hides no module that is there already.
 
     Raises:
-        InputError: They cannot.
+        InputError: It cannot.
     """
-    module = _module(name)
-    if not module.isidentifier() or keyword.iskeyword(module):
+    is_package = template is Template.package
+    module = _module(name) if is_package else name
+    if is_package and (not module.isidentifier() or keyword.iskeyword(module)):
         raise InputError(f"NAME: expected what Python can import, such as my-cars, got {name!r}")
-    if module in sys.stdlib_module_names or name in registered_names():
-        raise InputError(f"NAME: {name!r} is taken by Python or by an installed simulation")
+    if is_package and name in registered_names():
+        raise InputError(f"NAME: {name!r} is taken by an installed simulation; choose another")
+    if template not in (Template.package, Template.plugin, Template.device):
+        return
+    if module in sys.stdlib_module_names or module in packages_distributions():
+        text = f"{name!r} is taken by a module of Python or of an installed package"
+        raise InputError(f"NAME: {text}, which it would hide; choose another")
 
 
 def _module(name: str) -> str:

@@ -28,7 +28,7 @@ from cosmos_cli.launch.execute import Detached, RunOptions, execute, plan_of
 from cosmos_cli.launch.rehearsal import Rehearsal
 from cosmos_cli.launch.rehearsal_view import Asked, check_run
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
-from cosmos_cli.testing.junit import JunitOption, junit_case_of, write_junit
+from cosmos_cli.testing.junit import JunitOption, check_junit, junit_case_of, write_junit
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption, losing_output
 from cosmos_cli.view.factory import make_view
 
@@ -93,6 +93,7 @@ def run(
     if check:
         asked = Asked(scenario=scenario, inventory=tuple(inventory or ()), limit=limit, host=host)
         raise typer.Exit(_check(console, checked, options, asked))
+    check_junit(junit)
     _run(console, checked, options, junit)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -14,9 +14,9 @@ from cosmos_cli.commands.run_arguments import RunsOption
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import runs_root, utc_now
 from cosmos_cli.testing.case import CaseSettings, SuiteCase
-from cosmos_cli.testing.discovery import ChosenCases, choose_cases, find_scenarios
+from cosmos_cli.testing.discovery import ChosenCases, FoundScenarios, choose_cases, find_scenarios
 from cosmos_cli.testing.expression import parse_expression
-from cosmos_cli.testing.junit import JunitCase, JunitOption, write_junit
+from cosmos_cli.testing.junit import JunitCase, JunitOption, check_junit, write_junit
 from cosmos_cli.testing.last_failed import read_failed, remember_failed
 from cosmos_cli.testing.outcome import CaseOutcome
 from cosmos_cli.testing.seeds import parse_seeds
@@ -29,6 +29,7 @@ from cosmos_cli.testing.terminal import (
     summary_line,
 )
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
+from cosmos_cli.ui.plural import counted
 
 JOBS_MAX = 256
 SECONDS_MAX = 86_400.0 * 30
@@ -116,13 +117,9 @@ def test(
     settings = CaseSettings(
         overrides=tuple(set_ or ()), is_shortened=not full_length, realtime_s_max=realtime_s_max
     )
-    chosen = _chosen(
-        console,
-        paths or [],
-        settings,
-        expression=expression,
-        seeds_of=_seeds_of(console, seeds, last_failed=last_failed),
-    )
+    found = find_scenarios(paths or [])
+    seeds_of = _seeds_of(console, found, seeds, last_failed=last_failed)
+    chosen = _chosen(console, found, settings, expression=expression, seeds_of=seeds_of)
     if update_baselines:
         _check_owners(chosen.cases)
     options = SuiteOptions(
@@ -131,13 +128,14 @@ def test(
         keeps_all=keep,
         updates_baselines=update_baselines,
     )
+    check_junit(junit)
     check_folder(options.runs)
     started_utc, started_s = utc_now(), time.monotonic()
     result = _run(console, chosen.cases, options)
     seconds = time.monotonic() - started_s
     remember_failed(result.outcomes)
     if junit is not None:
-        cases = [junit_case(each) for each in in_order(result.outcomes, chosen.cases)]
+        cases = list(junit_cases(result.outcomes, chosen.cases))
         write_junit(junit, cases, seconds=seconds, started_utc=started_utc)
     _tell(console, result, chosen, seconds)
     return int(result.exit_code)
@@ -148,6 +146,8 @@ def _tell(console: Console, result: SuiteResult, chosen: ChosenCases, seconds: f
     ordered = in_order(result.outcomes, chosen.cases)
     for line in failure_lines(ordered):
         console.data(line)
+    for path, number in result.written.items():
+        console.say(f"{path}: {counted(number, 'expected value')} written")
     console.data(summary_line(result, deselected=chosen.deselected, seconds=seconds))
     console.print_json(
         {
@@ -164,14 +164,16 @@ def _tell(console: Console, result: SuiteResult, chosen: ChosenCases, seconds: f
 
 
 def _seeds_of(
-    console: Console, text: str | None, *, last_failed: bool
+    console: Console, found: FoundScenarios, text: str | None, *, last_failed: bool
 ) -> Callable[[Path], Sequence[int | None]]:
     """Return the function that tells a scenario's seeds; none for one that did not fail last time."""
     given: Sequence[int | None] = parse_seeds(text) if text else (None,)
-    failed = read_failed() if last_failed else ()
+    known = {str(outline.path.resolve()) for outline in found.outlines}
+    # Other folders' failures are remembered, too.
+    failed = [each for each in read_failed() if each[0] in known] if last_failed else []
     if not failed:
         if last_failed:
-            console.say("nothing failed last time: all tests are meant")
+            console.say("none of these failed last time: all tests are meant")
         return lambda path: given
     by_path: dict[str, list[int | None]] = {}
     for place, seed in failed:
@@ -183,14 +185,13 @@ def _seeds_of(
 
 def _chosen(
     console: Console,
-    paths: Sequence[Path],
+    found: FoundScenarios,
     settings: CaseSettings,
     *,
     expression: str,
     seeds_of: Callable[[Path], Sequence[int | None]],
 ) -> ChosenCases:
     is_meant = parse_expression(expression) if expression else lambda names: True
-    found = find_scenarios(paths)
     chosen = choose_cases(found, settings, seeds_of=seeds_of, is_meant=is_meant, warn=console.warn)
     console.say(
         collected_line(
@@ -247,15 +248,33 @@ def in_order(outcomes: Sequence[CaseOutcome], cases: Sequence[SuiteCase]) -> lis
     return sorted(outcomes, key=lambda each: places[each.case.key])
 
 
+def junit_cases(outcomes: Sequence[CaseOutcome], cases: Sequence[SuiteCase]) -> Iterator[JunitCase]:
+    """Yield all tests as JUnit XML holds them, those that an interruption left out as well."""
+    ended = {outcome.case.key: outcome for outcome in outcomes}
+    for case in cases:
+        if (outcome := ended.get(case.key)) is not None:
+            yield junit_case(outcome)
+        else:
+            yield JunitCase(
+                classname=str(case.path),
+                name=_junit_name(case),
+                seconds=0.0,
+                skipped="not run: interrupted before",
+                properties=(("seed", str(case.seed)), ("repeat", case.repeat_command)),
+            )
+
+
+def _junit_name(case: SuiteCase) -> str:
+    return f"{case.scenario_name}[seed={case.seed}]" if case.has_given_seed else case.scenario_name
+
+
 def junit_case(outcome: CaseOutcome) -> JunitCase:
-    """Return a test as JUnit XML holds it."""
+    """Return a test that ended as JUnit XML holds it."""
     case = outcome.case
     is_failed = outcome.outcome == "failed"
     return JunitCase(
         classname=str(case.path),
-        name=f"{case.scenario_name}[seed={case.seed}]"
-        if case.has_given_seed
-        else case.scenario_name,
+        name=_junit_name(case),
         seconds=outcome.seconds,
         failure=outcome.reasons[0] if is_failed else "",
         details="\n".join(details(outcome)) if is_failed else "",

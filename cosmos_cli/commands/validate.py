@@ -11,7 +11,7 @@ from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.launch.access import chosen_access
 from cosmos_cli.launch.place_plan import place_notes
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
-from cosmos_cli.models.resolved import origins, resolved_lines
+from cosmos_cli.models.resolved import origins, relative_root, resolved_lines
 from cosmos_cli.models.scenario_outline import check_test
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
 
@@ -71,7 +71,9 @@ def _summary(item: ScenarioFile) -> str:
 
 
 def _result(item: ScenarioFile, *, is_resolved: bool) -> dict[str, object]:
-    more = {"files": list(item.files), "origins": origins(item)} if is_resolved else {}
+    more: dict[str, object] = {}
+    if is_resolved:
+        more = {"files": list(item.files), "root": relative_root(item), "origins": origins(item)}
     return {
         "file": str(item.path),
         "access": chosen_access(item.scenario.recording),

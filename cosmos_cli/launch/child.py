@@ -31,8 +31,8 @@ from madns_runtime.recording.access import Access, umask_of
 from madns_runtime.timing.granted_clock import GrantedClock
 
 RELAY_MODULE = "madns_runtime.reactor.relay"
-HOST_PROGRAM: tuple[str, ...] = (sys.executable, "-m", "madns_runtime.host")
-AGENT_PROGRAM: tuple[str, ...] = (sys.executable, "-m", "madns_runtime.agent")
+HOST_PROGRAM: tuple[str, ...] = (sys.executable, "-P", "-m", "madns_runtime.host")
+AGENT_PROGRAM: tuple[str, ...] = (sys.executable, "-P", "-m", "madns_runtime.agent")
 STDERR_LINES = 10
 STDERR_BYTES = 8192
 

@@ -21,7 +21,7 @@ from cosmos_cli.system.bounded_process import describe_exit, run_bounded
 from cosmos_cli.ui.foreign_text import clean_text
 from madns_runtime.config import DeviceLaunch, Timeouts, to_mapping
 
-PROGRAM = (sys.executable, "-m", "madns_runtime.hardware.sampling")
+PROGRAM = (sys.executable, "-P", "-m", "madns_runtime.hardware.sampling")
 END_S = 15.0
 """Beyond its seconds, for the program to start and for devices to be made safe and closed."""
 USER = "cosmos-devices"

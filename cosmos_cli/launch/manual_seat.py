@@ -58,7 +58,7 @@ class ManualSeat:
 
     def command(self) -> str:
         """Return what to type into a shell."""
-        arguments = (sys.executable, "-m", "madns_runtime.agent", "--launch", str(self.path))
+        arguments = (sys.executable, "-P", "-m", "madns_runtime.agent", "--launch", str(self.path))
         return shlex.join(arguments)
 
     def send(self, command: Mapping[str, Any]) -> None:

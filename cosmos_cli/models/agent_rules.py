@@ -105,6 +105,11 @@ def rule_document(document: Document, index: int) -> Document:
     for path, text in document.texts.items():
         if path[: len(above)] == above:
             own.texts[("parameters", *path[len(above) :])] = text
+    if (
+        "parameters",
+    ) not in own.value_places:  # of --set, which knows the place of the whole alone
+        place = document.place(above)
+        own.value_places["parameters",] = dataclasses.replace(place, path=place.path or above)
     lower = copy.deepcopy(document.value.get("parameters") or {})
     merge_mapping(own, document, lower, ("parameters",))
     return own

@@ -20,7 +20,7 @@ from cosmos_cli.models.document import Document, read_document
 from cosmos_cli.models.overrides import KEY_FORM
 from cosmos_cli.models.text_forms import NonBlank
 from cosmos_cli.models.translate import faults_of
-from cosmos_cli.models.yaml_source import read_source
+from cosmos_cli.models.yaml_source import YamlSource, read_source
 from madns_runtime.config import FORBID_EXTRA
 
 FIGURES_MAX = 1000
@@ -87,7 +87,21 @@ def read_baseline(path: Path) -> Baseline:
     Raises:
         InputError: With every fault.
     """
-    document = read_document(read_source(path))
+    return parse_baseline(path, read_source(path))
+
+
+def parse_baseline(path: Path, source: YamlSource) -> Baseline:
+    """
+    Return the baseline of a text.
+
+    Args:
+        path: Where it lies, or would.
+        source: The text.
+
+    Raises:
+        InputError: With every fault.
+    """
+    document = read_document(source)
     try:
         content = _ADAPTER.validate_json(json.dumps(document.value), strict=True)
     except ValidationError as error:

@@ -61,10 +61,20 @@ class Document:
         """Return a fault at the place of *path*; of one that was not written, at the key above."""
         place, known = self._found(path, at_key)
         name = dotted(path if place.path is None else (*place.path, *path[len(known) :]))
+        text += self._variables_of(place)
         if place.override:
             return Fault(text=text, path=name, override=place.override)
         source = place.source or self.source
         return source.fault(text, line=place.line, column=place.column, path=name)
+
+    def _variables_of(self, place: SourcePlace) -> str:
+        """Return the variables that a value is made of, with their places: what is wrong may be there."""
+        told = []
+        for name in dict.fromkeys(place.variables):
+            own = self.place(("vars", name))
+            where = f"{(own.source or self.source).label}:{own.line}"
+            told.append(f"${{{name}}} of {f'--set {own.override}' if own.override else where}")
+        return f" ({', '.join(told)})" if told else ""
 
     def place(self, path: Path, *, at_key: bool = False) -> SourcePlace:
         """Return the place of *path*; of one that was not written, of the key above."""

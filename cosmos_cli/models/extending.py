@@ -65,6 +65,7 @@ def read_scenario_source(path: Path) -> ScenarioSource:
     """
     chain = _chain(path)
     root = _root(chain)
+    by = next((file for file in chain if file.root is not None), chain[0])
     for file, above in zip(chain[1:], chain, strict=False):
         if not file.path.is_relative_to(root):
             text = f"{file.label} lies outside of {root}, the root of the scenario, which travels with it"
@@ -72,6 +73,9 @@ def read_scenario_source(path: Path) -> ScenarioSource:
     document = chain[0].document
     for file in chain[1:]:
         merge_below(document, file.document)
+    if by.root is not None:
+        place = dataclasses.replace(by.root_place, source=by.document.source)
+        document.value_places["root",] = place
     return ScenarioSource(document=document, root=root, files=tuple(file.label for file in chain))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
@@ -65,8 +66,16 @@ def resolved_values(scenario: ScenarioFile) -> list[ResolvedValue]:
 
 
 def resolved_lines(scenario: ScenarioFile) -> Iterator[str]:
-    """Yield what results as YAML, which is a scenario again, with the origin behind each value."""
-    yield from _lines(scenario.document, scenario.to_written(), (), "")
+    """Yield what results as YAML, which beside the file is a scenario again, with the origin behind each value."""
+    document, root = scenario.document, relative_root(scenario)
+    if root != os.curdir:
+        yield _line("root: ", root, _origin_at(document, document.place(("root",))))
+    yield from _lines(document, scenario.to_written(), (), "")
+
+
+def relative_root(scenario: ScenarioFile) -> str:
+    """Return the folder that travels with a scenario, from the scenario's own."""
+    return os.path.relpath(scenario.root, scenario.path.resolve().parent)
 
 
 def origins(scenario: ScenarioFile) -> dict[str, Any]:
@@ -74,14 +83,27 @@ def origins(scenario: ScenarioFile) -> dict[str, Any]:
     return {dotted(one.path): one.origin.to_mapping() for one in resolved_values(scenario)}
 
 
-def _is_leaf(value: Any) -> bool:
+def _is_leaf(document: Document, value: Any, path: Path) -> bool:
+    """Tell whether a value stands in one line: all in it came from where it itself did."""
     if isinstance(value, dict):
         return not value
-    return not isinstance(value, list) or not any(isinstance(item, dict | list) for item in value)
+    if not isinstance(value, list):
+        return True
+    return not any(
+        isinstance(item, dict | list) or _has_own_origin(document, (*path, index))
+        for index, item in enumerate(value)
+    )
+
+
+def _has_own_origin(document: Document, path: Path) -> bool:
+    """Tell whether an item of a list is of --set or made of variables, which its list is not."""
+    place = document.value_places.get(path)
+    above = document.place(path[:-1])
+    return place is not None and bool(place.variables or place.override != above.override)
 
 
 def _leaves(document: Document, value: Any, path: Path) -> Iterator[ResolvedValue]:
-    if path and _is_leaf(value):
+    if path and _is_leaf(document, value, path):
         yield ResolvedValue(path=path, value=value, origin=_origin(document, path))
         return
     items = value.items() if isinstance(value, dict) else enumerate(value)
@@ -94,12 +116,15 @@ def _lines(document: Document, value: Any, path: Path, indent: str) -> Iterator[
     for step, item in items:
         inner = (*path, step)
         head = f"{indent}- " if isinstance(step, int) else f"{indent}{_key(step)}: "
-        if _is_leaf(item):
-            text = f"{head}{json.dumps(item, ensure_ascii=False)}"
-            yield f"{text:<{COMMENT_COLUMN}}  # {_origin(document, inner)}"
+        if _is_leaf(document, item, inner):
+            yield _line(head, item, _origin(document, inner))
         else:
             yield head.rstrip()
             yield from _lines(document, item, inner, f"{indent}  ")
+
+
+def _line(head: str, value: Any, origin: Origin) -> str:
+    return f"{f'{head}{json.dumps(value, ensure_ascii=False)}':<{COMMENT_COLUMN}}  # {origin}"
 
 
 def _key(key: str) -> str:

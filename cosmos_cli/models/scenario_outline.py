@@ -98,7 +98,8 @@ class ScenarioOutline:
         """Return a fault of --set KEY=VALUE at KEY of `test.set`, if it came from there."""
         if fault.override not in applied:
             return fault
-        told = f"{fault.path}: {fault.text}" if fault.path != fault.override else fault.text
+        is_elsewhere = fault.path not in ("", fault.override)
+        told = f"{fault.path}: {fault.text}" if is_elsewhere else fault.text
         return self.document.fault((SECTION, "set", fault.override), told)
 
 

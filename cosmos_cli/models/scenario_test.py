@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
@@ -10,6 +11,7 @@ from typing import Annotated, Any, Literal
 from annotated_types import Gt, Le, MaxLen
 from pydantic import Field
 
+from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.document import Path
 from cosmos_cli.models.overrides import KEY_FORM
 from cosmos_cli.models.text_forms import like
@@ -72,8 +74,27 @@ class ScenarioTest:
 
 
 def override_of(key: str, value: Any) -> str:
-    """Return KEY=VALUE of --set; JSON is YAML, too."""
-    return f"{key}={json.dumps(value)}"
+    """
+    Return KEY=VALUE of --set; JSON is YAML, too.
+
+    Raises:
+        InputError: The value is none that a scenario holds.
+    """
+    try:
+        return f"{key}={json.dumps(value, default=_plain)}"
+    except (TypeError, ValueError) as error:
+        text = "expected a text, a number, true, false, or a list or mapping of them"
+        raise InputError(faults=[Fault(text=f"{text}: {error}", override=key)]) from error
+
+
+def _plain(value: object) -> object:
+    """Return a path as its text, and a number or an array of numpy as plain ones."""
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    to_list = getattr(value, "tolist", None)
+    if to_list is None:
+        raise TypeError(f"got {type(value).__name__}")
+    return to_list()
 
 
 def faults_of_test(test: ScenarioTest) -> Iterator[tuple[Path, str]]:

@@ -279,7 +279,7 @@ class _Substitution:
         if is_plugins and found.is_open:
             document.open_texts.append(path)
         if not isinstance(found.value, str):
-            document.texts[path] = f"{kind_of(found.value)} (from {text})"
+            document.texts[path] = kind_of(found.value)
         return found.value
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
-from cosmos_cli.errors import InputError
-from cosmos_cli.models.baseline import Baseline, read_baseline
-from cosmos_cli.models.document import Document
+from cosmos_cli.errors import Fault, InputError
+from cosmos_cli.models.baseline import Baseline, parse_baseline
+from cosmos_cli.models.document import Document, Path, SourcePlace
+from cosmos_cli.models.yaml_source import YamlSource
 from cosmos_cli.testing.figures import ComparedFigure, FigureValue
 from madns_runtime.partial_file import write_whole
 
@@ -23,7 +25,7 @@ def update_baseline(baseline: Baseline, compared: Sequence[ComparedFigure]) -> i
         How many figures changed.
 
     Raises:
-        InputError: A figure has no value, or the file cannot be written.
+        InputError: A figure has no value, or cannot be written where it stands; then nothing is.
     """
     missing = [
         baseline.fault(figure.name, figure.why_none) for figure in compared if figure.got is None
@@ -34,22 +36,57 @@ def update_baseline(baseline: Baseline, compared: Sequence[ComparedFigure]) -> i
     if not changed:
         return 0
     text = edited(baseline.document, changed)
+    if not _means(baseline, text, changed):
+        raise InputError(faults=list(_unwritable(baseline, changed)))
     try:
-        write_whole(baseline.path, text.encode())
+        # A link to a baseline that is shared stays one.
+        write_whole(baseline.path.resolve(), text.encode())
     except OSError as error:
         raise InputError(f"{baseline.path}: cannot be written: {error.strerror}") from error
-    read_baseline(baseline.path)
     return len(changed)
 
 
 def edited(document: Document, values: Mapping[str, FigureValue]) -> str:
     """Return the text of a baseline with new expected values, its comments and its order as they are."""
     lines = document.source.text.splitlines(keepends=True)
-    edits = [_edit(document, lines, name, _scalar(value)) for name, value in values.items()]
+    edits = [
+        edit
+        for name, value in values.items()
+        if (edit := _edit(document, lines, name, _scalar(value))) is not None
+    ]
     for row, column, length, new in sorted(edits, reverse=True):
         line = lines[row]
         lines[row] = f"{line[:column]}{new}{line[column + length :]}"
     return "".join(lines)
+
+
+def _means(baseline: Baseline, text: str, changed: Mapping[str, FigureValue]) -> bool:
+    """Tell whether a text is the baseline with these expected values and no other difference."""
+    try:
+        found = parse_baseline(baseline.path, YamlSource.of(str(baseline.path), text)).figures
+    except InputError:
+        return False
+    wanted = {
+        name: replace(figure, expected=json.loads(_scalar(changed[name])))
+        if name in changed
+        else figure
+        for name, figure in baseline.figures.items()
+    }
+    return found == wanted
+
+
+def _unwritable(baseline: Baseline, changed: Mapping[str, FigureValue]) -> Iterator[Fault]:
+    """Yield a fault for each figure that cannot be written by itself; for all if none can with the others."""
+    alone = [
+        name
+        for name, value in changed.items()
+        if not _means(baseline, edited(baseline.document, {name: value}), {name: value})
+    ]
+    for name in alone or changed:
+        text = (
+            f"write `expected: {_scalar(changed[name])}` by hand, in a line or a figure of its own"
+        )
+        yield baseline.fault(name, f"no value can be put into what stands here: {text}")
 
 
 def _scalar(value: FigureValue) -> str:
@@ -60,24 +97,39 @@ def _scalar(value: FigureValue) -> str:
     return f"{mantissa}{'' if '.' in mantissa or not mark else '.0'}{mark}{power}"
 
 
-def _edit(document: Document, lines: Sequence[str], name: str, text: str) -> Edit:
-    where = ("figures", name)
-    expected = (*where, "expected")
-    if expected in document.key_places:
+def _edit(document: Document, lines: Sequence[str], name: str, text: str) -> Edit | None:
+    """Return the edit of a figure; None for one without a key of its own, which an alias stands for."""
+    expected = ("figures", name, "expected")
+    own = _own_keys(document, name)
+    if expected in own:
         place = document.value_places[expected]
         row, column = place.line - 1, place.column - 1
+        before = lines[row][:column]
+        if not document.texts.get(expected, "-"):  # `expected:` alone
+            text = f"{'' if before.endswith(' ') else ' ' if before.endswith(':') else ': '}{text}"
         return row, column, _length(document, expected, lines[row][column:]), text
-    first = min(
-        (document.key_places[path] for path in document.key_places if path[:-1] == where),
-        key=lambda place: (place.line, place.column),
-    )
+    if not own:
+        return None
+    first = min(own.values(), key=lambda place: (place.line, place.column))
     row, column = first.line - 1, first.column - 1
     is_flow = lines[row][:column].strip() != ""
     between = ", " if is_flow else "\n" + lines[row][:column]
     return row, column, 0, f"expected: {text}{between}"
 
 
-def _length(document: Document, path: tuple[str | int, ...], rest: str) -> int:
+def _own_keys(document: Document, name: str) -> dict[Path, SourcePlace]:
+    """Return the keys of a figure that stand there, without those that `<<` takes from a figure above."""
+    owners: dict[tuple[int, int], str | int] = {}
+    own: dict[Path, SourcePlace] = {}
+    for path, place in document.key_places.items():
+        if len(path) == 3 and path[0] == "figures":
+            owner = owners.setdefault((place.line, place.column), path[1])
+            if owner == path[1] == name:
+                own[path] = place
+    return own
+
+
+def _length(document: Document, path: Path, rest: str) -> int:
     """Return the characters of a scalar: a plain one as it is written, a quoted one to its closing mark."""
     if path in document.texts:
         return len(document.texts[path])

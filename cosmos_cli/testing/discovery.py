@@ -13,6 +13,7 @@ from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.document import read_document
 from cosmos_cli.models.scenario_outline import ScenarioOutline, is_scenario, read_outline
 from cosmos_cli.models.yaml_source import FILE_BYTES_MAX, read_source
+from cosmos_cli.provision.trees import is_folder_of_tree, is_name_of_tree
 from cosmos_cli.testing.case import CaseSettings, SuiteCase, make_cases
 from cosmos_cli.testing.expression import Matcher
 from madns_runtime.bounded_files import read_regular_file
@@ -41,8 +42,8 @@ def find_scenarios(paths: Sequence[Path]) -> FoundScenarios:
     Return the scenarios of files, and those in and below folders.
 
     A file that is named is one; of a folder's files those are that have a name and a simulation; one that cannot be
-    read is at fault if it seems to have them. Folders whose name begins with a dot are left out, as are links to
-    folders.
+    read is at fault if it seems to have them. Left out are what travels with no scenario either (folders whose name
+    begins with a dot, runs, virtual environments, caches) and links to folders.
 
     Raises:
         InputError: A path is missing, or the folders hold too many files.
@@ -64,7 +65,11 @@ def find_scenarios(paths: Sequence[Path]) -> FoundScenarios:
 def _files_below(folder: Path) -> list[tuple[Path, bool]]:
     files: list[tuple[Path, bool]] = []
     for here, folders, names in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        folders[:] = sorted(
+            name
+            for name in folders
+            if is_name_of_tree(name) and is_folder_of_tree(Path(here) / name)
+        )
         files += [(Path(here) / name, False) for name in sorted(names) if name.endswith(SUFFIXES)]
         if len(files) > FILES_MAX:
             raise InputError(
@@ -148,5 +153,6 @@ def choose_cases(
 
 
 def _names(outline: ScenarioOutline, seed: int | None) -> list[str]:
-    names = [outline.name, outline.path.name, *outline.test.tags]
-    return [name.lower() for name in (*names, *([f"seed={seed}"] if seed is not None else []))]
+    mark = "" if seed is None else f"[seed={seed}]"
+    names = [f"{outline.name}{mark}", f"{outline.path.name}{mark}", *outline.test.tags]
+    return [name.lower() for name in names]

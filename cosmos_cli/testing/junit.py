@@ -7,6 +7,7 @@ and bounded.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -103,6 +104,29 @@ def _add(suite: ElementTree.Element, case: JunitCase) -> None:
         ElementTree.SubElement(element, "skipped", {"message": clean_line(case.skipped)})
 
 
+def check_junit(path: Path | None) -> None:
+    """
+    Make the folders above the file, before the runs that it is to tell of.
+
+    Raises:
+        InputError: It could not be written.
+    """
+    if path is None:
+        return
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(path, error.strerror) from error
+    if path.is_dir():
+        raise _unwritable(path, "it is a folder; name a file")
+    if not os.access(path.parent, os.W_OK):
+        raise _unwritable(path, f"no right to write in {path.parent}")
+
+
+def _unwritable(path: Path, why: str | None) -> InputError:
+    return InputError(f"--junit {path}: cannot be written: {why}")
+
+
 def write_junit(
     path: Path, cases: Sequence[JunitCase], *, seconds: float, started_utc: str
 ) -> None:
@@ -116,7 +140,7 @@ def write_junit(
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, junit_text(cases, seconds=seconds, started_utc=started_utc))
     except OSError as error:
-        raise InputError(f"--junit {path}: cannot be written: {error.strerror}") from error
+        raise _unwritable(path, error.strerror) from error
 
 
 def junit_case_of(path: Path, directory: Path, document: Mapping[str, Any]) -> JunitCase:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Any, Literal
 
@@ -62,18 +62,16 @@ def judge_case(
     result: ProcessResult,
     *,
     is_interrupted: bool,
-    figures: Sequence[ComparedFigure] = (),
 ) -> CaseOutcome:
     """
-    Judge a test.
+    Judge a test, but for its baseline.
 
     Args:
         case: The test.
         result: End of its run.
         is_interrupted: Whether somebody stopped the suite, and the run did not come to its end before.
-        figures: The baseline's, with what came.
     """
-    reasons = _reasons(case, result, figures)
+    reasons = _reasons(case, result)
     is_cut = is_interrupted and result.exit_code == ExitCode.INTERRUPTED
     killed = is_interrupted and result.exit_code < 0
     outcome: ResultWord = "failed" if reasons else "passed"
@@ -90,23 +88,40 @@ def judge_case(
         broken=tuple(map(check_line, broken_checks(result.document))),
         words="" if verdict else "\n".join(result.words.splitlines()[-WORDS_LINES_MAX:]),
         directory=str(result.directory or ""),
-        figures=tuple(figures),
     )
 
 
-def _reasons(
-    case: SuiteCase, result: ProcessResult, figures: Sequence[ComparedFigure]
-) -> list[str]:
+def with_figures(
+    outcome: CaseOutcome, figures: Sequence[ComparedFigure], *, why_not_written: str = ""
+) -> CaseOutcome:
+    """
+    Return a judged test, judged by its baseline as well.
+
+    Args:
+        outcome: The test.
+        figures: The baseline's, with what came.
+        why_not_written: Why the baseline could not be written, which was to be; empty if it was, or was not to be.
+    """
+    told = [each.reason() for each in figures if not each.passed]
+    reasons = [f"baseline: {text}" for text in (*told, why_not_written) if text]
+    return replace(
+        outcome,
+        figures=tuple(figures),
+        outcome="failed" if reasons else outcome.outcome,
+        reasons=(*outcome.reasons, *reasons),
+    )
+
+
+def _reasons(case: SuiteCase, result: ProcessResult) -> list[str]:
     if result.is_too_long:
         return [f"not done after {case.deadline_s:g} s (its deadline), and ended"]
     reasons = []
     code, expected = result.exit_code, case.expect.exit_code
     verdict = str(result.document.get("verdict") or "")
-    if code != expected:
-        told = verdict or f"the run {describe_exit(code)} without a verdict"
+    told = verdict or f"the run {describe_exit(code)} without a verdict"
+    if code != expected or not verdict:
         reasons.append(f"expected exit code {expected}, got {code}: {told}" if expected else told)
-    reasons += _unexpected(case.expect, result.document, verdict)
-    return reasons + [f"baseline: {each.reason()}" for each in figures if not each.passed]
+    return reasons + _unexpected(case.expect, result.document, verdict)
 
 
 def _unexpected(expect: ExpectedOutcome, document: Mapping[str, Any], verdict: str) -> list[str]:

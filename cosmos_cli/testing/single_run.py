@@ -73,7 +73,8 @@ class FinishedRun:
             fields: Those that are wanted; all if none is named.
 
         Returns:
-            Arrays of shape (N,), in the order of recording; numbers as float64, null as NaN.
+            Arrays of shape (N,), in the order of recording; numbers as float64 with null as NaN, whole ones
+            without null as int64, the rest as objects.
 
         Raises:
             KeyError: There is no such stream or field; the message lists what there is.
@@ -94,7 +95,7 @@ def run(
     path: str | Path,
     settings: Mapping[str, Any] | None = None,
     *,
-    runs: Path | None = None,
+    runs: str | Path | None = None,
     deadline_s: float | None = None,
     **values: Any,
 ) -> FinishedRun:
@@ -103,13 +104,13 @@ def run(
 
     Args:
         path: The scenario's file; its section `test` does not count.
-        settings: Values by dotted key, as --set takes them: {"time.duration_s": 20}.
+        settings: Values by dotted key, as --set takes them: {"time.duration_s": 20}; numpy's and paths, too.
         runs: Folder of the run; tests in the folder of all runs if none.
         deadline_s: Longest time that it may take, s; from its length if none.
         values: More settings; two underscores stand for a dot: time__duration_s=20.
 
     Raises:
-        InputError: The scenario is wrong; with every fault.
+        InputError: The scenario, a setting or the folder is wrong; with every fault.
         RunFailedError: It was not done in time, or came to no verdict.
     """
     path = Path(path)
@@ -119,7 +120,7 @@ def run(
     overrides = [override_of(key, value) for key, value in chosen.items()]
     limit_s = deadline_of(load_scenario(path, overrides)) if deadline_s is None else deadline_s
     words = [str(path), *(word for item in overrides for word in ("--set", item))]
-    folder = runs_root() / FOLDER if runs is None else runs
+    folder = runs_root() / FOLDER if runs is None else Path(runs)
     result = _finished(words, folder, limit_s)
     if result.is_too_long:
         raise RunFailedError(f"{path}: not done after {limit_s:g} s, and ended")

@@ -14,13 +14,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from cosmos_cli.errors import ExitCode, RunFailedError
+from cosmos_cli.errors import ExitCode, InputError, RunFailedError
 from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.models.baseline import Baseline
 from cosmos_cli.system.stop_signals import stop_signals_noted
 from cosmos_cli.testing.baseline_update import update_baseline
 from cosmos_cli.testing.case import SuiteCase
 from cosmos_cli.testing.figures import ComparedFigure, compare_figures
-from cosmos_cli.testing.outcome import CaseOutcome, judge_case
+from cosmos_cli.testing.outcome import CaseOutcome, judge_case, with_figures
 from cosmos_cli.testing.schedule import SuiteSchedule
 from cosmos_cli.testing.suite_process import ProcessResult, SuiteProcess
 
@@ -50,6 +51,8 @@ class SuiteResult:
     not_run: int = 0
     """Tests that an interruption left out."""
     is_interrupted: bool = False
+    written: dict[Path, int] = field(default_factory=dict)
+    """Expected values that were written, by the baseline's file."""
 
     def count(self, word: str) -> int:
         """Return how many tests ended so."""
@@ -139,10 +142,12 @@ class _Suite:
         """Judge a test that has ended, and clear up behind it."""
         self.processes.remove((case, process))
         self.schedule.end(case)
-        figures = self.figures(case, found)
-        outcome = judge_case(
-            case, found, is_interrupted=self.result.is_interrupted, figures=figures
-        )
+        outcome = judge_case(case, found, is_interrupted=self.result.is_interrupted)
+        if case.baseline is not None and outcome.outcome != "interrupted":
+            figures, why_not = self.figures(
+                case.baseline, case, found, updates=outcome.outcome == "passed"
+            )
+            outcome = with_figures(outcome, figures, why_not_written=why_not)
         if outcome.outcome == "passed" and not self.options.keeps_all:
             if found.directory is not None:
                 _forget(RunDirectory(found.directory))
@@ -150,17 +155,24 @@ class _Suite:
         self.result.outcomes.append(outcome)
         self.tell(outcome)
 
-    def figures(self, case: SuiteCase, found: ProcessResult) -> list[ComparedFigure]:
-        """Return the baseline's figures, or write them, if the run came to what is expected."""
-        if case.baseline is None or found.directory is None:
-            return []
-        if found.exit_code != case.expect.exit_code:
-            return []
-        compared = compare_figures(case.baseline, RunDirectory(found.directory), found.document)
-        if self.options.updates_baselines and all(each.got is not None for each in compared):
-            update_baseline(case.baseline, compared)
-            return [replace(each, expected=each.got) for each in compared]
-        return compared
+    def figures(
+        self, baseline: Baseline, case: SuiteCase, found: ProcessResult, *, updates: bool
+    ) -> tuple[list[ComparedFigure], str]:
+        """Return the baseline's figures, written anew if that is wanted and *updates*; and why they cannot be."""
+        if found.directory is None or found.exit_code != case.expect.exit_code:
+            return [], ""
+        compared = compare_figures(baseline, RunDirectory(found.directory), found.document)
+        if not (updates and self.options.updates_baselines):
+            return compared, ""
+        if any(each.got is None for each in compared):
+            return compared, ""
+        try:
+            self.result.written[baseline.path] = update_baseline(baseline, compared)
+        except InputError as error:
+            return compared, "; ".join(
+                each.render().partition("\n")[0] for each in error.faults
+            ) or str(error)
+        return [replace(each, expected=each.got) for each in compared], ""
 
 
 def _forget(run: RunDirectory) -> None:

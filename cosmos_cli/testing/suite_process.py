@@ -80,7 +80,7 @@ class SuiteProcess:
         self._run: LivingRun | None = None
         self._out: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - until it has ended
         self._words: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - as long
-        command = [sys.executable, "-m", "cosmos_cli.start", "run", *arguments]
+        command = [sys.executable, "-P", "-m", "cosmos_cli.start", "run", *arguments]
         self._process = subprocess.Popen(
             [*command, "--runs", str(runs), "--no-report", "--json", "--quiet"],
             stdin=subprocess.DEVNULL,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 
 from cosmos_cli.testing.outcome import CaseOutcome
@@ -38,7 +39,7 @@ def details(outcome: CaseOutcome) -> list[str]:
     lines.append(f"repeat it: {outcome.case.repeat_command}")
     if outcome.directory:
         lines.append(f"its run: {outcome.directory}")
-        lines.append(f"its figures: cosmos report {outcome.directory}")
+        lines.append(f"its figures: {shlex.join(['cosmos', 'report', outcome.directory])}")
     return lines
 
 

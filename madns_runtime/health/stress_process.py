@@ -28,7 +28,7 @@ def start_stress_processes(workers: int) -> tuple[subprocess.Popen[bytes], ...]:
     Raises:
         OSError: No process can be started.
     """
-    command = [sys.executable, "-m", __name__]
+    command = [sys.executable, "-P", "-m", __name__]
     return tuple(
         subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
         for _ in range(workers)

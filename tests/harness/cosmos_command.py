@@ -42,7 +42,7 @@ class CosmosCommand:
     def start(self, *arguments, **more):
         """Start a command with pipes for what it says."""
         return subprocess.Popen(
-            [sys.executable, "-m", "cosmos_cli.start", *map(str, arguments)],
+            [sys.executable, "-P", "-m", "cosmos_cli.start", *map(str, arguments)],
             **{
                 "cwd": self.folder,
                 "env": self.environment,

@@ -43,7 +43,10 @@ def installed(tmp_path_factory):
 
 def test_its_test_runs_it_in_lockstep_and_finds_nothing_undeclared(installed):
     source, target = installed
+    lockstep = ("--quiet", "--set", "time.mode=lockstep")  # as its README has it, before the test
+    run("-m", "cosmos_cli.app", "run", "my-rovers.yaml", *lockstep, cwd=source, path=target)
 
+    assert list(source.glob("runs/*/flown/tests/test_my_rovers.py"))
     told = run("-m", "pytest", "-q", "-p", "no:cacheprovider", cwd=source, path=target)
 
     assert "2 passed" in told

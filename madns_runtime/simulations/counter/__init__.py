@@ -15,5 +15,6 @@ simulation = Simulation(
     agent_parameters=("service", "payload_bytes", "read_on_tick"),
     columns=("round_trips.round_trip_us",),
     figures="madns_runtime.simulations.counter.analysis:figures",
+    rerun="madns_runtime.simulations.counter.rerun:for_rerun",
     document="madns_runtime.simulations.counter.analysis:document",
 )

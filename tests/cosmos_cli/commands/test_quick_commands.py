@@ -326,6 +326,8 @@ def test_templates_leave_no_placeholder(template):
         ("class", "Python can import"),
         ("json", "is taken"),
         ("counter", "is taken"),
+        ("numpy", "is taken by a module of Python or of an installed package"),
+        ("madns-runtime", "is taken"),
     ],
 )
 def test_package_has_a_name_that_can_be_imported_and_is_free(cosmos, name, text):
@@ -334,6 +336,23 @@ def test_package_has_a_name_that_can_be_imported_and_is_free(cosmos, name, text)
     assert code == ExitCode.BAD_INPUT
     assert text in err
     assert os.listdir() == ["a.yaml"]
+
+
+@pytest.mark.parametrize("template", ["plugin", "device"])
+def test_a_file_that_would_hide_a_module_is_not_written(cosmos, template):
+    code, _, err = cosmos("init", "json", "--template", template)
+
+    assert (code, "which it would hide" in err) == (ExitCode.BAD_INPUT, True)
+    assert os.listdir() == ["a.yaml"]
+    assert cosmos("init", "json")[0] == 0  # of a scenario alone Python imports nothing
+
+
+def test_init_tells_commands_that_a_shell_takes_as_they_stand(cosmos):
+    _, _, err = cosmos("init", "rover", "--template", "package", "-d", "my box")
+
+    assert (
+        "next: pip install -e 'my box/rover'; then cosmos validate 'my box/rover/rover.yaml'" in err
+    )
 
 
 def test_init_overwrites_nothing(cosmos):

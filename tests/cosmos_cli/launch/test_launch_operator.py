@@ -453,7 +453,7 @@ def test_manual_agent_gets_its_launch_from_a_private_socket(launched: Launched) 
     command = manual_command(launched)
     socket_path = Path(command[-1])
 
-    assert command[:-1] == [sys.executable, "-m", "madns_runtime.agent", "--launch"]
+    assert command[:-1] == [sys.executable, "-P", "-m", "madns_runtime.agent", "--launch"]
     assert stat.S_IMODE(socket_path.stat().st_mode) == 0o600
     assert stat.S_IMODE(socket_path.parent.stat().st_mode) == 0o700
     assert "start agent-02 by hand within 600 s" in launched.talk

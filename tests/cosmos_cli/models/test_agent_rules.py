@@ -197,3 +197,23 @@ def test_a_fault_of_what_all_share_is_told_once(refusal):
     )
 
     assert told.count("fuel: expected a text") == 1
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "agent_parameters=[{agents: [agent-01], parameters: {payload_bytes: -1, size: 2}}]",
+        "agent_parameters[0]={agents: [agent-01], parameters: {payload_bytes: -1, size: 2}}",
+    ],
+)
+def test_a_rule_that_an_option_gives_has_its_faults_there(tmp_path, override):
+    path = tmp_path / "a.yaml"
+    path.write_text(HEAD)
+
+    with pytest.raises(InputError) as caught:
+        load_scenario(path, [override])
+
+    assert [(each.override, each.path) for each in caught.value.faults] == [
+        (override.partition("=")[0], "agent_parameters[0].parameters.payload_bytes"),
+        (override.partition("=")[0], "agent_parameters[0].parameters.size"),
+    ]

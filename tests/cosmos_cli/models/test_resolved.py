@@ -48,6 +48,25 @@ def test_each_value_tells_its_file_and_line_the_option_or_that_it_is_a_default(s
     assert found["agents", "tick_hz"].value == 10
 
 
+def test_an_item_of_a_list_tells_its_variable_or_option_where_the_list_has_another(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text(
+        "name: a\nsimulation: counter\nvars: {tower: upper}\n"
+        "agents: {count: 3, names: ['${tower}-1', b, c]}\n"
+        "test: {tags: [quick, slow]}\n"
+    )
+    scenario = load_scenario(path, ["agents.names[2]=spare"])
+    found = {one.path: str(one.origin) for one in resolved_values(scenario)}
+    again = tmp_path / "again.yaml"
+    again.write_text("\n".join(resolved_lines(scenario)))
+
+    assert found["agents", "names", 0] == f"{path}:4, ${{tower}} of {path}:3"
+    assert found["agents", "names", 1] == f"{path}:4"
+    assert found["agents", "names", 2] == "--set agents.names[2]"
+    assert found["test", "tags"] == f"{path}:5"
+    assert load_scenario(again).to_mapping() == scenario.to_mapping()
+
+
 def test_parameters_of_some_agents_tell_their_rule_and_the_rest_what_holds_for_all(
     scenario, tmp_path
 ):
@@ -82,3 +101,36 @@ def test_the_command_prints_it_in_both_forms(tmp_path, scenario, capsys):
         "default": False,
     }
     assert document["files"] == [path, f"{tmp_path}/base.yaml"]
+
+
+@pytest.mark.parametrize("says_root", ["few/few.yaml", "base.yaml", "nobody"])
+def test_a_root_above_is_told_so_that_what_is_printed_finds_its_files(tmp_path, says_root):
+    (tmp_path / "few").mkdir()
+    files = {
+        "base.yaml": "simulation: counter\nagents: {count: 2}\nrequirements: [./wheels]\n",
+        "few/few.yaml": "extends: ../base.yaml\nname: few\n",
+        "few/own.yaml": "name: own\nsimulation: counter\nagents: {count: 2}\n",
+    }
+    for name, text in files.items():
+        root = (
+            {"few/few.yaml": "root: ..\n", "base.yaml": "root: .\n"}[name]
+            if name == says_root
+            else ""
+        )
+        (tmp_path / name).write_text(text + root)
+    wheels = tmp_path / "wheels"
+    wheels.mkdir()
+    (wheels / "pyproject.toml").touch()
+    if says_root == "nobody":
+        lines = list(resolved_lines(load_scenario(tmp_path / "few/own.yaml")))
+        assert not any(line.startswith("root") for line in lines)
+        return
+    scenario = load_scenario(tmp_path / "few/few.yaml")
+    again = tmp_path / "few/again.yaml"
+    again.write_text("\n".join(resolved_lines(scenario)))
+
+    line = again.read_text().partition("\n")[0]
+    assert line.startswith('root: ".."') and line.endswith(
+        f"{says_root}:{3 if 'few' in says_root else 4}"
+    )
+    assert load_scenario(again).root == scenario.root == tmp_path

@@ -44,6 +44,7 @@ BROKEN = [
     ("{set: {time.duration_s: -1}}", "5:31: test.set.time.duration_s: expected > 0"),
     ("{set: {parameters.service: bets}}", "5:34: test.set.parameters.service: expected"),
     ("{set: {time.duration_s: 0.01}}", "test.set.time.duration_s: expected at least one tick"),
+    ("{set: {vars.n: 3}}", "5:22: test.set.vars.n: no variable is named n"),
     ("{set: {agents: 5}}", "5:22: test.set.agents: expected a mapping"),
     ("{tags: quick}", "5:14: test.tags: expected a list"),
     ("{tags: [Quick]}", "5:15: test.tags[0]: expected a tag such as quick"),

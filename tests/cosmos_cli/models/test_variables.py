@@ -128,9 +128,20 @@ def test_devices_keep_the_name_of_whoever_drives_them(tmp_path):
 
 
 def test_fault_of_a_value_tells_which_variable_it_is_of(tmp_path):
-    assert "a.yaml:5:7: seed: expected >= 0, got -4 (from ${seed})" in refusal(
+    assert "a.yaml:5:7: seed: expected >= 0, got -4 (${seed} of a.yaml:4)" in refusal(
         tmp_path, HEAD + "vars: {seed: -4}\nseed: ${seed}\n"
     )
+
+
+def test_fault_of_a_value_tells_where_its_variable_has_its_own(tmp_path):
+    (tmp_path / "b.yaml").write_text(
+        "simulation: counter\nvars: {n: 3}\nagents: {count: '${n}'}\ntime: {duration_s: 1}\n"
+    )
+    text = "extends: b.yaml\nname: a\nvars:\n  n: many\n"
+
+    told = "b.yaml:3:17: agents.count: expected a whole number, got 'many' (${n} of a.yaml:4)"
+    assert refusal(tmp_path, text).startswith(told)
+    assert "got 0 (${n} of --set vars.n)" in refusal(tmp_path, text, "vars.n=0")
 
 
 def test_a_scenario_made_of_final_values_knows_no_variables(tmp_path):

@@ -126,3 +126,61 @@ def test_a_figure_without_a_value_is_refused_at_its_place(baseline):
 
     with pytest.raises(InputError, match="b.yaml:1:11: figures.a: run.json has no x"):
         update_baseline(found, [missing])
+
+
+@pytest.mark.parametrize(
+    "figures",
+    [
+        "figures:\n  a:\n    path: x\n    expected:   # written by the first run\n  b: {path: y, expected: }\n",
+        "figures:\n  a: {path: x, expected}\n  b: {expected: ~, path: y}\n",
+        "figures:\n  a: &close {path: x, tolerance: 1}\n  b:\n    <<: *close\n    path: y\n",
+        "figures:\n  a: &close {path: x, expected: 3}\n  b: {<<: *close, path: y}\n",
+    ],
+)
+def test_an_empty_value_is_filled_and_what_figures_share_stays_shared(baseline, figures):
+    found = baseline(figures)
+    compared = [
+        ComparedFigure(name="a", expected=None, got=12.5),
+        ComparedFigure(name="b", expected=None, got='new: "1" #'),
+    ]
+
+    assert update_baseline(found, compared) == 2
+    written = read_baseline(found.path)
+    assert {name: each.expected for name, each in written.figures.items()} == {
+        "a": 12.5,
+        "b": 'new: "1" #',
+    }
+    assert [each.tolerance for each in written.figures.values()] == [
+        each.tolerance for each in found.figures.values()
+    ]
+
+
+@pytest.mark.parametrize(
+    ("figures", "line"),
+    [
+        ("figures:\n  a:\n    path: x\n    expected: |\n      two\n      lines\n", 2),
+        ('figures:\n  a:\n    path: x\n    expected: "two\n      lines"\n', 2),
+        ("figures:\n  a: {path: x, expected: !!int 3}\n", 2),
+        ("figures:\n  b: {path: y, expected: &three 3}\n  a: {path: x, expected: *three}\n", 3),
+        ("figures:\n  b: &same {path: y, expected: 3}\n  a: *same\n", 3),
+    ],
+)
+def test_a_value_that_cannot_be_replaced_leaves_the_file_as_it_is(baseline, figures, line):
+    found = baseline(figures)
+
+    with pytest.raises(
+        InputError, match=f"b.yaml:{line}:3: figures.a: .* write `expected: 12.5` by hand"
+    ):
+        update_baseline(found, [ComparedFigure(name="a", expected=3.0, got=12.5)])
+    assert found.path.read_text() == figures
+
+
+def test_a_link_to_a_baseline_stays_a_link(baseline, tmp_path):
+    baseline("figures: {a: {path: x, expected: 1}}")
+    link = tmp_path / "link.yaml"
+    link.symlink_to("b.yaml")
+
+    update_baseline(read_baseline(link), [ComparedFigure(name="a", expected=1.0, got=2.0)])
+
+    assert link.is_symlink()
+    assert "expected: 2" in (tmp_path / "b.yaml").read_text()

@@ -53,6 +53,19 @@ def test_a_folders_scenarios_are_found_and_what_is_none_is_counted(folder):
     assert found.faults == []
 
 
+def test_the_copies_that_runs_keep_and_installed_packages_are_no_tests(folder):
+    for place in ("runs/0001-a", "runs/tests/0002-a", "venv"):
+        copy = folder / place / "flown/a.yaml"
+        copy.parent.mkdir(parents=True)
+        copy.write_text(SCENARIO.format(name="copy", mode="lockstep", tag="quick"))
+        (folder / place / ("pyvenv.cfg" if place == "venv" else "plan.json")).touch()
+    names = [outline.name for outline in find_scenarios([folder]).outlines]
+    named = find_scenarios([folder / "runs/0001-a/flown"]).outlines
+
+    assert names == ["alpha", "beta", "gamma"]
+    assert [outline.name for outline in named] == ["copy"]
+
+
 def test_a_scenario_that_extends_another_has_what_that_says_and_its_own_test(folder):
     (folder / "base.yaml").write_text(
         "simulation: counter\nvars: {s: 7}\nagents: {count: 2, tick_hz: 10}\n"
@@ -121,6 +134,8 @@ def test_each_seed_is_a_test_with_its_own_settings(folder):
     cases = chosen(find_scenarios([folder / "a.yaml"]), "seed=3 or seed=1", seeds=(1, 2, 3)).cases
 
     assert [case.name.rpartition("/")[2] for case in cases] == ["a.yaml[seed=1]", "a.yaml[seed=3]"]
+    many = chosen(find_scenarios([folder / "a.yaml"]), "a.yaml[seed=1]", seeds=(1, 10, 21)).cases
+    assert [case.seed for case in many] == [1]
     assert cases[1].arguments()[1:] == ["--set", "time.duration_s=5", "--set", "seed=3"]
 
 

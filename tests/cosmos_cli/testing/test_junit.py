@@ -6,7 +6,7 @@ import pytest
 from lxml import etree
 
 from cosmos_cli.errors import InputError
-from cosmos_cli.testing.junit import JunitCase, junit_case_of, junit_text, write_junit
+from cosmos_cli.testing.junit import JunitCase, check_junit, junit_case_of, junit_text, write_junit
 
 SCHEMA = etree.XMLSchema(etree.parse(Path(__file__).with_name("junit.xsd")))
 FOREIGN = "\x1b[31mred\x00\x07 <&> \ud800 \ufffe \u202e\n\ttab ]]> \U0001f680"
@@ -91,3 +91,14 @@ def test_folders_are_made_and_what_cannot_be_written_is_told(tmp_path):
 
     with pytest.raises(InputError, match="--junit .*b.xml/c.xml: cannot be written"):
         write_junit(tmp_path / "a/b.xml/c.xml", [], seconds=0.0, started_utc="")
+
+
+def test_what_could_not_be_written_is_told_before_anything_runs(tmp_path):
+    (tmp_path / "file").touch()
+
+    check_junit(None)
+    check_junit(tmp_path / "new/j.xml")
+    with pytest.raises(InputError, match="file/j.xml: cannot be written: "):
+        check_junit(tmp_path / "file/j.xml")
+    with pytest.raises(InputError, match="cannot be written: it is a folder; name a file"):
+        check_junit(tmp_path)

@@ -5,13 +5,13 @@ from suite_cases import broken, make_case, make_result
 
 from cosmos_cli.models.scenario_test import ExpectedOutcome
 from cosmos_cli.testing.figures import ComparedFigure
-from cosmos_cli.testing.outcome import judge_case
+from cosmos_cli.testing.outcome import judge_case, with_figures
 from cosmos_cli.testing.terminal import details
 
 
-def judged(expect=None, result=None, *, is_interrupted=False, figures=()):
+def judged(expect=None, result=None, *, is_interrupted=False):
     case = make_case(expect=expect or ExpectedOutcome())
-    return judge_case(case, result or make_result(), is_interrupted=is_interrupted, figures=figures)
+    return judge_case(case, result or make_result(), is_interrupted=is_interrupted)
 
 
 @pytest.mark.parametrize(
@@ -28,6 +28,8 @@ def judged(expect=None, result=None, *, is_interrupted=False, figures=()):
         ({"verdict": "hold"}, make_result(0), "passed"),
         ({"verdict": "agent-07"}, make_result(0), "failed"),
         ({}, make_result(-9, document={}), "failed"),
+        ({}, make_result(0, document={}), "failed"),
+        ({"exit_code": 1}, make_result(1, document={}), "failed"),  # as any program that crashed
         ({}, make_result(0, is_too_long=True), "failed"),
         ({"exit_code": 130}, make_result(130, is_too_long=True), "failed"),
     ],
@@ -41,14 +43,15 @@ def test_a_failure_names_checks_worst_agent_run_and_the_command_that_repeats_it(
     case = make_case("ring", overrides=("time.duration_s=20", "seed=3"), seed=3)
     outcome = judge_case(
         case,
-        make_result(4, check, directory="/runs/tests/0001-ring"),
+        make_result(4, check, directory="/my runs/tests/0001-ring"),
         is_interrupted=False,
     )
 
     told = details(outcome)
     assert "  drift: got 2.5 m, limit 1 m, worst: agent-07 at 12.5 s" in told
     assert "repeat it: cosmos run ring.yaml --set time.duration_s=20 --set seed=3" in told
-    assert "its run: /runs/tests/0001-ring" in told
+    assert "its run: /my runs/tests/0001-ring" in told
+    assert "its figures: cosmos report '/my runs/tests/0001-ring'" in told
 
 
 def test_the_scenarios_own_seed_is_in_the_command_that_repeats_it():
@@ -67,7 +70,14 @@ def test_a_figure_out_of_tolerance_fails_and_says_what_was_expected():
     good = ComparedFigure(name="a", expected=1.0, got=1.05, allowed=0.1)
     bad = ComparedFigure(name="b", expected=1.0, got=1.2, allowed=0.1)
 
-    assert judged(figures=[good]).outcome == "passed"
-    outcome = judged(figures=[good, bad])
+    assert with_figures(judged(), [good]).outcome == "passed"
+    outcome = with_figures(judged(), [good, bad])
     assert outcome.outcome == "failed"
     assert outcome.reasons == ("baseline: b: expected 1 within 0.1, got 1.2",)
+
+
+def test_a_baseline_that_cannot_be_written_fails_its_test_alone():
+    outcome = with_figures(judged(), [], why_not_written="b.yaml: cannot be written")
+
+    assert outcome.outcome == "failed"
+    assert outcome.reasons == ("baseline: b.yaml: cannot be written",)

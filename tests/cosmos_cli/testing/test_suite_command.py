@@ -88,7 +88,10 @@ def test_a_suite_tells_each_test_keeps_failures_and_runs_them_again(cosmos):
     )
     mended, tests = results(cosmos("test", "--last-failed", "--json"))
     assert (mended["exit_code"], tests["bad"]["outcome"]) == (0, "passed")
-    assert "nothing failed last time" in cosmos("test", "--last-failed", "-k", "none").stderr
+    scenario(cosmos, "elsewhere", expect={"verdict": "nothing says this"})
+    assert cosmos("test", "-k", "elsewhere").returncode == 1
+    others = cosmos("test", "scenarios/good.yaml", "--last-failed")
+    assert (others.returncode, "none of these failed last time" in others.stderr) == (0, True)
 
 
 def test_a_seed_that_failed_is_run_again_alone(cosmos):
@@ -126,6 +129,18 @@ def test_baselines_are_written_and_hold_the_run_to_them(cosmos):
         "  ticks: {expected: 100, path: timing.ticks}\n"
         "  packets: {stream: round_trips, field: packet, statistic: max, expected: 49}\n"
     )
+    written = cosmos("test", "--update-baselines", "--set", "time.duration_s=6")
+    assert "scenarios/figures.yaml: 2 expected values written" in written.stderr
+    file.write_text(
+        "figures:\n"
+        "  ticks: {expected: 100, path: timing.ticks}\n"
+        "  packets: {stream: round_trips, field: packet, statistic: max, expected: !!int 48}\n"
+    )
+    scenario(cosmos, "other")
+    failed, tests = results(cosmos("test", "--update-baselines", "--json"))
+    assert (tests["s"]["outcome"], tests["other"]["outcome"]) == ("failed", "passed")
+    assert "figures.packets: no value can be put into what" in " ".join(tests["s"]["reasons"])
+    file.write_text(file.read_text().replace("!!int 48", "49"))
     held, tests = results(cosmos("test", "--json"))
     assert (held["exit_code"], [each["passed"] for each in tests["s"]["figures"]]) == (
         0,
@@ -147,6 +162,7 @@ def test_ctrl_c_ends_all_runs_cleanly_and_tells_what_was_found(cosmos, monkeypat
     scenario(cosmos, "short", set={"time.duration_s": 1})
     for name in ("a", "b", "c"):
         scenario(cosmos, name, set={"time.duration_s": 1e7}, deadline_s=600)
+    scenario(cosmos, "in-realtime", set={"time.mode": "realtime"})  # waits for the others
     with cosmos.start(
         "test", "-j", "4", "-k", "not c.yaml", "--json", "--junit", "j.xml"
     ) as process:
@@ -160,7 +176,11 @@ def test_ctrl_c_ends_all_runs_cleanly_and_tells_what_was_found(cosmos, monkeypat
     assert (process.returncode, document["exit_code"]) == (130, 130), err
     ended = {Path(each["scenario"]).stem: each["outcome"] for each in document["tests"]}
     assert {name: ended[name] for name in ("a", "b")} == dict.fromkeys("ab", "interrupted")
-    SCHEMA.assertValid(etree.parse(cosmos.folder / "j.xml"))
+    junit = etree.parse(cosmos.folder / "j.xml")
+    SCHEMA.assertValid(junit)
+    told = {each.get("name"): each for each in junit.getroot()[0]}
+    assert set(told) == {"a", "b", "short", "in-realtime"}
+    assert "not run" in told["in-realtime"].find("skipped").get("message")
     nobody_is_left(cosmos, monkeypatch)
 
 
@@ -225,6 +245,7 @@ def test_arrays(tmp_path):
     assert found.passed and found.exit_code == 0, found.verdict
     assert found.broken == []
     table = found.table("round_trips", "packet")
+    assert table["agent-01"]["packet"].dtype == np.int64
     assert sorted(table) == ["agent-01", "agent-02", "agent-03"]
     assert table["agent-02"]["packet"].tolist() == list(range(20))
     assert isinstance(table["agent-01"]["packet"], np.ndarray)
@@ -234,7 +255,15 @@ def test_arrays(tmp_path):
         found.table("round_trips", "none")
 
 
+def test_settings_of_numpy_and_paths(tmp_path):
+    found = run("scenarios/s.yaml", runs=str(tmp_path), description=tmp_path, time__duration_s=np.float64(1), agents={"count": np.int64(3)})
+    assert found.document["timing"]["ticks"] == 30
+    assert str(tmp_path) in (found.directory.path / "scenario.yaml").read_text()
+
+
 def test_refused(tmp_path):
+    with pytest.raises(InputError, match="--set agents.count: expected a text, a number.* got set"):
+        run("scenarios/s.yaml", runs=tmp_path, agents__count={3})
     with pytest.raises(InputError, match="agents.count: expected >= 1"):
         run("scenarios/s.yaml", runs=tmp_path, agents__count=0)
 """
@@ -254,4 +283,4 @@ def test_from_pytest_a_run_gives_its_verdict_and_its_records_as_arrays(cosmos):
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "2 passed" in done.stdout
+    assert "3 passed" in done.stdout
