@@ -70,7 +70,7 @@ def judge(
     else:
         file = load_scenario(scenario, warn=console.warn)
         expectations = expectations_for(found, file, tables)
-    judged = judge_run(found, tables, expectations)
+    judged = judge_run(found, tables, expectations, document.get("duration_s"))
     missing = (*_missing(document), *judged.gaps())
     code, text = conclusion_of_expectations(judged.results, missing)
     console.print_json(_told(found, judged, code, text, missing))

@@ -10,7 +10,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from cosmos_cli.evidence.expectations.accumulators import Floats
+from cosmos_cli.evidence.expectations.accumulators import Floats, Places
 from madns_runtime.analysis.tables import RecordedTable, Tables
 from madns_runtime.conditions.condition import AGENT, HOST, TIME
 from madns_runtime.recording.records import HEALTH, Field
@@ -37,6 +37,8 @@ class Batch:
     columns: Mapping[str, NDArray[Any]]
     values: NDArray[Any]
     """Of the field that was chosen; else empty."""
+    places: Places
+    """Of the records, among all of whoever recorded them."""
 
     def has(self, field: str) -> bool:
         """Tell whether the records have a field."""
@@ -62,7 +64,13 @@ class Batch:
     def _where(self, wanted: NDArray[np.bool_], values: NDArray[Any]) -> Batch:
         if wanted.all():
             return replace(self, values=values)
-        return replace(self, t_s=self.t_s[wanted], columns={}, values=values[wanted])
+        return replace(
+            self,
+            t_s=self.t_s[wanted],
+            columns={},
+            values=values[wanted],
+            places=self.places[wanted],
+        )
 
 
 class RecordSource:
@@ -112,27 +120,27 @@ class RecordSource:
             wanted = {*own, *filter(None, [time]), *([AGENT] if has_agents else [])}
             names = list(wanted | ({DETAILS} if beside else set())) or [next(iter(present))]
             for source in table.sources:
+                first = 0
                 for columns in table.batches(source, names, BATCH_RECORDS):
                     columns = _with_details(columns, beside)
-                    yield from _split(
-                        table, source, columns, _times(columns, time), has_agents=has_agents
+                    t_s = _times(columns, time)
+                    whole = Batch(
+                        agent=source,
+                        is_of_host=table.role == HOST,
+                        t_s=t_s,
+                        columns=columns,
+                        values=np.empty(0),
+                        places=np.arange(first, first + len(t_s)),
                     )
+                    first += len(t_s)
+                    yield whole
+                    if has_agents:
+                        yield from _split(whole)
 
 
-def _split(
-    table: RecordedTable,
-    source: str,
-    columns: Mapping[str, NDArray[Any]],
-    t_s: Floats,
-    *,
-    has_agents: bool,
-) -> Iterator[Batch]:
-    is_of_host = table.role == HOST
-    whole = Batch(agent=source, is_of_host=is_of_host, t_s=t_s, columns=columns, values=np.empty(0))
-    yield whole
-    if not has_agents:
-        return
-    agents = columns[AGENT].astype(str)
+def _split(whole: Batch) -> Iterator[Batch]:
+    """Yield the records of the host's half once more, by the agent that each is about."""
+    agents = whole.columns[AGENT].astype(str)
     names, inverse = np.unique(agents, return_inverse=True)
     order = np.argsort(inverse, kind="stable")
     ends = np.cumsum(np.bincount(inverse, minlength=len(names)))
@@ -140,8 +148,9 @@ def _split(
         yield replace(
             whole,
             agent=name,
-            t_s=t_s[rows],
-            columns={key: values[rows] for key, values in columns.items()},
+            t_s=whole.t_s[rows],
+            columns={key: values[rows] for key, values in whole.columns.items()},
+            places=whole.places[rows],
         )
 
 
@@ -160,7 +169,7 @@ def _times(columns: Mapping[str, NDArray[Any]], time: str | None) -> Floats:
         return np.zeros(len(next(iter(columns.values()))))
     values = columns[time]
     numbers = values.astype(np.float64) if values.dtype != object else _floats(values)
-    return np.where(np.isnan(numbers), 0.0, numbers)
+    return np.maximum(np.where(np.isnan(numbers), 0.0, numbers), 0.0)
 
 
 def _floats(values: NDArray[Any]) -> Floats:
