@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import heapq
 from collections.abc import Callable, Iterable
-from typing import Any, Final
+from typing import Final
 
 from madns_runtime.lockstep import frames
 from madns_runtime.lockstep.host_core import LockstepCore
 from madns_runtime.protocol.codec import pack
+from madns_runtime.protocol.messages import AgentFault
 
 RESTART_DELAY_S: Final = 0.2
 """From the loss of an agent that agents.restarts_max gives another start to its return, s of simulated time."""
@@ -138,7 +140,7 @@ class Absences:
 
     # Faults ---------------------------------------------------------------------------------------
 
-    def order(self, word: str, value: Any, agents: Iterable[str], *, begins: bool) -> None:
+    def order(self, fault: AgentFault, agents: Iterable[str]) -> None:
         """
         Have the workers begin or end a fault of agents; see `frames.FAULT`.
 
@@ -151,5 +153,6 @@ class Absences:
         for worker in self._crew.workers:
             own = [index for index in indices if index in worker.agents]
             if own:
-                self._meeting.order(worker, frames.FAULT, word, begins, value, own)
+                told = dataclasses.astuple(fault)
+                self._meeting.order(worker, frames.FAULT, self._clock.t_s, told, own)
         self._meeting.await_told("has not begun a fault")

@@ -76,7 +76,7 @@ class HostFaults:
         value = math.nan if after_s is None else after_s
         told = 0
         for agent in action.agents:
-            if self._send(agent, AgentFault(action.word, True, value, why)):
+            if self._send(agent, AgentFault(action.number, action.word, True, value, why)):
                 self.intended.order(agent, why, returns_s=returns_s)
                 told += 1
         self._port.session.await_returns(self.intended.are_expected(self._duration_s))
@@ -86,7 +86,8 @@ class HostFaults:
     def _order(self, action: TimelineAction, *, begins: bool) -> bool:
         """Have agents begin or end a fault of their steps; return whether one of them is there."""
         factor = words.factor_of(action)
-        orders = [self._send(a, AgentFault(action.word, begins, factor)) for a in action.agents]
+        order = AgentFault(action.number, action.word, begins, factor)
+        orders = [self._send(agent, order) for agent in action.agents]
         return any(orders)
 
     def _send(self, agent: str, order: AgentFault) -> bool:

@@ -61,6 +61,12 @@ def test_a_condition_that_has_to_hold_for_a_while_begins_anew_when_it_does_not()
     assert evaluator.look(6.0) is None
 
 
+def test_a_while_that_is_no_binary_number_is_over_at_its_tick():
+    evaluator = ConditionEvaluator(condition(for_s=0.2))
+
+    assert [evaluator.take(tick / 10, 11.0) for tick in (1, 2, 3)] == [None, None, 0.3]
+
+
 def test_records_outside_its_times_do_not_count():
     evaluator = ConditionEvaluator(condition(from_s=2.0, to_s=3.0))
 

@@ -132,8 +132,19 @@ def test_a_hung_agent_takes_no_step_and_its_records_say_which(run_faults):
 
     assert steps(run) == [0, 1, 2, 6, 7, 8, 9]
     events = {e["event"]: e for e in run.events_of("agents/agent-04")}
-    assert events["hang_begins"]["t_s"] == pytest.approx(0.2)
+    assert events["hang_begins"]["t_s"] == pytest.approx(0.3)
+    assert events["hang_ends"]["t_s"] == pytest.approx(0.6)
     assert events["hang_ends"]["ticks_withheld"] == 3
+
+
+def test_the_end_of_a_hang_from_before_a_restart_leaves_the_next_one_in_force(run_faults):
+    first, second = entry("hang", at_s=0.1, for_s=0.5), entry("hang", at_s=0.5, for_s=0.3)
+    run = run_faults(first, entry("restart", at_s=0.2), second)
+    run.result()
+
+    assert steps(run, life=".2") == [4, 8, 9]
+    said = [(e["event"], round(e["t_s"], 3)) for e in run.events_of("agents/agent-04", life=".2")]
+    assert said[1:3] == [("hang_begins", 0.5), ("hang_ends", 0.8)]
 
 
 def test_a_link_that_is_down_loses_telemetry_and_delays_the_rest(run_faults):

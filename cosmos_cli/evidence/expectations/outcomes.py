@@ -10,6 +10,7 @@ from cosmos_cli.evidence.expectations.accumulators import Occurrences
 from cosmos_cli.evidence.verdict import CheckResult
 from cosmos_cli.models.expectation import Expectation, owner_of
 from madns_runtime.conditions.condition import HOST
+from madns_runtime.written_times import later_s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +57,7 @@ def outcome_of_event(
         if is_same_stream and agent in after and other.place is not None:
             behind = other.place
         if expectation.within_s is not None:
-            end_s = begin_s + expectation.within_s
+            end_s = later_s(begin_s, expectation.within_s)
             latest_s = end_s if latest_s is None else min(latest_s, end_s)
     later = [each for each in found.found if each[0] >= begin_s and each[1] > behind]
     if must_not:
