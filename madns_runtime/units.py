@@ -115,7 +115,11 @@ def conversion(unit: str, wanted: str) -> float | None:
     ours, theirs = parse_unit(unit), parse_unit(wanted)
     if ours is None or theirs is None or ours[1] != theirs[1]:
         return None
-    return float(f"{ours[0] / theirs[0]:.15g}")  # 5 ms are 5000 us, not 5000.000000000001
+    exact = ours[0] / theirs[0]
+    rounded = float(
+        f"{exact:.12g}"
+    )  # 5 ms are 5000 us, not 5000.000000000001; a degree is what it is
+    return rounded if math.isclose(rounded, exact, rel_tol=1e-15) else exact
 
 
 def _symbol(symbol: str) -> tuple[float, Dimensions] | None:

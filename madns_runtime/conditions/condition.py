@@ -54,6 +54,16 @@ class ValueBounds:
             return cls(text=value)
         return cls(low=value - tolerance, high=value + tolerance)
 
+    def overlap(self, first: float, last: float) -> bool:
+        """Tell whether some number from *first* to *last*, these included, lies within."""
+        if self.text is not None:
+            return True
+        if self.is_closed:
+            return (self.high is None or self.high >= first) and (
+                self.low is None or self.low <= last
+            )
+        return (self.high is None or self.high > first) and (self.low is None or self.low < last)
+
     def negated(self) -> ValueBounds:
         """Return the bounds of every value that does not hold here."""
         return replace(self, is_negated=not self.is_negated)

@@ -105,8 +105,40 @@ BROKEN = [
     (f"{TICKS}, below: 3, while: {{stream: clock, field: x, below: 1}}", "x,", "has no field 'x'"),
     (f"{TICKS}, below: 3, while: {{stream: clock, field: t_s}}", "{stream", "expected a limit"),
     (f"{TICKS}, below: 3, whil: 3", "whil", "did you mean while?"),
+    ("name: a, event: emergancy, must: not_occur", "emergancy", "did you mean emergency?"),
+    ("name: a, event: burn", "burn", "own words stand in its own streams: name one under stream"),
+    ("name: a, stream: log, event: eror, field: level", "eror", "did you mean error?"),
+    ("name: a, stream: log, field: level, statistic: count, when: {equals: eror}, below: 1", "eror", "mean error?"),
+    ("name: a, stream: events, field: event, equals: strt, at_end: true", "strt", "did you mean start?"),
+    (f"{TICKS}, below: 3, while: {{stream: events, field: event, equals: strt}}", "strt", "did you mean start?"),
+    ("name: summary.x, event: start", "summary.x", "framework's own"),
+    ("name: a, stream: ticks, statistic: rate, above: 1, from_s: 3, to_s: 3", "3}", "of a stretch of time"),
+    ("name: a, stream: ticks, statistic: count, below: 0", "0}", "a count is never less than 0: below 0 never holds"),
+    ("name: a, stream: ticks, statistic: rate, within: [-3, -1]", "[-3", "never less than 0"),
+    (f"{TICKS}, statistic: first_time, when: {{above: 3}}, below: 5, from_s: 9", "5,", "from 9 s to 60 s"),
+    (f"{TICKS}, statistic: settled, when: {{above: 3}}, above: 60", "60}", "from 0 s to 60 s: above 60 s never holds"),
+    (f"{TICKS}, statistic: settled, when: {{above: 3}}, equals: 70, to_s: 50", "70,", "from 0 s to 50 s"),
     (f"{TICKS}, below: 3, statistic: rate, while: {{stream: clock, field: t_s, below: 1}}", "{stream", "rate"),
 ]  # fmt: skip
+
+
+TIME_OF = "name: a, stream: ticks, field: lateness_us, statistic: settled, when: {above: 3}"
+
+
+@pytest.mark.parametrize(
+    "check",
+    [
+        f"{TIME_OF}, within: [50, 80]",
+        f"{TIME_OF}, equals: 60",
+        f"{TIME_OF}, above: 59",
+        f"{TIME_OF}, below: 9, from_s: 8.5",
+        "name: a, stream: ticks, statistic: count, equals: 0",
+        "name: a, event: action_began, agents: [host, '*']",
+        "name: a, event: anything, field: action, agents: [host]",
+    ],
+)
+def test_what_may_hold_is_not_refused(tmp_path, check):
+    assert len(load(check, folder=tmp_path).expectations) == 1
 
 
 @pytest.mark.parametrize(("check", "at", "told"), BROKEN)

@@ -42,6 +42,12 @@ BROKEN_WHEN = [
         "by agents alone",
     ),
     ("stream: round_trips, field: packet, above: 1, for_s: -1", ".for_s", "expected >= 0"),
+    (
+        "stream: round_trips, field: packet, above: 1, for_s: 100",
+        ".for_s",
+        "cannot hold for so long",
+    ),
+    ("stream: events, field: event, equals: strt", ".equals", "did you mean start?"),
     ("stream: imu.w, field: w, above: 1", ".stream", "recorded by a device and not by agents"),
     ("stream: health, field: ram_percent, above: 1", ".stream", "name a stream of the simulation"),
     (
@@ -90,7 +96,11 @@ BROKEN = [
         "timeline[0].to_s",
         "leave it out for the end",
     ),
-    ("{every_s: 0.001, action: annotate, text: a}", "timeline", "make them rarer"),
+    (
+        "{every_s: 0.001, action: annotate, text: a}",
+        "timeline",
+        "make them rarer, most of all timeline[0]",
+    ),
     ("{rate_per_h: 0, action: annotate, text: a}", "timeline[0].rate_per_h", "expected > 0"),
     ("{rate_per_h: 1e9, action: annotate, text: a}", "timeline[0].rate_per_h", "expected <= 3600"),
     ("{at_s: 1, action: annotate}", "timeline[0].text", "missing"),
