@@ -72,11 +72,13 @@ class ValueBounds:
         """Tell whether a recorded value lies within."""
         if self.text is not None:
             return isinstance(value, str) and (value == self.text) is not self.is_negated
+        if isinstance(value, str):  # where records are counted, whatever they hold
+            return self.low is None and self.high is None and not self.is_negated
         try:
             number = float(value)  # type: ignore[arg-type]  # numpy's numbers are none of Python's
         except (TypeError, ValueError):
             return False
-        if isinstance(value, str) or math.isnan(number):
+        if math.isnan(number):
             return False
         is_within = (
             (self.low is None or number >= self.low) and (self.high is None or number <= self.high)

@@ -36,6 +36,8 @@ def condition(**values):
         (ValueBounds.equals("lost"), ("lost",), ("found", 3)),
         (ValueBounds.within(-1.0, 1.0).negated(), (-1.1, 2), (0.5, 1.0)),
         (ValueBounds.equals("lost").negated(), ("found",), ("lost", 3)),
+        (ValueBounds(), ("lost", "", 3), ()),
+        (ValueBounds().negated(), (), ("lost", 3)),
     ],
 )
 def test_bounds_hold_for_values_within_and_never_for_none_of_their_kind(bounds, held, not_held):
