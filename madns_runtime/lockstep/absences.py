@@ -17,6 +17,10 @@ RESTART_DELAY_S: Final = 0.2
 TIME_EPSILON_S: Final = 1e-9
 
 
+def _nobody_waits(agent: str) -> None:
+    """Do nothing."""
+
+
 class Absences:
     """
     The agents that are away.
@@ -42,6 +46,8 @@ class Absences:
         self._log = log
         self._returns: list[tuple[float, int]] = []
         """Simulated time, s, and agent, by index: a heap."""
+        self.resume: Callable[[str], None] = _nobody_waits
+        """Told of an agent that has returned, when its half and the host's know of it."""
 
     def begin(self) -> None:
         """Go on without who is lost from now on, if the run is to."""
@@ -137,6 +143,7 @@ class Absences:
         self._log("info", f"{name} has rejoined at t = {self._clock.t_s:.2f} s")
         self._journal.event("agent_rejoined", agent=name)
         self._half.call("agent_rejoined", name)
+        self.resume(name)
 
     # Faults ---------------------------------------------------------------------------------------
 

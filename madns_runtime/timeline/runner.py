@@ -103,6 +103,10 @@ class TimelineRunner:
             )
             self._begin(ordered, due.t_s, now_s)
 
+    def resume(self, agent: str) -> None:
+        """Let what is in force go on at an agent that has returned."""
+        self._dispatcher.resume(agent)
+
     def close(self) -> None:
         """Let nothing more begin or end: the run's simulated time is over."""
         self._position = len(self._due)

@@ -28,6 +28,8 @@ def test_a_value_at_a_limit_is_the_limit_in_another_unit_too(value, unit, wanted
     assert value * factor == expected
 
 
-@pytest.mark.parametrize(("unit", "wanted"), [("deg", "1"), ("degC", "K"), ("m", "s"), ("ells", "m")])
+@pytest.mark.parametrize(
+    ("unit", "wanted"), [("deg", "1"), ("degC", "K"), ("m", "s"), ("ells", "m")]
+)
 def test_what_does_not_convert_has_no_factor(unit, wanted):
     assert conversion(unit, wanted) is None

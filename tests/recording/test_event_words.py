@@ -6,7 +6,7 @@ from pathlib import Path
 import madns_runtime
 from madns_runtime.faults.step_faults import HANG, SLOW
 from madns_runtime.recording.records import EVENT_WORDS
-from madns_runtime.timeline.dispatcher import BEGAN, ENDED, REFUSED
+from madns_runtime.timeline.dispatcher import BEGAN, ENDED, REFUSED, RESUMED
 
 
 def test_all_words_of_events_are_known_and_no_others():
@@ -17,7 +17,7 @@ def test_all_words_of_events_are_known_and_no_others():
         if "hardware" in path.relative_to(folder).parts:
             continue  # devices have events of their own
         written.update(re.findall(r"(?:journal|self)\.event\(\s*\"(\w+)\"", text))
-    written.update((BEGAN, ENDED, REFUSED))
+    written.update((BEGAN, ENDED, REFUSED, RESUMED))
     written.update(f"{word}_{what}" for word in (HANG, SLOW) for what in ("begins", "ends"))
 
     assert set(EVENT_WORDS) == written
