@@ -120,10 +120,10 @@ class RecordSource:
             wanted = {*own, *filter(None, [time]), *([AGENT] if has_agents else [])}
             names = list(wanted | ({DETAILS} if beside else set())) or [next(iter(present))]
             for source in table.sources:
-                first = 0
+                first, last_s = 0, None
                 for columns in table.batches(source, names, BATCH_RECORDS):
                     columns = _with_details(columns, beside)
-                    t_s = _times(columns, time)
+                    t_s, last_s = _times(columns, time, last_s)
                     whole = Batch(
                         agent=source,
                         is_of_host=table.role == HOST,
@@ -163,13 +163,28 @@ def _time_field(stream: str, fields: Sequence[Field]) -> str | None:
     return next((each.name for each in fields if each.unit == "s" and each.kind == "float"), None)
 
 
-def _times(columns: Mapping[str, NDArray[Any]], time: str | None) -> Floats:
-    """Return the simulated time of each record, s: 0 of those from before it ran."""
+def _times(
+    columns: Mapping[str, NDArray[Any]], time: str | None, last_s: float | None
+) -> tuple[Floats, float | None]:
+    """
+    Return the simulated time of each record, s, and the last that is known; *last_s* is that of the batch before.
+
+    Records of whoever does not know the time yet are of time 0, and of an agent that was started anew of the first
+    time that it knows.
+    """
     if time is None:
-        return np.zeros(len(next(iter(columns.values()))))
+        return np.zeros(len(next(iter(columns.values())))), None
     values = columns[time]
     numbers = values.astype(np.float64) if values.dtype != object else _floats(values)
-    return np.maximum(np.where(np.isnan(numbers), 0.0, numbers), 0.0)
+    known = np.flatnonzero(~np.isnan(numbers))
+    if len(known) < len(numbers):
+        begins = 0 if last_s is not None else int(known[0]) if len(known) else len(numbers)
+        behind = numbers[known[-1]] if len(known) else (last_s or 0.0)
+        after = np.searchsorted(known, np.arange(len(numbers)))
+        numbers = np.append(numbers[known], behind)[after]
+        numbers[:begins] = 0.0
+    newest_s = float(numbers[known[-1]]) if len(known) else last_s
+    return np.maximum(numbers, 0.0), newest_s
 
 
 def _floats(values: NDArray[Any]) -> Floats:

@@ -308,6 +308,27 @@ def test_what_is_recorded_before_time_runs_counts_as_time_0():
     assert (least.got, least.t_s) == (5.0, 0.0)
 
 
+@pytest.mark.parametrize("rows", [1, 2, 65_536])
+def test_an_agent_that_was_started_anew_and_does_not_know_the_time_yet_starts_when_it_does(
+    rows, monkeypatch
+):
+    monkeypatch.setattr(records, "BATCH_RECORDS", rows)
+    words = ("start", "burn", "start", "done", "start")
+    tables = events_of(*words, t_s=objects([None, 4.0, None, 6.5, None]))
+    start = {"stream": "events", "field": "event", "event": "start", "agents": ("a",)}
+
+    first, second, third = judge(
+        expect(name="first", **start),
+        expect(name="second", after="first", **start),
+        expect(name="third", after="second", **start),
+        tables=tables,
+    ).results
+
+    assert first.got == 0.0
+    assert second.got == (4.0 if rows == 1 else 6.5), "as far as is read at a time"
+    assert third.got == 6.5
+
+
 @pytest.mark.parametrize("statistic", ["count", "rate", "first_time", "settled"])
 def test_a_text_where_a_number_is_counted_holds_nothing(statistic):
     bounds, when = ValueBounds.below(1e9), ValueBounds.below(9.0)
