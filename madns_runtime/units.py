@@ -103,9 +103,12 @@ def parse_unit(unit: str) -> tuple[float, Dimensions] | None:
             return None
         place = term.end()
         power = int(term["power"] or 1) * (-1 if term["divided"] else 1)
-        factor *= known[0] ** power
+        try:
+            factor *= known[0] ** power
+        except OverflowError:
+            return None
         powers = [have + power * own for have, own in zip(powers, known[1], strict=True)]
-    return factor, tuple(powers)
+    return (factor, tuple(powers)) if 0.0 < factor < math.inf else None
 
 
 def conversion(unit: str, wanted: str) -> float | None:
@@ -116,6 +119,8 @@ def conversion(unit: str, wanted: str) -> float | None:
     if ours is None or theirs is None or ours[1] != theirs[1]:
         return None
     exact = ours[0] / theirs[0]
+    if not 0.0 < exact < math.inf:
+        return None
     rounded = float(
         f"{exact:.12g}"
     )  # 5 ms are 5000 us, not 5000.000000000001; a degree is what it is

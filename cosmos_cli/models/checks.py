@@ -58,7 +58,9 @@ def resolve_checks(rules: Sequence[CheckRule], around: Surroundings) -> Resolved
         faults += words_at((index,), iter(own))
         earlier.setdefault(rule.name, rule)
         if not own:
-            found.append(_Placing(rule, around).expectation())
+            expectation = _Placing(rule, around).expectation()
+            faults += words_at((index,), _faults_of_order(expectation, found))
+            found.append(expectation)
     return ResolvedChecks(tuple(found), tuple(faults))
 
 
@@ -98,11 +100,26 @@ def _faults_among(rule: CheckRule, earlier: dict[str, CheckRule]) -> Iterator[Ru
         text = f"no check above is named {rule.after!r}{did_you_mean(rule.after, timed)}"
         yield ("after",), text
     elif not _has_time(other):
-        yield ("after",), f"{rule.after} has no time: expected an event or a first_time"
+        text = f"{rule.after} has no time: expected an event that must occur, or a first_time"
+        yield ("after",), text
 
 
 def _has_time(rule: CheckRule) -> bool:
-    return rule.event is not None or rule.kind == "first_time"
+    if rule.event is not None:
+        return rule.must != "not_occur"
+    return rule.kind == "first_time"
+
+
+def _faults_of_order(rule: Expectation, found: Sequence[Expectation]) -> Iterator[RuleFault]:
+    """Yield that some agents have nothing to come after: the event further up is another agent's, of several."""
+    other = next((each for each in found if rule.after and each.name == rule.after), None)
+    if other is None or len(other.agents) <= 1 or HOST in other.agents:
+        return
+    owners = {owner_of(name) for name in other.agents}
+    alone = [name for name in rule.agents if owner_of(name) not in owners]
+    if alone:
+        text = f"{rule.after} is of {named_agents(other.agents)}, and this of {named_agents(alone)} too"
+        yield ("after",), f"{text}: name agents of both, or one agent alone, or host, further up"
 
 
 class _Placing:

@@ -29,7 +29,18 @@ def test_a_value_at_a_limit_is_the_limit_in_another_unit_too(value, unit, wanted
 
 
 @pytest.mark.parametrize(
-    ("unit", "wanted"), [("deg", "1"), ("degC", "K"), ("m", "s"), ("ells", "m")]
+    ("unit", "wanted"),
+    [
+        ("deg", "1"),
+        ("degC", "K"),
+        ("m", "s"),
+        ("ells", "m"),
+        ("0 m", "m"),
+        ("1e308 1e308 m", "m"),
+        ("1e-308 1e-308 m", "m"),
+        ("1e-308^-9 m", "m"),
+        ("1e200 m", "1e-200 m"),
+    ],
 )
 def test_what_does_not_convert_has_no_factor(unit, wanted):
     assert conversion(unit, wanted) is None

@@ -50,7 +50,7 @@ def outcome_of_event(
     begin_s, latest_s = -math.inf, expectation.to_s
     behind = -1
     if after is not None:
-        other = after.get(agent) or _of_owner(after, agent) or after.get(HOST)
+        other = after.get(agent) or _of_owner(after, agent) or after.get(HOST) or _only(after)
         if other is None or other.t_s is None:
             return ExpectationOutcome(got=0.0 if must_not else None, t_s=None, passed=must_not)
         begin_s = other.t_s
@@ -74,6 +74,11 @@ def _of_owner(outcomes: Mapping[str, ExpectationOutcome], name: str) -> Expectat
     """Return what an agent came to, or its one device, for a device or for an agent."""
     own = [each for other, each in outcomes.items() if owner_of(other) == owner_of(name)]
     return own[0] if len(own) == 1 else None
+
+
+def _only(outcomes: Mapping[str, ExpectationOutcome]) -> ExpectationOutcome | None:
+    """Return what the one agent came to that there is: all others may come after it."""
+    return next(iter(outcomes.values())) if len(outcomes) == 1 else None
 
 
 def worst_result(

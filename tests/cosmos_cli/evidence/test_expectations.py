@@ -276,6 +276,16 @@ def test_of_events_of_one_time_the_one_that_is_recorded_later_comes_after(
     assert (by_event.passed, by_value.passed) == (passed, passed)
 
 
+def test_an_event_may_come_after_that_of_one_other_agent():
+    common = {"stream": "events", "field": "event", "event": "done"}
+    first = expect(name="first", agents=("a",), **common)
+    second = expect(name="second", agents=("b",), after="first", within_s=1.0, **common)
+
+    found = judge(first, second).results[1]
+
+    assert (found.got, found.passed) == (6.0, True)
+
+
 def test_an_event_does_not_come_after_itself():
     common = {"stream": "events", "field": "event", "event": "burn", "agents": ("a",)}
     once = expect(name="once", **common)

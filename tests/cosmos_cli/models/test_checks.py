@@ -153,6 +153,42 @@ def test_a_broken_expectation_is_refused_with_place_and_cure(tmp_path, check, at
     assert re.search(rf"scenario.yaml:{FIRST_LINE}:\d+: checks", fault.render())
 
 
+START_OF = "name: first, event: start, agents: [%s]"
+
+
+@pytest.mark.parametrize(
+    ("first", "told"),
+    [
+        (START_OF % "agent-01, agent-02", "first is of agent-01, agent-02, and this of agent-03 too"),
+        ("name: first, event: start, must: not_occur", "first has no time: expected an event that must"),
+        (f"{PACKET.replace('name: a', 'name: first')}, above: 0", "first has no time"),
+    ],
+)  # fmt: skip
+def test_an_event_comes_after_what_its_agents_have_a_time_of(tmp_path, first, told):
+    with pytest.raises(InputError) as refused:
+        load(first, "name: a, event: end, after: first", folder=tmp_path)
+
+    (fault,) = refused.value.faults
+    assert (fault.path, told in fault.text) == ("checks[1].after", True), fault.text
+
+
+@pytest.mark.parametrize("agents", ["agent-01", "host", "host, agent-01", "'*'"])
+def test_events_of_all_may_come_after_one_of_all_of_one_agent_or_of_the_host(tmp_path, agents):
+    scenario = load(START_OF % agents, "name: a, event: end, after: first", folder=tmp_path)
+
+    assert len(scenario.expectations) == 2
+
+
+@pytest.mark.parametrize(
+    "limit", ["below: .nan", "above: 1e400", "below: '${no}'", "within: [0, .inf]"]
+)
+def test_a_limit_that_is_no_number_is_one_fault(tmp_path, limit):
+    with pytest.raises(InputError) as refused:
+        load(f"{TICKS}, {limit}", folder=tmp_path)
+
+    assert [each.path.startswith("checks[0].") for each in refused.value.faults] == [True]
+
+
 def test_all_faults_are_told_at_once(tmp_path):
     with pytest.raises(InputError) as refused:
         load(

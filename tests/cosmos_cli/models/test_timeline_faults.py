@@ -176,6 +176,17 @@ def test_a_broken_entry_is_refused_with_its_place_and_cure(
     assert all(fault.line and fault.line >= 6 for fault in refused.value.faults)
 
 
+@pytest.mark.parametrize(
+    "when", ["at_s: .nan", "every_s: 1e400", "when: {stream: log, field: t_s, above: .inf}"]
+)
+def test_a_time_that_is_no_number_is_one_fault(tmp_path: Path, when: str) -> None:
+    with pytest.raises(InputError) as refused:
+        load(tmp_path, f"{{{when}, action: stop}}")
+
+    (fault,) = refused.value.faults
+    assert "expected a finite number" in fault.text
+
+
 def test_all_entries_are_told_of_at_once(tmp_path: Path) -> None:
     with pytest.raises(InputError) as refused:
         load(tmp_path, "{at_s: 1, action: anotate}", "{at_s: 1}", "4")
