@@ -132,6 +132,24 @@ def test_a_finished_run_is_judged_by_expectations_it_did_not_have_and_again_afte
     assert of_name(json.loads(collected.stdout), "prompt") == check
 
 
+def test_a_run_whose_tables_are_cut_is_not_judged_by_what_is_left(run):
+    _, document = run("lockstep", LASTING)
+    tables = run.cosmos.directory(document) / "tables"
+    (table,) = tables.glob("round_trips*")
+    table.write_bytes(table.read_bytes()[:-100])
+
+    cut = run.cosmos("judge", document["run"])
+    table.unlink()
+    gone = run.cosmos("judge", document["run"])
+    run.cosmos("collect", document["run"])
+    anew = run.cosmos("judge", document["run"])
+
+    assert (cut.returncode, gone.returncode) == (2, 2)
+    for refused in (cut, gone):
+        assert "not as it was collected; make it anew with: cosmos collect" in refused.stderr
+    assert (anew.returncode, "PASSED" in anew.stdout) == (0, True)
+
+
 def test_a_run_without_checks_is_judged_by_none(run):
     _, document = run("lockstep")
 
