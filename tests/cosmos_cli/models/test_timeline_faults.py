@@ -153,6 +153,11 @@ BROKEN = [
     ('{at_s: 1, action: step_clock, agents: ["*"], by_ms: 1e6}', "timeline[0].by_ms", "10000"),
     ('{at_s: 1, action: drift_clock, agents: ["*"]}', "timeline[0].ppm", "missing"),
     ('{at_s: 1, action: drift_clock, agents: ["*"], ppm: 900}', "timeline[0].ppm", "500"),
+    (
+        '{at_s: 1, action: delay_messages, agents: ["*"], delay_s: 1, jitter_s: -1}',
+        "timeline[0].jitter_s",
+        "expected >= 0, got -1",
+    ),
     ("{at_s: 1, action: drift_clock, ppm: 90}", "timeline[0].action", "needs agents"),
 ]
 
