@@ -43,9 +43,9 @@ class LockstepFaults:
         self.to_mapping = self._messages.to_mapping
         self._is_engaged = False
 
-    def begin(self, action: TimelineAction) -> None:
+    def begin(self, action: TimelineAction) -> list[str]:
         """
-        Put a fault in force.
+        Put a fault in force, and return which agents it does not find.
 
         Raises:
             ActionRefused: The run does not go on without an agent, or none of them is there.
@@ -53,7 +53,7 @@ class LockstepFaults:
         """
         if action.word in kinds.MESSAGE_FAULTS:
             self._messages.begin(action)
-            return
+            return []
         there = [name for name in action.agents if not self._is_lost(name)]
         if action.word in kinds.LOSSES and not self._goes_on:
             raise ActionRefused(kinds.MUST_CONTINUE)
@@ -63,6 +63,7 @@ class LockstepFaults:
             self._kill(action, there)
         else:
             self._order(action, there, begins=True)
+        return [name for name in action.agents if name not in there]
 
     def end(self, action: TimelineAction) -> None:
         """

@@ -92,14 +92,14 @@ class AgentOrders:
     def __init__(self, post: Callable[[str, ActionOrder], bool]) -> None:
         self._post = post
 
-    def begin(self, action: TimelineAction) -> None:
+    def begin(self, action: TimelineAction) -> list[str]:
         """
-        Order it.
+        Order it, and return who is not there.
 
         Raises:
             ActionRefused: None of its agents is there.
         """
-        self._order(action, is_end=False)
+        return self._order(action, is_end=False)
 
     def end(self, action: TimelineAction) -> None:
         """
@@ -114,12 +114,13 @@ class AgentOrders:
         """Order its begin of an agent that has returned."""
         self._post(agent, _ordered(action, is_end=False))
 
-    def _order(self, action: TimelineAction, *, is_end: bool) -> None:
+    def _order(self, action: TimelineAction, *, is_end: bool) -> list[str]:
         order = _ordered(action, is_end=is_end)
-        # A list: each agent is sent to, whatever became of the one before.
-        sent = [self._post(agent, order) for agent in action.agents]
-        if not any(sent):
+        # Each agent is sent to, whatever became of the one before.
+        absent = [agent for agent in action.agents if not self._post(agent, order)]
+        if len(absent) == len(action.agents):
             raise ActionRefused(f"not there at present: {_told(action.agents)}")
+        return absent
 
 
 def _ordered(action: TimelineAction, *, is_end: bool) -> ActionOrder:

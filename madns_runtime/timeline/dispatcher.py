@@ -57,11 +57,12 @@ class Dispatcher:
         try:
             if handler is None:
                 raise ActionRefused(f"there is no action {action.word!r} in this run")
-            handler.begin(action)
+            absent = handler.begin(action)
         except ActionRefused as refusal:
             self._record(REFUSED, **described(action, now_s), reason=str(refusal))
             return str(refusal)
-        self._record(BEGAN, **described(action, now_s), for_s=action.for_s, lasts=lasts)
+        told = {"not_there": list(absent)} if absent else {}
+        self._record(BEGAN, **described(action, now_s), for_s=action.for_s, lasts=lasts, **told)
         if lasts:
             self._in_force[action.number] = action
         return ""

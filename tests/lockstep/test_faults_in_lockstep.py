@@ -118,6 +118,20 @@ def test_an_agent_that_is_killed_returns_when_it_is_said_and_is_not_judged(run_f
     assert said == ["start", "killed", "emergency", "end"]
 
 
+def test_an_agent_that_is_away_is_named_and_the_others_take_part(run_faults):
+    timeline = [
+        entry("kill", at_s=at_s, for_s=0.4, agents=who) for at_s, who in ((0.2, A4), (0.4, SOME))
+    ]
+    run = run_faults(*timeline, entry("hang", SOME, at_s=0.5, for_s=0.1))
+    result = run.result()
+
+    assert result["lost_on_purpose"] == list(SOME)
+    began = [e for e in run.events_of("host") if e["event"].startswith("action_began")]
+    assert [e.get("not_there") for e in began] == [None, ["agent-04"]]
+    (refused,) = [e for e in run.events_of("host") if e["event"] == "action_refused"]
+    assert "agent-02, agent-04: not running" in refused["reason"]
+
+
 def test_everybody_may_be_killed_if_some_return(run_faults):
     run = run_faults(entry("kill", ALL, for_s=0.3))
     result = run.result()

@@ -37,6 +37,20 @@ def a_dispatcher() -> tuple[Dispatcher, Heard, list[tuple[str, dict[str, Any]]]]
     return Dispatcher({"kill": handler}, record), handler, events
 
 
+def test_agents_that_are_not_there_are_named_where_others_are() -> None:
+    class Finding(Heard):
+        def begin(self, action: TimelineAction) -> list[str]:  # type: ignore[override]  # as the protocol has it
+            return [agent for agent in action.agents if agent == "agent-02"]
+
+    events: list[dict[str, Any]] = []
+    dispatcher = Dispatcher({"kill": Finding()}, lambda event, **values: events.append(values))
+
+    dispatcher.begin(an_action(0, "kill", "agent-01", "agent-02"), 1.0, lasts=False)
+    dispatcher.begin(an_action(1, "kill", "agent-01"), 1.0, lasts=False)
+
+    assert [each.get("not_there") for each in events] == [["agent-02"], None]
+
+
 def test_what_is_in_force_goes_on_at_an_agent_that_has_returned() -> None:
     resumed: list[tuple[int, str]] = []
     events: list[str] = []
