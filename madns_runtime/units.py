@@ -103,9 +103,12 @@ def parse_unit(unit: str) -> tuple[float, Dimensions] | None:
             return None
         place = term.end()
         power = int(term["power"] or 1) * (-1 if term["divided"] else 1)
-        factor *= known[0] ** power
+        try:
+            factor *= known[0] ** power
+        except OverflowError:
+            return None
         powers = [have + power * own for have, own in zip(powers, known[1], strict=True)]
-    return factor, tuple(powers)
+    return (factor, tuple(powers)) if 0.0 < factor < math.inf else None
 
 
 def conversion(unit: str, wanted: str) -> float | None:
@@ -115,7 +118,13 @@ def conversion(unit: str, wanted: str) -> float | None:
     ours, theirs = parse_unit(unit), parse_unit(wanted)
     if ours is None or theirs is None or ours[1] != theirs[1]:
         return None
-    return float(f"{ours[0] / theirs[0]:.15g}")  # 5 ms are 5000 us, not 5000.000000000001
+    exact = ours[0] / theirs[0]
+    if not 0.0 < exact < math.inf:
+        return None
+    rounded = float(
+        f"{exact:.12g}"
+    )  # 5 ms are 5000 us, not 5000.000000000001; a degree is what it is
+    return rounded if math.isclose(rounded, exact, rel_tol=1e-15) else exact
 
 
 def _symbol(symbol: str) -> tuple[float, Dimensions] | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -70,7 +70,7 @@ def judge(
     else:
         file = load_scenario(scenario, warn=console.warn)
         expectations = expectations_for(found, file, tables)
-    judged = judge_run(found, tables, expectations)
+    judged = judge_run(found, tables, expectations, document.get("duration_s"))
     missing = (*_missing(document), *judged.gaps())
     code, text = conclusion_of_expectations(judged.results, missing)
     console.print_json(_told(found, judged, code, text, missing))
@@ -91,7 +91,27 @@ def _collected(run: RunDirectory) -> Mapping[str, Any]:
     if fault is not None or run.read_config() is None:
         what = f"{run.run_json}: {fault}" if fault else f"{run.plan_json}: not to be read"
         raise InputError(f"{what}; make it anew with: cosmos collect {run.path}")
+    cut = [name for name, size in _listed_tables(run) if _size_of(run.path / name) != size]
+    if cut:
+        what = f"{run.path / cut[0]}" + (f" and {len(cut) - 1} more" if cut[1:] else "")
+        text = "missing, or not as it was collected"
+        raise InputError(f"{what}: {text}; make it anew with: cosmos collect {run.path}")
     return document
+
+
+def _listed_tables(run: RunDirectory) -> Iterator[tuple[str, object]]:
+    """Yield the tables that the manifest lists, below the run's directory, and the size of each."""
+    files = (run.read_json(run.manifest_json) or {}).get("files")
+    for name, entry in files.items() if isinstance(files, dict) else ():
+        if name.startswith(f"{run.tables.name}/") and isinstance(entry, dict):
+            yield name, entry.get("bytes")
+
+
+def _size_of(path: Path) -> int | None:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return None
 
 
 def _missing(document: Mapping[str, Any]) -> tuple[str, ...]:

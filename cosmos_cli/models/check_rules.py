@@ -47,7 +47,7 @@ OF_TIMES = ("first_time", "settled")
 """Statistics in s."""
 OF_NUMBERS = ("count", "rate")
 FRAMEWORKS_OWN = (
-    "agents.", "deadline.", "devices.", "hardware.", "messages.", "records.", "time.",
+    "agents.", "deadline.", "devices.", "hardware.", "messages.", "records.", "summary.", "time.",
 )  # fmt: skip
 """Begin the names of checks that every run has."""
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
-from cosmos_cli.models.check_rules import OF_TIMES, CheckRule
+from cosmos_cli.models.check_rules import OF_NUMBERS, OF_TIMES, CheckRule
 from cosmos_cli.models.device_uses import named_agents
 from cosmos_cli.models.document import did_you_mean
 from cosmos_cli.models.expectation import Expectation, HeldBounds, owner_of
@@ -57,7 +58,9 @@ def resolve_checks(rules: Sequence[CheckRule], around: Surroundings) -> Resolved
         faults += words_at((index,), iter(own))
         earlier.setdefault(rule.name, rule)
         if not own:
-            found.append(_Placing(rule, around).expectation())
+            expectation = _Placing(rule, around).expectation()
+            faults += words_at((index,), _faults_of_order(expectation, found))
+            found.append(expectation)
     return ResolvedChecks(tuple(found), tuple(faults))
 
 
@@ -97,11 +100,26 @@ def _faults_among(rule: CheckRule, earlier: dict[str, CheckRule]) -> Iterator[Ru
         text = f"no check above is named {rule.after!r}{did_you_mean(rule.after, timed)}"
         yield ("after",), text
     elif not _has_time(other):
-        yield ("after",), f"{rule.after} has no time: expected an event or a first_time"
+        text = f"{rule.after} has no time: expected an event that must occur, or a first_time"
+        yield ("after",), text
 
 
 def _has_time(rule: CheckRule) -> bool:
-    return rule.event is not None or rule.kind == "first_time"
+    if rule.event is not None:
+        return rule.must != "not_occur"
+    return rule.kind == "first_time"
+
+
+def _faults_of_order(rule: Expectation, found: Sequence[Expectation]) -> Iterator[RuleFault]:
+    """Yield that some agents have nothing to come after: the event further up is another agent's, of several."""
+    other = next((each for each in found if rule.after and each.name == rule.after), None)
+    if other is None or len(other.agents) <= 1 or HOST in other.agents:
+        return
+    owners = {owner_of(name) for name in other.agents}
+    alone = [name for name in rule.agents if owner_of(name) not in owners]
+    if alone:
+        text = f"{rule.after} is of {named_agents(other.agents)}, and this of {named_agents(alone)} too"
+        yield ("after",), f"{text}: name agents of both, or one agent alone, or host, further up"
 
 
 class _Placing:
@@ -135,6 +153,16 @@ class _Placing:
         if rule.from_s is not None and rule.from_s >= end_s:
             text = f"expected less than time.duration_s ({end_s:g}), got {rule.from_s:g}"
             yield ("from_s",), f"{text}: nothing is recorded then"
+            return
+        begin_s, last_s = rule.from_s or 0.0, min(end_s, end_s if rule.to_s is None else rule.to_s)
+        if rule.kind == "rate" and rule.event is None and last_s <= begin_s:
+            text = f"expected more than from_s ({begin_s:g}), got {last_s:g}"
+            yield ("to_s",), f"{text}: a rate is of a stretch of time"
+        if rule.kind in OF_TIMES and rule.word and not rule.bounds().overlap(begin_s, last_s):
+            text = f"a {rule.kind} here is from {begin_s:g} s to {last_s:g} s"
+            yield (rule.word,), f"{text}: {rule.words('s')} never holds"
+        elif rule.kind in OF_NUMBERS and rule.word and not rule.bounds().overlap(0.0, math.inf):
+            yield (rule.word,), f"a {rule.kind} is never less than 0: {rule.words()} never holds"
 
     def _timeless_faults(self) -> Iterator[RuleFault]:
         rule = self._rule
@@ -155,6 +183,9 @@ class _Placing:
                         path,
                         f"stream {self._stream} is recorded by agents, not by the host's half",
                     )
+                elif len(self._rule.agents) > 1 and "agent" not in self._roles:
+                    text = "expected host alone, for all records of its half, or agents"
+                    yield path, f"{text}: write two checks"
             elif not around.labels.like(pattern, around.agents):
                 yield path, f"no agent is named {pattern}{did_you_mean(pattern, around.agents)}"
             elif self._roles == {"host"} and not streams.names_agents(self._stream):
@@ -194,21 +225,26 @@ class _Placing:
 
     def _value_faults(self, field: Field | None) -> Iterator[RuleFault]:
         rule = self._rule
+        streams, stream = self._around.streams, self._stream
         if rule.event is not None:
             if field is not None and field.kind != "str":
                 yield ("field",), f"{field.name} holds no words: an event is a word of a text field"
+            elif fault := streams.word_fault(stream, self._field, rule.event):
+                yield ("event",), fault
             return
-        is_statistic = rule.kind in (*OF_TIMES, "count", "rate")
+        is_statistic = rule.kind in (*OF_TIMES, *OF_NUMBERS)
         bounded: BoundsRule | None = rule.when if is_statistic else rule
         below = ("when",) if is_statistic else ()
         if is_statistic and isinstance(rule.equals, str | bool):
             yield ("equals",), f"a {rule.kind} is a number, got {rule.equals!r}"
         if bounded is not None:
             yield from words_at(below, kind_faults(bounded, field))
+            if fault := streams.word_fault(stream, self._field, bounded.equals):
+                yield (*below, "equals"), fault
         if not is_statistic and isinstance(rule.equals, str) and rule.kind not in ("each", "last"):
             yield ("statistic",), f"a text has no {rule.kind}: expected each or last"
         elif field is not None and field.kind == "str" and rule.kind not in (
-            "each", "last", "count", "rate", *OF_TIMES,
+            "each", "last", *OF_NUMBERS, *OF_TIMES,
         ):  # fmt: skip
             yield ("statistic",), f"{field.name} holds texts, which have no {rule.kind}"
         yield from unit_faults(rule.unit, field, must_know=rule.stop_when_broken)
@@ -229,6 +265,8 @@ class _Placing:
             field = streams.field(stream, name)
             yield from kind_faults(rule, field)
             yield from unit_faults(rule.unit, field)
+            if fault := streams.word_fault(stream, name, rule.equals):
+                yield ("equals",), fault
 
     def _unlike_fault(self, held: str) -> str | None:
         """Return why it is not known whose records of the stream under `while` go with those that are judged."""
@@ -342,7 +380,7 @@ def _words(rule: CheckRule, stream: str, field: str, unit: str) -> str:
     if rule.kind in OF_TIMES:
         assert rule.when is not None
         return f"{rule.kind} of {what} {rule.when.words(own)}: {rule.words('s')}{when}"
-    if rule.kind in ("count", "rate"):
+    if rule.kind in OF_NUMBERS:
         counted = "" if rule.when is None else f" {rule.when.words(own)}"
         return f"{rule.kind} of {what}{counted}: {rule.words('1/s' if rule.kind == 'rate' else '')}{when}"
     statistic = "last" if rule.at_end else rule.kind

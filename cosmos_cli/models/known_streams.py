@@ -13,6 +13,7 @@ from madns_runtime.hardware.stream_schemas import DEVICE_CLOCK, DEVICE_STATE, sc
 from madns_runtime.plugin.api import DeclaredStream
 from madns_runtime.recording.records import (
     CLOCK,
+    EVENT_WORDS,
     EVENTS,
     HEALTH,
     LATE_TICKS,
@@ -21,10 +22,13 @@ from madns_runtime.recording.records import (
     TICKS,
     Field,
 )
+from madns_runtime.recording.run_journal import LEVELS
 
 REAL_TIME_ONLY = tuple(schema.name for schema in (TICKS, LATE_TICKS, CLOCK, PROCESS, HEALTH))
 """Framework streams that no run in lockstep records: no time passes there that could be late."""
 NOT_A_VALUE = ("json", "packed")
+WORDS = {(EVENTS.name, "event"): EVENT_WORDS, (LOG.name, "level"): tuple(LEVELS)}
+"""All texts that a field of a stream of the framework's ever holds."""
 Role = Literal["agent", "host", "machine", "device"]
 APART: tuple[Role, ...] = ("machine", "device")
 """Who records in a process of its own, which no condition is evaluated in."""
@@ -145,6 +149,16 @@ class KnownStreams:
             return None
         known = list(dict.fromkeys(field.name for each in found for field in each.fields))
         return f"stream {stream} has no field {name!r}{did_you_mean(name, known)}"
+
+    def word_fault(self, stream: str, field: str, word: object) -> str | None:
+        """Return what is wrong with a text that is waited for in a field; None if it may come."""
+        words = WORDS.get((stream, field))
+        if words is None or not isinstance(word, str) or word in words:
+            return None
+        guess = did_you_mean(word, words)
+        if stream == EVENTS.name and not guess.endswith("?"):
+            guess += "; a simulation's own words stand in its own streams: name one under stream"
+        return f"stream {stream} never holds {word!r:.40} in {field}{guess}"
 
     def field(self, stream: str, name: str) -> Field | None:
         """Return a field; None if it is not known."""

@@ -27,6 +27,7 @@ from cosmos_cli.models.plugin_answers import ask_plugin
 from cosmos_cli.models.plugin_demand import ask_plugin_demand
 from cosmos_cli.models.scenario import OF_AUTHORS, Scenario, cross_faults
 from cosmos_cli.models.timeline import NO_TIMELINE, ResolvedTimeline, resolve_timeline
+from cosmos_cli.models.timeline_rules import NO_TIME
 from cosmos_cli.models.translate import faults_of
 from cosmos_cli.models.variables import (
     author_override_faults,
@@ -39,6 +40,7 @@ from madns_runtime.agent_parameters import AgentParameters
 from madns_runtime.config import RunConfig, to_mapping
 from madns_runtime.plugin.api import DeclaredStream, Demand, PlaceUse
 
+RULE_LISTS = ("checks[", "timeline[")
 _PLACEHOLDERS = {"name": "x", "simulation": "x", "agents": {"count": 1}}
 """Stand in for sections with faults, while the others are checked against each other."""
 
@@ -261,7 +263,19 @@ def _told_once(faults: Sequence[Fault], document: Document) -> list[Fault]:
     own = set(document.faults)
     lost = [*document.faults, *(document.fault(path, "") for path in document.without_value)]
     places = {_place(fault) for fault in lost}
-    told = (fault for fault in faults if fault in own or _place(fault) not in places)
+    # A rule of checks or of the timeline that has lost its limit, or its time, lacks nothing else.
+    rules = {each.path.rpartition(".")[0] for each in lost if each.path.startswith(RULE_LISTS)}
+    untimed = {f"{rule}.action" for rule in rules}
+    told = (
+        fault
+        for fault in faults
+        if fault in own
+        or (
+            _place(fault) not in places
+            and fault.path not in rules
+            and not (fault.path in untimed and fault.text.startswith(NO_TIME))
+        )
+    )
     files = {label: number for number, label in enumerate(_labels(document))}
     return sorted(
         told,

@@ -69,7 +69,7 @@ def resolve_timeline(
     entries: list[ScheduledEntry] = []
     conditions: list[Condition] = []
     known = {action.word: action for action in answers.known}
-    expected = 0.0
+    expected: dict[int, float] = {}
     for place, written in entries_of(document):
         if written is None:
             continue  # the model has said so already
@@ -93,10 +93,13 @@ def resolve_timeline(
         device_faults = _device_faults(scenario, entry, rule.agents, labels)
         faults += [document.fault((*path, *inner), text) for inner, text in device_faults]
         entries.append(entry)
-        expected += count_expected(entry, scenario.time.duration_s)
-    if expected > EXPECTED_SHARE * ACTIONS_MAX:
-        text = f"expected at most {EXPECTED_SHARE * ACTIONS_MAX:g} actions in a run, got some {expected:.0f}"
-        faults.append(document.fault(("timeline",), f"{text}: make them rarer"))
+        expected[place] = count_expected(entry, scenario.time.duration_s)
+    total = sum(expected.values())
+    if total > EXPECTED_SHARE * ACTIONS_MAX:
+        text = f"expected at most {EXPECTED_SHARE * ACTIONS_MAX:g} actions in a run, got some {total:.4g}"
+        most = max(expected, key=lambda place: expected[place])
+        told = f"{text}: make them rarer, most of all {dotted(('timeline', most))}"
+        faults.append(document.fault(("timeline",), told))
     return ResolvedTimeline(tuple(entries), tuple(faults), tuple(conditions), answers.known)
 
 
@@ -147,6 +150,11 @@ class _Placing:
         if self.rule.to_s is not None and self.rule.to_s > duration_s:
             text = f"expected <= time.duration_s ({duration_s:g}), got {self.rule.to_s:g}"
             yield ("to_s",), f"{text}; leave it out for the end of the run"
+        if self.rule.when is not None and self.rule.when.for_s >= duration_s:
+            text = (
+                f"expected less than time.duration_s ({duration_s:g}), got {self.rule.when.for_s:g}"
+            )
+            yield ("when", "for_s"), f"{text}: it cannot hold for so long"
 
     def _action_faults(self, action: KnownAction) -> Iterator[SectionFault]:
         mode = self.scenario.time.mode

@@ -16,6 +16,7 @@ from madns_runtime.config import FORBID_EXTRA
 ENTRIES_MAX: Final = 1000
 RATE_PER_H_MAX: Final = 3600
 WHEN_WORDS: Final = ("at_s", "every_s", "when", "rate_per_h")
+NO_TIME: Final = "expected a time beside it"
 RuleFault = tuple[tuple[str | int, ...], str]
 """The path within the entry, and what is wrong there."""
 
@@ -50,7 +51,7 @@ class TimelineRule:
         given = [word for word in WHEN_WORDS if getattr(self, word) is not None]
         listed = ", ".join(WHEN_WORDS)
         if not given:
-            yield ("action",), f"expected a time beside it: one of {listed}"
+            yield ("action",), f"{NO_TIME}: one of {listed}"
         for word in given[1:]:
             yield (word,), f"expected one of {listed}, got {given[0]} as well: write two entries"
         if given[:1] not in (["every_s"], ["rate_per_h"]):

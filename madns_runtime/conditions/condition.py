@@ -54,6 +54,16 @@ class ValueBounds:
             return cls(text=value)
         return cls(low=value - tolerance, high=value + tolerance)
 
+    def overlap(self, first: float, last: float) -> bool:
+        """Tell whether some number from *first* to *last*, these included, lies within."""
+        if self.text is not None:
+            return True
+        if self.is_closed:
+            return (self.high is None or self.high >= first) and (
+                self.low is None or self.low <= last
+            )
+        return (self.high is None or self.high > first) and (self.low is None or self.low < last)
+
     def negated(self) -> ValueBounds:
         """Return the bounds of every value that does not hold here."""
         return replace(self, is_negated=not self.is_negated)
@@ -62,11 +72,13 @@ class ValueBounds:
         """Tell whether a recorded value lies within."""
         if self.text is not None:
             return isinstance(value, str) and (value == self.text) is not self.is_negated
+        if isinstance(value, str):  # where records are counted, whatever they hold
+            return self.low is None and self.high is None and not self.is_negated
         try:
             number = float(value)  # type: ignore[arg-type]  # numpy's numbers are none of Python's
         except (TypeError, ValueError):
             return False
-        if isinstance(value, str) or math.isnan(number):
+        if math.isnan(number):
             return False
         is_within = (
             (self.low is None or number >= self.low) and (self.high is None or number <= self.high)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from madns_runtime.conditions.condition import Condition
+from madns_runtime.written_times import later_s
 
 
 class ConditionEvaluator:
@@ -57,7 +58,10 @@ class ConditionEvaluator:
             The simulated time from which on it has held for long enough, s; None if it has not.
         """
         since_s, for_s = self._since_s, self.condition.for_s
-        if self.is_met or since_s is None or for_s <= 0.0 or now_s < since_s + for_s:
+        if self.is_met or since_s is None or for_s <= 0.0:
+            return None
+        met_s = later_s(since_s, for_s)
+        if now_s < met_s:
             return None
         self.is_met = True
-        return since_s + for_s
+        return met_s

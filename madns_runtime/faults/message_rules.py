@@ -189,7 +189,7 @@ def _apply(
             else:
                 fate.late_s += _resent_after_s(value["probability"], draw, left_s)
         case words.DELAY:
-            fate.late_s += value["delay_s"] + max(0.0, value["jitter_s"]) * draw()
+            fate.late_s += value["delay_s"] + value["jitter_s"] * draw()
         case words.REORDER:
             if draw() < value["probability"]:
                 fate.late_s += value["within_s"] * draw()

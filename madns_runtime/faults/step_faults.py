@@ -1,4 +1,9 @@
-"""Faults of one agent's steps: hung, or slow by a factor; several may be in force at a time. Pure."""
+"""
+Faults of one agent's steps: hung, or slow by a factor; several may be in force at a time. Pure.
+
+They are told apart by the numbers of their actions: an agent that was started anew meanwhile has none of those before,
+and what ends one of these leaves alone those that began after its return.
+"""
 
 from __future__ import annotations
 
@@ -12,44 +17,38 @@ SLOW: Final = "slow"
 class StepFaults:
     """The faults in force at one agent."""
 
-    __slots__ = ("_factors", "_hangs", "withheld")
+    __slots__ = ("_factors", "withheld")
 
     def __init__(self) -> None:
-        self._hangs = 0
-        self._factors: list[float] = []
+        self._factors: dict[int, float] = {}
+        """By the number of the action; infinite where no step is taken."""
         self.withheld = 0
         """Ticks in which the agent was not stepped, since faults are in force."""
 
-    def begin(self, word: str, factor: float = 1.0) -> None:
-        """Put a fault in force: hang, or slow by *factor*."""
+    def begin(self, number: int, word: str, factor: float = 1.0) -> None:
+        """Put a fault in force, that of an action's *number*: hang, or slow by *factor*."""
         if not self.are_in_force:
             self.withheld = 0
-        if word == HANG:
-            self._hangs += 1
-        else:
-            self._factors.append(factor)
+        self._factors[number] = math.inf if word == HANG else factor
 
-    def end(self, word: str, factor: float = 1.0) -> None:
-        """Lift a fault; one that is not in force is left alone."""
-        if word == HANG:
-            self._hangs = max(0, self._hangs - 1)
-        elif factor in self._factors:
-            self._factors.remove(factor)
+    def end(self, number: int) -> bool:
+        """Lift a fault; return whether it was in force here."""
+        return self._factors.pop(number, None) is not None
 
     @property
     def are_in_force(self) -> bool:
         """Whether there is any."""
-        return bool(self._hangs or self._factors)
+        return bool(self._factors)
 
     @property
     def is_hung(self) -> bool:
         """Whether no step is taken."""
-        return self._hangs > 0
+        return math.inf in self._factors.values()
 
     @property
     def factor(self) -> float:
-        """Factor by which steps are slower: that of the slowest fault in force."""
-        return max(self._factors, default=1.0)
+        """Factor by which steps are slower: that of the slowest fault in force; infinite where none is taken."""
+        return max(self._factors.values(), default=1.0)
 
     def withholds(self, tick: int) -> bool:
         """Tell whether the step of *tick* is withheld where steps take no time, and count it; a slow agent takes one in so many."""

@@ -6,6 +6,7 @@ A unix socket of this user alone in the run directory. What is ordered is checke
 
 from __future__ import annotations
 
+import dataclasses
 import fnmatch
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -101,7 +102,7 @@ class ActionSocket:
                 "action": kind.word,
                 "summary": kind.summary,
                 "takes_agents": kind.takes_agents,
-                "parameters": list(getattr(kind.parameters, "__dataclass_fields__", ())),
+                "parameters": [field.name for field in dataclasses.fields(kind.parameters)],
                 "for_s": kind.lasting,
             }
             for kind in self._kinds.values()

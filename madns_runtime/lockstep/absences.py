@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 import heapq
 from collections.abc import Callable, Iterable
-from typing import Any, Final
+from typing import Final
 
 from madns_runtime.lockstep import frames
 from madns_runtime.lockstep.host_core import LockstepCore
 from madns_runtime.protocol.codec import pack
+from madns_runtime.protocol.messages import AgentFault
 
 RESTART_DELAY_S: Final = 0.2
 """From the loss of an agent that agents.restarts_max gives another start to its return, s of simulated time."""
 TIME_EPSILON_S: Final = 1e-9
+
+
+def _nobody_waits(agent: str) -> None:
+    """Do nothing."""
 
 
 class Absences:
@@ -40,6 +46,8 @@ class Absences:
         self._log = log
         self._returns: list[tuple[float, int]] = []
         """Simulated time, s, and agent, by index: a heap."""
+        self.resume: Callable[[str], None] = _nobody_waits
+        """Told of an agent that has returned, when its half and the host's know of it."""
 
     def begin(self) -> None:
         """Go on without who is lost from now on, if the run is to."""
@@ -135,10 +143,11 @@ class Absences:
         self._log("info", f"{name} has rejoined at t = {self._clock.t_s:.2f} s")
         self._journal.event("agent_rejoined", agent=name)
         self._half.call("agent_rejoined", name)
+        self.resume(name)
 
     # Faults ---------------------------------------------------------------------------------------
 
-    def order(self, word: str, value: Any, agents: Iterable[str], *, begins: bool) -> None:
+    def order(self, fault: AgentFault, agents: Iterable[str]) -> None:
         """
         Have the workers begin or end a fault of agents; see `frames.FAULT`.
 
@@ -151,5 +160,6 @@ class Absences:
         for worker in self._crew.workers:
             own = [index for index in indices if index in worker.agents]
             if own:
-                self._meeting.order(worker, frames.FAULT, word, begins, value, own)
+                told = dataclasses.astuple(fault)
+                self._meeting.order(worker, frames.FAULT, self._clock.t_s, told, own)
         self._meeting.await_told("has not begun a fault")

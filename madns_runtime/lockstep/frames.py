@@ -29,7 +29,7 @@ STOP: Final = 5
 RETURN: Final = 6
 """[RETURN, tick, [[index, incarnation, initial data], ...]]: make lost agents anew; *tick* is the next."""
 FAULT: Final = 7
-"""[FAULT, word, value, [index, ...]]: begin or end a fault of agents, see `lockstep.agent_faults`."""
+"""[FAULT, simulated time, values of an AgentFault, [index, ...]]: begin or end a fault of agents."""
 
 # Worker to host.
 READY: Final = 11

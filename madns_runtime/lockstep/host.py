@@ -119,6 +119,7 @@ class LockstepHost:
         self._absences = Absences(core, self._log)
         self._faults = LockstepFaults(core, self._absences)
         self._timeline = LockstepTimeline(core, program, self._faults)
+        self._absences.resume = self._timeline.runner.resume
         self._timeline.wait_for(conditions)
         self._machine = host_machine()
 

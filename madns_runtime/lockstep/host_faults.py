@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 from madns_runtime.faults.message_faults import MessageEnds, MessageFaults
 from madns_runtime.lockstep.absences import RESTART_DELAY_S, Absences
 from madns_runtime.lockstep.host_core import LockstepCore
+from madns_runtime.protocol.messages import AgentFault
 from madns_runtime.timeline import fault_kinds as kinds
 from madns_runtime.timeline.action import ActionRefused, TimelineAction
 
@@ -39,9 +43,9 @@ class LockstepFaults:
         self.to_mapping = self._messages.to_mapping
         self._is_engaged = False
 
-    def begin(self, action: TimelineAction) -> None:
+    def begin(self, action: TimelineAction) -> list[str]:
         """
-        Put a fault in force.
+        Put a fault in force, and return which agents it does not find.
 
         Raises:
             ActionRefused: The run does not go on without an agent, or none of them is there.
@@ -49,7 +53,7 @@ class LockstepFaults:
         """
         if action.word in kinds.MESSAGE_FAULTS:
             self._messages.begin(action)
-            return
+            return []
         there = [name for name in action.agents if not self._is_lost(name)]
         if action.word in kinds.LOSSES and not self._goes_on:
             raise ActionRefused(kinds.MUST_CONTINUE)
@@ -58,7 +62,8 @@ class LockstepFaults:
         if action.word in kinds.LOSSES:
             self._kill(action, there)
         else:
-            self._absences.order(action.word, kinds.factor_of(action), there, begins=True)
+            self._order(action, there, begins=True)
+        return [name for name in action.agents if name not in there]
 
     def end(self, action: TimelineAction) -> None:
         """
@@ -70,8 +75,7 @@ class LockstepFaults:
         if action.word in kinds.MESSAGE_FAULTS:
             self._messages.end(action)
         elif action.word not in kinds.LOSSES:
-            factor = kinds.factor_of(action)
-            self._absences.order(action.word, factor, action.agents, begins=False)
+            self._order(action, action.agents, begins=False)
 
     def release(self) -> None:
         """
@@ -83,13 +87,19 @@ class LockstepFaults:
         if self._is_engaged:
             self._messages.release()
 
+    def _order(self, action: TimelineAction, agents: Sequence[str], *, begins: bool) -> None:
+        factor = kinds.factor_of(action)
+        fault = AgentFault(action.number, action.word, begins, factor)
+        self._absences.order(fault, agents)
+
     def _kill(self, action: TimelineAction, agents: list[str]) -> None:
         after_s = RESTART_DELAY_S if action.word == kinds.RESTART else action.for_s
         why = kinds.killed_words(action)
         returns_s = None if after_s is None else max(action.t_s, self._clock.t_s) + after_s
         for agent in agents:
             self._account.intended.order(agent, why, returns_s=returns_s)
-        self._absences.order(kinds.KILL, why, agents, begins=True)
+        fault = AgentFault(action.number, kinds.KILL, True, math.nan, why)
+        self._absences.order(fault, agents)
         self._absences.take()
 
     def _is_lost(self, agent: str) -> bool:

@@ -33,7 +33,7 @@ from madns_runtime.plugin.context import clean_text
 from madns_runtime.plugin.half import HalfFailed, RoleProgram
 from madns_runtime.processes import register
 from madns_runtime.protocol.codec import unpack
-from madns_runtime.protocol.messages import ActionOrder, Delivery, TransmissionRefusal
+from madns_runtime.protocol.messages import ActionOrder, AgentFault, Delivery, TransmissionRefusal
 from madns_runtime.reactor.forking import leave_parent
 from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.watchdog import end_after_hang_up
@@ -333,20 +333,23 @@ class Worker:
             self._set_up_one(agent, packed, has_devices=devices is not None)
         return self._done()
 
-    def _fault(self, word: str, begins: bool, value: Any, indices: list[int]) -> bytes:
-        """Begin or end a fault of agents: of their steps, or their loss, whose reason is *value*."""
+    def _fault(self, t_s: float, told: list[Any], indices: list[int]) -> bytes:
+        """Begin or end a fault of agents at simulated time *t_s*: of their steps, or their loss."""
+        fault = AgentFault(*told)
+        self._clock.t_s = t_s
         for agent in [each for each in self._agents if each.index in indices]:
-            if word == KILL:
-                agent.journal.event("killed", reason=value)
-                self._lose(agent, AgentFailed(agent.index, value))
+            if fault.word == KILL:
+                agent.journal.event("killed", reason=fault.reason)
+                self._lose(agent, AgentFailed(agent.index, fault.reason))
                 continue
             faults = self._faults.setdefault(agent.index, StepFaults())
-            if begins:
-                faults.begin(word, value)
-            else:
-                faults.end(word, value)
-            told = {} if begins else {"ticks_withheld": faults.withheld}
-            agent.journal.event(f"{word}_{'begins' if begins else 'ends'}", factor=value, **told)
+            if fault.begins:
+                faults.begin(fault.number, fault.word, fault.value)
+                agent.journal.event(f"{fault.word}_begins", factor=fault.value)
+            elif faults.end(fault.number):
+                agent.journal.event(
+                    f"{fault.word}_ends", factor=fault.value, ticks_withheld=faults.withheld
+                )
             if not faults.are_in_force:
                 del self._faults[agent.index]
         return self._done()

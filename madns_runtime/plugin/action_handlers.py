@@ -92,14 +92,14 @@ class AgentOrders:
     def __init__(self, post: Callable[[str, ActionOrder], bool]) -> None:
         self._post = post
 
-    def begin(self, action: TimelineAction) -> None:
+    def begin(self, action: TimelineAction) -> list[str]:
         """
-        Order it.
+        Order it, and return who is not there.
 
         Raises:
             ActionRefused: None of its agents is there.
         """
-        self._order(action, is_end=False)
+        return self._order(action, is_end=False)
 
     def end(self, action: TimelineAction) -> None:
         """
@@ -110,19 +110,28 @@ class AgentOrders:
         """
         self._order(action, is_end=True)
 
-    def _order(self, action: TimelineAction, *, is_end: bool) -> None:
-        order = ActionOrder(
-            number=action.number,
-            word=action.word,
-            parameters=dict(action.parameters),
-            t_s=action.t_s,
-            for_s=action.for_s,
-            is_end=is_end,
-        )
-        # A list: each agent is sent to, whatever became of the one before.
-        sent = [self._post(agent, order) for agent in action.agents]
-        if not any(sent):
+    def resume(self, action: TimelineAction, agent: str) -> None:
+        """Order its begin of an agent that has returned."""
+        self._post(agent, _ordered(action, is_end=False))
+
+    def _order(self, action: TimelineAction, *, is_end: bool) -> list[str]:
+        order = _ordered(action, is_end=is_end)
+        # Each agent is sent to, whatever became of the one before.
+        absent = [agent for agent in action.agents if not self._post(agent, order)]
+        if len(absent) == len(action.agents):
             raise ActionRefused(f"not there at present: {_told(action.agents)}")
+        return absent
+
+
+def _ordered(action: TimelineAction, *, is_end: bool) -> ActionOrder:
+    return ActionOrder(
+        number=action.number,
+        word=action.word,
+        parameters=dict(action.parameters),
+        t_s=action.t_s,
+        for_s=action.for_s,
+        is_end=is_end,
+    )
 
 
 def with_instance(action: TimelineAction, kind: ActionKind) -> TimelineAction:
@@ -168,7 +177,12 @@ def timeline_runner(  # noqa: PLR0913 - the collaborators of a seam, most keywor
     runner = TimelineRunner(
         config.timeline,
         kinds,
-        Dispatcher(handlers, record),
+        Dispatcher(
+            handlers,
+            record,
+            # Devices outlive an agent's start, and so do faults around them.
+            {kind.word: of_agents.resume for kind in declared if kind.carried_out_by == "agent"},
+        ),
         seed=config.seed,
         duration_s=config.time.duration_s,
     )

@@ -41,6 +41,8 @@ class AgentActions:
         self._call = call
         self._journal = journal
         self._own = own
+        self._begun: set[int] = set()
+        """Numbers of the simulation's actions that this start of the agent has begun, and that are to end."""
 
     def take(self, order: ActionOrder) -> None:
         """Carry out an order; one that cannot be is recorded as refused."""
@@ -48,14 +50,27 @@ class AgentActions:
             if (own := self._own.get(order.word)) is not None:
                 own(order)
             elif (kind := self._kinds.get(order.word)) is not None:
-                method = "end_action" if order.is_end else "begin_action"
-                self._call(method, with_instance(self._action(order), kind))
+                self._take(order, kind)
             else:
                 raise ActionRefused("there is no such action here")
         except (ActionRefused, ConfigurationError) as refusal:
             self._journal.event(
                 "action_refused", number=order.number, action=order.word, reason=str(refusal)
             )
+
+    def _take(self, order: ActionOrder, kind: ActionKind) -> None:
+        action = with_instance(self._action(order), kind)
+        if not order.is_end:
+            self._call("begin_action", action)
+            if order.for_s is not None:
+                self._begun.add(order.number)
+            return
+        if order.number not in self._begun:
+            raise ActionRefused(
+                "to end: it was not begun here, or before this agent's present start"
+            )
+        self._begun.remove(order.number)
+        self._call("end_action", action)
 
     def _action(self, order: ActionOrder) -> TimelineAction:
         return TimelineAction(

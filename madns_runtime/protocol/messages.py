@@ -219,6 +219,8 @@ class AgentFault:
     """Host -> agent: a fault of you or of your steps begins or ends; see `timeline.fault_kinds`."""
 
     KIND: ClassVar[int] = 18
+    number: int
+    """The action's in the run."""
     word: str
     begins: bool
     value: float

@@ -39,7 +39,9 @@ class AgentFaults:
             self._journal.event("killed", reason=order.reason, returns_after_s=after_s)
             self._killed(order.reason, after_s)
             return
-        faults = self._ticks.hinder(order.word, order.value, begins=order.begins)
+        faults = self._ticks.hinder(order)
+        if faults is None:
+            return
         name = f"{order.word}_{'begins' if order.begins else 'ends'}"
         told = {} if order.begins else {"ticks_withheld": faults.withheld}
         self._journal.event(name, factor=order.value, **told)

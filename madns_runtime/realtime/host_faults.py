@@ -44,19 +44,21 @@ class HostFaults:
         # Infinite is never: the timer is made once and moved.
         self._timer = core.reactor.call_at(math.inf, self._due)
 
-    def begin(self, action: TimelineAction) -> None:
+    def begin(self, action: TimelineAction) -> list[str]:
         """
-        Put a fault in force.
+        Put a fault in force, and return which agents it does not find.
 
         Raises:
             ActionRefused: The run does not go on without an agent, or none of them is there.
         """
         if action.word in words.MESSAGE_FAULTS:
             self._messages.begin(action)
-        elif action.word in words.LOSSES:
-            self._kill(action)
-        elif not self._order(action, begins=True):
+            return []
+        is_loss = action.word in words.LOSSES
+        absent = self._kill(action) if is_loss else self._order(action, begins=True)
+        if len(absent) == len(action.agents):
             raise ActionRefused(words.nobody_words(action))
+        return absent
 
     def end(self, action: TimelineAction) -> None:
         """Lift a fault; an agent that was killed returns by itself."""
@@ -67,27 +69,27 @@ class HostFaults:
 
     # Agents ---------------------------------------------------------------------------------------
 
-    def _kill(self, action: TimelineAction) -> None:
+    def _kill(self, action: TimelineAction) -> list[str]:
         if not self._goes_on:
             raise ActionRefused(words.MUST_CONTINUE)
         after_s = 0.0 if action.word == words.RESTART else action.for_s
         returns_s = None if after_s is None else self._port.now_s() + after_s
         why = words.killed_words(action)
         value = math.nan if after_s is None else after_s
-        told = 0
+        absent = []
         for agent in action.agents:
-            if self._send(agent, AgentFault(action.word, True, value, why)):
+            if self._send(agent, AgentFault(action.number, action.word, True, value, why)):
                 self.intended.order(agent, why, returns_s=returns_s)
-                told += 1
+            else:
+                absent.append(agent)
         self._port.session.await_returns(self.intended.are_expected(self._duration_s))
-        if not told:
-            raise ActionRefused(words.nobody_words(action))
+        return absent
 
-    def _order(self, action: TimelineAction, *, begins: bool) -> bool:
-        """Have agents begin or end a fault of their steps; return whether one of them is there."""
+    def _order(self, action: TimelineAction, *, begins: bool) -> list[str]:
+        """Have agents begin or end a fault of their steps; return who is not there."""
         factor = words.factor_of(action)
-        orders = [self._send(a, AgentFault(action.word, begins, factor)) for a in action.agents]
-        return any(orders)
+        order = AgentFault(action.number, action.word, begins, factor)
+        return [agent for agent in action.agents if not self._send(agent, order)]
 
     def _send(self, agent: str, order: AgentFault) -> bool:
         is_there = self._port.session.send(agent, order, Service.SYNC, monotonic())

@@ -11,6 +11,7 @@ from typing import Any
 from madns_runtime.config import RunConfig
 from madns_runtime.faults.step_faults import StepFaults
 from madns_runtime.plugin.api import Tick
+from madns_runtime.protocol.messages import AgentFault
 from madns_runtime.realtime.agent_calls import AGENT, IDLE, METHOD, STEP, T_S, LoopSeat
 from madns_runtime.realtime.agent_link import AgentPort
 from madns_runtime.realtime.late_ticks import LateTicks
@@ -108,10 +109,19 @@ class PacedTicks:
         self.pacer.finish(now_s)
         self.late.never_run(self.pacer.missed, monotonic())
 
-    def hinder(self, word: str, factor: float, *, begins: bool) -> StepFaults:
-        """Begin or end a fault of the steps, and return those in force: without any, steps cost what they did."""
+    def hinder(self, order: AgentFault) -> StepFaults | None:
+        """
+        Begin or end a fault of the steps.
+
+        Returns:
+            Those in force: without any, steps cost what they did. None if one is to end that this start of the agent
+            never had.
+        """
         faults, calls = self._faults, self._calls
-        (faults.begin if begins else faults.end)(word, factor)
+        if order.begins:
+            faults.begin(order.number, order.word, order.value)
+        elif not faults.end(order.number):
+            return None
         self._step = self._hindered if faults.are_in_force else calls.step
         # What comes between agents is heard with a step, in the next that is taken.
         self._prepare = None if faults.is_hung else calls.prepare

@@ -98,6 +98,14 @@ EVENTS = StreamSchema(
 )
 """State changes, losses, deadlines broken, and who was the cause."""
 
+EVENT_WORDS = (
+    "start", "end", "state", "phase", "scheduling", "agent", "agent_rejoined", "emergency", "not_stopped", "killed",
+    "hang_begins", "hang_ends", "slow_begins", "slow_ends", "clock_stepped", "clock_drift_begins", "clock_drift_ends",
+    "condition_met", "action_began", "action_ended", "action_refused", "action_resumed", "sync_deadline_broken", "device", "device_losses",
+    "fault",
+)  # fmt: skip
+"""All that `events` of agents and of the host's half hold in `event`: a simulation records its own in streams of its own."""
+
 LOG = StreamSchema(
     "log",
     (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -80,11 +80,14 @@ class ActionRefused(MadnsError):
 class ActionHandler(Protocol):
     """Carries out the actions of some words, at the host."""
 
-    def begin(self, action: TimelineAction) -> None:
+    def begin(self, action: TimelineAction) -> Sequence[str] | None:
         """
         Let the action take place.
 
         Called at its simulated time; in lockstep before the first tick at or after that.
+
+        Returns:
+            Those of its agents that are not there, where it takes place at the others alone.
 
         Raises:
             ActionRefused: It cannot.

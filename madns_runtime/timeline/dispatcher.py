@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any, Final
 
 from madns_runtime.timeline.action import ActionHandler, ActionRefused, TimelineAction
@@ -10,7 +11,11 @@ from madns_runtime.timeline.action import ActionHandler, ActionRefused, Timeline
 BEGAN: Final = "action_began"
 ENDED: Final = "action_ended"
 REFUSED: Final = "action_refused"
+RESUMED: Final = "action_resumed"
 T_S_DIGITS: Final = 6
+Resume = Callable[[TimelineAction, str], None]
+"""Lets an action that is in force take place anew at an agent that has returned."""
+_NOTHING: Final[Mapping[str, Resume]] = MappingProxyType({})
 
 
 class Dispatcher:
@@ -20,11 +25,18 @@ class Dispatcher:
     Args:
         handlers: By word. A word without one is refused: the time mode does not have it.
         record: Records an event, given its name and values.
+        resume: By word, of actions whose effect ends with their agent.
     """
 
-    def __init__(self, handlers: Mapping[str, ActionHandler], record: Callable[..., None]) -> None:
+    def __init__(
+        self,
+        handlers: Mapping[str, ActionHandler],
+        record: Callable[..., None],
+        resume: Mapping[str, Resume] = _NOTHING,
+    ) -> None:
         self._handlers = handlers
         self._record = record
+        self._resume = resume
         self._in_force: dict[int, TimelineAction] = {}
 
     @property
@@ -45,14 +57,22 @@ class Dispatcher:
         try:
             if handler is None:
                 raise ActionRefused(f"there is no action {action.word!r} in this run")
-            handler.begin(action)
+            absent = handler.begin(action)
         except ActionRefused as refusal:
             self._record(REFUSED, **described(action, now_s), reason=str(refusal))
             return str(refusal)
-        self._record(BEGAN, **described(action, now_s), for_s=action.for_s, lasts=lasts)
+        told = {"not_there": list(absent)} if absent else {}
+        self._record(BEGAN, **described(action, now_s), for_s=action.for_s, lasts=lasts, **told)
         if lasts:
             self._in_force[action.number] = action
         return ""
+
+    def resume(self, agent: str) -> None:
+        """Let what is in force go on at an agent that has returned: what it was told is gone with its former start."""
+        for action in self.in_force:
+            if agent in action.agents and (resume := self._resume.get(action.word)) is not None:
+                resume(action, agent)
+                self._record(RESUMED, number=action.number, action=action.word, agent=agent)
 
     def end(self, action: TimelineAction, due_s: float, now_s: float) -> str:
         """End one that is in force, due at *due_s*; return why that was refused, or ""."""

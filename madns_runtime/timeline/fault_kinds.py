@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final, Literal
 
-from annotated_types import Gt, Le
+from annotated_types import Ge, Gt, Le
 
 from madns_runtime.timeline.action import ActionKind, TimelineAction
 
@@ -59,8 +59,8 @@ class DelayedMessages:
     __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
 
     delay_s: Delay
-    jitter_s: Annotated[float, Le(DELAY_S_MAX)] = 0.0
-    """Up to so much is added, by chance; less than 0 adds nothing."""
+    jitter_s: Annotated[float, Ge(0), Le(DELAY_S_MAX)] = 0.0
+    """Up to so much is added, by chance."""
     traffic: Traffic = "all"
 
 

@@ -11,6 +11,7 @@ from madns_runtime.timeline.action import ActionKind, TimelineAction
 from madns_runtime.timeline.dispatcher import Dispatcher
 from madns_runtime.timeline.entries import ScheduledEntry
 from madns_runtime.timeline.schedule import DueAction, schedule
+from madns_runtime.written_times import later_s
 
 ORDERS_MAX: Final = 10_000
 """Actions of one run that conditions begin or that are ordered live; more are refused."""
@@ -102,6 +103,10 @@ class TimelineRunner:
             )
             self._begin(ordered, due.t_s, now_s)
 
+    def resume(self, agent: str) -> None:
+        """Let what is in force go on at an agent that has returned."""
+        self._dispatcher.resume(agent)
+
     def close(self) -> None:
         """Let nothing more begin or end: the run's simulated time is over."""
         self._position = len(self._due)
@@ -153,5 +158,6 @@ class TimelineRunner:
         lasts = kind is not None and (ordered.for_s is not None or kind.lasting == "may")
         refusal = self._dispatcher.begin(action, now_s, lasts=lasts)
         if not refusal and lasts and ordered.for_s is not None and not self._is_closed:
-            heapq.heappush(self._ends, (max(due_s, now_s) + ordered.for_s, action.number, action))
+            end_s = later_s(max(due_s, now_s), ordered.for_s)
+            heapq.heappush(self._ends, (end_s, action.number, action))
         return refusal

@@ -14,10 +14,13 @@ from hashlib import blake2b
 from typing import Final
 
 from madns_runtime.timeline.entries import ScheduledEntry
+from madns_runtime.written_times import later_s
 
 ACTIONS_MAX: Final = 10_000
 """Actions of one run that its timeline knows beforehand."""
 SECONDS_PER_HOUR: Final = 3600.0
+ROUNDING: Final = 1e-12
+"""Of a quotient of times: 1.2 s are twelve times 0.1 s."""
 _HALF_STEP: Final = 2.0**-54
 
 
@@ -58,7 +61,8 @@ def count_expected(entry: ScheduledEntry, duration_s: float) -> float:
     """Return how many actions an entry has, drawn ones on average."""
     end_s = _end_s(entry, duration_s)
     if entry.every_s is not None:
-        return max(0.0, math.floor((end_s - entry.from_s) / entry.every_s) + 1)
+        periods = (end_s - entry.from_s) / entry.every_s
+        return max(0.0, math.floor(periods * (1.0 + ROUNDING)) + 1)
     if entry.rate_per_h is not None:
         length_h = max(0.0, end_s - entry.from_s) / SECONDS_PER_HOUR
         return entry.rate_per_h * length_h * max(1, len(entry.agents))
@@ -78,7 +82,7 @@ def _due_of(
             yield DueAction(entry.at_s, place, entry.agents)
     elif entry.every_s is not None:
         for number in range(ACTIONS_MAX):
-            t_s = entry.from_s + number * entry.every_s
+            t_s = later_s(entry.from_s, entry.every_s, number)
             if t_s > end_s or t_s >= duration_s:
                 return
             yield DueAction(t_s, place, entry.agents)

@@ -36,6 +36,8 @@ def condition(**values):
         (ValueBounds.equals("lost"), ("lost",), ("found", 3)),
         (ValueBounds.within(-1.0, 1.0).negated(), (-1.1, 2), (0.5, 1.0)),
         (ValueBounds.equals("lost").negated(), ("found",), ("lost", 3)),
+        (ValueBounds(), ("lost", "", 3), ()),
+        (ValueBounds().negated(), (), ("lost", 3)),
     ],
 )
 def test_bounds_hold_for_values_within_and_never_for_none_of_their_kind(bounds, held, not_held):
@@ -59,6 +61,12 @@ def test_a_condition_that_has_to_hold_for_a_while_begins_anew_when_it_does_not()
     assert evaluator.look(4.5) is None
     assert evaluator.look(5.5) == 5.0
     assert evaluator.look(6.0) is None
+
+
+def test_a_while_that_is_no_binary_number_is_over_at_its_tick():
+    evaluator = ConditionEvaluator(condition(for_s=0.2))
+
+    assert [evaluator.take(tick / 10, 11.0) for tick in (1, 2, 3)] == [None, None, 0.3]
 
 
 def test_records_outside_its_times_do_not_count():

@@ -61,6 +61,31 @@ def test_a_biased_receiver_measures_beside_the_truth_which_stays_as_it_was(cosmo
     assert {by_m for t_s, by_m in moved.items() if not 20 <= t_s < 40} == {0.0}
 
 
+def test_a_receiver_stays_biased_over_a_restart_of_its_agent_until_its_end(cosmos, tmp_path):
+    fault = {"action": "sensor_fault", "sensor": "gnss", "fault": "biased", "bias": [500.0]}
+    both = ["agent-01", "agent-02"]
+    restart = {"at_s": 10, "action": "restart", "agents": both}
+    # One that lasts over the restart, and one that was over before: its end lifts nothing.
+    biased = {"at_s": 5, "agents": ["agent-01"], "for_s": 30} | fault
+    over = {"at_s": 5, "agents": ["agent-02"], "for_s": 3} | fault
+    runs = {}
+    for name, timeline in (("sound", [restart]), ("biased", [biased, over, restart])):
+        code, result = cosmos.run(write(tmp_path, name, timeline), "on_agent_loss=continue")
+        assert code == 0, result
+        runs[name] = cosmos.directory(result)
+
+    moved = {}
+    for agent in both:
+        measured = [rows(folder, agent, "gnss.2") for folder in runs.values()]
+        by_m = [(round(a[1]), round(b[2] - a[2], 3)) for a, b in zip(*measured, strict=True)]
+        moved[agent] = [t_s for t_s, metres in by_m if metres == 500.0]
+    assert moved["agent-01"][-1] == 34 and len(moved["agent-01"]) >= 23
+    assert moved["agent-02"] == []
+    events = (runs["biased"] / "host/events.jsonl").read_text().splitlines()
+    resumed = [e for e in map(json.loads, events) if e.get("event") == "action_resumed"]
+    assert [(e["agent"], e["action"]) for e in resumed] == [("agent-01", "sensor_fault")]
+
+
 def test_a_stuck_thruster_repeats_to_the_bit_and_moves_its_vehicle_alone(cosmos, tmp_path):
     stuck = {"at_s": 10, "action": "stick_thruster_open", "agents": ["agent-01"], "for_s": 30}
     thruster = "{isp_s: 220, propellant_kg: 2, thrust_n: 1}"

@@ -262,15 +262,25 @@ def test_what_is_held_back_has_a_bound(monkeypatch):
 
 def test_a_slow_agent_steps_in_one_of_so_many_ticks_and_a_hung_one_in_none():
     faults = StepFaults()
-    faults.begin("slow", 3.0)
+    faults.begin(1, "slow", 3.0)
     assert [tick for tick in range(9) if not faults.withholds(tick)] == [0, 3, 6]
 
-    faults.begin("hang")
+    faults.begin(2, "hang")
     assert all(faults.withholds(tick) for tick in range(9))
-    faults.end("hang")
-    faults.end("slow", 3.0)
+    assert faults.end(2) and faults.end(1)
     assert not faults.are_in_force
     assert faults.withheld == 6 + 9
+
+
+def test_the_end_of_a_fault_that_an_earlier_start_had_leaves_the_one_of_now_in_force():
+    faults = StepFaults()
+    faults.begin(7, "hang")
+    faults.begin(8, "slow", 3.0)
+
+    assert not faults.end(3) and not faults.end(4), "a hang and a slow 3.0 from before the restart"
+    assert (faults.is_hung, faults.factor) == (True, math.inf)
+    assert faults.end(7)
+    assert (faults.is_hung, faults.factor) == (False, 3.0)
 
 
 def test_a_loss_that_was_ordered_is_excused_once_and_a_return_that_failed_is_not():

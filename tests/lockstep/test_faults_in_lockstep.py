@@ -118,6 +118,20 @@ def test_an_agent_that_is_killed_returns_when_it_is_said_and_is_not_judged(run_f
     assert said == ["start", "killed", "emergency", "end"]
 
 
+def test_an_agent_that_is_away_is_named_and_the_others_take_part(run_faults):
+    timeline = [
+        entry("kill", at_s=at_s, for_s=0.4, agents=who) for at_s, who in ((0.2, A4), (0.4, SOME))
+    ]
+    run = run_faults(*timeline, entry("hang", SOME, at_s=0.5, for_s=0.1))
+    result = run.result()
+
+    assert result["lost_on_purpose"] == list(SOME)
+    began = [e for e in run.events_of("host") if e["event"].startswith("action_began")]
+    assert [e.get("not_there") for e in began] == [None, ["agent-04"]]
+    (refused,) = [e for e in run.events_of("host") if e["event"] == "action_refused"]
+    assert "agent-02, agent-04: not running" in refused["reason"]
+
+
 def test_everybody_may_be_killed_if_some_return(run_faults):
     run = run_faults(entry("kill", ALL, for_s=0.3))
     result = run.result()
@@ -132,8 +146,19 @@ def test_a_hung_agent_takes_no_step_and_its_records_say_which(run_faults):
 
     assert steps(run) == [0, 1, 2, 6, 7, 8, 9]
     events = {e["event"]: e for e in run.events_of("agents/agent-04")}
-    assert events["hang_begins"]["t_s"] == pytest.approx(0.2)
+    assert events["hang_begins"]["t_s"] == pytest.approx(0.3)
+    assert events["hang_ends"]["t_s"] == pytest.approx(0.6)
     assert events["hang_ends"]["ticks_withheld"] == 3
+
+
+def test_the_end_of_a_hang_from_before_a_restart_leaves_the_next_one_in_force(run_faults):
+    first, second = entry("hang", at_s=0.1, for_s=0.5), entry("hang", at_s=0.5, for_s=0.3)
+    run = run_faults(first, entry("restart", at_s=0.2), second)
+    run.result()
+
+    assert steps(run, life=".2") == [4, 8, 9]
+    said = [(e["event"], round(e["t_s"], 3)) for e in run.events_of("agents/agent-04", life=".2")]
+    assert said[1:3] == [("hang_begins", 0.5), ("hang_ends", 0.8)]
 
 
 def test_a_link_that_is_down_loses_telemetry_and_delays_the_rest(run_faults):

@@ -73,7 +73,7 @@ EXAMPLES = (
     ),
     FaultOrder(number=3, device="pi22/imu", action="bias", value=0.5),
     ConditionMet(number=3, t_s=1.5),
-    AgentFault(word="slow", begins=True, value=2.5),
+    AgentFault(number=4, word="slow", begins=True, value=2.5),
 )
 
 SCALARS = (

@@ -28,10 +28,10 @@ def run(tmp_path):
     """Run the scenario with checks; return the exit code and run.json."""
     cosmos = CosmosCommand(tmp_path)
 
-    def run(mode, *checks, settings=LOOSE, options=("--no-report",)):
+    def run(mode, *checks, settings=LOOSE, options=("--no-report",), timeline=""):
         path = tmp_path / "expected.yaml"
         listed = "".join(f"  - {check}\n" for check in checks)
-        text = SCENARIO.replace("MODE", mode) + (f"checks:\n{listed}" if checks else "")
+        text = SCENARIO.replace("MODE", mode) + (f"checks:\n{listed}" if checks else "") + timeline
         path.write_text(text, "utf-8")
         return cosmos.run(path, *settings, options=options)
 
@@ -84,6 +84,18 @@ def test_what_a_time_mode_does_not_record_is_not_judged_and_alone_no_pass(run):
     assert (alone, other["verdict"][:15]) == (5, "DATA INCOMPLETE")
 
 
+def test_a_rate_is_of_the_time_that_a_run_which_was_stopped_had(run):
+    rate = "{name: rate, stream: round_trips, statistic: rate, within: [19, 21]}"
+
+    code, document = run("lockstep", rate, timeline="timeline: [{at_s: 2, action: stop}]\n")
+    again = run.cosmos("judge", document["run"], "--json")
+
+    assert (code, document["duration_s"]) == (0, 2.0)
+    check = of_name(document, "rate")
+    assert check["got"] == pytest.approx(20, abs=1)
+    assert of_name(json.loads(again.stdout), "rate") == check
+
+
 def test_a_finished_run_is_judged_by_expectations_it_did_not_have_and_again_after_collect(run):
     code, document = run("realtime", OF_TICKS, OF_HEALTH, OF_LOG, options=())
     cosmos, name = run.cosmos, document["run"]
@@ -118,6 +130,24 @@ def test_a_finished_run_is_judged_by_expectations_it_did_not_have_and_again_afte
     assert refused.returncode == 2
     assert "foreign.yaml:7:" in refused.stderr and "no agent is named agent-09" in refused.stderr
     assert of_name(json.loads(collected.stdout), "prompt") == check
+
+
+def test_a_run_whose_tables_are_cut_is_not_judged_by_what_is_left(run):
+    _, document = run("lockstep", LASTING)
+    tables = run.cosmos.directory(document) / "tables"
+    (table,) = tables.glob("round_trips*")
+    table.write_bytes(table.read_bytes()[:-100])
+
+    cut = run.cosmos("judge", document["run"])
+    table.unlink()
+    gone = run.cosmos("judge", document["run"])
+    run.cosmos("collect", document["run"])
+    anew = run.cosmos("judge", document["run"])
+
+    assert (cut.returncode, gone.returncode) == (2, 2)
+    for refused in (cut, gone):
+        assert "not as it was collected; make it anew with: cosmos collect" in refused.stderr
+    assert (anew.returncode, "PASSED" in anew.stdout) == (0, True)
 
 
 def test_a_run_without_checks_is_judged_by_none(run):

@@ -51,6 +51,7 @@ def test_orders_are_taken_listed_refused_and_recorded_and_a_stop_completes_the_r
     assert {"annotate", "stop", "device_fault", "slow", "kill"} <= {
         each["action"] for each in listed["actions"]
     }
+    assert [e["parameters"] for e in listed["actions"] if e["action"] == "slow"] == [["factor"]]
     # Of real time alone.
     assert not {"stress", "step_clock", "drift_clock"} & {e["action"] for e in listed["actions"]}
     assert [each["parameters"] for each in listed["in_force"]] == [{"text": "hello"}]

@@ -37,6 +37,40 @@ def a_dispatcher() -> tuple[Dispatcher, Heard, list[tuple[str, dict[str, Any]]]]
     return Dispatcher({"kill": handler}, record), handler, events
 
 
+def test_agents_that_are_not_there_are_named_where_others_are() -> None:
+    class Finding(Heard):
+        def begin(self, action: TimelineAction) -> list[str]:  # type: ignore[override]  # as the protocol has it
+            return [agent for agent in action.agents if agent == "agent-02"]
+
+    events: list[dict[str, Any]] = []
+    dispatcher = Dispatcher({"kill": Finding()}, lambda event, **values: events.append(values))
+
+    dispatcher.begin(an_action(0, "kill", "agent-01", "agent-02"), 1.0, lasts=False)
+    dispatcher.begin(an_action(1, "kill", "agent-01"), 1.0, lasts=False)
+
+    assert [each.get("not_there") for each in events] == [["agent-02"], None]
+
+
+def test_what_is_in_force_goes_on_at_an_agent_that_has_returned() -> None:
+    resumed: list[tuple[int, str]] = []
+    events: list[str] = []
+    dispatcher = Dispatcher(
+        {"brake": Heard(), "kill": Heard()},
+        lambda event, **values: events.append(event),
+        {"brake": lambda action, agent: resumed.append((action.number, agent))},
+    )
+    for number, word in enumerate(("brake", "kill", "brake", "brake")):
+        who = ("agent-01", "agent-02") if number < 3 else ("agent-01",)
+        dispatcher.begin(an_action(number, word, *who), 1.0, lasts=number != 2)
+
+    dispatcher.resume("agent-02")
+    dispatcher.end(an_action(0, "brake", "agent-01", "agent-02"), 3.0, 3.0)
+    dispatcher.resume("agent-02")
+
+    assert resumed == [(0, "agent-02")]
+    assert events.count("action_resumed") == 1
+
+
 def test_an_action_that_lasts_is_in_force_until_its_end() -> None:
     dispatcher, handler, events = a_dispatcher()
     action = an_action()

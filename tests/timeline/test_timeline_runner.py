@@ -63,6 +63,17 @@ def test_what_lasts_ends_and_ends_come_before_begins() -> None:
     assert runner.in_force == ()
 
 
+def test_an_end_that_is_no_binary_number_comes_at_its_tick() -> None:
+    runner, _, events = a_runner(
+        ScheduledEntry(action="kill", at_s=0.1, for_s=0.2, agents=("a",)),
+    )
+
+    runner.run_due(0.1)
+    runner.run_due(0.3)
+
+    assert [each["event"] for each in events] == ["action_began", "action_ended"]
+
+
 def test_without_for_s_an_action_is_in_force_until_the_end_of_the_run() -> None:
     runner, _, events = a_runner(ScheduledEntry(action="kill", at_s=10.0, agents=("a",)))
 

@@ -24,6 +24,19 @@ def test_the_end_of_the_run_is_no_time_for_an_action() -> None:
     assert times(ScheduledEntry(action="a", every_s=50.0)) == [(0.0, 0), (50.0, 0)]
 
 
+@pytest.mark.parametrize("tick_hz", [1, 2, 5, 10, 20, 50, 100])
+def test_a_period_that_is_no_binary_number_meets_its_ticks_and_its_last_time(tick_hz: int) -> None:
+    for last in (3, 6, 7, 12, 1234):
+        every = ScheduledEntry(action="a", every_s=1 / tick_hz, to_s=last / tick_hz)
+
+        found = times(every, duration_s=10_000.0)
+
+        assert found[:13] == [(number / tick_hz, 0) for number in range(min(last + 1, 13))]
+        assert count_expected(every, 10_000.0) == last + 1
+    tenths = times(ScheduledEntry(action="a", every_s=0.1, from_s=0.1), duration_s=400.0)
+    assert [t_s for t_s, _ in tenths] == [number / 10 for number in range(1, 4000)]
+
+
 def test_a_condition_has_no_time_beforehand() -> None:
     assert times(ScheduledEntry(action="a", condition=0)) == []
 

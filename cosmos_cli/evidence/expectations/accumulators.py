@@ -13,6 +13,7 @@ from madns_runtime.conditions.condition import ValueBounds
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Places = NDArray[np.int64]
 P99 = 0.99
 OCCURRENCES_KEPT = 100_000
 """Times of an event that are kept, the first ones; the others are counted."""
@@ -25,16 +26,23 @@ Found = tuple[float | None, float | None]
 class Accumulator(ABC):
     """One statistic."""
 
-    def take(self, t_s: Floats, values: NDArray[Any]) -> None:
-        """Take a batch: times, s, and values, none of which is missing; shape (N,) each, N at least 1."""
-        self._take(t_s, values)
+    def take(self, t_s: Floats, values: NDArray[Any], places: Places) -> None:
+        """
+        Take a batch; shape (N,) each, N at least 1.
+
+        Args:
+            t_s: Times, s.
+            values: None of which is missing.
+            places: Among all records of whoever recorded them: what tells the order of those of one time.
+        """
+        self._take(t_s, values, places)
 
     def result(self) -> Found:
         """Return what all batches came to."""
         return self._found_now()
 
     @abstractmethod
-    def _take(self, t_s: Floats, values: NDArray[Any]) -> None: ...
+    def _take(self, t_s: Floats, values: NDArray[Any], places: Places) -> None: ...
 
     @abstractmethod
     def _found_now(self) -> Found: ...
@@ -45,7 +53,7 @@ def holds(bounds: ValueBounds, values: NDArray[Any]) -> Flags:
     if bounds.text is not None:
         found: Flags = _are(values, bounds.text) != bounds.is_negated
         return found
-    numbers = values.astype(np.float64)
+    numbers = _numbers(values)
     within = np.ones(len(numbers), bool)
     if bounds.low is not None:
         within &= numbers >= bounds.low if bounds.is_closed else numbers > bounds.low
@@ -53,6 +61,15 @@ def holds(bounds: ValueBounds, values: NDArray[Any]) -> Flags:
         within &= numbers <= bounds.high if bounds.is_closed else numbers < bounds.high
     held: Flags = (within != bounds.is_negated) & ~np.isnan(numbers)
     return held
+
+
+def _numbers(values: NDArray[Any]) -> Floats:
+    """Return values as numbers: NaN where one is none, such as a text in a field whose kind nobody declared."""
+    if values.dtype != object:
+        return values.astype(np.float64)
+    return np.array(
+        [each if isinstance(each, int | float) else math.nan for each in values.tolist()], float
+    )
 
 
 def excess(bounds: ValueBounds, values: Floats) -> Floats:
@@ -73,7 +90,7 @@ class Worst(Accumulator):
         self._excess = -math.inf
         self._found: Found = (None, None)
 
-    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
+    def _take(self, t_s: Floats, values: NDArray[Any], places: Places) -> None:
         numbers = values.astype(np.float64)
         beyond = excess(self._bounds, numbers)
         at = int(np.argmax(beyond))
@@ -93,7 +110,7 @@ class Unlike(Accumulator):
         self._count: int | None = None
         self._first_s: float | None = None
 
-    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
+    def _take(self, t_s: Floats, values: NDArray[Any], places: Places) -> None:
         unlike = np.flatnonzero(~holds(self._bounds, values))
         self._count = (self._count or 0) + len(unlike)
         if len(unlike) and self._first_s is None:
@@ -110,7 +127,7 @@ class Last(Accumulator):
         self._bounds = bounds
         self._found: Found = (None, None)
 
-    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
+    def _take(self, t_s: Floats, values: NDArray[Any], places: Places) -> None:
         if self._bounds.text is not None:
             value = float(not holds(self._bounds, values[-1:])[0])
         else:
@@ -129,7 +146,7 @@ class Mean(Accumulator):
         self._sum = 0.0
         self._count = 0
 
-    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
+    def _take(self, t_s: Floats, values: NDArray[Any], places: Places) -> None:
         self._sum += float(np.sum(values.astype(np.float64) ** self._power))
         self._count += len(values)
 
@@ -148,7 +165,7 @@ class StandardDeviation(Accumulator):
         self._mean = 0.0
         self._squares = 0.0
 
-    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
+    def _take(self, t_s: Floats, values: NDArray[Any], places: Places) -> None:
         numbers = values.astype(np.float64)
         mean = float(np.mean(numbers))
         count = self._count + len(numbers)
@@ -175,7 +192,7 @@ class Percentile99(Accumulator):
         self._kept: Floats = np.empty(0)
         self._count = 0
 
-    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
+    def _take(self, t_s: Floats, values: NDArray[Any], places: Places) -> None:
         self._count += len(values)
         kept = np.concatenate((self._kept, values.astype(np.float64)))
         if len(kept) > self._kept_max:
@@ -203,7 +220,7 @@ class Counted(Accumulator):
         self._per_s = per_s
         self._count = 0
 
-    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
+    def _take(self, t_s: Floats, values: NDArray[Any], places: Places) -> None:
         held = len(values) if self._when is None else np.count_nonzero(holds(self._when, values))
         self._count += int(held)
 
@@ -217,11 +234,14 @@ class FirstTime(Accumulator):
     def __init__(self, when: ValueBounds) -> None:
         self._when = when
         self._first_s: float | None = None
+        self.place: int | None = None
+        """Of its record."""
 
-    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
-        held = t_s[holds(self._when, values)]
+    def _take(self, t_s: Floats, values: NDArray[Any], places: Places) -> None:
+        held = np.flatnonzero(holds(self._when, values))
         if len(held) and self._first_s is None:
-            self._first_s = float(held.min())
+            at = held[np.argmin(t_s[held])]
+            self._first_s, self.place = float(t_s[at]), int(places[at])
 
     def _found_now(self) -> Found:
         return self._first_s, self._first_s
@@ -234,7 +254,7 @@ class Settled(Accumulator):
         self._when = when
         self._since_s: float | None = None
 
-    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
+    def _take(self, t_s: Floats, values: NDArray[Any], places: Places) -> None:
         outside = np.flatnonzero(~holds(self._when, values))
         if len(outside):
             after = int(outside[-1]) + 1
@@ -247,20 +267,21 @@ class Settled(Accumulator):
 
 
 class Occurrences(Accumulator):
-    """The times of an event, in order of recording."""
+    """The times of an event, s, and the places of its records, in order of recording."""
 
     def __init__(self, word: str) -> None:
         self._word = word
         self.count = 0
-        self.times_s: list[float] = []
+        self.found: list[tuple[float, int]] = []
 
-    def _take(self, t_s: Floats, values: NDArray[Any]) -> None:
-        found = t_s[_are(values, self._word)]
+    def _take(self, t_s: Floats, values: NDArray[Any], places: Places) -> None:
+        found = np.flatnonzero(_are(values, self._word))
         self.count += len(found)
-        self.times_s += found[: OCCURRENCES_KEPT - len(self.times_s)].tolist()
+        kept = found[: OCCURRENCES_KEPT - len(self.found)]
+        self.found += zip(t_s[kept].tolist(), places[kept].tolist(), strict=True)
 
     def _found_now(self) -> Found:
-        first_s = min(self.times_s, default=None)
+        first_s = min((t_s for t_s, _ in self.found), default=None)
         return first_s, first_s
 
 

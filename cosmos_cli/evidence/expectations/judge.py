@@ -31,12 +31,14 @@ from cosmos_cli.evidence.expectations.outcomes import (
 from cosmos_cli.evidence.expectations.records import Batch, RecordSource
 from cosmos_cli.evidence.verdict import CheckResult
 from cosmos_cli.models.expectation import Expectation, scaled
+from cosmos_cli.models.known_streams import REAL_TIME_ONLY
 from madns_runtime.analysis.tables import Tables
 from madns_runtime.conditions.condition import HOST, ValueBounds
 from madns_runtime.units import conversion
 
-OTHER_MODE = "its stream is recorded in real time alone, and this run was in lockstep"
 RATE_UNIT = "1/s"
+_Earlier = tuple[str, Mapping[str, ExpectationOutcome]]
+"""The stream of an expectation further up, and what its agents came to."""
 NOBODY = ""
 """Stands for the machines or devices that should have recorded a stream, and of which there is none."""
 OF_NUMBERS = ("count", "rate")
@@ -94,19 +96,26 @@ def judge_expectations(
         fields = list(dict.fromkeys(each.expectation.field for each in own))
         for batch in source.batches(stream, [name for name in fields if name]):
             _give(batch, own)
-    times: dict[str, Mapping[str, ExpectationOutcome]] = {}
+    earlier: dict[str, _Earlier] = {}
     results = []
     for each in followed:
-        outcomes = each.outcomes(times)
-        times[each.expectation.name] = outcomes
+        outcomes = each.outcomes(earlier)
+        earlier[each.expectation.name] = each.expectation.stream, outcomes
         result = worst_result(each.expectation, outcomes, each.unit, duration_s=duration_s)
         results.append(
             result if source.has_time(each.expectation.stream) else replace(result, t_s=None)
         )
     return JudgedExpectations(
         results=tuple(results),
-        not_judged={each.name: OTHER_MODE for each in expectations if each not in judged},
+        not_judged={each.name: _of_other_mode(each) for each in expectations if each not in judged},
     )
+
+
+def _of_other_mode(expectation: Expectation) -> str:
+    held = expectation.meanwhile
+    is_held = held is not None and held.stream in REAL_TIME_ONLY
+    stream = held.stream if held is not None and is_held else expectation.stream
+    return f"stream {stream} is recorded in real time alone, and this run was in lockstep"
 
 
 def _give(batch: Batch, followed: Sequence[_Followed]) -> None:
@@ -169,7 +178,9 @@ class _Followed:
         wanted = np.ones(len(batch.t_s), bool)
         if expectation.from_s is not None:
             wanted &= batch.t_s >= expectation.from_s
-        if expectation.to_s is not None and not expectation.event:
+        if expectation.to_s is not None and expectation.statistic == "rate":
+            wanted &= batch.t_s < expectation.to_s  # from 2 s to 5 s are 30 ticks at 10 Hz, not 31
+        elif expectation.to_s is not None and not expectation.event:
             wanted &= batch.t_s <= expectation.to_s
         if self._held is not None:
             wanted &= self._held.during(batch.agent, batch.t_s)
@@ -183,7 +194,7 @@ class _Followed:
         accumulator = self._accumulators.get(batch.agent)
         if accumulator is None:
             accumulator = self._accumulators[batch.agent] = self._accumulator()
-        accumulator.take(batch.t_s, batch.values)
+        accumulator.take(batch.t_s, batch.values, batch.places)
 
     def _accumulator(self) -> Accumulator:  # noqa: PLR0911 - a table of what each statistic is
         expectation = self.expectation
@@ -221,12 +232,10 @@ class _Followed:
             return expectation.bounds
         return scaled(expectation.bounds, self._factor)
 
-    def outcomes(
-        self, times: Mapping[str, Mapping[str, ExpectationOutcome]]
-    ) -> dict[str, ExpectationOutcome]:
-        """Return what each agent came to; *times* are those of the expectations before."""
+    def outcomes(self, earlier: Mapping[str, _Earlier]) -> dict[str, ExpectationOutcome]:
+        """Return what each agent came to, given the same of the expectations before."""
         expectation = self.expectation
-        after = times.get(expectation.after) if expectation.after else None
+        after = earlier.get(expectation.after) if expectation.after else None
         found = {}
         for agent in self._names or (NOBODY,):
             accumulator = self._accumulators.get(agent)
@@ -245,11 +254,15 @@ class _Followed:
         self,
         agent: str,
         accumulator: Accumulator | None,
-        after: Mapping[str, ExpectationOutcome] | None,
+        after: _Earlier | None,
     ) -> ExpectationOutcome:
         expectation = self.expectation
         if isinstance(accumulator, Occurrences):
-            return outcome_of_event(expectation, agent, accumulator, after)
+            stream, outcomes = after or ("", None)
+            is_same = stream == expectation.stream
+            return outcome_of_event(
+                expectation, agent, accumulator, outcomes, is_same_stream=is_same
+            )
         got, t_s = (None, None) if accumulator is None else accumulator.result()
         if got is None or not np.isfinite(got):
             return ExpectationOutcome(got=None, t_s=t_s, passed=False, why=self._fault or "")
@@ -257,7 +270,8 @@ class _Followed:
         passed = got == 0.0 if bounds.text is not None else bounds.holds(got)
         is_value = expectation.statistic not in (*OF_NUMBERS, *OF_TIMES)
         shown = got / self._factor if is_value and bounds.text is None else got
-        return ExpectationOutcome(got=shown, t_s=t_s, passed=passed)
+        place = accumulator.place if isinstance(accumulator, FirstTime) else None
+        return ExpectationOutcome(got=shown, t_s=t_s, passed=passed, place=place)
 
 
 def _text_of(expectation: Expectation) -> bool:

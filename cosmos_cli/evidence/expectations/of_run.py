@@ -11,6 +11,7 @@ from cosmos_cli.evidence.remarks import declared_streams
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.run_documents import EXPECTATIONS
 from cosmos_cli.evidence.table_labels import run_labels
+from cosmos_cli.evidence.verdict import is_number
 from cosmos_cli.models.checks import Surroundings, resolve_checks
 from cosmos_cli.models.expectation import Expectation
 from cosmos_cli.models.known_streams import KnownDevice, KnownStreams
@@ -33,17 +34,26 @@ def planned_expectations(plan: Mapping[str, Any] | None) -> tuple[Expectation, .
 
 
 def judge_run(
-    run: RunDirectory, tables: Tables, expectations: Sequence[Expectation]
+    run: RunDirectory, tables: Tables, expectations: Sequence[Expectation], ran_s: object
 ) -> JudgedExpectations:
-    """Judge expectations over a gathered run's tables; none where its settings are lost."""
+    """
+    Judge expectations over a gathered run's tables; none where its settings are lost.
+
+    Args:
+        run: The run.
+        tables: Its own.
+        expectations: What is judged.
+        ran_s: Simulated time that its host tells, s, which a stop shortens; anything else for what was planned.
+    """
     config = run.read_config()
     if config is None or not expectations:
         return JudgedExpectations()
+    planned_s = config.time.duration_s
     return judge_expectations(
         expectations,
         tables,
         is_lockstep=config.time.is_lockstep,
-        duration_s=config.time.duration_s,
+        duration_s=min(float(ran_s), planned_s) if is_number(ran_s) and ran_s > 0 else planned_s,
     )
 
 

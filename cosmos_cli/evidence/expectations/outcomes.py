@@ -10,6 +10,7 @@ from cosmos_cli.evidence.expectations.accumulators import Occurrences
 from cosmos_cli.evidence.verdict import CheckResult
 from cosmos_cli.models.expectation import Expectation, owner_of
 from madns_runtime.conditions.condition import HOST
+from madns_runtime.written_times import later_s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,6 +22,8 @@ class ExpectationOutcome:
     t_s: float | None
     """Simulated time of it, s."""
     passed: bool
+    place: int | None = None
+    """Of its record, where others may come after it."""
     why: str = ""
     """Why there is none, if that is known."""
 
@@ -30,6 +33,8 @@ def outcome_of_event(
     agent: str,
     found: Occurrences,
     after: Mapping[str, ExpectationOutcome] | None,
+    *,
+    is_same_stream: bool,
 ) -> ExpectationOutcome:
     """
     Return whether an event occurred, or did not, as it must.
@@ -39,30 +44,41 @@ def outcome_of_event(
         agent: Whose event.
         found: Times of it, from `from_s` on.
         after: By agent: the times that it is to come after; None for none.
+        is_same_stream: Whether these are of the same stream: then of one time the later record comes after.
     """
     must_not = expectation.must == "not_occur"
     begin_s, latest_s = -math.inf, expectation.to_s
+    behind = -1
     if after is not None:
-        other = after.get(agent) or _of_owner(after, agent) or after.get(HOST)
+        other = after.get(agent) or _of_owner(after, agent) or after.get(HOST) or _only(after)
         if other is None or other.t_s is None:
             return ExpectationOutcome(got=0.0 if must_not else None, t_s=None, passed=must_not)
         begin_s = other.t_s
+        if is_same_stream and agent in after and other.place is not None:
+            behind = other.place
         if expectation.within_s is not None:
-            end_s = begin_s + expectation.within_s
+            end_s = later_s(begin_s, expectation.within_s)
             latest_s = end_s if latest_s is None else min(latest_s, end_s)
-    times_s = [each for each in found.times_s if each >= begin_s]
-    first_s = min(times_s, default=None)
+    later = [each for each in found.found if each[0] >= begin_s and each[1] > behind]
     if must_not:
-        wrong = [each for each in times_s if latest_s is None or each <= latest_s]
+        wrong = [t_s for t_s, _ in later if latest_s is None or t_s <= latest_s]
         return ExpectationOutcome(got=len(wrong), t_s=min(wrong, default=None), passed=not wrong)
-    passed = first_s is not None and (latest_s is None or first_s <= latest_s)
-    return ExpectationOutcome(got=first_s, t_s=first_s, passed=passed)
+    if not later:
+        return ExpectationOutcome(got=None, t_s=None, passed=False)
+    first_s, place = min(later)
+    is_in_time = latest_s is None or first_s <= latest_s
+    return ExpectationOutcome(got=first_s, t_s=first_s, passed=is_in_time, place=place)
 
 
 def _of_owner(outcomes: Mapping[str, ExpectationOutcome], name: str) -> ExpectationOutcome | None:
     """Return what an agent came to, or its one device, for a device or for an agent."""
     own = [each for other, each in outcomes.items() if owner_of(other) == owner_of(name)]
     return own[0] if len(own) == 1 else None
+
+
+def _only(outcomes: Mapping[str, ExpectationOutcome]) -> ExpectationOutcome | None:
+    """Return what the one agent came to that there is: all others may come after it."""
+    return next(iter(outcomes.values())) if len(outcomes) == 1 else None
 
 
 def worst_result(

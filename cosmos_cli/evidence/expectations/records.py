@@ -10,7 +10,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from cosmos_cli.evidence.expectations.accumulators import Floats
+from cosmos_cli.evidence.expectations.accumulators import Floats, Places
 from madns_runtime.analysis.tables import RecordedTable, Tables
 from madns_runtime.conditions.condition import AGENT, HOST, TIME
 from madns_runtime.recording.records import HEALTH, Field
@@ -37,6 +37,8 @@ class Batch:
     columns: Mapping[str, NDArray[Any]]
     values: NDArray[Any]
     """Of the field that was chosen; else empty."""
+    places: Places
+    """Of the records, among all of whoever recorded them."""
 
     def has(self, field: str) -> bool:
         """Tell whether the records have a field."""
@@ -62,7 +64,13 @@ class Batch:
     def _where(self, wanted: NDArray[np.bool_], values: NDArray[Any]) -> Batch:
         if wanted.all():
             return replace(self, values=values)
-        return replace(self, t_s=self.t_s[wanted], columns={}, values=values[wanted])
+        return replace(
+            self,
+            t_s=self.t_s[wanted],
+            columns={},
+            values=values[wanted],
+            places=self.places[wanted],
+        )
 
 
 class RecordSource:
@@ -112,27 +120,27 @@ class RecordSource:
             wanted = {*own, *filter(None, [time]), *([AGENT] if has_agents else [])}
             names = list(wanted | ({DETAILS} if beside else set())) or [next(iter(present))]
             for source in table.sources:
+                first, last_s = 0, None
                 for columns in table.batches(source, names, BATCH_RECORDS):
                     columns = _with_details(columns, beside)
-                    yield from _split(
-                        table, source, columns, _times(columns, time), has_agents=has_agents
+                    t_s, last_s = _times(columns, time, last_s)
+                    whole = Batch(
+                        agent=source,
+                        is_of_host=table.role == HOST,
+                        t_s=t_s,
+                        columns=columns,
+                        values=np.empty(0),
+                        places=np.arange(first, first + len(t_s)),
                     )
+                    first += len(t_s)
+                    yield whole
+                    if has_agents:
+                        yield from _split(whole)
 
 
-def _split(
-    table: RecordedTable,
-    source: str,
-    columns: Mapping[str, NDArray[Any]],
-    t_s: Floats,
-    *,
-    has_agents: bool,
-) -> Iterator[Batch]:
-    is_of_host = table.role == HOST
-    whole = Batch(agent=source, is_of_host=is_of_host, t_s=t_s, columns=columns, values=np.empty(0))
-    yield whole
-    if not has_agents:
-        return
-    agents = columns[AGENT].astype(str)
+def _split(whole: Batch) -> Iterator[Batch]:
+    """Yield the records of the host's half once more, by the agent that each is about."""
+    agents = whole.columns[AGENT].astype(str)
     names, inverse = np.unique(agents, return_inverse=True)
     order = np.argsort(inverse, kind="stable")
     ends = np.cumsum(np.bincount(inverse, minlength=len(names)))
@@ -140,8 +148,9 @@ def _split(
         yield replace(
             whole,
             agent=name,
-            t_s=t_s[rows],
-            columns={key: values[rows] for key, values in columns.items()},
+            t_s=whole.t_s[rows],
+            columns={key: values[rows] for key, values in whole.columns.items()},
+            places=whole.places[rows],
         )
 
 
@@ -154,13 +163,28 @@ def _time_field(stream: str, fields: Sequence[Field]) -> str | None:
     return next((each.name for each in fields if each.unit == "s" and each.kind == "float"), None)
 
 
-def _times(columns: Mapping[str, NDArray[Any]], time: str | None) -> Floats:
-    """Return the simulated time of each record, s: 0 of those from before it ran."""
+def _times(
+    columns: Mapping[str, NDArray[Any]], time: str | None, last_s: float | None
+) -> tuple[Floats, float | None]:
+    """
+    Return the simulated time of each record, s, and the last that is known; *last_s* is that of the batch before.
+
+    Records of whoever does not know the time yet are of time 0, and of an agent that was started anew of the first
+    time that it knows.
+    """
     if time is None:
-        return np.zeros(len(next(iter(columns.values()))))
+        return np.zeros(len(next(iter(columns.values())))), None
     values = columns[time]
     numbers = values.astype(np.float64) if values.dtype != object else _floats(values)
-    return np.where(np.isnan(numbers), 0.0, numbers)
+    known = np.flatnonzero(~np.isnan(numbers))
+    if len(known) < len(numbers):
+        begins = 0 if last_s is not None else int(known[0]) if len(known) else len(numbers)
+        behind = numbers[known[-1]] if len(known) else (last_s or 0.0)
+        after = np.searchsorted(known, np.arange(len(numbers)))
+        numbers = np.append(numbers[known], behind)[after]
+        numbers[:begins] = 0.0
+    newest_s = float(numbers[known[-1]]) if len(known) else last_s
+    return np.maximum(numbers, 0.0), newest_s
 
 
 def _floats(values: NDArray[Any]) -> Floats:

@@ -1,6 +1,7 @@
 """Expectations judged over all records: each statistic against numpy, events in order, units, and what is not there."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -121,7 +122,8 @@ def test_a_statistic_is_that_of_all_records_in_its_time_however_they_are_read(
         statistic=statistic, bounds=ValueBounds.below(1e9), from_s=20.0, to_s=70.0, agents=("a",)
     )
 
-    wanted = STATISTICS[statistic](DATA["a"][(T_S >= 20.0) & (T_S <= 70.0)])
+    until = T_S < 70.0 if statistic == "rate" else T_S <= 70.0
+    wanted = STATISTICS[statistic](DATA["a"][(T_S >= 20.0) & until])
     assert result.got == pytest.approx(wanted, rel=1e-12)
     assert result.passed
 
@@ -247,6 +249,118 @@ def test_events_are_judged_in_their_order_and_within_a_time():
     assert (nothing.passed, nothing.got) == (False, None)
 
 
+def events_of(*words, t_s=None):
+    """Return events of agent a, all of one time if none are given."""
+    times = objects([3.0] * len(words) if t_s is None else t_s)
+    columns = {"t_s": times, "event": objects(words), "details": objects([None] * len(words))}
+    return {"events": FakeTable("events", EVENTS.fields, {"a": columns})}
+
+
+@pytest.mark.parametrize(("words", "passed"), [(("burn", "done"), False), (("done", "burn"), True)])
+@pytest.mark.parametrize("rows", [1, 65_536])
+def test_of_events_of_one_time_the_one_that_is_recorded_later_comes_after(
+    words, passed, rows, monkeypatch
+):
+    monkeypatch.setattr(records, "BATCH_RECORDS", rows)
+    common = {"stream": "events", "field": "event", "agents": ("a",)}
+    done = expect(name="done", event="done", **common)
+    first = ValueBounds.equals("done")
+    seen = expect(
+        name="seen", statistic="first_time", when=first, bounds=ValueBounds.below(9), **common
+    )
+    burn = expect(name="burn", event="burn", after="done", **common)
+
+    by_event = judge(done, burn, tables=events_of(*words)).results[1]
+    by_value = judge(seen, replace(burn, after="seen"), tables=events_of(*words)).results[1]
+
+    assert (by_event.passed, by_value.passed) == (passed, passed)
+
+
+def test_an_event_may_come_after_that_of_one_other_agent():
+    common = {"stream": "events", "field": "event", "event": "done"}
+    first = expect(name="first", agents=("a",), **common)
+    second = expect(name="second", agents=("b",), after="first", within_s=1.0, **common)
+
+    found = judge(first, second).results[1]
+
+    assert (found.got, found.passed) == (6.0, True)
+
+
+def test_an_event_does_not_come_after_itself():
+    common = {"stream": "events", "field": "event", "event": "burn", "agents": ("a",)}
+    once = expect(name="once", **common)
+
+    again = judge(once, expect(name="again", after="once", **common)).results[1]
+    never = judge(once, expect(name="never", after="once", must="not_occur", **common)).results[1]
+    alone = events_of("done", "burn", t_s=[1.0, 2.0])
+    after = {"after": "once", **common}
+    single = judge(once, expect(name="again", **after), tables=alone).results[1]
+    none = judge(once, expect(name="never", must="not_occur", **after), tables=alone).results[1]
+
+    assert (again.got, again.passed) == (9.0, True)
+    assert (never.got, never.passed) == (1, False)
+    assert (single.got, single.passed) == (None, False)
+    assert (none.got, none.passed) == (0, True)
+
+
+def test_what_is_recorded_before_time_runs_counts_as_time_0():
+    early = {"t_s": np.array([-0.5, -0.1, 1.0]), "x_m": np.array([5.0, 6.0, 7.0])}
+    tables = {"state": FakeTable("state", STATE.fields, {"a": early})}
+    of_a = {"agents": ("a",), "from_s": 0.0}
+
+    counted, least = judge(
+        expect(name="c", statistic="count", bounds=ValueBounds.equals(3), **of_a),
+        expect(name="m", statistic="min", bounds=ValueBounds.above(0), **of_a),
+        tables=tables,
+    ).results
+
+    assert counted.passed
+    assert (least.got, least.t_s) == (5.0, 0.0)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 65_536])
+def test_an_agent_that_was_started_anew_and_does_not_know_the_time_yet_starts_when_it_does(
+    rows, monkeypatch
+):
+    monkeypatch.setattr(records, "BATCH_RECORDS", rows)
+    words = ("start", "burn", "start", "done", "start")
+    tables = events_of(*words, t_s=objects([None, 4.0, None, 6.5, None]))
+    start = {"stream": "events", "field": "event", "event": "start", "agents": ("a",)}
+
+    first, second, third = judge(
+        expect(name="first", **start),
+        expect(name="second", after="first", **start),
+        expect(name="third", after="second", **start),
+        tables=tables,
+    ).results
+
+    assert first.got == 0.0
+    assert second.got == (4.0 if rows == 1 else 6.5), "as far as is read at a time"
+    assert third.got == 6.5
+
+
+@pytest.mark.parametrize("statistic", ["count", "rate", "first_time", "settled"])
+def test_a_text_where_a_number_is_counted_holds_nothing(statistic):
+    bounds, when = ValueBounds.below(1e9), ValueBounds.below(9.0)
+    mixed = {"t_s": T_S[:3], "x_m": objects(["burn", 3.0, "done"])}
+    tables = {"state": FakeTable("state", STATE.fields, {"a": mixed})}
+
+    (result,) = judge(
+        expect(statistic=statistic, when=when, bounds=bounds, agents=("a",)), tables=tables
+    ).results
+
+    wanted = {"count": 1, "rate": 1 / DURATION_S}.get(statistic, float(T_S[1]))
+    assert result.got == wanted
+
+
+def test_a_text_under_while_where_a_number_is_meant_holds_nothing():
+    meanwhile = HeldBounds(stream="events", field="event", bounds=ValueBounds.above(3))
+
+    result = result_of(statistic="count", bounds=ValueBounds.equals(0), meanwhile=meanwhile)
+
+    assert result.passed
+
+
 def test_what_events_carry_beside_their_fields_is_a_value_too():
     result = result_of(
         stream="events", field="dv_m_s", bounds=ValueBounds.below(2.0), agents=("a",)
@@ -304,7 +418,7 @@ def test_a_stream_of_the_other_time_mode_is_not_judged_and_a_run_without_any_jud
     assert (lockstep.results, lockstep.gaps()) == (
         (),
         (
-            "checks: none of 1 was judged, such as ticks: its stream is recorded in real time alone,"
+            "checks: none of 1 was judged, such as ticks: stream ticks is recorded in real time alone,"
             " and this run was in lockstep",
         ),
     )

@@ -105,8 +105,40 @@ BROKEN = [
     (f"{TICKS}, below: 3, while: {{stream: clock, field: x, below: 1}}", "x,", "has no field 'x'"),
     (f"{TICKS}, below: 3, while: {{stream: clock, field: t_s}}", "{stream", "expected a limit"),
     (f"{TICKS}, below: 3, whil: 3", "whil", "did you mean while?"),
+    ("name: a, event: emergancy, must: not_occur", "emergancy", "did you mean emergency?"),
+    ("name: a, event: burn", "burn", "own words stand in its own streams: name one under stream"),
+    ("name: a, stream: log, event: eror, field: level", "eror", "did you mean error?"),
+    ("name: a, stream: log, field: level, statistic: count, when: {equals: eror}, below: 1", "eror", "mean error?"),
+    ("name: a, stream: events, field: event, equals: strt, at_end: true", "strt", "did you mean start?"),
+    (f"{TICKS}, below: 3, while: {{stream: events, field: event, equals: strt}}", "strt", "did you mean start?"),
+    ("name: summary.x, event: start", "summary.x", "framework's own"),
+    ("name: a, stream: ticks, statistic: rate, above: 1, from_s: 3, to_s: 3", "3}", "of a stretch of time"),
+    ("name: a, stream: ticks, statistic: count, below: 0", "0}", "a count is never less than 0: below 0 never holds"),
+    ("name: a, stream: ticks, statistic: rate, within: [-3, -1]", "[-3", "never less than 0"),
+    (f"{TICKS}, statistic: first_time, when: {{above: 3}}, below: 5, from_s: 9", "5,", "from 9 s to 60 s"),
+    (f"{TICKS}, statistic: settled, when: {{above: 3}}, above: 60", "60}", "from 0 s to 60 s: above 60 s never holds"),
+    (f"{TICKS}, statistic: settled, when: {{above: 3}}, equals: 70, to_s: 50", "70,", "from 0 s to 50 s"),
     (f"{TICKS}, below: 3, statistic: rate, while: {{stream: clock, field: t_s, below: 1}}", "{stream", "rate"),
 ]  # fmt: skip
+
+
+TIME_OF = "name: a, stream: ticks, field: lateness_us, statistic: settled, when: {above: 3}"
+
+
+@pytest.mark.parametrize(
+    "check",
+    [
+        f"{TIME_OF}, within: [50, 80]",
+        f"{TIME_OF}, equals: 60",
+        f"{TIME_OF}, above: 59",
+        f"{TIME_OF}, below: 9, from_s: 8.5",
+        "name: a, stream: ticks, statistic: count, equals: 0",
+        "name: a, event: action_began, agents: [host, '*']",
+        "name: a, event: anything, field: action, agents: [host]",
+    ],
+)
+def test_what_may_hold_is_not_refused(tmp_path, check):
+    assert len(load(check, folder=tmp_path).expectations) == 1
 
 
 @pytest.mark.parametrize(("check", "at", "told"), BROKEN)
@@ -119,6 +151,42 @@ def test_a_broken_expectation_is_refused_with_place_and_cure(tmp_path, check, at
     line = f"  - {{{check}}}"
     assert fault.column and line[fault.column - 1 :].startswith(at), line[fault.column - 1 :]
     assert re.search(rf"scenario.yaml:{FIRST_LINE}:\d+: checks", fault.render())
+
+
+START_OF = "name: first, event: start, agents: [%s]"
+
+
+@pytest.mark.parametrize(
+    ("first", "told"),
+    [
+        (START_OF % "agent-01, agent-02", "first is of agent-01, agent-02, and this of agent-03 too"),
+        ("name: first, event: start, must: not_occur", "first has no time: expected an event that must"),
+        (f"{PACKET.replace('name: a', 'name: first')}, above: 0", "first has no time"),
+    ],
+)  # fmt: skip
+def test_an_event_comes_after_what_its_agents_have_a_time_of(tmp_path, first, told):
+    with pytest.raises(InputError) as refused:
+        load(first, "name: a, event: end, after: first", folder=tmp_path)
+
+    (fault,) = refused.value.faults
+    assert (fault.path, told in fault.text) == ("checks[1].after", True), fault.text
+
+
+@pytest.mark.parametrize("agents", ["agent-01", "host", "host, agent-01", "'*'"])
+def test_events_of_all_may_come_after_one_of_all_of_one_agent_or_of_the_host(tmp_path, agents):
+    scenario = load(START_OF % agents, "name: a, event: end, after: first", folder=tmp_path)
+
+    assert len(scenario.expectations) == 2
+
+
+@pytest.mark.parametrize(
+    "limit", ["below: .nan", "above: 1e400", "below: '${no}'", "within: [0, .inf]"]
+)
+def test_a_limit_that_is_no_number_is_one_fault(tmp_path, limit):
+    with pytest.raises(InputError) as refused:
+        load(f"{TICKS}, {limit}", folder=tmp_path)
+
+    assert [each.path.startswith("checks[0].") for each in refused.value.faults] == [True]
 
 
 def test_all_faults_are_told_at_once(tmp_path):

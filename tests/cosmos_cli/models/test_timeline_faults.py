@@ -42,6 +42,12 @@ BROKEN_WHEN = [
         "by agents alone",
     ),
     ("stream: round_trips, field: packet, above: 1, for_s: -1", ".for_s", "expected >= 0"),
+    (
+        "stream: round_trips, field: packet, above: 1, for_s: 100",
+        ".for_s",
+        "cannot hold for so long",
+    ),
+    ("stream: events, field: event, equals: strt", ".equals", "did you mean start?"),
     ("stream: imu.w, field: w, above: 1", ".stream", "recorded by a device and not by agents"),
     ("stream: health, field: ram_percent, above: 1", ".stream", "name a stream of the simulation"),
     (
@@ -90,7 +96,11 @@ BROKEN = [
         "timeline[0].to_s",
         "leave it out for the end",
     ),
-    ("{every_s: 0.001, action: annotate, text: a}", "timeline", "make them rarer"),
+    (
+        "{every_s: 0.001, action: annotate, text: a}",
+        "timeline",
+        "make them rarer, most of all timeline[0]",
+    ),
     ("{rate_per_h: 0, action: annotate, text: a}", "timeline[0].rate_per_h", "expected > 0"),
     ("{rate_per_h: 1e9, action: annotate, text: a}", "timeline[0].rate_per_h", "expected <= 3600"),
     ("{at_s: 1, action: annotate}", "timeline[0].text", "missing"),
@@ -143,6 +153,11 @@ BROKEN = [
     ('{at_s: 1, action: step_clock, agents: ["*"], by_ms: 1e6}', "timeline[0].by_ms", "10000"),
     ('{at_s: 1, action: drift_clock, agents: ["*"]}', "timeline[0].ppm", "missing"),
     ('{at_s: 1, action: drift_clock, agents: ["*"], ppm: 900}', "timeline[0].ppm", "500"),
+    (
+        '{at_s: 1, action: delay_messages, agents: ["*"], delay_s: 1, jitter_s: -1}',
+        "timeline[0].jitter_s",
+        "expected >= 0, got -1",
+    ),
     ("{at_s: 1, action: drift_clock, ppm: 90}", "timeline[0].action", "needs agents"),
 ]
 
@@ -164,6 +179,17 @@ def test_a_broken_entry_is_refused_with_its_place_and_cure(
     assert place in told, told
     assert words in told[place]
     assert all(fault.line and fault.line >= 6 for fault in refused.value.faults)
+
+
+@pytest.mark.parametrize(
+    "when", ["at_s: .nan", "every_s: 1e400", "when: {stream: log, field: t_s, above: .inf}"]
+)
+def test_a_time_that_is_no_number_is_one_fault(tmp_path: Path, when: str) -> None:
+    with pytest.raises(InputError) as refused:
+        load(tmp_path, f"{{{when}, action: stop}}")
+
+    (fault,) = refused.value.faults
+    assert "expected a finite number" in fault.text
 
 
 def test_all_entries_are_told_of_at_once(tmp_path: Path) -> None:

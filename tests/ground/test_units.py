@@ -1,0 +1,46 @@
+"""Factors between units: as exact as binary numbers are."""
+
+import math
+
+import pytest
+
+from madns_runtime.units import conversion
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "wanted", "expected"),
+    [
+        (5, "ms", "us", 5000.0),
+        (1, "km", "m", 1000.0),
+        (3.6, "km/h", "m/s", 1.0),
+        (50, "%", "1", 0.5),
+        (1, "min", "s", 60.0),
+        (90, "deg", "rad", math.pi / 2),
+        (-180, "deg", "rad", -math.pi),
+        (math.pi, "rad", "deg", 180.0),
+        (1, "rpm", "deg/s", 6.0),
+    ],
+)
+def test_a_value_at_a_limit_is_the_limit_in_another_unit_too(value, unit, wanted, expected):
+    factor = conversion(unit, wanted)
+
+    assert factor is not None
+    assert value * factor == expected
+
+
+@pytest.mark.parametrize(
+    ("unit", "wanted"),
+    [
+        ("deg", "1"),
+        ("degC", "K"),
+        ("m", "s"),
+        ("ells", "m"),
+        ("0 m", "m"),
+        ("1e308 1e308 m", "m"),
+        ("1e-308 1e-308 m", "m"),
+        ("1e-308^-9 m", "m"),
+        ("1e200 m", "1e-200 m"),
+    ],
+)
+def test_what_does_not_convert_has_no_factor(unit, wanted):
+    assert conversion(unit, wanted) is None
