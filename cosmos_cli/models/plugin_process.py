@@ -15,7 +15,8 @@ from cosmos_cli.models.separate_process import SeparateDefect, work_separately
 from madns_runtime import errors as runtime_errors
 from madns_runtime.config import Timeouts, from_mapping, to_mapping
 from madns_runtime.errors import MadnsError, MissingExtraError, PluginError
-from madns_runtime.plugin.registry import import_asked, is_shipped
+from madns_runtime.plugin.queries import import_questions
+from madns_runtime.plugin.registry import is_shipped
 
 _CODE = re.compile(r"[\w./~-]+:[A-Za-z_]\w*")
 """Form in which a parameter names code of one's own: guidance.py:Guidance, package.module:Class."""
@@ -30,7 +31,7 @@ def ask_apart(work: Callable[[Tell], T], kind: type[T], document: Document, spec
     if is_shipped(spec):
         if not _names_code(settings):
             return work(lambda doing: None)
-        import_asked(spec)  # here once, in place of once in each fork
+        import_questions(spec)  # here once, in place of once in each fork
 
     def guarded(tell: Tell) -> Mapping[str, Any]:
         try:

@@ -6,7 +6,9 @@ What comes back is checked here, so that a slip in a plug-in is told as such and
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import importlib
 import inspect
 import itertools
 import math
@@ -14,7 +16,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from madns_runtime.errors import PluginError
+from madns_runtime.errors import MadnsError, PluginError
 from madns_runtime.plugin.api import (
     DeclaredStream,
     Demand,
@@ -26,9 +28,11 @@ from madns_runtime.plugin.api import (
 )
 from madns_runtime.plugin.code_places import place_of
 from madns_runtime.plugin.isolation import call_plugin
-from madns_runtime.plugin.registry import load_function
+from madns_runtime.plugin.registry import load_function, resolve
 from madns_runtime.recording.records import FRAMEWORK_STREAMS, Field
 
+OF_SCENARIOS = ("check", "check_actions", "streams", "labels", "device_uses", "place_uses")
+"""Parts of a descriptor that a scenario is read with."""
 NO_FIGURES = ("name", "flows", "measured")
 """Fields of a Demand or a Flow that are no amounts."""
 UNSAID = ("within_s",)
@@ -40,6 +44,14 @@ CHECK_MORE = ("names", "duration_s", "is_lockstep", "tick_hz")
 FIGURE_MAX = 1e18
 """Of bytes, seconds and hertz; what is beyond is a slip, and its products with agents and rates need no infinity."""
 Use = TypeVar("Use", DeviceUse, PlaceUse)
+
+
+def import_questions(spec: str) -> None:
+    """Import what a shipped simulation answers with while a scenario is read; whoever asks is told what is wrong with it."""
+    with contextlib.suppress(MadnsError, ImportError):
+        simulation = resolve(spec, Path())
+        for where in filter(None, (getattr(simulation, part) for part in OF_SCENARIOS)):
+            importlib.import_module(where.partition(":")[0])
 
 
 def ask_check(  # noqa: PLR0913 - what a scenario is; all but two by name

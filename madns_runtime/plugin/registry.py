@@ -62,8 +62,6 @@ PARTS = (
     "compare",
 )
 """Fields of a descriptor that name a part of the simulation, the halves first."""
-ASKED = ("check", "check_actions", "streams", "labels", "device_uses", "place_uses")
-"""Parts that a scenario is read with."""
 
 Role = Literal["host", "agent"]
 CONTRACTS: Mapping[Role, tuple[type, tuple[str, ...]]] = {
@@ -191,14 +189,6 @@ def is_shipped(spec: str) -> bool:
         found = [place for name, place in _registered(tuple(sys.path)) if name == spec]
         return bool(found) and all(map(is_shipped, found))
     return not is_file(spec) and spec.startswith(f"{__name__.partition('.')[0]}.")
-
-
-def import_asked(spec: str) -> None:
-    """Import the parts of a shipped simulation that a scenario is read with; what is wrong with them is told by who asks."""
-    with contextlib.suppress(MadnsError, ImportError):
-        simulation = resolve(spec, Path())
-        for where in filter(None, (getattr(simulation, part) for part in ASKED)):
-            importlib.import_module(where.partition(":")[0])
 
 
 def parse_parameters(descriptor: Simulation, mapping: Mapping[str, Any]) -> Any:
