@@ -26,6 +26,7 @@ from cosmos_cli.launch.place_plan import check_places
 from cosmos_cli.launch.plan import LaunchPlan, make_plan
 from cosmos_cli.launch.plan_view import (
     LOCKSTEP_WORDS,
+    demand_mapping,
     demand_of,
     feasibility_of,
     latency_of,
@@ -166,6 +167,7 @@ def _show(
             "plan": launch_plan.to_mapping(),
             "devices": [dataclasses.asdict(device) for device in devices],
             "resources": dataclasses.asdict(resources) | source,
+            "demand": demand_mapping(outlook.demand, resources) if outlook.demand else None,
             "feasibility": feasibility.to_mapping() if feasibility else None,
             "capacity": capacity.to_mapping() if capacity else None,
         }

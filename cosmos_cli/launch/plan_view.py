@@ -8,12 +8,14 @@ import socket
 import statistics
 import time
 from collections.abc import Sequence
+from typing import Any
 
 from cosmos_cli.launch.feasibility import (
     BITS_PER_BYTE,
     Feasibility,
     Inequality,
     Resources,
+    finite,
     judge,
     sendings_of,
 )
@@ -177,6 +179,30 @@ def show_flows(console: Console, demand: Demand, resources: Resources) -> None:
     told_s = ", ".join(f"{name} = {time_s * 1e3:.3g} ms" for name, time_s in times if time_s)
     if told or told_s:
         console.data("; ".join(text for text in (told, told_s) if text))
+
+
+def demand_mapping(demand: Demand, resources: Resources) -> dict[str, Any]:
+    """Return a demand as plain values, its flows as they travel and maneuvers among them; null stands for infinity."""
+    figures = {
+        field.name: getattr(demand, field.name)
+        for field in dataclasses.fields(demand)
+        if field.name != "flows"
+    }
+    flows = [
+        {
+            "name": each.name,
+            "wire_bytes": each.wire_bytes,
+            "rate_hz": each.rate_hz,
+            "within_s": each.within_s,
+            "senders_max": finite(each.senders_max),
+        }
+        for each in sendings_of(demand, resources)
+    ]
+    return {
+        **{name: finite(value) for name, value in figures.items()},
+        "measured": demand.measured,
+        "flows": flows,
+    }
 
 
 def show_feasibility(
