@@ -75,6 +75,8 @@ class _Looked(NamedTuple):
     """How much of the window each cause filled, but for steps, s."""
     steps: Mapping[int, _Steps]
     """By agent."""
+    together_s: float
+    """How much of the window all of them filled: a collection within a step counts once, s."""
 
     def steps_of(self, agent: int) -> tuple[_Steps, float]:
         """Return an agent's own steps, and for how long those of others took, s."""
@@ -167,9 +169,12 @@ class LoopAccount:
         filled_s = dict(looked.filled_s)
         own, others = looked.steps_of(late.agent)
         filled_s[own.cause_within(late.period_s)] = own.within_s
-        filled_s[Cause.OTHER_AGENT] = others + max(0.0, late.began_s - looked.began_s)
-        filled_s[Cause.START] = overlap_s(late.due_s, late.started_s, (late.due_s, late.began_s))
-        return name_cause(late.began_s - late.due_s, filled_s)
+        since_s = max(0.0, late.began_s - looked.began_s)
+        filled_s[Cause.OTHER_AGENT] = others + since_s
+        start_s = overlap_s(late.due_s, late.started_s, (late.due_s, late.began_s))
+        filled_s[Cause.START] = start_s
+        together_s = looked.together_s + since_s + start_s
+        return name_cause(late.began_s - late.due_s, filled_s, together_s=together_s)
 
     def _look_at(self, late: LateTick) -> _Looked:
         """Return what was at work between a late tick's deadline and its begin."""
@@ -177,6 +182,7 @@ class LoopAccount:
         window = late.due_s, late.began_s
         filled_s: dict[Cause, float] = {}
         steps: dict[int, _Steps] = {}
+        timed_s, timed_from_s = 0.0, late.began_s
         # A copy: Python's collector may begin meanwhile, and its span is added then and there. tuple() would make an
         # object as it goes through the spans, at which the collector of Python 3.11 begins.
         for cause, agent, begin_s, end_s in reversed(self._spans.copy()):
@@ -185,6 +191,8 @@ class LoopAccount:
             if begin_s >= late.began_s:
                 continue  # its own step, which has just ended, and what came in it
             within_s = overlap_s(begin_s, end_s, window)
+            timed_s += overlap_s(begin_s, min(end_s, timed_from_s), window)
+            timed_from_s = min(timed_from_s, begin_s)
             if cause is Cause.STEP:
                 before = steps.get(agent, NO_STEPS)
                 steps[agent] = _Steps(
@@ -203,8 +211,11 @@ class LoopAccount:
         if stolen_since_s > waited_since_s or math.isinf(waited_since_s):
             filled_s[Cause.STOLEN] = min(absent_s, stolen_since_s)
         filled_s[Cause.RECORDING] = min(absent_s, self._writer.computed_within_s(window))
+        kept_s = max(
+            filled_s[Cause.WAKE_UP], filled_s[Cause.RECORDING], filled_s.get(Cause.STOLEN, 0.0)
+        )
         self.add(Span(Cause.HOUSEKEEPING, NOBODY, looking_s, monotonic()))
-        return _Looked(late.due_s, late.began_s, filled_s, steps)
+        return _Looked(late.due_s, late.began_s, filled_s, steps, timed_s + kept_s)
 
     def _kept_off_s(self, own_step_s: float) -> float:
         """

@@ -137,6 +137,10 @@ class Loop:
     def cause_by_the_rule(self, seat, due_s, began_s):
         """Return the first cause that clearly filled half of a window; None if none did, or it is a matter of rounding."""
         filled_s, longest_s = dict.fromkeys(CAUSES, 0.0), 0.0
+        together_s, until_s = 0.0, due_s
+        for _, _, begin_s, end_s in sorted(self.lived, key=lambda span: span.begin_s):
+            together_s += max(0.0, min(end_s, began_s) - max(begin_s, until_s))
+            until_s = max(until_s, end_s)
         for cause, agent, begin_s, end_s in self.lived:
             within_s = min(end_s, began_s) - max(begin_s, due_s)
             if within_s <= 0.0:
@@ -149,9 +153,12 @@ class Loop:
         shares = {cause: filled_s.get(cause, 0.0) / (began_s - due_s) for cause in CAUSES}
         if any(abs(share - 0.5) < 0.01 for share in shares.values()):
             return None
-        if sum(shares.values()) < 0.49:
+        if together_s < 0.49 * (began_s - due_s):
             return Cause.UNEXPLAINED
-        return next((cause for cause in CAUSES if shares[cause] > 0.5), None)
+        if together_s < 0.51 * (began_s - due_s):
+            return None
+        most = max(CAUSES, key=lambda cause: shares[cause])
+        return next((cause for cause in CAUSES if shares[cause] > 0.5), most)
 
 
 class Nothing:

@@ -141,6 +141,15 @@ def test_what_nobody_timed_is_unexplained(loop):
     assert loop.account.explain(late) is Cause.UNEXPLAINED
 
 
+def test_a_collection_within_a_step_fills_no_more_than_the_step(loop):
+    late = late_by(0.010)
+    loop.account.add(Span(Cause.GARBAGE, NOBODY, late.due_s, late.due_s + 0.003))
+    loop.account.add(Span(Cause.STEP, ME, late.due_s - 0.005, late.due_s + 0.004))
+
+    # Together 4 ms of 10, though 3 and 4 are more than half.
+    assert loop.account.explain(late) is Cause.UNEXPLAINED
+
+
 def test_agents_of_a_pack_are_looked_at_once_and_each_has_its_own_cause(loop, monkeypatch):
     looks = []
     monkeypatch.setattr(loop.account, "look", lambda: looks.append(1))
