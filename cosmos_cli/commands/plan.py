@@ -109,7 +109,7 @@ def plan(
     )
     outlook = _Outlook.of(scenario_file, launch_plan, resources, latency_source)
     devices = list(itertools.chain(*plan_devices(scenario_file, launch_plan).values()))
-    _show(console, launch_plan, devices, outlook)
+    _show(console, launch_plan, devices, outlook, missing=given.missing)
     if outlook.feasibility and not outlook.feasibility.holds:
         raise typer.Exit(ExitCode.BUDGET_BROKEN)
 
@@ -147,7 +147,12 @@ class _Outlook:
 
 
 def _show(
-    console: Console, launch_plan: LaunchPlan, devices: Sequence[DeviceLaunch], outlook: _Outlook
+    console: Console,
+    launch_plan: LaunchPlan,
+    devices: Sequence[DeviceLaunch],
+    outlook: _Outlook,
+    *,
+    missing: Sequence[str],
 ) -> None:
     """Print the plan, and below it what real time asks of it."""
     resources, feasibility, capacity = outlook.resources, outlook.feasibility, outlook.capacity
@@ -160,7 +165,7 @@ def _show(
         if outlook.demand is not None and capacity is not None:
             show_flows(console, outlook.demand, resources)
             show_capacity(console, capacity)
-        show_feasibility(console, feasibility, resources, outlook.latency_source)
+        show_feasibility(console, feasibility, resources, outlook.latency_source, missing=missing)
     source = {"latency_source": outlook.latency_source}
     console.print_json(
         {

@@ -21,6 +21,7 @@ from cosmos_cli.launch.feasibility import (
 )
 from cosmos_cli.launch.plan import LaunchPlan
 from cosmos_cli.models.loading import ScenarioFile
+from cosmos_cli.models.planning import Planning
 from cosmos_cli.ui.console import Column, Console
 from cosmos_cli.ui.plural import counted
 from madns_runtime.config import DeviceLaunch
@@ -206,11 +207,19 @@ def demand_mapping(demand: Demand, resources: Resources) -> dict[str, Any]:
 
 
 def show_feasibility(
-    console: Console, feasibility: Feasibility | None, resources: Resources, latency_source: str
+    console: Console,
+    feasibility: Feasibility | None,
+    resources: Resources,
+    latency_source: str,
+    *,
+    missing: Sequence[str] = tuple(Planning().missing),
 ) -> None:
-    """Print the four inequalities, and what comes of them; None for a simulation without a demand."""
+    """Print the four inequalities, and what comes of them; None for a simulation without a demand: what is *missing* then."""
     if feasibility is None:
-        console.data("inequalities: this simulation does not say what it asks for (demand)")
+        console.data(
+            "inequalities: this simulation does not say what it asks for (demand); the scenario's section plan"
+            f" can, with {', '.join(missing)}"
+        )
         return
     console.data("")
     console.table(INEQUALITIES, [_row(item) for item in feasibility.inequalities])
