@@ -26,6 +26,7 @@ from cosmos_cli.launch.place_plan import check_places
 from cosmos_cli.launch.plan import LaunchPlan, make_plan
 from cosmos_cli.launch.plan_view import (
     LOCKSTEP_WORDS,
+    demand_mapping,
     demand_of,
     feasibility_of,
     latency_of,
@@ -108,7 +109,7 @@ def plan(
     )
     outlook = _Outlook.of(scenario_file, launch_plan, resources, latency_source)
     devices = list(itertools.chain(*plan_devices(scenario_file, launch_plan).values()))
-    _show(console, launch_plan, devices, outlook)
+    _show(console, launch_plan, devices, outlook, missing=given.missing)
     if outlook.feasibility and not outlook.feasibility.holds:
         raise typer.Exit(ExitCode.BUDGET_BROKEN)
 
@@ -146,7 +147,12 @@ class _Outlook:
 
 
 def _show(
-    console: Console, launch_plan: LaunchPlan, devices: Sequence[DeviceLaunch], outlook: _Outlook
+    console: Console,
+    launch_plan: LaunchPlan,
+    devices: Sequence[DeviceLaunch],
+    outlook: _Outlook,
+    *,
+    missing: Sequence[str],
 ) -> None:
     """Print the plan, and below it what real time asks of it."""
     resources, feasibility, capacity = outlook.resources, outlook.feasibility, outlook.capacity
@@ -159,13 +165,14 @@ def _show(
         if outlook.demand is not None and capacity is not None:
             show_flows(console, outlook.demand, resources)
             show_capacity(console, capacity)
-        show_feasibility(console, feasibility, resources, outlook.latency_source)
+        show_feasibility(console, feasibility, resources, outlook.latency_source, missing=missing)
     source = {"latency_source": outlook.latency_source}
     console.print_json(
         {
             "plan": launch_plan.to_mapping(),
             "devices": [dataclasses.asdict(device) for device in devices],
             "resources": dataclasses.asdict(resources) | source,
+            "demand": demand_mapping(outlook.demand, resources) if outlook.demand else None,
             "feasibility": feasibility.to_mapping() if feasibility else None,
             "capacity": capacity.to_mapping() if capacity else None,
         }

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 
 POINTS_MAX = 4096
 """Interval lengths that are looked at; beyond, a bound stands for what a longer one could hold."""
+ROUNDING = 1e-9
+"""Times that differ by so small a share are the same, and so are counts that differ by so little."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,9 +38,10 @@ class Sending:
 
     def messages(self, length_s: float) -> int:
         """Return how many of one sender's messages an interval of that length has to carry at worst."""
-        if length_s < self.within_s:
+        if length_s < self.within_s * (1.0 - ROUNDING):
             return 0
-        return math.floor((length_s - self.within_s) * self.rate_hz + 1e-9) + 1
+        # Ten tenths of a second add up to a little less than a second, in which messages of one a second count as well.
+        return max(1, math.floor((length_s - self.within_s) * self.rate_hz + ROUNDING) + 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,17 +58,17 @@ def busiest_interval(sendings: Sequence[Sending], agents: float) -> BusiestInter
     """
     Return the busiest interval of so many agents.
 
-    It begins with everybody's message of every kind. What an interval of length L carries is at most
-    U L + C, with U the mean rate, so that no interval longer than C / (best - U) can be busier than the best so far.
+    It begins with everybody's message of every kind. With U the mean rate, what an interval of length L carries is at
+    most U L + C, where C counts what a message that is urgent adds, and, of a length that is longer than any message may
+    be on its way, what one that has time takes away. No interval longer than C / (best - U) can be busier than the best so far.
     """
     mean = sum(each.senders(agents) * each.wire_bytes * each.rate_hz for each in sendings)
     best = BusiestInterval(length_s=math.inf, bytes_s=mean)
-    excess = sum(
-        each.senders(agents) * each.wire_bytes * max(0.0, 1.0 - each.within_s * each.rate_hz)
-        for each in sendings
-    )
+    excesses = [_excess_bytes(each, agents) for each in sendings]
+    latest_s = max((each.within_s for each in sendings), default=0.0)
     for count, length_s in enumerate(_lengths(sendings)):
-        if best.bytes_s > mean and length_s * (best.bytes_s - mean) > excess:
+        excess = math.fsum(each if length_s >= latest_s else max(0.0, each) for each in excesses)
+        if length_s * (best.bytes_s - mean) >= excess:
             break
         if count >= POINTS_MAX:
             bound = mean + excess / length_s
@@ -76,6 +79,14 @@ def busiest_interval(sendings: Sequence[Sending], agents: float) -> BusiestInter
         if here.bytes_s > best.bytes_s * (1.0 + 1e-12):
             best = here
     return best
+
+
+def _excess_bytes(sending: Sending, agents: float) -> float:
+    """Return what the senders' messages of a long interval are above the mean at most; negative if they have time."""
+    share = 1.0 - sending.within_s * sending.rate_hz
+    if abs(share) < ROUNDING:
+        return 0.0
+    return sending.senders(agents) * sending.wire_bytes * share
 
 
 def _load(interval: BusiestInterval) -> float:

@@ -11,7 +11,7 @@ And 2.10 holds for every interval, down to the shortest in which something must 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -25,6 +25,8 @@ IP_UDP_BYTES = 28
 BITS_PER_BYTE = 8
 COUNT_MAX = 2.0**53
 """Of agents: above, a number and the next one are the same, and nobody has as many."""
+ROUNDING = 1e-9
+"""Sides that differ by a smaller share are equal: 3 x 0.1 s are 0.3 s, and 0.30000000000000004 in floats."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,21 +65,26 @@ class Inequality:
     @property
     def holds(self) -> bool:
         """Whether it is fulfilled, or does not apply."""
-        return not self.applies or self.margin >= 0
+        return not self.applies or is_within(*self._sides)
 
     @property
     def margin(self) -> float:
-        """Margin, in the unit of both sides; negative if the inequality does not hold."""
-        return self.right - self.left if self.relation == "<=" else self.left - self.right
+        """Margin, in the unit of both sides; negative if the inequality does not hold, 0 at its limit."""
+        used, allowed = self._sides
+        return max(0.0, allowed - used) if is_within(used, allowed) else allowed - used
 
     @property
     def load(self) -> float:
         """The smaller side's share of the larger allowed one: 1 is the limit, 0 no load."""
-        sides = (self.left, self.right)
-        used, allowed = sides if self.relation == "<=" else reversed(sides)
+        used, allowed = self._sides
         if used == 0:
             return 0.0
         return used / allowed if allowed > 0 else math.inf
+
+    @property
+    def _sides(self) -> tuple[float, float]:
+        """The side that must be the smaller one, and the other."""
+        return (self.left, self.right) if self.relation == "<=" else (self.right, self.left)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values; null stands for infinity, and for the sides of one that does not apply."""
@@ -161,25 +168,29 @@ def has_maneuvers(demand: Demand) -> bool:
 
 
 def _asynchronous(demand: Demand, resources: Resources, agents: int) -> Inequality:
-    per_agent_s = demand.batch_compute_s / resources.workers
+    def left_s(count: int) -> float:
+        return demand.batch_compute_s * count / resources.workers + resources.latency_s
+
     return Inequality(
         number="2.7",
         name="asynchronous: every agent's batch within its buffer",
         formula="T_p(S_b) N_a / N_p + T_n <= T_bi",
-        left=per_agent_s * agents + resources.latency_s,
+        left=left_s(agents),
         relation="<=",
         right=demand.buffer_s,
         unit="s",
-        breaks_at=_first_beyond(per_agent_s, demand.buffer_s - resources.latency_s),
+        breaks_at=_first_beyond(left_s, demand.buffer_s),
         applies=has_batches(demand),
     )
 
 
 def _synchronous(demand: Demand, resources: Resources, agents: int) -> Inequality:
     at_once = resources.maneuvers_at_once
-    rounds = math.ceil(min(at_once or agents, agents) / resources.workers)
-    wait_s = demand.lead_s - 2 * resources.latency_s
-    rounds_beyond = _first_beyond(demand.sync_compute_s, wait_s)
+
+    def left_s(rounds: int) -> float:
+        return demand.sync_compute_s * rounds + 2 * resources.latency_s
+
+    rounds_beyond = _first_beyond(left_s, demand.lead_s)
     agents_beyond = (rounds_beyond - 1) * resources.workers + 1
     if at_once is not None and agents_beyond > at_once:
         agents_beyond = math.inf
@@ -187,7 +198,7 @@ def _synchronous(demand: Demand, resources: Resources, agents: int) -> Inequalit
         number="2.8",
         name="synchronous: a maneuver's states before it begins",
         formula="T_p(S_sync) ceil(n / N_p) + 2 T_n <= T_m - T_s",
-        left=demand.sync_compute_s * rounds + 2 * resources.latency_s,
+        left=left_s(math.ceil(min(at_once or agents, agents) / resources.workers)),
         relation="<=",
         right=demand.lead_s,
         unit="s",
@@ -206,7 +217,7 @@ def _lead(demand: Demand, tick_hz: float) -> Inequality:
         relation=">=",
         right=period_s,
         unit="s",
-        breaks_at=math.inf if demand.lead_s >= period_s else 1,
+        breaks_at=math.inf if is_within(period_s, demand.lead_s) else 1,
         applies=has_maneuvers(demand),
     )
 
@@ -260,7 +271,7 @@ def _first_too_busy(sendings: Sequence[Sending], bandwidth_bytes_s: float) -> fl
     """Return the smallest number of agents whose busiest interval is too busy; infinity below COUNT_MAX."""
 
     def is_too_busy(agents: int) -> bool:
-        return busiest_interval(sendings, agents).bytes_s > bandwidth_bytes_s
+        return not is_within(busiest_interval(sendings, agents).bytes_s, bandwidth_bytes_s)
 
     # In proportion to the agents as long as each may maneuver at the worst instant: look there first.
     one = busiest_interval(sendings, 1).bytes_s
@@ -287,20 +298,22 @@ def wire_bytes(message_bytes: int) -> int:
     return message_bytes + datagrams * (DATAGRAM_OVERHEAD_BYTES + IP_UDP_BYTES)
 
 
-def _first_beyond(each: float, allowed: float) -> float:
-    """Return the smallest whole n >= 1 with n * each > allowed; infinity if there is none below COUNT_MAX."""
-    if allowed < each:
-        return 1
-    if each <= 0 or math.isinf(allowed):
-        return math.inf
-    if allowed / each >= COUNT_MAX:
-        return math.inf
-    count = math.floor(allowed / each)
-    while count * each <= allowed:  # rounding of the division may be one off
-        count += 1
-    while count > 1 and (count - 1) * each > allowed:
-        count -= 1
-    return count
+def _first_beyond(left: Callable[[int], float], allowed: float) -> float:
+    """Return the smallest n >= 1 at which a left side that grows with n is beyond; infinity if none is below COUNT_MAX."""
+    low, high = 0, 1
+    while is_within(left(high), allowed):
+        low, high = high, 2 * high
+        if low >= COUNT_MAX:
+            return math.inf
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if is_within(left(middle), allowed) else (low, middle)
+    return high
+
+
+def is_within(used: float, allowed: float) -> bool:
+    """Tell whether the one is at most the other, but for ROUNDING; neither is negative."""
+    return used <= allowed * (1.0 + ROUNDING)
 
 
 def finite(value: float) -> float | None:

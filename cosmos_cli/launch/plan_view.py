@@ -8,17 +8,20 @@ import socket
 import statistics
 import time
 from collections.abc import Sequence
+from typing import Any
 
 from cosmos_cli.launch.feasibility import (
     BITS_PER_BYTE,
     Feasibility,
     Inequality,
     Resources,
+    finite,
     judge,
     sendings_of,
 )
 from cosmos_cli.launch.plan import LaunchPlan
 from cosmos_cli.models.loading import ScenarioFile
+from cosmos_cli.models.planning import Planning
 from cosmos_cli.ui.console import Column, Console
 from cosmos_cli.ui.plural import counted
 from madns_runtime.config import DeviceLaunch
@@ -179,12 +182,44 @@ def show_flows(console: Console, demand: Demand, resources: Resources) -> None:
         console.data("; ".join(text for text in (told, told_s) if text))
 
 
+def demand_mapping(demand: Demand, resources: Resources) -> dict[str, Any]:
+    """Return a demand as plain values, its flows as they travel and maneuvers among them; null stands for infinity."""
+    figures = {
+        field.name: getattr(demand, field.name)
+        for field in dataclasses.fields(demand)
+        if field.name != "flows"
+    }
+    flows = [
+        {
+            "name": each.name,
+            "wire_bytes": each.wire_bytes,
+            "rate_hz": each.rate_hz,
+            "within_s": each.within_s,
+            "senders_max": finite(each.senders_max),
+        }
+        for each in sendings_of(demand, resources)
+    ]
+    return {
+        **{name: finite(value) for name, value in figures.items()},
+        "measured": demand.measured,
+        "flows": flows,
+    }
+
+
 def show_feasibility(
-    console: Console, feasibility: Feasibility | None, resources: Resources, latency_source: str
+    console: Console,
+    feasibility: Feasibility | None,
+    resources: Resources,
+    latency_source: str,
+    *,
+    missing: Sequence[str] = tuple(Planning().missing),
 ) -> None:
-    """Print the four inequalities, and what comes of them; None for a simulation without a demand."""
+    """Print the four inequalities, and what comes of them; None for a simulation without a demand: what is *missing* then."""
     if feasibility is None:
-        console.data("inequalities: this simulation does not say what it asks for (demand)")
+        console.data(
+            "inequalities: this simulation does not say what it asks for (demand); the scenario's section plan"
+            f" can, with {', '.join(missing)}"
+        )
         return
     console.data("")
     console.table(INEQUALITIES, [_row(item) for item in feasibility.inequalities])

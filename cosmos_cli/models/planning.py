@@ -90,7 +90,12 @@ class Planning:
     @property
     def says_all(self) -> bool:
         """Whether nobody else needs to be asked for a demand."""
-        return all(getattr(self, name) is not None for name in (*REQUIRED, "flows"))
+        return not self.missing
+
+    @property
+    def missing(self) -> list[str]:
+        """What would still have to be given for a simulation that has no demand of its own."""
+        return [name for name in (*REQUIRED, "flows") if getattr(self, name) is None]
 
     def applied_to(self, demand: Demand | None) -> Demand:
         """Return a simulation's demand with what is given here in its place; None for a simulation without one."""

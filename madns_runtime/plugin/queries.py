@@ -37,8 +37,8 @@ NO_FIGURES = ("name", "flows", "measured")
 """Fields of a Demand or a Flow that are no amounts."""
 UNSAID = ("within_s",)
 """Figures that may be None."""
-ENDLESS = ("buffer_s",)
-"""Figures that may be infinite: of who needs nothing."""
+ENDLESS = ("buffer_s", "lead_s")
+"""Figures that may be infinite: of who needs nothing, and of who commands nothing."""
 CHECK_MORE = ("names", "duration_s", "is_lockstep", "tick_hz")
 """What a `check` may take beside parameters, count of agents and folder."""
 FIGURE_MAX = 1e18

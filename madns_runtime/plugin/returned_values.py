@@ -57,7 +57,7 @@ class Demand:
     sync_rate_hz: float
     """N_sync: synchronous exchanges a second, of one agent, at worst."""
     lead_s: float
-    """T_m - T_s: how far ahead of its execution a maneuver is commanded."""
+    """T_m - T_s: how far ahead of its execution a maneuver is commanded; infinity if none ever is."""
     measured: bool
     """Whether the compute times were measured on this machine (else they are declared)."""
     state_bytes: int = 0

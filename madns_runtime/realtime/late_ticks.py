@@ -9,7 +9,7 @@ from madns_runtime.realtime.loop_account import LateTick, LoopAccount
 from madns_runtime.recording.recorder import Recorder
 from madns_runtime.recording.records import LATE_TICKS
 from madns_runtime.timing.late_causes import CAUSES, Cause
-from madns_runtime.timing.rate import TickTiming
+from madns_runtime.timing.rate import Pacer, TickTiming
 
 
 class LateTicks:
@@ -56,20 +56,25 @@ class LateTicks:
         self._missed += missed
         self._recorder.record(LATE_TICKS.name, (index, int(lateness_s * 1e6), missed, cause.value))
 
-    def never_run(self, missed: int, now_s: float) -> None:
+    def never_run(self, pacer: Pacer, t_s: float, now_s: float) -> None:
         """
-        Count the ticks that no other followed, at the end of the run: none is recorded.
+        Count and record the ticks missed that no other followed, at the end of the run, as before the tick that is next.
 
         Args:
-            missed: By the agent until now, all together.
+            pacer: Of the agent.
+            t_s: The simulated time, s.
             now_s: Now, s of the local clock.
         """
-        new = missed - self._missed
-        if new > 0:
-            due_s = now_s - new * self._period_s
-            late = LateTick(self._seat, due_s, now_s, self.started_s, self._period_s)
-            self._counts[self._account.explain(late)] += new
-            self._missed = missed
+        new = pacer.missed - self._missed
+        if new <= 0:
+            return
+        index = pacer.next_index
+        due_s = now_s - (t_s - pacer.deadline_of(index - new))
+        late = LateTick(self._seat, due_s, now_s, self.started_s, self._period_s)
+        cause = self._account.explain(late)
+        self._counts[cause] += new
+        self._missed = pacer.missed
+        self._recorder.record(LATE_TICKS.name, (index, 0, new, cause.value))
 
     def counts(self) -> Mapping[str, int]:
         """Return how many ticks were missed, or began late, by cause; those of which there are none left out."""

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.recording.writer_thread import WriterThread
-from madns_runtime.timing.kernel_times import KernelCount, stolen_s, waited_s
+from madns_runtime.timing.kernel_times import KernelCount, KernelFile
 from madns_runtime.timing.late_causes import Cause, name_cause, overlap_s
 
 SPANS_MIN = 256
@@ -20,6 +20,9 @@ STOLEN_INTERVAL_S = 0.02
 """The kernel counts what was stolen in steps of 10 ms, and is not asked more often, however many ticks are late."""
 WAITED_INTERVAL_S = 0.001
 """What the loop waited for a processor is counted in nanoseconds and read more quickly."""
+WAITED_EVERY_S = 0.02
+STOLEN_EVERY_S = 0.1
+"""How often they are read at least, where something is ever stolen: what they grew by long before is no late tick's."""
 TOGETHER_S = 1e-6
 """Deadlines of one pack differ by roundings."""
 NOBODY = -1
@@ -72,6 +75,8 @@ class _Looked(NamedTuple):
     """How much of the window each cause filled, but for steps, s."""
     steps: Mapping[int, _Steps]
     """By agent."""
+    together_s: float
+    """How much of the window all of them filled: a collection within a step counts once, s."""
 
     def steps_of(self, agent: int) -> tuple[_Steps, float]:
         """Return an agent's own steps, and for how long those of others took, s."""
@@ -118,21 +123,35 @@ class LoopAccount:
         self._before = self._mark
         self._looked: _Looked | None = None
         """What the newest late tick of those begun together has met."""
-        self._stolen = KernelCount(stolen_s, STOLEN_INTERVAL_S)
-        self._waited = KernelCount(waited_s, WAITED_INTERVAL_S)
+        self._files = KernelFile.of_stolen_time(), KernelFile.of_waiting()
+        self._stolen = KernelCount(self._files[0], STOLEN_INTERVAL_S)
+        self._waited = KernelCount(self._files[1], WAITED_INTERVAL_S)
+        self._read_waited_at_s = self._read_stolen_at_s = -math.inf
         gc.callbacks.append(self._collecting)
 
     def close(self) -> None:
-        """Watch the collector no more."""
+        """Watch the collector and the kernel's counts no more."""
         gc.callbacks.remove(self._collecting)
+        for file in self._files:
+            file.close()
 
     def begin_ticks(self, now_s: float) -> None:
         """Note how much of its time the loop has slept and computed until now, as ticks are begun."""
+        if now_s >= self._read_waited_at_s:
+            self._read_at(now_s)
         self._before, self._mark = self._mark, _Mark(now_s, thread_time(), self._reactor.slept_s)
         self._looked = None
 
+    def _read_at(self, now_s: float) -> None:
+        """Read the kernel's counts as ticks are begun, so that a late tick is charged with what it met alone."""
+        self._read_waited_at_s = now_s + WAITED_EVERY_S
+        self._waited.read(now_s)
+        if self._stolen.newest_s > 0.0 and now_s >= self._read_stolen_at_s:
+            self._read_stolen_at_s = now_s + STOLEN_EVERY_S
+            self._stolen.read(now_s)
+
     def look(self) -> None:
-        """Read the kernel's counts, so that a late tick is charged with what it met alone: called now and then."""
+        """Read the kernel's counts: of a late tick, and now and then."""
         self._stolen.read()
         self._waited.read()
 
@@ -150,9 +169,12 @@ class LoopAccount:
         filled_s = dict(looked.filled_s)
         own, others = looked.steps_of(late.agent)
         filled_s[own.cause_within(late.period_s)] = own.within_s
-        filled_s[Cause.OTHER_AGENT] = others + max(0.0, late.began_s - looked.began_s)
-        filled_s[Cause.START] = overlap_s(late.due_s, late.started_s, (late.due_s, late.began_s))
-        return name_cause(late.began_s - late.due_s, filled_s)
+        since_s = max(0.0, late.began_s - looked.began_s)
+        filled_s[Cause.OTHER_AGENT] = others + since_s
+        start_s = overlap_s(late.due_s, late.started_s, (late.due_s, late.began_s))
+        filled_s[Cause.START] = start_s
+        together_s = looked.together_s + since_s + start_s
+        return name_cause(late.began_s - late.due_s, filled_s, together_s=together_s)
 
     def _look_at(self, late: LateTick) -> _Looked:
         """Return what was at work between a late tick's deadline and its begin."""
@@ -160,11 +182,17 @@ class LoopAccount:
         window = late.due_s, late.began_s
         filled_s: dict[Cause, float] = {}
         steps: dict[int, _Steps] = {}
-        # A copy: Python's collector may begin meanwhile, and its span is added then and there.
-        for cause, agent, begin_s, end_s in reversed(tuple(self._spans)):
+        timed_s, timed_from_s = 0.0, late.began_s
+        # A copy: Python's collector may begin meanwhile, and its span is added then and there. tuple() would make an
+        # object as it goes through the spans, at which the collector of Python 3.11 begins.
+        for cause, agent, begin_s, end_s in reversed(self._spans.copy()):
             if end_s < late.due_s:
                 break  # they end one after the other
+            if begin_s >= late.began_s:
+                continue  # its own step, which has just ended, and what came in it
             within_s = overlap_s(begin_s, end_s, window)
+            timed_s += overlap_s(begin_s, min(end_s, timed_from_s), window)
+            timed_from_s = min(timed_from_s, begin_s)
             if cause is Cause.STEP:
                 before = steps.get(agent, NO_STEPS)
                 steps[agent] = _Steps(
@@ -183,8 +211,11 @@ class LoopAccount:
         if stolen_since_s > waited_since_s or math.isinf(waited_since_s):
             filled_s[Cause.STOLEN] = min(absent_s, stolen_since_s)
         filled_s[Cause.RECORDING] = min(absent_s, self._writer.computed_within_s(window))
+        kept_s = max(
+            filled_s[Cause.WAKE_UP], filled_s[Cause.RECORDING], filled_s.get(Cause.STOLEN, 0.0)
+        )
         self.add(Span(Cause.HOUSEKEEPING, NOBODY, looking_s, monotonic()))
-        return _Looked(late.due_s, late.began_s, filled_s, steps)
+        return _Looked(late.due_s, late.began_s, filled_s, steps, timed_s + kept_s)
 
     def _kept_off_s(self, own_step_s: float) -> float:
         """

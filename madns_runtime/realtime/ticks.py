@@ -107,7 +107,7 @@ class PacedTicks:
     def finish(self, now_s: float) -> None:
         """Close the account at simulated time *now_s*, s."""
         self.pacer.finish(now_s)
-        self.late.never_run(self.pacer.missed, monotonic())
+        self.late.never_run(self.pacer, now_s, monotonic())
 
     def hinder(self, order: AgentFault) -> StepFaults | None:
         """
@@ -155,7 +155,7 @@ class PacedTicks:
         began_s = port.at(local_s)
         timing = pacer.begin(began_s)
         if timing is None:
-            self.late.never_run(pacer.missed, local_s)
+            self.late.never_run(pacer, began_s, local_s)
         else:
             index, t_s, deadline_s, lateness_s, missed = timing
             self.factor.add(t_s, began_s)
@@ -180,8 +180,9 @@ class PacedTicks:
             margin_s = pacer.end(port.at(ended_s))
             values: tuple[Any, ...] = (index, int(lateness_s * 1e6), int(margin_s * 1e6), missed)
             self._record("ticks", values)
+            # Before the account of a late tick, which is a span of its own: spans end one after the other.
+            self._add_span(Span(Cause.STEP, self._seat, local_s, ended_s))
             if missed or lateness_s > self._late_s:
                 self.late.explain(timing, local_s)
-            self._add_span(Span(Cause.STEP, self._seat, local_s, ended_s))
         if pacer.is_over:
             self._calls.ended()

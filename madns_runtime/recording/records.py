@@ -77,7 +77,11 @@ LATE_TICKS = StreamSchema(
         Field("cause", "", "str"),
     ),
 )
-"""Ticks that began too late, or not at all (*missed*, just before this one), and what was measured to be the cause."""
+"""
+Ticks that began too late, or not at all (*missed*, just before this one), and what was measured to be the cause.
+
+Those that no other followed stand before the one that would have come next, with a lateness of 0.
+"""
 
 CLOCK = StreamSchema(
     "clock",

@@ -43,19 +43,24 @@ CAUSES: Final = tuple(Cause)
 HALF: Final = 0.5
 
 
-def name_cause(window_s: float, filled_s: Mapping[Cause, float]) -> Cause:
+def name_cause(
+    window_s: float, filled_s: Mapping[Cause, float], *, together_s: float | None = None
+) -> Cause:
     """
     Return the cause of a late tick.
 
     Args:
         window_s: From the deadline, of the first tick missed or else of this one, to its begin, s.
         filled_s: The part of the window that each cause filled, s; parts may overlap.
+        together_s: The part that all of them filled, s; None for their sum, where they do not overlap.
     """
     limit_s = HALF * window_s
     for cause in CAUSES:
         if filled_s.get(cause, 0.0) >= limit_s > 0:
             return cause
-    if sum(filled_s.values()) >= limit_s > 0:
+    if together_s is None:
+        together_s = sum(filled_s.values())
+    if together_s >= limit_s > 0:
         return max(CAUSES, key=lambda cause: filled_s.get(cause, 0.0))
     return Cause.UNEXPLAINED
 

@@ -158,9 +158,18 @@ class Pacer:
         """Whether no tick is left."""
         return self._index >= self.tick_count
 
+    @property
+    def next_index(self) -> int:
+        """The tick to begin next; `tick_count` when none is left."""
+        return self._index
+
     def next_deadline_s(self) -> float | None:
         """Return when the next tick is due, s since T0; None when none is left."""
         return self._deadline_s if self._index < self.tick_count else None
+
+    def deadline_of(self, index: int) -> float:
+        """Return when a tick is due, s since T0."""
+        return index / self._tick_hz + self._phase_s
 
     def begin(self, now_s: float) -> TickTiming | None:
         """
@@ -221,7 +230,7 @@ class Pacer:
         count as `not_run`, not as missed.
         """
         due = self._newest_due(now_s)
-        return self._skip(due if self._deadline_of(due) == now_s else due + 1, "not_run")
+        return self._skip(due if self.deadline_of(due) == now_s else due + 1, "not_run")
 
     def finish(self, now_s: float) -> None:
         """Close the account at *now_s*: whatever was due until then and never run is missed."""
@@ -249,9 +258,6 @@ class Pacer:
             "margin_us_min": round(self._margin_s_min * 1e6) if has_margin else None,
         }
 
-    def _deadline_of(self, index: int) -> float:
-        return index / self._tick_hz + self._phase_s
-
     def _move_to(self, index: int) -> None:
         """Make *index* the next tick; when there is none, its deadline never comes."""
         self._index = index
@@ -264,13 +270,13 @@ class Pacer:
 
     def _newest_due(self, now_s: float) -> int:
         """Return the last index whose deadline is not after *now_s*: -1 before all, `tick_count` after the end."""
-        if now_s >= self._deadline_of(self.tick_count):
+        if now_s >= self.deadline_of(self.tick_count):
             return self.tick_count
         index = max(math.floor((now_s - self._phase_s) * self._tick_hz), -1)
         # The product may be rounded across a whole number; the deadlines themselves decide.
-        while self._deadline_of(index + 1) <= now_s:
+        while self.deadline_of(index + 1) <= now_s:
             index += 1
-        while index >= 0 and self._deadline_of(index) > now_s:
+        while index >= 0 and self.deadline_of(index) > now_s:
             index -= 1
         return index
 

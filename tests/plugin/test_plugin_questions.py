@@ -225,7 +225,7 @@ def test_demand_with_a_bad_figure_is_told_with_its_place(plugin, field, value):
     ("field", "value"),
     [
         *((field, "float('inf')") for field in ("batch_bytes", "batch_compute_s", "sync_bytes")),
-        *((field, "float('inf')") for field in ("sync_compute_s", "sync_rate_hz", "lead_s")),
+        *((field, "float('inf')") for field in ("sync_compute_s", "sync_rate_hz", "sync_bytes")),
         *((field, "10**400") for field in ("buffer_s", "batch_bytes", "lead_s")),
         *((field, "10**5000") for field in ("buffer_s", "batch_bytes")),
         ("flows", "(Flow(name='a', message_bytes=float('inf'), rate_hz=1),)"),

@@ -16,16 +16,30 @@ PERIOD_S = 0.010
 ME, OTHER = 0, 1
 
 
+class Counted:
+    """A file of the kernel's, as a test has it count."""
+
+    def __init__(self, kernel, name):
+        self.kernel, self.name = kernel, name
+
+    def __call__(self):
+        return self.kernel[self.name]
+
+    def close(self):
+        pass
+
+
 @pytest.fixture
 def loop(monkeypatch):
     """A loop that sleeps when it is told to, and its writer of records; the machine is never busy."""
-    for count in ("waited_s", "stolen_s"):
-        monkeypatch.setattr(loop_account, count, float)
+    kernel = {"waited": 0.0, "stolen": 1.0}  # of a machine from which something was stolen once
+    for name, of in (("waited", "of_waiting"), ("stolen", "of_stolen_time")):
+        monkeypatch.setattr(loop_account.KernelFile, of, lambda name=name: Counted(kernel, name))
     reactor = SimpleNamespace(slept_s=0.0, last_sleep=(-9.0, -9.0))
     writer = SimpleNamespace(computed_s=0.0)
     writer.computed_within_s = lambda window: min(writer.computed_s, window[1] - window[0])
     account = LoopAccount(reactor, writer, agents=2)
-    yield SimpleNamespace(reactor=reactor, writer=writer, account=account)
+    yield SimpleNamespace(reactor=reactor, writer=writer, account=account, kernel=kernel)
     account.close()
 
 
@@ -68,6 +82,49 @@ def test_a_writer_that_computed_while_the_loop_was_to_wake_is_the_cause(loop):
     assert loop.account.explain(late) is Cause.RECORDING
 
 
+@pytest.mark.parametrize("count", ["waited", "stolen"])
+def test_a_step_that_blocks_is_not_charged_with_what_the_kernel_counted_long_before(
+    loop, monkeypatch, count
+):
+    clock = SimpleNamespace(now_s=monotonic())
+    monkeypatch.setattr(loop_account, "monotonic", lambda: clock.now_s)
+    monkeypatch.setattr(loop_account, "thread_time", float)
+    for each in (loop.account._waited, loop.account._stolen):
+        monkeypatch.setattr(each, "_now_s", lambda: clock.now_s)
+    for _ in range(
+        100
+    ):  # a second in which the loop slept, and waited now and then for a processor
+        clock.now_s += PERIOD_S
+        loop.reactor.slept_s += PERIOD_S
+        loop.kernel[count] += 0.002
+        loop.account.begin_ticks(clock.now_s)
+    due_s = clock.now_s + PERIOD_S
+    began_s, clock.now_s = clock.now_s, clock.now_s + 10 * PERIOD_S
+    loop.account.add(Span(Cause.STEP, ME, began_s, clock.now_s))
+    loop.kernel[count] += 0.002
+    loop.account.begin_ticks(clock.now_s)
+
+    assert loop.account.explain(LateTick(ME, due_s, clock.now_s, 0.0, PERIOD_S)) is Cause.STEP
+
+
+def test_a_tick_due_while_another_late_one_was_looked_at_is_of_housekeeping(loop, monkeypatch):
+    clock = SimpleNamespace(now_s=monotonic())
+    monkeypatch.setattr(loop_account, "monotonic", lambda: clock.now_s)
+    first = LateTick(ME, clock.now_s - 0.008, clock.now_s, 0.0, PERIOD_S)
+    clock.now_s += 0.001
+    loop.account.add(Span(Cause.STEP, ME, first.began_s, clock.now_s))
+
+    def look():
+        clock.now_s += 0.005
+
+    monkeypatch.setattr(loop.account, "look", look)
+    loop.account.explain(first)
+    loop.account.begin_ticks(clock.now_s)
+    next_one = LateTick(OTHER, clock.now_s - 0.004, clock.now_s, 0.0, PERIOD_S)
+
+    assert loop.account.explain(next_one) is Cause.HOUSEKEEPING
+
+
 def test_an_agent_that_began_after_its_deadline_was_started_late(loop):
     now_s = monotonic()
 
@@ -81,6 +138,15 @@ def test_what_nobody_timed_is_unexplained(loop):
     late = late_by(0.008)
     loop.account.add(Span(Cause.STEP, ME, late.due_s - 0.005, late.due_s - 0.001))
 
+    assert loop.account.explain(late) is Cause.UNEXPLAINED
+
+
+def test_a_collection_within_a_step_fills_no_more_than_the_step(loop):
+    late = late_by(0.010)
+    loop.account.add(Span(Cause.GARBAGE, NOBODY, late.due_s, late.due_s + 0.003))
+    loop.account.add(Span(Cause.STEP, ME, late.due_s - 0.005, late.due_s + 0.004))
+
+    # Together 4 ms of 10, though 3 and 4 are more than half.
     assert loop.account.explain(late) is Cause.UNEXPLAINED
 
 
@@ -131,6 +197,21 @@ def test_a_collection_while_spans_are_looked_at_is_noted_and_disturbs_nothing(lo
     monkeypatch.setattr(loop_account, "overlap_s", collect_first)
 
     assert loop.account.explain(late) is Cause.RECEIVING
+    assert any(span.cause is Cause.GARBAGE for span in loop.account._spans)
+
+
+def test_a_collection_at_any_allocation_ends_no_look(loop):
+    late = late_by(0.008)
+    loop.account.add(Span(Cause.RECEIVING, NOBODY, late.due_s, late.began_s))
+    thresholds = gc.get_threshold()
+    gc.set_threshold(1)
+    try:
+        for _ in range(100):
+            loop.account.explain(late)
+            loop.account.begin_ticks(late.began_s)
+    finally:
+        gc.set_threshold(*thresholds)
+
     assert any(span.cause is Cause.GARBAGE for span in loop.account._spans)
 
 

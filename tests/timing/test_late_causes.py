@@ -24,6 +24,13 @@ def test_cause_of_a_window_of_one_second(filled_s, cause):
     assert name_cause(1.0, filled_s) is cause
 
 
+def test_causes_that_overlap_are_judged_by_what_they_fill_together():
+    filled_s = {Cause.GARBAGE: 0.3, Cause.STEP: 0.4}
+
+    assert name_cause(1.0, filled_s, together_s=0.4) is Cause.UNEXPLAINED
+    assert name_cause(1.0, filled_s, together_s=0.6) is Cause.STEP
+
+
 def test_a_window_without_length_has_no_cause():
     assert name_cause(0.0, {Cause.STEP: 1.0}) is Cause.UNEXPLAINED
 

@@ -193,12 +193,13 @@ def _maneuver(
     request = split(whole) or whole
     truth, took_s = _timed(propagate_vehicle, request, replace(propagation, element_sets=()))
     urgent = truth.states[:URGENT_KNOTS_MAX]
-    grid = Segment(revision=1, t0_s=knot_s, knot_s=knot_s, states=urgent)
+    messages = [piece.to_segment(1) for piece in truth.pieces]
+    if len(urgent) > 1:  # of long knots the piece up to the first one may be all that is urgent
+        messages.append(Segment(revision=1, t0_s=knot_s, knot_s=knot_s, states=urgent))
     command = Command(
         number=0, kind="delta_v", commanded_s=0.0, at_s=at_s, frame="rtn", vector=(0.0, 0.0, 1.0)
     )
-    messages = [grid, command, *(piece.to_segment(1) for piece in truth.pieces)]
-    sync_bytes = sum(len(pack(message.to_message())) for message in messages)
+    sync_bytes = sum(len(pack(message.to_message())) for message in (command, *messages))
     left = end_knot - len(urgent)
     return sync_bytes, took_s, max(0, left) * state.nbytes
 

@@ -264,10 +264,12 @@ def test_plan_without_a_latency_measures_loopback(cosmos):
 def test_plan_of_a_simulation_that_does_not_tell_its_demand(cosmos):
     cosmos("init", "rover", "--template", "plugin")
 
-    code, out, _ = cosmos("plan", "rover.yaml")
+    code, out, _ = cosmos("plan", "rover.yaml", "--set", "plan.lead_s=1")
 
     assert code == 0
     assert "does not say what it asks for" in out
+    # What is given by itself is not enough, and is not passed over without a word.
+    assert "with batch_bytes, batch_compute_s, buffer_s, sync_bytes, sync_compute_s, flows\n" in out
 
 
 def test_inventory_lists_machines(cosmos):

@@ -1,4 +1,6 @@
 import math
+import random
+from fractions import Fraction
 
 import pytest
 from hypothesis import given
@@ -68,3 +70,58 @@ def test_many_points_end_with_a_bound():
     assert math.isfinite(found.bytes_s)
     assert found.bytes_s >= carried(close, 1, 0.002) / 0.002
     assert POINTS_MAX < 1e5
+
+
+def exactly(kinds, agents, until_s=30):
+    """The busiest interval's load by fractions: of all lengths up to *until_s* at which a message more must be there."""
+
+    def senders(most):
+        return agents if most is None else min(agents, most)
+
+    def load(length):
+        return sum(
+            senders(most) * size * (math.floor((length - within) * rate) + 1)
+            for size, rate, within, most in kinds
+            if length >= within
+        )
+
+    lengths = {
+        within + number / rate
+        for _, rate, within, _ in kinds
+        for number in range(math.ceil(until_s * rate))
+    }
+    mean = sum(senders(most) * size * rate for size, rate, _, most in kinds)
+    return max(mean, *(load(length) / length for length in lengths if length <= until_s))
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_decimals_are_judged_as_fractions_are(seed):
+    chance = random.Random(seed)
+    kinds = []
+    for _ in range(4):
+        rate = Fraction(chance.choice(["0.1", "0.2", "1", "2", "10", "12"]))
+        within = chance.choice([1 / rate, Fraction("0.05"), Fraction(1), Fraction("0.5")])
+        kinds.append((chance.choice([100, 757, 5437]), rate, within, chance.choice([None, 3])))
+    sendings = [
+        sending(size, float(rate), float(within), senders_max=math.inf if most is None else most)
+        for size, rate, within, most in kinds
+    ]
+    # What comes within the first second is the most, or next to it.
+    assert busiest_interval(sendings, 10).bytes_s == pytest.approx(
+        float(exactly(kinds, 10)), rel=2e-3
+    )
+
+
+def test_ten_tenths_of_a_second_are_a_second():
+    # 176,736 B in a second; sums of 0.1 in floats pass it by.
+    kinds = [sending(5437, 2, 0.5), sending(5437, 0.1, 1), sending(757, 10, 0.5, senders_max=3)]
+
+    found = busiest_interval(kinds, 10)
+
+    assert (found.length_s, found.bytes_s) == (pytest.approx(1.0), pytest.approx(176_736))
+
+
+def test_one_kind_that_has_time_makes_up_for_one_that_has_not():
+    found = busiest_interval([sending(100, 1, 0.5), sending(5000, 1, 3)], 10)
+
+    assert (found.length_s, found.bytes_s) == (math.inf, 51_000)

@@ -165,6 +165,35 @@ def test_breaks_at_is_where_it_first_does_not_hold(number, workers):
     assert not inequality(number, agents=limit, offered=offered).holds
 
 
+@pytest.mark.parametrize(
+    ("number", "compute_s", "allowed_s", "latency_s", "workers", "breaks_at"),
+    [
+        ("2.7", 0.1, 0.3, 0.0, 1, 4),
+        ("2.7", 0.1, 0.3, 0.1, 3, 7),
+        ("2.7", 0.1, 1.001, 0.001, 1, 11),
+        ("2.8", 0.1, 0.3, 0.0, 3, 10),
+        ("2.8", 0.1, 0.7, 0.1, 1, 6),
+        ("2.8", 0.1, 1.001, 0.0005, 7, 71),
+    ],
+)
+def test_sides_that_are_equal_but_for_rounding_hold(
+    number, compute_s, allowed_s, latency_s, workers, breaks_at
+):
+    # Decimals as people type them: none of these left sides is the right one in floats.
+    asked = demand(
+        batch_compute_s=compute_s, buffer_s=allowed_s, sync_compute_s=compute_s, lead_s=allowed_s
+    )
+    offered = resources(workers=workers, latency_s=latency_s)
+
+    last = inequality(number, agents=breaks_at - 1, asked=asked, offered=offered)
+
+    assert last.breaks_at == breaks_at
+    assert last.holds
+    assert last.margin == pytest.approx(0.0, abs=1e-12)
+    assert last.margin >= 0.0
+    assert not inequality(number, agents=breaks_at, asked=asked, offered=offered).holds
+
+
 def test_latency_beyond_the_buffer_breaks_at_the_first_agent():
     assert inequality("2.7", offered=resources(latency_s=11.0)).breaks_at == 1
 
