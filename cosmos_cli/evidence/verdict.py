@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, TypeGuard
 
 from cosmos_cli.errors import ExitCode
+from cosmos_cli.ui.plural import counted
 from madns_runtime.conditions.reports import BROKEN
 
 ORDER = (
@@ -349,7 +350,11 @@ def _conclude(
         return ExitCode.BUDGET_BROKEN, text + hint
     if facts.problems:
         return ExitCode.MACHINES, f"NOT CLEAN: {_listed(facts.problems)}"
-    return ExitCode.OK, f"PASSED: {len(checks)} checks hold"
+    return ExitCode.OK, _all_hold(len(checks))
+
+
+def _all_hold(count: int) -> str:
+    return f"PASSED: {counted(count, 'check')} hold{'s' if count == 1 else ''}"
 
 
 def conclusion_of_expectations(
@@ -367,7 +372,7 @@ def conclusion_of_expectations(
     broken = [result for result in results if not result.passed]
     if broken:
         return ExitCode.BUDGET_BROKEN, f"CHECK BROKEN: {_listed([_told(each) for each in broken])}"
-    return ExitCode.OK, f"PASSED: {len(results)} checks hold"
+    return ExitCode.OK, _all_hold(len(results))
 
 
 def _told(check: CheckResult) -> str:

@@ -26,7 +26,7 @@ def make_case(name="s", **more):
 
 
 def make_result(exit_code=0, *checks, **more):
-    document = {"run": "0001-s", "verdict": "PASSED: 1 checks hold", "checks": list(checks)}
+    document = {"run": "0001-s", "verdict": "PASSED: 1 check holds", "checks": list(checks)}
     return ProcessResult(**{"exit_code": exit_code, "seconds": 1.0, "document": document, **more})
 
 
