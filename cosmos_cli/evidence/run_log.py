@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from cosmos_cli.onboard.log_tail import read_tails
-from madns_runtime.recording.run_journal import LEVELS
+from madns_runtime.recording.records import LOG_LEVELS
 
 STDERR = "stderr"
 """Stands where a level would: what a process wrote to its standard error, which has no time."""
-RANKS: Mapping[str, int] = {**LEVELS, STDERR: max(LEVELS.values()) + 1}
+RANKS: Mapping[str, int] = {**LOG_LEVELS, STDERR: max(LOG_LEVELS.values()) + 1}
 TEXT_CHARACTERS_MAX = 4000
 NAME_CHARACTERS_MAX = 40
 

@@ -18,16 +18,16 @@ from madns_runtime.recording.records import (
     HEALTH,
     LATE_TICKS,
     LOG,
+    LOG_LEVELS,
     PROCESS,
     TICKS,
     Field,
 )
-from madns_runtime.recording.run_journal import LEVELS
 
 REAL_TIME_ONLY = tuple(schema.name for schema in (TICKS, LATE_TICKS, CLOCK, PROCESS, HEALTH))
 """Framework streams that no run in lockstep records: no time passes there that could be late."""
 NOT_A_VALUE = ("json", "packed")
-WORDS = {(EVENTS.name, "event"): EVENT_WORDS, (LOG.name, "level"): tuple(LEVELS)}
+WORDS = {(EVENTS.name, "event"): EVENT_WORDS, (LOG.name, "level"): tuple(LOG_LEVELS)}
 """All texts that a field of a stream of the framework's ever holds."""
 Role = Literal["agent", "host", "machine", "device"]
 APART: tuple[Role, ...] = ("machine", "device")

@@ -122,6 +122,9 @@ LOG = StreamSchema(
 )
 """Logged sentences, as loud as recording.verbosity lets through."""
 
+LOG_LEVELS = {"critical": 50, "error": 40, "warning": 30, "info": 20, "debug": 10}
+"""All that `log` holds in `level`, each with its number in Python's logging."""
+
 HEALTH = StreamSchema(
     "health",
     (

@@ -10,19 +10,12 @@ from typing import Any
 from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.recording.record_files import RecordCounts
 from madns_runtime.recording.recorder import CLOSE_TIMEOUT_S, Recorder
-from madns_runtime.recording.records import EVENTS, LOG
+from madns_runtime.recording.records import EVENTS, LOG, LOG_LEVELS
 from madns_runtime.timing.clock import utc_now_iso
 
 T_S_DIGITS = 6
 LOG_CHARACTERS_MAX = 65_536
 """Of one sentence: whoever reads a log takes no longer ones at a time than this may become in a file."""
-LEVELS = {
-    "critical": logging.CRITICAL,
-    "error": logging.ERROR,
-    "warning": logging.WARNING,
-    "info": logging.INFO,
-    "debug": logging.DEBUG,
-}
 VERBOSITY_LEVELS = (logging.CRITICAL + 1, 50, 40, 30, 20, 10)
 """The least level that recording.verbosity 0 to 5 lets through, as logging numbers them."""
 
@@ -83,9 +76,11 @@ class RunJournal:
         Raises:
             PluginError: The level is none of these.
         """
-        number = LEVELS.get(level)
+        number = LOG_LEVELS.get(level)
         if number is None:
-            raise PluginError(f"unknown log level {level!r}; expected one of {', '.join(LEVELS)}")
+            raise PluginError(
+                f"unknown log level {level!r}; expected one of {', '.join(LOG_LEVELS)}"
+            )
         if number < self._level:
             return
         if (rest := len(text) - LOG_CHARACTERS_MAX) > 0:
