@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -24,7 +25,7 @@ from .inventory import format_inventory
 from .places import Places
 from .specification import BoardSpec, TowerSpec, name_boards
 
-STOP_PATIENCE_S = 30.0
+STOP_PATIENCE_S = 60.0
 ANSWER_PATIENCE_S = 60.0
 POLL_S = 0.02
 SSH_CONFIG_VARIABLE = "COSMOS_SSH_CONFIG"
@@ -77,6 +78,8 @@ class Tower:
         self.boards: dict[str, BoardInfo] = {}
         self.places: Places
         self.process: subprocess.Popen[bytes] | None = None
+        self._folder = -1
+        """Open while the tower lives: another one may have its index as soon as it is gone."""
 
     def __enter__(self) -> Tower:
         self.start()
@@ -109,6 +112,7 @@ class Tower:
         )
         state = self._read_state(self.process)
         self.places = Places(state["tower"])
+        self._folder = os.open(self.places.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         self.boards = {
             name: BoardInfo(
                 name=name, address=board["address"], arch=board["arch"], ssh_key=self.places.key
@@ -121,7 +125,10 @@ class Tower:
         if self.process is not None:
             _end(self.process)
             self.process = None
-            wait_until_gone(self.places)
+            try:
+                wait_until_gone(self.places, self._folder)
+            finally:
+                os.close(self._folder)
 
     def _read_state(self, process: subprocess.Popen[bytes]) -> dict[str, Any]:
         """Return what the supervisor says when it is up; if it does not come up, raise what it says then."""
@@ -253,10 +260,19 @@ def ask(places: Places, request: Mapping[str, Any]) -> dict[str, Any]:
     return answer
 
 
-def wait_until_gone(places: Places) -> None:
-    """Wait until a stopped or killed tower's guardian has removed its last trace."""
+def wait_until_gone(places: Places, folder: int | None = None) -> None:
+    """
+    Wait until a stopped or killed tower's guardian has removed its last trace.
+
+    Args:
+        places: The tower's.
+        folder: A descriptor of its folder; without it a tower that takes the index meanwhile is waited for, too.
+
+    Raises:
+        TowerError: It is still there.
+    """
     until_s = time.monotonic() + STOP_PATIENCE_S
-    while places.folder.exists():
+    while places.folder.exists() if folder is None else os.fstat(folder).st_nlink:
         if time.monotonic() > until_s:
             raise TowerError(f"{places.folder} is still there; `python -m tests.tower down`")
         time.sleep(POLL_S)
