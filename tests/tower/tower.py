@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import socket
 import subprocess
 import sys
@@ -78,8 +77,8 @@ class Tower:
         self.boards: dict[str, BoardInfo] = {}
         self.places: Places
         self.process: subprocess.Popen[bytes] | None = None
-        self._folder = -1
-        """Open while the tower lives: another one may have its index as soon as it is gone."""
+        self._key = b""
+        """By which its folder is told from that of another tower, which may have the index as soon as this one is gone."""
 
     def __enter__(self) -> Tower:
         self.start()
@@ -112,7 +111,7 @@ class Tower:
         )
         state = self._read_state(self.process)
         self.places = Places(state["tower"])
-        self._folder = os.open(self.places.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        self._key = self.places.key.read_bytes()
         self.boards = {
             name: BoardInfo(
                 name=name, address=board["address"], arch=board["arch"], ssh_key=self.places.key
@@ -125,10 +124,7 @@ class Tower:
         if self.process is not None:
             _end(self.process)
             self.process = None
-            try:
-                wait_until_gone(self.places, self._folder)
-            finally:
-                os.close(self._folder)
+            wait_until_gone(self.places, self._key)
 
     def _read_state(self, process: subprocess.Popen[bytes]) -> dict[str, Any]:
         """Return what the supervisor says when it is up; if it does not come up, raise what it says then."""
@@ -260,22 +256,29 @@ def ask(places: Places, request: Mapping[str, Any]) -> dict[str, Any]:
     return answer
 
 
-def wait_until_gone(places: Places, folder: int | None = None) -> None:
+def wait_until_gone(places: Places, key: bytes = b"") -> None:
     """
     Wait until a stopped or killed tower's guardian has removed its last trace.
 
     Args:
         places: The tower's.
-        folder: A descriptor of its folder; without it a tower that takes the index meanwhile is waited for, too.
+        key: Its own; without it a tower that takes the index meanwhile is waited for, too.
 
     Raises:
         TowerError: It is still there.
     """
     until_s = time.monotonic() + STOP_PATIENCE_S
-    while places.folder.exists() if folder is None else os.fstat(folder).st_nlink:
+    while places.folder.exists() and not _is_of_another(places, key):
         if time.monotonic() > until_s:
             raise TowerError(f"{places.folder} is still there; `python -m tests.tower down`")
         time.sleep(POLL_S)
+
+
+def _is_of_another(places: Places, key: bytes) -> bool:
+    """Tell whether a folder has the key of another tower; not while it has none, as at its begin and end."""
+    with contextlib.suppress(FileNotFoundError):
+        return bool(key) and places.key.read_bytes() not in (key, b"")
+    return False
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
