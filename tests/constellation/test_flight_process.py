@@ -235,9 +235,9 @@ print(json.dumps({"send": [{"to": "*", "payload": [1, "x"]}],
 def test_what_is_no_answer_fails_the_agent_by_the_programs_name(tmp_path, answer, words):
     ship = Ship(tmp_path, program(tmp_path, f"print({answer}, flush=True)"), crosslinks={})
 
-    # A second line may pass for the next tick's answer, but not for long.
+    # A second line may pass for the next tick's answer, for as long as a busy machine keeps the program waiting.
     with pytest.raises(BlamedError, match=words) as caught:
-        ship.run(100)
+        ship.run(5000)
 
     assert str(caught.value).startswith(sys.executable)
     assert not Path(f"/proc/{ship.process.pid}").exists()

