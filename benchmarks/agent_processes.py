@@ -13,7 +13,7 @@ from typing import Any
 
 from madns_runtime.processes import read_start_ticks
 
-COSMOS = (sys.executable, "-m", "cosmos_cli.start")
+COSMOS = (sys.executable, "-P", "-m", "cosmos_cli.start")
 LOOK_S = 0.1
 LOGIN_S = 60.0
 """For one command on a machine."""

@@ -12,10 +12,11 @@ class Heard:
     def __init__(self) -> None:
         self.calls: list[tuple[str, int]] = []
 
-    def begin(self, action: TimelineAction) -> None:
+    def begin(self, action: TimelineAction) -> list[str] | None:
         if "agent-bad" in action.agents:
             raise ActionRefused("agent-bad is no agent of this run")
         self.calls.append(("begin", action.number))
+        return None
 
     def end(self, action: TimelineAction) -> None:
         self.calls.append(("end", action.number))
@@ -39,7 +40,7 @@ def a_dispatcher() -> tuple[Dispatcher, Heard, list[tuple[str, dict[str, Any]]]]
 
 def test_agents_that_are_not_there_are_named_where_others_are() -> None:
     class Finding(Heard):
-        def begin(self, action: TimelineAction) -> list[str]:  # type: ignore[override]  # as the protocol has it
+        def begin(self, action: TimelineAction) -> list[str]:
             return [agent for agent in action.agents if agent == "agent-02"]
 
     events: list[dict[str, Any]] = []
