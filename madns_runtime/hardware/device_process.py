@@ -22,6 +22,7 @@ from madns_runtime.reactor.scheduling import apply as apply_scheduling
 from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
 from madns_runtime.recording.run_journal import RunJournal
+from madns_runtime.recording.writer_thread import WriterThread
 
 RECORDS_TIMEOUT_S = 2.0
 ERROR_CHARACTERS_MAX = 500
@@ -71,11 +72,12 @@ class DeviceLoop:
         self._why = ""
         self._records: list[DeviceRecords] = []
         self._runners: dict[str, DeviceRunner] = {}
+        self._writer = WriterThread(config.recording)
         for seat in seats:
             launch = seat.launch
             folder = directory / "devices" / launch.place / launch.name
             files = RecordFiles(folder, run=config.run, source=launch.full_name)
-            recorder = Recorder(files, config.recording)
+            recorder = Recorder(files, config.recording, self._writer.writes(files))
             journal = RunJournal(recorder, config.recording.verbosity, t_s=lambda: None)
             records = DeviceRecords(journal, seat.channels)
             self._records.append(records)
@@ -91,8 +93,9 @@ class DeviceLoop:
         reactor.add_reader(self._control.fileno(), self._obey)
         for records in self._records:
             records.journal.recorder.start()
-        # The recorders' threads run already and keep the normal policy; only the loop is raised.
-        apply_scheduling(self._config.scheduling, is_host=False)
+        # The recorders' thread runs already: only the loop is raised to its priority.
+        grant = apply_scheduling(self._config.scheduling, is_host=False)
+        self._writer.follow(grant.policy)
         for runner in self._runners.values():
             runner.open()
         reactor.run()

@@ -86,8 +86,8 @@ def apply(scheduling: Scheduling, *, is_host: bool) -> SchedulingGrant:
     Ask the kernel for what *scheduling* says, for the calling thread alone.
 
     Threads and processes started later fall back to the normal policy (SCHED_RESET_ON_FORK), so that
-    neither a recorder's disk nor a worker's computing competes with a loop. They do inherit the
-    processors, so start them before where that matters.
+    neither a recorder's disk nor a worker's computing competes with a loop (see `WriterThread.follow` for the
+    least that a recorder needs). They do inherit the processors, so start them before where that matters.
 
     Args:
         scheduling: What is asked for.

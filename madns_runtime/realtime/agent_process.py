@@ -77,8 +77,10 @@ class AgentProcess:
         self._runners = {runner.name: runner for runner in runners}
         for runner in runners:
             runner.start()
-        # The recorders' threads run already and keep the normal policy; only the loop is raised.
-        self._grant = apply_scheduling(self._launch.config.scheduling, is_host=False).to_mapping()
+        # The recorders' thread runs already: only the loop is raised to its priority.
+        grant = apply_scheduling(self._launch.config.scheduling, is_host=False)
+        self._process.writer.follow(grant.policy)
+        self._grant = grant.to_mapping()
         for runner in runners:
             runner.set_scheduling(self._grant)
         reactor.run()

@@ -52,6 +52,7 @@ from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
 from madns_runtime.recording.result_file import hand_over
 from madns_runtime.recording.run_journal import RunJournal
+from madns_runtime.recording.writer_thread import WriterThread
 from madns_runtime.timing.clock import utc_at_iso
 
 PROGRESS_INTERVAL_S = 0.5
@@ -59,8 +60,6 @@ HANG_UP_WAIT_S = 0.5
 """On a busy computer, from the end of a dead operator's line to an agent until the end of that to the host."""
 HANG_GRACE_S = 2.0
 """Beyond the time for shutdown: a loop that hangs in a plug-in, without an operator, ends by force."""
-
-BEST = Service.BEST
 
 
 class HostRuntime:
@@ -105,8 +104,9 @@ class HostRuntime:
             end=self._end,
             on_heard=self._port.want_pump,
         )
-        recorder = Recorder(files, config.recording, tap=self._conditions.tap)
-        self._recorder = recorder
+        self._writer = WriterThread(config.recording)
+        writer, tap = self._writer.writes(files), self._conditions.tap
+        recorder = self._recorder = Recorder(files, config.recording, writer, tap=tap)
         self._journal = RunJournal(recorder, config.recording.verbosity, t_s=self._port.t_s)
         self._announced = Announcements(self._journal, self._operator.emit)
         self._log = self._announced.log
@@ -164,6 +164,7 @@ class HostRuntime:
         heed_signals(self._reactor, terminated, is_detached=self._launch.is_detached)
         self._recorder.start()
         grant = apply_scheduling(self._config.scheduling, is_host=True)
+        self._writer.follow(grant.policy)
         self._report.scheduling = grant.to_mapping()
         socket = self._port.socket
         for warning in filter(None, (socket.warning, grant.warning)):
@@ -181,7 +182,7 @@ class HostRuntime:
     def _take_datagram(self, data: bytes, address: Address) -> None:
         message = self._session.receive_data(data, address, monotonic())
         if message is not None and self._takes_data:
-            self._guard(self._half.take, *message, BEST)
+            self._guard(self._half.take, *message, Service.BEST)
             if not self._port.must_pump:
                 return
         self._pump()

@@ -14,6 +14,9 @@ from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.timing.kernel_times import thread_computed_s
 from madns_runtime.timing.late_causes import overlap_s
 
+FIFO_PRIORITY = 1
+"""Of SCHED_FIFO: the least there is, below every loop's."""
+
 
 class RecordWriter(Protocol):
     """Writer of the bytes that wait in a recorder's files."""
@@ -53,6 +56,7 @@ class WriterThread:
         self._pass_under_way: tuple[float, float] | None = None
         """Its begin, and the thread's CPU time then, s."""
         self._thread_id = 0
+        self._follows_fifo = False
 
     def writes(self, files: RecordFiles) -> RecordWriter:
         """Return the writer of some more files."""
@@ -67,6 +71,14 @@ class WriterThread:
             if self._thread is None:
                 self._thread = threading.Thread(target=self._write_on, name="recorder", daemon=True)
                 self._thread.start()
+
+    def follow(self, policy: str) -> None:
+        """
+        Compute before all programs of the normal policy, if the loop that records got *policy* fifo.
+
+        Whatever keeps this thread from computing while it has the interpreter keeps that loop waiting for it.
+        """
+        self._follows_fifo = policy == "fifo"
 
     def computed_within_s(self, window: tuple[float, float]) -> float:
         """
@@ -88,9 +100,10 @@ class WriterThread:
         self._wake.set()
 
     def _write_on(self) -> None:
-        _schedule_normally()
+        # SCHED_FIFO at its loop's priority, which a thread may inherit, would let it compete with that loop.
+        _schedule("SCHED_OTHER", 0)
         self._thread_id = threading.get_native_id()
-        is_troubled = False
+        is_troubled = is_raised = False
         interval_s = self._settings.sync_interval_s or math.inf
         synced_s = monotonic()
         while True:
@@ -98,6 +111,9 @@ class WriterThread:
             (self._hurry if is_troubled else self._wake).wait(self._settings.flush_interval_s)
             self._wake.clear()
             self._hurry.clear()
+            if self._follows_fifo and not is_raised:
+                is_raised = True
+                _schedule("SCHED_FIFO", FIFO_PRIORITY)
             began_s, computed_s = self._pass_under_way = monotonic(), thread_time()
             closing = [writing for writing in self._writings if writing.is_closing]
             must_sync = monotonic() - synced_s >= interval_s
@@ -164,8 +180,8 @@ class _Writing:
             )
 
 
-def _schedule_normally() -> None:
-    """Leave SCHED_FIFO, which a thread inherits: the disk's work must not compete with a loop."""
+def _schedule(policy: str, priority: int) -> None:
+    """Ask for a scheduling policy for the calling thread; what is refused stays as it was."""
     # Where it stays as it is, the loop records what scheduling it was granted.
     with contextlib.suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.sched_setscheduler(0, getattr(os, policy), os.sched_param(priority))

@@ -16,6 +16,7 @@ from madns_runtime.recording.reader import read_stream
 from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
 from madns_runtime.recording.records import TICKS
+from madns_runtime.recording.writer_thread import FIFO_PRIORITY, WriterThread
 
 RECORDING_CHILD = """
 import json, sys, time
@@ -172,32 +173,42 @@ def test_disk_that_stays_full_costs_counted_records_and_no_broken_line(tmp_path)
 
 @pytest.mark.root
 @pytest.mark.skipif(os.geteuid() != 0, reason="sets a real-time policy")
-def test_writer_leaves_the_real_time_policy_of_its_starter(tmp_path):
-    policies = []
+@pytest.mark.parametrize(
+    ("granted", "policy", "priority"),
+    [("normal", os.SCHED_OTHER, 0), ("fifo", os.SCHED_FIFO, FIFO_PRIORITY)],
+)
+def test_writer_has_the_least_real_time_policy_if_its_loop_was_granted_it(
+    tmp_path, granted, policy, priority
+):
+    schedulings = []
 
     def loop():
         try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(5))
         except OSError:
             return
-        recorder = Recorder(
-            RecordFiles(tmp_path, run="r", source="a"), Recording(flush_interval_s=0.05)
-        )
+        settings = Recording(flush_interval_s=0.05)
+        writer = WriterThread(settings)
+        files = RecordFiles(tmp_path, run="r", source="a")
+        recorder = Recorder(files, settings, writer.writes(files))
         recorder.open_stream(TICKS)
         recorder.start()
+        writer.follow(granted)
         recorder.record("ticks", (0, 50, 9000, 0))
         wait_until(lambda: recorder.counts().written)
-        writer = next(t for t in threading.enumerate() if t.name == "recorder")
-        policies.extend((os.sched_getscheduler(0), os.sched_getscheduler(writer.native_id)))
+        thread = next(t for t in threading.enumerate() if t.name == "recorder").native_id
+        for number in (0, thread):
+            its_priority = os.sched_getparam(number).sched_priority
+            schedulings.append((os.sched_getscheduler(number), its_priority))
         recorder.close(30)
 
     thread = threading.Thread(target=loop)
     thread.start()
     thread.join(120)
-    if not policies:
+    if not schedulings:
         pytest.skip("no real-time policy is granted here")
 
-    assert policies == [os.SCHED_FIFO, os.SCHED_OTHER]
+    assert schedulings == [(os.SCHED_FIFO, 5), (policy, priority)]
 
 
 def _size(path):
