@@ -8,7 +8,6 @@ import platform
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -30,27 +29,25 @@ settings.register_profile(
 )
 settings.load_profile("any_machine")
 
-SLOW_FIRST = ("runs", "cars", "faults", "cosmos_cli", "fleet", "tower", "docs", "lockstep")
-"""Folders whose tests start processes: begun first, so that none of them runs on alone at the end."""
+SLOWNESS = {"slow": 6, "root": 6, "browser": 3, "process": 1}
+"""How long a test with a marker takes, very roughly, beside one that starts a process."""
 
 
 def pytest_collection_modifyitems(config, items):
-    """Bring what may take longest to the front, then the slow folders' tests; the order within a file stays."""
-    here = Path(__file__).parent
-    places = {name: place for place, name in enumerate(SLOW_FIRST)}
-    limits_s = {}
+    """
+    Bring the files to the front that may take longest, then those whose tests start processes or compute for long.
+
+    So that at the end, when workers run out of files, none of them is a long one. The order within a file stays.
+    """
+    limits_s, slowness = {}, {}
     for item in items:
+        if is_left_out(config, item):
+            continue
         marker = item.get_closest_marker("timeout")
-        limit_s = marker.args[0] if marker and not is_left_out(config, item) else 0
-        limits_s[item.path] = max(limit_s, limits_s.get(item.path, 0))
-    items.sort(
-        key=lambda item: (
-            -limits_s[item.path],
-            places.get(item.path.relative_to(here).parts[0], len(SLOW_FIRST))
-            if item.path.is_relative_to(here)
-            else len(SLOW_FIRST),
-        )
-    )
+        limits_s[item.path] = max(marker.args[0] if marker else 0, limits_s.get(item.path, 0))
+        marked = [weight for name, weight in SLOWNESS.items() if item.get_closest_marker(name)]
+        slowness[item.path] = slowness.get(item.path, 0) + max(marked, default=0)
+    items.sort(key=lambda item: (-limits_s.get(item.path, 0), -slowness.get(item.path, 0)))
 
 
 def is_left_out(config, item):

@@ -3,7 +3,8 @@ A laboratory for each test; nothing may be left running in it.
 
 A test here waits far more than it works, so those that use a laboratory run some at once: each in a
 thread, in a folder of its own, started before pytest comes to it. They come after all other tests, whose
-timing they would disturb.
+timing they would disturb. With workers (pytest-xdist) they are tests like others: at the end the processors
+would wait for them.
 """
 
 from __future__ import annotations
@@ -26,9 +27,10 @@ Stories = dict[str, tuple[Laboratory, "Future[None]"]]
 
 
 @pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Move the tests of this folder to the end, in whatever order they were shuffled to."""
-    items.sort(key=lambda item: item.path.parent == FOLDER)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Move the tests of this folder to the end, in whatever order they were shuffled to, if there are no workers."""
+    if not hasattr(config, "workerinput"):
+        items.sort(key=lambda item: item.path.parent == FOLDER)
 
 
 @pytest.fixture(scope="session")
