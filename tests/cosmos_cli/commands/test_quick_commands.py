@@ -9,12 +9,14 @@ import sys
 from pathlib import Path
 
 import pytest
+from pydantic import TypeAdapter
 
 from cosmos_cli import app
 from cosmos_cli.commands.init import render
 from cosmos_cli.errors import ExitCode, RunFailedError
 from cosmos_cli.launch.feasibility import Resources, judge
 from cosmos_cli.launch.plan_view import verdict_words
+from cosmos_cli.models import parameters
 from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.plugin.api import Demand
 
@@ -526,6 +528,39 @@ def test_validate_imports_only_what_it_needs(tmp_path):
     )
 
     assert result.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.process
+def test_validate_makes_the_validator_of_parameters_once(cosmos, monkeypatch, tmp_path):
+    """Not once more for the scenario as its test changes it, nor in each process that answers for code of one's own."""
+    made = tmp_path / "made"
+
+    def counted(kind):
+        with made.open("a") as file:
+            file.write(f"{kind.__name__}\n")
+        return TypeAdapter(kind)
+
+    monkeypatch.setattr(parameters, "TypeAdapter", counted)
+    parameters.adapter_of.cache_clear()
+
+    code, _, err = cosmos("validate", ROOT / "scenarios/planet93.yaml")
+
+    assert (code, err) == (0, "")
+    assert made.read_text() == "ConstellationParameters\n"
+
+
+@pytest.mark.process
+def test_no_garbage_is_looked_for_among_what_was_imported():
+    code = (
+        "import gc; gc.disable(); from cosmos_cli import app; app.load_command('validate');"
+        "print(gc.isenabled(), len(gc.get_objects()) < gc.get_freeze_count())"
+    )
+
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+
+    assert result.stdout == "True True\n"
 
 
 @pytest.mark.process
