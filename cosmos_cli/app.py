@@ -156,8 +156,7 @@ def _counts_once(parameter: Any) -> bool:
 def load_command(verb: str) -> Any:
     """Import `cosmos_cli.commands.<verb>` and return its function as a command, or as a group of its SUBCOMMANDS."""
     module = importlib.import_module(f"cosmos_cli.commands.{verb.replace(' ', '_')}")
-    gc.set_threshold(GARBAGE_AFTER)
-    gc.enable()
+    _collect_garbage()
     function = getattr(module, verb.rpartition(" ")[2])
     if hasattr(module, "SUBCOMMANDS"):
         return _as_group(function, verb, module.SUBCOMMANDS)
@@ -170,6 +169,14 @@ def load_command(verb: str) -> Any:
         if parameter.envvar == INVENTORY_VARIABLE:
             parameter.type = _with_own_split(parameter.type)
     return command
+
+
+def _collect_garbage() -> None:
+    """Begin to look for garbage, unless that goes on already, but not among all that was imported: it stays."""
+    if not gc.isenabled():
+        gc.freeze()
+        gc.enable()
+    gc.set_threshold(GARBAGE_AFTER)
 
 
 def _verbose_option() -> Any:
