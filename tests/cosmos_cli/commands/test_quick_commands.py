@@ -12,6 +12,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from cosmos_cli import app
+from cosmos_cli.commands import command_group
 from cosmos_cli.commands.init import render
 from cosmos_cli.errors import ExitCode, RunFailedError
 from cosmos_cli.launch.feasibility import Resources, judge
@@ -414,7 +415,7 @@ def fail_with(monkeypatch, error):
     def broken(name):
         raise error
 
-    monkeypatch.setattr(app, "load_command", broken)
+    monkeypatch.setattr(command_group, "load_command", broken)
 
 
 @pytest.mark.parametrize(
@@ -552,7 +553,8 @@ def test_validate_makes_the_validator_of_parameters_once(cosmos, monkeypatch, tm
 @pytest.mark.process
 def test_no_garbage_is_looked_for_among_what_was_imported():
     code = (
-        "import gc; gc.disable(); from cosmos_cli import app; app.load_command('validate');"
+        "import gc; gc.disable(); from cosmos_cli.commands.command_group import load_command;"
+        "load_command('validate');"
         "print(gc.isenabled(), len(gc.get_objects()) < gc.get_freeze_count())"
     )
 
@@ -582,6 +584,29 @@ def test_help_and_version():
     assert command("--version").stdout.startswith("cosmos 0.")
     assert "validate" in command("--help").stdout
     assert command("validate", "--help").returncode == 0
+
+
+@pytest.mark.process
+def test_help_imports_no_command(tmp_path):
+    code = (
+        "import sys; from cosmos_cli import app; app.run(['--help']);"
+        "print([m for m in sys.modules if m.partition('.')[0] in ('pydantic', 'yaml', 'numpy')])"
+    )
+
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+
+    assert result.stdout.splitlines()[-1] == "[]"
+
+
+def test_commands_are_listed_with_their_own_help():
+    commands = [(verb, command_group.load_command(verb)) for verb in command_group.COMMANDS]
+    commands += command_group.each_command()
+    told = {verb: command_group.command_outline(verb).help for verb, _ in commands}
+
+    assert len(told) > 30
+    assert told == {verb: command.help for verb, command in commands}
 
 
 def test_interrupt_ends_with_130_and_no_traceback(cosmos, monkeypatch):
