@@ -566,10 +566,10 @@ def test_no_garbage_is_looked_for_among_what_was_imported():
 
 
 @pytest.mark.process
-def test_a_run_begins_before_what_only_its_evidence_needs_is_imported():
+def test_a_run_begins_before_what_only_its_evidence_or_a_check_needs_is_imported():
     code = (
         "import sys; import cosmos_cli.commands.run;"
-        "print([m for m in ('numpy', 'scipy', 'pyarrow', 'paramiko') if m in sys.modules])"
+        "print([m for m in ('numpy', 'scipy', 'pyarrow', 'paramiko', 'packaging') if m in sys.modules])"
     )
 
     result = subprocess.run(
