@@ -17,7 +17,7 @@ from cosmos_cli.commands.init import render
 from cosmos_cli.errors import ExitCode, RunFailedError
 from cosmos_cli.launch.feasibility import Resources, judge
 from cosmos_cli.launch.plan_view import verdict_words
-from cosmos_cli.models import parameters
+from cosmos_cli.models import parameters, scenario_outline, timeline
 from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.plugin.api import Demand
 
@@ -548,6 +548,24 @@ def test_validate_makes_the_validator_of_parameters_once(cosmos, monkeypatch, tm
 
     assert (code, err) == (0, "")
     assert made.read_text() == "ConstellationParameters\n"
+
+
+def test_validate_reads_a_scenario_without_a_test_once(cosmos, monkeypatch):
+    monkeypatch.setattr(scenario_outline, "read_scenario_source", None)
+
+    assert cosmos("validate", "a.yaml")[0] == 0
+
+
+def test_all_entries_of_a_timeline_have_one_validator(cosmos, monkeypatch):
+    made = []
+    monkeypatch.setattr(
+        timeline, "TypeAdapter", lambda kind: made.append(kind) or TypeAdapter(kind)
+    )
+    entries = "".join(f"- {{at_s: {t_s}, action: annotate, text: x}}\n" for t_s in range(20))
+    Path("b.yaml").write_text(f"{SCENARIO}timeline:\n{entries}")
+
+    assert cosmos("validate", "b.yaml")[0] == 0
+    assert len(made) <= 1
 
 
 @pytest.mark.process
