@@ -156,7 +156,8 @@ def _build_union(expected: Any, value: Any, where: str) -> Any:
 
 
 @functools.lru_cache(maxsize=CLASSES_KEPT)
-def _hints_of(cls: type) -> dict[str, Any]:
+def types_of_fields(cls: type) -> Mapping[str, Any]:
+    """Return the types of a dataclass's fields by name, bounds and all; whatever its annotations raise is raised."""
     return typing.get_type_hints(cls, include_extras=True)
 
 
@@ -165,7 +166,7 @@ def _build_dataclass(cls: type, value: Any, where: str) -> Any:
         raise ConfigurationError(f"{where}: expected a mapping, got {value!r}")
     old_keys: Mapping[str, str] = getattr(cls, "__old_keys__", {})
     value = {old_keys.get(key, key): item for key, item in value.items()}
-    hints = _hints_of(cls)
+    hints = types_of_fields(cls)
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     unknown = sorted(set(value) - set(fields))
     if unknown:

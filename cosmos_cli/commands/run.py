@@ -25,9 +25,8 @@ from cosmos_cli.evidence.run_directory import runs_root, utc_now
 from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.launch.access import chosen_access
 from cosmos_cli.launch.execute import Detached, RunOptions, execute, plan_of
-from cosmos_cli.launch.rehearsal import Rehearsal
-from cosmos_cli.launch.rehearsal_view import Asked, check_run
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
+from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.testing.junit import JunitOption, check_junit, junit_case_of, write_junit
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption, losing_output
 from cosmos_cli.view.factory import make_view
@@ -91,8 +90,7 @@ def run(
     if junit is not None and (check or detach):
         raise InputError("--junit writes the verdict: leave out --check and --detach")
     if check:
-        asked = Asked(scenario=scenario, inventory=tuple(inventory or ()), limit=limit, host=host)
-        raise typer.Exit(_check(console, checked, options, asked))
+        raise typer.Exit(_check(console, checked, options, tuple(inventory or ()), limit))
     check_junit(junit)
     _run(console, checked, options, junit)
 
@@ -121,14 +119,22 @@ def _check(
     console: Console,
     scenario: ScenarioFile,
     options: RunOptions,
-    asked: Asked,
+    inventory: tuple[str, ...],
+    limit: str | None,
 ) -> int:
+    with IMPORT_TURN:
+        # A seventh of a run's start, which --check alone has use for.
+        from cosmos_cli.launch import rehearsal, rehearsal_view
+
     chosen_access(scenario.scenario.recording)
-    rehearsal = Rehearsal(
+    asked = rehearsal_view.Asked(
+        scenario=scenario.path, inventory=inventory, limit=limit, host=options.host
+    )
+    planned = rehearsal.Rehearsal(
         plan=plan_of(scenario, options),
         scenario=scenario,
         runs=options.runs,
         options=options.connecting,
         forks=options.forks,
     )
-    return check_run(console, rehearsal, asked)
+    return rehearsal_view.check_run(console, planned, asked)

@@ -42,7 +42,7 @@ def validate(
     for path in files:
         try:
             scenario_file = load_scenario(path, set_ or (), warn=console.warn)
-            check_test(path, set_ or (), console.warn)
+            check_test(scenario_file, console.warn)
         except InputError as error:
             faults += error.faults
             omitted += error.omitted

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -103,7 +104,7 @@ def parse_baseline(path: Path, source: YamlSource) -> Baseline:
     """
     document = read_document(source)
     try:
-        content = _ADAPTER.validate_json(json.dumps(document.value), strict=True)
+        content = _adapter().validate_json(json.dumps(document.value), strict=True)
     except ValidationError as error:
         errors = error.errors(include_url=False)
         raise InputError(faults=faults_of(document, errors, BaselineContent)) from error
@@ -111,6 +112,12 @@ def parse_baseline(path: Path, source: YamlSource) -> Baseline:
     if faults:
         raise InputError(faults=faults)
     return Baseline(path=path, figures=content.figures, document=document)
+
+
+@cache
+def _adapter() -> TypeAdapter[BaselineContent]:
+    """Return what judges a baseline; made when there is one, for it takes milliseconds."""
+    return TypeAdapter(BaselineContent)
 
 
 def _faults(document: Document, content: BaselineContent) -> list[Fault]:
@@ -131,6 +138,3 @@ def _faults(document: Document, content: BaselineContent) -> list[Fault]:
             text = "expected a dotted path, such as timing.ticks or checks[0].got"
             faults.append(document.fault((*where, "path"), text))
     return faults
-
-
-_ADAPTER: TypeAdapter[BaselineContent] = TypeAdapter(BaselineContent)

@@ -6,17 +6,20 @@ Code of somebody's own may hang, or end the process.
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 
 from cosmos_cli.models.document import Document
+from cosmos_cli.models.parameters import adapter_of
 from cosmos_cli.models.separate_process import SeparateDefect, work_separately
 from madns_runtime import errors as runtime_errors
 from madns_runtime.config import Timeouts, from_mapping, to_mapping
 from madns_runtime.errors import MadnsError, MissingExtraError, PluginError
 from madns_runtime.plugin.queries import import_questions
-from madns_runtime.plugin.registry import is_shipped
+from madns_runtime.plugin.registry import is_shipped, resolve
 
 _CODE = re.compile(r"[\w./~-]+:[A-Za-z_]\w*")
 """Form in which a parameter names code of one's own: guidance.py:Guidance, package.module:Class."""
@@ -31,7 +34,7 @@ def ask_apart(work: Callable[[Tell], T], kind: type[T], document: Document, spec
     if is_shipped(spec):
         if not _names_code(settings):
             return work(lambda doing: None)
-        import_questions(spec)  # here once, in place of once in each fork
+        _prepare(spec)
 
     def guarded(tell: Tell) -> Mapping[str, Any]:
         try:
@@ -51,6 +54,14 @@ def ask_apart(work: Callable[[Tell], T], kind: type[T], document: Document, spec
         name, text = answer["raised"]
         raise getattr(runtime_errors, name, PluginError)(text)
     return from_mapping(kind, answer["value"])
+
+
+def _prepare(spec: str) -> None:
+    """Import and make what a shipped simulation is asked with: here once, in place of once in each fork."""
+    with contextlib.suppress(MadnsError, ImportError):  # whoever asks is told what is wrong with it
+        simulation = resolve(spec, Path())
+        import_questions(simulation)
+        adapter_of(simulation.parameters)
 
 
 def _limit_s(document: Document) -> float:

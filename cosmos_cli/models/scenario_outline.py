@@ -143,16 +143,19 @@ def is_scenario(document: Document) -> bool:
     return "extends" in value or ("name" in value and "simulation" in value)
 
 
-def check_test(path: Path, given: Sequence[str], warn: Callable[[str], None]) -> None:
+def check_test(scenario: ScenarioFile, warn: Callable[[str], None]) -> None:
     """
     Check what `cosmos test` would meet beyond the scenario itself, which is right.
 
     Raises:
         InputError: With the faults of the scenario as its test changes it, and of the baseline.
     """
-    outline = read_outline(path)
+    if SECTION not in scenario.document.value:
+        return
+    outline = read_outline(scenario.path)
     faults: list[Fault] = []
     omitted = 0
+    given = scenario.overrides
     for look in (
         lambda: outline.load(outline.overrides(given), warn) if outline.test.set else None,
         outline.baseline,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
@@ -103,13 +104,19 @@ def resolve_timeline(
     return ResolvedTimeline(tuple(entries), tuple(faults), tuple(conditions), answers.known)
 
 
+@cache
+def _rule_adapter() -> TypeAdapter[TimelineRule]:
+    """Return what judges one entry; made once, and not for a scenario without a timeline: it takes milliseconds."""
+    return TypeAdapter(TimelineRule)
+
+
 def _rule(
     document: Document, path: ValuePath, written: Any, faults: list[Fault]
 ) -> TimelineRule | None:
     """Return an entry, or None and enter what is wrong with it by itself."""
     own = {key: value for key, value in written.items() if key in RULE_KEYS}
     try:
-        rule = TypeAdapter(TimelineRule).validate_json(json.dumps(own), strict=True)
+        rule = _rule_adapter().validate_json(json.dumps(own), strict=True)
     except ValidationError as error:
         faults += faults_of(document, error.errors(include_url=False), TimelineRule, below=path)
         return None

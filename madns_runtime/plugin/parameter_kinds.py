@@ -15,6 +15,7 @@ from enum import Enum, Flag
 from pathlib import Path, PurePath
 from typing import Annotated, Any, Final, Literal
 
+from madns_runtime.plain_values import types_of_fields
 from madns_runtime.plugin.isolation import said
 
 SCALARS: Final = (bool, int, float, str)
@@ -37,7 +38,7 @@ def _class_faults(cls: type, where: str, seen: set[type]) -> Iterator[str]:
         return
     seen.add(cls)
     try:
-        hints = typing.get_type_hints(cls, include_extras=True)
+        hints = types_of_fields(cls)
     except Exception as error:  # noqa: BLE001 - annotations are evaluated, and may raise anything
         yield f"{where}: its annotations cannot be read: {said(error)}"
         return

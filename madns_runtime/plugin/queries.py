@@ -6,7 +6,6 @@ What comes back is checked here, so that a slip in a plug-in is told as such and
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import importlib
 import inspect
@@ -16,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from madns_runtime.errors import MadnsError, PluginError
+from madns_runtime.errors import PluginError
 from madns_runtime.plugin.api import (
     DeclaredStream,
     Demand,
@@ -25,10 +24,11 @@ from madns_runtime.plugin.api import (
     PlaceUse,
     PlannedAction,
     Rerun,
+    Simulation,
 )
 from madns_runtime.plugin.code_places import place_of
 from madns_runtime.plugin.isolation import call_plugin
-from madns_runtime.plugin.registry import load_function, resolve
+from madns_runtime.plugin.registry import load_function
 from madns_runtime.recording.records import FRAMEWORK_STREAMS, Field
 
 OF_SCENARIOS = ("check", "check_actions", "streams", "labels", "device_uses", "place_uses")
@@ -46,12 +46,10 @@ FIGURE_MAX = 1e18
 Use = TypeVar("Use", DeviceUse, PlaceUse)
 
 
-def import_questions(spec: str) -> None:
-    """Import what a shipped simulation answers with while a scenario is read; whoever asks is told what is wrong with it."""
-    with contextlib.suppress(MadnsError, ImportError):
-        simulation = resolve(spec, Path())
-        for where in filter(None, (getattr(simulation, part) for part in OF_SCENARIOS)):
-            importlib.import_module(where.partition(":")[0])
+def import_questions(simulation: Simulation) -> None:
+    """Import what a shipped simulation answers with while a scenario is read."""
+    for where in filter(None, (getattr(simulation, part) for part in OF_SCENARIOS)):
+        importlib.import_module(where.partition(":")[0])
 
 
 def ask_check(  # noqa: PLR0913 - what a scenario is; all but two by name

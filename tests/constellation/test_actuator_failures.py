@@ -3,7 +3,7 @@
 import pytest
 
 from madns_runtime.simulations.constellation.actions import SensorFault
-from madns_runtime.simulations.constellation.truth.maneuvers.actuator_failures import (
+from madns_runtime.simulations.constellation.truth.maneuvers.actuators import (
     WHEELS_FAILED,
     ActuatorFailures,
 )

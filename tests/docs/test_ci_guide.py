@@ -11,7 +11,7 @@ import pytest
 import yaml
 from guides import ROOT, blocks
 
-from cosmos_cli.app import each_command
+from cosmos_cli.commands.command_group import each_command
 from cosmos_cli.models.baseline import read_baseline
 from cosmos_cli.models.scenario_outline import read_outline
 

@@ -6,7 +6,7 @@ import pytest
 from guides import GUIDES, ROOT, commands, spans
 from tower.faults import FAULTS
 
-from cosmos_cli.app import COMMANDS, each_command
+from cosmos_cli.commands.command_group import COMMANDS, each_command
 
 ENVIRONMENT = re.compile(r"\bCOSMOS_[A-Z_]+")
 OTHERS_OPTIONS = {"--privileged"}

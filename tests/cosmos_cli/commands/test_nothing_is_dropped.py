@@ -3,7 +3,7 @@
 import pytest
 
 from cosmos_cli import app
-from cosmos_cli.app import each_command
+from cosmos_cli.commands.command_group import each_command
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.loading import load_scenario
 

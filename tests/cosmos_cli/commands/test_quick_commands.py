@@ -9,12 +9,15 @@ import sys
 from pathlib import Path
 
 import pytest
+from pydantic import TypeAdapter
 
 from cosmos_cli import app
+from cosmos_cli.commands import command_group
 from cosmos_cli.commands.init import render
 from cosmos_cli.errors import ExitCode, RunFailedError
 from cosmos_cli.launch.feasibility import Resources, judge
 from cosmos_cli.launch.plan_view import verdict_words
+from cosmos_cli.models import parameters, scenario_outline, timeline
 from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.plugin.api import Demand
 
@@ -412,7 +415,7 @@ def fail_with(monkeypatch, error):
     def broken(name):
         raise error
 
-    monkeypatch.setattr(app, "load_command", broken)
+    monkeypatch.setattr(command_group, "load_command", broken)
 
 
 @pytest.mark.parametrize(
@@ -529,10 +532,62 @@ def test_validate_imports_only_what_it_needs(tmp_path):
 
 
 @pytest.mark.process
-def test_a_run_begins_before_what_only_its_evidence_needs_is_imported():
+def test_validate_makes_the_validator_of_parameters_once(cosmos, monkeypatch, tmp_path):
+    """Not once more for the scenario as its test changes it, nor in each process that answers for code of one's own."""
+    made = tmp_path / "made"
+
+    def counted(kind):
+        with made.open("a") as file:
+            file.write(f"{kind.__name__}\n")
+        return TypeAdapter(kind)
+
+    monkeypatch.setattr(parameters, "TypeAdapter", counted)
+    parameters.adapter_of.cache_clear()
+
+    code, _, err = cosmos("validate", ROOT / "scenarios/planet93.yaml")
+
+    assert (code, err) == (0, "")
+    assert made.read_text() == "ConstellationParameters\n"
+
+
+def test_validate_reads_a_scenario_without_a_test_once(cosmos, monkeypatch):
+    monkeypatch.setattr(scenario_outline, "read_scenario_source", None)
+
+    assert cosmos("validate", "a.yaml")[0] == 0
+
+
+def test_all_entries_of_a_timeline_have_one_validator(cosmos, monkeypatch):
+    made = []
+    monkeypatch.setattr(
+        timeline, "TypeAdapter", lambda kind: made.append(kind) or TypeAdapter(kind)
+    )
+    entries = "".join(f"- {{at_s: {t_s}, action: annotate, text: x}}\n" for t_s in range(20))
+    Path("b.yaml").write_text(f"{SCENARIO}timeline:\n{entries}")
+
+    assert cosmos("validate", "b.yaml")[0] == 0
+    assert len(made) <= 1
+
+
+@pytest.mark.process
+def test_no_garbage_is_looked_for_among_what_was_imported():
+    code = (
+        "import gc; gc.disable(); from cosmos_cli.commands.command_group import load_command;"
+        "load_command('validate');"
+        "print(gc.isenabled(), len(gc.get_objects()) < gc.get_freeze_count())"
+    )
+
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+
+    assert result.stdout == "True True\n"
+
+
+@pytest.mark.process
+def test_a_run_begins_before_what_only_its_evidence_or_a_check_needs_is_imported():
     code = (
         "import sys; import cosmos_cli.commands.run;"
-        "print([m for m in ('numpy', 'scipy', 'pyarrow', 'paramiko') if m in sys.modules])"
+        "print([m for m in ('numpy', 'scipy', 'pyarrow', 'paramiko', 'packaging') if m in sys.modules])"
     )
 
     result = subprocess.run(
@@ -547,6 +602,29 @@ def test_help_and_version():
     assert command("--version").stdout.startswith("cosmos 0.")
     assert "validate" in command("--help").stdout
     assert command("validate", "--help").returncode == 0
+
+
+@pytest.mark.process
+def test_help_imports_no_command(tmp_path):
+    code = (
+        "import sys; from cosmos_cli import app; app.run(['--help']);"
+        "print([m for m in sys.modules if m.partition('.')[0] in ('pydantic', 'yaml', 'numpy')])"
+    )
+
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+
+    assert result.stdout.splitlines()[-1] == "[]"
+
+
+def test_commands_are_listed_with_their_own_help():
+    commands = [(verb, command_group.load_command(verb)) for verb in command_group.COMMANDS]
+    commands += command_group.each_command()
+    told = {verb: command_group.command_outline(verb).help for verb, _ in commands}
+
+    assert len(told) > 30
+    assert told == {verb: command.help for verb, command in commands}
 
 
 def test_interrupt_ends_with_130_and_no_traceback(cosmos, monkeypatch):

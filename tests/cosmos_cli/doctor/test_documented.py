@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from cosmos_cli.app import COMMANDS
+from cosmos_cli.commands.command_group import COMMANDS
 from cosmos_cli.doctor.judge import CHECKS
 
 FLEET = Path(__file__).parents[3] / "docs/fleet.md"

@@ -28,8 +28,7 @@ def scenario(tmp_path):
 
 def faults(path, given=()):
     with pytest.raises(InputError) as caught:
-        load_scenario(path, given)
-        check_test(path, given, print)
+        check_test(load_scenario(path, given), print)
     return caught.value.faults
 
 

@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from cosmos_cli.app import TIMED, load_command
 from cosmos_cli.app import run as cosmos
+from cosmos_cli.commands.command_group import TIMED, load_command
 from cosmos_cli.ui import step_times
 
 SCENARIO = """

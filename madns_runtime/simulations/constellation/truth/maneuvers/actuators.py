@@ -1,5 +1,5 @@
 """
-Actuators of a vehicle: the real change of a command, errors included, or why there is none.
+Actuators of a vehicle: the real change of a command, errors and failures included, or why there is none.
 
 Pure. Chance is drawn for a name, (seed, agent, number of the command), not in turn: what one command gets
 never depends on when, or after which others, the host heard of it.
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,7 @@ TORQUE_N_M_MIN = 1e-15
 """Less than wheels can give is nothing."""
 DIPOLE_A_M2_MIN = 1e-12
 """Less turns nothing."""
+WHEELS_FAILED = "the wheels have failed"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -224,6 +226,41 @@ def magnetise(
         if abs(commanded) > most
     )
     return Magnetisation(dipole_a_m2=scaled((x, y, z), factor), limits=limits)
+
+
+class ActuatorFailures:
+    """Weak thrusters and wheels without torque of all vehicles; several failures of one may be in force at a time."""
+
+    def __init__(self) -> None:
+        self._factors: dict[int, dict[int, float]] = {}
+        """By failure: by vehicle, the share that its thruster gives."""
+        self._without_wheels: dict[int, frozenset[int]] = {}
+
+    def weaken(self, failure: int, factors: Mapping[int, float]) -> None:
+        """Put a failure in force: the share that the thrusters of some vehicles give."""
+        self._factors[failure] = dict(factors)
+
+    def fail_wheels(self, failure: int, vehicles: frozenset[int]) -> None:
+        """Put a failure in force: the wheels of some vehicles take no torque."""
+        self._without_wheels[failure] = vehicles
+
+    def lift(self, failure: int) -> None:
+        """End a failure."""
+        self._factors.pop(failure, None)
+        self._without_wheels.pop(failure, None)
+
+    def given(self, vehicle: int, delta_v_m_s: Vector) -> Vector:
+        """Return what a vehicle's thruster makes of a commanded change of velocity, m/s, before its own errors."""
+        if not self._factors:
+            return delta_v_m_s
+        factor = math.prod(each.get(vehicle, 1.0) for each in self._factors.values())
+        x, y, z = delta_v_m_s
+        return (factor * x, factor * y, factor * z)
+
+    def refusal(self, vehicle: int, kind: str) -> str:
+        """Return why a command of a kind cannot be carried out; empty if it can."""
+        has_failed = any(vehicle in each for each in self._without_wheels.values())
+        return WHEELS_FAILED if kind == "torque" and has_failed else ""
 
 
 def _turned(vector: Vector, along_rad: float, across_rad: float) -> Vector:

@@ -20,10 +20,8 @@ from madns_runtime.simulations.constellation.truth.maneuvers.account import (
     ManeuverAccount,
     Times,
 )
-from madns_runtime.simulations.constellation.truth.maneuvers.actuator_failures import (
-    ActuatorFailures,
-)
 from madns_runtime.simulations.constellation.truth.maneuvers.actuators import (
+    ActuatorFailures,
     ActuatorRefusal,
     Burn,
     Magnetisation,
