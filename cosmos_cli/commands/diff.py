@@ -65,7 +65,8 @@ def diff(
 
     Ends with 0 when they were compared, whatever was found; with --expect-same, 1 when their records differ.
     """
-    console = Console(json=as_json, quiet=quiet)
+    instead = "the exit code tells what was found" if expect_same or run_first else None
+    console = Console(json=as_json, quiet=quiet, instead=instead)
     code = ExitCode.OK
     names = [a, *others]
     if len(names) > RUNS_MAX:

@@ -57,7 +57,7 @@ def judge(
     Nothing of the run is changed. Ends with 0 if all hold, 4 if one is broken, and 5 if data of the run are missing
     or none of the expectations could be judged.
     """
-    console = Console(json=as_json, quiet=quiet)
+    console = Console(json=as_json, quiet=quiet, instead="the exit code is the verdict's")
     found = find_run(runs_root(folder), run)
     document = _collected(found)
     tables = open_tables(found.tables)

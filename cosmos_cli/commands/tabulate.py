@@ -48,7 +48,7 @@ def tabulate(
 
     An agent that was lost has its rows here, too. Ends with 5 if nothing is on record at some of the times.
     """
-    console = Console(json=as_json, quiet=quiet)
+    console = Console(json=as_json, quiet=quiet, instead="the table is written all the same")
     found = find_run(runs_root(folder), run)
     config, document = found.read_config(), found.read_json(found.run_json)
     if config is None or document is None or document.get("status") == "running":
