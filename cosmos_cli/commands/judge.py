@@ -65,7 +65,7 @@ def judge(
         expectations = planned_expectations(found.read_json(found.plan_json))
         if not expectations:
             raise InputError(
-                f"{found.name} had no checks; name a scenario that has: cosmos judge {found.name} -s FILE"
+                f"{found.name} had no checks; name a scenario that has: cosmos judge {found.shell_path} -s FILE"
             )
     else:
         file = load_scenario(scenario, warn=console.warn)
@@ -85,17 +85,17 @@ def _collected(run: RunDirectory) -> Mapping[str, Any]:
     document = run.read_json(run.run_json)
     if document is None or document.get("status") == "running":
         raise InputError(
-            f"{run.name} is not collected yet; do that with: cosmos collect {run.path}"
+            f"{run.name} is not collected yet; do that with: cosmos collect {run.shell_path}"
         )
     fault = fault_of_summary(document)
     if fault is not None or run.read_config() is None:
         what = f"{run.run_json}: {fault}" if fault else f"{run.plan_json}: not to be read"
-        raise InputError(f"{what}; make it anew with: cosmos collect {run.path}")
+        raise InputError(f"{what}; make it anew with: cosmos collect {run.shell_path}")
     cut = [name for name, size in _listed_tables(run) if _size_of(run.path / name) != size]
     if cut:
         what = f"{run.path / cut[0]}" + (f" and {len(cut) - 1} more" if cut[1:] else "")
         text = "missing, or not as it was collected"
-        raise InputError(f"{what}: {text}; make it anew with: cosmos collect {run.path}")
+        raise InputError(f"{what}: {text}; make it anew with: cosmos collect {run.shell_path}")
     return document
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -60,7 +61,9 @@ def open_side(run: RunDirectory, given: str) -> Side:
     """
     document = run.read_json(run.run_json)
     if document is None or document.get("status") == "running":
-        raise InputError(f"{run.name} is not collected yet; do that with: cosmos collect {given}")
+        raise InputError(
+            f"{run.name} is not collected yet; do that with: cosmos collect {shlex.quote(given)}"
+        )
     config = run.read_config()
     # By way of the class, which knows the old names of keys.
     settings = to_mapping(config) if config else (run.read_json(run.plan_json) or {}).get("config")
