@@ -25,6 +25,7 @@ from cosmos_cli.evidence.verdict import conclusion_of_expectations
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.report.cells import format_cell
 from cosmos_cli.ui.console import Column, Console, JsonOption, QuietOption
+from madns_runtime.plain_values import mapping_at
 from madns_runtime.processes import list_processes
 
 COLUMNS = (
@@ -73,9 +74,13 @@ def judge(
     judged = judge_run(found, tables, expectations, document.get("duration_s"))
     missing = (*_missing(document), *judged.gaps())
     code, text = conclusion_of_expectations(judged.results, missing)
-    console.print_json(_told(found, judged, code, text, missing))
+    nulls = _not_finite(document)
+    console.print_json(_told(found, judged, code, text, missing) | {"records_not_finite": nulls})
     if not as_json:
         _print(console, judged, missing)
+    if nulls:
+        were = "1 value was" if nulls == 1 else f"{nulls} values were"
+        console.say(f"{were} NaN or infinite when recorded, and null since: no check sees them")
     (console.say if as_json else console.data)(f"{text} | {found.path}")
     return int(code)
 
@@ -112,6 +117,12 @@ def _size_of(path: Path) -> int | None:
         return path.stat().st_size
     except OSError:
         return None
+
+
+def _not_finite(document: Mapping[str, Any]) -> int:
+    """Return how many values of the run were NaN or infinite: in its records they are null, which checks skip."""
+    count = mapping_at(document, "records").get("not_finite")
+    return count if isinstance(count, int) else 0
 
 
 def _missing(document: Mapping[str, Any]) -> tuple[str, ...]:
