@@ -101,7 +101,8 @@ class FieldDifference:
             difference[is_long] -= turn * np.round(difference[is_long] / turn)
         self.null_in_one += int(is_one_null.sum())
         self.compared += int(is_both.sum())
-        self._squares += float(np.dot(difference, difference))
+        with np.errstate(over="ignore"):  # of runs of which one diverged
+            self._squares += float(np.dot(difference, difference))
         is_different = is_one_null | (difference != 0.0)
         self.different += int(is_different.sum())
         self._note_first(a, is_different)

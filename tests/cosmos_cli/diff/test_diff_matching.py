@@ -152,6 +152,15 @@ def test_whole_numbers_that_no_float_can_hold_differ_by_their_last_digit(kind):
     assert found.values == (1_764_000_000_000_000_001, 1_764_000_000_000_000_002)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_run_that_diverged_differs_without_a_root_mean_square():
+    found = FieldDifference(Field("x_m", "m"))
+
+    found.add(rows([0, 1], x_m=[1e300, 1.0]), rows([0, 1], x_m=[1.0, 1.0]))
+
+    assert (found.different, found.max) == (1, 1e300)
+
+
 def test_whole_numbers_far_apart_differ_by_what_lies_between():
     found = FieldDifference(Field("n", "", "int"))
 
