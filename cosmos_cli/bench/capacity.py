@@ -180,7 +180,7 @@ def find_capacity(
             found.stopped_by = "the time is over"
             break
         say(
-            f"trial {len(found.trials) + 1}: {agents} agents at {trials.hz:g} Hz for {trials.seconds:g} s"
+            f"trial {len(found.trials) + 1}: {counted(agents, 'agent')} at {trials.hz:g} Hz for {trials.seconds:g} s"
         )
         settings = [word for each in trials.overrides(agents) for word in ("--set", each)]
         outcome = run(

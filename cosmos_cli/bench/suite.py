@@ -121,7 +121,7 @@ class SuiteRun:
             "agents": dict(self.counts),
         }
 
-    def _count_cells(self, trips: Mapping[str, Any], total: Mapping[str, int]) -> list[str]:
+    def _count_cells(self, trips: Mapping[str, Any], total: Mapping[str, int | None]) -> list[str]:
         """Return packets and ticks of an agent, beside the agents' own view alone: the host's row has the same ones."""
         if trips.get("seen_by") != "agent":
             return [""] * len(COUNTS)
@@ -129,9 +129,11 @@ class SuiteRun:
         counts = total if agent == ALL else mapping_at(self.counts, agent)
         return [_shown(counts.get(name)) for name in COUNTS]
 
-    def _total(self, name: str) -> int:
-        values = (mapping_at(self.counts, agent).get(name) for agent in self.counts)
-        return sum(value for value in values if isinstance(value, int))
+    def _total(self, name: str) -> int | None:
+        """Return the sum over the agents; None where none tells, as of ticks in lockstep, which records none."""
+        values = [mapping_at(self.counts, agent).get(name) for agent in self.counts]
+        known = [value for value in values if isinstance(value, int)]
+        return sum(known) if known else None
 
 
 COUNTS = ("sent", "lost", "ticks", "missed")

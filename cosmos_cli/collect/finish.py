@@ -365,7 +365,7 @@ def _write_summary(run: RunDirectory, gathered: Gathered, evidence: Evidence) ->
     except OSError as error:
         raise RunFailedError(
             f"{run.path}: the summary cannot be written: {error.strerror or error}; the verdict was: "
-            f"{verdict.text}; make room and repeat with: cosmos collect {run.path}"
+            f"{verdict.text}; make room and repeat with: cosmos collect {run.shell_path}"
         ) from error
     return RunSummary(run=run, verdict=verdict, document=document)
 

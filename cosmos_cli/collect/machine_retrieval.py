@@ -258,7 +258,7 @@ class MachineRetrieval:
                 FailureKind.TIMEOUT,
                 f"reading {counted(len(sizes), 'file')} of {self._source.directory},"
                 f" {size_words(total)}: {failure.text}",
-                f"is its card failing? repeat with: cosmos collect {self._run.path}",
+                f"is its card failing? repeat with: cosmos collect {self._run.shell_path}",
             ) from failure
 
     def _too_many(self) -> MachineFailure:

@@ -45,7 +45,7 @@ def find_unread(
         found[path] = (
             f"not read: it is {size_words(sizes[path])}, with holes, and the run can have recorded at"
             f" most {size_words(bytes_max)}; delete it, or if it is right, repeat with:"
-            f" cosmos collect --size-max SIZE {run.path}"
+            f" cosmos collect --size-max SIZE {run.shell_path}"
         )
     return found
 

@@ -114,7 +114,7 @@ def capacity(
     Doubles their number until the budget breaks, then bisects; each trial is a run, and is kept. Ends with 4 when no
     number keeps it, with 3 when machines failed.
     """
-    console = Console(json=json, quiet=quiet)
+    console = Console(json=json, quiet=quiet, instead=f"the trials lie in {runs_root(runs)}")
     if first > largest:
         raise InputError(f"--first {first} is more than --largest {largest}")
     machines = some_machines(inventory, limit, host)

@@ -56,7 +56,9 @@ def suite(
     Round trips as agents saw them and as the host did, packets lost, ticks missed; each run is an ordinary one.
     Ends with the exit code of the first run that did not pass.
     """
-    console = Console(json=json, quiet=quiet)
+    console = Console(
+        json=json, quiet=quiet, instead=f"the runs go on, and lie in {runs_root(runs)}"
+    )
     some_machines(inventory, limit, host)
     settings = list(set_ or ())
     settings += [] if minutes is None else [f"time.duration_s={minutes * 60!r}"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -12,13 +13,14 @@ import typer
 from cosmos_cli.commands.run_arguments import RunsOption
 from cosmos_cli.diff.compare import Comparison, Selection, compare
 from cosmos_cli.diff.document import several_documents, to_document
-from cosmos_cli.diff.side import check_comparable, open_side
+from cosmos_cli.diff.side import Side, check_comparable, open_side
 from cosmos_cli.diff.terminal import print_comparison
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
 from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.launch.execute import Detached, RunOptions, execute
+from cosmos_cli.models.document import did_you_mean
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
 from cosmos_cli.ui.progress import told_progress
@@ -65,7 +67,8 @@ def diff(
 
     Ends with 0 when they were compared, whatever was found; with --expect-same, 1 when their records differ.
     """
-    console = Console(json=as_json, quiet=quiet)
+    instead = "the exit code tells what was found" if expect_same or run_first else None
+    console = Console(json=as_json, quiet=quiet, instead=instead)
     code = ExitCode.OK
     names = [a, *others]
     if len(names) > RUNS_MAX:
@@ -112,8 +115,27 @@ def _compare_each(
     first, *others = [open_side(run, name) for run, name in zip(found, names, strict=True)]
     for other in others:
         check_comparable(first, other)
+    _check_chosen((first, *others), agents, streams)
     with told_progress(console, "diff") as progress:
         return [compare(first, other, selection, progress) for other in others]
+
+
+def _check_chosen(sides: Sequence[Side], agents: tuple[str, ...], streams: tuple[str, ...]) -> None:
+    """
+    Refuse a word that chooses nothing: one that is misspelt would pass for runs without a difference.
+
+    Raises:
+        InputError: There is one.
+    """
+    labels = [run_labels(side.run) for side in sides] if agents else []
+    for glob in agents:
+        if not any(own.like(glob, side.agents) for own, side in zip(labels, sides, strict=True)):
+            raise InputError(f"--agents {glob}: no agent of these runs is called so")
+    names = sorted({name for side in sides for name in side.stream_names})
+    for glob in streams:
+        if not fnmatch.filter(names, glob):
+            hint = did_you_mean(glob, names)
+            raise InputError(f"--streams {glob}: these runs recorded no such stream{hint}")
 
 
 def _run_all(

@@ -25,7 +25,7 @@ from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.outcome import Outcome, failed
 from cosmos_cli.fleet.retry_file import offer_retry
 from cosmos_cli.fleet.shell import NO_SUDO_MARK, as_root, watched
-from cosmos_cli.ui.console import Console, JsonOption, QuietOption
+from cosmos_cli.ui.console import WORK_GOES_ON, Console, JsonOption, QuietOption
 from cosmos_cli.ui.foreign_text import clean_text
 from cosmos_cli.ui.plural import counted
 
@@ -61,7 +61,7 @@ def exec(  # noqa: A001 - the verb's name is the function's
 
     Ends with 1 when it failed on any machine, with 3 when a machine itself failed.
     """
-    console = Console(json=json, quiet=quiet)
+    console = Console(json=json, quiet=quiet, instead=WORK_GOES_ON)
     fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
     line = command[0] if len(command) == 1 else shlex.join(command)
     width = max(len(target.name) for target in fleet.targets)

@@ -25,6 +25,7 @@ from cosmos_cli.evidence.verdict import conclusion_of_expectations
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.report.cells import format_cell
 from cosmos_cli.ui.console import Column, Console, JsonOption, QuietOption
+from madns_runtime.plain_values import mapping_at
 from madns_runtime.processes import list_processes
 
 COLUMNS = (
@@ -57,7 +58,7 @@ def judge(
     Nothing of the run is changed. Ends with 0 if all hold, 4 if one is broken, and 5 if data of the run are missing
     or none of the expectations could be judged.
     """
-    console = Console(json=as_json, quiet=quiet)
+    console = Console(json=as_json, quiet=quiet, instead="the exit code is the verdict's")
     found = find_run(runs_root(folder), run)
     document = _collected(found)
     tables = open_tables(found.tables)
@@ -65,7 +66,7 @@ def judge(
         expectations = planned_expectations(found.read_json(found.plan_json))
         if not expectations:
             raise InputError(
-                f"{found.name} had no checks; name a scenario that has: cosmos judge {found.name} -s FILE"
+                f"{found.name} had no checks; name a scenario that has: cosmos judge {found.shell_path} -s FILE"
             )
     else:
         file = load_scenario(scenario, warn=console.warn)
@@ -73,9 +74,13 @@ def judge(
     judged = judge_run(found, tables, expectations, document.get("duration_s"))
     missing = (*_missing(document), *judged.gaps())
     code, text = conclusion_of_expectations(judged.results, missing)
-    console.print_json(_told(found, judged, code, text, missing))
+    nulls = _not_finite(document)
+    console.print_json(_told(found, judged, code, text, missing) | {"records_not_finite": nulls})
     if not as_json:
         _print(console, judged, missing)
+    if nulls:
+        were = "1 value was" if nulls == 1 else f"{nulls} values were"
+        console.say(f"{were} NaN or infinite when recorded, and null since: no check sees them")
     (console.say if as_json else console.data)(f"{text} | {found.path}")
     return int(code)
 
@@ -85,17 +90,17 @@ def _collected(run: RunDirectory) -> Mapping[str, Any]:
     document = run.read_json(run.run_json)
     if document is None or document.get("status") == "running":
         raise InputError(
-            f"{run.name} is not collected yet; do that with: cosmos collect {run.path}"
+            f"{run.name} is not collected yet; do that with: cosmos collect {run.shell_path}"
         )
     fault = fault_of_summary(document)
     if fault is not None or run.read_config() is None:
         what = f"{run.run_json}: {fault}" if fault else f"{run.plan_json}: not to be read"
-        raise InputError(f"{what}; make it anew with: cosmos collect {run.path}")
+        raise InputError(f"{what}; make it anew with: cosmos collect {run.shell_path}")
     cut = [name for name, size in _listed_tables(run) if _size_of(run.path / name) != size]
     if cut:
         what = f"{run.path / cut[0]}" + (f" and {len(cut) - 1} more" if cut[1:] else "")
         text = "missing, or not as it was collected"
-        raise InputError(f"{what}: {text}; make it anew with: cosmos collect {run.path}")
+        raise InputError(f"{what}: {text}; make it anew with: cosmos collect {run.shell_path}")
     return document
 
 
@@ -112,6 +117,12 @@ def _size_of(path: Path) -> int | None:
         return path.stat().st_size
     except OSError:
         return None
+
+
+def _not_finite(document: Mapping[str, Any]) -> int:
+    """Return how many values of the run were NaN or infinite: in its records they are null, which checks skip."""
+    count = mapping_at(document, "records").get("not_finite")
+    return count if isinstance(count, int) else 0
 
 
 def _missing(document: Mapping[str, Any]) -> tuple[str, ...]:

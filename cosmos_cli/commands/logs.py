@@ -106,7 +106,8 @@ def logs(
         for portion in follower().lines(is_following=True):
             printer.print(portion)
         console.say(f"{found.name} has ended")
-    _tell_rest(console, found, reading, printer.count)
+    is_silent = not printer.count and lines != 0
+    _tell_rest(console, found, reading, level, is_silent=is_silent)
     return int(ExitCode.MACHINES if failed else ExitCode.OK)
 
 
@@ -189,10 +190,13 @@ def _expect_known(
     raise InputError(f"{run.name} has no agent, host or machine named {source}{hint}")
 
 
-def _tell_rest(console: Console, run: RunDirectory, reading: LogReading, count: int) -> None:
+def _tell_rest(
+    console: Console, run: RunDirectory, reading: LogReading, level: LogLevel, *, is_silent: bool
+) -> None:
     if reading.damaged:
         console.say(f"{counted(reading.damaged, 'line')} could not be read")
-    if not count:
+    if is_silent:
         config = run.read_config()
         loudness = f" at recording.verbosity {config.recording.verbosity}" if config else ""
-        console.say(f"{run.name}: nothing was said{loudness}")
+        what = "nothing" if level is LogLevel.DEBUG else f"nothing as loud as {level.value}"
+        console.say(f"{run.name}: {what} was said{loudness}")

@@ -30,7 +30,7 @@ from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
 from cosmos_cli.fleet.outcome import InOrder, Outcome, failed
 from cosmos_cli.onboard.apt_words import PYTHON_HINT
-from cosmos_cli.ui.console import Console, JsonOption, QuietOption
+from cosmos_cli.ui.console import WORK_GOES_ON, Console, JsonOption, QuietOption
 from cosmos_cli.ui.plural import counted
 
 PARTS = ("files", "links", "facts", "system", "apt_words", "apt")
@@ -83,7 +83,7 @@ def packages(
     Ends with 3 when any machine failed. What a machine always needs belongs into cosmos_packages of the
     inventory; `cosmos up` installs it.
     """
-    console = Console(json=json, quiet=quiet)
+    console = Console(json=json, quiet=quiet, instead=WORK_GOES_ON)
     wanted = check_names(action, names or [])
     fleet = without_this_computer(console, fleet_of(inventory, limit, forks, accept_new_host_keys))
     start_s = time.monotonic()

@@ -24,7 +24,7 @@ from cosmos_cli.fleet.fleet import Fleet
 from cosmos_cli.fleet.open_connection import connect
 from cosmos_cli.fleet.outcome import Outcome, failed
 from cosmos_cli.fleet.reboot import Rebooted, Rebooting
-from cosmos_cli.ui.console import Console, JsonOption, QuietOption, confirm
+from cosmos_cli.ui.console import WORK_GOES_ON, Console, JsonOption, QuietOption, confirm
 from cosmos_cli.ui.name_ranges import compact
 from cosmos_cli.ui.plural import counted
 from madns_runtime.processes import read_boot_id
@@ -61,7 +61,7 @@ def reboot(
 
     This computer is never rebooted. Ends with 3 when any machine failed or was not back in time.
     """
-    console = Console(json=json, quiet=quiet)
+    console = Console(json=json, quiet=quiet, instead=WORK_GOES_ON)
     fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
     own = [target.name for target in fleet.targets if target.connection == "local"]
     fleet = without_this_computer(console, fleet)

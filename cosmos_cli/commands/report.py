@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -33,11 +34,13 @@ def report(
     found = find_run(runs_root(folder), run)
     document = found.read_json(found.run_json)
     if document is None or document.get("status") == "running":
-        raise InputError(f"{found.name} is not collected yet; do that with: cosmos collect {run}")
+        raise InputError(
+            f"{found.name} is not collected yet; do that with: cosmos collect {shlex.quote(run)}"
+        )
     fault = fault_of_summary(document)
     if fault is not None:
         raise InputError(
-            f"{found.run_json}: {fault}; make it anew with: cosmos collect {found.path}"
+            f"{found.run_json}: {fault}; make it anew with: cosmos collect {found.shell_path}"
         )
     if as_json:
         console.print_json(with_simulation(found, document, console.warn))

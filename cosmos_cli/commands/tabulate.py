@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -48,11 +49,13 @@ def tabulate(
 
     An agent that was lost has its rows here, too. Ends with 5 if nothing is on record at some of the times.
     """
-    console = Console(json=as_json, quiet=quiet)
+    console = Console(json=as_json, quiet=quiet, instead="the table is written all the same")
     found = find_run(runs_root(folder), run)
     config, document = found.read_config(), found.read_json(found.run_json)
     if config is None or document is None or document.get("status") == "running":
-        raise InputError(f"{found.name} is not collected yet; do that with: cosmos collect {run}")
+        raise InputError(
+            f"{found.name} is not collected yet; do that with: cosmos collect {shlex.quote(run)}"
+        )
     ran_s = document.get("duration_s")
     times_s = times_of(config, ran_s if isinstance(ran_s, int | float) else None, rate_hz)
     plan, result = found.read_json(found.plan_json), found.read_json(found.result_json)

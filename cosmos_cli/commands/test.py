@@ -108,7 +108,7 @@ def test(
     Their runs lie in `tests` of the folder of runs. Ends with 0 if all passed, 1 if one failed, 2 if a scenario is wrong
     or none is meant, 130 if interrupted.
     """
-    console = Console(json=json, quiet=quiet)
+    console = Console(json=json, quiet=quiet, instead=_instead(junit))
     if update_baselines and (seeds or full_length):
         raise InputError(
             "--update-baselines writes figures of the test as it stands: leave out --seeds and"
@@ -139,6 +139,12 @@ def test(
         write_junit(junit, cases, seconds=seconds, started_utc=started_utc)
     _tell(console, result, chosen, seconds)
     return int(result.exit_code)
+
+
+def _instead(junit: Path | None) -> str:
+    return (
+        f"the tests go on{f', their results come to {junit}' if junit else ''}; the exit code tells"
+    )
 
 
 def _tell(console: Console, result: SuiteResult, chosen: ChosenCases, seconds: float) -> None:

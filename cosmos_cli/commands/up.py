@@ -28,7 +28,7 @@ from cosmos_cli.provision.udp_echo import Echo
 from cosmos_cli.provision.up_table import MachineResult, result_of
 from cosmos_cli.provision.up_view import UpView
 from cosmos_cli.system.import_turn import IMPORT_TURN
-from cosmos_cli.ui.console import Console, JsonOption, QuietOption
+from cosmos_cli.ui.console import WORK_GOES_ON, Console, JsonOption, QuietOption
 from cosmos_cli.ui.step_times import HERE, timed
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def up(
     The second time nothing changes. Ends with 3 when any machine failed; the others are ready all the same.
     """
     start_s = time.monotonic()
-    console = Console(json=json, quiet=quiet)
+    console = Console(json=json, quiet=quiet, instead=WORK_GOES_ON)
     fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
     names = [target.name for target in fleet.targets]
 

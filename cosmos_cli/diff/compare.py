@@ -30,7 +30,7 @@ OF_THE_RUN = ("run", "base_directory", "network.port")
 """Keys that differ between any two runs and say nothing of them."""
 TIMING = (
     ("exit code", ("exit_code",)),
-    ("simulated time, s", ("duration_s",)),
+    ("duration, s", ("duration_s",)),
     ("real-time factor", ("rtf",)),
     ("ticks", ("timing", "ticks")),
     ("ticks missed", ("timing", "missed")),

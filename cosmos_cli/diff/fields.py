@@ -17,6 +17,7 @@ from madns_runtime.recording.records import Field
 TURN = {"deg": 360.0, "rad": 2.0 * math.pi}
 """A whole turn: angles differ by the shorter way round."""
 TEXT_CHARACTERS_MAX = 60
+LARGE = 2**62
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +71,7 @@ class FieldDifference:
         """Take pairs of records, row for row."""
         left, right = a.columns[self.field.name], b.columns[self.field.name]
         if self.is_number:
-            self._add_numbers(a, as_array(left), as_array(right))
+            self._add_numbers(a, left, right)
         else:
             self._add_texts(a, left, right)
 
@@ -86,17 +87,22 @@ class FieldDifference:
             self.max, self.values = other.max, other.values
             self.at = other.at.within(who)
 
-    def _add_numbers(self, a: Rows, left: NDArray[np.float64], right: NDArray[np.float64]) -> None:
+    def _add_numbers(self, a: Rows, given: NDArray[Any], other: NDArray[Any]) -> None:
+        left, right = as_array(given), as_array(other)
         is_one_null = np.isnan(left) != np.isnan(right)
         is_both = ~np.isnan(left) & ~np.isnan(right)
         difference = np.where(is_both, left - right, 0.0)
+        if self.field.kind == "int":
+            exact = _exact_difference(given, other)
+            difference = np.where(np.isnan(exact), difference, exact)
         turn = TURN.get(self.field.unit)
         if turn is not None:
             is_long = np.abs(difference) > turn / 2.0
             difference[is_long] -= turn * np.round(difference[is_long] / turn)
         self.null_in_one += int(is_one_null.sum())
         self.compared += int(is_both.sum())
-        self._squares += float(np.dot(difference, difference))
+        with np.errstate(over="ignore"):  # of runs of which one diverged
+            self._squares += float(np.dot(difference, difference))
         is_different = is_one_null | (difference != 0.0)
         self.different += int(is_different.sum())
         self._note_first(a, is_different)
@@ -105,7 +111,7 @@ class FieldDifference:
             size = abs(float(difference[worst]))
             if size > self.max:
                 self.max, self.at = size, place_of(a, worst)
-                self.values = (float(left[worst]), float(right[worst]))
+                self.values = (_number(given[worst]), _number(other[worst]))
 
     def _add_texts(self, a: Rows, left: NDArray[Any], right: NDArray[Any]) -> None:
         pairs = zip(left.tolist(), right.tolist(), strict=True)
@@ -125,6 +131,29 @@ def place_of(rows: Rows, index: int) -> RecordPlace:
     """Return where a record is."""
     who = rows.who[index]
     return RecordPlace(float(rows.keys[index]), who if isinstance(who, str) else "")
+
+
+def _exact_difference(left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.float64]:
+    """
+    Return left - right of whole numbers, NaN where one is none.
+
+    As floats two numbers above 2^53 are the same when they are not: nanoseconds of an epoch are such numbers.
+    """
+    if left.dtype.kind == right.dtype.kind == "i" and not (
+        _is_large(left).any() or _is_large(right).any()
+    ):
+        return as_array(left - right)
+    pairs = zip(left.tolist(), right.tolist(), strict=True)
+    return np.array([float(x - y) if type(x) is type(y) is int else np.nan for x, y in pairs])
+
+
+def _is_large(values: NDArray[Any]) -> NDArray[np.bool_]:
+    """Tell which whole numbers are so large that the difference of two might not fit 64 bits."""
+    return (values >= LARGE) | (values < -LARGE)
+
+
+def _number(value: Any) -> int | float:
+    return int(value) if isinstance(value, int | np.integer) else float(value)
 
 
 def _plain(value: Any) -> Any:

@@ -138,13 +138,11 @@ def _from_lines(key: Key, files: Sequence[RecordFile], reader: TableReader | Non
 
 def _from_table(reader: TableReader, source: str) -> Recorded:
     role: Mapping[str, Role] = {"host": "host", "machine": "machine", "device": "device"}
-    names = {field.name for field in reader.fields}
-    fields = tuple(f for f in reader.fields if not (f.name == "t_s" and "tick" in names))
     return Recorded(
         table=reader.name,
         role=role.get(reader.role, "agent"),
         source=source,
-        fields=fields,
+        fields=reader.recorded_fields,
         files=(),
         reader=reader,
     )

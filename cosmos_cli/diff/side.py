@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -41,6 +42,19 @@ class Side:
         return float(value) if is_number(value) and value else 1.0
 
     @property
+    def agents(self) -> tuple[str, ...]:
+        """Names of the run's agents, those that recorded nothing as well."""
+        config = self.run.read_config()
+        planned = config.agents.resolved_names() if config else ()
+        recorded = [key[1] for key, one in self.streams.items() if one.role == "agent"]
+        return tuple(dict.fromkeys((*planned, *recorded)))
+
+    @property
+    def stream_names(self) -> frozenset[str]:
+        """Names of what it recorded, as streams and as tables."""
+        return frozenset(name for one in self.streams.values() for name in (one.stream, one.table))
+
+    @property
     def duration_s(self) -> float:
         """Simulated time that the run was to have, s."""
         value = mapping_at(self.settings, "time").get("duration_s")
@@ -60,7 +74,9 @@ def open_side(run: RunDirectory, given: str) -> Side:
     """
     document = run.read_json(run.run_json)
     if document is None or document.get("status") == "running":
-        raise InputError(f"{run.name} is not collected yet; do that with: cosmos collect {given}")
+        raise InputError(
+            f"{run.name} is not collected yet; do that with: cosmos collect {shlex.quote(given)}"
+        )
     config = run.read_config()
     # By way of the class, which knows the old names of keys.
     settings = to_mapping(config) if config else (run.read_json(run.plan_json) or {}).get("config")

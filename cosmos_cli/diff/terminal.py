@@ -35,8 +35,8 @@ KEY_WORDS: Mapping[By, str] = {"tick": "tick ", "time": "t = ", "order": "record
 def print_comparison(console: Console, found: Comparison) -> None:
     """Print a comparison on stdout; its last line says whether the runs are the same."""
     names = (found.a.run.name, found.b.run.name)
-    console.data(f"A  {names[0]}: {found.a.document.get('verdict')}")
-    console.data(f"B  {names[1]}: {found.b.document.get('verdict')}")
+    console.data(f"A  {names[0]}: {found.a.document.get('verdict') or 'no verdict'}")
+    console.data(f"B  {names[1]}: {found.b.document.get('verdict') or 'no verdict'}")
     for line in found.missing:
         console.data(f"missing: {line}")
     for line in found.remarks:

@@ -14,6 +14,7 @@ import importlib.metadata
 import os
 import platform
 import re
+import shlex
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -65,6 +66,11 @@ class RunDirectory:
     def name(self) -> str:
         """Name of the run, such as 0007-iridium10."""
         return self.path.name
+
+    @property
+    def shell_path(self) -> str:
+        """The path as a shell takes it, for commands that are to be copied: folders have spaces in their names."""
+        return shlex.quote(str(self.path))
 
     @property
     def number(self) -> int | None:
@@ -278,7 +284,7 @@ def alone(run: RunDirectory, *, patience_s: float = 0.0, must_own: bool = True) 
         except LockHeld as held:
             raise InputError(
                 f"{run.name}: another command is collecting it: {held}; wait for its end,"
-                f" then repeat with: cosmos collect {run.path}"
+                f" then repeat with: cosmos collect {run.shell_path}"
             ) from None
         with access_applied(run.access):
             yield

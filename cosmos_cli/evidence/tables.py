@@ -257,6 +257,16 @@ class TableReader:
         skipped = (self._source_column, INCARNATION, *self._labels)
         return tuple(_field(schema.field(name)) for name in schema.names if name not in skipped)
 
+    @property
+    def recorded_fields(self) -> tuple[Field, ...]:
+        """The fields without a t_s that was made of the tick, as the stream's own schema has them."""
+        made = [
+            column.name
+            for column in self._file.schema_arrow
+            if column.name == TIME and b"kind" not in (column.metadata or {})
+        ]
+        return tuple(field for field in self.fields if field.name not in made)
+
     def has(self, *names: str) -> bool:
         """Tell whether the table has all these columns."""
         return set(names) <= set(self._file.schema_arrow.names)

@@ -271,7 +271,7 @@ def _execute(
         except KeyboardInterrupt:
             raise CollectionInterrupted(
                 "interrupted while collecting; what was recorded is kept, here or where it was; go on with:"
-                f" cosmos collect {run.path}"
+                f" cosmos collect {run.shell_path}"
             ) from None
         finally:
             view.close()
@@ -318,7 +318,7 @@ def _retrieve(
     if not prepared.remote:
         return ()
     if not is_wanted:
-        text = f"its records were not fetched; fetch them with: cosmos collect {prepared.run.path}"
+        text = f"its records were not fetched; fetch them with: cosmos collect {prepared.run.shell_path}"
         return tuple(Problem(text=text, machine=name, step="collect") for name in prepared.remote)
     # Imported late: agents run meanwhile on the same processors, and a run on this computer needs none of it.
     with IMPORT_TURN:

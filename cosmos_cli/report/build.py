@@ -135,7 +135,7 @@ def _gaps(run: RunDirectory, recorded: RecordedRun) -> list[Section]:
         return []
     text = (
         f"{', '.join(dict.fromkeys(unread))} cannot be read: what they hold is not shown;"
-        f" cosmos collect {recorded.document.get('run')} makes anew what was recorded."
+        f" cosmos collect {run.shell_path} makes anew what was recorded."
     )
     return [Section(title="Tables that are missing", blocks=[ReportRemark(text=text)])]
 

@@ -194,7 +194,8 @@ def _facts(document: Mapping[str, Any]) -> Iterator[str]:
     yield counted(count, "agent") if isinstance(count, int) else "agents not counted"
     duration_s = document.get("duration_s")
     if isinstance(duration_s, int | float):
-        yield f"{duration_s:g} s simulated"
+        # The key tells what was to be run: one that was aborted has not come so far.
+        yield f"{duration_s:g} s {'simulated' if document.get('status') == 'complete' else 'planned'}"
     yield f"started {str(document.get('started_utc'))[:19].replace('T', ' ')} UTC"
     yield f"seed {document.get('seed')}"
 

@@ -24,7 +24,7 @@ def print_report(
     console: Console, document: Mapping[str, Any], sections: Sequence[Section]
 ) -> None:
     """Print a run's report on stdout."""
-    console.data(f"{document.get('run')}: {document.get('verdict')}")
+    console.data(f"{document.get('run')}: {document.get('verdict') or 'no verdict'}")
     console.data("")
     for name, value, remark in figures_of(document):
         console.data(f"  {name:<18}{value:>14}   {remark}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -123,7 +124,9 @@ def check_collected(run: RunDirectory, given: str) -> None:
     """
     document = run.read_json(run.run_json)
     if document is None or document.get("status") == "running":
-        raise InputError(f"{run.name} is not collected yet; do that with: cosmos collect {given}")
+        raise InputError(
+            f"{run.name} is not collected yet; do that with: cosmos collect {shlex.quote(given)}"
+        )
 
 
 def scenario_folder(run: RunDirectory) -> Path | None:
@@ -207,7 +210,7 @@ def _devices(
             continue
         if not found:
             faults.append(
-                f"{clean_line(full_name)}: no records of it in {folder}; fetch them with: cosmos collect {run.path}"
+                f"{clean_line(full_name)}: no records of it in {folder}; fetch them with: cosmos collect {run.shell_path}"
             )
             continue
         own = (

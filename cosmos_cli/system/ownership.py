@@ -66,6 +66,7 @@ def check_own_folder(descriptor: int, path: Path) -> None:
         owner = pwd.getpwuid(uid).pw_name
     except KeyError:
         owner = f"user {uid}"
+    others = "" if uid == ROOT else " or root"
     raise InputError(
-        f"{path}: belongs to {owner}: nothing is written there; let {owner} or root repeat the command"
+        f"{path}: belongs to {owner}: nothing is written there; let {owner}{others} repeat the command"
     )

@@ -154,5 +154,9 @@ def _statistic(
         finite = [value for value in newest if math.isfinite(value)]
         return (max(finite), "") if finite else (None, "no last value is a number")
     if figure.statistic == "rms":
-        return math.hypot(summary.mean, summary.sd), ""
-    return getattr(summary, figure.statistic or "mean"), ""
+        got = math.hypot(summary.mean, summary.sd)
+    else:
+        got = getattr(summary, figure.statistic or "mean")
+    if not math.isfinite(got):
+        return None, f"its values are so large, up to {summary.max:g}, that it is not finite"
+    return got, ""

@@ -42,6 +42,8 @@ SetOption = Annotated[
     ),
 ]
 
+WORK_GOES_ON = "the work on machines goes on; the exit code tells"
+"""Of commands that do something on machines: as `Console.instead`."""
 AGREEMENTS = ("y", "yes")
 TALK_CHARACTERS_MAX = 100_000
 """An exception's text or a machine's answer may be of any length; what is meant for eyes is not."""
@@ -62,26 +64,35 @@ class Console:
     json: bool = False
     """The result goes to stdout as JSON; lines meant for eyes are left out."""
     quiet: bool = False
+    instead: str | None = None
+    """
+    Of a command that works on when stdout takes no more: where its result can be found; told once on stderr.
+    None: it ends there, as `cosmos logs -f | head` must.
+    """
 
     def data(self, text: str) -> None:
         """Print a line of the result on stdout; left out under --json."""
         if not self.json:
-            _write(sys.stdout, text)
+            with self._losing_output():
+                _write(sys.stdout, text)
 
     def say(self, text: str, *, length_max: int | None = TALK_CHARACTERS_MAX) -> None:
         """Print a line of talk on stderr, cut after *length_max* characters; left out under --quiet."""
         if not self.quiet:
-            _write(sys.stderr, text, length_max=length_max)
+            with losing_talk():
+                _write(sys.stderr, text, length_max=length_max)
 
     def warn(self, text: str) -> None:
         """Print a warning on stderr; left out under --quiet."""
         if not self.quiet:
-            tell(sys.stderr, text, word="warning", colour="yellow")
+            with losing_talk():
+                tell(sys.stderr, text, word="warning", colour="yellow")
 
     def print_json(self, value: Any) -> None:
         """Print *value* as JSON on stdout if --json was asked for."""
         if self.json:
-            print_json(value)
+            with self._losing_output():
+                print_json(value)
 
     def print_json_line(self, value: Any) -> None:
         """Print *value* as one line of JSON on stdout if --json was asked for: of many values, each as it comes."""
@@ -92,20 +103,28 @@ class Console:
         """Print a table on stdout: framed on a terminal that is wide enough, aligned plain lines elsewhere."""
         if self.json:
             return
-        rows = [[clean_line(cell, length_max=None) for cell in row] for row in rows]
-        lines = aligned(columns, rows)
-        if not is_terminal(sys.stdout):
-            _write(sys.stdout, "\n".join(lines))
-            return
-        width = shutil.get_terminal_size().columns
-        frame = len(columns) + 3  # beside the two spaces between columns
-        if max(map(len, lines)) + frame <= width:
-            with IMPORT_TURN:
-                from cosmos_cli.ui.rich_console import print_table  # a tenth of a second to import
+        with self._losing_output():
+            _print_table(columns, rows)
 
-            print_table([(column.heading, column.is_number) for column in columns], rows)
-        else:
-            _write(sys.stdout, "\n".join(stacked(columns, rows, width)))
+    def _losing_output(self) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext() if self.instead is None else losing_output(self.instead)
+
+
+def _print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
+    rows = [[clean_line(cell, length_max=None) for cell in row] for row in rows]
+    lines = aligned(columns, rows)
+    if not is_terminal(sys.stdout):
+        _write(sys.stdout, "\n".join(lines))
+        return
+    width = shutil.get_terminal_size().columns
+    frame = len(columns) + 3  # beside the two spaces between columns
+    if max(map(len, lines)) + frame <= width:
+        with IMPORT_TURN:
+            from cosmos_cli.ui.rich_console import print_table  # a tenth of a second to import
+
+        print_table([(column.heading, column.is_number) for column in columns], rows)
+    else:
+        _write(sys.stdout, "\n".join(stacked(columns, rows, width)))
 
 
 def print_json(value: Any) -> None:
@@ -220,25 +239,41 @@ def losing_output(instead: str) -> Iterator[None]:
         tell_lost_output(error, instead)
 
 
+@contextlib.contextmanager
+def losing_talk() -> Iterator[None]:
+    """Go on when stderr takes no more, as behind `2>&1 | head`: nobody listens, and the work matters more."""
+    try:
+        yield
+    except OSError:
+        let_go_of_output(sys.stderr)
+
+
 def tell_lost_output(error: OSError, instead: str = "") -> None:
     """Say on stderr, if anybody hears, that stdout takes no more."""
-    let_go_of_output()
+    let_go_of_output(sys.stdout)
     why = error.strerror or str(error)
     with contextlib.suppress(OSError):
         print_error(f"stdout: {why}" + (f"; {instead}" if instead else ""))
     let_go_of_output()
 
 
-def let_go_of_output() -> None:
+def let_go_of_output(lost: TextIO | None = None) -> None:
     """
     Send the rest of both streams nowhere: whoever read them is gone, as `head` or a closed terminal.
 
     What is still buffered would fail again whenever it is flushed, at the latest at the interpreter's end.
+
+    Args:
+        lost: One that failed, and under PYTHONUNBUFFERED has kept nothing that would fail again.
     """
+    if isinstance(lost, ClosedOutput):
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - as long as the process
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
+            if stream is lost:
+                os.dup2(nowhere, stream.fileno())
         except OSError:
             os.dup2(nowhere, stream.fileno())
             stream.flush()

@@ -87,8 +87,9 @@ class Distribution:
         if not count:
             return None
         values = self._values * scale
-        mean = float((values * self._counts).sum() / count)
-        variance = float((self._counts * (values - mean) ** 2).sum() / count)
+        with np.errstate(over="ignore", invalid="ignore"):  # what diverged has no mean
+            mean = float((values * self._counts).sum() / count)
+            variance = float((self._counts * (values - mean) ** 2).sum() / count)
         quantiles = {name: self._quantile(q) * scale for name, q in QUANTILES.items()}
         return Summary(
             count=count,

@@ -32,3 +32,14 @@ def test_commands_and_records_of_nan_break_checks_that_name_the_agent(tmp_path):
     assert broken["records.not_finite"]["got"] == broken["commands_refused"]["got"] > 0
     assert broken["commands_refused"]["worst"] == "agent-02"
     assert "agent-02.error_m" in broken
+
+    (tmp_path / "checks.yaml").write_text(
+        (tmp_path / "rover.yaml").read_text()
+        + "checks: [{name: few, stream: truth, statistic: count, above: 1}]\n"
+    )
+    judged = cosmos("judge", "last", "-s", "checks.yaml", "--json")
+
+    count = broken["records.not_finite"]["got"]
+    assert judged.returncode == 0, judged.stderr
+    assert json.loads(judged.stdout)["records_not_finite"] == count
+    assert f"{count} values were NaN or infinite when recorded" in judged.stderr

@@ -35,7 +35,10 @@ class Accumulator(ABC):
             values: None of which is missing.
             places: Among all records of whoever recorded them: what tells the order of those of one time.
         """
-        self._take(t_s, values, places)
+        with np.errstate(
+            over="ignore", invalid="ignore"
+        ):  # what diverged has no statistic: inf or NaN
+            self._take(t_s, values, places)
 
     def result(self) -> Found:
         """Return what all batches came to."""
@@ -171,7 +174,7 @@ class StandardDeviation(Accumulator):
         count = self._count + len(numbers)
         apart = mean - self._mean
         self._squares += float(np.sum((numbers - mean) ** 2))
-        self._squares += apart**2 * self._count * len(numbers) / count
+        self._squares += apart * apart * self._count * len(numbers) / count
         self._mean += apart * len(numbers) / count
         self._count = count
 

@@ -142,6 +142,16 @@ def test_suite_prints_a_table_per_run_and_one_of_all(command):
     assert lines[-1].startswith("2 of 2 runs passed in ")
 
 
+def test_suite_in_lockstep_leaves_ticks_that_nobody_records_empty(command):
+    file = SCENARIOS / "thesis" / "benchmark_at_once.yaml"
+    chosen = settings("agents.count=2", "time.mode=lockstep", *OF_A_MOMENT)
+    done = command("bench", "suite", file, "--minutes", "0.02", *chosen)
+
+    assert done.returncode == 0, done.stderr
+    (line,) = [line for line in done.stdout.splitlines() if line.startswith("agent    all")]
+    assert line.split()[-2:] == ["48", "0"]  # sent and lost are the last that are told
+
+
 def test_folder_without_a_suite_and_a_faulty_file_are_bad_input(tmp_path, capsys):
     assert cosmos(["bench", "suite", str(tmp_path)]) == 2
     assert "expected benchmark_*.yaml there, found none" in capsys.readouterr().err

@@ -118,6 +118,28 @@ def test_report_of_a_run_that_is_not_collected_says_what_to_do(made, capsys):
     assert "cosmos collect 1" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("verb", ["report", "judge", "tabulate", "rerun", "diff"])
+def test_commands_to_be_copied_name_a_folder_with_a_space_as_a_shell_takes_it(
+    tmp_path, capsys, verb
+):
+    run = SyntheticRun(tmp_path / "my runs").write().run
+
+    assert app.run([verb, str(run.path), *([str(run.path)] if verb == "diff" else [])]) == 2
+
+    assert f"cosmos collect '{run.path}'" in capsys.readouterr().err
+
+
+def test_verdict_that_is_not_there_is_said_to_be_none(made, capsys):
+    finish(made)
+    document = json.loads(made.run.run_json.read_text())
+    del document["verdict"]
+    made.run.run_json.write_text(json.dumps(document))
+
+    assert app.run(["report", "1"]) == 0
+
+    assert capsys.readouterr().out.splitlines()[0] == "0001-synthetic: no verdict"
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(60)
 def test_pipe_among_the_tables_is_named_and_not_waited_for(made, capsys):

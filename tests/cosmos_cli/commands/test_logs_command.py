@@ -139,6 +139,14 @@ def test_run_that_said_nothing_says_so(made, capsys):
     assert "0001-x: nothing was said" in capsys.readouterr().err
 
 
+def test_run_that_said_something_is_not_called_silent(made, capsys):
+    assert cosmos(["logs", "-n", "0"]) == 0
+    assert capsys.readouterr().err == ""
+
+    assert cosmos(["logs", "1", "a2", "--level", "error"]) == 0
+    assert capsys.readouterr().err == "0001-x: nothing as loud as error was said\n"
+
+
 def test_only_whole_lines_are_told_and_each_once(made):
     path = made / "host/log.jsonl"
     reading = LogReading()

@@ -7,6 +7,7 @@ from harness.synthetic_run import SyntheticRun, make_config
 from cosmos_cli import app
 from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.diff import recorded
+from madns_runtime.recording.records import Field, StreamSchema
 
 AGENTS, TICKS = 3, 300
 
@@ -200,12 +201,29 @@ def test_what_the_framework_recorded_is_compared_when_it_is_named(make, capsys):
 
 
 def test_nothing_chosen_is_never_the_same(make, capsys):
-    make(), make()
+    nothing = StreamSchema("silent", (Field("tick", "", "int"),))
+    for _ in range(2):
+        make(lambda made: made.recorder("agents/agent-01", "agent-01", nothing).close())
 
-    code, document = diff(capsys, "1", "2", "--expect-same", "--agents", "nobody")
+    code, document = diff(capsys, "1", "2", "--expect-same", "--streams", "silent")
 
     assert code == 1
-    assert document["streams"] == []
+    assert [one["rows"] for one in document["streams"]] == [[0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("option", "word", "expected"),
+    [
+        ("--agents", "agent-99", "--agents agent-99: no agent of these runs is called so"),
+        ("--streams", "stat", "--streams stat: these runs recorded no such stream, did you mean"),
+    ],
+)
+def test_a_word_that_chooses_nothing_is_refused(make, capsys, option, word, expected):
+    make(), make()
+
+    assert app.run(["diff", "1", "2", "--expect-same", option, "*", option, word]) == 2
+
+    assert expected in capsys.readouterr().err
 
 
 def test_streams_are_read_a_bounded_number_of_rows_at_a_time(make, capsys, monkeypatch):

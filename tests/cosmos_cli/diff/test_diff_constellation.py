@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -143,6 +144,19 @@ def test_measurements_are_held_against_the_truth_of_their_own_time(fly, capsys):
     assert [e["rms"] for e in errors["position"]] == pytest.approx([0.0, 4.0], abs=1e-6)
     assert errors["position"][1]["count"] == 2 * (TICKS - 2)
     assert errors["velocity"][1]["max"] == 0.0
+
+
+def test_measurements_of_which_the_tables_alone_are_left_are_the_same(fly, capsys, tmp_path):
+    fly(noise_m=4.0), fly(noise_m=4.0)
+    shutil.rmtree(tmp_path / "runs" / "0002-synthetic" / "agents")
+
+    assert app.run(["diff", "1", "2", "--json", "--quiet"]) == 0
+
+    document = json.loads(capsys.readouterr().out)
+    gnss = next(one for one in document["streams"] if one["table"] == "gnss")
+    assert (gnss["matched"], gnss["fields_only_a"]) == (2 * (TICKS - 2), [])
+    found = document["constellation"]["measurements"]
+    assert [e["count"] for e in found[0]["errors"]] == [2 * (TICKS - 2)] * 2
 
 
 def test_delta_v_commanded_and_given_stand_side_by_side(fly, capsys):

@@ -140,6 +140,35 @@ def test_a_value_that_one_lacks_is_a_difference_without_a_size():
     assert found.first.key == 1
 
 
+@pytest.mark.parametrize("kind", [np.int64, object])
+def test_whole_numbers_that_no_float_can_hold_differ_by_their_last_digit(kind):
+    found = FieldDifference(Field("time_ns", "ns", "int"))
+    first = np.array([1_764_000_000_000_000_001, 2, 2**63 - 1], dtype=kind)
+    second = np.array([1_764_000_000_000_000_002, 2, 2**63 - 1], dtype=kind)
+
+    found.add(rows([0, 1, 2], time_ns=first), rows([0, 1, 2], time_ns=second))
+
+    assert (found.different, found.max, found.at.key) == (1, 1.0, 0.0)
+    assert found.values == (1_764_000_000_000_000_001, 1_764_000_000_000_000_002)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_run_that_diverged_differs_without_a_root_mean_square():
+    found = FieldDifference(Field("x_m", "m"))
+
+    found.add(rows([0, 1], x_m=[1e300, 1.0]), rows([0, 1], x_m=[1.0, 1.0]))
+
+    assert (found.different, found.max) == (1, 1e300)
+
+
+def test_whole_numbers_far_apart_differ_by_what_lies_between():
+    found = FieldDifference(Field("n", "", "int"))
+
+    found.add(rows([0], n=[-(2**63)]), rows([0], n=[2**63 - 1]))
+
+    assert found.max == 2.0**64
+
+
 def test_json_of_a_table_and_of_a_line_is_the_same():
     found = FieldDifference(Field("details", "", "json"))
     line, table = np.empty(2, dtype=object), np.empty(2, dtype=object)

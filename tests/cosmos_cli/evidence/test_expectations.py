@@ -128,6 +128,23 @@ def test_a_statistic_is_that_of_all_records_in_its_time_however_they_are_read(
     assert result.passed
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("statistic", ["mean", "rms", "sd"])
+def test_a_statistic_of_values_that_diverged_is_not_finite_and_breaks_its_check(
+    statistic, monkeypatch
+):
+    monkeypatch.setattr(records, "BATCH_RECORDS", 3)
+    values = np.array([1.0, -2.0, 3.0, 1e200, -1e300, 1.7e308, 1.7e308, 1.7e308])
+    state = FakeTable("state", STATE.fields, {"a": {"t_s": T_S[:8], "x_m": values}})
+
+    (result,) = judge(
+        expect(statistic=statistic, bounds=ValueBounds.below(1.0), agents=("a",)),
+        tables={"state": state},
+    ).results
+
+    assert (result.got, result.passed) == (None, False)
+
+
 @pytest.mark.parametrize("rows", [7, 65_536])
 def test_first_time_and_settled_are_times_of_records(rows, monkeypatch):
     monkeypatch.setattr(records, "BATCH_RECORDS", rows)

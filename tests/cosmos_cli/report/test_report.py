@@ -249,6 +249,8 @@ def test_failed_run_is_red_and_names_who_why_and_what_is_missing(tmp_path):
     page = made.run.report_html.read_text()
     assert 'class="verdict bad"' in page
     assert "ABORTED: agent-02: killed by SIGKILL" in page
+    assert " s planned" in page
+    assert " s simulated" not in page
     assert "Data that are missing" in page
     assert "agent-02: " in page
 

@@ -11,6 +11,7 @@ from cosmos_cli.evidence.tabulate import gather
 from cosmos_cli.models.baseline import read_baseline
 from cosmos_cli.testing.baseline_update import update_baseline
 from cosmos_cli.testing.figures import ComparedFigure, compare_figures
+from madns_runtime.recording.records import Field, StreamSchema
 
 BASELINE = """\
 # What the run of the ring comes to.
@@ -84,6 +85,26 @@ def test_what_does_not_hold_says_why(baseline, run, figure, words):
 @pytest.mark.parametrize("got", [math.nan, math.inf, None])
 def test_what_is_no_number_never_passes(got):
     assert not ComparedFigure(name="a", expected=1.0, got=got, allowed=1e9).passed
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("statistic", ["mean", "rms", "sd"])
+def test_a_statistic_of_values_that_diverged_never_passes_and_is_no_number(
+    baseline, tmp_path, statistic
+):
+    made = SyntheticRun(tmp_path / "runs").write()
+    schema = StreamSchema("x", (Field("tick", "", "int"), Field("x_m", "m")))
+    recorder = made.recorder("agents/agent-01", "agent-01", schema)
+    for tick in range(3):
+        recorder.record("x", (tick, 1.7e308))
+    recorder.close()
+    gather(made.run, 10.0, lambda *told: None)
+    text = f"figures: {{d: {{stream: x, field: x_m, statistic: {statistic}, expected: 1}}}}"
+
+    (figure,) = compare_figures(baseline(text), made.run, {})
+
+    assert (figure.got, figure.passed) == (None, False)
+    assert "so large, up to 1.7e+308, that it is not finite" in figure.why_none
 
 
 def test_new_values_are_written_and_nothing_else_is_touched(baseline):

@@ -54,6 +54,55 @@ def test_verdicts_exit_code_survives_a_reader_that_has_gone(run_path: Path) -> N
     assert "Exception ignored" not in ended.stderr
 
 
+TINY = "name: tiny\nsimulation: counter\nagents: {count: 1, tick_hz: 5}\ntime: {mode: lockstep, duration_s: 1}\n"
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("redirection", ["| true", "2>&1 | true", ">&-"])
+def test_tests_go_on_without_an_output_and_tell_by_their_file_and_code(
+    tmp_path: Path, redirection: str
+) -> None:
+    for name, code in (("a", 1), ("b", 0)):
+        (tmp_path / f"{name}.yaml").write_text(f"{TINY}test: {{expect: {{exit_code: {code}}}}}\n")
+    junit = tmp_path / "results.xml"
+
+    ended = shell(
+        f"{COSMOS} test {tmp_path} -j 1 --runs {tmp_path / 'runs'} --junit {junit} {redirection};"
+        " exit ${PIPESTATUS[0]}"
+    )
+
+    assert ended.returncode == 1
+    assert 'tests="2"' in junit.read_text()
+    assert 'failures="1"' in junit.read_text()
+    assert ended.stderr.count("error: ") == ("2>&1" not in redirection)
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(("above", "code"), [(3, 0), (100, 4)])
+def test_code_of_judge_survives_a_reader_that_has_gone(
+    tmp_path: Path, above: int, code: int
+) -> None:
+    (tmp_path / "a.yaml").write_text(TINY)
+    (tmp_path / "b.yaml").write_text(
+        f"{TINY}checks: [{{name: few, stream: round_trips, statistic: count, above: {above}}}]\n"
+    )
+    shell(f"{COSMOS} run {tmp_path / 'a.yaml'} --runs {tmp_path / 'runs'} -q")
+
+    ended = shell(
+        f"{COSMOS} judge -s {tmp_path / 'b.yaml'} --runs {tmp_path / 'runs'} | true; exit ${{PIPESTATUS[0]}}"
+    )
+
+    assert ended.returncode == code
+
+
+@pytest.mark.process
+def test_collecting_goes_on_when_nobody_hears_its_talk(run_path: Path) -> None:
+    ended = shell(f"{COSMOS} collect {run_path} 2>&1 | true; exit ${{PIPESTATUS[0]}}")
+
+    assert ended.returncode == 5
+    assert (run_path / "run.json").exists()
+
+
 @pytest.mark.process
 @pytest.mark.parametrize("redirection", [">/dev/full", ">&-"])
 def test_other_commands_end_with_1_and_one_line(redirection: str) -> None:
