@@ -101,7 +101,9 @@ class LineFramer(EndedFramer):
             return None, end + 1
         frame, used = self._checked(line, end + 1)
         # Without its carriage return a line may be longer than one with it.
-        return self._garbage(used) if frame is not None and len(frame) > self._max else (frame, used)
+        return (
+            self._garbage(used) if frame is not None and len(frame) > self._max else (frame, used)
+        )
 
     def _checked(self, line: bytes, used: int) -> tuple[bytes | None, int]:
         return line, used
@@ -243,6 +245,18 @@ FRAMERS: Final[Mapping[Framing, Callable[[int], Framer]]] = {
     "length_prefixed": LengthFramer,
     "raw": Framer,
 }
+
+
+def make_framer(
+    framing: Framing,
+    frame_bytes_max: int,
+    length_bytes: int = 2,
+    length_order: Literal["little", "big"] = "little",
+) -> Framer:
+    """Return what cuts and wraps; the length's bytes and their order are those of `length_prefixed`."""
+    if framing == "length_prefixed":
+        return LengthFramer(frame_bytes_max, length_bytes, length_order)
+    return FRAMERS[framing](frame_bytes_max)
 
 
 def cobs_encode(data: bytes) -> bytes:
