@@ -9,7 +9,7 @@ from typing import Any, Final
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.clock import DeviceClock
-from madns_runtime.hardware.contract import Channel, Sample
+from madns_runtime.hardware.contract import Channel, Device, Sample
 from madns_runtime.hardware.faults import InsertedFaults
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.profiles import PREFIX, counts_by_channel
@@ -58,6 +58,11 @@ class Intake:
         self._dropped = 0
         """Samples that inserted faults have dropped, as far as they are counted."""
 
+    def serve(self, device: Device) -> None:
+        """Let a device that is about to be opened count, and see the faults that are in force."""
+        device.count = self.count
+        self.faults.show_to(device)
+
     def take(self, sample: Sample, now_s: float, *, ahead_s: float = 0.0) -> None:
         """
         Hand on what a driver read.
@@ -83,6 +88,7 @@ class Intake:
         if self.faults.dropped != self._dropped:
             self.count("dropped", self.faults.dropped - self._dropped)
             self._dropped = self.faults.dropped
+        self.tell_held(now_s)  # what waits no longer, as its delay was lifted, came before it
         if altered is not None:
             self._tell(altered, now_s)
         self._page.header[page.SAMPLES] += 1

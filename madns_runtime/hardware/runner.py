@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 import socket
 from collections.abc import Callable, Mapping
@@ -17,9 +16,14 @@ from madns_runtime.hardware.contract import Device, SimulatedDevice
 from madns_runtime.hardware.intake import Intake
 from madns_runtime.hardware.outbox import UserOutbox
 from madns_runtime.hardware.outputs import DeviceOutputs, DueOutput
-from madns_runtime.hardware.process_resources import has_descriptors, resident_bytes
+from madns_runtime.hardware.process_resources import (
+    GROWTH_BYTES_MAX,
+    has_descriptors,
+    resident_bytes,
+)
 from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.seat import DeviceSeat
+from madns_runtime.hardware.simulated import pass_over, samples_by_now
 from madns_runtime.hardware.status import StatusLimits, back_off_s
 from madns_runtime.plugin.context import describe_exception
 from madns_runtime.reactor.reactor import Reactor
@@ -27,8 +31,6 @@ from madns_runtime.reactor.reactor import Reactor
 BURST_MAX: Final = 256
 """Samples taken in a row from a device that has them ready; then others get their turn."""
 STATE_PERIOD_S: Final = 1.0
-GROWTH_BYTES_MAX: Final = 256 << 20
-"""Memory that a device's process may take beyond what it had when the device was opened first."""
 
 
 class DeviceRunner:
@@ -96,11 +98,11 @@ class DeviceRunner:
         try:
             self._device = device = self._seat.make()
             device.may_move, device.place = self._launch.may_move, self._launch.place
-            device.count = self._intake.count
-            self._intake.faults.show_to(device)
+            self._intake.serve(device)
             identity = device.open()
             self._seat.check_identity(identity)
             self._is_own = True
+            self._intake.count("passed_while_closed", pass_over(device, self._records.time, header))
             self._fd = device.fileno()
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything
             self._fail("open", error)
@@ -174,7 +176,7 @@ class DeviceRunner:
         """Bring outputs into their safe state, where they may move at all; return whether they are."""
         if not (self._outputs and self._launch.may_move and self._is_own):
             return True  # nothing has moved, and what is in its place is not to be touched
-        self._outputs.clear_writes()
+        self._intake.count("writes_lost", self._outputs.clear_writes())
         self._schedule_write()
         try:
             device.make_safe()
@@ -190,7 +192,7 @@ class DeviceRunner:
         """Make safe, close, and return what the run came to: counts, and the account of records."""
         self._is_ending = True
         self._records.event("ending", monotonic(), why=reason)
-        self._outputs.clear()
+        self._intake.count("writes_left", self._outputs.clear())
         self._close_device()
         if not self._header[page.MOVED]:  # else the guardian tries what the driver could not
             self._header[page.STATE] = page.SAFE
@@ -238,28 +240,14 @@ class DeviceRunner:
         self._header[page.ACTIVE_S] = monotonic()
         try:
             if isinstance(device, SimulatedDevice):
-                self._simulate(device)
+                for given in samples_by_now(device, self._records.time, BURST_MAX):
+                    self._take(given)
             elif (sample := device.read()) is not None:
                 self._take(sample)
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything
             self._fail("read", error)
             return False
         return True
-
-    def _simulate(self, device: SimulatedDevice) -> None:
-        """Take what a device that follows simulated time gives by now; before that runs, what it gives at 0."""
-        time = self._records.time
-        now_s = monotonic()
-        t_s = time.at(now_s) if time.is_known else 0.0
-        for _ in range(BURST_MAX):
-            sample = device.sample_at(max(t_s, 0.0))
-            if sample is not None:
-                self._take(
-                    dataclasses.replace(sample, taken_s=now_s - (max(t_s, 0.0) - sample.taken_s))
-                )
-            next_s = device.next_s()
-            if next_s is None or next_s > t_s:
-                return
 
     def _take(self, sample: Any) -> None:
         self._intake.take(sample, monotonic(), ahead_s=self._period_s)
@@ -362,6 +350,7 @@ class DeviceRunner:
             self._refuse(str(error))
             return str(error)
         self._records.event("fault", monotonic(), action=action, value=value)
+        self._held_timer.reschedule(self._intake.faults.next_due_s())
         if self._intake.faults.is_disconnected:
             self._close_device()
         elif self._device is None:
