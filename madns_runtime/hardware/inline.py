@@ -9,6 +9,7 @@ from madns_runtime.config import DeviceLaunch
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.contract import SimulatedDevice
+from madns_runtime.hardware.driver_answers import identity_of
 from madns_runtime.hardware.intake import Intake
 from madns_runtime.hardware.kind_registry import DeviceProgram
 from madns_runtime.hardware.outputs import DeviceOutputs, DueOutput
@@ -83,7 +84,7 @@ class InlineDevice:
 
     def open(self) -> None:
         """Open it at simulated time 0."""
-        identity = self._device.open()
+        identity = identity_of(self._device.open())
         header = self._page.header
         header[page.STATE], header[page.OPENED_S] = page.OPEN, 0.0
         self._records.time.set(0.0, 0.0, 1.0)

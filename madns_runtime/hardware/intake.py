@@ -18,6 +18,8 @@ from madns_runtime.hardware.values import are_finite, hold_to_limits, to_frame, 
 
 FROZEN: Final = "frozen:"
 """Before an input's name: how often it stood still."""
+NOT_FINITE: Final = "_not_finite"
+"""Behind an input's name: how often it was no number."""
 EVENTS_MAX: Final = 1000
 """Of one kind of event, such as refused values; more are counted alone."""
 
@@ -127,7 +129,7 @@ class Intake:
             numbers = to_numbers(channel, value)
             if not are_finite(numbers):
                 # On record, where the check records.not_finite finds it, and in nobody's hands.
-                self.count(f"{name}_not_finite")
+                self.count(f"{name}{NOT_FINITE}")
                 last = self._page.read(name).number
                 self._records.sample(name, last, sample.taken_s, numbers, told_s=now_s)
                 continue

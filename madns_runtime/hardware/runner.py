@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import socket
 from collections.abc import Callable, Mapping
@@ -13,6 +12,8 @@ from typing import Any, Final
 from madns_runtime.errors import MachineError, MadnsError, PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.contract import Device, SimulatedDevice
+from madns_runtime.hardware.descriptor import DriverDescriptor
+from madns_runtime.hardware.driver_answers import descriptor_of, details_of, identity_of
 from madns_runtime.hardware.intake import Intake
 from madns_runtime.hardware.outbox import UserOutbox
 from madns_runtime.hardware.outputs import DeviceOutputs, DueOutput
@@ -63,7 +64,7 @@ class DeviceRunner:
         self.tell_fault: Callable[[str, float | None], object] = lambda action, value: None
         """Told of an inserted fault that came from an agent."""
         self._device: Device | None = None
-        self._fd: int | None = None
+        self._descriptor: DriverDescriptor | None = None
         self._failures = 0
         self._late_us_max = 0
         self._is_ending = False
@@ -99,11 +100,13 @@ class DeviceRunner:
             self._device = device = self._seat.make()
             device.may_move, device.place = self._launch.may_move, self._launch.place
             self._intake.serve(device)
-            identity = device.open()
+            identity = identity_of(device.open())
             self._seat.check_identity(identity)
             self._is_own = True
             self._intake.count("passed_while_closed", pass_over(device, self._records.time, header))
-            self._fd = device.fileno()
+            if (fd := descriptor_of(device.fileno())) is not None:
+                intake, readable = self._intake, self._readable
+                self._descriptor = DriverDescriptor(fd, self._reactor, readable, intake.event)
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything
             self._fail("open", error)
             return
@@ -113,11 +116,9 @@ class DeviceRunner:
         self._first_bytes = self._first_bytes or resident_bytes()
         if header[page.MOVED]:
             self._make_safe(device)  # what an earlier process, or a failed attempt, has left
-        if self._fd is None:
+        if self._descriptor is None:
             self._due_s = now_s
             self._read_timer.reschedule(now_s)
-        else:
-            self._reactor.add_reader(self._fd, self._readable)
 
     def _fail(self, method: str, error: BaseException) -> None:
         """Note what a driver raised, close the device, and open it anew after a while."""
@@ -161,9 +162,9 @@ class DeviceRunner:
         if device is None:
             return
         self._read_timer.reschedule(math.inf)
-        if self._fd is not None:
-            self._reactor.remove_reader(self._fd)
-            self._fd = None
+        if self._descriptor is not None:
+            self._descriptor.close()
+            self._descriptor = None
         self._make_safe(device)
         try:
             device.close()
@@ -203,7 +204,7 @@ class DeviceRunner:
 
     def _read_due(self) -> None:
         now_s = monotonic()
-        if self._fd is not None:
+        if self._descriptor is not None:
             self._readable()
             return
         self._late_us_max = max(self._late_us_max, int((now_s - self._due_s) * 1e6))
@@ -226,9 +227,13 @@ class DeviceRunner:
         self._read_timer.reschedule(self._due_s)
 
     def _readable(self) -> None:
-        for _ in range(BURST_MAX):
+        for number in range(BURST_MAX):
             before = self._header[page.SAMPLES]
-            if not self._read() or self._header[page.SAMPLES] == before:
+            if not self._read():
+                return
+            if self._header[page.SAMPLES] == before:
+                if self._descriptor is not None:
+                    self._descriptor.note_read(has_samples=number > 0)
                 return
         self._read_timer.reschedule(monotonic())  # more is ready, and others get their turn first
 
@@ -366,12 +371,15 @@ class DeviceRunner:
             self._fail("read", MachineError(f"no sample within {self._hang_s:g} s"))
         if self._device is not None:
             try:
-                details = self._device.health()
+                details = details_of(self._device.health())
             except BaseException as error:  # noqa: BLE001 - a driver may raise anything
                 self._fail("health", error)
         counts = int(self._header[page.SAMPLES]), int(self._header[page.ERRORS])
-        with contextlib.suppress(PluginError):  # details that JSON cannot carry
+        try:
             self._records.state(now_s, counts, self._late_us_max, details)
+        except PluginError as error:  # details that JSON cannot carry
+            self._refuse(f"health: {error}")
+            self._records.state(now_s, counts, self._late_us_max, {})
         self._late_us_max = 0
         self._check_memory()
         estimate = self._intake.clock.estimate()
