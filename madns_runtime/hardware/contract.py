@@ -9,7 +9,7 @@ device's own process, one at a time: none of them may hold up a tick, however lo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Literal
@@ -24,6 +24,11 @@ Value = float | Sequence[float] | bytes
 ELEMENTS_MAX = 4096
 """Numbers of one channel: a camera's picture is no sample."""
 FRAME_BYTES_MAX = 8192
+COLUMNS_TAKEN: Mapping[str, tuple[str, ...]] = {
+    "in": ("t_s", "number", "age_us"),
+    "out": ("t_s", "lateness_us"),
+}
+"""By direction: names of what is recorded before a channel's numbers."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,21 +83,38 @@ class Channel:
             found.append(
                 f"{self.name}: {self.size} elements, and {len(self.components)} components"
             )
+        found += self._column_faults()
         if self.is_frame and (self.shape or not 1 <= self.frame_bytes_max <= FRAME_BYTES_MAX):
             found.append(f"{self.name}: frames have no shape and 1 to {FRAME_BYTES_MAX} bytes")
         if self.limits is not None and not self.limits[0] <= self.limits[1]:
             found.append(f"{self.name}: limits {self.limits} are no range")
         if self.safe is not None and self.direction == "in":
             found.append(f"{self.name}: only an output has a safe value")
+        elif self.safe is not None:
+            found += self._safe_faults()
         if self.underrun == "safe" and (self.safe is None or self.is_frame):
             found.append(f"{self.name}: underrun: safe needs a safe value of numbers")
-        if self.direction == "out" and self.safe is not None and self.limits is not None:
-            values = self.safe if isinstance(self.safe, tuple) else (self.safe,)
-            if not all(self.limits[0] <= value <= self.limits[1] for value in values):
-                found.append(
-                    f"{self.name}: safe value {self.safe} is beyond the limits {self.limits}"
-                )
         return found
+
+    def _column_faults(self) -> Iterator[str]:
+        """Yield what keeps its values from standing in a record beside their time."""
+        if self.is_frame:
+            return
+        names = self.column_names()
+        if len(set(names)) < len(names):
+            yield f"{self.name}: expected components with distinct names, got {', '.join(names)}"
+        if taken := sorted(set(names) & set(COLUMNS_TAKEN[self.direction])):
+            yield f"no number may be called {taken[0]}, as what is recorded beside it is"
+
+    def _safe_faults(self) -> Iterator[str]:
+        """Yield what is wrong with the safe value of an output."""
+        values = self.safe if isinstance(self.safe, tuple) else (self.safe or 0.0,)
+        if isinstance(self.safe, tuple) and len(values) != self.size:
+            yield f"{self.name}: {self.size} elements, and {len(values)} safe values"
+        if not all(map(math.isfinite, values)):
+            yield f"{self.name}: expected a finite safe value, got {self.safe}"
+        elif self.limits and not all(self.limits[0] <= v <= self.limits[1] for v in values):
+            yield f"{self.name}: safe value {self.safe} is beyond the limits {self.limits}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

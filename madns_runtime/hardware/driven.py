@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from madns_runtime.config import DeviceLaunch
 from madns_runtime.hardware import messages, page
-from madns_runtime.hardware.intake import counts_of
+from madns_runtime.hardware.intake import NOT_FINITE, counts_of
 from madns_runtime.hardware.kind_registry import DeviceProgram
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.seat import DeviceSeat
@@ -83,7 +83,10 @@ class DrivenDevice:
         if state == page.OPENING:
             return f"it has not opened within {self.limits.lost_s:g} s"
         if state == page.OPEN:
-            return f"no sample for {self.limits.lost_s:g} s"
+            counts = self.seat.page.counts.read()
+            told = [f"{name} {n}" for name, n in counts.items() if name.endswith(NOT_FINITE) and n]
+            what = f"sample of finite numbers ({', '.join(told)})" if told else "sample"
+            return f"no {what} for {self.limits.lost_s:g} s"
         return "it is closed"
 
     def _counts(self) -> dict[str, Any]:

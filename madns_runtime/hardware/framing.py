@@ -61,7 +61,28 @@ class Framer:
         return None, count
 
 
-class LineFramer(Framer):
+class EndedFramer(Framer):
+    """Frames that end with a byte which is in none; of one that is too long the rest is thrown away as well."""
+
+    end_byte = b"\n"
+    _is_skipping = False
+    """Whether the beginning of a frame that is too long was thrown away, and its end has not come."""
+
+    def _cut_to_end(self, buffer: bytearray, longest: int) -> int | tuple[None, int] | None:
+        """Return where the next frame's end is; garbage of one longer than *longest*; None if more must come first."""
+        end = buffer.find(self.end_byte)
+        if end < 0:
+            if not buffer or not (self._is_skipping or len(buffer) > longest):
+                return None
+            self._is_skipping = True
+            return self._garbage(len(buffer))
+        if self._is_skipping or end > longest:
+            self._is_skipping = False
+            return self._garbage(end + 1)
+        return end
+
+
+class LineFramer(EndedFramer):
     """Lines that end with a line feed; a carriage return before it is left out."""
 
     overhead_bytes = 1
@@ -72,14 +93,17 @@ class LineFramer(Framer):
         return frame + b"\r\n"
 
     def _cut(self, buffer: bytearray) -> tuple[bytes | None, int] | None:
-        end = buffer.find(b"\n")
-        if end < 0:
-            too_many = len(buffer) > self._max + self.overhead_bytes
-            return self._garbage(len(buffer)) if too_many else None
-        if end > self._max + self.overhead_bytes:
-            return self._garbage(end + 1)
+        end = self._cut_to_end(buffer, self._max + self.overhead_bytes)
+        if not isinstance(end, int):
+            return end
         line = bytes(buffer[:end]).removesuffix(b"\r")
-        return self._checked(line, end + 1) if line else (None, end + 1)
+        if not line:
+            return None, end + 1
+        frame, used = self._checked(line, end + 1)
+        # Without its carriage return a line may be longer than one with it.
+        return (
+            self._garbage(used) if frame is not None and len(frame) > self._max else (frame, used)
+        )
 
     def _checked(self, line: bytes, used: int) -> tuple[bytes | None, int]:
         return line, used
@@ -147,21 +171,22 @@ class UbxFramer(Framer):
         return body[:2] + body[4:], used
 
 
-class CobsFramer(Framer):
+class CobsFramer(EndedFramer):
     """Frames without a zero byte, by consistent overhead byte stuffing, each ended by one (Cheshire and Baker, 1999)."""
+
+    end_byte = b"\0"
 
     def wrap(self, frame: bytes) -> bytes:
         """Return the frame stuffed, with its end."""
         return cobs_encode(frame) + b"\0"
 
     def _cut(self, buffer: bytearray) -> tuple[bytes | None, int] | None:
-        end = buffer.find(b"\0")
-        longest = self._max + self._max // 254 + 2
-        if end < 0:
-            return self._garbage(len(buffer)) if len(buffer) > longest else None
+        end = self._cut_to_end(buffer, self._max + self._max // 254 + 2)
+        if not isinstance(end, int):
+            return end
         if end == 0:
             return None, 1  # zeros between frames are no garbage
-        frame = cobs_decode(bytes(buffer[:end])) if end <= longest else None
+        frame = cobs_decode(bytes(buffer[:end]))
         if frame is None or len(frame) > self._max:
             return self._garbage(end + 1)
         return frame, end + 1
@@ -220,6 +245,18 @@ FRAMERS: Final[Mapping[Framing, Callable[[int], Framer]]] = {
     "length_prefixed": LengthFramer,
     "raw": Framer,
 }
+
+
+def make_framer(
+    framing: Framing,
+    frame_bytes_max: int,
+    length_bytes: int = 2,
+    length_order: Literal["little", "big"] = "little",
+) -> Framer:
+    """Return what cuts and wraps; the length's bytes and their order are those of `length_prefixed`."""
+    if framing == "length_prefixed":
+        return LengthFramer(frame_bytes_max, length_bytes, length_order)
+    return FRAMERS[framing](frame_bytes_max)
 
 
 def cobs_encode(data: bytes) -> bytes:

@@ -9,6 +9,7 @@ from madns_runtime.config import DeviceLaunch
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.contract import SimulatedDevice
+from madns_runtime.hardware.driver_answers import identity_of
 from madns_runtime.hardware.intake import Intake
 from madns_runtime.hardware.kind_registry import DeviceProgram
 from madns_runtime.hardware.outputs import DeviceOutputs, DueOutput
@@ -71,6 +72,8 @@ class InlineDevice:
         )
         self._outputs = DeviceOutputs(launch, program.channels, self._intake.count)
         self._device.may_move, self._device.place = launch.may_move, launch.place
+        self._intake.serve(self._device)
+        self._now_s = now_s
         self.port = DevicePort(
             launch.name,
             program.channels,
@@ -81,7 +84,7 @@ class InlineDevice:
 
     def open(self) -> None:
         """Open it at simulated time 0."""
-        identity = self._device.open()
+        identity = identity_of(self._device.open())
         header = self._page.header
         header[page.STATE], header[page.OPENED_S] = page.OPEN, 0.0
         self._records.time.set(0.0, 0.0, 1.0)
@@ -109,21 +112,36 @@ class InlineDevice:
                 continue
             self._count += 1
             sample = self._device.sample_at(due_s)
-            if sample is not None and not self._intake.faults.is_disconnected:
-                self._intake.take(sample, due_s if sample.handed_s is None else sample.handed_s)
+            if sample is None:
+                continue
+            if self._intake.faults.is_disconnected:
+                self._intake.count("passed_while_closed")
+                continue
+            self._intake.take(sample, due_s if sample.handed_s is None else sample.handed_s)
         self._intake.tell_held(t_s)
         self._account.observe(self._page.status(self._limits, t_s), t_s)
         self._handed_s = t_s
 
     def insert_fault(self, action: str, value: float | None) -> None:
         """
-        Put a fault in force, or clear all; of one that is disconnected no sample is heard.
+        Put a fault in force, or clear all.
+
+        One that is disconnected is made safe, and lost at once: no sample of it is heard, and nothing is put out.
 
         Raises:
             ConfigurationError: There is no such fault, or its value is none.
         """
         self._intake.faults.insert(action, value)
-        self._intake.event("fault", self._handed_s, action=action, value=value)
+        now_s = self._now_s()
+        self._intake.event("fault", now_s, action=action, value=value)
+        is_open = self._page.header[page.STATE] == page.OPEN
+        if self._intake.faults.is_disconnected and is_open:
+            self._make_safe(now_s)
+            self._page.header[page.STATE] = page.CLOSED
+            self._records.event("closed", now_s)
+        elif not self._intake.faults.is_disconnected and not is_open:
+            self._page.header[page.STATE], self._page.header[page.OPENED_S] = page.OPEN, now_s
+            self._records.event("opened", now_s)
 
     def _hear(self) -> None:
         """Take what the agent has handed over since the last time."""
@@ -146,7 +164,9 @@ class InlineDevice:
         for output in self._outputs.due(now_s, now_s, float):
             if output.point is not None and output.point.is_underrun:
                 self._intake.event("underrun", now_s, channel=output.channel.name)
-            if output.value is not None:
+            if self._intake.faults.is_disconnected:
+                self._outputs.note_lost(output)
+            elif output.value is not None:
                 self._put_out(output, now_s)
 
     def _put_out(self, output: DueOutput, now_s: float) -> None:
@@ -159,9 +179,8 @@ class InlineDevice:
     def close(self) -> dict[str, Any]:
         """Make it safe and close it, and return what the run came to."""
         self._hear()
-        self._outputs.clear()
-        if self._page.header[page.MOVED]:
-            self._device.make_safe()
+        self._intake.count("writes_left", self._outputs.clear())
+        self._make_safe(self._now_s())
         self._device.close()
         account = self._account
         return {
@@ -174,6 +193,14 @@ class InlineDevice:
             **self._outputs.summary(self._page.counts.read()),
             "records": self._records.close(RECORDS_TIMEOUT_S),
         }
+
+    def _make_safe(self, now_s: float) -> None:
+        """Make outputs safe if any has moved; what was still to be put out, but for a profile's points, is lost."""
+        self._intake.count("writes_lost", self._outputs.clear_writes())
+        if self._page.header[page.MOVED]:
+            self._device.make_safe()
+            self._page.header[page.MOVED] = 0.0
+            self._records.event("made_safe", now_s)
 
     def _pass_on(self, message: list[Any]) -> int:
         return int(not messages.send(self._own_end, message))

@@ -9,7 +9,7 @@ from typing import Any, Final
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.clock import DeviceClock
-from madns_runtime.hardware.contract import Channel, Sample
+from madns_runtime.hardware.contract import Channel, Device, Sample
 from madns_runtime.hardware.faults import InsertedFaults
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.profiles import PREFIX, counts_by_channel
@@ -18,6 +18,8 @@ from madns_runtime.hardware.values import are_finite, hold_to_limits, to_frame, 
 
 FROZEN: Final = "frozen:"
 """Before an input's name: how often it stood still."""
+NOT_FINITE: Final = "_not_finite"
+"""Behind an input's name: how often it was no number."""
 EVENTS_MAX: Final = 1000
 """Of one kind of event, such as refused values; more are counted alone."""
 
@@ -58,6 +60,11 @@ class Intake:
         self._dropped = 0
         """Samples that inserted faults have dropped, as far as they are counted."""
 
+    def serve(self, device: Device) -> None:
+        """Let a device that is about to be opened count, and see the faults that are in force."""
+        device.count = self.count
+        self.faults.show_to(device)
+
     def take(self, sample: Sample, now_s: float, *, ahead_s: float = 0.0) -> None:
         """
         Hand on what a driver read.
@@ -83,6 +90,7 @@ class Intake:
         if self.faults.dropped != self._dropped:
             self.count("dropped", self.faults.dropped - self._dropped)
             self._dropped = self.faults.dropped
+        self.tell_held(now_s)  # what waits no longer, as its delay was lifted, came before it
         if altered is not None:
             self._tell(altered, now_s)
         self._page.header[page.SAMPLES] += 1
@@ -121,7 +129,7 @@ class Intake:
             numbers = to_numbers(channel, value)
             if not are_finite(numbers):
                 # On record, where the check records.not_finite finds it, and in nobody's hands.
-                self.count(f"{name}_not_finite")
+                self.count(f"{name}{NOT_FINITE}")
                 last = self._page.read(name).number
                 self._records.sample(name, last, sample.taken_s, numbers, told_s=now_s)
                 continue

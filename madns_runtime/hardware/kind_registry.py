@@ -18,12 +18,18 @@ from typing import Any, Final
 from madns_runtime.errors import ConfigurationError, MachineError, PluginError
 from madns_runtime.hardware.bounds import bound_faults
 from madns_runtime.hardware.contract import Channel, Device, DeviceKind, Needs, SimulatedDevice
+from madns_runtime.hardware.kind_declaration import (
+    channel_faults,
+    declared_channels,
+    declared_needs,
+    kind_faults,
+)
 from madns_runtime.plain_values import from_mapping
+from madns_runtime.plugin.code_places import told_place
 from madns_runtime.plugin.isolation import call_plugin
 from madns_runtime.plugin.registry import load_object
 
 GROUP: Final = "madns.devices"
-CHANNELS_MAX: Final = 64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,6 +77,8 @@ def resolve_kind(spec: str, base_directory: Path) -> DeviceKind:
             f"{where}: expected a madns_runtime.hardware.contract.DeviceKind, or a Device class with one as its"
             f" `kind`, got {found!r:.80}"
         )
+    if wrong := kind_faults(kind):
+        raise PluginError(f"{told_place(where, found)}: {'; '.join(wrong)}")
     if isinstance(found, type):
         return replace(kind, device=found)
     if isinstance(kind.device, str) and kind.device.startswith(":"):
@@ -98,12 +106,14 @@ def prepare(spec: str, parameters: Mapping[str, Any], base_directory: Path) -> D
         )
         if beyond := bound_faults(values, f"{kind.name}.parameters"):
             raise ConfigurationError("; ".join(beyond))
-    channels = kind.channels
-    if callable(channels):
-        channels = tuple(call_plugin(f"{kind.name}.channels", channels, values))
-    needs = kind.needs
-    if callable(needs):
-        needs = call_plugin(f"{kind.name}.needs", needs, values)
+    declared: Any = kind.channels
+    if callable(declared):
+        declared = call_plugin(f"{kind.name}.channels", declared, values)
+    channels = declared_channels(kind.name, declared)
+    declared = kind.needs
+    if callable(declared):
+        declared = call_plugin(f"{kind.name}.needs", declared, values)
+    needs = declared_needs(kind.name, declared)
     faults = channel_faults(channels)
     if faults:
         raise PluginError(f"{kind.name}: {'; '.join(faults)}")
@@ -114,19 +124,6 @@ def prepare(spec: str, parameters: Mapping[str, Any], base_directory: Path) -> D
         needs=needs,
         make=partial(_make, replace(kind, needs=needs), values, base_directory),
     )
-
-
-def channel_faults(channels: tuple[Channel, ...]) -> list[str]:
-    """Return what is wrong with the channels that a kind declares."""
-    if not channels or len(channels) > CHANNELS_MAX:
-        return [f"expected 1 to {CHANNELS_MAX} channels, got {len(channels)}"]
-    faults = [fault for channel in channels for fault in channel.faults()]
-    names = [channel.name for channel in channels]
-    faults += [
-        f"two channels are called {name}" for name in sorted(set(names)) if names.count(name) > 1
-    ]
-    taken = {"events", "log", "device_state", "device_clock"} & set(names)
-    return faults + [f"no channel may be called {name}" for name in sorted(taken)]
 
 
 def _with_paths(parameters: Any, base_directory: Path) -> Any:

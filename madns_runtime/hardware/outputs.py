@@ -193,9 +193,9 @@ class DeviceOutputs:
         elif not output.point.is_underrun:
             self._count(count_name("lost", output.channel.name), 1)
 
-    def clear_writes(self) -> None:
-        """Forget all writes: what was to come belongs to what is over."""
-        self._pending.clear()
+    def clear_writes(self) -> int:
+        """Forget all writes, and return how many: what was to come belongs to what is over."""
+        return self._pending.clear()
 
     def clear(self) -> int:
         """Forget all that waits, points too, and return how many writes: who handed it over is gone, or the run is."""

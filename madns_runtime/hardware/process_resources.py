@@ -8,6 +8,8 @@ import resource
 from typing import Final
 
 PAGE_BYTES: Final = resource.getpagesize()
+GROWTH_BYTES_MAX: Final = 256 << 20
+"""Memory that a device's process may take beyond what it had when the device was opened first."""
 
 
 def has_descriptors() -> bool:

@@ -6,6 +6,7 @@ A register holds one number or several of one type; raw numbers become values as
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from typing import Annotated, Any, Final, Literal, Protocol
 
 from annotated_types import Ge, Le, MinLen
 
-from madns_runtime.errors import MachineError
+from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.hardware.contract import Channel, Device, Sample, Value
 from madns_runtime.hardware.values import check_range, to_numbers
 
@@ -23,6 +24,8 @@ RegisterType = Literal[
     "u32_le", "u32_be", "i32_le", "i32_be", "f32_le", "f32_be",
 ]  # fmt: skip
 BYTES: Final = {"8": 1, "16": 2, "24": 3, "32": 4}
+F32_MAX: Final = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
+"""The largest number that 32 bits hold."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,15 +87,27 @@ class RegisterBus(Protocol):
         """Let go of the bus."""
 
 
-def register_channels(registers: Sequence[Register]) -> tuple[Channel, ...]:
+def map_channels(given: RegisterMap) -> tuple[Channel, ...]:
     """
-    Return a channel per register.
+    Return a channel per register of a map.
 
     Raises:
-        PluginError: A register has one limit alone, or a scale of zero.
+        PluginError: A register has one limit alone, a scale of zero, no finite offset, or bits of a float to shift; or
+            there is an identity to compare and no register of it.
     """
-    for each in registers:
+    if given.identity_value is not None and given.identity_address is None:
+        raise PluginError("map: identity_value needs identity_address: the register that holds it")
+    for each in given.registers:
         check_range(each.name, each.low, each.high, each.scale)
+        if not math.isfinite(each.offset):
+            raise PluginError(f"{each.name}: expected a finite offset, got {each.offset}")
+        if each.shift and each.type.startswith("f"):
+            raise PluginError(f"{each.name}: shift is of integers, and {each.type} is none")
+    return register_channels(given.registers)
+
+
+def register_channels(registers: Sequence[Register]) -> tuple[Channel, ...]:
+    """Return a channel per register."""
     return tuple(
         Channel(
             name=each.name,
@@ -214,7 +229,8 @@ def encode_number(kind: RegisterType, number: float, shift: int = 0) -> bytes:
     """Return the bytes of a number, held to what the register can hold."""
     order: Literal["little", "big"] = "big" if kind.endswith("_be") else "little"
     if kind.startswith("f"):
-        return struct.pack("<f" if order == "little" else ">f", number)
+        held = min(max(number, -F32_MAX), F32_MAX)
+        return struct.pack("<f" if order == "little" else ">f", held)
     width, is_signed = _width(kind), kind.startswith("i")
     bits = 8 * width
     low = -(1 << bits - 1) if is_signed else 0

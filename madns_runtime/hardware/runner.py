@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
 import math
 import socket
 from collections.abc import Callable, Mapping
@@ -14,12 +12,19 @@ from typing import Any, Final
 from madns_runtime.errors import MachineError, MadnsError, PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.contract import Device, SimulatedDevice
+from madns_runtime.hardware.descriptor import DriverDescriptor
+from madns_runtime.hardware.driver_answers import descriptor_of, details_of, identity_of
 from madns_runtime.hardware.intake import Intake
 from madns_runtime.hardware.outbox import UserOutbox
 from madns_runtime.hardware.outputs import DeviceOutputs, DueOutput
-from madns_runtime.hardware.process_resources import has_descriptors, resident_bytes
+from madns_runtime.hardware.process_resources import (
+    GROWTH_BYTES_MAX,
+    has_descriptors,
+    resident_bytes,
+)
 from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.seat import DeviceSeat
+from madns_runtime.hardware.simulated import pass_over, samples_by_now
 from madns_runtime.hardware.status import StatusLimits, back_off_s
 from madns_runtime.plugin.context import describe_exception
 from madns_runtime.reactor.reactor import Reactor
@@ -27,8 +32,6 @@ from madns_runtime.reactor.reactor import Reactor
 BURST_MAX: Final = 256
 """Samples taken in a row from a device that has them ready; then others get their turn."""
 STATE_PERIOD_S: Final = 1.0
-GROWTH_BYTES_MAX: Final = 256 << 20
-"""Memory that a device's process may take beyond what it had when the device was opened first."""
 
 
 class DeviceRunner:
@@ -61,7 +64,7 @@ class DeviceRunner:
         self.tell_fault: Callable[[str, float | None], object] = lambda action, value: None
         """Told of an inserted fault that came from an agent."""
         self._device: Device | None = None
-        self._fd: int | None = None
+        self._descriptor: DriverDescriptor | None = None
         self._failures = 0
         self._late_us_max = 0
         self._is_ending = False
@@ -96,12 +99,14 @@ class DeviceRunner:
         try:
             self._device = device = self._seat.make()
             device.may_move, device.place = self._launch.may_move, self._launch.place
-            device.count = self._intake.count
-            self._intake.faults.show_to(device)
-            identity = device.open()
+            self._intake.serve(device)
+            identity = identity_of(device.open())
             self._seat.check_identity(identity)
             self._is_own = True
-            self._fd = device.fileno()
+            self._intake.count("passed_while_closed", pass_over(device, self._records.time, header))
+            if (fd := descriptor_of(device.fileno())) is not None:
+                intake, readable = self._intake, self._readable
+                self._descriptor = DriverDescriptor(fd, self._reactor, readable, intake.event)
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything
             self._fail("open", error)
             return
@@ -111,11 +116,9 @@ class DeviceRunner:
         self._first_bytes = self._first_bytes or resident_bytes()
         if header[page.MOVED]:
             self._make_safe(device)  # what an earlier process, or a failed attempt, has left
-        if self._fd is None:
+        if self._descriptor is None:
             self._due_s = now_s
             self._read_timer.reschedule(now_s)
-        else:
-            self._reactor.add_reader(self._fd, self._readable)
 
     def _fail(self, method: str, error: BaseException) -> None:
         """Note what a driver raised, close the device, and open it anew after a while."""
@@ -159,9 +162,9 @@ class DeviceRunner:
         if device is None:
             return
         self._read_timer.reschedule(math.inf)
-        if self._fd is not None:
-            self._reactor.remove_reader(self._fd)
-            self._fd = None
+        if self._descriptor is not None:
+            self._descriptor.close()
+            self._descriptor = None
         self._make_safe(device)
         try:
             device.close()
@@ -174,7 +177,7 @@ class DeviceRunner:
         """Bring outputs into their safe state, where they may move at all; return whether they are."""
         if not (self._outputs and self._launch.may_move and self._is_own):
             return True  # nothing has moved, and what is in its place is not to be touched
-        self._outputs.clear_writes()
+        self._intake.count("writes_lost", self._outputs.clear_writes())
         self._schedule_write()
         try:
             device.make_safe()
@@ -190,7 +193,7 @@ class DeviceRunner:
         """Make safe, close, and return what the run came to: counts, and the account of records."""
         self._is_ending = True
         self._records.event("ending", monotonic(), why=reason)
-        self._outputs.clear()
+        self._intake.count("writes_left", self._outputs.clear())
         self._close_device()
         if not self._header[page.MOVED]:  # else the guardian tries what the driver could not
             self._header[page.STATE] = page.SAFE
@@ -201,7 +204,7 @@ class DeviceRunner:
 
     def _read_due(self) -> None:
         now_s = monotonic()
-        if self._fd is not None:
+        if self._descriptor is not None:
             self._readable()
             return
         self._late_us_max = max(self._late_us_max, int((now_s - self._due_s) * 1e6))
@@ -224,9 +227,13 @@ class DeviceRunner:
         self._read_timer.reschedule(self._due_s)
 
     def _readable(self) -> None:
-        for _ in range(BURST_MAX):
+        for number in range(BURST_MAX):
             before = self._header[page.SAMPLES]
-            if not self._read() or self._header[page.SAMPLES] == before:
+            if not self._read():
+                return
+            if self._header[page.SAMPLES] == before:
+                if self._descriptor is not None:
+                    self._descriptor.note_read(has_samples=number > 0)
                 return
         self._read_timer.reschedule(monotonic())  # more is ready, and others get their turn first
 
@@ -238,28 +245,14 @@ class DeviceRunner:
         self._header[page.ACTIVE_S] = monotonic()
         try:
             if isinstance(device, SimulatedDevice):
-                self._simulate(device)
+                for given in samples_by_now(device, self._records.time, BURST_MAX):
+                    self._take(given)
             elif (sample := device.read()) is not None:
                 self._take(sample)
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything
             self._fail("read", error)
             return False
         return True
-
-    def _simulate(self, device: SimulatedDevice) -> None:
-        """Take what a device that follows simulated time gives by now; before that runs, what it gives at 0."""
-        time = self._records.time
-        now_s = monotonic()
-        t_s = time.at(now_s) if time.is_known else 0.0
-        for _ in range(BURST_MAX):
-            sample = device.sample_at(max(t_s, 0.0))
-            if sample is not None:
-                self._take(
-                    dataclasses.replace(sample, taken_s=now_s - (max(t_s, 0.0) - sample.taken_s))
-                )
-            next_s = device.next_s()
-            if next_s is None or next_s > t_s:
-                return
 
     def _take(self, sample: Any) -> None:
         self._intake.take(sample, monotonic(), ahead_s=self._period_s)
@@ -362,6 +355,7 @@ class DeviceRunner:
             self._refuse(str(error))
             return str(error)
         self._records.event("fault", monotonic(), action=action, value=value)
+        self._held_timer.reschedule(self._intake.faults.next_due_s())
         if self._intake.faults.is_disconnected:
             self._close_device()
         elif self._device is None:
@@ -377,12 +371,15 @@ class DeviceRunner:
             self._fail("read", MachineError(f"no sample within {self._hang_s:g} s"))
         if self._device is not None:
             try:
-                details = self._device.health()
+                details = details_of(self._device.health())
             except BaseException as error:  # noqa: BLE001 - a driver may raise anything
                 self._fail("health", error)
         counts = int(self._header[page.SAMPLES]), int(self._header[page.ERRORS])
-        with contextlib.suppress(PluginError):  # details that JSON cannot carry
+        try:
             self._records.state(now_s, counts, self._late_us_max, details)
+        except PluginError as error:  # details that JSON cannot carry
+            self._refuse(f"health: {error}")
+            self._records.state(now_s, counts, self._late_us_max, {})
         self._late_us_max = 0
         self._check_memory()
         estimate = self._intake.clock.estimate()

@@ -95,6 +95,7 @@ def sample(order: SamplingOrder) -> dict[str, Any]:
     events: list[Mapping[str, Any]] = []
     manager.watch(reactor, events.append)
     reactor.on_signal(signal.SIGCHLD, manager.reap)
+    manager.reap()  # who has ended before that was listened to
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         reactor.on_signal(number, reactor.stop)
     hardware = manager.hardware_of(USER)

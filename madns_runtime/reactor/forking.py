@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 
 
 def leave_parent(keep: set[int]) -> None:
-    """Make a forked child independent of its parent's descriptors, but those of *keep*, and of its signals."""
+    """
+    Make a forked child independent of its parent's descriptors, but those of *keep*, and of its signals.
+
+    What the parent had is not collected here: a socket of its garbage would close a number that is this process's by then.
+    """
+    gc.freeze()
     signal.set_wakeup_fd(-1)
     for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_DFL)

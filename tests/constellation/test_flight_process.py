@@ -47,6 +47,7 @@ ANSWER = "print(json.dumps({}), flush=True)"
 def patience(monkeypatch):
     """Other tests' programs ended in this process, too."""
     monkeypatch.setattr(flight_program.FlightProgram, "patience_s", flight_program.PATIENCE_S)
+    monkeypatch.setattr(process.ExternalFlight, "last_answers_s", process.LAST_ANSWERS_S)
 
 
 def program(folder, body, text=ECHO):
@@ -228,8 +229,12 @@ print(json.dumps({"send": [{"to": "*", "payload": [1, "x"]}],
         ("'{\"estimate\": 3}'", "a mapping of 1 to 64"),
         ("'{}\\n{}'", "one line for each tick and none for the setup"),
         ("'{\"t_s\": 7.5}'", "the answer to the tick at 0 s, got 7.5"),
-        ('\'{"t_s": "x"}\'', "it wrote"),
-        ("'x' * 300_000", "lines of at most|a JSON object"),
+        ('\'{"t_s": "x"}\'', "t_s to be the number that the tick has, got 'x'; it wrote"),
+        ("'{\"t_s\": true}'", "t_s to be the number that the tick has, got True; it wrote"),
+        ('\'{"estimate": {"a_m": NaN}}\'', "JSON has no NaN and no infinity: write null"),
+        ('\'{"estimate": {"a_m": -inf}}\'', "JSON has no NaN and no infinity: write null"),
+        ('\'{"estimate": {"a_m": "5"}}\'', "expected numbers for a_m, as in the first call, got"),
+        ("'x' * 262_145", "lines of at most 262144 bytes"),
     ],
 )
 def test_what_is_no_answer_fails_the_agent_by_the_programs_name(tmp_path, answer, words):
@@ -323,8 +328,9 @@ def test_a_program_that_falls_behind_is_sent_no_more_than_it_can_hold(tmp_path):
     assert ship.summary["ticks_sent"] == UNANSWERED_MAX
     assert ship.summary["ticks_skipped"] == 30
     assert ship.summary["unanswered"] == UNANSWERED_MAX
-    # Patience has not run out for those that were sent.
-    assert ship.late == {"name": LATE_CHECK, "limit": 0, "got": 30, "passed": False}
+    # Patience has not run out for those that were sent, but nothing was ever answered.
+    got = 30 + UNANSWERED_MAX
+    assert ship.late == {"name": LATE_CHECK, "limit": 0, "got": got, "passed": False}
 
 
 def test_a_program_that_never_answers_breaks_a_check(tmp_path):
@@ -334,6 +340,27 @@ def test_a_program_that_never_answers_breaks_a_check(tmp_path):
 
     # The last one, too, has its time.
     assert ship.late == {"name": LATE_CHECK, "limit": 0, "got": 5, "passed": False}
+
+
+def test_a_program_that_never_answers_breaks_it_though_the_run_is_shorter_than_its_patience(
+    tmp_path,
+):
+    command = program(tmp_path, "pass")
+    with Ship(tmp_path, command, is_lockstep=False) as ship:
+        ship.run(5)
+
+    assert ship.summary["unanswered"] == 5
+    assert ship.late == {"name": LATE_CHECK, "limit": 0, "got": 5, "passed": False}
+
+
+def test_the_first_answer_is_waited_for_at_the_end(tmp_path):
+    """An agent that has rejoined just now, say: its program is still starting."""
+    command = program(tmp_path, "time.sleep(0.3)\nprint('{}', flush=True)", "import time" + ECHO)
+    with Ship(tmp_path, command, is_lockstep=False) as ship:
+        ship.run(1)
+
+    assert ship.summary["answers"] == 1
+    assert ship.late == {"name": LATE_CHECK, "limit": 0, "got": 0, "passed": True}
 
 
 def test_one_that_answers_in_time_breaks_none(tmp_path):

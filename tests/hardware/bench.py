@@ -135,6 +135,7 @@ class DeviceBench:
         self.reactor = Reactor()
         self.manager.watch(self.reactor, self.events.append)
         self.reactor.on_signal(signal.SIGCHLD, self.manager.reap)
+        self.manager.reap()
         self.hardware: Hardware = self.manager.hardware_of(AGENT)
 
     def until(self, is_so: Callable[[], bool], timeout_s: float = 20.0) -> float:

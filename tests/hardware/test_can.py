@@ -108,6 +108,10 @@ def test_frames_on_the_wire_are_the_kernels(kernel):
         assert other.recv(100)[:4] == struct.pack("=I", LONG)
         with pytest.raises(PluginError, match="4 bytes of identifier"):
             device.write({"sent": b"abc"}, 0.0)
+        with pytest.raises(
+            PluginError, match="one of 29 with bit 31 set beside them; got 0x00001abc"
+        ):
+            device.write({"sent": frame(0x1ABC, b"")}, 0.0)
 
 
 def test_an_interface_that_is_not_there(kernel):

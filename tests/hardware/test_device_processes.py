@@ -9,9 +9,10 @@ import time
 import orjson
 import pytest
 
+from madns_runtime.config import DeviceLaunch
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware.guardian import ATTEMPTS_MAX
-from tests.hardware.bench import line_bench
+from tests.hardware.bench import AGENT, DeviceBench, line_bench
 
 pytestmark = pytest.mark.process
 
@@ -360,3 +361,41 @@ def test_a_disconnected_device_stays_so_for_longer_than_a_hang_and_through_a_new
         result = bench.close()["pi22/line"]
 
     assert result["restarts"] == 1  # by the test's own kill
+
+
+def test_a_recording_that_is_opened_anew_goes_on_and_does_not_begin_anew(tmp_path):
+    recorded = tmp_path / "recorded"
+    recorded.mkdir()
+    fields = ",".join(
+        f'{{"name":"{name}","unit":"","kind":"float"}}' for name in ("t_s", "number", "age_us", "v")
+    )
+    (recorded / "v.jsonl").write_text(
+        f'{{"schema":1,"stream":"v","shape":"array","fields":[{fields}]}}\n'
+        + "".join(f"[{number / 50},{number + 1},0,{number}]\n" for number in range(50 * 60))
+    )
+    launch = DeviceLaunch(
+        name="tape",
+        place="pi22",
+        kind="playback",
+        base_directory=str(tmp_path),
+        rate_hz=50.0,
+        parameters={"directory": "recorded"},
+        users=(AGENT,),
+    )
+    bench = DeviceBench(tmp_path, (launch,))
+    try:
+        bench.start_time()
+        tape = bench.hardware["tape"]
+        bench.until(lambda: tape["v"].number >= 20)
+        bench.manager.insert_fault("pi22/tape", "disconnect", None)
+        bench.until(lambda: tape.status == "lost")
+        bench.run(0.3)
+        bench.manager.insert_fault("pi22/tape", "clear", None)
+        before = tape["v"].number
+        bench.until(lambda: tape["v"].number >= before + 20)
+    finally:
+        result = bench.close()["pi22/tape"]
+
+    values = [record[3] for record in records(tmp_path, "v", "pi22/tape")]
+    assert values == sorted(set(values))
+    assert result["report"]["passed_while_closed"] >= before

@@ -71,6 +71,31 @@ def test_too_long_a_line_is_garbage():
     assert framer.garbage_bytes == 13
 
 
+@pytest.mark.parametrize("framing", ["lines", "nmea", "cobs"])
+@pytest.mark.parametrize("cut", [1, 10, 1000])
+def test_of_too_long_a_frame_no_part_is_a_frame_however_it_is_cut(framing, cut):
+    framer = FRAMERS[framing](16)
+    # Its tail by itself would be a good frame.
+    stream = b"x" * 40 + FRAMERS[framing](16).wrap(b"tail")
+    found = []
+    for start in range(0, len(stream), cut):
+        found += framer.feed(stream[start : start + cut])
+
+    assert found == []
+    assert framer.garbage_bytes == len(stream)
+    assert framer.feed(framer.wrap(b"good")) == [b"good"]
+
+
+@pytest.mark.parametrize("framing", ["lines", "nmea"])
+def test_a_frame_a_byte_too_long_is_garbage_also_where_its_line_has_no_carriage_return(framing):
+    framer = FRAMERS[framing](8)
+    line = FRAMERS[framing](16).wrap(b"ABCDEFGHI").replace(b"\r", b"")
+
+    assert framer.feed(line) == []
+    assert framer.garbage_bytes == len(line)
+    assert framer.feed(framer.wrap(b"ABCDEFGH")) == [b"ABCDEFGH"]
+
+
 def test_sentence_of_a_receiver_is_checked():
     framer = NmeaFramer()
     good = b"$GPGGA,092750.000,5321.6802,N,00630.3372,W,1,8,1.03,61.7,M,55.2,M,,*76\r\n"

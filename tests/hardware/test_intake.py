@@ -76,3 +76,18 @@ def test_a_sample_that_is_refused_is_not_counted_as_one():
         intake.take(Sample(values={"depth": 1.0}, taken_s=1.0), 1.0)
 
     assert intake.summary()["samples"] == 0
+
+
+@pytest.mark.parametrize(("fault", "value"), [("clear", None), ("delay", 0.1)])
+def test_samples_whose_delay_is_lifted_come_before_the_next_one(fault, value):
+    intake, device_page, kept = make_intake()
+    intake.faults.insert("delay", 0.5)
+    for number in range(4):
+        intake.take(Sample(values={"level": float(number)}, taken_s=0.1 * number), 0.1 * number)
+    intake.faults.insert(fault, value)
+    for number in (4, 5):
+        intake.take(Sample(values={"level": float(number)}, taken_s=0.1 * number), 0.1 * number)
+    intake.tell_held(1.0)
+
+    assert [values for _, _, values in kept.samples] == [(float(number),) for number in range(6)]
+    assert device_page.read("level").values == (5.0,)

@@ -1,5 +1,7 @@
 """Devices in lockstep: judged by the agents' accounts, and the same records each time."""
 
+import json
+
 import pytest
 from harness.cosmos_command import LOOSE, CosmosCommand
 
@@ -34,3 +36,115 @@ def test_two_lockstep_runs_with_devices_record_the_same(tmp_path):
     assert first["devices"]["agent-01/gps"]["samples"] == 60
     assert "hardware.lost" in {check["name"] for check in first["checks"]}
     assert list(cosmos.directory(first).glob("devices/agent-01/gps/value.jsonl"))
+
+
+VALVE = """
+from madns_runtime.hardware.contract import Channel, DeviceKind, Sample, SimulatedDevice
+
+
+class Valve(SimulatedDevice):
+    kind = DeviceKind(
+        name="valve",
+        summary="a valve that is moved, and leaks",
+        channels=(
+            Channel(name="position"),
+            Channel(name="duty", direction="out", limits=(0.0, 1.0), safe=0.0),
+        ),
+        needs_hardware=False,
+        follows_simulated_time=True,
+    )
+
+    def sample_at(self, t_s):
+        self.count("lost_bytes", 2)
+        return Sample(values={"position": t_s}, taken_s=t_s)
+
+    def write(self, values, due_s):
+        pass
+"""
+MOVER = """
+from dataclasses import dataclass
+
+from madns_runtime.plugin.api import AgentSimulation, HostSimulation, Simulation
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameters:
+    pass
+
+
+class Host(HostSimulation):
+    pass
+
+
+class Agent(AgentSimulation):
+    def setup(self, context, initial):
+        self.context, self.changes = context, []
+
+    def step(self, tick):
+        valve = self.context.hardware["valve"]
+        valve.write("duty", tick.t_s / 10)
+        if not tick.t_s:
+            valve.write("duty", 0.9, due_s=1000.0)
+
+    def device_changed(self, device, status):
+        self.changes.append((self.context.now_s(), status))
+
+    def finish(self):
+        return {"changes": self.changes}
+
+
+simulation = Simulation(name="mover", parameters=Parameters, host=":Host", agent=":Agent")
+"""
+MOVED = """
+name: moved
+simulation: ./mover.py:simulation
+agents: {count: 1, tick_hz: 10}
+time: {duration_s: 6, mode: lockstep}
+hardware:
+  armed: true
+  devices: [{name: valve, kind: ./valve.py:Valve, rate_hz: 10}]
+timeline:
+  - {at_s: 3, action: device_fault, agents: ["*"], device: valve, fault: disconnect, for_s: 1.5}
+"""
+
+
+def rows(path):
+    lines = map(json.loads, path.read_text().splitlines()[1:])
+    return [row for row in lines if isinstance(row, list) or "event" in row]
+
+
+def test_a_device_that_is_disconnected_in_lockstep_takes_nothing_and_is_lost_at_once(tmp_path):
+    for name, text in (("valve.py", VALVE), ("mover.py", MOVER), ("moved.yaml", MOVED)):
+        (tmp_path / name).write_text(text)
+    cosmos = CosmosCommand(tmp_path)
+
+    code, run = cosmos.run(tmp_path / "moved.yaml", *LOOSE)
+
+    assert code == 4
+    told = run["devices"]["agent-01/valve"]
+    assert (told["samples"], told["lost"]) == (45, 1)
+    counts = told["counts"]
+    assert counts["lost_bytes"] == 120, "what a driver counts by itself"
+    assert "hardware.lost_bytes" in run["verdict"]
+    assert (counts["passed_while_closed"], counts["writes_lost"]) == (15, 15)
+    # Of those still to come the newest of an output alone waits: that of the last tick, which no other followed.
+    assert (counts["writes_replaced"], counts["writes_left"]) == (1, 1)
+    folder = cosmos.directory(run)
+    put_out_s = [row[0] for row in rows(next(folder.glob("devices/*/valve/duty.jsonl")))]
+    assert not [t_s for t_s in put_out_s if 2.9 < t_s < 4.4]
+    events = rows(next(folder.glob("devices/*/valve/events.jsonl")))
+    assert [(e["event"], e["t_s"]) for e in events[1:-1]] == [
+        ("fault", 3.0),
+        ("made_safe", 3.0),
+        ("closed", 3.0),
+        ("fault", 4.5),
+        ("opened", 4.5),
+        ("made_safe", 5.9),
+    ]
+    result = json.loads((folder / "result.json").read_text())
+    changes = result["agents"]["agent-01"]["simulation"]["changes"]
+    assert [[round(t_s, 6), status] for t_s, status in changes] == [
+        [0.0, "ok"],
+        [3.0, "lost"],
+        [4.5, "ok"],
+    ]

@@ -244,3 +244,11 @@ def test_a_missing_library_is_told_with_its_cure(monkeypatch):
     program = prepare("i2c", {"address": 0x19, "map": shape}, None)
     with pytest.raises(MachineError, match=r"smbus2 is not installed here; pip install 'smbus2>=0"):
         program.make()
+
+
+def test_a_number_beyond_what_a_float_of_32_bits_holds_is_held_to_it():
+    register = {"name": "level", "address": 0x10, "type": "f32_le", "direction": "out"}
+    with opened("i2c", address=0x19, map={"registers": [register]}) as device:
+        device.write({"level": -1e300}, 0.0)
+
+    assert bytes(CHIP[0x10:0x14]) == b"\xff\xff\x7f\xff"

@@ -12,7 +12,13 @@ from typing import Final, Protocol
 
 from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.hardware.contract import Device, Sample, Value
-from madns_runtime.hardware.kinds.can import DATA_BYTES_MAX, HEAD_BYTES, CanParameters, frame_of
+from madns_runtime.hardware.kinds.can import (
+    DATA_BYTES_MAX,
+    EXTENDED,
+    HEAD_BYTES,
+    CanParameters,
+    frame_of,
+)
 
 FRAME: Final = struct.Struct("=IB3x8s")
 """As the kernel's struct can_frame: identifier with flags, length, data."""
@@ -96,7 +102,13 @@ class CanDevice(Device):
             raise PluginError(
                 f"sent: expected 4 bytes of identifier and 0 to 8 of data, got {frame.hex()}"
             )
-        self._send(int.from_bytes(frame[:HEAD_BYTES], "little"), frame[HEAD_BYTES:])
+        identifier = int.from_bytes(frame[:HEAD_BYTES], "little")
+        number = identifier & ~EXTENDED
+        if number >> (29 if identifier & EXTENDED else 11):
+            raise PluginError(
+                f"sent: expected an identifier of 11 bits, or one of 29 with bit 31 set beside them; got 0x{identifier:08x}"
+            )
+        self._send(identifier, frame[HEAD_BYTES:])
 
     def health(self) -> Mapping[str, float | int | str | bool | None]:
         """Return what was not handed on."""

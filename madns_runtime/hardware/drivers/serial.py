@@ -14,7 +14,7 @@ from serial.rs485 import RS485Settings
 
 from madns_runtime.errors import MachineError
 from madns_runtime.hardware.contract import Device, Sample, Value
-from madns_runtime.hardware.framing import FRAMERS, Framer, LengthFramer
+from madns_runtime.hardware.framing import Framer, make_framer
 
 READ_BYTES = 65_536
 
@@ -140,9 +140,7 @@ class SerialDevice(Device):
 
     def _make_framer(self) -> Framer:
         p = self.parameters
-        if p.framing == "length_prefixed":
-            return LengthFramer(p.frame_bytes_max, p.length_bytes, p.length_order)
-        return FRAMERS[p.framing](p.frame_bytes_max)
+        return make_framer(p.framing, p.frame_bytes_max, p.length_bytes, p.length_order)
 
     def _send(self, data: bytes) -> None:
         try:

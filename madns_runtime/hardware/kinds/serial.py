@@ -9,7 +9,7 @@ from annotated_types import Ge, Le, MinLen
 
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware.contract import Channel, DeviceKind, Needs
-from madns_runtime.hardware.framing import Framing
+from madns_runtime.hardware.framing import Framing, make_framer
 from madns_runtime.hardware.values import from_hex
 
 
@@ -42,16 +42,27 @@ def channels_of(parameters: SerialParameters) -> tuple[Channel, ...]:
     Return what comes and what goes.
 
     Raises:
-        PluginError: The safe frame is no hexadecimal text, or too long.
+        PluginError: The safe frame is no hexadecimal text, too long, or none that the framing could carry.
     """
-    safe_frame = from_hex("safe_frame_hex", parameters.safe_frame_hex)
-    if len(safe_frame) > parameters.frame_bytes_max:
+    p = parameters
+    frame_bytes_max = p.frame_bytes_max
+    if p.framing == "length_prefixed":
+        frame_bytes_max = min(frame_bytes_max, (1 << 8 * p.length_bytes) - 1)
+    safe_frame = from_hex("safe_frame_hex", p.safe_frame_hex)
+    if len(safe_frame) > frame_bytes_max:
         raise PluginError(
-            f"safe_frame_hex: expected at most {parameters.frame_bytes_max} bytes, got {len(safe_frame)}"
+            f"safe_frame_hex: expected at most {frame_bytes_max} bytes, got {len(safe_frame)}"
         )
+    if safe_frame:
+        try:
+            make_framer(p.framing, p.frame_bytes_max, p.length_bytes, p.length_order).wrap(
+                safe_frame
+            )
+        except PluginError as error:
+            raise PluginError(f"safe_frame_hex: {error}") from None
     shared: dict[str, Any] = {
         "is_frame": True,
-        "frame_bytes_max": parameters.frame_bytes_max,
+        "frame_bytes_max": frame_bytes_max,
         "passing": "queue",
     }
     return (

@@ -10,7 +10,7 @@ from annotated_types import Ge, Le
 from madns_runtime.hardware.contract import Channel, DeviceKind, Needs
 from madns_runtime.hardware.registers import (
     RegisterMap,
-    register_channels,
+    map_channels,
 )
 
 
@@ -32,7 +32,7 @@ class SpiParameters:
 
 def channels_of(parameters: SpiParameters) -> tuple[Channel, ...]:
     """Return a channel per register."""
-    return register_channels(parameters.map.registers)
+    return map_channels(parameters.map)
 
 
 def needs_of(parameters: SpiParameters) -> Needs:

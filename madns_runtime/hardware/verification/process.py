@@ -77,6 +77,7 @@ class _DrivenDevice:
         manager.start()
         manager.watch(reactor, lambda event: None)
         reactor.on_signal(signal.SIGCHLD, manager.reap)
+        manager.reap()  # who has ended before that was listened to
         if self._until(lambda: header[page.STATE] == page.OPEN, 20.0) is None:
             manager.close()
             return [

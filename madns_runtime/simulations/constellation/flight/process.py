@@ -196,6 +196,8 @@ class ExternalFlight:
         if not self._is_lockstep:
             self._await_last()
         overdue = sum(self._is_late(sent_s, self._listened_s) for sent_s, _ in self._asked)
+        if not self._counts["answers"]:  # nobody knows whether it works at all
+            overdue = len(self._asked)
         code = self._link.end()
         self._keep_talk()
         if code:
@@ -222,8 +224,8 @@ class ExternalFlight:
         """Count the answers to the last ticks; there is no tick any more in which they could be carried out."""
         began_s = monotonic()
         oldest_s = self._asked[0][0] if self._asked else math.inf
-        # Whoever has never answered, or is overdue, is not waited for.
-        is_owed = self._counts["answers"] > 0 and not self._is_late(oldest_s, self._present_s())
+        # Whoever is overdue is not waited for.
+        is_owed = not self._is_late(oldest_s, self._present_s())
         wait_s = min(self._settings.answer_s, ExternalFlight.last_answers_s) if is_owed else 0.0
         with contextlib.suppress(BlamedError):  # whoever is gone answers no more
             self._account_for_last()

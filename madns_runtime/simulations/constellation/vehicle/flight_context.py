@@ -157,7 +157,8 @@ class VehicleContext:
             names = self._open_estimates(values)
         try:
             believed = [values[name] for name in names]
-            row = [None if value is None else float(value) for value in believed]
+            is_text = any(isinstance(value, str | bytes) for value in believed)
+            row = [] if is_text else [None if one is None else float(one) for one in believed]
         except (KeyError, TypeError, ValueError, OverflowError):
             row = []
         if len(row) != len(names) or len(values) != len(names):

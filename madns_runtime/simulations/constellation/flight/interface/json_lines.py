@@ -12,6 +12,7 @@ writes; docs/flight-messages.schema.json is this schema, written by `python docs
 from __future__ import annotations
 
 import dataclasses
+import re
 import typing
 from collections.abc import Iterable, Mapping, Set
 from typing import Any, Final, Literal
@@ -97,6 +98,11 @@ SETUP: Final[Mapping[str, Schema]] = {
 """Content of the first line to a program."""
 
 
+OVERLONG: Final = FlightAnswer(fault=f"expected lines of at most {LINE_BYTES_MAX} bytes")
+NO_NUMBERS: Final = re.compile(rb"[-:\[,\s](?:nan|inf(?:inity)?)\b", re.IGNORECASE)
+"""As C, C++ and Python write what is no finite number, which JSON cannot."""
+
+
 class JsonLines:
     """Both directions of a conversation in lines."""
 
@@ -135,10 +141,9 @@ class JsonLines:
     def feed(self, data: bytes) -> list[FlightAnswer]:
         """Take what came, and return the answers that are whole now; what has no end is one, too, with its fault."""
         *lines, self._rest = (self._rest + data).split(b"\n")
-        answers = [read_answer(line) for line in lines]
+        answers = [OVERLONG if len(line) > LINE_BYTES_MAX else read_answer(line) for line in lines]
         if len(self._rest) > LINE_BYTES_MAX:
-            fault = f"expected lines of at most {LINE_BYTES_MAX} bytes"
-            answers.append(FlightAnswer(fault=fault))
+            answers.append(OVERLONG)
             self._rest = b""
         return answers
 
@@ -148,7 +153,8 @@ def read_answer(line: bytes) -> FlightAnswer:
     try:
         answer = orjson.loads(line)
     except orjson.JSONDecodeError:
-        return FlightAnswer(fault=f"expected a JSON object, got {shown(line)}")
+        cure = " (JSON has no NaN and no infinity: write null)" if NO_NUMBERS.search(line) else ""
+        return FlightAnswer(fault=f"expected a JSON object, got {shown(line)}{cure}")
     try:
         _check(answer)
         commands = tuple(_command(command) for command in answer.get("commands", ()))
@@ -176,6 +182,9 @@ def _check(answer: Any) -> None:
         raise PluginError(
             f"expected the keys {', '.join(sorted(KEYS))}, got {', '.join(sorted(unknown))}"
         )
+    t_s = answer.get("t_s")
+    if t_s is not None and (isinstance(t_s, bool) or not isinstance(t_s, int | float)):
+        raise PluginError(f"expected t_s to be the number that the tick has, got {t_s!r:.80}")
     for key in ("commands", "send", "log"):
         items = answer.get(key, [])
         if not isinstance(items, list) or not all(isinstance(item, Mapping) for item in items):

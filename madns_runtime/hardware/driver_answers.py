@@ -1,0 +1,58 @@
+"""What a driver's methods return beside samples, looked at before it is used."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Mapping
+from typing import Any
+
+from madns_runtime.errors import PluginError
+from madns_runtime.plugin.context import clean_text
+
+
+def identity_of(told: Any) -> str:
+    """
+    Return the identity that `open` gave; of nothing an empty one.
+
+    Raises:
+        PluginError: It is no text.
+    """
+    if told is None:
+        return ""
+    if not isinstance(told, str):
+        raise PluginError(f"expected a text as the device's identity, got {told!r:.80}")
+    return clean_text(told)
+
+
+def descriptor_of(told: Any) -> int | None:
+    """
+    Return the descriptor that `fileno` gave.
+
+    Raises:
+        PluginError: It is none, or that of a regular file, which is readable at any time.
+    """
+    if told is None:
+        return None
+    if not isinstance(told, int) or told < 0:
+        raise PluginError(f"expected an open descriptor (a number), or None; got {told!r:.80}")
+    if stat.S_ISREG(os.fstat(told).st_mode):
+        raise PluginError(
+            "expected a descriptor that is readable when there is something new, got a regular file's, which always is:"
+            " return None, to be read at the device's rate"
+        )
+    return told
+
+
+def details_of(told: Any) -> Mapping[str, Any]:
+    """
+    Return what `health` gave; of nothing an empty mapping.
+
+    Raises:
+        PluginError: It is no mapping.
+    """
+    if told is None:
+        return {}
+    if not isinstance(told, Mapping):
+        raise PluginError(f"expected a mapping of what is known of its state, got {told!r:.80}")
+    return told

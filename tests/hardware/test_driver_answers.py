@@ -1,0 +1,124 @@
+"""Drivers that return what they should not, or say that there is something to read when there is nothing."""
+
+from __future__ import annotations
+
+import pytest
+
+from madns_runtime.config import DeviceLaunch
+from tests.hardware.bench import AGENT, DeviceBench
+from tests.hardware.test_device_processes import records
+
+pytestmark = pytest.mark.process
+
+DRIVER = """
+import os
+import time
+
+from madns_runtime.hardware.contract import Channel, Device, DeviceKind, Sample
+
+
+class Probe(Device):
+    kind = DeviceKind(name="probe", summary="s", channels=(Channel(name="level"),))
+
+    def open(self):
+        self.pipe = os.pipe()
+        os.close(self.pipe[1])
+        self.file = open(__file__)
+        return IDENTITY
+
+    def read(self):
+        READ
+
+    def health(self):
+        return HEALTH
+
+    def fileno(self):
+        return FILENO
+"""
+
+
+def probe(folder, *, identity='"p-1"', read=None, health="{}", fileno="None") -> DeviceBench:
+    read = read or "return Sample(values={'level': 1.0}, taken_s=time.monotonic())"
+    told = {"IDENTITY": identity, "READ": read, "HEALTH": health, "FILENO": fileno}
+    text = DRIVER
+    for name, value in told.items():
+        text = text.replace(name, value)
+    (folder / "probe.py").write_text(text)
+    launch = DeviceLaunch(
+        name="probe",
+        place="pi22",
+        kind="./probe.py:Probe",
+        base_directory=str(folder),
+        rate_hz=50.0,
+        users=(AGENT,),
+    )
+    bench = DeviceBench(folder, (launch,))
+    bench.start_time()
+    return bench
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"identity": "5"}, "Probe.open raised PluginError: expected a text as the device's identity"),
+        ({"fileno": "-1"}, "expected an open descriptor (a number), or None; got -1"),
+        ({"fileno": "self.file"}, "expected an open descriptor (a number), or None; got <_io"),
+        ({"fileno": "self.file.fileno()"}, "got a regular file's, which always is: return None"),
+        ({"health": "[1]"}, "expected a mapping of what is known of its state, got [1]"),
+        ({"read": "return Sample(values={'level': float('nan')}, taken_s=time.monotonic())"},
+         "no sample of finite numbers (level_not_finite "),
+    ],
+)  # fmt: skip
+def test_a_wrong_answer_is_told_and_ends_no_process(tmp_path, wrong, told):
+    bench = probe(tmp_path, **wrong)
+    try:
+        bench.until(lambda: "lost" in bench.statuses("probe"))
+    finally:
+        result = bench.close()["pi22/probe"]
+
+    assert told in result["why"]
+    assert result["restarts"] == 0
+
+
+def test_nothing_is_an_identity_and_a_health_and_what_json_does_not_carry_is_refused(tmp_path):
+    bench = probe(tmp_path, identity="None", health="[None, {'v': object()}][int(time.time()) % 2]")
+    try:
+        bench.until(lambda: bench.hardware["probe"]["level"].number > 150)
+    finally:
+        result = bench.close()["pi22/probe"]
+
+    assert (result["errors"], result["restarts"]) == (0, 0)
+    assert result["report"]["refused"] >= 1
+    assert len(records(tmp_path, "device_state", "pi22/probe")) >= 2
+    events = records(tmp_path, "events", "pi22/probe")
+    assert events[0]["identity"] == ""
+    [*_, why] = [event["why"] for event in events if event["event"] == "refused"]
+    assert "health: " in why
+    assert "object has no JSON form" in why
+
+
+def test_a_descriptor_that_is_readable_for_nothing_is_told_once_and_takes_no_processor(tmp_path):
+    """A pipe whose other end is closed: readable for ever, and nothing to read."""
+    bench = probe(tmp_path, fileno="self.pipe[0]", read="self.reads = getattr(self, 'reads', 0) + 1",
+                  health="{'reads': getattr(self, 'reads', 0)}")  # fmt: skip
+    try:
+        bench.run(2.5)
+    finally:
+        bench.close()
+
+    told = [e for e in records(tmp_path, "events", "pi22/probe") if e["event"] == "empty_reads"]
+    assert len(told) == 1
+    assert "if the other end is gone, read() should raise" in told[0]["why"]
+    last = records(tmp_path, "device_state", "pi22/probe")[-1]
+    # The first thousand at once, then one each 2 ms: without a pause there are hundreds of thousands.
+    assert 1000 < last[-1]["reads"] < 1000 + 500 * last[0] + 50
+
+
+def test_a_driver_that_ends_its_process_at_once_is_told_by_its_exit_code(tmp_path):
+    bench = probe(tmp_path, read="os._exit(3)")
+    try:
+        bench.until(lambda: "lost" in bench.statuses("probe"))
+    finally:
+        result = bench.close()["pi22/probe"]
+
+    assert result["why"] == "exit code 3"
