@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import traceback
 import zlib
@@ -20,8 +21,10 @@ from madns_runtime.errors import (
 )
 from madns_runtime.medium.carrier import Carrier
 from madns_runtime.medium.mailbox import Mailbox
+from madns_runtime.medium.outcomes import LinkOutcome
 from madns_runtime.plugin.device_view import DeviceView
-from madns_runtime.protocol.messages import Service
+from madns_runtime.protocol.codec import pack, unpack
+from madns_runtime.protocol.messages import Service, Transmission
 from madns_runtime.recording.records import FRAMEWORK_STREAMS, Field, StreamSchema
 from madns_runtime.recording.run_journal import RunJournal
 
@@ -131,8 +134,22 @@ class JobContext(RunContext):
         self.agent_parameters = agent_parameters
         self.submit = submit
         self.wake = wake
-        self.enter = half.carrier.enter
         self.account = half.carrier.account
+
+    def enter(
+        self, sender: str, transmission: Transmission, outcomes: Sequence[LinkOutcome]
+    ) -> None:
+        """See to a message of a place that is no agent; see `plugin.api.HostContext.enter`."""
+        if not isinstance(sender, str) or not isinstance(transmission, Transmission):
+            raise PluginError(
+                f"enter({sender!r:.80}, a {type(transmission).__name__}, ...): expected a place's name and a"
+                " Transmission of madns_runtime.plugin.api"
+            )
+        # Whoever sent it may go on to change it; what a message cannot carry is told here.
+        payload = unpack(pack(transmission.payload))
+        self._half.carrier.enter(
+            sender, dataclasses.replace(transmission, payload=payload), outcomes
+        )
 
     @property
     def timer_lateness_s(self) -> float:

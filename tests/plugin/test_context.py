@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from madns_runtime.config import Agents
-from madns_runtime.plugin.context import describe_exception
+from madns_runtime.errors import MadnsError
+from madns_runtime.plugin.context import JobContext, describe_exception
 from madns_runtime.plugin.executor import JobFailed, run_job
+from madns_runtime.protocol.messages import Transmission
 
 PLUGIN = """\
 import json
@@ -97,3 +101,37 @@ def test_thousands_of_agents_share_one_list_of_all_names():
 
     assert first is second
     assert (first[0], first[-1]) == ("agent-0001", "agent-5000")
+
+
+def entered(transmission, sender="kiosk"):
+    """Enter a message of a place by the host's context; return what the carrier got."""
+    got = []
+    context = SimpleNamespace(
+        _half=SimpleNamespace(carrier=SimpleNamespace(enter=lambda *taken: got.append(taken)))
+    )
+    JobContext.enter(context, sender, transmission, ())
+    return got[0][1]
+
+
+def test_a_message_of_a_place_is_the_one_that_was_entered_whatever_becomes_of_its_payload():
+    payload = {"x_m": np.arange(3.0)}
+
+    kept = entered(Transmission("car-1", 1, 0.5, payload))
+    payload["x_m"] += 1.0
+
+    assert kept.payload["x_m"].tolist() == [0.0, 1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("transmission", "sender", "told"),
+    [
+        (Transmission("car-1", 1, 0.5, {1, 2}), "kiosk", "a message cannot carry a set"),
+        (Transmission("car-1", 1, 0.5, 1), 7, "expected a place's name and a Transmission"),
+        ({"to": "car-1"}, "kiosk", "expected a place's name and a Transmission"),
+    ],
+)
+def test_a_message_of_a_place_that_cannot_be_is_told_in_the_line_that_enters_it(
+    transmission, sender, told
+):
+    with pytest.raises(MadnsError, match=told):
+        entered(transmission, sender)
