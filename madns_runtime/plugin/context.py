@@ -22,6 +22,7 @@ from madns_runtime.errors import (
 from madns_runtime.medium.carrier import Carrier
 from madns_runtime.medium.mailbox import Mailbox
 from madns_runtime.medium.outcomes import LinkOutcome
+from madns_runtime.plugin.code_places import error_text
 from madns_runtime.plugin.device_view import DeviceView
 from madns_runtime.protocol.codec import pack, unpack
 from madns_runtime.protocol.messages import Service, Transmission
@@ -214,7 +215,8 @@ def describe_exception(error: BaseException, doing: str) -> str:
         own = [frame for frame in frames[1:] if _is_below(Path(frame.filename), home)]
         frame = own[-1] if own else frames[-1]
         place = f" ({Path(frame.filename).name}:{frame.lineno})"
-    text = f": {clean_text(str(error))}" if str(error) else ""
+    said = error_text(error)
+    text = f": {clean_text(said)}" if said else ""
     return f"{doing} raised {type(error).__name__}{text}{place}"
 
 

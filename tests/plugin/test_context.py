@@ -14,6 +14,7 @@ from madns_runtime.config import Agents
 from madns_runtime.errors import MadnsError
 from madns_runtime.plugin.context import JobContext, describe_exception
 from madns_runtime.plugin.executor import JobFailed, run_job
+from madns_runtime.plugin.isolation import said
 from madns_runtime.protocol.messages import Transmission
 
 PLUGIN = """\
@@ -65,6 +66,18 @@ def test_place_is_the_plugins_own_line_not_the_librarys(plugin):
 
 def test_exception_without_a_text_is_told_by_its_kind(plugin):
     assert told(plugin["check"], -1) == "Rover.step raised ValueError (rover.py:14)"
+
+
+def test_exception_that_cannot_say_what_it_is_is_told_all_the_same():
+    class OutOfReach(Exception):
+        def __str__(self) -> Any:
+            return 404
+
+    def step() -> None:
+        raise OutOfReach
+
+    assert told(step).startswith("Rover.step raised OutOfReach: (its __str__ raised TypeError) (")
+    assert said(OutOfReach()) == "OutOfReach: (its __str__ raised TypeError)"
 
 
 def test_library_in_an_environment_beside_the_plugin_is_not_the_plugin(tmp_path, plugin):
