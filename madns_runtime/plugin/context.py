@@ -7,6 +7,7 @@ import math
 import traceback
 import zlib
 from collections.abc import Callable, Container, Mapping, Sequence
+from numbers import Real
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -189,7 +190,8 @@ def check_sending(
         return
     if service is not Service.SYNC:
         raise PluginError(f"deadline_s goes with Service.SYNC, not with {service!r}")
-    if isinstance(deadline_s, bool) or not math.isfinite(deadline_s):
+    is_number = isinstance(deadline_s, Real) and not isinstance(deadline_s, bool)
+    if not is_number or not math.isfinite(deadline_s):
         raise PluginError(f"deadline_s: expected a simulated time in seconds, got {deadline_s!r}")
     if not is_running:
         raise PluginError("deadline_s is simulated time, which has not begun")

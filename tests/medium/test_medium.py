@@ -88,6 +88,23 @@ def test_what_cannot_be_sent_to_agents_is_told():
     assert sent == []
 
 
+@pytest.mark.parametrize(
+    ("to", "number", "told"),
+    [
+        (5, None, "receiver's name, got 5"),
+        (None, None, "name"),
+        ("kiosk", "7", "whole number, got"),
+    ],
+)
+def test_a_receiver_or_number_that_is_none_is_the_senders_fault(to, number, told):
+    box, sent = mailbox()
+    box.due(0.0)
+
+    with pytest.raises(PluginError, match=told):
+        box.transmit(to, PAYLOAD, number=number)
+    assert sent == []
+
+
 def test_a_message_is_held_until_the_first_tick_at_or_after_its_arrival():
     box, _ = mailbox()
     box.due(0.0)

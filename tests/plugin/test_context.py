@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from madns_runtime.config import Agents
-from madns_runtime.errors import MadnsError
-from madns_runtime.plugin.context import JobContext, describe_exception
+from madns_runtime.errors import MadnsError, PluginError
+from madns_runtime.plugin.context import JobContext, check_sending, describe_exception
 from madns_runtime.plugin.executor import JobFailed, run_job
 from madns_runtime.plugin.isolation import said
-from madns_runtime.protocol.messages import Transmission
+from madns_runtime.protocol.messages import Service, Transmission
+from madns_runtime.recording.run_journal import RunJournal
 
 PLUGIN = """\
 import json
@@ -148,3 +149,16 @@ def test_a_message_of_a_place_that_cannot_be_is_told_in_the_line_that_enters_it(
 ):
     with pytest.raises(MadnsError, match=told):
         entered(transmission, sender)
+
+
+@pytest.mark.parametrize("deadline_s", ["5", True, float("nan"), [5.0]])
+def test_a_deadline_that_is_no_time_is_told_as_such(deadline_s):
+    with pytest.raises(PluginError, match="deadline_s: expected a simulated time in seconds"):
+        check_sending("host", ("host",), Service.SYNC, deadline_s, is_running=True)
+
+
+def test_a_log_of_what_is_no_text_is_told_as_such():
+    journal = RunJournal(SimpleNamespace(open_stream=lambda schema: None), 1, t_s=lambda: 0.0)
+
+    with pytest.raises(PluginError, match=r"log: expected a text, got ValueError; str\(\) it"):
+        journal.log("error", ValueError("x"))
