@@ -7,10 +7,12 @@ that a simulation did not declare.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from cosmos_cli.evidence.completeness import mapping_at
+from cosmos_cli.evidence.plugin_checks import check_fault, listed_checks
 from cosmos_cli.evidence.streams import StreamScan
 from cosmos_cli.evidence.verdict import is_number
 from cosmos_cli.ui.name_ranges import compact
@@ -25,6 +27,34 @@ NOT_DECLARED = "not declared by the simulation's streams()"
 
 Declared = Mapping[tuple[str, str], DeclaredStream]
 """By role and name."""
+
+
+def result_remarks(
+    result: Mapping[str, Any], summaries: Mapping[str, Mapping[str, Any]]
+) -> tuple[str, ...]:
+    """
+    Return the remarks on what the host tells of itself, of its half and of the agents.
+
+    Args:
+        result: The host's.
+        summaries: Of the halves, by who made them.
+    """
+    return (
+        *affinity_remarks(mapping_at(result, "agents")),
+        *long_call_remarks(mapping_at(result, "host_calls")),
+        *malformed_check_remarks(summaries),
+    )
+
+
+def malformed_check_remarks(summaries: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
+    """Return a remark for each kind of malformed check in summaries, with who returned it; at most REMARKS_MAX."""
+    found: dict[str, list[str]] = {}
+    for who, summary in summaries.items():
+        for fault in map(check_fault, listed_checks(summary)):
+            if fault:
+                found.setdefault(fault, []).append(who)
+    remarks = (f"{compact(names)}: checks of finish(): {fault}" for fault, names in found.items())
+    return tuple(itertools.islice(remarks, REMARKS_MAX))
 
 
 def affinity_remarks(agents: Mapping[str, Any]) -> tuple[str, ...]:

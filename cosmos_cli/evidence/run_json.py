@@ -21,12 +21,8 @@ from cosmos_cli.evidence.devices import device_checks
 from cosmos_cli.evidence.expectations.judge import JudgedExpectations
 from cosmos_cli.evidence.flown_files import KEY as FLOWN
 from cosmos_cli.evidence.flown_files import flown_remarks
-from cosmos_cli.evidence.remarks import (
-    Declared,
-    affinity_remarks,
-    long_call_remarks,
-    undeclared_remarks,
-)
+from cosmos_cli.evidence.plugin_checks import plugin_checks
+from cosmos_cli.evidence.remarks import Declared, result_remarks, undeclared_remarks
 from cosmos_cli.evidence.run_directory import SCHEMA
 from cosmos_cli.evidence.run_documents import Problem, text_or_none
 from cosmos_cli.evidence.statistics import TickStatistics, TickTotals, tick_totals, worst_sources
@@ -44,7 +40,6 @@ from cosmos_cli.evidence.verdict import (
     Verdict,
     is_number,
     judge,
-    plugin_checks,
 )
 from cosmos_cli.models.inventory.machine import LOOPBACK
 from madns_runtime.config import HardwareSettings, RunConfig
@@ -186,9 +181,8 @@ class Evidence:
             expectations=self.expectations.results,
             remarks=(
                 *(causes.remarks(self._lateness_limit_s()) if causes else ()),
-                *affinity_remarks(mapping_at(result, "agents")),
+                *result_remarks(result, self._summaries()),
                 *datagram_remarks(datagram_account(result)),
-                *long_call_remarks(mapping_at(result, "host_calls")),
                 *undeclared_remarks(self.declared, self.scans),
                 *flown_remarks(self.started),
                 *self.expectations.remarks(),
@@ -232,6 +226,10 @@ class Evidence:
     def _plugin_checks(self) -> list[Any]:
         summaries = self._simulation()
         return plugin_checks({"host": summaries["host"]}) + plugin_checks(summaries["agents"])
+
+    def _summaries(self) -> Mapping[str, Mapping[str, Any]]:
+        summaries = self._simulation()
+        return {"host": summaries["host"], **summaries["agents"]}
 
     def _ticks_due(self) -> int | None:
         """Return the ticks of each agent by the plan; None if it is lost."""

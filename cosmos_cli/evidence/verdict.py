@@ -236,64 +236,9 @@ def at_most(name: str, limit: float, got: float | None) -> CheckResult:
     return CheckResult(name=name, limit=limit, got=got, passed=got is not None and got <= limit)
 
 
-def plugin_checks(summaries: Mapping[str, Mapping[str, Any]]) -> list[CheckResult]:
-    """
-    Return the plug-in's own checks over the host's or all agents' summaries, the worst of each name.
-
-    Worst is a check that did not pass, then the one with the largest excess over its limit; it bears the
-    name of whose it is, unless it holds and is the same for all. A value that is not finite was not
-    measured. What is no list, or in it no proper `Check` mapping, is a broken check named WHO.checks: a
-    verdict must not depend on a typing slip.
-
-    Args:
-        summaries: By who made them.
-    """
-    worst: dict[str, CheckResult] = {}
-    is_alike: dict[str, bool] = {}
-    for who, summary in summaries.items():
-        listed = summary.get("checks", ())
-        # What is no list is taken for one malformed check.
-        for item in listed if isinstance(listed, list | tuple) else (None,):
-            check = _parse_check(item, who)
-            known = worst.get(check.name)
-            if known is not None:
-                same = known.passed and check.passed and known.got == check.got
-                is_alike[check.name] = is_alike.get(check.name, True) and same
-            if known is None or _badness(check) > _badness(known):
-                worst[check.name] = check
-    return [
-        replace(check, worst=None) if is_alike.get(name) else check for name, check in worst.items()
-    ]
-
-
-def _parse_check(item: Any, who: str) -> CheckResult:
-    mapping = item if isinstance(item, Mapping) else {}
-    name, limit, got, passed = (mapping.get(key) for key in ("name", "limit", "got", "passed"))
-    told = mapping.get("worst")
-    if (
-        (isinstance(name, str) and name)
-        and is_number(limit)
-        and isinstance(passed, bool)
-        and (is_number(got) or got is None or isinstance(got, float))
-    ):
-        return CheckResult(
-            name=name,
-            limit=limit,
-            got=got if is_number(got) else None,
-            passed=is_number(got) and passed,
-            worst=told if isinstance(told, str) and told else who,
-        )
-    return CheckResult(name=f"{who}.checks", limit=0, got=None, passed=False, worst=who)
-
-
 def is_number(value: object) -> TypeGuard[float]:
     """Tell whether a value from a file is a finite number; JSON knows no other, msgpack does."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _badness(check: CheckResult) -> tuple[bool, float]:
-    excess = float("inf") if check.got is None else abs(check.got - check.limit)
-    return (not check.passed, excess if not check.passed else -excess)
 
 
 def _blame(who: str | None, reason: str | None) -> str:

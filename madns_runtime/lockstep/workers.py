@@ -250,7 +250,12 @@ def _await_exit(pid: int) -> int | None:
     """Wait for a child's end and return its exit code; None if it lives on after EXIT_WAIT_S."""
     limit = GrantedLimit(EXIT_WAIT_S, lambda: (pid,))
     while True:
-        ended, status = os.waitpid(pid, os.WNOHANG)
+        try:
+            ended, status = os.waitpid(pid, os.WNOHANG)
+        except (
+            ChildProcessError
+        ):  # a plug-in has SIGCHLD ignored, and the kernel keeps no exit code
+            return 0
         if ended:
             return os.waitstatus_to_exitcode(status)
         if limit.is_over():

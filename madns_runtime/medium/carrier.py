@@ -6,10 +6,12 @@ The host's side of messages between agents: keeps what is on its way, and the ac
 
 from __future__ import annotations
 
+import dataclasses
 import heapq
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
+from numbers import Real
 from typing import Any, Final, Protocol
 
 from madns_runtime.errors import MessageTooLarge, PluginError
@@ -25,6 +27,10 @@ from madns_runtime.protocol.messages import Delivery, Transmission, Transmission
 
 LEAD_S: Final = 1.0
 """Lead of the hand-over before the arrival, s: far more than a network takes."""
+
+
+_MAKE: Final[dict[str, Callable[[Any], Any]]] = {"arrives_s": float, "size_bytes": int}
+"""Plain kinds of an outcome's values; others are texts."""
 
 
 class WayFaults(Protocol):
@@ -83,13 +89,14 @@ class Carrier:
             isinstance(outcome, LinkOutcome) for outcome in outcomes or (None,)
         ):
             raise PluginError(f"{outcomes!r:.200}: expected a list of one or more LinkOutcome")
+        outcomes = [_checked(outcome, transmission) for outcome in outcomes]
         if self.faults is not None:
             outcomes = self.faults.ways(sender, transmission, outcomes)
         now_s = self._now_s()
         self.account(outcomes[0].channel).transmissions += 1
         for outcome in outcomes:
             account = self.account(outcome.channel)
-            account.enter(_checked(outcome, transmission), now_s)
+            account.enter(outcome, now_s)
             if outcome.arrives_s is not None:
                 self._keep(sender, transmission, outcome, account)
             elif outcome.outcome != LOST and sender in self._agents:
@@ -166,13 +173,58 @@ class Carrier:
 
 
 def _checked(outcome: LinkOutcome, transmission: Transmission) -> LinkOutcome:
-    """Return an outcome that is possible: what is delivered arrives, and later than it was sent."""
+    """Return an outcome that is possible: of plain values, and what is delivered arrives, and later than it was sent."""
+    if not _is_plain(outcome):
+        outcome = _plain(outcome)
     arrives_s = outcome.arrives_s
     if (outcome.outcome == DELIVERED) != (arrives_s is not None) or not (
         arrives_s is None or transmission.sent_s < arrives_s < math.inf
     ):
         raise PluginError(
-            f"{outcome.outcome!r} with arrives_s {arrives_s!r}: expected a message that is {DELIVERED!r} to"
+            f"{outcome.outcome!r:.80} with arrives_s {arrives_s!r}: expected a message that is {DELIVERED!r} to"
             f" arrive later than it was sent, at {transmission.sent_s:g} s, and no other to arrive"
         )
     return outcome
+
+
+def _is_plain(outcome: LinkOutcome) -> bool:
+    """Tell whether an outcome holds what messages and accounts can: of most it is known by their types alone."""
+    return (
+        type(outcome.to) is type(outcome.outcome) is type(outcome.channel) is str
+        and outcome.outcome != ""
+        and (outcome.arrives_s is None or type(outcome.arrives_s) is float)
+        and type(outcome.size_bytes) is int
+    )
+
+
+def _plain(outcome: LinkOutcome) -> LinkOutcome:
+    """
+    Return an outcome with numbers and texts of other kinds, such as NumPy's, as plain ones.
+
+    Raises:
+        PluginError: A value is neither.
+    """
+    changed: dict[str, Any] = {}
+    for name, kind, wanted in (
+        ("to", str, "a receiver's name"),
+        ("outcome", str, f"{DELIVERED!r}, {LOST!r}, or a word that says why not"),
+        ("arrives_s", Real, "a simulated time in seconds, or None"),
+        ("size_bytes", Real, "a number of bytes"),
+        ("channel", str, "a text"),
+    ):
+        value = getattr(outcome, name)
+        if name == "arrives_s" and value is None:
+            continue
+        if (
+            not isinstance(value, kind)
+            or isinstance(value, bool)
+            or (name, value) == ("outcome", "")
+        ):
+            raise PluginError(f"a LinkOutcome with {name} {value!r:.80}: expected {wanted}")
+        try:
+            changed[name] = _MAKE.get(name, str)(value)
+        except (ValueError, OverflowError):  # of NaN, or a whole number without end
+            raise PluginError(
+                f"a LinkOutcome with {name} {value!r:.80}: expected {wanted}"
+            ) from None
+    return dataclasses.replace(outcome, **changed)

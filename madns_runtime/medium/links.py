@@ -13,8 +13,10 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Final
+from numbers import Integral, Real
+from typing import TYPE_CHECKING, Any, Final
 
+from madns_runtime.errors import PluginError
 from madns_runtime.medium.outcomes import DELIVERED, EVERYBODY, LOST, LinkOutcome
 from madns_runtime.protocol.codec import pack
 from madns_runtime.protocol.messages import Transmission
@@ -111,6 +113,9 @@ class LinkMedium:
         rate_byte_s: What a transmitter sends, B/s.
         loss: Share of messages that are lost on their way.
         queue_max: Messages that may wait at one transmitter; further ones are refused.
+
+    Raises:
+        PluginError: A value is none of these.
     """
 
     def __init__(  # noqa: PLR0913 - the answers that make a medium, each by name
@@ -124,6 +129,7 @@ class LinkMedium:
         loss: float = 0.0,
         queue_max: int = 256,
     ) -> None:
+        _check_answers(delay_s, rate_byte_s, loss, queue_max)
         self._agents = tuple(agents)
         self._index = {name: number for number, name in enumerate(agents)}
         self._chance = Chance(random)
@@ -152,6 +158,11 @@ class LinkMedium:
             if receiver == sender:
                 continue
             barrier = self._reach(sender, receiver, leaves_s) if self._reach else None
+            if barrier is not None and (not isinstance(barrier, str) or not barrier):
+                raise PluginError(
+                    f"reach({sender!r}, {receiver!r}, {leaves_s:g}) returned {barrier!r:.80}: expected None if the"
+                    " receiver can receive it, else why not, in a word such as 'out_of_range'"
+                )
             if barrier and to == EVERYBODY:
                 continue
             if barrier:
@@ -162,6 +173,45 @@ class LinkMedium:
                 delay_s = self._delay_s
                 if callable(delay_s):
                     delay_s = delay_s(sender, receiver, leaves_s)
+                    if not _is_positive(delay_s):
+                        raise PluginError(
+                            f"delay_s({sender!r}, {receiver!r}, {leaves_s:g}) returned {delay_s!r:.80}: expected"
+                            " seconds, more than 0"
+                        )
                 arrives_s = leaves_s + duration_s + delay_s
                 found.append(outcome(to=receiver, outcome=DELIVERED, arrives_s=arrives_s))
         return found or [outcome(to=to, outcome=NOBODY_IN_REACH)]
+
+
+def _check_answers(delay_s: Any, rate_byte_s: Any, loss: Any, queue_max: Any) -> None:
+    """
+    Refuse answers that no medium has.
+
+    Raises:
+        PluginError: One is no such number.
+    """
+    is_share = isinstance(loss, Real) and not isinstance(loss, bool) and 0 <= loss <= 1
+    is_count = isinstance(queue_max, Integral) and not isinstance(queue_max, bool)
+    for name, value, is_fit, wanted in (
+        (
+            "delay_s",
+            delay_s,
+            callable(delay_s) or _is_positive(delay_s),
+            "seconds, more than 0, or a function of (sender, receiver, t_s)",
+        ),
+        (
+            "rate_byte_s",
+            rate_byte_s,
+            rate_byte_s == math.inf or _is_positive(rate_byte_s),
+            "bytes per second, more than 0, or math.inf",
+        ),
+        ("loss", loss, is_share, "a share from 0 to 1"),
+        ("queue_max", queue_max, is_count and queue_max >= 0, "a whole number, 0 or more"),
+    ):
+        if not is_fit:
+            raise PluginError(f"LinkMedium: {name}: expected {wanted}, got {value!r:.80}")
+
+
+def _is_positive(value: Any) -> bool:
+    """Tell whether a value is a number of finite size above 0."""
+    return isinstance(value, Real) and not isinstance(value, bool) and bool(0 < value < math.inf)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Callable, Sequence
+from numbers import Integral
 from typing import Any, Final
 
 from madns_runtime.errors import PluginError
@@ -86,7 +87,8 @@ class Mailbox:
         Hand a message to the medium; see `plugin.api.AgentContext.transmit`.
 
         Raises:
-            PluginError: The simulation declares no medium, or no tick has begun.
+            PluginError: The simulation declares no medium, no tick has begun, or the receiver is no name or the
+                number none.
         """
         if not self._has_medium:
             raise PluginError(f"to {to!r:.80}: {WHAT_TO_DECLARE}")
@@ -94,8 +96,14 @@ class Mailbox:
             raise PluginError(
                 f"to {to!r:.80}: there is no time before the first tick; send to agents in step()"
             )
+        if not isinstance(to, str):
+            raise PluginError(f"expected a receiver's name, got {to!r:.80}")
         if number is None:
             number = self._number
+        elif not isinstance(number, Integral) or isinstance(number, bool):
+            raise PluginError(f"number: expected a whole number, got {number!r:.80}")
+        else:
+            number = int(number)
         self._post(Transmission(to, number, self.tick_s, message))
         self._number = max(self._number, number + 1)
         return number

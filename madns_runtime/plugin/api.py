@@ -192,7 +192,8 @@ class HostContext(Context, Protocol):
         It is delivered to those of its *outcomes* that are agents, and counted, as what `Medium.carry` returns.
 
         Raises:
-            PluginError: There is no outcome, or one arrives no later than it was sent.
+            PluginError: There is no outcome, one is impossible or arrives no later than it was sent, or the
+                transmission holds what messages do not carry.
         """
 
     def account(self, channel: str = "") -> MessageAccount:

@@ -29,6 +29,14 @@ def place_of(thing: Any) -> str:
     return f"{file}:{line}"
 
 
+def error_text(error: BaseException) -> str:
+    """Return what an error says of itself; of one whose class cannot, that."""
+    try:
+        return str(error)
+    except Exception as fault:  # noqa: BLE001 - __str__ of a plug-in's class may raise anything
+        return f"(its __str__ raised {type(fault).__name__})"
+
+
 def blame(error: BaseException, thing: Callable[..., Any]) -> str:
     """Return the last line of a function's or class's own file that took part in an error: its writer looks there first."""
     try:

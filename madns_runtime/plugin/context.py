@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import traceback
 import zlib
 from collections.abc import Callable, Container, Mapping, Sequence
+from numbers import Real
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -20,8 +22,11 @@ from madns_runtime.errors import (
 )
 from madns_runtime.medium.carrier import Carrier
 from madns_runtime.medium.mailbox import Mailbox
+from madns_runtime.medium.outcomes import LinkOutcome
+from madns_runtime.plugin.code_places import error_text
 from madns_runtime.plugin.device_view import DeviceView
-from madns_runtime.protocol.messages import Service
+from madns_runtime.protocol.codec import pack, unpack
+from madns_runtime.protocol.messages import Service, Transmission
 from madns_runtime.recording.records import FRAMEWORK_STREAMS, Field, StreamSchema
 from madns_runtime.recording.run_journal import RunJournal
 
@@ -131,8 +136,22 @@ class JobContext(RunContext):
         self.agent_parameters = agent_parameters
         self.submit = submit
         self.wake = wake
-        self.enter = half.carrier.enter
         self.account = half.carrier.account
+
+    def enter(
+        self, sender: str, transmission: Transmission, outcomes: Sequence[LinkOutcome]
+    ) -> None:
+        """See to a message of a place that is no agent; see `plugin.api.HostContext.enter`."""
+        if not isinstance(sender, str) or not isinstance(transmission, Transmission):
+            raise PluginError(
+                f"enter({sender!r:.80}, a {type(transmission).__name__}, ...): expected a place's name and a"
+                " Transmission of madns_runtime.plugin.api"
+            )
+        # Whoever sent it may go on to change it; what a message cannot carry is told here.
+        payload = unpack(pack(transmission.payload))
+        self._half.carrier.enter(
+            sender, dataclasses.replace(transmission, payload=payload), outcomes
+        )
 
     @property
     def timer_lateness_s(self) -> float:
@@ -171,7 +190,8 @@ def check_sending(
         return
     if service is not Service.SYNC:
         raise PluginError(f"deadline_s goes with Service.SYNC, not with {service!r}")
-    if isinstance(deadline_s, bool) or not math.isfinite(deadline_s):
+    is_number = isinstance(deadline_s, Real) and not isinstance(deadline_s, bool)
+    if not is_number or not math.isfinite(deadline_s):
         raise PluginError(f"deadline_s: expected a simulated time in seconds, got {deadline_s!r}")
     if not is_running:
         raise PluginError("deadline_s is simulated time, which has not begun")
@@ -197,7 +217,8 @@ def describe_exception(error: BaseException, doing: str) -> str:
         own = [frame for frame in frames[1:] if _is_below(Path(frame.filename), home)]
         frame = own[-1] if own else frames[-1]
         place = f" ({Path(frame.filename).name}:{frame.lineno})"
-    text = f": {clean_text(str(error))}" if str(error) else ""
+    said = error_text(error)
+    text = f": {clean_text(said)}" if said else ""
     return f"{doing} raised {type(error).__name__}{text}{place}"
 
 

@@ -26,7 +26,7 @@ from madns_runtime.timing.granted_clock import repeat_until_granted
 
 try:
     from distributed import Client, LocalCluster
-    from distributed.protocol.pickle import dumps
+    from distributed.protocol.pickle import dumps, loads
 except ImportError as error:
     raise MissingExtraError("dask", "dask") from error
 
@@ -44,13 +44,16 @@ class DaskExecutor(Executor):
     `Client.get_executor()`, made to the contract that the host's loop relies on.
 
     A job whose scheduler is gone fails, where Dask's own executor cancels it, which nobody would be
-    told of. Arguments travel as they are: Dask looks for tasks of its own in lists and mappings.
+    told of. Arguments travel packed: Dask looks for tasks of its own in lists and mappings.
 
     Args:
         client: Connected.
         address: The scheduler's.
         cluster: Our own one, or None.
     """
+
+    packs_at_once = True
+    """What a job is given is packed while `submit` runs; Dask itself would do it later."""
 
     def __init__(
         self,
@@ -85,7 +88,12 @@ class DaskExecutor(Executor):
             # Dask takes jobs also when it has given up its scheduler, and never answers.
             outer.set_exception(self._lost())
             return outer
-        inner = self._executor.submit(_do, functools.partial(fn, *args, **kwargs))
+        try:
+            packed = dumps(functools.partial(fn, *args, **kwargs))
+        except Exception as error:  # noqa: BLE001 - classes of a plug-in may raise anything
+            outer.set_exception(error)
+            return outer
+        inner = self._executor.submit(_do, packed)
         inner.add_done_callback(lambda done: self._pass_on(done, outer))
         return outer
 
@@ -152,9 +160,9 @@ def dask_setup(worker: Any) -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _do(job: Callable[[], T]) -> T:
+def _do(packed: bytes) -> Any:
     """Do a job in a worker; a value that cannot travel is its failure, where Dask would try for ever."""
-    value = job()
+    value = loads(packed)()
     dumps(value, buffer_callback=lambda _: None)  # arrays are not copied
     return value
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import multiprocessing
 import os
 import signal
@@ -15,6 +16,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
 )
 from functools import partial
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any, cast
 
@@ -121,6 +123,35 @@ def run_job(function: Callable[..., Any], *arguments: Any) -> Any:
         raise JobFailed(describe_exception(error, name)) from error
 
 
+def pack_job(function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes | None:
+    """
+    Return a job as it is now; None if a part of it has no such form, as a lock has none.
+
+    A pool encodes what it is given later, in a thread of its own: what the submitter changes meanwhile, such as an
+    array of states, would reach the job or not, whichever is first.
+    """
+    buffer = io.BytesIO()
+    try:
+        ForkingPickler(buffer, 5).dump((function, arguments))
+    except Exception:  # noqa: BLE001 - classes of a plug-in may raise anything; an executor that needs this form says so
+        return None
+    return buffer.getvalue()
+
+
+def run_packed_job(packed: bytes) -> Any:
+    """
+    Do one job that `pack_job` has packed in the host's process, in a worker.
+
+    Raises:
+        JobFailed: The function raised, or cannot be found here.
+    """
+    try:
+        function, arguments = ForkingPickler.loads(packed)
+    except BaseException as error:  # an import may raise anything
+        raise JobFailed(describe_exception(error, "unpacking the job")) from error
+    return run_job(function, *arguments)
+
+
 class JobRunner:
     """
     Hands functions to an executor and their results to the loop.
@@ -150,7 +181,7 @@ class JobRunner:
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> int:
         """
-        Start a job and return its number.
+        Start a job and return its number; its arguments are copied.
 
         Raises:
             ConfigurationError: More than JOBS_MAX are waiting.
@@ -161,7 +192,7 @@ class JobRunner:
         self._submitted_count += 1
         job = self._submitted_count
         try:
-            future = self._executor.submit(run_job, function, *arguments)
+            future = self._start(function, arguments)
         except BrokenExecutor as error:
             raise MachineError(WORKER_DIED) from error
         self._pending[job] = future
@@ -169,6 +200,13 @@ class JobRunner:
             lambda _: self._reactor.call_soon_threadsafe(lambda: self._done(job))
         )
         return job
+
+    def _start(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Future[Any]:
+        if not getattr(self._executor, "packs_at_once", False):
+            packed = pack_job(function, arguments)
+            if packed is not None:
+                return self._executor.submit(run_packed_job, packed)
+        return self._executor.submit(run_job, function, *arguments)
 
     def close(self) -> None:
         """Let go of every job and end the workers, also one that is deep in its work."""

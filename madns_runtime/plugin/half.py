@@ -179,6 +179,11 @@ class Half:
             return check(value)
         except PluginError as error:
             raise HalfFailed(f"{self.name}.{name} returned {clean_text(str(error))}") from error
+        except Exception as error:  # of the value's own class, while it was looked at
+            text = describe_exception(error, "looking at it")
+            raise HalfFailed(
+                f"{self.name}.{name} returned a {type(value).__name__}: {text}"
+            ) from error
 
     def _method(self, name: str) -> Callable[..., Any]:
         """Return a method; of a half that does not inherit it, and lacks it, the one that it would inherit."""

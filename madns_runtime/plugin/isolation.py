@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from madns_runtime.errors import MadnsError, MissingExtraError, PluginError
-from madns_runtime.plugin.code_places import blame
+from madns_runtime.plugin.code_places import blame, error_text
 from madns_runtime.plugin.time_limit import PluginStopped, hold
 
 EXTRA_OF_MODULE = {
@@ -71,6 +71,6 @@ def said(error: BaseException) -> str:
         return f"it called sys.exit({'' if error.code is None else repr(error.code)})"
     if isinstance(error, PluginStopped):
         return str(error)
-    text = str(error.msg) if isinstance(error, SyntaxError) else str(error)
+    text = str(error.msg) if isinstance(error, SyntaxError) else error_text(error)
     text = " ".join(text.split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -29,7 +29,7 @@ from madns_runtime.plugin.api import (
 from madns_runtime.plugin.code_places import place_of
 from madns_runtime.plugin.isolation import call_plugin
 from madns_runtime.plugin.registry import load_function
-from madns_runtime.recording.records import FRAMEWORK_STREAMS, Field
+from madns_runtime.recording.records import FIELD_KINDS, FRAMEWORK_STREAMS, Field
 
 OF_SCENARIOS = ("check", "check_actions", "streams", "labels", "device_uses", "place_uses")
 """Parts of a descriptor that a scenario is read with."""
@@ -308,6 +308,10 @@ def _streams_fault(found: Any) -> str | None:
         fields: Any = item.fields
         if not isinstance(fields, tuple | list) or not all(isinstance(f, Field) for f in fields):
             return f"must give {item.name!r} fields as a tuple of Field, got {_shown(fields)}"
+        for field in fields:
+            if field.kind not in FIELD_KINDS:
+                kinds = ", ".join(FIELD_KINDS)
+                return f"must give {item.name!r} fields of kind {kinds}, got {_shown(field)}"
     return None
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from numbers import Real
 from typing import Any
 
 import orjson
@@ -55,7 +56,8 @@ def next_time(value: Any) -> float | None:
     if value is None:
         return None
     try:
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        # With NumPy's, which a time becomes by one operand of theirs.
+        is_number = isinstance(value, Real) and not isinstance(value, bool)
         time_s = float(value) if is_number else math.nan
     except OverflowError:  # a whole number beyond what a float holds has no short text either
         raise PluginError(

@@ -66,6 +66,8 @@ class Peer:
     """Messages of the host's half that had nobody to go to."""
     retired_counters: list[Mapping[str, Any]] = field(default_factory=list)
     """Counters of the links of earlier incarnations."""
+    retired_records: list[Mapping[str, Any]] = field(default_factory=list)
+    """Last words of earlier incarnations, as `records`; empty of one that ended without any."""
 
 
 class Roster:
@@ -292,6 +294,8 @@ class HostLinks:
             peer.link.abandon()
             self._tell_broken(peer, peer.link)
             peer.retired_counters.append(peer.link.counters.to_mapping())
+            peer.retired_records.append(peer.records)
+            peer.records = {}
         peer.link = link
         peer.incarnations_seen.add(link.incarnation)
         peer.pings.clear()

@@ -131,7 +131,11 @@ class HostReport:
             "messages": _totals(agents.values()),
             "between_agents": between_agents(
                 carried,
-                (peer.records.get("between_agents", {}) for peer in session.peers.values()),
+                (
+                    records.get("between_agents", {})
+                    for peer in session.peers.values()
+                    for records in (*peer.retired_records, peer.records)
+                ),
             ),
             "refused": dict(session.refused),
             "malformed_messages": session.malformed_count,
@@ -186,7 +190,10 @@ def _messages(
     lives = (*peer.retired_counters, host_side)
     broken = [side.get("deadlines_broken", 0) for side in lives]
     excused = [count for life, count in enumerate(broken, start=1) if life in ended_on_purpose]
-    own = (agent_side or {}).get("deadlines_broken", 0)
+    own = sum(
+        side.get("deadlines_broken", 0)
+        for side in (*(each.get("messages", {}) for each in peer.retired_records), agent_side or {})
+    )
     joined["sync"]["deadlines_broken"] = own + sum(broken) - sum(excused)
     if any(excused):
         joined["sync"]["deadlines_broken_on_purpose"] = sum(excused)

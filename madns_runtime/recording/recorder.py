@@ -174,12 +174,16 @@ class Recorder:
         Keep what a program wrote in <name>.txt beside the records: its first part and its last. Never blocks.
 
         Raises:
-            PluginError: The name is no file name.
+            PluginError: The name is no file name, or the data are no bytes.
         """
+        if not isinstance(data, bytes | bytearray | memoryview):
+            raise PluginError(
+                f"keep_text({name!r:.80}): expected bytes, got {type(data).__name__}; encode() a text"
+            )
         text = self._texts.get(name)
         if text is None:
             text = self._texts[name] = self._files.create_text(name)
-        text.add(data)
+        text.add(bytes(data))
 
     def newest(self, stream: str) -> Mapping[str, Any]:
         """Return the newest record of a stream by its fields' names; empty where there is none."""

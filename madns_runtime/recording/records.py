@@ -29,6 +29,10 @@ class Field:
     one is an int: `number_rows` then rounds and encodes many records at once."""
 
 
+FIELD_KINDS = ("float", "int", "str", "bool", "json", "packed")
+"""All kinds of fields."""
+
+
 @dataclass(frozen=True, slots=True)
 class StreamSchema:
     """One stream: file name without suffix, its fields, and the shape of its records."""

@@ -74,8 +74,10 @@ class RunJournal:
             t_s: Simulated time, s; None where it does not run.
 
         Raises:
-            PluginError: The level is none of these.
+            PluginError: The level is none of these, or the sentence is no text.
         """
+        if not isinstance(text, str):
+            raise PluginError(f"log: expected a text, got {type(text).__name__}; str() it")
         number = LOG_LEVELS.get(level)
         if number is None:
             raise PluginError(

@@ -19,7 +19,7 @@ import orjson
 
 from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.recording.number_rows import DIGITS_MAX, NumberRows
-from madns_runtime.recording.records import StreamSchema
+from madns_runtime.recording.records import FIELD_KINDS, Field, StreamSchema
 
 LINES_PER_WRITE_MAX = 1024
 LINE_OVERHEAD_BYTES = 56
@@ -36,7 +36,7 @@ def check_name(name: str) -> None:
     Raises:
         PluginError: It is no file name.
     """
-    if not NAME_PATTERN.fullmatch(name):
+    if not isinstance(name, str) or not NAME_PATTERN.fullmatch(name):
         raise PluginError(
             f"stream {name!r}: expected a name of letters, digits, - and _, at most 64"
         )
@@ -47,10 +47,15 @@ def check_schema(schema: StreamSchema) -> None:
     Check that a stream of this schema can be a file that is read back.
 
     Raises:
-        PluginError: Its name is no file name, it has no fields, two of one name, or some that are rounded among
-            others that are no numbers.
+        PluginError: Its name is no file name, it has no fields, two of one name, one of no such kind, or some that
+            are rounded among others that are no numbers.
     """
     check_name(schema.name)
+    for field in schema.fields:
+        if not isinstance(field, Field) or field.kind not in FIELD_KINDS:
+            raise PluginError(
+                f"stream {schema.name}: expected fields of kind {', '.join(FIELD_KINDS)}, got {field!r:.100}"
+            )
     names = [field.name for field in schema.fields]
     if not names or len(set(names)) != len(names):
         raise PluginError(f"stream {schema.name}: expected fields with distinct names, got {names}")

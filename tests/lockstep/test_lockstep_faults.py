@@ -1,11 +1,13 @@
 """What goes wrong in lockstep is named: who, in which call, why; and nothing of the run lives on."""
 
+import os
 import signal
 
 import pytest
 from harness.waiting import is_alive, wait_until
 
 from madns_runtime.config import Timeouts
+from madns_runtime.lockstep.workers import _await_exit
 from madns_runtime.processes import list_processes
 
 pytestmark = pytest.mark.process
@@ -189,3 +191,12 @@ def test_its_processes_are_registered_while_they_live(start_host, monkeypatch):
     assert roles[0] == ("agent", "agent-01,agent-02")
     assert roles[-1] == ("host", "host")
     assert list_processes() == []
+
+
+def test_worker_whose_end_a_plugin_has_ignored_has_ended():
+    earlier = signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    try:
+        pid = os.posix_spawn("/bin/true", ["true"], {})
+        assert _await_exit(pid) == 0
+    finally:
+        signal.signal(signal.SIGCHLD, earlier)

@@ -88,6 +88,23 @@ def test_what_cannot_be_sent_to_agents_is_told():
     assert sent == []
 
 
+@pytest.mark.parametrize(
+    ("to", "number", "told"),
+    [
+        (5, None, "receiver's name, got 5"),
+        (None, None, "name"),
+        ("kiosk", "7", "whole number, got"),
+    ],
+)
+def test_a_receiver_or_number_that_is_none_is_the_senders_fault(to, number, told):
+    box, sent = mailbox()
+    box.due(0.0)
+
+    with pytest.raises(PluginError, match=told):
+        box.transmit(to, PAYLOAD, number=number)
+    assert sent == []
+
+
 def test_a_message_is_held_until_the_first_tick_at_or_after_its_arrival():
     box, _ = mailbox()
     box.due(0.0)
@@ -285,3 +302,96 @@ def test_losses_are_the_share_wanted_and_hang_on_the_seed_alone():
     assert abs(len(first) - 600) < 5 * math.sqrt(0.21 * 2000)
     assert lost(1, ("car-2", "car-1")) == first
     assert lost(2, ("car-1", "car-2")) != first
+
+
+@pytest.mark.parametrize(
+    ("outcome", "told"),
+    [
+        (
+            LinkOutcome(to="car-2", outcome="delivered", arrives_s="5"),
+            r"arrives_s '5': expected a sim",
+        ),
+        (
+            LinkOutcome(to="car-2", outcome=True),
+            r"outcome True: expected 'delivered', 'lost', or a word",
+        ),
+        (LinkOutcome(to="car-2", outcome=""), r"outcome '': expected"),
+        (LinkOutcome(to="car-2", outcome=None), r"outcome None: expected"),
+        (LinkOutcome(to=["car-2"], outcome="lost"), r"to \['car-2'\]: expected a receiver's name"),
+        (LinkOutcome(to=2, outcome="lost"), r"to 2: expected"),
+        (LinkOutcome(to="car-2", outcome="lost", channel=[]), r"channel \[\]: expected a text"),
+        (
+            LinkOutcome(to="car-2", outcome="lost", size_bytes="9"),
+            r"size_bytes '9': expected a number",
+        ),
+        (LinkOutcome(to="car-2", outcome="lost", size_bytes=math.nan), r"size_bytes nan: expected"),
+    ],
+)
+def test_an_outcome_of_other_values_is_the_mediums_fault_and_enters_no_account(outcome, told):
+    desk = Desk()
+
+    with pytest.raises(PluginError, match=f"a LinkOutcome with {told}"):
+        desk.enter(outcome)
+    assert desk.carrier.to_mapping() == {}
+
+
+def test_numbers_and_texts_of_numpy_in_an_outcome_become_plain():
+    desk = Desk().enter(
+        LinkOutcome(
+            to=np.str_("car-2"),
+            outcome="delivered",
+            arrives_s=np.float32(0.5),
+            size_bytes=np.int64(9),
+        ),
+        LinkOutcome(to="car-3", outcome=np.str_("busy")),
+    )
+    desk.at(0.0)
+
+    (_, refusal), (to, found) = desk.posted
+    assert type(refusal.reason) is type(to) is str
+    assert type(found.arrives_s) is float
+    assert list(map(type, desk.carrier.to_mapping()["refused_because"])) == [str]
+
+
+@pytest.mark.parametrize(
+    ("answers", "told"),
+    [
+        ({"loss": 5}, "loss: expected a share from 0 to 1, got 5"),
+        ({"loss": math.nan}, "loss: expected a share"),
+        (
+            {"rate_byte_s": 0},
+            "rate_byte_s: expected bytes per second, more than 0, or math.inf, got 0",
+        ),
+        ({"rate_byte_s": math.nan}, "rate_byte_s: expected"),
+        ({"delay_s": 0.0}, "delay_s: expected seconds, more than 0, or a function"),
+        ({"delay_s": "0.1"}, "delay_s: expected seconds"),
+        ({"queue_max": -1}, "queue_max: expected a whole number, 0 or more, got -1"),
+    ],
+)
+def test_a_medium_that_cannot_be_is_refused_when_it_is_made(answers, told):
+    with pytest.raises(PluginError, match=f"LinkMedium: {told}"):
+        LinkMedium(NAMES, np.random.default_rng(1), **{"delay_s": 0.1, **answers})
+
+
+@pytest.mark.parametrize("answer", [True, False, 3, ""])
+def test_a_reach_that_answers_yes_or_no_is_told_what_to_return(answer):
+    medium = LinkMedium(
+        NAMES, np.random.default_rng(1), delay_s=0.1, reach=lambda sender, receiver, t_s: answer
+    )
+
+    with pytest.raises(
+        PluginError, match=r"reach\('car-1', 'car-2', 0\) returned .* expected None if"
+    ):
+        medium.carry("car-1", Transmission("car-2", 0, 0.0, PAYLOAD))
+
+
+@pytest.mark.parametrize("answer", [None, 0.0, -1.0, math.nan, math.inf, "0.1"])
+def test_a_delay_that_is_none_is_told_with_whom_it_was_asked_for(answer):
+    medium = LinkMedium(
+        NAMES, np.random.default_rng(1), delay_s=lambda sender, receiver, t_s: answer
+    )
+
+    with pytest.raises(
+        PluginError, match=r"delay_s\('car-1', 'car-2', 0\) returned .* expected sec"
+    ):
+        medium.carry("car-1", Transmission("car-2", 0, 0.0, PAYLOAD))

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from madns_runtime.config import Agents
-from madns_runtime.plugin.context import describe_exception
+from madns_runtime.errors import MadnsError, PluginError
+from madns_runtime.plugin.context import JobContext, check_sending, describe_exception
 from madns_runtime.plugin.executor import JobFailed, run_job
+from madns_runtime.plugin.isolation import said
+from madns_runtime.protocol.messages import Service, Transmission
+from madns_runtime.recording.run_journal import RunJournal
 
 PLUGIN = """\
 import json
@@ -63,6 +69,18 @@ def test_exception_without_a_text_is_told_by_its_kind(plugin):
     assert told(plugin["check"], -1) == "Rover.step raised ValueError (rover.py:14)"
 
 
+def test_exception_that_cannot_say_what_it_is_is_told_all_the_same():
+    class OutOfReach(Exception):
+        def __str__(self) -> Any:
+            return 404
+
+    def step() -> None:
+        raise OutOfReach
+
+    assert told(step).startswith("Rover.step raised OutOfReach: (its __str__ raised TypeError) (")
+    assert said(OutOfReach()) == "OutOfReach: (its __str__ raised TypeError)"
+
+
 def test_library_in_an_environment_beside_the_plugin_is_not_the_plugin(tmp_path, plugin):
     folder = tmp_path / ".venv/lib/site-packages"
     folder.mkdir(parents=True)
@@ -97,3 +115,50 @@ def test_thousands_of_agents_share_one_list_of_all_names():
 
     assert first is second
     assert (first[0], first[-1]) == ("agent-0001", "agent-5000")
+
+
+def entered(transmission, sender="kiosk"):
+    """Enter a message of a place by the host's context; return what the carrier got."""
+    got = []
+    context = SimpleNamespace(
+        _half=SimpleNamespace(carrier=SimpleNamespace(enter=lambda *taken: got.append(taken)))
+    )
+    JobContext.enter(context, sender, transmission, ())
+    return got[0][1]
+
+
+def test_a_message_of_a_place_is_the_one_that_was_entered_whatever_becomes_of_its_payload():
+    payload = {"x_m": np.arange(3.0)}
+
+    kept = entered(Transmission("car-1", 1, 0.5, payload))
+    payload["x_m"] += 1.0
+
+    assert kept.payload["x_m"].tolist() == [0.0, 1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("transmission", "sender", "told"),
+    [
+        (Transmission("car-1", 1, 0.5, {1, 2}), "kiosk", "a message cannot carry a set"),
+        (Transmission("car-1", 1, 0.5, 1), 7, "expected a place's name and a Transmission"),
+        ({"to": "car-1"}, "kiosk", "expected a place's name and a Transmission"),
+    ],
+)
+def test_a_message_of_a_place_that_cannot_be_is_told_in_the_line_that_enters_it(
+    transmission, sender, told
+):
+    with pytest.raises(MadnsError, match=told):
+        entered(transmission, sender)
+
+
+@pytest.mark.parametrize("deadline_s", ["5", True, float("nan"), [5.0]])
+def test_a_deadline_that_is_no_time_is_told_as_such(deadline_s):
+    with pytest.raises(PluginError, match="deadline_s: expected a simulated time in seconds"):
+        check_sending("host", ("host",), Service.SYNC, deadline_s, is_running=True)
+
+
+def test_a_log_of_what_is_no_text_is_told_as_such():
+    journal = RunJournal(SimpleNamespace(open_stream=lambda schema: None), 1, t_s=lambda: 0.0)
+
+    with pytest.raises(PluginError, match=r"log: expected a text, got ValueError; str\(\) it"):
+        journal.log("error", ValueError("x"))

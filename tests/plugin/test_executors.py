@@ -114,6 +114,45 @@ def test_truth_is_the_same_whoever_computes_it(cluster):
         assert np.array_equal(truth.invariants, expected.invariants)
 
 
+@pytest.mark.parametrize("kind", ["process", "thread", "dask"])
+def test_a_job_gets_what_it_was_given_whatever_its_submitter_changes_afterwards(kind):
+    executor = make_executor(ExecutorSettings(kind=kind, workers=1))
+    reactor, found = Reactor(), {}
+
+    def done(job, future):
+        found[job] = future.result()
+        if len(found) == 5:
+            reactor.stop()
+
+    runner, load_w = JobRunner(reactor, executor, done), np.full(3, 1000.0)
+    for _ in range(4):  # more than a pool encodes ahead of its workers
+        runner.submit(time.sleep, 0.2)
+    given = runner.submit(functools.partial(np.sum, load_w), None)
+    load_w += 1.0
+    reactor.call_at(reactor.now_s() + PATIENCE_S, reactor.stop)
+    reactor.run()
+    runner.close()
+
+    assert found[given] == 3000.0
+
+
+def test_a_job_that_cannot_be_copied_is_shared_with_threads():
+    executor = make_executor(ExecutorSettings(kind="thread", workers=1))
+    reactor, lock, found = Reactor(), threading.Lock(), []
+
+    def done(job, future):
+        found.append(future.result())
+        reactor.stop()
+
+    runner = JobRunner(reactor, executor, done)
+    runner.submit(lambda given: given is lock, lock)
+    reactor.call_at(reactor.now_s() + PATIENCE_S, reactor.stop)
+    reactor.run()
+    runner.close()
+
+    assert found == [True]
+
+
 def left_since(before):
     """Return the processes that were begun and live; multiprocessing's tracker of resources ends with this one."""
     found = []

@@ -9,6 +9,7 @@ import math
 from concurrent.futures import Future
 from typing import Any
 
+import numpy as np
 import pytest
 
 from madns_runtime.errors import MachineError, PluginError
@@ -242,6 +243,26 @@ def test_numbers_of_a_summary_that_are_not_finite_break_a_check(checks):
 def test_time_that_no_clock_reaches_is_refused(value):
     with pytest.raises(PluginError, match="expected a simulated time in seconds"):
         validation.next_time(value)
+
+
+@pytest.mark.parametrize("value", [np.float32(0.5), np.float64(0.5), np.int64(2), 0.5, 2])
+def test_time_may_be_a_number_of_numpy_and_becomes_a_plain_one(value):
+    assert type(validation.next_time(value)) is float
+    assert validation.next_time(value) == value
+
+
+class Dumb:
+    def __repr__(self) -> str:
+        raise ValueError("no words")
+
+
+def test_value_that_cannot_be_looked_at_is_the_fault_of_the_method_that_returned_it(logged):
+    half = made(type("Rover", (Base,), {"wanted": Dumb()}), logged, HostHalf)
+
+    with pytest.raises(
+        HalfFailed, match=r"Rover.timer returned a Dumb: .* raised ValueError: no words"
+    ):
+        half.call_timer(0.0)
 
 
 @dataclasses.dataclass

@@ -141,6 +141,11 @@ def test_other_real_arrays_become_float64_without_loss(dtype):
     np.testing.assert_array_equal(array, decoded)
 
 
+def test_array_with_a_mask_is_refused_rather_than_sent_without_it():
+    with pytest.raises(UnencodableValue, match=r"filled\(nan\)"):
+        pack({"x": np.ma.masked_array([1.0, 2.0], [False, True])})
+
+
 def test_array_view_with_strides_survives():
     array = np.arange(24.0).reshape(4, 6)[::2, 1::2]
 

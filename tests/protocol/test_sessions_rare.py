@@ -303,6 +303,20 @@ def test_orders_to_a_process_that_another_replaced_are_lost_and_their_deadlines_
     assert earlier["deadlines_broken"] == earlier["sync"]["lost"] == 1
 
 
+def test_last_word_of_an_agent_that_returns_is_kept_and_is_not_taken_for_that_of_the_next_life():
+    w = world(count=2, policy="continue")
+    w.run_for(1.5)
+    w.agents["agent-1"].emergency("it raised", w.now_s)
+    w.run_for(1.0)
+
+    w.join("agent-1")
+    w.run_for(1.0)
+
+    peer = w.host.peers["agent-1"]
+    assert peer.retired_records == [{"written": 7}]
+    assert peer.records == {}
+
+
 def test_nothing_waits_for_a_process_that_has_not_said_hello():
     w = world(count=2, policy="continue")
     w.run_for(1.5)

@@ -57,3 +57,25 @@ def test_deadlines_that_were_broken_before_an_agent_came_again_stay_counted():
     result = HostReport(10.0).result(session, network={}, intended=IntendedLosses())
 
     assert result["messages"]["sync"]["deadlines_broken"] == 2
+
+
+def test_what_earlier_incarnations_counted_stays_counted():
+    def words(received: int, deadlines_broken: int) -> dict[str, Any]:
+        counts = {"received": received, "held": 0, "late": 0, "no_room": 0}
+        return {"between_agents": counts, "messages": {"deadlines_broken": deadlines_broken}}
+
+    peer = Peer(
+        name="agent-01",
+        index=1,
+        phase=Phase.STOPPED,
+        records=words(3, 1),
+        retired_records=[words(40, 2), {}],
+    )
+    session: Any = SimpleNamespace(peers={"agent-01": peer}, refused={}, malformed_count=0)
+
+    result = HostReport(10.0).result(
+        session, network={}, carried={"sent": 50, "delivered": 43}, intended=IntendedLosses()
+    )
+
+    assert result["between_agents"]["receivers"]["received"] == 43
+    assert result["messages"]["sync"]["deadlines_broken"] == 3

@@ -164,6 +164,12 @@ def test_unfit_fields_are_refused(tmp_path, fields):
         make_recorder(tmp_path).open_stream(StreamSchema("s", fields))
 
 
+@pytest.mark.parametrize("field", ["x", Field("x", "", "double")])
+def test_fields_of_no_kind_are_refused(tmp_path, field):
+    with pytest.raises(PluginError, match=r"stream s: expected fields of kind float, int, .* got "):
+        make_recorder(tmp_path).open_stream(StreamSchema("s", (field,)))
+
+
 def test_single_field_that_reads_as_another_kind_of_line_is_refused(tmp_path):
     schema = StreamSchema("s", (Field("end", "", "int"),), shape="object")
 

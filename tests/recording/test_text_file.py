@@ -85,6 +85,16 @@ def test_a_name_that_is_no_file_name_is_refused(tmp_path, name):
         recorder(tmp_path).keep_text(name, b"x")
 
 
+def test_text_that_is_no_bytes_is_refused_and_costs_no_record(tmp_path):
+    keeping = recorder(tmp_path)
+
+    with pytest.raises(PluginError, match=r"keep_text\('said'\): expected bytes, got str; encode"):
+        keeping.keep_text("said", "hello")
+    keeping.keep_text("said", bytearray(b"hello"))
+    keeping.close()
+    assert (tmp_path / "said.txt").read_bytes() == b"hello"
+
+
 def test_a_disk_that_refuses_is_told_of(tmp_path):
     keeping = recorder(tmp_path)
     (tmp_path / "said.txt").mkdir()

@@ -5,13 +5,14 @@ from pathlib import Path
 
 import pytest
 
+from cosmos_cli.evidence.plugin_checks import plugin_checks
+from cosmos_cli.evidence.remarks import malformed_check_remarks
 from cosmos_cli.evidence.verdict import (
     ORDER,
     CheckLimits,
     CheckResult,
     RunFacts,
     judge,
-    plugin_checks,
 )
 
 TOP = Path(__file__).parents[3]
@@ -231,11 +232,30 @@ def test_malformed_check_is_a_broken_one_named_after_who_made_it(item):
     assert (held.name, held.passed) == ("y", True)
 
 
-@pytest.mark.parametrize("listed", [None, 3, "x", {"name": "x"}])
+@pytest.mark.parametrize(
+    "listed", [None, 3, "x", {"name": "x", "limit": 1, "got": 0, "passed": True}]
+)
 def test_checks_that_are_no_list_are_a_broken_check(listed):
     (check,) = plugin_checks({"host": {"checks": listed}})
 
     assert (check.name, check.passed, check.got) == ("host.checks", False, None)
+
+
+def test_what_is_wrong_with_a_malformed_check_is_a_remark_with_who_returned_it():
+    check = {"name": "gap_m", "limit": 1.0, "got": 0.5, "passed": 1}
+    summaries = {
+        "host": {"checks": {**check, "passed": True}},
+        "agent-01": {"checks": [check, {**check, "passed": True}]},
+        "agent-02": {"checks": [check]},
+        "agent-03": {"checks": [{**check, "passed": True, "limit": None}]},
+    }
+
+    assert malformed_check_remarks(summaries) == (
+        "host: checks of finish(): expected a list of mappings, got {'name': 'gap_m', 'limit': 1.0, 'got': 0.5,"
+        " 'passed': True}",
+        "agent-01, agent-02: checks of finish(): passed of 'gap_m': expected true or false, got 1",
+        "agent-03: checks of finish(): limit of 'gap_m': expected a finite number, got None",
+    )
 
 
 @pytest.mark.parametrize("summary", [{}, {"checks": []}, {"checks": ()}])
