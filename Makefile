@@ -15,9 +15,13 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: $(RUNNABLE)  ## Run ten real Iridium satellites on ten loopback agents.
 	$(VENV)/bin/cosmos run scenarios/iridium10.yaml
 
+# Lint keeps one processor for a minute: the tests begin beside it, and what it says comes in one piece.
 test: $(READY)  ## Lint, types, import contracts and every test but those of `.ci/nightly`.
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint measured unmeasured
-	$(VENV)/bin/python -m pytest --numprocesses 6 --dist loadfile --no-loadscope-reorder --durations=25 $(addprefix --ignore=,$(MEASURED))
+	@{ $(MAKE) --no-print-directory lint >$(VENV)/lint.txt 2>&1; status=$$?; cat $(VENV)/lint.txt; exit $$status; } & lint=$$!; \
+	$(MAKE) --no-print-directory measured unmeasured && \
+	$(VENV)/bin/python -m pytest --numprocesses 6 --dist loadfile --no-loadscope-reorder --durations=25 $(addprefix --ignore=,$(MEASURED)); failed=$$?; \
+	wait $$lint || failed=1; \
+	exit $$failed
 
 lint: $(READY)
 	$(VENV)/bin/ruff check .
