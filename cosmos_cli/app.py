@@ -8,6 +8,7 @@ import os
 import sys
 import tempfile
 import traceback
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -70,6 +71,9 @@ def cosmos(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and end the process with the exit code of DESIGN 9."""
     open_standard_streams()
+    if not sys.warnoptions:
+        # numpy's, of records that diverged: what comes of them tells, and a line of our source helps nobody.
+        warnings.simplefilter("ignore", RuntimeWarning)
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     code = run(arguments)
     # At its end the interpreter would look through all objects for cycles, for 50 ms, and free them one by one.

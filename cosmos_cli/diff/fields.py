@@ -18,6 +18,8 @@ TURN = {"deg": 360.0, "rad": 2.0 * math.pi}
 """A whole turn: angles differ by the shorter way round."""
 TEXT_CHARACTERS_MAX = 60
 LARGE = 2**62
+TURNS_MAX = 1e6
+"""Further apart two values are no angles any more, but one that diverged: of 1e200 deg no float knows the rest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +99,8 @@ class FieldDifference:
             difference = np.where(np.isnan(exact), difference, exact)
         turn = TURN.get(self.field.unit)
         if turn is not None:
-            is_long = np.abs(difference) > turn / 2.0
+            turns = np.abs(difference) / turn
+            is_long = (turns > 0.5) & (turns < TURNS_MAX)
             difference[is_long] -= turn * np.round(difference[is_long] / turn)
         self.null_in_one += int(is_one_null.sum())
         self.compared += int(is_both.sum())

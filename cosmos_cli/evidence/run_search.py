@@ -7,6 +7,7 @@ What bears a run's name has to be one: in a folder that others share, anybody ma
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 
 from cosmos_cli.errors import InputError
@@ -58,7 +59,10 @@ def find_run(root: Path, which: str) -> RunDirectory:
             )
     _refuse_other(root, which)
     known = ", ".join(run.name for run in runs[-5:]) or "none yet"
-    raise InputError(f"{which}: no such run in {root}; the last ones are: {known}")
+    here = ""
+    if _holds_run(Path(which)):  # as one that was unpacked
+        here = f"; if the folder here is meant, name it {shlex.quote(os.path.join('.', which))}"
+    raise InputError(f"{which}: no such run in {root}; the last ones are: {known}{here}")
 
 
 def find_elsewhere(which: str) -> list[RunDirectory]:

@@ -12,6 +12,7 @@ from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.simulation_calls import call_simulation
 from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.evidence.tables import no_tables, open_recorded_run
+from cosmos_cli.evidence.verdict import is_number
 from cosmos_cli.report.devices import device_sections, is_told_in_words
 from cosmos_cli.report.expectations import expectation_sections
 from cosmos_cli.report.health import health_blocks, process_blocks
@@ -268,7 +269,10 @@ def _round_trip_remark(round_trip: Mapping[str, Any]) -> str:
 
 
 def _milliseconds(value: object) -> str:
-    return "–" if value is None else f"{_number(value, '.3g')} ms"
+    if value is None:
+        return "–"
+    is_long = is_number(value) and abs(value) >= 999.5  # three figures would be a power of ten
+    return f"{_number(value, '.0f' if is_long else '.3g')} ms"
 
 
 def _number(value: object, form: str = "") -> str:

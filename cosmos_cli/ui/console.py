@@ -257,7 +257,7 @@ def tell_lost_output(error: OSError, instead: str = "") -> None:
     let_go_of_output()
 
 
-def let_go_of_output(lost: TextIO | None = None) -> None:
+def let_go_of_output(lost: object = None) -> None:
     """
     Send the rest of both streams nowhere: whoever read them is gone, as `head` or a closed terminal.
 
@@ -272,7 +272,7 @@ def let_go_of_output(lost: TextIO | None = None) -> None:
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
-            if stream is lost:
+            if lost is stream:
                 os.dup2(nowhere, stream.fileno())
         except OSError:
             os.dup2(nowhere, stream.fileno())

@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -238,6 +240,33 @@ def test_either_quaternion_of_one_attitude_is_the_same_body(fly, capsys):
     found = compared(capsys)["attitude"]
 
     assert found["agent-01"]["angle_deg_max"] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.process
+def test_estimates_that_diverged_cost_no_warning_of_our_source(fly):
+    fly(), fly(slot_error_deg=1e200)
+
+    done = subprocess.run(
+        [sys.executable, "-m", "cosmos_cli.start", "diff", "1", "2", "--quiet"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "DIFFERENT: records differ in estimates" in done.stdout
+    assert "compared nothing itself" not in done.stdout
+
+
+def test_estimates_and_commands_that_diverged_are_told_as_json(fly, capsys):
+    fly(), fly(slot_error_deg=1e200, delta_v_m_s=1.7e308)
+
+    found = compared(capsys)
+
+    assert [one["last_deg"] for one in found["estimates"]["all"]] == pytest.approx([0.1, 1e200])
+    assert [one["rms_deg"] for one in found["estimates"]["all"]] == [pytest.approx(0.1), None]
+    assert found["control"]["all"][1]["commanded_m_s"] is None
 
 
 def test_several_runs_are_each_compared_with_the_first(fly, capsys):

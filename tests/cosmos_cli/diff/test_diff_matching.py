@@ -161,6 +161,14 @@ def test_a_run_that_diverged_differs_without_a_root_mean_square():
     assert (found.different, found.max) == (1, 1e300)
 
 
+def test_an_angle_that_diverged_is_not_the_same_by_whole_turns():
+    found = FieldDifference(Field("slot_error_deg", "deg"))
+
+    found.add(rows([0, 1], slot_error_deg=[0.1, 360.1]), rows([0, 1], slot_error_deg=[1e200, 0.1]))
+
+    assert (found.different, found.max) == (1, 1e200)
+
+
 def test_whole_numbers_far_apart_differ_by_what_lies_between():
     found = FieldDifference(Field("n", "", "int"))
 

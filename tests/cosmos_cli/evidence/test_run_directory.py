@@ -156,6 +156,14 @@ def test_folder_of_runs_that_is_a_file_is_bad_input(tmp_path):
             ask(tmp_path / "file")
 
 
+def test_a_run_in_this_folder_that_is_named_without_its_path_is_pointed_at(tmp_path, monkeypatch):
+    create_run(tmp_path / "unpacked", "x")
+    monkeypatch.chdir(tmp_path / "unpacked")
+
+    with pytest.raises(InputError, match="if the folder here is meant, name it ./0001-x"):
+        find_run(tmp_path / "runs", "0001-x")
+
+
 def test_run_of_another_user_is_not_written_into_but_by_root(tmp_path, monkeypatch):
     run = create_run(tmp_path, "x")
     owner = pwd.getpwuid(os.getuid()).pw_name

@@ -8,7 +8,7 @@ import pytest
 from harness.synthetic_run import STATE, T0_UTC, SyntheticRun, make_config
 
 from cosmos_cli.collect.finish import finish_run
-from cosmos_cli.report.build import MACHINE_CHAPTERS, build_sections
+from cosmos_cli.report.build import MACHINE_CHAPTERS, build_sections, figures_of
 from cosmos_cli.report.cells import format_cell
 from cosmos_cli.report.html import encode_array, render_page
 from cosmos_cli.report.plotly_figures import to_plotly
@@ -420,6 +420,16 @@ def test_array_is_stored_as_short_as_its_curve_allows(values, dtype):
 )
 def test_cell_reads_as(value, text):
     assert format_cell(value) == text
+
+
+@pytest.mark.parametrize(
+    ("trip_ms", "text"),
+    [(0.38251, "0.383 ms"), (999.4, "999 ms"), (1000.0, "1000 ms"), (None, "–")],
+)
+def test_a_round_trip_is_told_in_figures_and_not_in_powers_of_ten(trip_ms, text):
+    told = {name: value for name, value, _ in figures_of({"round_trip_ms": {"p50": trip_ms}})}
+
+    assert told["round trip p50"] == text
 
 
 def foreign(tmp_path, *schemas):

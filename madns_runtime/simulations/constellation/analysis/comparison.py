@@ -293,9 +293,9 @@ def total_effort(efforts: Mapping[str, Effort]) -> Effort:
     """Return what all agents commanded and spent."""
     given = [one.given_m_s for one in efforts.values() if one.given_m_s is not None]
     return Effort(
-        commanded_m_s=math.fsum(one.commanded_m_s for one in efforts.values()),
+        commanded_m_s=sum(one.commanded_m_s for one in efforts.values()),
         commands=sum(one.commands for one in efforts.values()),
-        given_m_s=math.fsum(given) if given else None,
+        given_m_s=sum(given) if given else None,
     )
 
 
@@ -308,7 +308,7 @@ def total_slot_error(errors: Mapping[str, SlotError]) -> SlotError | None:
         sum(e.squares for e in every),
         sum(e.count for e in every),
         (sum(e.settled_squares for e in every), sum(e.settled_count for e in every)),
-        math.sqrt(sum(e.last_deg**2 for e in every) / len(errors)),
+        math.hypot(*(e.last_deg for e in every)) / math.sqrt(len(errors)),
     )
 
 
