@@ -18,6 +18,8 @@ from madns_runtime.hardware.seat import DeviceSeat
 from madns_runtime.hardware.status import StatusAccount, StatusLimits
 
 NOT_MADE_SAFE: Final = "could not be made safe: its driver failed, look at the device"
+TELLING: Final = (NOT_FINITE, "received_bytes", "garbage_bytes", "bad_checksums")
+"""Ends of the names of counts that tell why there may be no sample: values that are no numbers, bytes that make no frame."""
 
 
 @dataclass(slots=True)
@@ -83,10 +85,13 @@ class DrivenDevice:
         if state == page.OPENING:
             return f"it has not opened within {self.limits.lost_s:g} s"
         if state == page.OPEN:
-            counts = self.seat.page.counts.read()
-            told = [f"{name} {n}" for name, n in counts.items() if name.endswith(NOT_FINITE) and n]
-            what = f"sample of finite numbers ({', '.join(told)})" if told else "sample"
-            return f"no {what} for {self.limits.lost_s:g} s"
+            rate_hz = self.seat.launch.rate_hz
+            counts = self.seat.page.counts.read().items()
+            told = [f"{name} {n}" for name, n in counts if n and name.endswith(TELLING)]
+            return (
+                f"no sample for {self.limits.lost_s:g} s, where rate_hz ({rate_hz:g}) promises one every {1 / rate_hz:g} s"
+                f"{'; so far ' if told else ''}{', '.join(told)}"
+            )
         return "it is closed"
 
     def _counts(self) -> dict[str, Any]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 from madns_runtime.config import DeviceLaunch
-from tests.hardware.bench import AGENT, DeviceBench
+from tests.hardware.bench import AGENT, DeviceBench, Terminal
 from tests.hardware.test_device_processes import records
 
 pytestmark = pytest.mark.process
@@ -66,7 +68,7 @@ def probe(folder, *, identity='"p-1"', read=None, health="{}", fileno="None") ->
         ({"fileno": "self.file.fileno()"}, "got a regular file's, which always is: return None"),
         ({"health": "[1]"}, "expected a mapping of what is known of its state, got [1]"),
         ({"read": "return Sample(values={'level': float('nan')}, taken_s=time.monotonic())"},
-         "no sample of finite numbers (level_not_finite "),
+         "no sample for 1 s, where rate_hz (50) promises one every 0.02 s; so far level_not_finite "),
     ],
 )  # fmt: skip
 def test_a_wrong_answer_is_told_and_ends_no_process(tmp_path, wrong, told):
@@ -122,3 +124,29 @@ def test_a_driver_that_ends_its_process_at_once_is_told_by_its_exit_code(tmp_pat
         result = bench.close()["pi22/probe"]
 
     assert result["why"] == "exit code 3"
+
+
+def test_a_line_that_sends_no_frame_is_told_by_its_bytes(tmp_path):
+    terminal = Terminal()
+    launch = DeviceLaunch(
+        name="line",
+        place="pi22",
+        kind="serial",
+        base_directory=str(tmp_path),
+        rate_hz=20.0,
+        parameters={"port": terminal.port},
+        users=(AGENT,),
+    )
+    bench = DeviceBench(tmp_path, (launch,))
+    try:
+        os.write(terminal.fd, b"no line feed")
+        bench.start_time()
+        bench.until(lambda: "lost" in bench.statuses("line"))
+    finally:
+        result = bench.close()["pi22/line"]
+        terminal.close()
+
+    told = (
+        "no sample for 1 s, where rate_hz (20) promises one every 0.05 s; so far received_bytes 12"
+    )
+    assert result["why"] == told

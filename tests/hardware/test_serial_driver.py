@@ -74,6 +74,16 @@ def test_half_a_frame_is_kept_until_its_end_comes(line):
     assert wait_for(device) == b"halves"
 
 
+def test_what_came_and_what_was_no_frame_outlive_the_opening(line):
+    device, ours = line
+    counts = {}
+    device.count = lambda name, number: counts.update({name: counts.get(name, 0) + number})
+    os.write(ours, b"x" * 2000 + b"\ngood\n")
+    assert wait_for(device) == b"good"
+
+    assert counts == {"received_bytes": 2006, "garbage_bytes": 2001, "bad_checksums": 0}
+
+
 def test_a_line_that_is_pulled_out_is_gone(line):
     device, ours = line
     os.close(ours)

@@ -105,7 +105,12 @@ class SerialDevice(Device):
             raise MachineError(f"{self.parameters.port} is gone: {error.strerror}") from None
         if data:
             self._taken_s = monotonic()
-            self._frames = self._framer.feed(data)[::-1]
+            framer = self._framer
+            before = framer.garbage_bytes, framer.bad_checksums
+            self._frames = framer.feed(data)[::-1]
+            self.count("received_bytes", len(data))
+            self.count("garbage_bytes", framer.garbage_bytes - before[0])
+            self.count("bad_checksums", framer.bad_checksums - before[1])
             self._is_drained = bool(self._frames)
         elif _is_hung_up(self._fd):  # an idle line reads as empty, too
             raise MachineError(f"{self.parameters.port} is gone: end of file")
