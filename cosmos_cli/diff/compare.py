@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -17,7 +17,7 @@ from cosmos_cli.diff.stream import (
     identical_stream,
 )
 from cosmos_cli.evidence.completeness import mapping_at
-from cosmos_cli.evidence.simulation_calls import call_simulation
+from cosmos_cli.evidence.simulation_calls import call_simulation, check_blocks, json_document
 from cosmos_cli.evidence.tables import no_tables, open_recorded_run
 from cosmos_cli.evidence.verdict import is_number
 from madns_runtime.analysis.tables import ComparedRun
@@ -231,6 +231,10 @@ def _compare_by_simulation(
             f"compare() must return a madns_runtime.analysis.values.SimulationDifference,"
             f" got {type(found).__name__}"
         )
+    if found is not None:
+        check_blocks(found.blocks, "compare()")
+        told = json_document(found.document, "compare()'s document")
+        found = replace(found, document=told)
     result.by_simulation = found
 
 

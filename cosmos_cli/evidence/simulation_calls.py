@@ -11,12 +11,16 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+import orjson
+
 from cosmos_cli.models.separate_process import SeparateDefect, SeparateFailure, work_separately
 from madns_runtime.analysis.plain import from_plain, to_plain
+from madns_runtime.analysis.values import Block
 from madns_runtime.config import RunConfig
 from madns_runtime.errors import MadnsError, PluginError
 from madns_runtime.plugin.isolation import call_plugin
 from madns_runtime.plugin.registry import is_shipped, load_function, resolve
+from madns_runtime.recording.encoding import to_plain as plain_array
 
 Tell = Callable[[str], None]
 Part = Literal["figures", "document", "compare"]
@@ -56,6 +60,49 @@ def call_simulation(config: RunConfig, part: Part, *arguments: Any) -> tuple[str
         raise PluginError(found["fault"])
     name, value = from_plain(found["value"])
     return name, value
+
+
+def json_document(told: Any, doing: str) -> dict[str, Any]:
+    """
+    Return what a simulation tells in numbers as JSON holds it: arrays are lists, and what is not finite is null.
+
+    Args:
+        told: By the simulation.
+        doing: The call, for the message.
+
+    Raises:
+        PluginError: It is no mapping, or holds what JSON does not.
+    """
+    if not isinstance(told, Mapping):
+        raise PluginError(f"{doing} must return a mapping, got {type(told).__name__}")
+    try:
+        text = orjson.dumps(dict(told), plain_array, orjson.OPT_SERIALIZE_NUMPY)
+    except TypeError as error:
+        raise PluginError(
+            f"{doing} must return plain values: {error.__cause__ or error}"
+        ) from error
+    document: dict[str, Any] = orjson.loads(text)
+    return document
+
+
+def check_blocks(blocks: Any, doing: str) -> None:
+    """
+    Refuse what is shown nowhere, such as a mark without its figure.
+
+    Args:
+        blocks: Of a section or of a comparison.
+        doing: The call, for the message.
+
+    Raises:
+        PluginError: It is no list of blocks.
+    """
+    listed = blocks if isinstance(blocks, list | tuple) else [blocks]
+    wrong = [block for block in listed if not isinstance(block, Block)]
+    if wrong or listed is not blocks:
+        raise PluginError(
+            f"{doing} must give blocks as a list of Figure, SpaceFigure, TableBlock and ReportRemark, got"
+            f" {type((wrong or [blocks])[0]).__name__}"
+        )
 
 
 def _call(config: RunConfig, part: Part, arguments: tuple[Any, ...], tell: Tell) -> tuple[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any
 from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.evidence.datagrams import WORDS
 from cosmos_cli.evidence.run_directory import RunDirectory
-from cosmos_cli.evidence.simulation_calls import call_simulation
+from cosmos_cli.evidence.simulation_calls import call_simulation, check_blocks, json_document
 from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.evidence.tables import no_tables, open_recorded_run
 from cosmos_cli.evidence.verdict import is_number
@@ -95,12 +95,11 @@ def with_simulation(
         return dict(document)
     try:
         _, told = call_simulation(recorded.config, "document", recorded)
-        if not isinstance(told, Mapping | None):
-            raise PluginError(f"document() must return a mapping, got {type(told).__name__}")
+        told = {} if told is None else json_document(told, "document()")
     except PluginError as error:
         warn(f"{recorded.config.simulation} tells nothing itself: {error}")
         return dict(document)
-    return {**(told or {}), **document}
+    return {**told, **document}
 
 
 def _simulation_sections(recorded: RecordedRun) -> list[Section]:
@@ -114,6 +113,8 @@ def _simulation_sections(recorded: RecordedRun) -> list[Section]:
             return []
         if not isinstance(found, list) or not all(isinstance(one, Section) for one in found):
             raise PluginError("figures() must return madns_runtime.analysis.values.Section")
+        for section in found:
+            check_blocks(section.blocks, f"figures(), in section {section.title!r:.80},")
     except PluginError as error:
         return [
             Section(

@@ -122,6 +122,13 @@ BROKEN = {
         "    return [Section(title='s', blocks=[table])]",
         "figures hold numbers, texts and values of theirs",
     ),
+    "draws a mark without its figure": (
+        "from madns_runtime.analysis.values import *\n"
+        "def figures(run):\n"
+        "    return [Section(title='s', blocks=[Series(x=[1, 2], y=[1, 2])])]",
+        "figures(), in section 's', must give blocks as a list of Figure, SpaceFigure, TableBlock and ReportRemark,"
+        " got Series",
+    ),
     "draws what does not fit together": (
         "from madns_runtime.analysis.values import *\n"
         "def figures(run):\n    return [Series(x=[1, 2], y=[1])]",
@@ -168,6 +175,50 @@ def test_comparison_of_a_plug_in_that_fails_is_told_and_the_records_are_compared
     assert [stream["table"] for stream in document["streams"] if not stream["identical"]] == [
         "path"
     ]
+
+
+ARRAYS = "{'x_m': np.array([1.0, np.nan]), 'mean_m': float('nan'), 'count': np.int64(2)}"
+PLAIN = {"x_m": [1.0, None], "mean_m": None, "count": 2}
+
+
+def test_arrays_and_numbers_that_are_not_finite_are_lists_and_null_in_the_json(
+    drive, tmp_path, capsys
+):
+    made = drive()
+    drive(north_m=7.0)
+    (tmp_path / "figures.py").write_text(
+        "import numpy as np\nfrom madns_runtime.analysis.values import SimulationDifference\n"
+        f"def document(run):\n    return {ARRAYS}\n"
+        f"def compare(a, b):\n    return SimulationDifference(document={ARRAYS}, blocks=[])"
+    )
+    document = made.run.read_json(made.run.run_json)
+
+    told = with_simulation(made.run, document, pytest.fail)
+    assert app.run(["diff", "1", "2", "--json", "--quiet"]) == 0
+    compared = json.loads(capsys.readouterr().out)
+
+    assert {name: told[name] for name in PLAIN} == compared["rover"] == PLAIN
+
+
+@pytest.mark.parametrize(
+    ("document", "blocks", "fault"),
+    [
+        ("'x'", "[]", "compare()'s document must return a mapping, got str"),
+        ("{}", "'table'", "compare() must give blocks as a list of Figure"),
+    ],
+)
+def test_a_comparison_of_other_values_is_a_remark(drive, tmp_path, capsys, document, blocks, fault):
+    drive(), drive(north_m=7.0)
+    (tmp_path / "figures.py").write_text(
+        "from madns_runtime.analysis.values import SimulationDifference\n"
+        f"def compare(a, b):\n    return SimulationDifference(document={document}, blocks={blocks})"
+    )
+
+    assert app.run(["diff", "1", "2", "--json", "--quiet"]) == 0
+    compared = json.loads(capsys.readouterr().out)
+
+    assert any(fault in remark for remark in compared["remarks"])
+    assert "rover" not in compared
 
 
 def test_numbers_of_a_simulation_stand_in_the_json_and_never_over_the_run_s_own(drive, tmp_path):
