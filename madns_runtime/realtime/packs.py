@@ -16,6 +16,7 @@ from typing import Protocol
 from madns_runtime.config import Agents
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.realtime.process_port import ProcessPort
+from madns_runtime.realtime.wake_lead import LEAD_S_MAX, WakeLead
 from madns_runtime.timing.rate import stagger
 
 PACK_AGENTS_MAX = 8
@@ -49,8 +50,12 @@ class Pack:
 
     def __init__(self, phase_s: float, *, reactor: Reactor, process: ProcessPort) -> None:
         self.phase_s = phase_s
+        self._reactor = reactor
         self._process = process
         self._members: list[PackMember] = []
+        self._lead = WakeLead()
+        self._due_s = math.inf
+        """The deadline that it wakes for, s of the local clock."""
         # Infinite is never: the timer is made once and moved.
         self._timer = reactor.call_at(math.inf, self._due)
 
@@ -69,7 +74,8 @@ class Pack:
             deadline_s = member.next_deadline_s()
             if deadline_s < earliest_s:
                 earliest_s, first = deadline_s, member
-        self._timer.reschedule(math.inf if first is None else first.local_s(earliest_s))
+        self._due_s = math.inf if first is None else first.local_s(earliest_s)
+        self._timer.reschedule(self._due_s - self._lead.lead_s)
 
     def _due(self) -> None:
         members, process = self._members, self._process
@@ -77,6 +83,7 @@ class Pack:
         if is_shared:
             process.begin()
         process.account.begin_ticks(monotonic())
+        self._wait_for_deadline()
         try:
             for member in members:
                 member.tick()
@@ -87,6 +94,16 @@ class Pack:
             if is_shared:
                 process.end()
         self.arm()
+
+    def _wait_for_deadline(self) -> None:
+        """Wait for what is left until the deadline, LEAD_S_MAX at most, and learn from a wake-up out of sleep."""
+        ordered_s, now_s = self._timer.when_s, monotonic()
+        slept_from_s, slept_to_s = self._reactor.last_sleep
+        if slept_from_s <= ordered_s <= slept_to_s:
+            self._lead.learn(now_s - ordered_s)
+        until_s = min(self._due_s, ordered_s + LEAD_S_MAX)
+        while now_s < until_s:
+            now_s = monotonic()
 
 
 def split_into_packs(names: Sequence[str]) -> list[Sequence[str]]:

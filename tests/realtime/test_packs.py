@@ -9,6 +9,7 @@ import pytest
 
 from madns_runtime.config import Agents
 from madns_runtime.realtime.packs import PACK_AGENTS_MAX, Pack, phase_of, split_into_packs
+from madns_runtime.realtime.wake_lead import LEAD_S_MAX, WakeLead
 
 
 @pytest.mark.parametrize(
@@ -76,6 +77,8 @@ PROCESS = SimpleNamespace(
 
 
 class Loop:
+    last_sleep = (-math.inf, -math.inf)
+
     def call_at(self, when_s, callback):
         self.timer = SimpleNamespace(when_s=when_s)
         self.timer.reschedule = lambda at_s: setattr(self.timer, "when_s", at_s)
@@ -113,3 +116,74 @@ def test_it_wakes_for_whoever_is_due_first_and_no_more_when_nobody_is():
     early.due_s = late.due_s = math.inf
     pack.arm()
     assert loop.timer.when_s == math.inf
+
+
+class Clock:
+    """A clock that goes on by so much with each look."""
+
+    def __init__(self, monkeypatch, at_s, step_s):
+        self.at_s, self.step_s = at_s, step_s
+        monkeypatch.setattr("madns_runtime.realtime.packs.monotonic", self)
+
+    def __call__(self):
+        self.at_s += self.step_s
+        return self.at_s
+
+
+class Observer(Member):
+    """Notes when it ticks."""
+
+    def __init__(self, due_s, clock):
+        super().__init__(due_s)
+        self.clock, self.ticked_s = clock, []
+
+    def tick(self):
+        self.ticked_s.append(self.clock.at_s)
+        super().tick()
+
+
+def wake(loop, clock, *, took_s, is_asleep=True):
+    """Let the loop's timer fire, so long before what follows."""
+    clock.at_s = loop.timer.when_s + took_s
+    loop.last_sleep = (0.0, clock.at_s) if is_asleep else (0.0, loop.timer.when_s - 1e-6)
+    loop.due()
+
+
+def test_it_wakes_ahead_of_its_deadline_by_what_waking_takes_and_ticks_at_it(monkeypatch):
+    clock = Clock(monkeypatch, 100.0, 1e-7)
+    member = Observer(1.0, clock)
+    loop, pack = pack_of(member)
+    pack.arm()
+    for _ in range(200):
+        wake(loop, clock, took_s=50e-6)
+
+    late_s = [at_s - (101.0 + 0.5 * count) for count, at_s in enumerate(member.ticked_s)]
+    assert late_s[0] == pytest.approx(50e-6, abs=1e-6)
+    assert all(0.0 <= each < 6e-6 for each in late_s[-50:])
+    assert member.due_s + 100.0 - loop.timer.when_s == pytest.approx(50e-6, abs=5e-6)
+
+
+def test_a_wake_up_of_a_loop_that_was_at_work_tells_nothing(monkeypatch):
+    clock = Clock(monkeypatch, 100.0, 1e-7)
+    member = Observer(1.0, clock)
+    loop, pack = pack_of(member)
+    pack.arm()
+    for _ in range(50):
+        wake(loop, clock, took_s=80e-6, is_asleep=False)
+
+    assert loop.timer.when_s == member.due_s + 100.0
+
+
+def test_it_never_waits_for_long_and_a_late_wake_up_weighs_as_any_other():
+    lead = WakeLead()
+    for _ in range(1000):
+        lead.learn(5e-3)
+    assert lead.lead_s == LEAD_S_MAX
+
+    calm = WakeLead()
+    for count in range(4000):
+        calm.learn(10.0 if count % 10 == 0 else 40e-6)
+    assert calm.lead_s == pytest.approx(40e-6, abs=5e-6)
+    for _ in range(100):
+        calm.learn(0.0)
+    assert calm.lead_s == 0.0
