@@ -8,7 +8,9 @@ file is always created, exclusively, and a name that is taken is not used. Stand
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -47,6 +49,25 @@ def create_partial(path: Path, *, mode: int = 0o666, takes_over: bool = False) -
             return partial, os.open(partial, FLAGS, mode)
     partial = _random_name(path)
     return partial, os.open(partial, FLAGS, mode)
+
+
+def check_replaceable(path: Path) -> None:
+    """
+    See that a file may take the place of what a person named: root's would take that of /dev/null, for everybody.
+
+    Raises:
+        OSError: There is a device, a pipe or a socket, or a link of the system to one, such as /dev/stdout.
+    """
+    try:
+        mode = path.stat().st_mode
+    except OSError:  # nothing is there, or nothing can be written there either
+        mode = stat.S_IFREG
+    is_file = stat.S_ISREG(mode) or stat.S_ISDIR(mode)
+    folder = path.parent.resolve()
+    is_systems = folder == Path("/dev") or folder.is_relative_to("/proc")
+    if not is_file or (is_systems and path.is_symlink()):
+        why = "it is a device, a pipe or a stream, and no file; name a file"
+        raise OSError(errno.EINVAL, why, str(path))
 
 
 @contextlib.contextmanager

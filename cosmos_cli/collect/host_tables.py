@@ -23,6 +23,7 @@ from cosmos_cli.evidence.table_labels import TableLabels
 from cosmos_cli.evidence.tables import TableLayout, TableWriter
 from madns_runtime.config import RunConfig
 from madns_runtime.errors import PluginError
+from madns_runtime.partial_file import check_replaceable
 from madns_runtime.plugin.api import Tabulated
 from madns_runtime.plugin.code_places import place_of
 from madns_runtime.plugin.isolation import call_plugin
@@ -103,6 +104,7 @@ def write_table(
         InputError: It cannot be written.
     """
     try:
+        check_replaceable(path)
         return _write(parts, layout, path, agents=agents, progress=progress)
     except (OSError, pa.ArrowException) as error:
         why = getattr(error, "strerror", None) or error

@@ -17,6 +17,7 @@ from cosmos_cli.report.build import build_sections, with_simulation
 from cosmos_cli.report.html import write_report
 from cosmos_cli.report.terminal import print_report
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
+from madns_runtime.partial_file import check_replaceable
 
 
 def report(
@@ -46,6 +47,7 @@ def report(
         console.print_json(with_simulation(found, document, console.warn))
     if html is not None:
         try:
+            check_replaceable(html)
             console.say(f"report written to {write_report(found, document, html)}")
         except OSError as error:
             raise InputError(f"{html}: cannot be written: {error.strerror or error}") from error

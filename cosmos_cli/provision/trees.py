@@ -303,8 +303,15 @@ def is_name_of_tree(name: str) -> bool:
 
 def is_folder_of_tree(path: Path) -> bool:
     """Tell whether a folder belongs to a tree: no cache, virtual environment or run."""
-    is_run = RUN_NAME.match(path.name) is not None and (path / "plan.json").exists()
-    return not (is_run or path.name in CACHE_FOLDERS or (path / "pyvenv.cfg").exists())
+    return not (_is_run(path) or path.name in CACHE_FOLDERS or (path / "pyvenv.cfg").exists())
+
+
+def _is_run(path: Path) -> bool:
+    """Tell whether a folder is a run's: by its name and part of what it holds, or renamed, as a copy is, by all of it."""
+    is_planned = (path / "plan.json").exists()
+    has_records = (path / "host").is_dir() and (path / "agents").is_dir()
+    is_named = RUN_NAME.match(path.name) is not None
+    return (is_planned or has_records) if is_named else (is_planned and has_records)
 
 
 def _refuse_outside(path: Path, top: Path) -> None:

@@ -19,7 +19,7 @@ import typer
 from cosmos_cli.errors import InputError
 from cosmos_cli.testing.check_lines import broken_checks, check_line
 from cosmos_cli.ui.foreign_text import clean_line, clean_text
-from madns_runtime.partial_file import write_whole
+from madns_runtime.partial_file import check_replaceable, write_whole
 
 SUITE: Final = "cosmos"
 TEXT_CHARACTERS_MAX: Final = 20_000
@@ -115,6 +115,7 @@ def check_junit(path: Path | None) -> None:
         return
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        check_replaceable(path)
     except OSError as error:
         raise _unwritable(path, error.strerror) from error
     if path.is_dir():
@@ -138,6 +139,7 @@ def write_junit(
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        check_replaceable(path)
         write_whole(path, junit_text(cases, seconds=seconds, started_utc=started_utc))
     except OSError as error:
         raise _unwritable(path, error.strerror) from error

@@ -270,9 +270,10 @@ def let_go_of_output(lost: object = None) -> None:
         sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - as long as the process
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (sys.stdout, sys.stderr):
+        is_lost = stream is lost
         try:
             stream.flush()
-            if lost is stream:
+            if is_lost:
                 os.dup2(nowhere, stream.fileno())
         except OSError:
             os.dup2(nowhere, stream.fileno())

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from madns_runtime.analysis.sampling import points_per_series, thin
+from madns_runtime.analysis.sampling import points_per_series, thin_pieces
 from madns_runtime.analysis.tables import AGENT, RecordedRun, RecordedTable
 from madns_runtime.analysis.values import (
     SIMULATED_TIME,
@@ -27,6 +28,7 @@ GROUP_SIZE = 5
 GROUP_RANGE = " … "
 """Between the first and the last name of a group."""
 FIGURES_MAX = 12
+NOWHERE: NDArray[np.int64] = np.empty(0, dtype=np.int64)
 TIME_FIELDS = ("t_s", "tick", "packet", "monotonic_s")
 
 
@@ -46,6 +48,7 @@ def grouped_lines(  # noqa: PLR0913 - what is drawn and how it is lettered; all 
     form: Literal["line", "steps", "points", "joined points"] = "line",
     group: str = "agents",
     limits: Sequence[LimitLine] = (),
+    returns: Mapping[str, NDArray[np.int64]] | None = None,
 ) -> list[Block]:
     """
     Return one figure of a quantity of many, thinned; a remark if there is not a single value.
@@ -59,15 +62,17 @@ def grouped_lines(  # noqa: PLR0913 - what is drawn and how it is lettered; all 
         form: How values are joined.
         group: Figures of one group change their choice together.
         limits: What should not be passed.
+        returns: Numbers of the samples before which the line is broken, by whose they are.
     """
     points = points_per_series(len(series))
     choices = []
+    starts = returns or {}
     for label, names in groups_of_agents(tuple(series)):
         marks = [
             Series(x=thinned[0], y=thinned[1], name=name, form=form)
             for name in names
             if np.isfinite(series[name][1]).any()
-            for thinned in [thin(*series[name], points)]
+            for thinned in [thin_pieces(*series[name], starts.get(name, NOWHERE), points)]
         ]
         if marks:
             choices.append(FigureChoice(name=label, marks=marks))
@@ -107,6 +112,7 @@ def field_lines(  # noqa: PLR0913 - a field, and how it is lettered
         y=y,
         note=note,
         group="agents" if is_of_agents else table.role,
+        returns={who: run.returns(table, who) for who in series if who in table.sources},
     )
 
 

@@ -61,6 +61,32 @@ def thin(x: Floats, y: Floats, points_max: int) -> tuple[Floats, Floats]:
     return x[chosen], y[chosen]
 
 
+def with_breaks(x: Floats, y: Floats, starts: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """
+    Put a sample of NaN before each of some: no line is drawn to it from the one before.
+
+    Args:
+        x: Abscissae, shape (N,); of a break it is that of the sample behind it.
+        y: Ordinates, shape (N,) or (N, M).
+        starts: Numbers of samples.
+    """
+    if not len(starts):
+        return x, y
+    return np.insert(x, starts, x[starts]), np.insert(y, starts, np.nan, axis=0)
+
+
+def thin_pieces(
+    x: Floats, y: Floats, starts: NDArray[np.int64], points_max: int
+) -> tuple[Floats, Floats]:
+    """Thin as `thin` does, each piece that begins at one of *starts* by itself, with a break before it."""
+    pieces = list(zip(np.split(x, starts), np.split(y, starts), strict=True))
+    room = points_max - len(starts)
+    thinned = [thin(*piece, max(room * len(piece[0]) // max(len(x), 1), 2)) for piece in pieces]
+    heads = np.cumsum([len(piece[0]) for piece in thinned])[:-1]
+    joined = [np.concatenate(columns) for columns in zip(*thinned, strict=True)]
+    return with_breaks(joined[0], joined[1], heads)
+
+
 def evenly(count: int, points_max: int) -> NDArray[np.int64]:
     """Return indices of at most *points_max* of *count* samples, evenly spread, both ends included."""
     if count <= points_max:

@@ -20,6 +20,7 @@ from madns_runtime.plain_values import mapping_at
 from madns_runtime.recording.records import Field
 
 AGENT = "agent"
+INCARNATION = "incarnation"
 Columns = Mapping[str, NDArray[Any]]
 """By the fields' names, shape (N,) each: numbers as float64 with null as NaN or as int64, the rest as objects."""
 
@@ -154,6 +155,13 @@ class RecordedRun:
                 label = f"{source} · {agent}" if table.role == AGENT else agent
                 found[label] = (x[rows], y[rows])
         return found, axis
+
+    def returns(self, table: RecordedTable, source: str) -> NDArray[np.int64]:
+        """Return the numbers of the records with which an agent that was away goes on, as its next incarnation."""
+        if not table.has(INCARNATION):
+            return np.empty(0, dtype=np.int64)
+        lives = as_array(table.read(source, (INCARNATION,))[INCARNATION])
+        return np.flatnonzero(np.diff(lives)) + 1
 
     def values(self, table: RecordedTable, source: str, name: str) -> Floats:
         """Return one field of a source as floats, null as NaN."""

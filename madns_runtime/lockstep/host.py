@@ -244,6 +244,8 @@ class LockstepHost:
                 account.agents[number].peer_messages = counts
                 account.agents[number].columns = newest
         account.set_states("complete")
+        # The view's last picture stays on the terminal: without this one of some moment before the end.
+        self._meeting.operator.emit(account.progress(self._clock.t_s, monotonic()))
         account.simulation = self._guarded.finish()
 
     def _t_s(self) -> float | None:

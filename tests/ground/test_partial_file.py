@@ -8,7 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from madns_runtime.partial_file import SUFFIX, create_partial, partial_file, write_whole
+from madns_runtime.partial_file import (
+    SUFFIX,
+    check_replaceable,
+    create_partial,
+    partial_file,
+    write_whole,
+)
 
 
 def mode(path):
@@ -64,6 +70,20 @@ def test_link_under_the_name_itself_is_replaced_and_not_followed(tmp_path):
 
     assert victim.read_bytes() == b"precious"
     assert not (tmp_path / "a").is_symlink()
+
+
+def test_devices_pipes_and_streams_are_no_place_for_a_file(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "null").symlink_to("/dev/null")
+    (tmp_path / "link").symlink_to(tmp_path / "file")
+    (tmp_path / "file").touch()
+
+    named = ["/dev/null", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"]
+    for path in (*map(Path, named), tmp_path / "pipe", tmp_path / "null"):
+        with pytest.raises(OSError, match="a device, a pipe or a stream, and no file"):
+            check_replaceable(path)
+    for name in ("file", "link", "new", "no/such/file"):
+        check_replaceable(tmp_path / name)
 
 
 def test_link_that_is_laid_again_and_again_is_evaded(tmp_path, monkeypatch):

@@ -93,7 +93,10 @@ def test_the_host_tells_how_far_it_is_and_how_fast(start_host):
         "SIMULATION_START",
         "SIMULATION_COMPLETE",
     ]
-    assert any(event["event"] == "progress" and event["is_lockstep"] for event in run.events)
+    last = [event for event in run.events if event["event"] == "progress"][-1]
+    assert last["is_lockstep"]
+    told = (last["t_s"], last["running"], last["complete"])
+    assert told == (result["duration_s"], 0, len(result["agents"]))
     assert result["rtf"] == pytest.approx(result["duration_s"] / result["wall_s"], abs=1e-2)
     assert run.process.returncode == 0
 

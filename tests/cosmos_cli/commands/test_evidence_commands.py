@@ -112,6 +112,17 @@ def test_report_to_an_impossible_path_is_bad_input(made, tmp_path, capsys):
     assert "no/such/here.html: cannot be written" in capsys.readouterr().err
 
 
+def test_report_takes_no_devices_place(made, tmp_path, capsys):
+    finish(made)
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+
+    assert app.run(["report", "1", "--html", str(pipe)]) == 2
+
+    assert "pipe: cannot be written: it is a device, a pipe or a stream" in capsys.readouterr().err
+    assert pipe.is_fifo()
+
+
 def test_report_of_a_run_that_is_not_collected_says_what_to_do(made, capsys):
     assert app.run(["report", "1"]) == 2
 

@@ -21,6 +21,7 @@ from cosmos_cli.provision import trees
 from cosmos_cli.provision.environment import ask_installed, installed_request
 from cosmos_cli.provision.trees import (
     TreeFile,
+    is_folder_of_tree,
     runtime_tree,
     scenario_tree,
     send_tree,
@@ -114,6 +115,24 @@ def test_tree_holds_the_scenarios_files_and_no_more(folder):
     (folder / "empty").mkdir()
 
     assert paths(the_tree(folder)) == ["data/orbits.csv", "flight.py", "small.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("name", "lacks", "belongs"),
+    [
+        ("copy of a run", (), False),
+        ("copy of a run", ("plan.json",), True),  # whatever it is
+        ("0007-small", ("plan.json",), False),
+        ("0007-small", ("host", "agents"), False),
+        ("0007-small", ("plan.json", "host"), True),
+        ("flight", ("host", "agents"), True),
+    ],
+)
+def test_runs_belong_to_no_tree_whatever_they_are_called_and_lack(tmp_path, name, lacks, belongs):
+    for part in {"plan.json", "host", "agents"}.difference(lacks):
+        (tmp_path / name / part).mkdir(parents=True)
+
+    assert is_folder_of_tree(tmp_path / name) == belongs
 
 
 def test_hash_is_of_names_contents_and_execute_bits_alone(folder, tmp_path):

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from harness.synthetic_run import STATE, T0_UTC, SyntheticRun, make_config
+from harness.synthetic_run import RECORDING, STATE, T0_UTC, SyntheticRun, make_config
 
 from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.report.build import MACHINE_CHAPTERS, build_sections, figures_of
@@ -13,7 +13,7 @@ from cosmos_cli.report.cells import format_cell
 from cosmos_cli.report.html import encode_array, render_page
 from cosmos_cli.report.plotly_figures import to_plotly
 from madns_runtime.analysis.chapters import Chapter
-from madns_runtime.analysis.sampling import BinCounts, TimeEnvelope, evenly, thin
+from madns_runtime.analysis.sampling import BinCounts, TimeEnvelope, evenly, thin, thin_pieces
 from madns_runtime.analysis.values import (
     Figure,
     FigureChoice,
@@ -23,6 +23,8 @@ from madns_runtime.analysis.values import (
     SpaceFigure,
     TableBlock,
 )
+from madns_runtime.recording.record_files import RecordFiles
+from madns_runtime.recording.recorder import Recorder
 from madns_runtime.recording.records import LOG, Field, StreamSchema
 
 INVARIANTS = StreamSchema(
@@ -344,6 +346,43 @@ def test_thinning_survives_gaps_and_shows_them():
     assert np.nanmax(thin_y) == 199.0
     assert np.isnan(thin_y[0])
     assert np.isnan(thin_y[-1])
+
+
+def test_pieces_are_thinned_by_themselves_with_a_break_between():
+    x = np.arange(1000.0)
+    x[400:] += 5000.0
+
+    thin_x, thin_y = thin_pieces(x, x, np.array([400]), 100)
+
+    (gap,) = np.flatnonzero(np.isnan(thin_y))
+    assert len(thin_x) <= 100
+    assert (thin_y[gap - 1], thin_x[gap], thin_y[gap + 1]) == (399.0, 5400.0, 5400.0)
+
+
+def test_no_line_is_drawn_through_the_time_that_an_agent_was_away(tmp_path):
+    made = SyntheticRun(tmp_path, make_config(1)).write(with_states=True)
+    again = RecordFiles(made.run.path / "agents/agent-01", run="x", source="agent-01", life=2)
+    recorder = Recorder(again, RECORDING)
+    for schema in (STATE, ELEMENTS):
+        recorder.open_stream(schema)
+    recorder.set_t0(T0_UTC)
+    for tick in range(5000, 5010):
+        recorder.record("state", (tick, 7.158e6, 0.0, 0.0, 0.0, 7462.0, 0.0))
+        recorder.record("elements", (tick, 7.158e6, 86.4))
+    recorder.close()
+    first = made.recorder("agents/agent-01", "agent-01", ELEMENTS)
+    first.record("elements", (0, 7.158e6, 86.4))
+    first.close()
+
+    _, sections = build(made)
+
+    orbits, *others = [b for b in sections["Orbits"] if isinstance(b, Figure | SpaceFigure)]
+    flown = next(path.points for path in orbits.paths if path.name.startswith("agent-01"))
+    assert np.isnan(flown[:, 0]).sum() == 1
+    for figure in others:
+        assert [np.isnan(mark.y).sum() for mark in figure.choices[0].marks] == [
+            1 for _ in figure.choices[0].marks
+        ]
 
 
 def test_few_samples_are_not_thinned():

@@ -51,6 +51,9 @@ const look = () => {
   data.requests = performance.getEntriesByType("resource").filter((e) => !/^(data|blob):/.test(e.name)).length;
   data.scripts = document.scripts.length;
   data.shown = document.documentElement.innerHTML.split("{{plotly}}&lt;/script&gt;").length - 1;
+  const behind = [...document.querySelectorAll("td.n + td:not(.n), th.n + th:not(.n)")];
+  data.behind = behind.length;
+  data.touching = behind.filter((cell) => parseFloat(getComputedStyle(cell).paddingLeft) < 5).length;
   data.inspected = "yes";
 };
 look();
@@ -122,6 +125,8 @@ def test_every_figure_draws_without_an_error_or_a_request(page):
     assert told["drawn"] == told["figures"]
     assert (told["failed"], told["errors"], told["empty"]) == ("0", "", "")
     assert (told["requests"], told["violations"]) == ("0", "0")
+    assert int(told["behind"]) > 0
+    assert told["touching"] == "0"  # words do not touch the number before them
 
 
 def test_page_shows_what_a_run_said_and_does_nothing_of_it(hostile_page):

@@ -1,5 +1,6 @@
 """Results as JUnit XML that other programs read."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -102,3 +103,6 @@ def test_what_could_not_be_written_is_told_before_anything_runs(tmp_path):
         check_junit(tmp_path / "file/j.xml")
     with pytest.raises(InputError, match="cannot be written: it is a folder; name a file"):
         check_junit(tmp_path)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="cannot be written: it is a device, a pipe or a stream"):
+        check_junit(tmp_path / "pipe")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from madns_runtime.analysis.lines import generic_blocks, grouped_lines
-from madns_runtime.analysis.sampling import evenly, thin
+from madns_runtime.analysis.sampling import evenly, thin_pieces, with_breaks
 from madns_runtime.analysis.tables import RecordedRun, RecordedTable
 from madns_runtime.analysis.values import (
     Axis,
@@ -108,13 +108,14 @@ def elements_blocks(table: RecordedTable, run: RecordedRun) -> list[Block]:
     choices, rows = [], []
     for agent in table.sources:
         t_s, _ = run.time_of(table, agent)
+        returns = run.returns(table, agent)
         marks = []
         columns = [run.values(table, agent, f.name) * _scale(f.unit) for f in fields]
         for panel, (field, values) in enumerate(zip(fields, columns, strict=True)):
             shown = values
             if field.name == NODE and np.isfinite(values).all():
                 shown = np.unwrap(values, period=360.0)  # it moves slowly, over 360 deg as well
-            x, y = thin(t_s, shown, points)
+            x, y = thin_pieces(t_s, shown, returns, points)
             marks.append(Series(x=x, y=y, panel=panel, tone="main"))
         choices.append(FigureChoice(name=_satellite(run, agent), marks=marks))
         rows.append([_satellite(run, agent), *(_last(values) for values in columns)])
@@ -232,7 +233,12 @@ def _read_state(
         for part in (0, 1)
     )
     chosen = _drawn(t_s, r_km, v_km_s, _points(len(table.sources)))
-    return t_s[chosen], r_km[chosen], v_km_s[chosen], _satellite(run, agent)
+    # One that was away has no line through what it did not fly, least of all through the Earth.
+    returns = np.unique(np.searchsorted(chosen, run.returns(table, agent)))
+    returns = returns[(returns > 0) & (returns < len(chosen))]
+    _, r_km = with_breaks(t_s[chosen], r_km[chosen], returns)
+    t_s, v_km_s = with_breaks(t_s[chosen], v_km_s[chosen], returns)
+    return t_s, r_km, v_km_s, _satellite(run, agent)
 
 
 def _drawn(t_s: Floats, r_km: Floats, v_km_s: Floats, points: int) -> NDArray[np.int64]:
