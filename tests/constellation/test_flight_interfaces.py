@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -346,6 +347,21 @@ def test_one_that_hangs_in_lockstep_is_named_and_killed(tmp_path):
         ship.run(1)
 
     assert not Path(f"/proc/{ship.process.pid}").exists()
+
+
+@pytest.mark.parametrize("is_lockstep", [True, False])
+def test_one_that_prints_between_its_frames_is_told_what_came(tmp_path, is_lockstep):
+    flight = attached({"kind": "stdio"}) | {"answer_s": 3.0 if is_lockstep else 20.0}
+    talk = "import sys; print('debug\\0', flush=True); sys.stdin.read()"
+    flight["command"] = [sys.executable, "-c", talk]
+    ship = Ship(tmp_path, None, flight=flight, is_lockstep=is_lockstep)
+    told = r"of what it said was no good packet: corrupt \d+"
+    if is_lockstep:
+        with pytest.raises(BlamedError, match=told):
+            ship.run(1)
+        return
+    ship.run_until(lambda: any(re.search(told, text) for _, text in ship.context.logs))
+    ship.agent.finish()
 
 
 def test_one_that_floods_costs_no_tick_and_is_counted(tmp_path):
