@@ -129,9 +129,9 @@ class InlineDevice:
         One that is disconnected is made safe, and lost at once: no sample of it is heard, and nothing is put out.
 
         Raises:
-            ConfigurationError: There is no such fault, or its value is none.
+            ConfigurationError: There is no such fault, its value is none, or it would alter nothing.
         """
-        self._intake.faults.insert(action, value)
+        self._intake.insert_fault(action, value)
         now_s = self._now_s()
         self._intake.event("fault", now_s, action=action, value=value)
         is_open = self._page.header[page.STATE] == page.OPEN

@@ -148,3 +148,45 @@ def test_a_device_that_is_disconnected_in_lockstep_takes_nothing_and_is_lost_at_
         [3.0, "lost"],
         [4.5, "ok"],
     ]
+
+
+FRAMES = """
+from madns_runtime.hardware.contract import Channel, DeviceKind, Sample, SimulatedDevice
+
+
+class Line(SimulatedDevice):
+    kind = DeviceKind(
+        name="line",
+        summary="frames",
+        channels=(Channel(name="received", is_frame=True, passing="queue"),),
+        needs_hardware=False,
+        follows_simulated_time=True,
+    )
+
+    def sample_at(self, t_s):
+        return Sample(values={"received": b"x"}, taken_s=t_s)
+"""
+BIASED = """
+name: biased
+simulation: counter
+agents: {count: 1, tick_hz: 10}
+time: {duration_s: 3, mode: lockstep}
+hardware:
+  devices: [{name: line, kind: ./line.py:Line, rate_hz: 10}]
+timeline:
+  - {at_s: 1, action: device_fault, agents: ["*"], device: line, fault: bias, value: 3}
+"""
+
+
+def test_a_fault_that_would_alter_nothing_is_refused_before_the_run(tmp_path):
+    (tmp_path / "line.py").write_text(FRAMES)
+    (tmp_path / "biased.yaml").write_text(BIASED)
+    cosmos = CosmosCommand(tmp_path)
+
+    done = cosmos("validate", "biased.yaml")
+
+    assert done.returncode == 2
+    told = "timeline[0].fault: bias is added to numbers, and line measures frames of bytes alone"
+    assert told in done.stderr
+    (tmp_path / "biased.yaml").write_text(BIASED.replace("bias, value: 3", "freeze"))
+    assert cosmos("validate", "biased.yaml").returncode == 0
