@@ -131,6 +131,7 @@ class DevicePort:
         if self._unsent or self._packs:
             self.flush()
         if messages.send(self._end, message):
+            self._unsent.pop(channel, None)  # an older one, which must not come behind it
             return
         if declared.passing == "newest":
             self._unsent[channel] = message
