@@ -424,6 +424,64 @@ class Own:
     assert ship.context.records["estimates"] == [(n, n / HZ) for n in range(5)]
 
 
+OWN = """
+from madns_runtime.simulations.constellation.flight.interface.answers import FlightAnswer
+
+
+class Own:
+    answers_by_time = False
+    faults = 3
+
+    def setup(self, setup):
+        return [b"S\\n"]
+
+    def tick(self, tick):
+        return [b"T\\n"]
+
+    def feed(self, data):
+        return [FlightAnswer() for _ in range(data.count(b"\\n"))]
+
+
+class Wrong(Own):
+    def METHOD(self, given):
+        BODY
+"""
+TALK = [sys.executable, "-c", "import sys\nfor line in sys.stdin: print('A', flush=True)"]
+
+
+@pytest.mark.parametrize(
+    ("method", "body", "told"),
+    [
+        ("feed", "return None", "Wrong.feed: expected a list of FlightAnswer, got None"),
+        ("feed", "return ['x']", r"Wrong.feed: expected a list of FlightAnswer, got \['x'\]"),
+        ("feed", "raise ValueError('odd')", r"Wrong.feed raised ValueError: odd \(own.py:2\d\)"),
+        ("tick", "return 'T'", "Wrong.tick: expected a list of bytes, got 'T'"),
+        ("tick", "return b'T'", "Wrong.tick: expected a list of bytes, got b'T'"),
+        ("setup", "return {}['x']", r"Wrong.setup raised KeyError: 'x' \(own.py:2\d\)"),
+    ],
+)
+def test_what_a_protocol_of_ones_own_does_wrong_is_told_by_its_name(tmp_path, method, body, told):
+    (tmp_path / "own.py").write_text(OWN.replace("METHOD", method).replace("BODY", body))
+    flight = attached({"kind": "stdio"}, "own.py:Wrong") | {"command": TALK}
+
+    with pytest.raises(BlamedError, match=told):
+        Ship(tmp_path, None, flight=flight).run(3)
+
+
+def test_faults_of_a_protocol_of_ones_own_that_are_no_counts_are_left_out(tmp_path):
+    (tmp_path / "own.py").write_text(OWN.partition("class Wrong")[0])
+    flight = attached({"kind": "stdio"}, "own.py:Own") | {"command": TALK}
+    flight["command"] = [
+        *TALK[:2],
+        "import sys\nsys.stdin.readline()\n" + TALK[2].partition("\n")[2],
+    ]
+    with Ship(tmp_path, None, flight=flight) as ship:
+        ship.run(2)
+
+    assert ship.summary["answers"] == 2
+    assert ship.summary["interface"]["faults"] == {}
+
+
 def test_a_socket_that_somebody_listens_at_is_left_to_him_and_one_left_behind_gives_way(tmp_path):
     transport = {"kind": "unix", "path": "a.sock", "listen": True}
     first = socket.socket(socket.AF_UNIX)
