@@ -190,3 +190,36 @@ def test_a_fault_that_would_alter_nothing_is_refused_before_the_run(tmp_path):
     assert told in done.stderr
     (tmp_path / "biased.yaml").write_text(BIASED.replace("bias, value: 3", "freeze"))
     assert cosmos("validate", "biased.yaml").returncode == 0
+
+
+FAILING = """
+
+class Failing(Valve):
+    kind = Valve.kind
+
+    def METHOD(self, *given):
+        raise ValueError("stuck")
+"""
+
+
+@pytest.mark.parametrize("method", ["open", "sample_at", "write", "make_safe", "close"])
+def test_what_a_driver_raises_in_lockstep_is_told_by_its_own_line(tmp_path, method):
+    text = VALVE.replace('        self.count("lost_bytes", 2)\n', "")
+    (tmp_path / "valve.py").write_text(text + FAILING.replace("METHOD", method))
+    (tmp_path / "mover.py").write_text(MOVER)
+    moved = MOVED.partition("timeline:")[0].replace("duration_s: 6", "duration_s: 1")
+    (tmp_path / "moved.yaml").write_text(moved.replace("valve.py:Valve", "valve.py:Failing"))
+
+    code, run = CosmosCommand(tmp_path).run(tmp_path / "moved.yaml", *LOOSE)
+
+    line = len((text + FAILING).splitlines())
+    told = f"device valve: Failing.{method} raised ValueError: stuck (valve.py:{line})"
+    device = run["devices"]["agent-01/valve"]
+    if method in ("make_safe", "close"):  # the run is over, and its account is given all the same
+        assert (device["why"], device["errors"], device["samples"]) == (told, 1, 10)
+        assert device["unsafe"] == (method == "make_safe")
+        assert ("hardware.unsafe" in run["verdict"]) == (method == "make_safe")
+        assert code == (4 if method == "make_safe" else 0)
+    else:
+        assert code == 1
+        assert told in run["verdict"]
