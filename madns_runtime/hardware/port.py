@@ -23,6 +23,7 @@ from madns_runtime.plugin.device_view import (
     DeviceStatus,
 )
 from madns_runtime.protocol.messages import FaultOrder
+from madns_runtime.recording.run_journal import RunJournal
 
 FRAMES_MAX: Final = 10_000
 """Values of a queue that may wait to be taken; the oldest are given up beyond, and counted."""
@@ -110,7 +111,7 @@ class DevicePort:
         queue = self._frames.get(channel)
         if queue is None:
             raise PluginError(f"{self.name} has no queue {channel!r}{self._known()}")
-        self._collect()
+        self.collect()
         now_s = self._now_s()
         found = [ChannelFrame(value, number, now_s - taken_s) for number, taken_s, value in queue]
         queue.clear()
@@ -217,14 +218,15 @@ class DevicePort:
     def answers(self) -> list[tuple[int, str]]:
         """Return the newest orders' numbers, each with the reason of its refusal, else empty."""
         if self._orders:
-            self._collect()
+            self.collect()
         return list(self._answers)
 
     def _answered(self, number: int, refusal: str) -> None:
         self._orders.discard(number)
         self._answers.append((number, refusal))
 
-    def _collect(self) -> None:
+    def collect(self) -> None:
+        """Take what has come from the device's process into the queues; in lockstep that makes room for more."""
         for word, *rest in messages.receive_all(self._end):
             if word == messages.ANSWER:
                 self._answered(rest[0], rest[1])
@@ -315,6 +317,14 @@ class Hardware(Mapping[str, DevicePort]):
         """Tell all devices what simulated time it is."""
         for port in self._ports.values():
             port.tell_time(local_s, t_s, rate)
+
+
+def tell_losses(losses: Mapping[str, Mapping[str, int]], journal: RunJournal) -> None:
+    """Record what devices, by name, and an agent had no room for, by kind, and say so in its log."""
+    for device, counts in losses.items():
+        journal.event("device_losses", device=device, **counts)
+        told = ", ".join(f"{name} {count}" for name, count in counts.items())
+        journal.say("warning", f"device {device}: there was no room for all: {told}")
 
 
 NO_HARDWARE: Final = Hardware()

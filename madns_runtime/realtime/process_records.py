@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from madns_runtime.hardware.port import tell_losses
 from madns_runtime.health.probe import ProcessUsage
 from madns_runtime.recording.records import CLOCK, LATE_TICKS, PROCESS, TICKS
 from madns_runtime.recording.run_journal import RunJournal
@@ -66,10 +67,7 @@ class ProcessRecords:
 
     def device_losses(self, losses: Mapping[str, Mapping[str, int]]) -> None:
         """Tell what devices, by name, and the agent had no room for, by kind."""
-        for device, counts in losses.items():
-            self._journal.event("device_losses", device=device, **counts)
-            told = ", ".join(f"{name} {count}" for name, count in counts.items())
-            self._journal.say("warning", f"device {device}: there was no room for all: {told}")
+        tell_losses(losses, self._journal)
 
     def report(self) -> dict[str, Any]:
         """Return what a ping tells of the records: how many were dropped, and the disk's trouble."""

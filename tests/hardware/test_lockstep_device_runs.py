@@ -223,3 +223,63 @@ def test_what_a_driver_raises_in_lockstep_is_told_by_its_own_line(tmp_path, meth
     else:
         assert code == 1
         assert told in run["verdict"]
+
+
+READER = """
+
+from dataclasses import dataclass
+
+from madns_runtime.plugin.api import AgentSimulation, HostSimulation, Simulation
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameters:
+    pass
+
+
+class Host(HostSimulation):
+    pass
+
+
+class Agent(AgentSimulation):
+    def setup(self, context, initial):
+        self.context, self.numbers = context, []
+
+    def step(self, tick):
+        frames = self.context.hardware["line"].frames("received")
+        self.numbers += [frame.number for frame in frames]
+
+    def finish(self):
+        return {"taken": len(self.numbers), "last": self.numbers[-1]}
+
+
+simulation = Simulation(name="reader", parameters=Parameters, host=":Host", agent=":Agent")
+"""
+READ = """
+name: read
+simulation: ./line.py:simulation
+agents: {count: 1, tick_hz: TICK_HZ}
+time: {duration_s: 24, mode: lockstep}
+hardware:
+  devices: [{name: line, kind: ./line.py:Line, rate_hz: 1000}]
+"""
+
+
+@pytest.mark.parametrize(("tick_hz", "taken", "dropped"), [(1, 23_001, 0), (0.0625, 10_001, 6000)])
+def test_frames_between_two_ticks_come_whole_or_are_counted(tmp_path, tick_hz, taken, dropped):
+    """More than a socket holds, by far; and more than a queue does."""
+    (tmp_path / "line.py").write_text(FRAMES + READER)
+    (tmp_path / "read.yaml").write_text(READ.replace("TICK_HZ", str(tick_hz)))
+    cosmos = CosmosCommand(tmp_path)
+
+    code, run = cosmos.run(tmp_path / "read.yaml", *LOOSE)
+
+    assert code == 0, run["verdict"]
+    assert "frames_missed" not in run["devices"]["agent-01/line"]["counts"]
+    folder = cosmos.directory(run)
+    result = json.loads((folder / "result.json").read_text())
+    told = result["agents"]["agent-01"]["simulation"]
+    assert told == {"taken": taken, "last": taken + dropped}
+    events = rows(folder / "agents" / "agent-01" / "events.jsonl")
+    losses = [each["frames_dropped"] for each in events if each["event"] == "device_losses"]
+    assert losses == ([dropped] if dropped else [])
