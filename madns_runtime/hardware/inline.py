@@ -85,6 +85,12 @@ class InlineDevice:
             now_s=now_s,
         )
 
+        self.port.make_room = self._make_room
+
+    def _make_room(self) -> bool:
+        self._hear()
+        return True
+
     def open(self) -> None:
         """Open it at simulated time 0."""
         identity = identity_of(self._call("open", self._device.open))

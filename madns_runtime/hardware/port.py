@@ -65,6 +65,8 @@ class DevicePort:
         self._limits = limits
         self.local_s: Callable[[float], float] = float
         """Returns when a simulated time is on that clock, s."""
+        self.make_room: Callable[[], bool] = lambda: False
+        """Has the device take what was sent, where it lives in this process, and tells whether it has: in lockstep."""
         self._frames: dict[str, deque[tuple[int, float, Any]]] = {
             channel.name: deque(maxlen=FRAMES_MAX)
             for channel in channels
@@ -131,7 +133,9 @@ class DevicePort:
         message = [messages.WRITE, channel, sent, local_s]
         if self._unsent or self._packs:
             self.flush()
-        if messages.send(self._end, message):
+        if messages.send(self._end, message) or (
+            self.make_room() and messages.send(self._end, message)
+        ):
             self._unsent.pop(channel, None)  # an older one, which must not come behind it
             return
         if declared.passing == "newest":

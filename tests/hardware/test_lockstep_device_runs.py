@@ -283,3 +283,35 @@ def test_frames_between_two_ticks_come_whole_or_are_counted(tmp_path, tick_hz, t
     events = rows(folder / "agents" / "agent-01" / "events.jsonl")
     losses = [each["frames_dropped"] for each in events if each["event"] == "device_losses"]
     assert losses == ([dropped] if dropped else [])
+
+
+WRITER = """
+    def write(self, values, due_s):
+        pass
+"""
+
+
+def test_all_frames_that_an_agent_writes_in_a_tick_are_put_out(tmp_path):
+    sent = 'Channel(name="sent", direction="out", is_frame=True, passing="queue")'
+    line = FRAMES.replace('passing="queue"),)', f'passing="queue"), {sent})') + WRITER
+    step = "for number in range(2000): self.context.hardware['line'].write('sent', b'%d' % number)"
+    reader = READER.replace(
+        'frames = self.context.hardware["line"]',
+        f"{step}\n        frames = self.context.hardware['line']",
+    )
+    (tmp_path / "line.py").write_text(line + reader)
+    read = READ.replace("TICK_HZ", "1").replace("duration_s: 24", "duration_s: 4")
+    (tmp_path / "read.yaml").write_text(read.replace("hardware:", "hardware:\n  armed: true"))
+    cosmos = CosmosCommand(tmp_path)
+
+    code, run = cosmos.run(tmp_path / "read.yaml", *LOOSE)
+
+    assert code == 0, run["verdict"]
+    folder = cosmos.directory(run)
+    put_out = [
+        bytes.fromhex(row[-1]) for row in rows(next(folder.glob("devices/*/line/sent.jsonl")))
+    ]
+    assert (
+        put_out == [b"%d" % number for number in range(2000)] * 3
+    )  # those of the last tick are left
+    assert run["devices"]["agent-01/line"]["counts"]["writes_left"] == 2000
