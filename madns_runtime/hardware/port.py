@@ -23,7 +23,6 @@ from madns_runtime.plugin.device_view import (
     DeviceStatus,
 )
 from madns_runtime.protocol.messages import FaultOrder
-from madns_runtime.recording.run_journal import RunJournal
 
 FRAMES_MAX: Final = 10_000
 """Values of a queue that may wait to be taken; the oldest are given up beyond, and counted."""
@@ -321,14 +320,6 @@ class Hardware(Mapping[str, DevicePort]):
         """Tell all devices what simulated time it is."""
         for port in self._ports.values():
             port.tell_time(local_s, t_s, rate)
-
-
-def tell_losses(losses: Mapping[str, Mapping[str, int]], journal: RunJournal) -> None:
-    """Record what devices, by name, and an agent had no room for, by kind, and say so in its log."""
-    for device, counts in losses.items():
-        journal.event("device_losses", device=device, **counts)
-        told = ", ".join(f"{name} {count}" for name, count in counts.items())
-        journal.say("warning", f"device {device}: there was no room for all: {told}")
 
 
 NO_HARDWARE: Final = Hardware()

@@ -20,7 +20,6 @@ from typing import Any, NoReturn
 
 from madns_runtime.errors import MadnsError
 from madns_runtime.faults.step_faults import StepFaults
-from madns_runtime.hardware.port import tell_losses
 from madns_runtime.lockstep import frames
 from madns_runtime.lockstep.agent import Crewmates, LockstepAgent
 from madns_runtime.lockstep.assignment import Assignment
@@ -383,7 +382,7 @@ class Worker:
             if reason is not None:
                 agent.journal.event("emergency", reason=reason)
                 agent.journal.say("critical", f"emergency shutdown: {reason}")
-            tell_losses(agent.devices.hardware.losses(), agent.journal)
+            agent.journal.device_losses(agent.devices.hardware.losses())
             counts = agent.journal.close().to_mapping()
             if agent.devices:
                 counts["devices"] = agent.devices.close()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from madns_runtime.hardware.port import tell_losses
 from madns_runtime.health.probe import ProcessUsage
 from madns_runtime.recording.records import CLOCK, LATE_TICKS, PROCESS, TICKS
 from madns_runtime.recording.run_journal import RunJournal
@@ -67,7 +66,7 @@ class ProcessRecords:
 
     def device_losses(self, losses: Mapping[str, Mapping[str, int]]) -> None:
         """Tell what devices, by name, and the agent had no room for, by kind."""
-        tell_losses(losses, self._journal)
+        self._journal.device_losses(losses)
 
     def report(self) -> dict[str, Any]:
         """Return what a ping tells of the records: how many were dropped, and the disk's trouble."""
