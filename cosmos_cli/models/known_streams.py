@@ -27,6 +27,11 @@ from madns_runtime.recording.records import (
 REAL_TIME_ONLY = tuple(schema.name for schema in (TICKS, LATE_TICKS, CLOCK, PROCESS, HEALTH))
 """Framework streams that no run in lockstep records: no time passes there that could be late."""
 NOT_A_VALUE = ("json", "packed")
+INPUT_HEAD = tuple(field.name for field in schema_of(Channel(name="any")).fields[:-1])
+FRAME_FIELDS = tuple(
+    field.name for field in schema_of(Channel(name="any", is_frame=True)).fields[len(INPUT_HEAD) :]
+)
+"""Names of what a device records of an input, before its values, and of frames as values."""
 WORDS = {(EVENTS.name, "event"): EVENT_WORDS, (LOG.name, "level"): tuple(LOG_LEVELS)}
 """All texts that a field of a stream of the framework's ever holds."""
 Role = Literal["agent", "host", "machine", "device"]
@@ -133,6 +138,15 @@ class KnownStreams:
             told = ", ".join(known) or f"{name}.CHANNEL"
             return f"{name} is a device: expected a channel of it, such as {told}"
         return f"no stream {name!r} is recorded{did_you_mean(name, list(self._streams))}"
+
+    def has_numbers(self, device: str) -> bool:
+        """Tell whether an input of a device is of numbers, and no frame; so it may be where its channels are not known."""
+        if device not in self._devices or device in self._channels_open:
+            return True
+        own = [found for name, found in self._streams.items() if self._device_of(name) == device]
+        fields = [tuple(field.name for field in each.fields) for found in own for each in found]
+        inputs = [names for names in fields if names[: len(INPUT_HEAD)] == INPUT_HEAD]
+        return any(names[len(INPUT_HEAD) :] != FRAME_FIELDS for names in inputs)
 
     def _device_of(self, stream: str) -> str:
         return stream.rpartition(".")[0]

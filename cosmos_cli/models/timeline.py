@@ -24,7 +24,7 @@ from cosmos_cli.models.translate import faults_of
 from cosmos_cli.models.value_rules import words_at
 from madns_runtime.conditions.condition import Condition
 from madns_runtime.errors import ConfigurationError
-from madns_runtime.hardware.fault_actions import check_fault
+from madns_runtime.hardware.fault_actions import ON_NUMBERS, check_fault
 from madns_runtime.timeline.entries import ScheduledEntry
 from madns_runtime.timeline.fault_kinds import LOSSES, MUST_CONTINUE
 from madns_runtime.timeline.kinds import DEVICE_FAULT
@@ -91,7 +91,7 @@ def resolve_timeline(
         if awaited is not None:
             entry = replace(entry, condition=len(conditions))
             conditions.append(awaited.condition(len(conditions), dotted(path)))
-        device_faults = _device_faults(scenario, entry, rule.agents, labels)
+        device_faults = _device_faults(scenario, entry, rule.agents, labels, streams)
         faults += [document.fault((*path, *inner), text) for inner, text in device_faults]
         entries.append(entry)
         expected[place] = count_expected(entry, scenario.time.duration_s)
@@ -219,7 +219,11 @@ class _Placing:
 
 
 def _device_faults(
-    scenario: Scenario, entry: ScheduledEntry, patterns: Sequence[str], labels: AgentLabels | None
+    scenario: Scenario,
+    entry: ScheduledEntry,
+    patterns: Sequence[str],
+    labels: AgentLabels | None,
+    streams: KnownStreams,
 ) -> Iterator[SectionFault]:
     """Yield what does not fit between a device's fault and the devices of its agents."""
     if entry.action != DEVICE_FAULT.word:
@@ -234,7 +238,13 @@ def _device_faults(
     if device not in names:
         hint = did_you_mean(device, names) if names else "; there is none under hardware"
         yield ("device",), f"no device {device!r} in this scenario{hint}"
-    elif labels is not None:
+        return
+    if fault in ON_NUMBERS and not streams.has_numbers(device):
+        yield (
+            ("fault",),
+            f"{fault} is added to numbers, and {device} measures frames of bytes alone",
+        )
+    if labels is not None:
         agents = scenario.agents.resolved_names()
         users = labels.like_any(_patterns_of_users(scenario, device), agents)
         for place, pattern in enumerate(patterns):

@@ -237,7 +237,7 @@ def known_keys(model: Any, path: Path, *, member: str = "") -> list[str]:
 def _about(model: Any, path: Path) -> str:
     """Return what kind of value is missing, if that is plain."""
     names = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}
-    found = [names[kind] for kind in _types_at(model, path) if kind in names]
+    found = dict.fromkeys(names[kind] for kind in _types_at(model, path) if kind in names)
     return f"; expected {' or '.join(found)}" if found else ""
 
 

@@ -36,7 +36,7 @@ class DriverDescriptor:
         self,
         fd: int,
         reactor: Reactor,
-        readable: Callable[[], object],
+        readable: Callable[[], None],
         tell: Callable[..., object],
     ) -> None:
         self._fd = fd

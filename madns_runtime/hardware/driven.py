@@ -10,7 +10,9 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from madns_runtime.config import DeviceLaunch
+from madns_runtime.errors import ConfigurationError
 from madns_runtime.hardware import messages, page
+from madns_runtime.hardware.fault_actions import check_fault_fits
 from madns_runtime.hardware.intake import NOT_FINITE, counts_of
 from madns_runtime.hardware.kind_registry import DeviceProgram
 from madns_runtime.hardware.page import DevicePage
@@ -63,6 +65,14 @@ class DrivenDevice:
     def name(self) -> str:
         """Full name of the device, such as pi22/imu."""
         return self.seat.launch.full_name
+
+    def refusal_of(self, action: str) -> str:
+        """Return why a fault cannot be inserted around it; empty if it can."""
+        try:
+            check_fault_fits(action, self.seat.channels)
+        except ConfigurationError as error:
+            return f"{self.name}: {error}"
+        return ""
 
     def note_fault(self, action: str, value: float | None) -> None:
         """Take note of an inserted fault in force: a process that is started anew is told it again."""

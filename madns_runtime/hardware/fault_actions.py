@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Final, get_args
 
 from madns_runtime.errors import ConfigurationError
+from madns_runtime.hardware.contract import Channel
 from madns_runtime.timeline.kinds import DeviceFaultWord
 
 ACTIONS: Final[tuple[str, ...]] = get_args(DeviceFaultWord)
@@ -15,6 +17,25 @@ WITH_VALUE: Final = {
     "drop": "the share of samples that is lost, 0 to 1",
     "delay": "the time by which samples come late, s",
 }
+
+
+ON_NUMBERS: Final = frozenset(("bias", "noise"))
+
+
+def check_fault_fits(action: str, channels: Iterable[Channel]) -> None:
+    """
+    Refuse a fault that would alter nothing of a device.
+
+    Raises:
+        ConfigurationError: It acts on numbers, and no input is of any.
+    """
+    inputs = [each for each in channels if each.direction == "in"]
+    if action in ON_NUMBERS and all(each.is_frame for each in inputs):
+        told = ", ".join(each.name for each in inputs) or "none"
+        raise ConfigurationError(
+            f"{action} is added to numbers, and the device has no input of numbers (inputs: {told}): drop, delay, freeze and"
+            " disconnect act on frames, too"
+        )
 
 
 def check_fault(action: str, value: float | None) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from madns_runtime.config import DeviceLaunch
-from madns_runtime.errors import PluginError
+from madns_runtime.errors import BlamedError, PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.contract import SimulatedDevice
 from madns_runtime.hardware.driver_answers import identity_of
@@ -17,6 +17,7 @@ from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.port import DevicePort
 from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.status import StatusAccount, StatusLimits
+from madns_runtime.plugin.context import describe_exception
 
 RECORDS_TIMEOUT_S: Final = 10.0
 SAMPLES_MAX: Final = 1_000_000
@@ -59,6 +60,8 @@ class InlineDevice:
         self._rate_hz = launch.rate_hz
         self._count = 0
         self._launch = launch
+        self._why = ""
+        """What its driver raised at the end."""
         self._handed_s = 0.0
         """When agents handed over what is heard next, simulated, s."""
         self._own_end, other_end = messages.make_pair()
@@ -82,9 +85,15 @@ class InlineDevice:
             now_s=now_s,
         )
 
+        self.port.make_room = self._make_room
+
+    def _make_room(self) -> bool:
+        self._hear()
+        return True
+
     def open(self) -> None:
         """Open it at simulated time 0."""
-        identity = identity_of(self._device.open())
+        identity = identity_of(self._call("open", self._device.open))
         header = self._page.header
         header[page.STATE], header[page.OPENED_S] = page.OPEN, 0.0
         self._records.time.set(0.0, 0.0, 1.0)
@@ -102,7 +111,7 @@ class InlineDevice:
         """
         self._hear()
         for _ in range(SAMPLES_MAX):
-            next_s = self._device.next_s()
+            next_s = self._call("next_s", self._device.next_s)
             due_s = self._count / self._rate_hz if next_s is None else max(next_s, 0.0)
             output_s = min(self._outputs.next_write_s(), self._outputs.next_point_s())
             if min(due_s, output_s) > t_s:
@@ -111,7 +120,7 @@ class InlineDevice:
                 self._put_out_due(max(output_s, self._handed_s))
                 continue
             self._count += 1
-            sample = self._device.sample_at(due_s)
+            sample = self._call("sample_at", self._device.sample_at, due_s)
             if sample is None:
                 continue
             if self._intake.faults.is_disconnected:
@@ -129,9 +138,9 @@ class InlineDevice:
         One that is disconnected is made safe, and lost at once: no sample of it is heard, and nothing is put out.
 
         Raises:
-            ConfigurationError: There is no such fault, or its value is none.
+            ConfigurationError: There is no such fault, its value is none, or it would alter nothing.
         """
-        self._intake.faults.insert(action, value)
+        self._intake.insert_fault(action, value)
         now_s = self._now_s()
         self._intake.event("fault", now_s, action=action, value=value)
         is_open = self._page.header[page.STATE] == page.OPEN
@@ -171,7 +180,8 @@ class InlineDevice:
 
     def _put_out(self, output: DueOutput, now_s: float) -> None:
         self._page.header[page.MOVED] = 1.0
-        self._device.write({output.channel.name: output.value}, output.due_s)
+        values = {output.channel.name: output.value}
+        self._call("write", self._device.write, values, output.due_s)
         self._records.written(output.channel.name, output.due_s, now_s, output.told)
         if output.point is not None and not output.point.is_underrun:
             self._outputs.note_played(output.point, now_s - output.due_s)
@@ -181,14 +191,15 @@ class InlineDevice:
         self._hear()
         self._intake.count("writes_left", self._outputs.clear())
         self._make_safe(self._now_s())
-        self._device.close()
+        self._tried("close", self._device.close)
         account = self._account
         return {
             "status": account.status,
             "stale_ratio": account.stale_ratio(),
             "lost": account.times_lost,
             "restarts": 0,
-            "why": "",
+            "unsafe": int(self._page.header[page.MOVED]),
+            "why": self._why,
             **self._intake.summary(),
             **self._outputs.summary(self._page.counts.read()),
             "records": self._records.close(RECORDS_TIMEOUT_S),
@@ -197,10 +208,36 @@ class InlineDevice:
     def _make_safe(self, now_s: float) -> None:
         """Make outputs safe if any has moved; what was still to be put out, but for a profile's points, is lost."""
         self._intake.count("writes_lost", self._outputs.clear_writes())
-        if self._page.header[page.MOVED]:
-            self._device.make_safe()
+        if self._page.header[page.MOVED] and self._tried("make_safe", self._device.make_safe):
             self._page.header[page.MOVED] = 0.0
             self._records.event("made_safe", now_s)
 
+    def _call(self, method: str, call: Callable[..., Any], *arguments: Any) -> Any:
+        """
+        Call a method of the driver.
+
+        Raises:
+            BlamedError: It raised; the text says where.
+        """
+        try:
+            return call(*arguments)
+        except (Exception, SystemExit) as error:
+            text = describe_exception(error, f"{type(self._device).__name__}.{method}")
+            raise BlamedError(f"device {self.name}: {text}") from error
+
+    def _tried(self, method: str, call: Callable[[], object]) -> bool:
+        """Call a method at whose fault the rest is to go on all the same; return whether it raised nothing."""
+        try:
+            self._call(method, call)
+        except BlamedError as error:
+            self._why = str(error)
+            self._page.header[page.ERRORS] += 1
+            self._records.event("error", self._now_s(), why=self._why)
+            return False
+        return True
+
     def _pass_on(self, message: list[Any]) -> int:
+        if messages.send(self._own_end, message):
+            return 0
+        self.port.collect()  # nobody else makes room before the tick; what is too much is counted there
         return int(not messages.send(self._own_end, message))

@@ -10,6 +10,7 @@ from madns_runtime.errors import PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.clock import DeviceClock
 from madns_runtime.hardware.contract import Channel, Device, Sample
+from madns_runtime.hardware.fault_actions import check_fault_fits
 from madns_runtime.hardware.faults import InsertedFaults
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.profiles import PREFIX, counts_by_channel
@@ -64,6 +65,16 @@ class Intake:
         """Let a device that is about to be opened count, and see the faults that are in force."""
         device.count = self.count
         self.faults.show_to(device)
+
+    def insert_fault(self, action: str, value: float | None) -> None:
+        """
+        Put a fault in force, or clear all; see `InsertedFaults`.
+
+        Raises:
+            ConfigurationError: There is no such fault, its value is none, or it would alter nothing.
+        """
+        check_fault_fits(action, self._inputs.values())
+        self.faults.insert(action, value)
 
     def take(self, sample: Sample, now_s: float, *, ahead_s: float = 0.0) -> None:
         """

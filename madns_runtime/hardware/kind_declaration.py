@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from madns_runtime.errors import ConfigurationError, PluginError
 from madns_runtime.hardware.contract import Channel, DeviceKind, Needs
 from madns_runtime.plain_values import from_mapping, to_mapping
 
+T = TypeVar("T", Channel, Needs)
 CHANNELS_MAX: Final = 64
 STREAMS_TAKEN: Final = frozenset(("events", "log", "device_state", "device_clock"))
 """Names of files that are recorded beside those of channels."""
@@ -29,10 +30,11 @@ def kind_faults(kind: DeviceKind) -> list[str]:
     if has_parameters and not (is_class and is_dataclass(kind.parameters)):
         told = getattr(kind.parameters, "__name__", repr(kind.parameters))
         return [*found, f"parameters: expected a dataclass, got {told:.80}"]
-    if not isinstance(kind.files, tuple | list):
-        return [*found, f"files: expected a tuple of parameters' names, got {kind.files!r:.80}"]
+    given: Any = kind.files
+    if not isinstance(given, tuple | list):
+        return [*found, f"files: expected a tuple of parameters' names, got {given!r:.80}"]
     known = {field.name for field in fields(kind.parameters)} if has_parameters else set()
-    unknown = [name for name in kind.files if name not in known]
+    unknown = [name for name in given if name not in known]
     return found + [f"files: there is no parameter {name!r:.80}" for name in unknown]
 
 
@@ -82,7 +84,7 @@ def declared_needs(kind: str, given: Any) -> Needs:
     return _declared(Needs, given, f"{kind}: needs")
 
 
-def _declared(cls: type[Any], given: Any, where: str) -> Any:
+def _declared(cls: type[T], given: T, where: str) -> T:
     try:
         return from_mapping(cls, to_mapping(given), where)
     except ConfigurationError as error:

@@ -63,7 +63,13 @@ def resolve_kind(spec: str, base_directory: Path) -> DeviceKind:
     """
     where = spec
     if ":" not in spec:
-        entries = {entry.name: entry.value for entry in metadata.entry_points(group=GROUP)}
+        entries: dict[str, str] = {}
+        for entry in metadata.entry_points(group=GROUP):
+            if entries.setdefault(entry.name, entry.value) != entry.value and entry.name == spec:
+                raise PluginError(
+                    f"two installed distributions have a kind of device named {spec!r}: name {entries[spec]} or"
+                    f" {entry.value}, or remove one of them"
+                )
         if spec not in entries:
             close = difflib.get_close_matches(spec, entries, n=1)
             hint = f", did you mean {close[0]}?" if close else ""

@@ -188,6 +188,8 @@ class DeviceManager:
             for driven in process.devices:
                 if driven.name != target:
                     continue
+                if refusal := driven.refusal_of(action):
+                    return refusal
                 message = [messages.FAULT, target, action, value]
                 if process.control is not None and messages.send(process.control, message):
                     driven.note_fault(action, value)

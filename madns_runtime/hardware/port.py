@@ -64,6 +64,8 @@ class DevicePort:
         self._limits = limits
         self.local_s: Callable[[float], float] = float
         """Returns when a simulated time is on that clock, s."""
+        self.make_room: Callable[[], bool] = lambda: False
+        """Has the device take what was sent, where it lives in this process, and tells whether it has: in lockstep."""
         self._frames: dict[str, deque[tuple[int, float, Any]]] = {
             channel.name: deque(maxlen=FRAMES_MAX)
             for channel in channels
@@ -110,7 +112,7 @@ class DevicePort:
         queue = self._frames.get(channel)
         if queue is None:
             raise PluginError(f"{self.name} has no queue {channel!r}{self._known()}")
-        self._collect()
+        self.collect()
         now_s = self._now_s()
         found = [ChannelFrame(value, number, now_s - taken_s) for number, taken_s, value in queue]
         queue.clear()
@@ -130,7 +132,10 @@ class DevicePort:
         message = [messages.WRITE, channel, sent, local_s]
         if self._unsent or self._packs:
             self.flush()
-        if messages.send(self._end, message):
+        if messages.send(self._end, message) or (
+            self.make_room() and messages.send(self._end, message)
+        ):
+            self._unsent.pop(channel, None)  # an older one, which must not come behind it
             return
         if declared.passing == "newest":
             self._unsent[channel] = message
@@ -216,14 +221,15 @@ class DevicePort:
     def answers(self) -> list[tuple[int, str]]:
         """Return the newest orders' numbers, each with the reason of its refusal, else empty."""
         if self._orders:
-            self._collect()
+            self.collect()
         return list(self._answers)
 
     def _answered(self, number: int, refusal: str) -> None:
         self._orders.discard(number)
         self._answers.append((number, refusal))
 
-    def _collect(self) -> None:
+    def collect(self) -> None:
+        """Take what has come from the device's process into the queues; in lockstep that makes room for more."""
         for word, *rest in messages.receive_all(self._end):
             if word == messages.ANSWER:
                 self._answered(rest[0], rest[1])

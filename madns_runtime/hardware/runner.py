@@ -350,7 +350,7 @@ class DeviceRunner:
     def insert_fault(self, action: str, value: float | None) -> str:
         """Put a fault in force, or clear all, and return why not, else ""; see `InsertedFaults`."""
         try:
-            self._intake.faults.insert(action, value)
+            self._intake.insert_fault(action, value)
         except MadnsError as error:
             self._refuse(str(error))
             return str(error)

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.faults.clock_faults import FaultableClock
-from madns_runtime.hardware.fault_actions import check_fault
+from madns_runtime.hardware.fault_actions import check_fault, check_fault_fits
 from madns_runtime.health.stress_process import (
     end_stress_processes,
     reap,
@@ -118,6 +118,7 @@ class OrderedActions(AgentActions):
         word, value = ("clear", None) if order.is_end else (fault.fault, fault.value)
         try:
             check_fault(word, value)
+            check_fault_fits(word, device.channels.values())
         except ConfigurationError as error:
             raise ActionRefused(str(error)) from None
         device.order_fault(ORDERS_FROM + order.number, word, value)

@@ -66,10 +66,7 @@ class ProcessRecords:
 
     def device_losses(self, losses: Mapping[str, Mapping[str, int]]) -> None:
         """Tell what devices, by name, and the agent had no room for, by kind."""
-        for device, counts in losses.items():
-            self._journal.event("device_losses", device=device, **counts)
-            told = ", ".join(f"{name} {count}" for name, count in counts.items())
-            self._journal.say("warning", f"device {device}: there was no room for all: {told}")
+        self._journal.device_losses(losses)
 
     def report(self) -> dict[str, Any]:
         """Return what a ping tells of the records: how many were dropped, and the disk's trouble."""

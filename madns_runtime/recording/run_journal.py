@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from madns_runtime.errors import MachineError, PluginError
@@ -59,6 +59,13 @@ class RunJournal:
             when = {"t_s": self._now_s(), "utc": self._utc(), "event": event}
             with contextlib.suppress(MachineError):
                 self.recorder.record(EVENTS.name, {**when, **values})
+
+    def device_losses(self, losses: Mapping[str, Mapping[str, int]]) -> None:
+        """Tell what devices, by name, and an agent had no room for, by kind; also in the log."""
+        for device, counts in losses.items():
+            self.event("device_losses", device=device, **counts)
+            told = ", ".join(f"{name} {count}" for name, count in counts.items())
+            self.say("warning", f"device {device}: there was no room for all: {told}")
 
     def say(self, level: str, text: str) -> None:
         """Log a sentence of the framework's own, now."""

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -348,6 +349,21 @@ def test_one_that_hangs_in_lockstep_is_named_and_killed(tmp_path):
     assert not Path(f"/proc/{ship.process.pid}").exists()
 
 
+@pytest.mark.parametrize("is_lockstep", [True, False])
+def test_one_that_prints_between_its_frames_is_told_what_came(tmp_path, is_lockstep):
+    flight = attached({"kind": "stdio"}) | {"answer_s": 3.0 if is_lockstep else 20.0}
+    talk = "import sys; print('debug\\0', flush=True); sys.stdin.read()"
+    flight["command"] = [sys.executable, "-c", talk]
+    ship = Ship(tmp_path, None, flight=flight, is_lockstep=is_lockstep)
+    told = r"of what it said was no good packet: corrupt \d+"
+    if is_lockstep:
+        with pytest.raises(BlamedError, match=told):
+            ship.run(1)
+        return
+    ship.run_until(lambda: any(re.search(told, text) for _, text in ship.context.logs))
+    ship.agent.finish()
+
+
 def test_one_that_floods_costs_no_tick_and_is_counted(tmp_path):
     flight = attached({"kind": "stdio"})
     flight["command"] = [
@@ -406,6 +422,64 @@ class Own:
         ship.run(5)
 
     assert ship.context.records["estimates"] == [(n, n / HZ) for n in range(5)]
+
+
+OWN = """
+from madns_runtime.simulations.constellation.flight.interface.answers import FlightAnswer
+
+
+class Own:
+    answers_by_time = False
+    faults = 3
+
+    def setup(self, setup):
+        return [b"S\\n"]
+
+    def tick(self, tick):
+        return [b"T\\n"]
+
+    def feed(self, data):
+        return [FlightAnswer() for _ in range(data.count(b"\\n"))]
+
+
+class Wrong(Own):
+    def METHOD(self, given):
+        BODY
+"""
+TALK = [sys.executable, "-c", "import sys\nfor line in sys.stdin: print('A', flush=True)"]
+
+
+@pytest.mark.parametrize(
+    ("method", "body", "told"),
+    [
+        ("feed", "return None", "Wrong.feed: expected a list of FlightAnswer, got None"),
+        ("feed", "return ['x']", r"Wrong.feed: expected a list of FlightAnswer, got \['x'\]"),
+        ("feed", "raise ValueError('odd')", r"Wrong.feed raised ValueError: odd \(own.py:2\d\)"),
+        ("tick", "return 'T'", "Wrong.tick: expected a list of bytes, got 'T'"),
+        ("tick", "return b'T'", "Wrong.tick: expected a list of bytes, got b'T'"),
+        ("setup", "return {}['x']", r"Wrong.setup raised KeyError: 'x' \(own.py:2\d\)"),
+    ],
+)
+def test_what_a_protocol_of_ones_own_does_wrong_is_told_by_its_name(tmp_path, method, body, told):
+    (tmp_path / "own.py").write_text(OWN.replace("METHOD", method).replace("BODY", body))
+    flight = attached({"kind": "stdio"}, "own.py:Wrong") | {"command": TALK}
+
+    with pytest.raises(BlamedError, match=told):
+        Ship(tmp_path, None, flight=flight).run(3)
+
+
+def test_faults_of_a_protocol_of_ones_own_that_are_no_counts_are_left_out(tmp_path):
+    (tmp_path / "own.py").write_text(OWN.partition("class Wrong")[0])
+    flight = attached({"kind": "stdio"}, "own.py:Own") | {"command": TALK}
+    flight["command"] = [
+        *TALK[:2],
+        "import sys\nsys.stdin.readline()\n" + TALK[2].partition("\n")[2],
+    ]
+    with Ship(tmp_path, None, flight=flight) as ship:
+        ship.run(2)
+
+    assert ship.summary["answers"] == 2
+    assert ship.summary["interface"]["faults"] == {}
 
 
 def test_a_socket_that_somebody_listens_at_is_left_to_him_and_one_left_behind_gives_way(tmp_path):

@@ -340,3 +340,18 @@ def test_seeded_noise_in_lines_is_a_fault_in_words_and_raises_nothing():
     assert len(answers) > 490
     assert sum(bool(one.fault) for one in answers) > 100
     assert all(one.fault.isprintable() for one in answers)
+
+
+def test_what_a_transport_lacks_is_told_once_though_several_kinds_have_it(tmp_path):
+    (tmp_path / "lacking.yaml").write_text(
+        "name: lacking\nsimulation: constellation\nagents: {count: 1, tick_hz: 10}\n"
+        "time: {mode: lockstep, duration_s: 3}\nparameters:\n"
+        '  satellites: {walker: "56:1/1/0", altitude_km: 780}\n  epoch_utc: 2026-01-01T00:00:00Z\n'
+        "  flight: {interface: {transport: {kind: tcp}, protocol: frames}}\n"
+    )
+    with pytest.raises(InputError) as caught:
+        load_scenario(tmp_path / "lacking.yaml", ())
+
+    (fault,) = caught.value.faults
+    assert fault.path == "parameters.flight.interface.transport.address"
+    assert fault.text == "missing; expected a text"

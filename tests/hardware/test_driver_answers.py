@@ -142,9 +142,13 @@ def test_a_line_that_sends_no_frame_is_told_by_its_bytes(tmp_path):
         os.write(terminal.fd, b"no line feed")
         bench.start_time()
         bench.until(lambda: "lost" in bench.statuses("line"))
+        refusal = bench.manager.insert_fault("pi22/line", "bias", 1.0)
     finally:
         result = bench.close()["pi22/line"]
         terminal.close()
+
+    assert refusal is not None
+    assert refusal.startswith("pi22/line: bias is added to numbers, and the device has no input")
 
     told = (
         "no sample for 1 s, where rate_hz (20) promises one every 0.05 s; so far received_bytes 12"

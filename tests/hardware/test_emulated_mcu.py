@@ -195,6 +195,24 @@ def test_image_that_is_no_program_is_told(tmp_path):
         wait_until(lambda: mcu.read() and False)
 
 
+@pytest.mark.parametrize(
+    ("data", "told"),
+    [
+        (b"", "is empty; build it first"),
+        (b"\x7fELF\x02\x01\x01" + bytes(9) + b"\x02\x00\x3e\x00" + bytes(100), "another processor .e_machine 62"),
+    ],
+)  # fmt: skip
+def test_image_that_this_computers_compiler_made_is_told(tmp_path, data, told):
+    """As `cc` in the place of `arm-none-eabi-gcc` does: the emulator would run it, into a lockup."""
+    image = tmp_path / "main.elf"
+    image.write_bytes(data)
+    with (
+        pytest.raises(MachineError, match=rf"main\.elf is .*{told.removeprefix('is ')}"),
+        opened("emulated_mcu", firmware=image),
+    ):
+        pass
+
+
 def test_missing_emulator_is_told_with_what_installs_it(image):
     with (
         pytest.raises(MachineError, match="apt install qemu-system-nothing"),

@@ -2,7 +2,7 @@
 
 import pytest
 
-from madns_runtime.errors import PluginError
+from madns_runtime.errors import ConfigurationError, PluginError
 from madns_runtime.hardware import page
 from madns_runtime.hardware.contract import Channel, Sample
 from madns_runtime.hardware.intake import Intake
@@ -91,3 +91,17 @@ def test_samples_whose_delay_is_lifted_come_before_the_next_one(fault, value):
 
     assert [values for _, _, values in kept.samples] == [(float(number),) for number in range(6)]
     assert device_page.read("level").values == (5.0,)
+
+
+@pytest.mark.parametrize("action", ["bias", "noise"])
+def test_a_fault_of_numbers_is_refused_where_all_inputs_are_frames(action):
+    line = Channel(name="received", is_frame=True, passing="queue")
+    sent = Channel(name="duty", direction="out")
+    intake = Intake((line, sent), DevicePage([line]), Kept(), seed=[1], frozen_s={}, pass_on=len)
+
+    with pytest.raises(ConfigurationError, match=r"no input of numbers \(inputs: received\)"):
+        intake.insert_fault(action, 1.0)
+
+    intake.insert_fault("drop", 1.0)
+    assert intake.faults.in_force == {"drop": 1.0}
+    make_intake()[0].insert_fault(action, 1.0)

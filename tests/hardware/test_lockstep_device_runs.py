@@ -148,3 +148,170 @@ def test_a_device_that_is_disconnected_in_lockstep_takes_nothing_and_is_lost_at_
         [3.0, "lost"],
         [4.5, "ok"],
     ]
+
+
+FRAMES = """
+from madns_runtime.hardware.contract import Channel, DeviceKind, Sample, SimulatedDevice
+
+
+class Line(SimulatedDevice):
+    kind = DeviceKind(
+        name="line",
+        summary="frames",
+        channels=(Channel(name="received", is_frame=True, passing="queue"),),
+        needs_hardware=False,
+        follows_simulated_time=True,
+    )
+
+    def sample_at(self, t_s):
+        return Sample(values={"received": b"x"}, taken_s=t_s)
+"""
+BIASED = """
+name: biased
+simulation: counter
+agents: {count: 1, tick_hz: 10}
+time: {duration_s: 3, mode: lockstep}
+hardware:
+  devices: [{name: line, kind: ./line.py:Line, rate_hz: 10}]
+timeline:
+  - {at_s: 1, action: device_fault, agents: ["*"], device: line, fault: bias, value: 3}
+"""
+
+
+def test_a_fault_that_would_alter_nothing_is_refused_before_the_run(tmp_path):
+    (tmp_path / "line.py").write_text(FRAMES)
+    (tmp_path / "biased.yaml").write_text(BIASED)
+    cosmos = CosmosCommand(tmp_path)
+
+    done = cosmos("validate", "biased.yaml")
+
+    assert done.returncode == 2
+    told = "timeline[0].fault: bias is added to numbers, and line measures frames of bytes alone"
+    assert told in done.stderr
+    (tmp_path / "biased.yaml").write_text(BIASED.replace("bias, value: 3", "freeze"))
+    assert cosmos("validate", "biased.yaml").returncode == 0
+
+
+FAILING = """
+
+class Failing(Valve):
+    kind = Valve.kind
+
+    def METHOD(self, *given):
+        raise ValueError("stuck")
+"""
+
+
+@pytest.mark.parametrize("method", ["open", "sample_at", "write", "make_safe", "close"])
+def test_what_a_driver_raises_in_lockstep_is_told_by_its_own_line(tmp_path, method):
+    text = VALVE.replace('        self.count("lost_bytes", 2)\n', "")
+    (tmp_path / "valve.py").write_text(text + FAILING.replace("METHOD", method))
+    (tmp_path / "mover.py").write_text(MOVER)
+    moved = MOVED.partition("timeline:")[0].replace("duration_s: 6", "duration_s: 1")
+    (tmp_path / "moved.yaml").write_text(moved.replace("valve.py:Valve", "valve.py:Failing"))
+
+    code, run = CosmosCommand(tmp_path).run(tmp_path / "moved.yaml", *LOOSE)
+
+    line = len((text + FAILING).splitlines())
+    told = f"device valve: Failing.{method} raised ValueError: stuck (valve.py:{line})"
+    device = run["devices"]["agent-01/valve"]
+    if method in ("make_safe", "close"):  # the run is over, and its account is given all the same
+        assert (device["why"], device["errors"], device["samples"]) == (told, 1, 10)
+        assert device["unsafe"] == (method == "make_safe")
+        assert ("hardware.unsafe" in run["verdict"]) == (method == "make_safe")
+        assert code == (4 if method == "make_safe" else 0)
+    else:
+        assert code == 1
+        assert told in run["verdict"]
+
+
+READER = """
+
+from dataclasses import dataclass
+
+from madns_runtime.plugin.api import AgentSimulation, HostSimulation, Simulation
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameters:
+    pass
+
+
+class Host(HostSimulation):
+    pass
+
+
+class Agent(AgentSimulation):
+    def setup(self, context, initial):
+        self.context, self.numbers = context, []
+
+    def step(self, tick):
+        frames = self.context.hardware["line"].frames("received")
+        self.numbers += [frame.number for frame in frames]
+
+    def finish(self):
+        return {"taken": len(self.numbers), "last": self.numbers[-1]}
+
+
+simulation = Simulation(name="reader", parameters=Parameters, host=":Host", agent=":Agent")
+"""
+READ = """
+name: read
+simulation: ./line.py:simulation
+agents: {count: 1, tick_hz: TICK_HZ}
+time: {duration_s: 24, mode: lockstep}
+hardware:
+  devices: [{name: line, kind: ./line.py:Line, rate_hz: 1000}]
+"""
+
+
+@pytest.mark.parametrize(("tick_hz", "taken", "dropped"), [(1, 23_001, 0), (0.0625, 10_001, 6000)])
+def test_frames_between_two_ticks_come_whole_or_are_counted(tmp_path, tick_hz, taken, dropped):
+    """More than a socket holds, by far; and more than a queue does."""
+    (tmp_path / "line.py").write_text(FRAMES + READER)
+    (tmp_path / "read.yaml").write_text(READ.replace("TICK_HZ", str(tick_hz)))
+    cosmos = CosmosCommand(tmp_path)
+
+    code, run = cosmos.run(tmp_path / "read.yaml", *LOOSE)
+
+    assert code == 0, run["verdict"]
+    assert "frames_missed" not in run["devices"]["agent-01/line"]["counts"]
+    folder = cosmos.directory(run)
+    result = json.loads((folder / "result.json").read_text())
+    told = result["agents"]["agent-01"]["simulation"]
+    assert told == {"taken": taken, "last": taken + dropped}
+    events = rows(folder / "agents" / "agent-01" / "events.jsonl")
+    losses = [each["frames_dropped"] for each in events if each["event"] == "device_losses"]
+    assert losses == ([dropped] if dropped else [])
+
+
+WRITER = """
+    def write(self, values, due_s):
+        pass
+"""
+
+
+def test_all_frames_that_an_agent_writes_in_a_tick_are_put_out(tmp_path):
+    sent = 'Channel(name="sent", direction="out", is_frame=True, passing="queue")'
+    line = FRAMES.replace('passing="queue"),)', f'passing="queue"), {sent})') + WRITER
+    step = "for number in range(2000): self.context.hardware['line'].write('sent', b'%d' % number)"
+    reader = READER.replace(
+        'frames = self.context.hardware["line"]',
+        f"{step}\n        frames = self.context.hardware['line']",
+    )
+    (tmp_path / "line.py").write_text(line + reader)
+    read = READ.replace("TICK_HZ", "1").replace("duration_s: 24", "duration_s: 4")
+    (tmp_path / "read.yaml").write_text(read.replace("hardware:", "hardware:\n  armed: true"))
+    cosmos = CosmosCommand(tmp_path)
+
+    code, run = cosmos.run(tmp_path / "read.yaml", *LOOSE)
+
+    assert code == 0, run["verdict"]
+    folder = cosmos.directory(run)
+    put_out = [
+        bytes.fromhex(row[-1]) for row in rows(next(folder.glob("devices/*/line/sent.jsonl")))
+    ]
+    assert (
+        put_out == [b"%d" % number for number in range(2000)] * 3
+    )  # those of the last tick are left
+    assert run["devices"]["agent-01/line"]["counts"]["writes_left"] == 2000

@@ -63,6 +63,27 @@ def test_what_a_device_has_no_room_for_is_counted(device):
     assert Hardware({"line": made}).losses() == {"pi22/line": made.losses()}
 
 
+def test_an_older_value_that_found_no_room_does_not_come_behind_a_newer_one(device, monkeypatch):
+    made, _ = device
+    sent = []
+    room = iter(
+        [False, False, True, True]
+    )  # there is some between the look for the old one and the new one
+
+    def send(end, message):
+        has_room = next(room)
+        if has_room:
+            sent.append(message[2])
+        return has_room
+
+    monkeypatch.setattr(messages, "send", send)
+    made.write("level", 1.0)
+    made.write("level", 2.0)
+    made.flush()
+
+    assert sent == [2.0]
+
+
 def test_a_device_with_room_for_all_tells_nothing(device):
     made, _ = device
     made.write("sent", b"x")

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from time import monotonic
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from madns_runtime.bounded_files import FileRefused, read_regular_file
 from madns_runtime.errors import MachineError
@@ -34,6 +34,11 @@ START_S: Final = 10.0
 """For the emulator to greet."""
 END_S: Final = 2.0
 FIRMWARE_BYTES_MAX: Final = 64 << 20
+ELF_MARK: Final = b"\x7fELF"
+ELF_LITTLE: Final = b"\x01"
+"""At byte 5: numbers have their least byte first."""
+ELF_MACHINE: Final = slice(18, 20)
+ELF_ARM: Final = 40
 WORDS_BYTES_MAX: Final = 4096
 UNSENT_BYTES_MAX: Final = 65_536
 """Of the serial line that the emulator has not taken yet."""
@@ -67,6 +72,8 @@ class EmulatedMcu(Device):
             raise MachineError(f"no firmware {p.firmware}; build it first") from None
         except (OSError, FileRefused) as error:
             raise MachineError(f"{p.firmware} cannot be read: {error}") from None
+        if fault := _image_fault(image, Path(program).name):
+            raise MachineError(f"{p.firmware} {fault}")
         self._poll = select.epoll()
         self._held: dict[tuple[str, int], Any] = {}
         """What the sensors hold, by sensor and element, as far as it was told since it was asked for."""
@@ -308,3 +315,18 @@ class EmulatedMcu(Device):
 
 def _ignore(_answer: Any) -> None:
     """Take that a value was set."""
+
+
+def _image_fault(image: bytes, program: str) -> str:
+    """Return why an image cannot be firmware for an emulator, which would run it all the same; empty if it may be."""
+    if not image:
+        return "is empty; build it first"
+    is_elf = image.startswith(ELF_MARK) and len(image) >= ELF_MACHINE.stop
+    order: Literal["little", "big"] = "little" if image[5:6] == ELF_LITTLE else "big"
+    machine = int.from_bytes(image[ELF_MACHINE], order)
+    if is_elf and program == "qemu-system-arm" and machine != ELF_ARM:
+        return (
+            f"is a program for another processor (e_machine {machine} of its ELF header, an Arm's is {ELF_ARM}); build it"
+            " with arm-none-eabi-gcc"
+        )
+    return ""

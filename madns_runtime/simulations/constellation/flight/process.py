@@ -26,6 +26,7 @@ from madns_runtime.simulations.constellation.flight.interface.answers import (
     FlightAnswer,
     carry_out,
     shown,
+    told_faults,
 )
 from madns_runtime.simulations.constellation.flight.interface.link import FlightLink
 from madns_runtime.simulations.constellation.flight.interface.opening import (
@@ -207,16 +208,15 @@ class ExternalFlight:
         summary: dict[str, Any] = dict(counts)
         if self._link.program is not None:
             lines, size_bytes = self._link.program.talk_counts
-            summary |= {"stderr_lines": lines, "stderr_bytes": size_bytes}
+            summary |= {"stderr_lines": lines, "stderr_bytes": size_bytes, "exit_code": code}
         summary["unanswered"] = len(self._asked)
-        if self._link.program is not None:
-            summary["exit_code"] = code
         if self._settings.interface is not None:
             summary["interface"] = self._interface_summary()
         if not self._is_lockstep:  # where no summary depends on a clock
             summary["answer_s_max"] = round(self._answer_s_max, 6)
-            late = counts["answers_late"] + counts["ticks_skipped"] + overdue
-            late += self._ticks_unanswered
+            late = (
+                counts["answers_late"] + counts["ticks_skipped"] + overdue + self._ticks_unanswered
+            )
             summary["checks"] = [{"name": LATE_CHECK, "limit": 0, "got": late, "passed": late == 0}]
         return summary
 
@@ -272,7 +272,8 @@ class ExternalFlight:
                 since = f"the tick at {self._asked[0][1]:g} s"
                 self._context.log(
                     "warning",
-                    f"{self._link.who} has answered nothing since {since}: no further ones are sent",
+                    f"{self._link.who} has answered nothing since {since}: no further ones are sent"
+                    f"{self._last_words()}",
                 )
             counts["ticks_skipped"] += 1
             return
@@ -296,8 +297,7 @@ class ExternalFlight:
                 came_s = arrival.came_s if self._is_recorded else self._present_s()
                 self._take(answer, came_s, t_s)
         self._keep_talk()
-        how = link.how_it_ended()
-        if how:
+        if how := link.how_it_ended():
             self._keep_talk()
             raise BlamedError(f"{link.who} {how} before {t_s:g} s{self._last_words()}")
         if self._is_recorded:
@@ -393,7 +393,8 @@ class ExternalFlight:
             self._agent.keep_text(STDERR_TEXT, said)
 
     def _last_words(self) -> str:
-        """Return the last line of its standard error, and where all of it lies; nothing if it said nothing."""
+        """Return what was no packet of what it said, the last line of its standard error, and where all of that lies."""
         line = self._link.program.last_line if self._link.program else ""
-        where = f"agents/{self._context.name}/{STDERR_TEXT}.txt"
-        return f"; its last words: {line!r} ({where})" if line else ""
+        name = self._context.name
+        words = f"; its last words: {line!r} (agents/{name}/{STDERR_TEXT}.txt)" if line else ""
+        return told_faults(getattr(self._protocol, "faults", {})) + words

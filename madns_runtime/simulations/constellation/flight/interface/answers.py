@@ -6,6 +6,7 @@ Pure but for what the context does.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -99,6 +100,12 @@ def _command(command: CommandRequest, context: FlightContext) -> None:
         context.dipole(value, at_s=at_s, duration_s=command.duration_s)
     else:
         raise PluginError(f"expected a command that this vehicle knows, got {command.kind}")
+
+
+def told_faults(faults: Mapping[str, int]) -> str:
+    """Return what a protocol counted of what it could not take, to be added to other words; nothing of none."""
+    told = ", ".join(f"{kind} {count}" for kind, count in faults.items() if count)
+    return f"; of what it said was no good packet: {told}" if told else ""
 
 
 def shown(data: bytes) -> str:

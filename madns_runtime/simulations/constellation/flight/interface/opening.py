@@ -21,6 +21,7 @@ from madns_runtime.simulations.constellation.flight.interface.local_transports i
     find_device,
     socket_path,
 )
+from madns_runtime.simulations.constellation.flight.interface.own_protocol import OwnProtocol
 from madns_runtime.simulations.constellation.flight.interface.reports import SetupReport, TickReport
 from madns_runtime.simulations.constellation.flight.interface.socket_transports import (
     SocketLink,
@@ -80,7 +81,7 @@ def make_protocol(name: str, base_directory: Path) -> FlightProtocol:
     lacking = [each for each in METHODS if not callable(getattr(protocol, each, None))]
     if lacking:
         raise BlamedError(f"interface.protocol: {name}: expected the methods {', '.join(lacking)}")
-    ready: FlightProtocol = protocol
+    ready: FlightProtocol = protocol if made else OwnProtocol(protocol)
     return ready
 
 

@@ -1,0 +1,78 @@
+"""A protocol that its user has written: called with blame, and what it returns looked at before it is used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from madns_runtime.errors import BlamedError
+from madns_runtime.plugin.context import describe_exception
+from madns_runtime.simulations.constellation.flight.interface.answers import FlightAnswer
+from madns_runtime.simulations.constellation.flight.interface.reports import SetupReport, TickReport
+
+
+class OwnProtocol:
+    """
+    A `FlightProtocol` around one of a user's own.
+
+    Args:
+        protocol: Made.
+    """
+
+    def __init__(self, protocol: Any) -> None:
+        self._protocol = protocol
+        self._name = type(protocol).__name__
+        self.answers_by_time = bool(getattr(protocol, "answers_by_time", True))
+
+    @property
+    def faults(self) -> Mapping[str, int]:
+        """What it counts of what it could not take, as far as that is a mapping of numbers."""
+        told = getattr(self._protocol, "faults", {})
+        known = told if isinstance(told, Mapping) else {}
+        return {str(kind): int(n) for kind, n in known.items() if isinstance(n, int | float)}
+
+    def setup(self, setup: SetupReport) -> Sequence[bytes]:
+        """
+        Return the packets that tell the software who it is.
+
+        Raises:
+            BlamedError: It raised, or returned something else.
+        """
+        return self._packets("setup", self._protocol.setup, setup)
+
+    def tick(self, tick: TickReport) -> Sequence[bytes]:
+        """
+        Return the packets of a tick.
+
+        Raises:
+            BlamedError: It raised, or returned something else.
+        """
+        return self._packets("tick", self._protocol.tick, tick)
+
+    def feed(self, data: bytes) -> Sequence[FlightAnswer]:
+        """
+        Take bytes, and return the answers that are whole now.
+
+        Raises:
+            BlamedError: It raised, or returned something else.
+        """
+        told = self._called("feed", self._protocol.feed, data)
+        if not isinstance(told, list | tuple) or not all(isinstance(x, FlightAnswer) for x in told):
+            raise self._wrong("feed", "a list of FlightAnswer", told)
+        return told
+
+    def _packets(self, method: str, call: Callable[[Any], Any], report: Any) -> Sequence[bytes]:
+        told = self._called(method, call, report)
+        kinds = bytes | bytearray | memoryview
+        if not isinstance(told, list | tuple) or not all(isinstance(x, kinds) for x in told):
+            raise self._wrong(method, "a list of bytes", told)
+        return [bytes(packet) for packet in told]
+
+    def _called(self, method: str, call: Callable[[Any], Any], argument: Any) -> Any:
+        try:
+            return call(argument)
+        except Exception as error:
+            raise BlamedError(describe_exception(error, f"{self._name}.{method}")) from error
+
+    def _wrong(self, method: str, expected: str, told: Any) -> BlamedError:
+        return BlamedError(f"{self._name}.{method}: expected {expected}, got {told!r:.80}")
