@@ -11,7 +11,6 @@ import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,6 +18,7 @@ from madns_runtime.errors import ConfigurationError, MachineError, PluginError
 from madns_runtime.hardware.bounds import bound_faults
 from madns_runtime.hardware.contract import Channel, Device, DeviceKind, Needs, SimulatedDevice
 from madns_runtime.plain_values import from_mapping
+from madns_runtime.plugin.entry_points import place_of_name, registered
 from madns_runtime.plugin.isolation import call_plugin
 from madns_runtime.plugin.registry import load_object
 
@@ -40,7 +40,7 @@ class DeviceProgram:
 
 def registered_kinds() -> tuple[str, ...]:
     """Return the names of all installed kinds, sorted."""
-    return tuple(sorted({entry.name for entry in metadata.entry_points(group=GROUP)}))
+    return tuple(sorted(registered(GROUP)))
 
 
 def resolve_kind(spec: str, base_directory: Path) -> DeviceKind:
@@ -57,13 +57,13 @@ def resolve_kind(spec: str, base_directory: Path) -> DeviceKind:
     """
     where = spec
     if ":" not in spec:
-        entries = {entry.name: entry.value for entry in metadata.entry_points(group=GROUP)}
+        entries = registered(GROUP)
         if spec not in entries:
             close = difflib.get_close_matches(spec, entries, n=1)
             hint = f", did you mean {close[0]}?" if close else ""
             known = ", ".join(sorted(entries)) or "none"
             raise PluginError(f"no kind of device named {spec!r}{hint}; installed are {known}")
-        where = entries[spec]
+        where = place_of_name(GROUP, spec)
     module, found = load_object(where, base_directory)
     kind = getattr(found, "kind", None) if isinstance(found, type) else found
     if not isinstance(kind, DeviceKind):
