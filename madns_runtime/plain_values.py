@@ -13,8 +13,9 @@ import types
 import typing
 from collections.abc import Mapping
 from enum import Enum
+from numbers import Integral, Real
 from pathlib import Path, PurePath
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeGuard, TypeVar
 
 from madns_runtime.errors import ConfigurationError
 
@@ -181,3 +182,13 @@ def _build_dataclass(cls: type, value: Any, where: str) -> Any:
     if missing:
         raise ConfigurationError(f"{where}: missing {', '.join(missing)}")
     return cls(**{k: _build(hints[k], v, f"{where}.{k}") for k, v in value.items()})
+
+
+def is_real(value: object) -> TypeGuard[float]:
+    """Tell whether a value is a real number, of Python or of NumPy; what is true or false is none."""
+    return issubclass(type(value), Real) and type(value) is not bool
+
+
+def is_whole(value: object) -> TypeGuard[int]:
+    """Tell whether a value is a whole number, as `is_real`."""
+    return issubclass(type(value), Integral) and type(value) is not bool

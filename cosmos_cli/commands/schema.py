@@ -5,13 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.schema import schema_text
-from cosmos_cli.models.separate_process import SeparateDefect, SeparateFailure, work_separately
+from cosmos_cli.models.separate_process import (
+    SeparateDefect,
+    SeparateFailure,
+    Work,
+    work_separately,
+)
 from cosmos_cli.ui.console import Console
 from madns_runtime.bounded_files import read_regular_file
 from madns_runtime.config import Timeouts
@@ -36,7 +41,7 @@ def schema(
 ) -> None:
     """Print the JSON Schema of scenarios, for completion in editors."""
     console = Console()
-    text = _current_schema()
+    text = _current_schema(console.warn)
     if check and output is None:
         output = KEPT
         if not output.is_file():
@@ -54,30 +59,50 @@ def schema(
     console.say(f"{output}: {'current' if check else 'written'}")
 
 
-def _current_schema() -> str:
+def _current_schema(warn: Callable[[str], None]) -> str:
+    """Return the schema of all installed simulations; *warn* hears of those that do not load, and are left out."""
     names = registered_names()
     if all(map(is_shipped, names)):
         return str(_schema_of(names, lambda doing: None)["text"])
+    faults = {name: _fault_of(name) for name in names if not is_shipped(name)}
+    for name, fault in faults.items():
+        if fault:
+            warn(f"{name} is left out: {fault}")
+    whole = [name for name in names if not faults.get(name)]
+    return str(_asked_separately(partial(_schema_of, whole))["text"])
+
+
+def _fault_of(name: str) -> str:
+    """Return why an installed simulation that is not shipped does not load; empty if it does."""
+
+    def load(tell: Callable[[str], None]) -> Mapping[str, str]:
+        tell(f"importing {name}")
+        try:
+            schema_text({name: resolve(name, Path())})
+        except MadnsError as error:
+            return {"fault": str(error)}
+        return {"fault": ""}
+
     try:
-        found = work_separately(partial(_schema_of, names), limit_s=Timeouts().loading_s)
+        return str(_asked_separately(load)["fault"])
+    except PluginError as error:
+        return str(error)
+
+
+def _asked_separately(work: Work) -> Mapping[str, Any]:
+    try:
+        return work_separately(work, limit_s=Timeouts().loading_s)
     except SeparateFailure as failure:
         raise PluginError(str(failure)) from None
     except SeparateDefect as defect:
         raise RuntimeError(str(defect)) from None
-    if "fault" in found:
-        raise PluginError(found["fault"])
-    return str(found["text"])
 
 
 def _schema_of(names: Sequence[str], tell: Callable[[str], None]) -> Mapping[str, str]:
-    """Return the schema as `text`, or what is wrong with an installed simulation as `fault`."""
     simulations = {}
     for name in names:
         tell(f"importing {name}")
-        try:
-            simulations[name] = resolve(name, Path())
-        except MadnsError as error:
-            return {"fault": f"{name}: {error}"}
+        simulations[name] = resolve(name, Path())
     return {"text": schema_text(simulations)}
 
 

@@ -38,16 +38,14 @@ def plugin_checks(summaries: Mapping[str, Mapping[str, Any]]) -> list[CheckResul
 
 
 def _parse_check(item: Any, who: str) -> CheckResult:
-    mapping = item if isinstance(item, Mapping) else {}
-    name, limit, got, passed = (mapping.get(key) for key in ("name", "limit", "got", "passed"))
-    told = mapping.get("worst")
     if check_fault(item):
         return CheckResult(name=f"{who}.checks", limit=0, got=None, passed=False, worst=who)
+    got, told = item.get("got"), item.get("worst")
     return CheckResult(
-        name=name,
-        limit=limit,
+        name=item["name"],
+        limit=item["limit"],
         got=got if is_number(got) else None,
-        passed=is_number(got) and passed,
+        passed=is_number(got) and item["passed"],
         worst=told if isinstance(told, str) and told else who,
     )
 

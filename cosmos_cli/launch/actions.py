@@ -94,10 +94,11 @@ class QuoteLastWords:
 
 @dataclass(frozen=True, slots=True)
 class FindLastCall:
-    """Find the plug-in's call in which a host has ended; answered by LastCallFound."""
+    """Find the plug-in's call in which a host has ended, or stands; answered by LastCallFound."""
 
     name: str
-    how: str
+    how: str = ""
+    """End of the host; empty while it lives."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any
 
 from cosmos_cli.launch.actions import Agenda, CloseChild, Kill, LookAtGroup, Send, Terminate
-from cosmos_cli.launch.run_events import ChildStarted, GroupKilled, GroupSeen
+from cosmos_cli.launch.run_events import ChildStarted, GroupKilled, GroupSeen, LastCallFound
 
 HOST = "host"
 TERM_GRACE_S = 3.0
@@ -125,6 +125,15 @@ class Children:
             self._agenda.problem(
                 f"{child} {event.why}: killed with SIGKILL ({pids})", child.machine
             )
+
+    def last_call_found(self, event: LastCallFound) -> None:
+        """Say in which call of the plug-in a host has ended, or stands."""
+        child = self[event.name]
+        if event.how:
+            how = event.how + (event.where or child.meanwhile)
+            self._agenda.problem(f"{child} {how} before the run was over", child.machine)
+        elif event.where:
+            self._agenda.problem(f"{child} stands{event.where}", child.machine)
 
     def _give_up(self, child: ChildRecord) -> None:
         """Take a child for ended that even SIGKILL has not ended."""

@@ -107,10 +107,11 @@ class GroupKilled:
 
 @dataclass(frozen=True, slots=True)
 class LastCallFound:
-    """The plug-in's call in which a host has ended, in words or empty."""
+    """The plug-in's call in which a host has ended, or stands, in words or empty."""
 
     name: str
     how: str
+    """As of `FindLastCall`."""
     where: str
 
 

@@ -90,7 +90,7 @@ class Supervision:
             happened.ReattachFailed: self._watch.reattach_failed,
             happened.GroupSeen: self._children.group_seen,
             happened.GroupKilled: self._children.killed,
-            happened.LastCallFound: self._last_call_found,
+            happened.LastCallFound: self._children.last_call_found,
             happened.MachineAsked: self._machine_asked,
             happened.MachineReached: self._machine_reached,
             happened.SignalUndelivered: lambda event: self._watch.give_up(event.machine),
@@ -260,11 +260,6 @@ class Supervision:
             self._agenda.do(actions.FindLastCall(HOST, event.how), actions.QuoteLastWords(HOST))
             self._close_down(grace_s=0.0)
 
-    def _last_call_found(self, event: happened.LastCallFound) -> None:
-        child = self._children[event.name]
-        how = event.how + (event.where or child.meanwhile)
-        self._agenda.problem(f"{child} {how} before the run was over", child.machine)
-
     def _supervisor_exited(self, child: ChildRecord, how: str) -> None:
         if self._is_closing:
             return
@@ -287,7 +282,7 @@ class Supervision:
     def _give_up_on_host(self, late: str) -> None:
         host = self._children[HOST]  # one that was not started has no deadline
         self._children.end(host, late + host.meanwhile)
-        self._agenda.do(actions.QuoteLastWords(HOST))
+        self._agenda.do(actions.FindLastCall(HOST), actions.QuoteLastWords(HOST))
         self._close_down(grace_s=0.0)
 
     # Machines -------------------------------------------------------------------------------------

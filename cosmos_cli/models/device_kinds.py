@@ -11,7 +11,6 @@ import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -35,6 +34,7 @@ from madns_runtime.hardware.contract import Channel, DeviceKind, Needs
 from madns_runtime.hardware.kind_registry import GROUP, prepare, registered_kinds, resolve_kind
 from madns_runtime.plain_values import from_mapping
 from madns_runtime.plugin.code_places import blame
+from madns_runtime.plugin.entry_points import registered
 from madns_runtime.plugin.isolation import said
 from madns_runtime.plugin.registry import is_file
 from madns_runtime.plugin.time_limit import PluginStopped, hold
@@ -154,7 +154,7 @@ def _is_shipped(kind: str) -> bool:
     """Tell whether a kind's code is ours; nothing is imported."""
     if ":" in kind:
         return not is_file(kind) and kind.startswith(SHIPPED)
-    entries = [entry.value for entry in metadata.entry_points(group=GROUP) if entry.name == kind]
+    entries = registered(GROUP).get(kind, ())
     return all(entry.startswith(SHIPPED) for entry in entries)  # none: nothing will be imported
 
 

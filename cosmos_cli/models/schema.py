@@ -12,7 +12,7 @@ import functools
 import inspect
 import json
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import TypeAdapter
@@ -21,6 +21,7 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from cosmos_cli.models.parameters import adapter_of
 from cosmos_cli.models.scenario import Scenario
 from cosmos_cli.models.timeline_schema import (
+    drop_action_definitions,
     entry_schema,
     own_entry_schema,
     timeline_inputs,
@@ -89,10 +90,11 @@ def scenario_schema(simulations: Mapping[str, Simulation]) -> dict[str, Any]:
     """
     known = sorted(simulations.items())
     actions = {name: simulation.actions for name, simulation in known}
+    of_timeline = timeline_inputs(actions)
     inputs: list[tuple[str, Any, TypeAdapter[Any]]] = [
         ("", "validation", TypeAdapter(Scenario)),
         *((name, "validation", adapter_of(each.parameters)) for name, each in known),
-        *timeline_inputs(actions),
+        *of_timeline,
     ]
     places, shared = TypeAdapter.json_schemas(inputs, schema_generator=_DescribedSchema)
     definitions = shared["$defs"]
@@ -103,16 +105,21 @@ def scenario_schema(simulations: Mapping[str, Simulation]) -> dict[str, Any]:
     }
     root["properties"]["timeline"]["items"] = entry_schema(places, definitions)
     whole = _taken_requirements(root, definitions)
+    entries = {
+        name: own_entry_schema(places, definitions, name, own) for name, own in actions.items()
+    }
+    of_parameters = {
+        name: definitions[_definition_of(places[name, "validation"])] for name in actions
+    }
+    # Simulations may have one class of parameters: what it requires is taken when all have read it.
+    required = {name: each.get("required", []) for name, each in of_parameters.items()}
+    for each in of_parameters.values():
+        each.pop("required", None)
     choices = [
-        _choice(
-            name,
-            places[name, "validation"],
-            definitions,
-            own_entry_schema(places, definitions, name, actions[name]),
-        )
-        for name in actions
+        _choice(name, places[name, "validation"], required[name], entries[name]) for name in actions
     ]
     found = {**root, "allOf": [whole, *choices], "$defs": definitions}
+    drop_action_definitions(found, of_timeline, places, definitions)
     _let_variables_stand(found)
     return {"$schema": DIALECT, **found}
 
@@ -163,7 +170,7 @@ def _let_variables_stand(schema: Any) -> None:
 def _choice(
     name: str,
     place: Mapping[str, Any],
-    definitions: Mapping[str, Any],
+    required: Sequence[str],
     entry: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Return the rule that this simulation's parameters and its actions are its own."""
@@ -174,7 +181,7 @@ def _choice(
             "timeline": {"items": entry},
         }
     }
-    if required := definitions[_definition_of(place)].pop("required", None):
+    if required:
         whole = {"required": ["parameters"], "properties": {"parameters": {"required": required}}}
         then |= {"if": {"required": ["extends"]}, "then": {}, "else": whole}
     # What a base names is not known here: then no simulation's rule holds.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -39,7 +41,7 @@ def entry_schema(places: Places, definitions: Definitions) -> dict[str, Any]:
 
     Args:
         places: Where pydantic put what `timeline_inputs` asked for.
-        definitions: The schema's; those of parameters are taken, since theirs are not an entry's only keys.
+        definitions: The schema's.
     """
     place = places[ENTRY, "validation"]
     entry = definitions[str(place["$ref"]).rpartition("/")[2]]
@@ -56,6 +58,25 @@ def own_entry_schema(
     known = [*_words(FRAMEWORK_ACTIONS), *_words(actions), {"type": "string", "pattern": VARIABLE}]
     rules = [_rule(kind, places, definitions, owner) for kind in actions]
     return {"properties": {"action": {"anyOf": known}}, **({"allOf": rules} if rules else {})}
+
+
+def drop_action_definitions(
+    schema: Mapping[str, Any], inputs: Inputs, places: Places, definitions: Definitions
+) -> None:
+    """
+    Drop the definitions of actions' parameters to which nothing in *schema* refers: their rules hold copies.
+
+    Args:
+        schema: With *definitions* in it.
+        inputs: As of `timeline_inputs`.
+        places: Where pydantic put them.
+        definitions: The schema's.
+    """
+    text = json.dumps(schema)
+    for name, mode, _ in inputs:
+        definition = str(places[name, mode]["$ref"])
+        if name != ENTRY and json.dumps(definition) not in text:
+            definitions.pop(definition.rpartition("/")[2], None)
 
 
 def _words(kinds: Iterable[ActionKind]) -> list[dict[str, Any]]:
@@ -75,7 +96,8 @@ def _rule(
     then: dict[str, Any] = {}
     if kind.parameters is not NoParameters:
         place = places[_name(owner, kind), "validation"]
-        found = definitions.pop(str(place["$ref"]).rpartition("/")[2])
+        # A copy: several actions may have one class, and a simulation's parameters may hold it as well.
+        found = copy.deepcopy(definitions[str(place["$ref"]).rpartition("/")[2]])
         then["properties"] = found["properties"]
         required += found.get("required", [])
     if required:

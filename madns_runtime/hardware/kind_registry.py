@@ -11,7 +11,6 @@ import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,6 +25,7 @@ from madns_runtime.hardware.kind_declaration import (
 )
 from madns_runtime.plain_values import from_mapping
 from madns_runtime.plugin.code_places import told_place
+from madns_runtime.plugin.entry_points import place_of_name, registered
 from madns_runtime.plugin.isolation import call_plugin
 from madns_runtime.plugin.registry import load_object
 
@@ -46,7 +46,7 @@ class DeviceProgram:
 
 def registered_kinds() -> tuple[str, ...]:
     """Return the names of all installed kinds, sorted."""
-    return tuple(sorted({entry.name for entry in metadata.entry_points(group=GROUP)}))
+    return tuple(sorted(registered(GROUP)))
 
 
 def resolve_kind(spec: str, base_directory: Path) -> DeviceKind:
@@ -63,19 +63,13 @@ def resolve_kind(spec: str, base_directory: Path) -> DeviceKind:
     """
     where = spec
     if ":" not in spec:
-        entries: dict[str, str] = {}
-        for entry in metadata.entry_points(group=GROUP):
-            if entries.setdefault(entry.name, entry.value) != entry.value and entry.name == spec:
-                raise PluginError(
-                    f"two installed distributions have a kind of device named {spec!r}: name {entries[spec]} or"
-                    f" {entry.value}, or remove one of them"
-                )
+        entries = registered(GROUP)
         if spec not in entries:
             close = difflib.get_close_matches(spec, entries, n=1)
             hint = f", did you mean {close[0]}?" if close else ""
             known = ", ".join(sorted(entries)) or "none"
             raise PluginError(f"no kind of device named {spec!r}{hint}; installed are {known}")
-        where = entries[spec]
+        where = place_of_name(GROUP, spec)
     module, found = load_object(where, base_directory)
     kind = getattr(found, "kind", None) if isinstance(found, type) else found
     if not isinstance(kind, DeviceKind):

@@ -11,7 +11,6 @@ import heapq
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from numbers import Real
 from typing import Any, Final, Protocol
 
 from madns_runtime.errors import MessageTooLarge, PluginError
@@ -22,6 +21,7 @@ from madns_runtime.medium.outcomes import (
     Medium,
     MessageAccount,
 )
+from madns_runtime.plain_values import is_real
 from madns_runtime.protocol.link_settings import SendQueueFull
 from madns_runtime.protocol.messages import Delivery, Transmission, TransmissionRefusal
 
@@ -205,21 +205,18 @@ def _plain(outcome: LinkOutcome) -> LinkOutcome:
         PluginError: A value is neither.
     """
     changed: dict[str, Any] = {}
-    for name, kind, wanted in (
-        ("to", str, "a receiver's name"),
-        ("outcome", str, f"{DELIVERED!r}, {LOST!r}, or a word that says why not"),
-        ("arrives_s", Real, "a simulated time in seconds, or None"),
-        ("size_bytes", Real, "a number of bytes"),
-        ("channel", str, "a text"),
+    for name, wanted in (
+        ("to", "a receiver's name"),
+        ("outcome", f"{DELIVERED!r}, {LOST!r}, or a word that says why not"),
+        ("arrives_s", "a simulated time in seconds, or None"),
+        ("size_bytes", "a number of bytes"),
+        ("channel", "a text"),
     ):
-        value = getattr(outcome, name)
+        value: Any = getattr(outcome, name)
         if name == "arrives_s" and value is None:
             continue
-        if (
-            not isinstance(value, kind)
-            or isinstance(value, bool)
-            or (name, value) == ("outcome", "")
-        ):
+        is_fit = is_real(value) if name in _MAKE else isinstance(value, str)
+        if not is_fit or (name, value) == ("outcome", ""):
             raise PluginError(f"a LinkOutcome with {name} {value!r:.80}: expected {wanted}")
         try:
             changed[name] = _MAKE.get(name, str)(value)

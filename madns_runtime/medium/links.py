@@ -13,11 +13,11 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from hashlib import blake2b
-from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, Final
 
 from madns_runtime.errors import PluginError
 from madns_runtime.medium.outcomes import DELIVERED, EVERYBODY, LOST, LinkOutcome
+from madns_runtime.plain_values import is_real, is_whole
 from madns_runtime.protocol.codec import pack
 from madns_runtime.protocol.messages import Transmission
 
@@ -157,7 +157,7 @@ class LinkMedium:
         for receiver in self._agents if to == EVERYBODY else (to,):
             if receiver == sender:
                 continue
-            barrier = self._reach(sender, receiver, leaves_s) if self._reach else None
+            barrier: Any = self._reach(sender, receiver, leaves_s) if self._reach else None
             if barrier is not None and (not isinstance(barrier, str) or not barrier):
                 raise PluginError(
                     f"reach({sender!r}, {receiver!r}, {leaves_s:g}) returned {barrier!r:.80}: expected None if the"
@@ -190,8 +190,7 @@ def _check_answers(delay_s: Any, rate_byte_s: Any, loss: Any, queue_max: Any) ->
     Raises:
         PluginError: One is no such number.
     """
-    is_share = isinstance(loss, Real) and not isinstance(loss, bool) and 0 <= loss <= 1
-    is_count = isinstance(queue_max, Integral) and not isinstance(queue_max, bool)
+    is_share = is_real(loss) and 0 <= loss <= 1
     for name, value, is_fit, wanted in (
         (
             "delay_s",
@@ -206,7 +205,12 @@ def _check_answers(delay_s: Any, rate_byte_s: Any, loss: Any, queue_max: Any) ->
             "bytes per second, more than 0, or math.inf",
         ),
         ("loss", loss, is_share, "a share from 0 to 1"),
-        ("queue_max", queue_max, is_count and queue_max >= 0, "a whole number, 0 or more"),
+        (
+            "queue_max",
+            queue_max,
+            is_whole(queue_max) and queue_max >= 0,
+            "a whole number, 0 or more",
+        ),
     ):
         if not is_fit:
             raise PluginError(f"LinkMedium: {name}: expected {wanted}, got {value!r:.80}")
@@ -214,4 +218,4 @@ def _check_answers(delay_s: Any, rate_byte_s: Any, loss: Any, queue_max: Any) ->
 
 def _is_positive(value: Any) -> bool:
     """Tell whether a value is a number of finite size above 0."""
-    return isinstance(value, Real) and not isinstance(value, bool) and bool(0 < value < math.inf)
+    return is_real(value) and bool(0 < value < math.inf)

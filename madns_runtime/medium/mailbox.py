@@ -10,11 +10,11 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Callable, Sequence
-from numbers import Integral
 from typing import Any, Final
 
 from madns_runtime.errors import PluginError
 from madns_runtime.medium.outcomes import EVERYBODY
+from madns_runtime.plain_values import is_whole
 from madns_runtime.protocol.messages import Delivery, Service, Transmission
 
 HELD_MAX: Final = 4096
@@ -100,7 +100,7 @@ class Mailbox:
             raise PluginError(f"expected a receiver's name, got {to!r:.80}")
         if number is None:
             number = self._number
-        elif not isinstance(number, Integral) or isinstance(number, bool):
+        elif not is_whole(number):
             raise PluginError(f"number: expected a whole number, got {number!r:.80}")
         else:
             number = int(number)

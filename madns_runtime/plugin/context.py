@@ -7,7 +7,6 @@ import math
 import traceback
 import zlib
 from collections.abc import Callable, Container, Mapping, Sequence
-from numbers import Real
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -23,6 +22,7 @@ from madns_runtime.errors import (
 from madns_runtime.medium.carrier import Carrier
 from madns_runtime.medium.mailbox import Mailbox
 from madns_runtime.medium.outcomes import LinkOutcome
+from madns_runtime.plain_values import is_real
 from madns_runtime.plugin.code_places import error_text
 from madns_runtime.plugin.device_view import DeviceView
 from madns_runtime.protocol.codec import pack, unpack
@@ -138,9 +138,7 @@ class JobContext(RunContext):
         self.wake = wake
         self.account = half.carrier.account
 
-    def enter(
-        self, sender: str, transmission: Transmission, outcomes: Sequence[LinkOutcome]
-    ) -> None:
+    def enter(self, sender: Any, transmission: Any, outcomes: Sequence[LinkOutcome]) -> None:
         """See to a message of a place that is no agent; see `plugin.api.HostContext.enter`."""
         if not isinstance(sender, str) or not isinstance(transmission, Transmission):
             raise PluginError(
@@ -190,8 +188,7 @@ def check_sending(
         return
     if service is not Service.SYNC:
         raise PluginError(f"deadline_s goes with Service.SYNC, not with {service!r}")
-    is_number = isinstance(deadline_s, Real) and not isinstance(deadline_s, bool)
-    if not is_number or not math.isfinite(deadline_s):
+    if not is_real(deadline_s) or not math.isfinite(deadline_s):
         raise PluginError(f"deadline_s: expected a simulated time in seconds, got {deadline_s!r}")
     if not is_running:
         raise PluginError("deadline_s is simulated time, which has not begun")

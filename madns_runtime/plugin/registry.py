@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import difflib
-import functools
 import hashlib
 import importlib
 import importlib.util
@@ -20,7 +19,6 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
@@ -38,6 +36,7 @@ from madns_runtime.plugin.code_places import (
     told_place,
 )
 from madns_runtime.plugin.columns import shape_faults
+from madns_runtime.plugin.entry_points import place_of_name, registered
 from madns_runtime.plugin.isolation import missing_extra, said
 from madns_runtime.plugin.parameter_kinds import kind_faults
 from madns_runtime.plugin.time_limit import PluginStopped, hold
@@ -90,13 +89,7 @@ class IdleHost(HostSimulation):
 
 def registered_names() -> tuple[str, ...]:
     """Return the names of all installed simulations, sorted."""
-    return tuple(sorted({name for name, _ in _registered(tuple(sys.path))}))
-
-
-@functools.lru_cache(maxsize=8)
-def _registered(path: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
-    """Return name and place of all installed simulations; read once per path of imports, as that takes 8 ms."""
-    return tuple((entry.name, entry.value) for entry in metadata.entry_points(group=GROUP))
+    return tuple(sorted(registered(GROUP)))
 
 
 def resolve(spec: str, base_directory: Path) -> Simulation:
@@ -108,16 +101,16 @@ def resolve(spec: str, base_directory: Path) -> Simulation:
         base_directory: Folder of the scenario; files are found from here.
 
     Raises:
-        PluginError: There is no such simulation, its file does not load, or its descriptor is faulty.
+        PluginError: There is no such simulation, or more than one of that name, its file does not load, or its
+            descriptor is faulty.
         MissingExtraError: It needs an optional dependency that is not installed.
     """
     if ":" in spec:
         where = spec
     else:
-        entries = dict(_registered(tuple(sys.path)))
-        if spec not in entries:
-            raise PluginError(_unknown_name(spec, sorted(entries), base_directory))
-        where = entries[spec]
+        if spec not in registered(GROUP):
+            raise PluginError(_unknown_name(spec, sorted(registered(GROUP)), base_directory))
+        where = place_of_name(GROUP, spec)
     module, descriptor = load_object(where, base_directory)
     return _checked(descriptor, where, module)
 
@@ -186,7 +179,7 @@ def is_file(spec: str) -> bool:
 def is_shipped(spec: str) -> bool:
     """Tell whether a spec means a simulation of this package; nothing is imported."""
     if ":" not in spec:
-        found = [place for name, place in _registered(tuple(sys.path)) if name == spec]
+        found = registered(GROUP).get(spec, ())
         return bool(found) and all(map(is_shipped, found))
     return not is_file(spec) and spec.startswith(f"{__name__.partition('.')[0]}.")
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from numbers import Real
 from typing import Any
 
 import orjson
 
 from madns_runtime.errors import PluginError
+from madns_runtime.plain_values import is_real
 from madns_runtime.protocol.codec import pack
 from madns_runtime.protocol.datagram import MESSAGE_BYTES_MAX
 from madns_runtime.recording.encoding import count_not_finite
@@ -57,8 +57,7 @@ def next_time(value: Any) -> float | None:
         return None
     try:
         # With NumPy's, which a time becomes by one operand of theirs.
-        is_number = isinstance(value, Real) and not isinstance(value, bool)
-        time_s = float(value) if is_number else math.nan
+        time_s = float(value) if is_real(value) else math.nan
     except OverflowError:  # a whole number beyond what a float holds has no short text either
         raise PluginError(
             "a whole number without end: expected a simulated time in seconds"

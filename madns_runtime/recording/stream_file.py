@@ -29,7 +29,7 @@ NAME_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 CONTROL_KEYS = ("end", "t0_utc")
 
 
-def check_name(name: str) -> None:
+def check_name(name: Any) -> None:
     """
     Check that a stream or a text may be called so.
 
@@ -51,7 +51,8 @@ def check_schema(schema: StreamSchema) -> None:
             are rounded among others that are no numbers.
     """
     check_name(schema.name)
-    for field in schema.fields:
+    fields: tuple[Any, ...] = schema.fields  # of a plug-in
+    for field in fields:
         if not isinstance(field, Field) or field.kind not in FIELD_KINDS:
             raise PluginError(
                 f"stream {schema.name}: expected fields of kind {', '.join(FIELD_KINDS)}, got {field!r:.100}"

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from importlib import metadata
 
 import pytest
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.loading import load_scenario
 from madns_runtime.errors import PluginError
-from madns_runtime.hardware.kind_registry import GROUP, prepare
+from madns_runtime.hardware.kind_registry import prepare
 
 DRIVER = """
 import time
@@ -136,15 +135,3 @@ def test_a_length_of_one_byte_bounds_the_frames_that_an_agent_may_send():
     channels = {each.name: each for each in prepare("serial", given, None).channels}
 
     assert channels["sent"].frame_bytes_max == 255
-
-
-def test_of_two_distributions_with_a_kind_of_one_name_none_is_taken_for_the_other(monkeypatch):
-    ours = [each for each in metadata.entry_points(group=GROUP) if each.name == "null"]
-    theirs = metadata.EntryPoint(name="null", value="labkit.nothing:kind", group=GROUP)
-    monkeypatch.setattr(metadata, "entry_points", lambda group: [*ours, *ours, theirs])
-
-    with pytest.raises(PluginError, match=r"two installed .* named 'null': name .*:kind or labkit"):
-        prepare("null", {}, None)
-
-    monkeypatch.setattr(metadata, "entry_points", lambda group: [*ours, *ours])
-    assert prepare("null", {}, None).kind.name == "null"

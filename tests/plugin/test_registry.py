@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from madns_runtime.errors import ConfigurationError, MissingExtraError, PluginError
+from madns_runtime.hardware import kind_registry
 from madns_runtime.plugin import registry
 from madns_runtime.plugin.api import Simulation
 
@@ -67,6 +68,41 @@ def test_registered_name_is_found(tmp_path):
 
     assert descriptor.name == "counter"
     assert {"counter", "constellation"} <= set(registry.registered_names())
+
+
+def install(folder, name, value, *, group="madns.simulations"):
+    """Install metadata of a distribution that registers two-grids in a group, and put its folder on the path."""
+    info = folder / f"{name.replace('-', '_')}-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[{group}]\ntwo-grids = {value}\n")
+
+
+@pytest.mark.parametrize(
+    ("group", "find"),
+    [("madns.simulations", registry.resolve), ("madns.devices", kind_registry.resolve_kind)],
+)
+def test_name_of_two_distributions_is_refused_with_both_of_them(tmp_path, monkeypatch, group, find):
+    install(tmp_path / "a", "grid-nodes", "grid_nodes:simulation", group=group)
+    install(tmp_path / "b", "grid-two", "grid_two:simulation", group=group)
+    monkeypatch.syspath_prepend(tmp_path / "a")
+    monkeypatch.syspath_prepend(tmp_path / "b")
+
+    with pytest.raises(PluginError) as caught:
+        find("two-grids", tmp_path)
+
+    assert str(caught.value).startswith("'two-grids' is registered by more than one distribution: ")
+    for told in ("grid-nodes 1.0 (grid_nodes:simulation)", "grid-two 1.0 (grid_two:simulation)"):
+        assert told in str(caught.value)
+
+
+def test_name_that_two_distributions_register_for_one_place_is_that_place(tmp_path, monkeypatch):
+    place = "madns_runtime.simulations.counter:simulation"
+    for name in ("grid-old", "grid-new"):
+        install(tmp_path, name, place)
+    monkeypatch.syspath_prepend(tmp_path)
+
+    assert registry.resolve("two-grids", tmp_path).name == "counter"
 
 
 def test_module_and_attribute_are_found(tmp_path):

@@ -140,6 +140,28 @@ def test_schema_is_printed_written_and_checked(cosmos):
     assert err == "error: s.json: is not current; write it with: cosmos schema --output s.json\n"
 
 
+@pytest.mark.process
+def test_installed_simulations_that_do_not_load_are_left_out_of_the_schema_and_told(
+    cosmos, tmp_path, monkeypatch
+):
+    _, shipped, _ = cosmos("schema")
+    info = tmp_path / "installed/broken_sims-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken-sims\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[madns.simulations]\nbroken = broken_sim:simulation\ngone = no_such_module:simulation\n"
+    )
+    (info.parent / "broken_sim.py").write_text("raise RuntimeError('no licence')\n")
+    monkeypatch.syspath_prepend(info.parent)
+
+    code, out, err = cosmos("schema")
+
+    assert (code, out) == (0, shipped)
+    assert "broken is left out: " in err
+    assert "RuntimeError: no licence" in err
+    assert "gone is left out: no_such_module:simulation: No module named 'no_such_module'" in err
+
+
 def test_schema_that_is_kept_in_scenarios_is_checked_by_default(cosmos):
     Path("scenarios").mkdir()
     cosmos("schema", "-o", "scenarios/scenario.schema.json")

@@ -164,6 +164,20 @@ def test_host_is_started_first_and_a_supervisor_when_it_listens() -> None:
     assert table.play((0, ChildSaid(HOST, LISTENING))) == []  # once
 
 
+@pytest.mark.parametrize(
+    ("where", "told"),
+    [(" in Grid.setup", ["host (pid 10) stands in Grid.setup"]), ("", [])],
+)
+def test_call_of_the_plug_in_in_which_a_hanging_host_stands_is_told(
+    where: str, told: list[str]
+) -> None:
+    table = Table(remote=())
+    table.play((0, Begun()), (0, ChildStarted(HOST, None, 10)))
+    table.wait(TIMEOUTS.host_start_s)
+
+    assert problems(table.play((0, happened.LastCallFound(HOST, "", where)))) == told
+
+
 def test_host_that_does_not_listen_is_ended_then_killed_then_given_up() -> None:
     table = Table(remote=())
     table.play((0, Begun()), (0, ChildStarted(HOST, None, 10)))
@@ -175,7 +189,11 @@ def test_host_that_does_not_listen_is_ended_then_killed_then_given_up() -> None:
 
     why = "has not listened within 20 s (timeouts.host_start_s) while loading a.py"
     assert problems(late) == [f"host (pid 10) {why}: it is being ended"]
-    assert late[1:] == [actions.Terminate(HOST), actions.QuoteLastWords(HOST)]
+    assert late[1:] == [
+        actions.Terminate(HOST),
+        actions.FindLastCall(HOST),
+        actions.QuoteLastWords(HOST),
+    ]
     assert killed == [actions.Kill(HOST, "did not heed SIGTERM for 3 s")]
     assert problems(met) == [
         "host (pid 10) did not heed SIGTERM for 3 s: killed with SIGKILL (10, 11)"

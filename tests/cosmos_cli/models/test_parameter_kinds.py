@@ -6,14 +6,18 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import pytest
+from annotated_types import Gt
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.models.schema import scenario_schema
 from madns_runtime.config import RunConfig, from_mapping, to_mapping
+from madns_runtime.plugin.api import ActionKind, Simulation
 from madns_runtime.plugin.registry import parse_parameters, resolve
 
 pytestmark = pytest.mark.process
@@ -210,6 +214,36 @@ def test_the_schema_knows_every_kind(folder):
     # What a scenario must say that extends no other one.
     whole = schema["allOf"][1]["then"]["else"]
     assert "table" in whole["properties"]["parameters"]["required"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Share:
+    factor: Annotated[float, Gt(0)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Grid:
+    share: Share
+
+
+@pytest.mark.parametrize("parameters", [Grid, Share])
+def test_the_schema_knows_actions_that_have_one_class_of_parameters(parameters):
+    actions = tuple(
+        ActionKind(word=word, summary=word, parameters=Share) for word in ("trip", "shed")
+    )
+    of_two = {
+        name: Simulation(name=name, parameters=parameters, agent="x:Y", actions=actions)
+        for name in ("grid", "grid-two")
+    }
+
+    schema = scenario_schema(of_two)
+
+    for choice in schema["allOf"][1:]:
+        rules = choice["then"]["properties"]["timeline"]["items"]["allOf"]
+        found = [rule["then"]["properties"]["factor"]["exclusiveMinimum"] for rule in rules]
+        assert found == [0, 0]
+        assert [rule["then"]["required"] for rule in rules] == [["agents", "factor"]] * 2
+    assert schema["$defs"]["Share"]["properties"]["factor"]["exclusiveMinimum"] == 0
 
 
 @pytest.mark.parametrize(
