@@ -100,6 +100,12 @@ def test_user_who_may_run_no_commands_is_a_failure(
     assert "This account is currently not available." in failure["text"]
 
 
+def test_empty_command_is_refused(inventory, capsys):
+    assert run(["exec", "-i", inventory(), "--", " "]) == 2
+
+    assert "expected a command behind --" in capsys.readouterr().err
+
+
 def test_ping_tells_scripts_the_same(inventory, capsys):
     file = inventory(bad={"ansible_host": "no-such-machine.invalid"})
 
