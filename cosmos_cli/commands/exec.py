@@ -19,7 +19,7 @@ from cosmos_cli.commands.fleet_command import (
     fleet_of,
     require_root,
 )
-from cosmos_cli.errors import ExitCode
+from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.fleet.connection import Completed, Connection
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.outcome import Outcome, failed
@@ -62,6 +62,8 @@ def exec(  # noqa: A001 - the verb's name is the function's
     Ends with 1 when it failed on any machine, with 3 when a machine itself failed.
     """
     console = Console(json=json, quiet=quiet, instead=WORK_GOES_ON)
+    if not any(word.strip() for word in command):
+        raise InputError("expected a command behind --, got an empty text")
     fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
     line = command[0] if len(command) == 1 else shlex.join(command)
     width = max(len(target.name) for target in fleet.targets)

@@ -15,6 +15,7 @@ from cosmos_cli.commands.fleet_command import (
     fleet_of,
 )
 from cosmos_cli.fleet.connection import SMALL_BYTES_MAX, Connection
+from cosmos_cli.fleet.failure import runs_no_commands
 from cosmos_cli.fleet.outcome import InOrder, Outcome, failed
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
 from cosmos_cli.ui.plural import counted
@@ -62,8 +63,13 @@ def ping(
 
 def _ask(connection: Connection) -> Times:
     start_s = time.monotonic()
-    connection.run("true", timeout_s=COMMAND_TIMEOUT_S, said_bytes_max=SMALL_BYTES_MAX)
-    return connection.opening_s * 1e3, (time.monotonic() - start_s) * 1e3
+    done = connection.run("true", timeout_s=COMMAND_TIMEOUT_S, said_bytes_max=SMALL_BYTES_MAX)
+    exec_s = time.monotonic() - start_s
+    if done.exit_status:
+        raise runs_no_commands(
+            done.exit_status, (done.stderr or done.stdout).decode(errors="replace")
+        )
+    return connection.opening_s * 1e3, exec_s * 1e3
 
 
 def _words(outcome: Outcome[Times]) -> str:

@@ -49,7 +49,9 @@ def _entry(run: RunDirectory, *, is_living: bool) -> dict[str, Any]:
         duration_s = document["duration_s"]
     status = text_or_none(document.get("status")) or "unknown" if is_here else "packed"
     if status == "running" and not is_living:
-        status = "cut off"
+        # That of a detached run may live on a machine, and has no end here before it is collected.
+        is_detached = (run.read_json(run.plan_json) or {}).get("is_detached") is True
+        status = "detached" if is_detached else "cut off"
     exit_code = document.get("exit_code")
     return {
         "run": run.name,

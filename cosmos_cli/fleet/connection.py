@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.target import Target
 
 OUTPUT_BYTES_MAX = 4 * 1024 * 1024
@@ -142,3 +143,20 @@ class Connection(Protocol):
 
     def close(self) -> None:
         """Close it; harmless when repeated."""
+
+
+def address_here(connection: Connection, given: str | None) -> str:
+    """
+    Return the address by which a machine reaches this computer: the one *given*, else as its connection shows.
+
+    Raises:
+        MachineFailure: None is given, and a ProxyCommand shows none.
+    """
+    address = given or connection.own_address
+    if not address:
+        raise MachineFailure(
+            FailureKind.UNSUPPORTED,
+            "through a ProxyCommand it is not seen by which address this machine reaches this computer",
+            "name it with cosmos_host_address in the inventory, or use ProxyJump where it will do",
+        )
+    return address

@@ -5,6 +5,8 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Any
 
+SAID_CHARACTERS_MAX = 200
+
 
 class FailureKind(StrEnum):
     """Kinds of failure; scripts may rely on these words."""
@@ -18,7 +20,7 @@ class FailureKind(StrEnum):
     HOST_KEY_CHANGED = "host_key_changed"
     HOST_KEY_UNKNOWN = "host_key_unknown"
     AUTHENTICATION = "authentication"
-    """Wrong key or wrong user; the server does not tell which."""
+    """Wrong key or wrong user, the server does not tell which; or a user who may run no commands."""
     LOST = "lost"
     """The connection broke, or the machine stopped answering, in the midst of it."""
     TIMEOUT = "timeout"
@@ -59,3 +61,15 @@ class MachineFailure(Exception):
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for --json."""
         return {"kind": self.kind.value, "text": self.text, "advice": self.advice}
+
+
+def runs_no_commands(status: int, said: str) -> MachineFailure:
+    """Return the failure of a machine that lets somebody in and then runs nothing, with what it said."""
+    words = " ".join(said.split())[:SAID_CHARACTERS_MAX]
+    return MachineFailure(
+        FailureKind.AUTHENTICATION,
+        f"the login works, but no command does: exit status {status}"
+        + (f": {words}" if words else ""),
+        "give the user a login shell there (`sudo chsh -s /bin/bash USER`) with start-up files that let commands"
+        " run, or name another user in ansible_user",
+    )

@@ -6,6 +6,7 @@ One connection, one process there, one frame a question. For the pool's threads:
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import importlib.util
@@ -14,6 +15,7 @@ import marshal
 import re
 import shlex
 import threading
+import time
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,11 +24,12 @@ from pathlib import Path
 from typing import Any, Self
 
 from cosmos_cli.fleet.answers.parts import greeting
-from cosmos_cli.fleet.answers.reader import AnswerReader, ExpectedAnswer
+from cosmos_cli.fleet.answers.reader import READ_BYTES, AnswerReader, ExpectedAnswer
 from cosmos_cli.fleet.answers.verbs import BODY_BYTES_MAX, answer_shape, failure_of
 from cosmos_cli.fleet.connection import EXIT_STATUS_TIMEOUT_S, Connection, Stream
-from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure, runs_no_commands
 from cosmos_cli.fleet.liveness import BlockingStream, SilenceWatch
+from cosmos_cli.fleet.shell import for_login_shell
 from cosmos_cli.fleet.transfer_limits import Patience, duration_words
 from cosmos_cli.ui.step_times import timed
 
@@ -139,6 +142,8 @@ class Helper:
             try:
                 board._greet(package, timeout_s)
             except MachineFailure as failure:
+                if failure.kind is FailureKind.DATA:
+                    board._read_to_its_end()
                 explained = board._explain(failure, python)
                 board.close()  # of a channel that is closed nobody learns how it ended; of a process here, sooner
                 if explained is failure:
@@ -259,13 +264,24 @@ class Helper:
             return MachineFailure(
                 FailureKind.PYTHON, f"{failure.text}, expected {needed} or later", advice
             )
-        if self._stream.ending(timeout_s=EXIT_STATUS_TIMEOUT_S).exit_status == NO_PYTHON_STATUS:
+        status = self._stream.ending(timeout_s=EXIT_STATUS_TIMEOUT_S).exit_status
+        if status == NO_PYTHON_STATUS:
             return MachineFailure(
                 FailureKind.PYTHON,
                 f"{python}: no such interpreter" if python else "no Python 3 found",
                 advice,
             )
+        if failure.kind is FailureKind.DATA and status is not None and status > 0:
+            return runs_no_commands(status, failure.text)
         return failure
+
+    def _read_to_its_end(self) -> None:
+        """Read what else comes, which is of no use, so that the exit status is known if there is one by then."""
+        until_s = time.monotonic() + EXIT_STATUS_TIMEOUT_S
+        with contextlib.suppress(MachineFailure):
+            while (left_s := until_s - time.monotonic()) > 0:
+                if not self._link.read_some(READ_BYTES, timeout_s=left_s):
+                    return
 
 
 NO_PYTHON_STATUS = 127
@@ -274,7 +290,7 @@ NO_PYTHON_STATUS = 127
 def start_command(python: str | None, package_bytes: int) -> str:
     """Return the shell command that starts the loop with the first interpreter that there is."""
     candidates = " ".join(shlex.quote(p) for p in ((python,) if python else PYTHONS))
-    return (
+    return for_login_shell(
         f'for p in {candidates}; do command -v "$p" >/dev/null 2>&1 &&'
         f' exec "$p" -I -S -c {shlex.quote(_BOOT)} {package_bytes}; done; exit {NO_PYTHON_STATUS}'
     )

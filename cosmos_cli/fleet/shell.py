@@ -1,5 +1,7 @@
 """
-A command that ends with whoever asked for it. Pure.
+Commands for a machine's login shell, whichever that is, and those that end with whoever asked for them. Pure.
+
+sshd hands a command to the login shell of the user, which may be fish or tcsh: neither reads what POSIX says.
 
 Without a terminal, sshd lets a command run on when its connection closes. So a shell beside it waits for
 the end of standard input, on which nothing is ever sent, and then ends the whole process group.
@@ -7,6 +9,7 @@ the end of standard input, on which nothing is ever sent, and then ends the whol
 
 from __future__ import annotations
 
+import re
 import shlex
 
 NO_SUDO_MARK = "cosmos: no sudo"
@@ -23,14 +26,25 @@ _WATCH = (
 )
 
 
+def for_login_shell(script: str) -> str:
+    """
+    Return a command that has /bin/sh run *script*, for any login shell: POSIX's, fish, tcsh.
+
+    Single quotes do not hide a backslash from fish, nor an exclamation mark from tcsh: those stand outside of
+    them, where all shells read them alike.
+    """
+    quoted = re.sub(r"[\\!]", r"'\\\g<0>'", shlex.quote(script))
+    return f"exec /bin/sh -c {quoted}"
+
+
 def watched(command: str) -> str:
     """Return a shell command that does the same and is ended, with its children, when standard input ends."""
-    return f"exec /bin/sh -c {shlex.quote(_WATCH)} sh {shlex.quote(command)}"
+    return for_login_shell(f"set -- {shlex.quote(command)}; {_WATCH}")
 
 
 def as_root(command: str) -> str:
     """Return a shell command that does the same as root; says NO_SUDO_MARK last when it may not."""
-    return (
+    return for_login_shell(
         f'if [ "$(id -u)" != 0 ]; then sudo -n true || {{ echo {shlex.quote(NO_SUDO_MARK)} >&2;'
         f" exit 1; }}; exec sudo -n /bin/sh -c {shlex.quote(command)}; fi; {command}"
     )

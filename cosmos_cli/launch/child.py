@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from cosmos_cli.fleet.shell import for_login_shell
 from cosmos_cli.launch.channel import PipeChannel
 from cosmos_cli.launch.children import GROUP_CHECK_S, KILL_WAIT_S
 from cosmos_cli.launch.machines import MachinePaths
@@ -218,7 +219,7 @@ def start_command(program: RemoteProgram, paths: MachinePaths) -> str:
         f" && exec env {assignments} {shlex.quote(paths.python)} -P -m {program.module}"
         f" 2>>{shlex.quote(stderr)}"
     )
-    return f"exec /bin/sh -c {shlex.quote(script)}"
+    return for_login_shell(script)
 
 
 def relay_command(program: RemoteProgram, incarnation: int, paths: MachinePaths) -> str:
@@ -229,7 +230,7 @@ def relay_command(program: RemoteProgram, incarnation: int, paths: MachinePaths)
         f"cd {shlex.quote(paths.root)}"
         f" && exec env {_assignments(paths, {})} {shlex.quote(paths.python)} -P -m {relay}"
     )
-    return f"exec /bin/sh -c {shlex.quote(script)}"
+    return for_login_shell(script)
 
 
 def _assignments(paths: MachinePaths, more: Mapping[str, str]) -> str:

@@ -220,12 +220,19 @@ class _Dealer:
         """Return where agents run that no rule sends elsewhere: not beside the host, if there is another machine."""
         return [place for place in self.places if place.machine is not self.host] or self.places
 
+    def _without_machines(self) -> list[str]:
+        """Return the names of the inventory that mean nobody here: empty groups, and what --limit leaves out."""
+        machines = [place.machine for place in self.places]
+        known = frozenset[str]().union(*(machine.inventory_names for machine in machines))
+        return sorted(known - {machine.name for machine in machines})
+
     def _places_for(self, path: ValuePath, rule: PlacementRule) -> list[_Place]:
         """Return where a rule's agents may run; an empty list and a fault if nowhere."""
         places = self.places if rule.machines or rule.devices else self.default_places()
         if rule.machines and self.has_inventory:
+            machines = [place.machine for place in self.places]
             try:
-                chosen = matching_machines([p.machine for p in self.places], rule.machines)
+                chosen = matching_machines(machines, rule.machines, groups=self._without_machines())
             except PatternError as error:
                 self.faults.append(self.fault_at((*path, "machines"), str(error)))
                 return []

@@ -10,10 +10,11 @@ from typing import Any
 import yaml
 
 from cosmos_cli.evidence.run_directory import RunDirectory
-from cosmos_cli.fleet.connection import ConnectOptions
+from cosmos_cli.fleet.connection import Connection, ConnectOptions, address_here
+from cosmos_cli.fleet.failure import MachineFailure
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.target import Target, target_of
-from cosmos_cli.launch.machines import Prepared, RemoteMachine, reach_machines
+from cosmos_cli.launch.machines import Connect, Prepared, RemoteMachine, reach_machines
 from cosmos_cli.launch.plan import LaunchPlan
 from cosmos_cli.launch.request import MachineConfig
 from cosmos_cli.models.inventory import Machine
@@ -71,10 +72,25 @@ def reach(
         prepare,
         parts=STORE_PARTS,
         options=options,
-        connect=connect,
+        connect=with_address(connect, plan, scenario.run_config("")),
         forks=forks,
         say=say,
     )
+
+
+def with_address(connect: Connect, plan: LaunchPlan, config: RunConfig) -> Connect:
+    """Return what connects as *connect* does, and fails where it is not known how a machine reaches a host here."""
+
+    def connect_and_see(target: Target, options: ConnectOptions) -> Connection:
+        connection = connect(target, options)
+        try:
+            address_here(connection, plan.involved[target.name].variables.cosmos_host_address)
+        except MachineFailure:
+            connection.close()
+            raise
+        return connection
+
+    return connect if plan.host is not None or says_address(config) else connect_and_see
 
 
 def places_of(

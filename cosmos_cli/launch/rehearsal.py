@@ -16,7 +16,7 @@ from typing import Any
 
 from cosmos_cli.collect.disk import size_words
 from cosmos_cli.doctor.probe import Responder
-from cosmos_cli.fleet.connection import Connection, ConnectOptions
+from cosmos_cli.fleet.connection import Connection, ConnectOptions, address_here
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
 from cosmos_cli.fleet.liveness import SilenceWatch
@@ -25,6 +25,7 @@ from cosmos_cli.fleet.outcome import Outcome
 from cosmos_cli.fleet.pool import for_each
 from cosmos_cli.fleet.target import Target, target_of
 from cosmos_cli.launch.plan import LaunchPlan
+from cosmos_cli.launch.preparation import says_address
 from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.loading import ScenarioFile
 from cosmos_cli.models.machine_facts import MachineFacts
@@ -232,8 +233,10 @@ class Rehearsal:
         """Try datagrams to this computer; None where the run's host is another, and in lockstep."""
         if self.plan.host is not None:
             return None
+        config = self.scenario.run_config("")
+        said = config.network.address if says_address(config) else None
         arguments = {
-            "address": machine.variables.cosmos_host_address or connection.own_address,
+            "address": address_here(connection, machine.variables.cosmos_host_address or said),
             "port": responder.port,
             "nonce_hex": responder.nonce.hex(),
             "count": ROUND_TRIP_COUNT,

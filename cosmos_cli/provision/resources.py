@@ -8,7 +8,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cosmos_cli.fleet.connection import Connection
+from cosmos_cli.fleet.connection import Connection, address_here
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.fleet import Fleet
 from cosmos_cli.fleet.open_connection import connect
@@ -151,7 +151,7 @@ class UpResources:
 
     def udp_question(self, connection: Connection, machine: Machine) -> dict[str, Any]:
         """Return where a machine is to send a datagram that comes back."""
-        return self._echo.question(machine.variables.cosmos_host_address or connection.own_address)
+        return self._echo.question(address_here(connection, machine.variables.cosmos_host_address))
 
     def udp_heard(self, question: dict[str, Any]) -> int:
         """Return how many datagrams of a question came here."""

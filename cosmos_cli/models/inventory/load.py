@@ -146,6 +146,7 @@ def _machines(reader: Reader) -> Iterator[Machine]:
         for index, machine in enumerate(reader.tree.machines_of(group)):
             positions[machine][group] = index
     said = {name: _said_by(group) for name, group in groups.items()}
+    names = frozenset((*groups, *reader.machines))
     for name, entry in reader.machines.items():
         layers = [*(said[group.name] for group in memberships[name]), _said_by(entry)]
         raw: dict[str, Any] = {}
@@ -162,6 +163,7 @@ def _machines(reader: Reader) -> Iterator[Machine]:
             variables=variables,
             raw_variables=raw,
             positions=positions[name],
+            inventory_names=names,
         )
 
 

@@ -179,6 +179,8 @@ class Machine:
     """Its place in each of its groups, from 0: what tower[0] counts."""
     devices_folder: Path = Path()
     """Folder from which its devices' files are found: that of the inventory that lists them."""
+    inventory_names: frozenset[str] = field(default=frozenset(), compare=False, repr=False)
+    """Machines and groups of its inventory, those without machines and those that --limit leaves out as well."""
 
 
 LOOPBACK = Machine(name="loopback", address="127.0.0.1", connection="local")

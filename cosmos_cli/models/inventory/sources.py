@@ -47,6 +47,8 @@ def read_inventory_document(path: Path) -> Document:
         InputError: It cannot be read as YAML, or is an inventory of another kind.
     """
     if path.suffix and path.suffix not in EXTENSIONS:
+        if hint := _ini_fault(_read_plain(path)):
+            raise InputError(faults=[hint])
         text = f"expected a name that ends in {', '.join(EXTENSIONS)} or has no ending"
         raise _refused(path, f"{text}: Ansible reads no YAML from others, got {path.name!r}")
     source = _read_plain(path)

@@ -67,6 +67,16 @@ def test_runs_lists_what_was_run(made, capsys):
     assert (second["run"], second["status"]) == ("0002-synthetic", "cut off")
 
 
+def test_run_that_went_on_without_its_operator_is_not_called_cut_off(made, capsys):
+    plan = made.run.read_json(made.run.plan_json)
+    made.run.plan_json.write_text(json.dumps(plan | {"is_detached": True}))
+
+    assert app.run(["runs", "--json"]) == 0
+
+    (entry,) = json.loads(capsys.readouterr().out)
+    assert (entry["status"], entry["exit_code"]) == ("detached", None)
+
+
 def test_runs_of_an_empty_folder_says_how_to_make_one(capsys):
     assert app.run(["runs"]) == 0
 

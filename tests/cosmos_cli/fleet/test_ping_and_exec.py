@@ -82,6 +82,30 @@ def test_ping_of_machines_that_fail_says_why_and_hides_nobody(inventory, capsys,
     assert lines[-1] == "6 machines: 4 answered, 2 failed"
 
 
+@pytest.mark.parametrize("command", ["ping", "facts"])
+def test_user_who_may_run_no_commands_is_a_failure(
+    inventory, capsys, tmp_path, known_hosts, command
+):
+    # What a login shell such as /usr/sbin/nologin says and does.
+    says = "ForceCommand echo This account is currently not available.; exit 1"
+    with Sshd(tmp_path / "nologin", extra=says) as server:
+        file = inventory(none=entry(server))
+        with known_hosts.open("a") as known:
+            known.write(server.known_hosts_line())
+        assert run([command, "-i", file, "--json", "--limit", "none"]) == 3
+
+    failure = json.loads(capsys.readouterr().out)["machines"][0]["failure"]
+    assert failure["kind"] == "authentication"
+    assert "no command does: exit status 1" in failure["text"]
+    assert "This account is currently not available." in failure["text"]
+
+
+def test_empty_command_is_refused(inventory, capsys):
+    assert run(["exec", "-i", inventory(), "--", " "]) == 2
+
+    assert "expected a command behind --" in capsys.readouterr().err
+
+
 def test_ping_tells_scripts_the_same(inventory, capsys):
     file = inventory(bad={"ansible_host": "no-such-machine.invalid"})
 

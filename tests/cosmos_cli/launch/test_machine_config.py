@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.launch.machines import expanded
 from cosmos_cli.launch.plan import LaunchPlan, MachinePlan
 from cosmos_cli.launch.preparation import (
@@ -18,6 +19,7 @@ from cosmos_cli.launch.preparation import (
     listening_config,
     places_of,
     plan_mapping,
+    with_address,
 )
 from cosmos_cli.launch.request import SYNC_INTERVAL_S, LaunchRequest, Life, MachineConfig, config_at
 from cosmos_cli.launch.restarts import Restarts
@@ -95,6 +97,27 @@ def test_inventory_and_scenario_may_name_the_address() -> None:
 
     assert addresses(named) == {"pi2": "192.0.2.9", "pi4": "10.0.0.1"}
     assert addresses(named, config) == {"pi2": "192.0.2.9", "pi4": "10.9.9.9"}
+
+
+def test_machine_behind_a_proxy_command_fails_before_the_run_unless_an_address_is_named() -> None:
+    closed: list[str] = []
+
+    def connect(target: Any, options: Any) -> Any:
+        return SimpleNamespace(own_address="", close=lambda: closed.append(target.name))
+
+    host = machine("pi3")
+    behind, named = machine("pi2"), machine("pi4", cosmos_host_address="192.0.2.9")
+    both = plan(behind, named)
+    config = dataclasses.replace(CONFIG, network=Network(address="10.9.9.9"))
+    target = SimpleNamespace(name="pi2")
+
+    with pytest.raises(MachineFailure, match="cosmos_host_address") as caught:
+        with_address(connect, both, CONFIG)(target, None)  # type: ignore[arg-type]
+    assert (caught.value.kind, closed) == (FailureKind.UNSUPPORTED, ["pi2"])
+    with_address(connect, both, CONFIG)(SimpleNamespace(name="pi4"), None)  # type: ignore[arg-type]
+    with_address(connect, both, config)(target, None)  # type: ignore[arg-type]
+    with_address(connect, plan(behind, host, host=host), CONFIG)(target, None)  # type: ignore[arg-type]
+    assert closed == ["pi2"]
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.fleet.target import Target, target_of
 from cosmos_cli.launch.plan import make_plan
-from cosmos_cli.models.inventory import Machine, Variables
+from cosmos_cli.models.inventory import Machine, Variables, load_machines
 from cosmos_cli.models.scenario import Scenario
 
 
@@ -180,6 +180,30 @@ def test_local_machines_with_a_remote_host_are_not_local():
 
     assert not make_plan(scenario(1), [here]).elsewhere
     assert make_plan(scenario(1), [here, board("pi01")], host="pi01").elsewhere
+
+
+@pytest.fixture
+def inventory(tmp_path):
+    file = tmp_path / "tower.yaml"
+    hosts = "tower: {hosts: {pi01: {}, pi02: {}, pi03: {}}}, hwil: {hosts: {pi03: {}}}, spare: {}"
+    file.write_text(f"all: {{children: {{{hosts}}}}}\n")
+    return file
+
+
+@pytest.mark.parametrize("pattern", ["tower:!hwil", "tower:!pi03", "tower:!spare", "tower,spare"])
+def test_rule_may_name_what_limit_leaves_out_and_groups_without_machines(inventory, pattern):
+    left = load_machines(str(inventory), "!pi03")
+
+    assert placed(2, {"machines": pattern}, boards=left) == {"pi01": [1], "pi02": [2]}
+
+
+def test_rule_that_means_only_what_limit_leaves_out_is_a_fault(inventory):
+    left = load_machines(str(inventory), "!pi03")
+
+    fault = "placement[0].machines", "means no machine; there are pi01, pi02"
+    assert faults_of(1, {"machines": "hwil"}, boards=left) == [fault]
+    told = faults_of(1, {"machines": "pi04"}, boards=left)
+    assert "no machine or group is named pi04" in told[0][1]
 
 
 @pytest.mark.parametrize(

@@ -492,7 +492,8 @@ def test_limit_leaves_the_machines_it_means(read):
 @pytest.mark.parametrize(
     ("name", "text", "told"),
     [
-        ("i.ini", "[tower]\npi01\n", "expected a name that ends in .yml, .yaml, .json or has no ending"),
+        ("i.ini", "[tower]\npi01\n", "expected YAML, got an inventory in INI form; convert it"),
+        ("i.ini", "all: {hosts: {pi01: {}}}", "expected a name that ends in .yml, .yaml, .json or has no ending"),
         ("i", "# boards\n[tower]\npi01 ansible_host=10.0.0.1\n", "expected YAML, got an inventory in INI form"),
         ("i.yaml", "pi01 ansible_host=10.0.0.1\n", "expected YAML, got an inventory in INI form"),
         ("i.yaml", "#!/usr/bin/env python3\nprint()\n", "scripts that print an inventory are not run"),

@@ -1,0 +1,55 @@
+"""Every command that a machine is given is one that each login shell reads alike: POSIX's, fish, tcsh."""
+
+import re
+import shlex
+
+import pytest
+
+from cosmos_cli.fleet.helper import start_command as helper_command
+from cosmos_cli.fleet.shell import as_root, for_login_shell, watched
+from cosmos_cli.launch.child import RemoteProgram, relay_command, start_command
+from cosmos_cli.launch.machines import MachinePaths
+
+PROGRAM = RemoteProgram(
+    name="agents", module="madns_runtime.agent", run_directory="/home/pi/it's/runs/1", stderr="a/b"
+)
+PATHS = MachinePaths(
+    root="/home/pi/it's",
+    python="/usr/bin/python3",
+    base_directory="/home/pi/it's/trees/1",
+    state="/home/pi/it's/state",
+    variables={"PYTHONPATH": "/home/pi/it's"},
+)
+COMMANDS = {
+    "plain": for_login_shell("true"),
+    "helper": helper_command(None, 100),
+    "helper with a Python": helper_command("/opt/py thon/bin/python3", 100),
+    "watched": watched(r"""printf '%s\\n' "it's" !x"""),
+    "as root": as_root(watched(r"""printf '%s\\n' "it's" !x""")),
+    "start": start_command(PROGRAM, PATHS),
+    "relay": relay_command(PROGRAM, 1, PATHS),
+}
+NOT_ALIKE = re.compile(r"[\\!]")
+"""What fish (the first) and tcsh (the second) read within single quotes, and others do not."""
+
+
+@pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
+def test_login_shell_is_asked_for_one_program_with_plain_words(command):
+    words = shlex.split(command)
+
+    assert words[:3] == ["exec", "/bin/sh", "-c"]
+    assert len(words) == 4
+    bare = re.sub(r"""'[^']*'|"'"|\\[\\!]""", "", command)
+    assert re.fullmatch(r"[\w /-]*", bare), "outside of quotes stands what a shell may read"
+
+
+@pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
+def test_no_quotes_hold_what_some_shell_would_read_within_them(command):
+    quoted = re.findall(r"""'([^']*)'|"'"|\\[\\!]""", command)
+
+    assert not [text for text in quoted if NOT_ALIKE.search(text)]
+
+
+@pytest.mark.parametrize("script", [r"echo 'a\\b\'", "echo it's !!", "", r"\\!\!"])
+def test_script_arrives_as_it_was(script):
+    assert shlex.split(for_login_shell(script))[3] == script
