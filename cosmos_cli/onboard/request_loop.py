@@ -34,7 +34,9 @@ HEADER_BYTES_MAX = 64 * 1024 * 1024
 BODY_BYTES_MAX = 1024 * 1024 * 1024
 LAST_WORDS_BYTES = 4000
 SUDO_TIMEOUT_S = 20.0
-SLOW_SUDO_ADVICE = "does it wait for a name server? /etc/hosts there should have the machine's own name"
+SLOW_SUDO_ADVICE = (
+    "does it wait for a name server? /etc/hosts there should have the machine's own name"
+)
 LOCK_PATIENCE_S = 60.0
 """Without a question for so long the machine's lock is given up: the operator is gone."""
 
