@@ -34,6 +34,9 @@ HEADER_BYTES_MAX = 64 * 1024 * 1024
 BODY_BYTES_MAX = 1024 * 1024 * 1024
 LAST_WORDS_BYTES = 4000
 SUDO_TIMEOUT_S = 20.0
+SLOW_SUDO_ADVICE = (
+    "does it wait for a name server? /etc/hosts there should have the machine's own name"
+)
 LOCK_PATIENCE_S = 60.0
 """Without a question for so long the machine's lock is given up: the operator is gone."""
 
@@ -193,10 +196,11 @@ class Rooted:
                 ["sudo", "-n", "true"], stdin=subprocess.DEVNULL, stderr=subprocess.PIPE
             )
             _, said = asked.communicate(timeout=SUDO_TIMEOUT_S)
-        except (FileNotFoundError, subprocess.TimeoutExpired) as error:
-            raise no_sudo(
-                f"sudo: {error}"
-            ) from None  # what runs as root cannot be killed from here
+        except FileNotFoundError:
+            raise no_sudo("there is no sudo") from None
+        except subprocess.TimeoutExpired:  # what runs as root cannot be killed from here
+            text = f"sudo -n true has not ended in {SUDO_TIMEOUT_S:g} s"
+            raise HelperRefusal("timeout", text, SLOW_SUDO_ADVICE) from None
         if asked.returncode:
             raise no_sudo(said.decode(errors="replace").strip() or "sudo refused")
         process = subprocess.Popen(
