@@ -66,6 +66,7 @@ class Carrier:
         self._now_s = now_s
         self._accounts: dict[str, MessageAccount] = {}
         self._serial = 0
+        self._untold = 0
         # Bounded by senders, their queues and the receivers: a message waits at most for its queue.
         self._heap: list[tuple[float, str, int, int, str, Delivery, MessageAccount]] = []
 
@@ -101,7 +102,8 @@ class Carrier:
                 self._keep(sender, transmission, outcome, account)
             elif outcome.outcome != LOST and sender in self._agents:
                 number, to, sent_s = transmission.number, transmission.to, transmission.sent_s
-                self._send(sender, TransmissionRefusal(number, to, sent_s, outcome.outcome))
+                refusal = TransmissionRefusal(number, to, sent_s, outcome.outcome)
+                self._untold += not self._send(sender, refusal)
 
     def hand_over(self) -> None:
         """Send on what arrives up to LEAD_S from now on, in order of arrival."""
@@ -135,6 +137,7 @@ class Carrier:
             "lost": lost,
             "refused": sum(outcomes.values()),
             "refused_because": dict(sorted(outcomes.items())),
+            "refusals_untold": self._untold,
             "in_flight": total["in_flight"],
             "undelivered": total["undelivered"],
             "known_late": total["heard_late"],

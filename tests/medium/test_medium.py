@@ -210,6 +210,7 @@ def test_every_message_is_accounted_whatever_becomes_of_it():
         "lost": 1,
         "refused": 2,
         "refused_because": {"too_fast": 2},
+        "refusals_untold": 1,  # car-1 took no more; the kiosk is no agent
         "in_flight": 1,
         "undelivered": 2,
         "known_late": 0,
