@@ -145,6 +145,7 @@ def make_plan(  # noqa: PLR0913 - labels and the place of faults are of the scen
     dealer.deal(("agents", "count"), claims.left, dealer.default_places(), None)
     if dealer.faults:
         raise InputError(faults=dealer.faults)
+    _refuse_twins([place.machine for place in dealer.places if place.agents], dealer.host)
     order = {name: index for index, name in enumerate(names)}
     return LaunchPlan(
         scenario=scenario.name,
@@ -163,6 +164,21 @@ def make_plan(  # noqa: PLR0913 - labels and the place of faults are of the scen
         notes=tuple(dealer.notes),
         is_lockstep=scenario.time.is_lockstep,
     )
+
+
+def _refuse_twins(machines: Sequence[Machine], host: Machine | None) -> None:
+    """Refuse machines that record in one folder: each would offer the other's records as its own."""
+    named: dict[tuple[str, int | None, str | None, str], str] = {}
+    involved = {machine.name: machine for machine in (*machines, *((host,) if host else ()))}
+    for target in map(target_of, involved.values()):
+        if target.connection == "local":
+            continue
+        place = target.address, target.port, target.user, target.root
+        if (other := named.setdefault(place, target.name)) != target.name:
+            raise InputError(
+                f"{other} and {target.name} are one machine, {target.address}, with one cosmos_root: correct"
+                " ansible_host, leave one of them out (--limit), or give each a cosmos_root of its own"
+            )
 
 
 @dataclass(slots=True)

@@ -182,6 +182,31 @@ def test_local_machines_with_a_remote_host_are_not_local():
     assert make_plan(scenario(1), [here, board("pi01")], host="pi01").elsewhere
 
 
+def twin(name, **variables):
+    values = {"ansible_user": "pi"} | variables
+    return Machine(name=name, address="10.0.0.1", variables=Variables.of(values))
+
+
+def test_machines_that_would_record_in_one_folder_are_refused():
+    with pytest.raises(InputError, match="pi01 and pi02 are one machine, 10.0.0.1"):
+        placed(2, boards=[twin("pi01"), twin("pi02")])
+    with pytest.raises(InputError, match="pi01 and pi02 are one machine"):
+        placed(1, boards=[twin("pi01"), twin("pi02")], host="pi02")
+
+
+@pytest.mark.parametrize(
+    "other", [{"ansible_user": "you"}, {"ansible_port": 2222}, {"cosmos_root": "~/b"}]
+)
+def test_machines_at_one_address_may_differ_in_what_tells_their_folders_apart(other):
+    assert len(placed(2, boards=[twin("pi01"), twin("pi02", **other)])) == 2
+
+
+def test_twin_that_takes_no_part_is_nobodys_business():
+    boards = [twin("pi01"), twin("pi02", cosmos_agents=0)]
+
+    assert placed(2, boards=boards) == {"pi01": [1, 2]}
+
+
 @pytest.fixture
 def inventory(tmp_path):
     file = tmp_path / "tower.yaml"

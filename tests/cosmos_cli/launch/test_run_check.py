@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import socket
+from types import SimpleNamespace
 
 import pytest
 
 from cosmos_cli.app import run as cosmos
 from cosmos_cli.launch import rehearsal
+from cosmos_cli.models.loading import load_scenario
 
 SCENARIO = """
 name: checked
@@ -157,3 +159,35 @@ def test_machine_that_is_not_reached_is_named(place, capsys):
     assert (machine["ok"], machine["is_ready"]) == (False, False)
     assert machine["failure"]["kind"] == "unreachable"
     assert answer["plan"]["machines"]["no-such-machine.invalid"]["agents"]
+
+
+@pytest.mark.parametrize(
+    ("said", "given", "asked"),
+    [
+        ("127.0.0.1", None, "10.0.0.1"),
+        ("10.9.9.9", None, "10.9.9.9"),
+        ("10.9.9.9", "192.0.2.9", "192.0.2.9"),
+    ],
+)
+def test_datagrams_are_tried_by_the_address_that_the_run_would_use(place, said, given, asked):
+    scenario = load_scenario(place / "s.yaml", overrides=[f"network.address={said}"])
+    trial = rehearsal.Rehearsal(
+        plan=SimpleNamespace(host=None), scenario=scenario, runs=place, options=None, forks=1
+    )
+    told = []
+
+    class Board:
+        def call(self, verb, arguments, *, timeout_s):
+            told.append(arguments["address"])
+            return SimpleNamespace(value={})
+
+    machine = SimpleNamespace(variables=SimpleNamespace(cosmos_host_address=given))
+
+    trial._trips(
+        Board(),
+        SimpleNamespace(own_address="10.0.0.1"),
+        machine,
+        SimpleNamespace(port=1, nonce=b"n" * 16),
+    )
+
+    assert told == [asked]
