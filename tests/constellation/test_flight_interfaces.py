@@ -468,8 +468,10 @@ def test_what_a_protocol_of_ones_own_does_wrong_is_told_by_its_name(tmp_path, me
         Ship(tmp_path, None, flight=flight).run(3)
 
 
-def test_faults_of_a_protocol_of_ones_own_that_are_no_counts_are_left_out(tmp_path):
-    (tmp_path / "own.py").write_text(OWN.partition("class Wrong")[0])
+@pytest.mark.parametrize("faults", ["faults = 3", "faults = {'odd': float('nan'), 'even': True}"])
+def test_faults_of_a_protocol_of_ones_own_that_are_no_counts_are_left_out(tmp_path, faults):
+    text = OWN.partition("class Wrong")[0].replace("faults = 3", faults)
+    (tmp_path / "own.py").write_text(text)
     flight = attached({"kind": "stdio"}, "own.py:Own") | {"command": TALK}
     flight["command"] = [
         *TALK[:2],
