@@ -54,7 +54,14 @@ def pass_over(device: Device, time: SimulatedTime, header: memoryview[float]) ->
 def samples_by_now(
     device: SimulatedDevice, time: SimulatedTime, count_max: int
 ) -> Iterator[Sample]:
-    """Yield what a device gives by now, at most so many, by this machine's clock; before simulated time runs, what at 0."""
+    """
+    Yield what a device gives by now, taken at times of this machine's clock; before simulated time runs, what it gives at 0.
+
+    Args:
+        device: It is open.
+        time: Simulated time.
+        count_max: Samples at most; the rest comes with the next call.
+    """
     now_s = monotonic()
     t_s = time.at(now_s) if time.is_known else 0.0
     for _ in range(count_max):

@@ -355,7 +355,7 @@ def test_one_that_prints_between_its_frames_is_told_what_came(tmp_path, is_locks
     talk = "import sys; print('debug\\0', flush=True); sys.stdin.read()"
     flight["command"] = [sys.executable, "-c", talk]
     ship = Ship(tmp_path, None, flight=flight, is_lockstep=is_lockstep)
-    told = r"of what it said was no good packet: corrupt \d+"
+    told = r"; it said what was no good packet: corrupt \d+"
     if is_lockstep:
         with pytest.raises(BlamedError, match=told):
             ship.run(1)

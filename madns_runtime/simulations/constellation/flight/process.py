@@ -393,7 +393,7 @@ class ExternalFlight:
             self._agent.keep_text(STDERR_TEXT, said)
 
     def _last_words(self) -> str:
-        """Return what was no packet of what it said, the last line of its standard error, and where all of that lies."""
+        """Return how much it said that was no packet, the last line of its standard error, and the file that holds it all."""
         line = self._link.program.last_line if self._link.program else ""
         name = self._context.name
         words = f"; its last words: {line!r} (agents/{name}/{STDERR_TEXT}.txt)" if line else ""
