@@ -186,9 +186,13 @@ def _build_dataclass(cls: type, value: Any, where: str) -> Any:
 
 def is_real(value: object) -> TypeGuard[float]:
     """Tell whether a value is a real number, of Python or of NumPy; what is true or false is none."""
+    if type(value) is float:
+        return True
     return issubclass(type(value), Real) and type(value) is not bool
 
 
 def is_whole(value: object) -> TypeGuard[int]:
     """Tell whether a value is a whole number, as `is_real`."""
+    if type(value) is int:
+        return True
     return issubclass(type(value), Integral) and type(value) is not bool

@@ -160,8 +160,8 @@ class RecordedRun:
         """Return the numbers of the records with which an agent that was away goes on, as its next incarnation."""
         if not table.has(INCARNATION):
             return np.empty(0, dtype=np.int64)
-        lives = as_array(table.read(source, (INCARNATION,))[INCARNATION])
-        return np.flatnonzero(np.diff(lives)) + 1
+        incarnations = as_array(table.read(source, (INCARNATION,))[INCARNATION])
+        return np.flatnonzero(np.diff(incarnations)) + 1
 
     def values(self, table: RecordedTable, source: str, name: str) -> Floats:
         """Return one field of a source as floats, null as NaN."""

@@ -104,7 +104,7 @@ class Channel:
         if len(set(names)) < len(names):
             yield f"{self.name}: expected components with distinct names, got {', '.join(names)}"
         if taken := sorted(set(names) & set(COLUMNS_TAKEN[self.direction])):
-            yield f"no number may be called {taken[0]}, as what is recorded beside it is"
+            yield f"{self.name}: no number may be called {taken[0]}, as what is recorded beside it is"
 
     def _safe_faults(self) -> Iterator[str]:
         """Yield what is wrong with the safe value of an output."""

@@ -26,7 +26,7 @@ class DriverDescriptor:
         fd: The driver's.
         reactor: The loop of the device's process.
         readable: Called when it is readable.
-        tell: Told once when it is readable for nothing, as `Intake.event`.
+        tell: Told when it is readable for nothing, or was closed meanwhile, as `Intake.event`.
 
     Raises:
         OSError: It is not open.
@@ -63,4 +63,10 @@ class DriverDescriptor:
         self._reactor.remove_reader(self._fd)
 
     def _look_again(self) -> None:
-        self._reactor.add_reader(self._fd, self._readable)
+        try:
+            self._reactor.add_reader(self._fd, self._readable)
+        except (
+            OSError
+        ) as error:  # the driver has closed it; a device that stays silent is opened anew
+            why = f"its descriptor {self._fd} cannot be waited for: {error.strerror}"
+            self._tell("error", monotonic(), why=why)

@@ -95,7 +95,7 @@ class DeviceLoop:
             records.journal.recorder.start()
         # The recorders' thread runs already: only the loop is raised to its priority.
         grant = apply_scheduling(self._config.scheduling, is_host=False)
-        self._writer.follow(grant.policy)
+        self._writer.follow(grant.priority)
         for runner in self._runners.values():
             runner.open()
         reactor.run()

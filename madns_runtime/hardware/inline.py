@@ -16,6 +16,7 @@ from madns_runtime.hardware.outputs import DeviceOutputs, DueOutput
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.port import DevicePort
 from madns_runtime.hardware.records import DeviceRecords
+from madns_runtime.hardware.simulated import STANDS_STILL
 from madns_runtime.hardware.status import StatusAccount, StatusLimits
 from madns_runtime.plugin.context import describe_exception
 
@@ -107,7 +108,7 @@ class InlineDevice:
         What is put out at the time of a sample comes first.
 
         Raises:
-            PluginError: The driver gave what is no sample.
+            PluginError: The driver gave what is no sample, or lets time stand still.
         """
         self._hear()
         for _ in range(SAMPLES_MAX):
@@ -127,6 +128,10 @@ class InlineDevice:
                 self._intake.count("passed_while_closed")
                 continue
             self._intake.take(sample, due_s if sample.handed_s is None else sample.handed_s)
+        else:
+            raise PluginError(
+                f"device {self.name}: {SAMPLES_MAX} samples and outputs by {t_s:g} s, and no end: {STANDS_STILL}"
+            )
         self._intake.tell_held(t_s)
         self._account.observe(self._page.status(self._limits, t_s), t_s)
         self._handed_s = t_s

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator
 from time import monotonic
+from typing import Final
 
+from madns_runtime.errors import PluginError
 from madns_runtime.hardware import page
 from madns_runtime.hardware.contract import Device, Sample, SimulatedDevice
 from madns_runtime.hardware.records import SimulatedTime
+
+PASSED_AT_ONCE_MAX: Final = 10_000
+"""Samples of one simulated time."""
+STANDS_STILL: Final = (
+    "next_s() should tell of a later time once sample_at() has given what there was"
+)
 
 
 def pass_over(device: Device, time: SimulatedTime, header: memoryview[float]) -> int:
@@ -22,12 +31,22 @@ def pass_over(device: Device, time: SimulatedTime, header: memoryview[float]) ->
 
     Returns:
         How many samples were left out.
+
+    Raises:
+        PluginError: The driver lets time stand still.
     """
     if not isinstance(device, SimulatedDevice) or not time.is_known:
         return 0
     t_s, passed = time.at(monotonic()), 0
+    latest_s, still = -math.inf, 0
     while (next_s := device.next_s()) is not None and next_s <= t_s:
         header[page.ACTIVE_S] = monotonic()
+        still = 0 if next_s > latest_s else still + 1
+        latest_s = max(latest_s, next_s)
+        if still > PASSED_AT_ONCE_MAX:
+            raise PluginError(
+                f"more than {PASSED_AT_ONCE_MAX} samples at {next_s:g} s: {STANDS_STILL}"
+            )
         passed += device.sample_at(t_s) is not None
     return passed
 
@@ -35,7 +54,14 @@ def pass_over(device: Device, time: SimulatedTime, header: memoryview[float]) ->
 def samples_by_now(
     device: SimulatedDevice, time: SimulatedTime, count_max: int
 ) -> Iterator[Sample]:
-    """Yield what a device gives by now, at most so many, by this machine's clock; before simulated time runs, what at 0."""
+    """
+    Yield what a device gives by now, taken at times of this machine's clock; before simulated time runs, what it gives at 0.
+
+    Args:
+        device: It is open.
+        time: Simulated time.
+        count_max: Samples at most; the rest comes with the next call.
+    """
     now_s = monotonic()
     t_s = time.at(now_s) if time.is_known else 0.0
     for _ in range(count_max):

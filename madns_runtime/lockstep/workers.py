@@ -247,15 +247,13 @@ def _fork(launch: HostLaunch, directory: Path, share: range) -> WorkerProcess:
 
 
 def _await_exit(pid: int) -> int | None:
-    """Wait for a child's end and return its exit code; None if it lives on after EXIT_WAIT_S."""
+    """Wait for a child's end and return its exit code, 0 if nobody knows it; None if it lives on after EXIT_WAIT_S."""
     limit = GrantedLimit(EXIT_WAIT_S, lambda: (pid,))
     while True:
         try:
             ended, status = os.waitpid(pid, os.WNOHANG)
-        except (
-            ChildProcessError
-        ):  # a plug-in has SIGCHLD ignored, and the kernel keeps no exit code
-            return 0
+        except ChildProcessError:
+            return 0  # a plug-in has SIGCHLD ignored: the kernel kept no exit code
         if ended:
             return os.waitstatus_to_exitcode(status)
         if limit.is_over():

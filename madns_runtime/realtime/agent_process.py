@@ -79,7 +79,7 @@ class AgentProcess:
             runner.start()
         # The recorders' thread runs already: only the loop is raised to its priority.
         grant = apply_scheduling(self._launch.config.scheduling, is_host=False)
-        self._process.writer.follow(grant.policy)
+        self._process.writer.follow(grant.priority)
         self._grant = grant.to_mapping()
         for runner in runners:
             runner.set_scheduling(self._grant)

@@ -164,7 +164,7 @@ class HostRuntime:
         heed_signals(self._reactor, terminated, is_detached=self._launch.is_detached)
         self._recorder.start()
         grant = apply_scheduling(self._config.scheduling, is_host=True)
-        self._writer.follow(grant.policy)
+        self._writer.follow(grant.priority)
         self._report.scheduling = grant.to_mapping()
         socket = self._port.socket
         for warning in filter(None, (socket.warning, grant.warning)):

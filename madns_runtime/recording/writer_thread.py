@@ -15,7 +15,7 @@ from madns_runtime.timing.kernel_times import thread_computed_s
 from madns_runtime.timing.late_causes import overlap_s
 
 FIFO_PRIORITY = 1
-"""Of SCHED_FIFO: the least there is, below every loop's."""
+"""Of SCHED_FIFO: the least there is."""
 
 
 class RecordWriter(Protocol):
@@ -72,13 +72,17 @@ class WriterThread:
                 self._thread = threading.Thread(target=self._write_on, name="recorder", daemon=True)
                 self._thread.start()
 
-    def follow(self, policy: str) -> None:
+    def follow(self, priority: int) -> None:
         """
-        Compute before all programs of the normal policy, if the loop that records got *policy* fifo.
+        Compute before all programs of the normal policy, if the loop that records does so as well.
 
         Whatever keeps this thread from computing while it has the interpreter keeps that loop waiting for it.
+
+        Args:
+            priority: SCHED_FIFO priority of that loop; 0 with the normal policy. One that is no higher than
+                FIFO_PRIORITY is not followed: this thread would not give way to the loop.
         """
-        self._follows_fifo = policy == "fifo"
+        self._follows_fifo = priority > FIFO_PRIORITY
 
     def computed_within_s(self, window: tuple[float, float]) -> float:
         """

@@ -355,7 +355,7 @@ def test_one_that_prints_between_its_frames_is_told_what_came(tmp_path, is_locks
     talk = "import sys; print('debug\\0', flush=True); sys.stdin.read()"
     flight["command"] = [sys.executable, "-c", talk]
     ship = Ship(tmp_path, None, flight=flight, is_lockstep=is_lockstep)
-    told = r"of what it said was no good packet: corrupt \d+"
+    told = r"; it said what was no good packet: corrupt \d+"
     if is_lockstep:
         with pytest.raises(BlamedError, match=told):
             ship.run(1)
@@ -468,8 +468,24 @@ def test_what_a_protocol_of_ones_own_does_wrong_is_told_by_its_name(tmp_path, me
         Ship(tmp_path, None, flight=flight).run(3)
 
 
-def test_faults_of_a_protocol_of_ones_own_that_are_no_counts_are_left_out(tmp_path):
-    (tmp_path / "own.py").write_text(OWN.partition("class Wrong")[0])
+def test_what_a_protocol_of_ones_own_does_wrong_with_the_last_answers_is_told(tmp_path):
+    body = "if self.is_odd: raise ValueError('odd')\n        return Own.feed(self, given)"
+    text = OWN.replace("METHOD", "feed").replace("BODY", body)
+    (tmp_path / "own.py").write_text(text.replace("faults = 3", "is_odd = False"))
+    flight = attached({"kind": "stdio"}, "own.py:Wrong") | {"command": TALK}
+
+    with Ship(tmp_path, None, flight=flight, is_lockstep=False) as ship:
+        ship.run(1)
+        ship.agent._cockpit._software._protocol._protocol.is_odd = True
+
+    told = "the last answers: Wrong.feed raised ValueError: odd (own.py:21)"
+    assert [text for level, text in ship.context.logs if level == "error"] == [told]
+
+
+@pytest.mark.parametrize("faults", ["faults = 3", "faults = {'odd': float('nan'), 'even': True}"])
+def test_faults_of_a_protocol_of_ones_own_that_are_no_counts_are_left_out(tmp_path, faults):
+    text = OWN.partition("class Wrong")[0].replace("faults = 3", faults)
+    (tmp_path / "own.py").write_text(text)
     flight = attached({"kind": "stdio"}, "own.py:Own") | {"command": TALK}
     flight["command"] = [
         *TALK[:2],

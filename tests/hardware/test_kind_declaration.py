@@ -48,7 +48,7 @@ hardware:
         (ONE[:-3] + ", direction='input'),)", "direction: expected one of .'in', 'out'."),
         (ONE[:-3] + ", unit=3),)", "unit: expected str, got 3"),
         (ONE[:-3] + ", shape=(2,), components=('x', 'x')),)", "distinct names, got a_x, a_x"),
-        ('channels=(Channel(name="number"),)', "no number may be called number"),
+        ('channels=(Channel(name="number"),)', "number: no number may be called number"),
         (
             'channels=(Channel(name="lateness_us", direction="out"),)',
             "no number may be called lateness_us",

@@ -69,6 +69,17 @@ def test_in_lockstep_each_point_is_put_out_at_its_due_time(tmp_path):
     assert told["lateness_us"] == {"p50": 0, "p99": 0, "max": 0}
 
 
+def test_in_lockstep_a_driver_that_lets_time_stand_still_is_told_so(tmp_path, monkeypatch):
+    bench = InlineBench(tmp_path)
+    monkeypatch.setattr("madns_runtime.hardware.inline.SAMPLES_MAX", 50)
+    bench.advance(4.8)  # 49 samples, one per 0.1 s
+    monkeypatch.setattr("madns_runtime.hardware.drivers.null.NullDevice.next_s", lambda self: 4.8)
+    with pytest.raises(
+        PluginError, match=r"null: 50 samples and outputs by 4.9 s, and no end: next_s"
+    ):
+        bench.advance(4.9)
+
+
 def test_in_lockstep_what_came_too_late_is_put_out_once_and_counted(tmp_path):
     bench = InlineBench(tmp_path)
     bench.advance(1.0)

@@ -175,9 +175,9 @@ def test_disk_that_stays_full_costs_counted_records_and_no_broken_line(tmp_path)
 @pytest.mark.skipif(os.geteuid() != 0, reason="sets a real-time policy")
 @pytest.mark.parametrize(
     ("granted", "policy", "priority"),
-    [("normal", os.SCHED_OTHER, 0), ("fifo", os.SCHED_FIFO, FIFO_PRIORITY)],
+    [(0, os.SCHED_OTHER, 0), (1, os.SCHED_OTHER, 0), (2, os.SCHED_FIFO, FIFO_PRIORITY)],
 )
-def test_writer_has_the_least_real_time_policy_if_its_loop_was_granted_it(
+def test_writer_has_the_least_real_time_priority_if_its_loop_was_granted_a_higher_one(
     tmp_path, granted, policy, priority
 ):
     schedulings = []

@@ -10,7 +10,6 @@ time no tick waits for anything: an answer is taken in the first tick after it h
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -214,9 +213,8 @@ class ExternalFlight:
             summary["interface"] = self._interface_summary()
         if not self._is_lockstep:  # where no summary depends on a clock
             summary["answer_s_max"] = round(self._answer_s_max, 6)
-            late = (
-                counts["answers_late"] + counts["ticks_skipped"] + overdue + self._ticks_unanswered
-            )
+            late = counts["answers_late"] + counts["ticks_skipped"] + overdue
+            late += self._ticks_unanswered
             summary["checks"] = [{"name": LATE_CHECK, "limit": 0, "got": late, "passed": late == 0}]
         return summary
 
@@ -224,14 +222,16 @@ class ExternalFlight:
         """Count the answers to the last ticks; there is no tick any more in which they could be carried out."""
         began_s = monotonic()
         oldest_s = self._asked[0][0] if self._asked else math.inf
-        # Whoever is overdue is not waited for.
-        is_owed = not self._is_late(oldest_s, self._present_s())
+        is_owed = not self._is_late(oldest_s, self._present_s())  # the overdue had their time
         wait_s = min(self._settings.answer_s, ExternalFlight.last_answers_s) if is_owed else 0.0
-        with contextlib.suppress(BlamedError):  # whoever is gone answers no more
+        try:
             self._account_for_last()
             while self._asked and monotonic() - began_s < wait_s and not self._link.how_it_ended():
                 self._link.wait(LOOK_S)
                 self._account_for_last()
+        except BlamedError as error:
+            if not self._link.how_it_ended():  # whoever is gone answers no more
+                self._context.log("error", f"the last answers: {error}")
         ExternalFlight.last_answers_s -= monotonic() - began_s
 
     def _account_for_last(self) -> None:
@@ -393,7 +393,7 @@ class ExternalFlight:
             self._agent.keep_text(STDERR_TEXT, said)
 
     def _last_words(self) -> str:
-        """Return what was no packet of what it said, the last line of its standard error, and where all of that lies."""
+        """Return how much it said that was no packet, the last line of its standard error, and the file that holds it all."""
         line = self._link.program.last_line if self._link.program else ""
         name = self._context.name
         words = f"; its last words: {line!r} (agents/{name}/{STDERR_TEXT}.txt)" if line else ""

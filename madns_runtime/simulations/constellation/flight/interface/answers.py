@@ -103,9 +103,9 @@ def _command(command: CommandRequest, context: FlightContext) -> None:
 
 
 def told_faults(faults: Mapping[str, int]) -> str:
-    """Return what a protocol counted of what it could not take, to be added to other words; nothing of none."""
+    """Return what a protocol counted of what it could not take, as the end of a sentence; empty if there is nothing."""
     told = ", ".join(f"{kind} {count}" for kind, count in faults.items() if count)
-    return f"; of what it said was no good packet: {told}" if told else ""
+    return f"; it said what was no good packet: {told}" if told else ""
 
 
 def shown(data: bytes) -> str:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from madns_runtime.errors import BlamedError
+from madns_runtime.plain_values import is_real
 from madns_runtime.plugin.context import describe_exception
 from madns_runtime.simulations.constellation.flight.interface.answers import FlightAnswer
 from madns_runtime.simulations.constellation.flight.interface.reports import SetupReport, TickReport
@@ -29,7 +31,7 @@ class OwnProtocol:
         """What it counts of what it could not take, as far as that is a mapping of numbers."""
         told = getattr(self._protocol, "faults", {})
         known = told if isinstance(told, Mapping) else {}
-        return {str(kind): int(n) for kind, n in known.items() if isinstance(n, int | float)}
+        return {str(kind): int(n) for kind, n in known.items() if is_real(n) and math.isfinite(n)}
 
     def setup(self, setup: SetupReport) -> Sequence[bytes]:
         """
