@@ -31,8 +31,12 @@ def for_login_shell(script: str) -> str:
     Return a command that has /bin/sh run *script*, for any login shell: POSIX's, fish, tcsh.
 
     Single quotes do not hide a backslash from fish, nor an exclamation mark from tcsh: those stand outside of
-    them, where all shells read them alike.
+    them, where all shells read them alike. Nor do they hide the end of a line from tcsh: a script of several
+    lines is sent as one, which has /bin/sh make it anew.
     """
+    if "\n" in script:
+        one_line = script.replace("\\", r"\\").replace("\n", r"\n")
+        script = f'eval "$(printf %b {shlex.quote(one_line)})"'
     quoted = re.sub(r"[\\!]", r"'\\\g<0>'", shlex.quote(script))
     return f"exec /bin/sh -c {quoted}"
 

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import subprocess
 
 import pytest
 
@@ -25,12 +26,14 @@ COMMANDS = {
     "helper": helper_command(None, 100),
     "helper with a Python": helper_command("/opt/py thon/bin/python3", 100),
     "watched": watched(r"""printf '%s\\n' "it's" !x"""),
+    "lines": watched("echo a\necho 'b\\nc'"),
+    "lines as root": as_root(watched("echo a\necho 'b\\nc'")),
     "as root": as_root(watched(r"""printf '%s\\n' "it's" !x""")),
     "start": start_command(PROGRAM, PATHS),
     "relay": relay_command(PROGRAM, 1, PATHS),
 }
-NOT_ALIKE = re.compile(r"[\\!]")
-"""What fish (the first) and tcsh (the second) read within single quotes, and others do not."""
+NOT_ALIKE = re.compile(r"[\\!\n]")
+"""What fish (the first) and tcsh (the others) read within single quotes, and other shells do not."""
 
 
 @pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
@@ -53,3 +56,18 @@ def test_no_quotes_hold_what_some_shell_would_read_within_them(command):
 @pytest.mark.parametrize("script", [r"echo 'a\\b\'", "echo it's !!", "", r"\\!\!"])
 def test_script_arrives_as_it_was(script):
     assert shlex.split(for_login_shell(script))[3] == script
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    "script", ["printf '%s|' a 'b\nc' 'd\\ne' 'f\\\\' '%b'\n", "exit 3\necho never"]
+)
+def test_script_of_several_lines_does_the_same_in_one(script):
+    sent = for_login_shell(script)
+    expected, got = (
+        subprocess.run(["/bin/sh", "-c", each], capture_output=True, timeout=60, check=False)
+        for each in (script, sent)
+    )
+
+    assert "\n" not in sent
+    assert (got.returncode, got.stdout, got.stderr) == (expected.returncode, expected.stdout, b"")
