@@ -41,14 +41,17 @@ def for_login_shell(script: str) -> str:
     return f"exec /bin/sh -c {quoted}"
 
 
-def watched(command: str) -> str:
-    """Return a shell command that does the same and is ended, with its children, when standard input ends."""
-    return for_login_shell(f"set -- {shlex.quote(command)}; {_WATCH}")
+def watched(command: str, *, is_root: bool = False) -> str:
+    """
+    Return a shell command that does the same and is ended, with its children, when standard input ends.
 
-
-def as_root(command: str) -> str:
-    """Return a shell command that does the same as root; says NO_SUDO_MARK last when it may not."""
-    return for_login_shell(
-        f'if [ "$(id -u)" != 0 ]; then sudo -n true || {{ echo {shlex.quote(NO_SUDO_MARK)} >&2;'
-        f" exit 1; }}; exec sudo -n /bin/sh -c {shlex.quote(command)}; fi; {command}"
+    Args:
+        command: Quoted once, however it is sent on: each level makes five of a quotation mark, and Linux takes
+            128 KiB as one argument.
+        is_root: Whether it is root's; NO_SUDO_MARK is the last that is said where the user may not.
+    """
+    root = (
+        f'if [ "$(id -u)" != 0 ]; then sudo -n true || {{ echo {shlex.quote(NO_SUDO_MARK)} >&2; exit 1; }};'
+        f' exec sudo -n /bin/sh -c {shlex.quote(_WATCH)} sh "$1"; fi; '
     )
+    return for_login_shell(f"set -- {shlex.quote(command)}; {root if is_root else ''}{_WATCH}")
