@@ -10,18 +10,23 @@ PIP = $(VENV)/bin/python -m pip install --quiet
 # One setting of Python's in an environment would let every process of a test compile all anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test lint measured unmeasured check clean
+.PHONY: demo test linted tested lint measured unmeasured check clean
 
 demo: $(RUNNABLE)  ## Run ten real Iridium satellites on ten loopback agents.
 	$(VENV)/bin/cosmos run scenarios/iridium10.yaml
 
 # Lint keeps one processor for a minute: the tests begin beside it, and what it says comes in one piece.
 test: $(READY)  ## Lint, types, import contracts and every test but those of `.ci/nightly`.
-	@{ $(MAKE) --no-print-directory lint >$(VENV)/lint.txt 2>&1; status=$$?; cat $(VENV)/lint.txt; exit $$status; } & lint=$$!; \
-	$(MAKE) --no-print-directory measured unmeasured && \
-	$(VENV)/bin/python -m pytest --numprocesses 6 --dist loadfile --no-loadscope-reorder --durations=25 $(addprefix --ignore=,$(MEASURED)); failed=$$?; \
-	wait $$lint || failed=1; \
-	exit $$failed
+	@$(MAKE) --no-print-directory --jobs=2 --keep-going linted tested
+
+linted: $(READY)
+	@$(MAKE) --no-print-directory --output-sync=target lint
+
+# A line with $(MAKE) runs under `make -n`, too: pytest has one of its own. Tests call make, and this one's flags are not theirs.
+tested: $(READY)
+	@$(MAKE) --no-print-directory measured
+	@$(MAKE) --no-print-directory unmeasured
+	MAKEFLAGS= $(VENV)/bin/python -m pytest --numprocesses 6 --dist loadfile --no-loadscope-reorder --durations=25 $(addprefix --ignore=,$(MEASURED))
 
 lint: $(READY)
 	$(VENV)/bin/ruff check .

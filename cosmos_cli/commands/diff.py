@@ -23,6 +23,7 @@ from cosmos_cli.launch.execute import Detached, RunOptions, execute
 from cosmos_cli.models.document import did_you_mean
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
+from cosmos_cli.ui.name_ranges import compact
 from cosmos_cli.ui.progress import told_progress
 from cosmos_cli.view.factory import make_view
 
@@ -130,7 +131,10 @@ def _check_chosen(sides: Sequence[Side], agents: tuple[str, ...], streams: tuple
     labels = [run_labels(side.run) for side in sides] if agents else []
     for glob in agents:
         if not any(own.like(glob, side.agents) for own, side in zip(labels, sides, strict=True)):
-            raise InputError(f"--agents {glob}: no agent of these runs is called so")
+            known = compact(name for side in sides for name in side.agents)
+            raise InputError(
+                f"--agents {glob}: no agent of these runs is called so; there are {known}"
+            )
     names = sorted({name for side in sides for name in side.stream_names})
     for glob in streams:
         if not fnmatch.filter(names, glob):

@@ -102,7 +102,7 @@ def down(
     With an inventory also runs that are only found on its machines. Ends with 3 when a machine does
     not answer, with 1 when something lives still.
     """
-    console = Console(json=json, quiet=quiet)
+    console = Console(json=json, quiet=quiet, instead="the exit code tells what lives still")
     fleet = Fleetwide(
         options=ConnectOptions(accept_new_host_keys=accept_new_host_keys),
         forks=forks,

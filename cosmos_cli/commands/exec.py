@@ -24,7 +24,7 @@ from cosmos_cli.fleet.connection import Completed, Connection
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.outcome import Outcome, failed
 from cosmos_cli.fleet.retry_file import offer_retry
-from cosmos_cli.fleet.shell import NO_SUDO_MARK, as_root, watched
+from cosmos_cli.fleet.shell import NO_SUDO_MARK, watched
 from cosmos_cli.ui.console import WORK_GOES_ON, Console, JsonOption, QuietOption
 from cosmos_cli.ui.foreign_text import clean_text
 from cosmos_cli.ui.plural import counted
@@ -97,7 +97,7 @@ def exec(  # noqa: A001 - the verb's name is the function's
 
 
 def _task(line: str, *, is_root: bool, timeout_s: float) -> Callable[[Connection], Completed]:
-    shell_line = as_root(watched(line)) if is_root else watched(line)
+    shell_line = watched(line, is_root=is_root)
 
     def task(connection: Connection) -> Completed:
         if is_root:

@@ -65,7 +65,8 @@ def inject(
     A device's fault freezes what it measures, biases it, makes it noisy, drops it or delays it, or unplugs it; the
     device itself knows nothing of it. Recorded in the run. Ends with 1 when the run refuses.
     """
-    console = Console(json=as_json, quiet=quiet)
+    instead = None if listed else "the exit code tells whether the run refused"
+    console = Console(json=as_json, quiet=quiet, instead=instead)
     found = find_run(runs_root(folder), run)
     if listed:
         if target is not None:

@@ -16,6 +16,7 @@ from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.evidence.table_labels import TableLabels
 from cosmos_cli.models.agent_labels import AgentLabels
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
+from cosmos_cli.ui.name_ranges import compact
 from cosmos_cli.ui.plural import counted
 from cosmos_cli.ui.progress import told_progress
 
@@ -81,5 +82,7 @@ def tabulate(
 def _chosen(names: tuple[str, ...], globs: list[str], labels: AgentLabels) -> tuple[str, ...]:
     unknown = [glob for glob in globs if not labels.like(glob, names)]
     if unknown:
-        raise InputError(f"--agents {unknown[0]}: no agent of the run is called so")
+        raise InputError(
+            f"--agents {unknown[0]}: no agent of the run is called so; there are {compact(names)}"
+        )
     return tuple(labels.like_any(globs, names)) if globs else names

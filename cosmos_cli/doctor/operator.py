@@ -99,12 +99,12 @@ def container(case: Case) -> Iterator[CheckRemark]:
 
 
 def cut_off(case: Case) -> Iterator[CheckRemark]:
-    """Runs that never came to their end."""
+    """Runs that were cut off, or ran detached, and are not collected."""
     names: list[str] = case.part("here").get("cut_off") or []
     if names:
         yield CheckRemark(
             level=Severity.NOTE,
-            found=f"runs that were cut off and not collected: {', '.join(names)}",
+            found=f"runs that were cut off, or ran detached, and are not collected: {', '.join(names)}",
             cure=f"`cosmos collect {names[-1].partition('-')[0].lstrip('0')}`",
         )
 

@@ -31,20 +31,27 @@ def for_login_shell(script: str) -> str:
     Return a command that has /bin/sh run *script*, for any login shell: POSIX's, fish, tcsh.
 
     Single quotes do not hide a backslash from fish, nor an exclamation mark from tcsh: those stand outside of
-    them, where all shells read them alike.
+    them, where all shells read them alike. Nor do they hide the end of a line from tcsh: a script of several
+    lines is sent as one, which has /bin/sh make it anew.
     """
+    if "\n" in script:
+        one_line = script.replace("\\", r"\\").replace("\n", r"\n")
+        script = f'eval "$(printf %b {shlex.quote(one_line)})"'
     quoted = re.sub(r"[\\!]", r"'\\\g<0>'", shlex.quote(script))
     return f"exec /bin/sh -c {quoted}"
 
 
-def watched(command: str) -> str:
-    """Return a shell command that does the same and is ended, with its children, when standard input ends."""
-    return for_login_shell(f"set -- {shlex.quote(command)}; {_WATCH}")
+def watched(command: str, *, is_root: bool = False) -> str:
+    """
+    Return a shell command that does the same and is ended, with its children, when standard input ends.
 
-
-def as_root(command: str) -> str:
-    """Return a shell command that does the same as root; says NO_SUDO_MARK last when it may not."""
-    return for_login_shell(
-        f'if [ "$(id -u)" != 0 ]; then sudo -n true || {{ echo {shlex.quote(NO_SUDO_MARK)} >&2;'
-        f" exit 1; }}; exec sudo -n /bin/sh -c {shlex.quote(command)}; fi; {command}"
+    Args:
+        command: Quoted once, however it is sent on: each level makes five of a quotation mark, and Linux takes
+            128 KiB as one argument.
+        is_root: Whether it is root's; NO_SUDO_MARK is the last that is said where the user may not.
+    """
+    root = (
+        f'if [ "$(id -u)" != 0 ]; then sudo -n true || {{ echo {shlex.quote(NO_SUDO_MARK)} >&2; exit 1; }};'
+        f' exec sudo -n /bin/sh -c {shlex.quote(_WATCH)} sh "$1"; fi; '
     )
+    return for_login_shell(f"set -- {shlex.quote(command)}; {root if is_root else ''}{_WATCH}")

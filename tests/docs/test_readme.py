@@ -98,6 +98,28 @@ def test_make_has_the_readmes_two_targets():
         assert done.returncode == 0, done.stderr
 
 
+def test_dry_run_of_make_runs_nothing(tmp_path):
+    (tmp_path / "bin").mkdir()
+    for tool in ("python", "ruff", "mypy", "lint-imports"):
+        (tmp_path / "bin" / tool).write_text(f"#!/bin/sh\necho {tool} >>{tmp_path}/ran\n")
+        (tmp_path / "bin" / tool).chmod(0o755)
+    for stamp in (".runnable", ".ready"):
+        (tmp_path / stamp).touch()
+
+    done = subprocess.run(
+        ["make", "-n", "test", f"VENV={tmp_path}"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+    assert done.returncode == 0, done.stderr
+    assert f"{tmp_path}/bin/mypy" in done.stdout
+    assert f"{tmp_path}/bin/python -m pytest --numprocesses 6" in done.stdout
+    assert not (tmp_path / "ran").exists()
+
+
 def test_every_shipped_scenario_that_no_quick_test_runs_is_valid(capsys):
     others = [each for each in shipped() if "quick" not in each.test.tags]
     assert {tag for each in others for tag in each.test.tags} >= {"emulator", "hardware"}

@@ -35,9 +35,8 @@ class Accumulator(ABC):
             values: None of which is missing.
             places: Among all records of whoever recorded them: what tells the order of those of one time.
         """
-        with np.errstate(
-            over="ignore", invalid="ignore"
-        ):  # what diverged has no statistic: inf or NaN
+        # What diverged has no statistic: inf or NaN.
+        with np.errstate(over="ignore", invalid="ignore"):
             self._take(t_s, values, places)
 
     def result(self) -> Found:

@@ -214,7 +214,11 @@ def test_nothing_chosen_is_never_the_same(make, capsys):
 @pytest.mark.parametrize(
     ("option", "word", "expected"),
     [
-        ("--agents", "agent-99", "--agents agent-99: no agent of these runs is called so"),
+        (
+            "--agents",
+            "agent-99",
+            "--agents agent-99: no agent of these runs is called so; there are agent-[",
+        ),
         ("--streams", "stat", "--streams stat: these runs recorded no such stream, did you mean"),
     ],
 )

@@ -2,11 +2,12 @@
 
 import re
 import shlex
+import subprocess
 
 import pytest
 
 from cosmos_cli.fleet.helper import start_command as helper_command
-from cosmos_cli.fleet.shell import as_root, for_login_shell, watched
+from cosmos_cli.fleet.shell import NO_SUDO_MARK, for_login_shell, watched
 from cosmos_cli.launch.child import RemoteProgram, relay_command, start_command
 from cosmos_cli.launch.machines import MachinePaths
 
@@ -25,12 +26,14 @@ COMMANDS = {
     "helper": helper_command(None, 100),
     "helper with a Python": helper_command("/opt/py thon/bin/python3", 100),
     "watched": watched(r"""printf '%s\\n' "it's" !x"""),
-    "as root": as_root(watched(r"""printf '%s\\n' "it's" !x""")),
+    "lines": watched("echo a\necho 'b\\nc'"),
+    "lines as root": watched("echo a\necho 'b\\nc'", is_root=True),
+    "as root": watched(r"""printf '%s\\n' "it's" !x""", is_root=True),
     "start": start_command(PROGRAM, PATHS),
     "relay": relay_command(PROGRAM, 1, PATHS),
 }
-NOT_ALIKE = re.compile(r"[\\!]")
-"""What fish (the first) and tcsh (the second) read within single quotes, and others do not."""
+NOT_ALIKE = re.compile(r"[\\!\n]")
+"""What fish (the first) and tcsh (the others) read within single quotes, and other shells do not."""
 
 
 @pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
@@ -53,3 +56,54 @@ def test_no_quotes_hold_what_some_shell_would_read_within_them(command):
 @pytest.mark.parametrize("script", [r"echo 'a\\b\'", "echo it's !!", "", r"\\!\!"])
 def test_script_arrives_as_it_was(script):
     assert shlex.split(for_login_shell(script))[3] == script
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    "script", ["printf '%s|' a 'b\nc' 'd\\ne' 'f\\\\' '%b'\n", "exit 3\necho never"]
+)
+def test_script_of_several_lines_does_the_same_in_one(script):
+    sent = for_login_shell(script)
+    expected, got = (
+        subprocess.run(["/bin/sh", "-c", each], capture_output=True, timeout=60, check=False)
+        for each in (script, sent)
+    )
+
+    assert "\n" not in sent
+    assert (got.returncode, got.stdout, got.stderr) == (expected.returncode, expected.stdout, b"")
+
+
+ARGUMENT_BYTES_MAX = 128 * 1024
+"""Of Linux, for each."""
+
+
+def test_script_with_many_quotation_marks_still_fits_one_argument():
+    assert len(watched("echo 'it'\n" * 800, is_root=True)) < ARGUMENT_BYTES_MAX
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("may", [True, False])
+def test_command_of_root_is_run_by_sudo_or_says_that_there_is_none(tmp_path, may):
+    # Whoever runs the tests may be root already: what says who one is, and sudo, are stand-ins.
+    for name, does in (
+        ("id", "echo 1000"),
+        ("sudo", 'shift; echo "sudo $1" >&2; exec "$@"' if may else "exit 1"),
+    ):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{does}\n")
+        (tmp_path / name).chmod(0o755)
+    with subprocess.Popen(
+        ["/bin/sh", "-c", watched('echo "it\'s"\nexit 3', is_root=True)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={"PATH": f"{tmp_path}:/usr/bin:/bin"},
+        text=True,
+        start_new_session=True,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        said, errors = process.stdout.read(), process.stderr.read()
+        status = process.wait(timeout=60)
+
+    expected = (3, "it's\n", "sudo true\nsudo /bin/sh\n") if may else (1, "", f"{NO_SUDO_MARK}\n")
+    assert (status, said, errors) == expected

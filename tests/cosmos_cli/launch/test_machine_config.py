@@ -109,14 +109,16 @@ def test_machine_behind_a_proxy_command_fails_before_the_run_unless_an_address_i
     behind, named = machine("pi2"), machine("pi4", cosmos_host_address="192.0.2.9")
     both = plan(behind, named)
     config = dataclasses.replace(CONFIG, network=Network(address="10.9.9.9"))
-    target = SimpleNamespace(name="pi2")
+    options: Any = None
+    at_pi2: Any = SimpleNamespace(name="pi2")
+    at_pi4: Any = SimpleNamespace(name="pi4")
 
     with pytest.raises(MachineFailure, match="cosmos_host_address") as caught:
-        with_address(connect, both, CONFIG)(target, None)  # type: ignore[arg-type]
+        with_address(connect, both, CONFIG)(at_pi2, options)
     assert (caught.value.kind, closed) == (FailureKind.UNSUPPORTED, ["pi2"])
-    with_address(connect, both, CONFIG)(SimpleNamespace(name="pi4"), None)  # type: ignore[arg-type]
-    with_address(connect, both, config)(target, None)  # type: ignore[arg-type]
-    with_address(connect, plan(behind, host, host=host), CONFIG)(target, None)  # type: ignore[arg-type]
+    with_address(connect, both, CONFIG)(at_pi4, options)
+    with_address(connect, both, config)(at_pi2, options)
+    with_address(connect, plan(behind, host, host=host), CONFIG)(at_pi2, options)
     assert closed == ["pi2"]
 
 

@@ -9,6 +9,9 @@ from pathlib import Path
 import pytest
 from harness.synthetic_run import SyntheticRun
 
+from cosmos_cli import app
+from cosmos_cli.commands import inject
+
 COSMOS = f"{sys.executable} -m cosmos_cli.app"
 
 
@@ -93,6 +96,31 @@ def test_code_of_judge_survives_a_reader_that_has_gone(
     )
 
     assert ended.returncode == code
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("command", ["down --all", "wipe -i {inventory} --yes"])
+def test_code_of_what_was_done_survives_a_full_output(tmp_path: Path, command: str) -> None:
+    inventory = tmp_path / "here.yaml"
+    inventory.write_text("all: {hosts: {here: {ansible_connection: local}}}\n")
+    state = f"COSMOS_STATE_DIR={tmp_path}/state COSMOS_RUNS={tmp_path}/runs"
+
+    ended = shell(f"{state} {COSMOS} {command.format(inventory=inventory)} --json >/dev/full")
+
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stderr.count("error: stdout: No space left on device; the exit code tells") == 1
+
+
+@pytest.mark.parametrize(("refusal", "code"), [(None, 0), ("no such agent", 1)])
+def test_code_of_inject_survives_a_full_output(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refusal: str | None, code: int
+) -> None:
+    run = SyntheticRun(tmp_path).write().run
+    monkeypatch.setattr(inject, "order_action", lambda *given: {"refusal": refusal or ""})
+    with open("/dev/full", "w", encoding="utf-8") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+
+        assert app.run(["inject", str(run.path), "agent-01", "annotate", "text=x"]) == code
 
 
 @pytest.mark.process
