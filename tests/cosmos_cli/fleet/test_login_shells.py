@@ -7,7 +7,7 @@ import subprocess
 import pytest
 
 from cosmos_cli.fleet.helper import start_command as helper_command
-from cosmos_cli.fleet.shell import NO_SUDO_MARK, for_login_shell, watched
+from cosmos_cli.fleet.shell import for_login_shell, watched
 from cosmos_cli.launch.child import RemoteProgram, relay_command, start_command
 from cosmos_cli.launch.machines import MachinePaths
 
@@ -79,31 +79,3 @@ ARGUMENT_BYTES_MAX = 128 * 1024
 
 def test_script_with_many_quotation_marks_still_fits_one_argument():
     assert len(watched("echo 'it'\n" * 800, is_root=True)) < ARGUMENT_BYTES_MAX
-
-
-@pytest.mark.process
-@pytest.mark.parametrize("may", [True, False])
-def test_command_of_root_is_run_by_sudo_or_says_that_there_is_none(tmp_path, may):
-    # Whoever runs the tests may be root already: what says who one is, and sudo, are stand-ins.
-    for name, does in (
-        ("id", "echo 1000"),
-        ("sudo", 'shift; echo "sudo $1" >&2; exec "$@"' if may else "exit 1"),
-    ):
-        (tmp_path / name).write_text(f"#!/bin/sh\n{does}\n")
-        (tmp_path / name).chmod(0o755)
-    with subprocess.Popen(
-        ["/bin/sh", "-c", watched('echo "it\'s"\nexit 3', is_root=True)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env={"PATH": f"{tmp_path}:/usr/bin:/bin"},
-        text=True,
-        start_new_session=True,
-    ) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
-        said, errors = process.stdout.read(), process.stderr.read()
-        status = process.wait(timeout=60)
-
-    expected = (3, "it's\n", "sudo true\nsudo /bin/sh\n") if may else (1, "", f"{NO_SUDO_MARK}\n")
-    assert (status, said, errors) == expected

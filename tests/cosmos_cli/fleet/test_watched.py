@@ -11,7 +11,7 @@ from cosmos_cli.fleet.connection import OUTPUT_BYTES_MAX
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.liveness import BlockingStream
 from cosmos_cli.fleet.local import LocalConnection
-from cosmos_cli.fleet.shell import NO_SUDO_MARK, as_root, watched
+from cosmos_cli.fleet.shell import NO_SUDO_MARK, watched
 from cosmos_cli.fleet.target import Target
 
 pytestmark = pytest.mark.process
@@ -129,7 +129,7 @@ def test_who_may_not_become_root_is_told_by_a_mark(here, tmp_path, monkeypatch):
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
 
-    done = here.run(as_root(watched("touch /never")), stdin=None, timeout_s=WAIT_S)
+    done = here.run(watched("touch /never", is_root=True), stdin=None, timeout_s=WAIT_S)
 
     assert done.exit_status == 1
     assert done.stderr == f"sudo: a password is required\n{NO_SUDO_MARK}\n".encode()
@@ -142,6 +142,6 @@ def test_who_may_becomes_root_once(here, tmp_path, monkeypatch):
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
 
-    done = here.run(as_root(watched("echo 'x y'; exit 3")), stdin=None, timeout_s=WAIT_S)
+    done = here.run(watched("echo 'x y'\nexit 3", is_root=True), stdin=None, timeout_s=WAIT_S)
 
     assert (done.exit_status, done.stdout) == (3, b"rooted\nx y\n")
