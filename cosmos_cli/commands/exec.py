@@ -59,7 +59,8 @@ def exec(  # noqa: A001 - the verb's name is the function's
     """
     Run a command on every machine at once; it ends with this one, also on Ctrl-C.
 
-    Ends with 1 when it failed on any machine, with 3 when a machine itself failed.
+    Ends with 1 when it failed on any machine or the disk did not take what they said, with 3 when a machine itself
+    failed.
     """
     console = Console(json=json, quiet=quiet, instead=WORK_GOES_ON)
     if not any(word.strip() for word in command):
@@ -93,7 +94,8 @@ def exec(  # noqa: A001 - the verb's name is the function's
             "exit_code": int(exit_code),
         }
     )
-    return int(exit_code)
+    # What machines said is nowhere else: a full disk that took it must not pass for success.
+    return int(exit_code) or (int(ExitCode.RUN_FAILED) if console.lost else 0)
 
 
 def _task(line: str, *, is_root: bool, timeout_s: float) -> Callable[[Connection], Completed]:

@@ -17,8 +17,8 @@ import os
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Annotated, Any, TextIO
 
 import typer
@@ -69,6 +69,8 @@ class Console:
     Of a command that works on when stdout takes no more: where its result can be found; told once on stderr.
     None: it ends there, as `cosmos logs -f | head` must.
     """
+    lost: list[OSError] = field(default_factory=list)
+    """Why stdout took no more, of a command that worked on: not that its reader had gone, who wanted no more."""
 
     def data(self, text: str) -> None:
         """Print a line of the result on stdout; left out under --json."""
@@ -107,7 +109,13 @@ class Console:
             _print_table(columns, rows)
 
     def _losing_output(self) -> contextlib.AbstractContextManager[None]:
-        return contextlib.nullcontext() if self.instead is None else losing_output(self.instead)
+        if self.instead is None:
+            return contextlib.nullcontext()
+        return losing_output(self.instead, self._note_lost)
+
+    def _note_lost(self, error: OSError) -> None:
+        if not isinstance(error, BrokenPipeError):
+            self.lost.append(error)
 
 
 def _print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
@@ -226,16 +234,19 @@ def open_standard_streams() -> None:
 
 
 @contextlib.contextmanager
-def losing_output(instead: str) -> Iterator[None]:
+def losing_output(instead: str, note: Callable[[OSError], None] | None = None) -> Iterator[None]:
     """
     Go on when stdout takes no more: the verdict's exit code matters more than its line.
 
     Args:
         instead: Where what was to be printed can be found; told on stderr.
+        note: Told why stdout took no more.
     """
     try:
         yield
     except OSError as error:
+        if note is not None:
+            note(error)
         tell_lost_output(error, instead)
 
 

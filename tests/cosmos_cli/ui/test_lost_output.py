@@ -111,6 +111,23 @@ def test_code_of_what_was_done_survives_a_full_output(tmp_path: Path, command: s
     assert ended.stderr.count("error: stdout: No space left on device; the exit code tells") == 1
 
 
+@pytest.mark.process
+@pytest.mark.parametrize(("redirection", "code"), [(">/dev/full", 1), ("| true", 0)])
+def test_what_machines_said_is_nowhere_else_and_fails_on_a_full_disk_alone(
+    tmp_path: Path, redirection: str, code: int
+) -> None:
+    inventory = tmp_path / "here.yaml"
+    inventory.write_text("all: {hosts: {here: {ansible_connection: local}}}\n")
+
+    ended = shell(
+        f"{COSMOS} exec -i {inventory} --json -- 'echo said; touch {tmp_path}/done' {redirection};"
+        " exit ${PIPESTATUS[0]}"
+    )
+
+    assert ended.returncode == code, ended.stderr
+    assert (tmp_path / "done").exists()
+
+
 @pytest.mark.parametrize(("refusal", "code"), [(None, 0), ("no such agent", 1)])
 def test_code_of_inject_survives_a_full_output(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refusal: str | None, code: int
