@@ -16,7 +16,7 @@ from typing import Protocol
 from madns_runtime.config import Agents
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.realtime.process_port import ProcessPort
-from madns_runtime.realtime.wake_lead import LEAD_S_MAX, WakeLead
+from madns_runtime.realtime.wake_lead import WAIT_S_MAX, WakeLead
 from madns_runtime.timing.rate import stagger
 
 PACK_AGENTS_MAX = 8
@@ -54,8 +54,8 @@ class Pack:
         self._process = process
         self._members: list[PackMember] = []
         self._lead = WakeLead()
-        self._due_s = math.inf
-        """The deadline that it wakes for, s of the local clock."""
+        self._next: tuple[PackMember, float] | None = None
+        """Whose tick it wakes for, and when that is due, s of simulated time."""
         # Infinite is never: the timer is made once and moved.
         self._timer = reactor.call_at(math.inf, self._due)
 
@@ -74,8 +74,12 @@ class Pack:
             deadline_s = member.next_deadline_s()
             if deadline_s < earliest_s:
                 earliest_s, first = deadline_s, member
-        self._due_s = math.inf if first is None else first.local_s(earliest_s)
-        self._timer.reschedule(self._due_s - self._lead.lead_s)
+        if first is None:
+            self._next = None
+            self._timer.reschedule(math.inf)
+        else:
+            self._next = first, earliest_s
+            self._timer.reschedule(first.local_s(earliest_s) - self._lead.lead_s)
 
     def _due(self) -> None:
         members, process = self._members, self._process
@@ -83,8 +87,8 @@ class Pack:
         if is_shared:
             process.begin()
         process.account.begin_ticks(monotonic())
-        self._wait_for_deadline()
         try:
+            self._wait_for_deadline()
             for member in members:
                 member.tick()
             now_s = monotonic()
@@ -96,12 +100,16 @@ class Pack:
         self.arm()
 
     def _wait_for_deadline(self) -> None:
-        """Wait for what is left until the deadline, LEAD_S_MAX at most, and learn from a wake-up out of sleep."""
+        """Wait for what is left until the deadline, WAIT_S_MAX at most, and learn from a wake-up out of sleep."""
         ordered_s, now_s = self._timer.when_s, monotonic()
         slept_from_s, slept_to_s = self._reactor.last_sleep
         if slept_from_s <= ordered_s <= slept_to_s:
             self._lead.learn(now_s - ordered_s)
-        until_s = min(self._due_s, ordered_s + LEAD_S_MAX)
+        if self._next is None:
+            return
+        member, deadline_s = self._next
+        # By the clock as it is estimated now: a tick that is a little early would cost another wake-up.
+        until_s = min(member.local_s(deadline_s), ordered_s + WAIT_S_MAX)
         while now_s < until_s:
             now_s = monotonic()
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 LEAD_S_MAX = 100e-6
 """The most that a loop may wake too early and wait for without sleeping, s."""
+WAIT_S_MAX = 2 * LEAD_S_MAX
+"""The most that it then waits, s: meanwhile the estimate of the host's clock may have moved the deadline."""
 RAISE_S = 1e-6
 LOWER_S = 3e-6
 """Steps by which the lead follows: three to one, so that one wake-up of four comes before its deadline."""

@@ -9,7 +9,7 @@ import pytest
 
 from madns_runtime.config import Agents
 from madns_runtime.realtime.packs import PACK_AGENTS_MAX, Pack, phase_of, split_into_packs
-from madns_runtime.realtime.wake_lead import LEAD_S_MAX, WakeLead
+from madns_runtime.realtime.wake_lead import LEAD_S_MAX, WAIT_S_MAX, WakeLead
 
 
 @pytest.mark.parametrize(
@@ -161,6 +161,20 @@ def test_it_wakes_ahead_of_its_deadline_by_what_waking_takes_and_ticks_at_it(mon
     assert late_s[0] == pytest.approx(50e-6, abs=1e-6)
     assert all(0.0 <= each < 6e-6 for each in late_s[-50:])
     assert member.due_s + 100.0 - loop.timer.when_s == pytest.approx(50e-6, abs=5e-6)
+
+
+def test_it_waits_for_a_deadline_that_a_better_clock_has_moved_but_not_for_long(monkeypatch):
+    clock = Clock(monkeypatch, 100.0, 1e-7)
+    member = Observer(1.0, clock)
+    loop, pack = pack_of(member)
+    pack.arm()
+    monkeypatch.setattr(member, "local_s", lambda t_s: 100.00005 + t_s)
+    wake(loop, clock, took_s=10e-6)
+    assert member.ticked_s == [pytest.approx(101.00005, abs=1e-6)]
+
+    monkeypatch.setattr(member, "local_s", lambda t_s: 107.0 + t_s)
+    wake(loop, clock, took_s=10e-6)
+    assert member.ticked_s[1] - loop.last_sleep[1] < WAIT_S_MAX
 
 
 def test_a_wake_up_of_a_loop_that_was_at_work_tells_nothing(monkeypatch):
