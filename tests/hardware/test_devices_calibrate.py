@@ -193,7 +193,8 @@ def test_a_device_is_led_through_its_sensors(
     monkeypatch.setattr(sys, "stdin", Terminal("\n\n"))
     monkeypatch.setattr(devices_calibrate, "POSITIONS", ("z up", "z up again"))
 
-    code, found = told("imu", "-i", inventory, "--seconds", 0.6)
+    # Long enough for the least number of samples on a busy computer, too.
+    code, found = told("imu", "-i", inventory, "--seconds", 2.0)
 
     assert code == 1
     gyro, accelerometer = found["sensors"]
