@@ -220,7 +220,7 @@ def test_what_was_done_before_ctrl_c_is_shown_and_nothing_is_left(
 
     monkeypatch.setattr(devices_calibrate, "wait_for_enter", interrupt)
 
-    code = cosmos(["devices", "calibrate", "imu", "-i", str(inventory), "--seconds", "0.6"])
+    code = cosmos(["devices", "calibrate", "imu", "-i", str(inventory), "--seconds", "2.0"])
 
     printed = capsys.readouterr()
     assert code == 130
