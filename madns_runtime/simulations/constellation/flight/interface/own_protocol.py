@@ -73,7 +73,7 @@ class OwnProtocol:
     def _called(self, method: str, call: Callable[[Any], Any], argument: Any) -> Any:
         try:
             return call(argument)
-        except Exception as error:
+        except Exception as error:  # of a user's class: told by its name
             raise BlamedError(describe_exception(error, f"{self._name}.{method}")) from error
 
     def _wrong(self, method: str, expected: str, told: Any) -> BlamedError:
