@@ -54,6 +54,10 @@ class Pack:
         self._process = process
         self._members: list[PackMember] = []
         self._lead = WakeLead()
+        self._is_answered = False
+        """Whether the host has sent something since the last ticks, to an agent by itself."""
+        if process.agents == 1:
+            process.after_packet = self._answered
         self._next: tuple[PackMember, float] | None = None
         """Whose tick it wakes for, and when that is due, s of simulated time."""
         # Infinite is never: the timer is made once and moved.
@@ -91,13 +95,24 @@ class Pack:
             self._wait_for_deadline()
             for member in members:
                 member.tick()
-            now_s = monotonic()
-            for member in members:
-                member.say_how_it_is(now_s)
+            # What a pack says leaves in one packet with its ticks' messages. Of an agent by itself it would hold up the
+            # answer to its tick: where answers come, it is said behind them.
+            if not self._is_answered:
+                self._say_how_it_is()
+            self._is_answered = False
         finally:
             if is_shared:
                 process.end()
         self.arm()
+
+    def _answered(self) -> None:
+        self._is_answered = True
+        self._say_how_it_is()
+
+    def _say_how_it_is(self) -> None:
+        now_s = monotonic()
+        for member in self._members:
+            member.say_how_it_is(now_s)
 
     def _wait_for_deadline(self) -> None:
         """Wait for what is left until the deadline, WAIT_S_MAX at most, and learn from a wake-up out of sleep."""

@@ -68,6 +68,8 @@ class ProcessPort:
         self._is_frozen = False
         self._takers: dict[int, Callable[[bytes], None]] = {}
         self._packets_max = PACKETS_BATCH_MAX if agents > 1 else 1
+        self.after_packet: Callable[[], None] | None = None
+        """Called when packets that came have been dealt out."""
         self._waiting: list[bytes] = []
         self._depth = 0
 
@@ -128,6 +130,8 @@ class ProcessPort:
             if packet is None:
                 break
             self._deal_out(packet)
+        if self.after_packet is not None:
+            self.after_packet()
         self.account.add(Span(Cause.RECEIVING, NOBODY, began_s, monotonic()))
 
     def _deal_out(self, packet: bytes) -> None:

@@ -11,16 +11,16 @@ LEAD_S_MAX = 100e-6
 """The most that a loop may wake too early and wait for without sleeping, s."""
 WAIT_S_MAX = 2 * LEAD_S_MAX
 """The most that it then waits, s: meanwhile the estimate of the host's clock may have moved the deadline."""
-RAISE_S = 1e-6
-LOWER_S = 3e-6
-"""Steps by which the lead follows: three to one, so that one wake-up of four comes before its deadline."""
+RAISE_S = 3e-6
+LOWER_S = 1e-6
+"""Steps by which the lead follows: three to one, so that three wake-ups of four come before their deadline."""
 
 
 class WakeLead:
     """
     What most wake-ups of one loop take, learned from each.
 
-    It follows a quartile and not a mean: a wake-up that was late by milliseconds counts as any other late one.
+    It follows the upper quartile of those that a lead can help: one that was late by milliseconds says nothing of the others.
     """
 
     __slots__ = ("lead_s",)
@@ -32,6 +32,8 @@ class WakeLead:
     def learn(self, took_s: float) -> None:
         """Take note that it took so long from the time that a timer was set to until a tick could begin, s."""
         lead_s = self.lead_s
+        if took_s > WAIT_S_MAX:
+            return
         if took_s > lead_s:
             self.lead_s = min(lead_s + RAISE_S, LEAD_S_MAX)
         else:

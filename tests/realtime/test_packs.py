@@ -72,8 +72,9 @@ class Member:
 
 
 PROCESS = SimpleNamespace(
-    begin=int, end=int, account=SimpleNamespace(begin_ticks=lambda now_s: None)
+    agents=8, begin=int, end=int, account=SimpleNamespace(begin_ticks=lambda now_s: None)
 )
+ALONE = SimpleNamespace(**{**vars(PROCESS), "agents": 1})
 
 
 class Loop:
@@ -86,9 +87,9 @@ class Loop:
         return self.timer
 
 
-def pack_of(*members):
+def pack_of(*members, process=PROCESS):
     loop = Loop()
-    pack = Pack(0.0, reactor=loop, process=PROCESS)
+    pack = Pack(0.0, reactor=loop, process=process)
     for member in members:
         pack.add(member)
     return loop, pack
@@ -116,6 +117,37 @@ def test_it_wakes_for_whoever_is_due_first_and_no_more_when_nobody_is():
     early.due_s = late.due_s = math.inf
     pack.arm()
     assert loop.timer.when_s == math.inf
+
+
+def test_a_pack_says_how_it_is_with_its_ticks():
+    member = Member(1.0)
+    loop, _ = pack_of(member)
+
+    loop.due()
+
+    assert (member.ticks, member.pings) == (1, 1)
+
+
+def test_an_agent_by_itself_says_how_it_is_behind_the_answer_to_its_tick():
+    member = Member(1.0)
+    loop, _ = pack_of(member, process=ALONE)
+    ALONE.after_packet()
+
+    loop.due()
+    assert (member.ticks, member.pings) == (1, 1), "behind the packet before the tick"
+    ALONE.after_packet()
+
+    assert (member.ticks, member.pings) == (1, 2)
+
+
+def test_an_agent_that_nobody_answers_says_how_it_is_with_its_next_tick():
+    member = Member(1.0)
+    loop, _ = pack_of(member, process=ALONE)
+
+    loop.due()
+    loop.due()
+
+    assert (member.ticks, member.pings) == (2, 2)
 
 
 class Clock:
@@ -188,16 +220,20 @@ def test_a_wake_up_of_a_loop_that_was_at_work_tells_nothing(monkeypatch):
     assert loop.timer.when_s == member.due_s + 100.0
 
 
-def test_it_never_waits_for_long_and_a_late_wake_up_weighs_as_any_other():
+def test_it_never_waits_for_long():
     lead = WakeLead()
     for _ in range(1000):
-        lead.learn(5e-3)
+        lead.learn(1.5 * LEAD_S_MAX)
+
     assert lead.lead_s == LEAD_S_MAX
 
-    calm = WakeLead()
+
+def test_lead_covers_three_wake_ups_of_four_and_late_ones_do_not_move_it():
+    lead = WakeLead()
     for count in range(4000):
-        calm.learn(10.0 if count % 10 == 0 else 40e-6)
-    assert calm.lead_s == pytest.approx(40e-6, abs=5e-6)
+        lead.learn(10.0 if count % 2 else (count // 2 * 7 % 20) * 2e-6)
+    assert lead.lead_s == pytest.approx(30e-6, abs=8e-6)
+
     for _ in range(100):
-        calm.learn(0.0)
-    assert calm.lead_s == 0.0
+        lead.learn(0.0)
+    assert lead.lead_s == 0.0
