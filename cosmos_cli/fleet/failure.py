@@ -63,6 +63,14 @@ class MachineFailure(Exception):
         return {"kind": self.kind.value, "text": self.text, "advice": self.advice}
 
 
+def ended_early(said: str) -> MachineFailure:
+    """Return the failure of a program that ended before it was told to, with what it wrote to standard error."""
+    said = said.strip()
+    return MachineFailure(
+        FailureKind.LOST, "what worked there ended early" + (f": {said}" if said else "")
+    )
+
+
 def runs_no_commands(status: int, said: str) -> MachineFailure:
     """Return the failure of a machine that lets somebody in and then runs nothing, with what it said."""
     words = " ".join(said.split())[:SAID_CHARACTERS_MAX]

@@ -12,7 +12,7 @@ import tempfile
 import time
 
 from cosmos_cli.fleet.connection import OUTPUT_BYTES_MAX, SAID_BYTES_MAX, Completed, StreamEnd
-from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.failure import ended_early
 from cosmos_cli.fleet.target import Target
 from cosmos_cli.fleet.transfer_limits import BoundedOutput, OutputLimits, not_ended
 
@@ -118,7 +118,7 @@ class LocalStream:
             wait_for(self._stdin.fileno(), select.POLLOUT, timeout_s)
             return os.write(self._stdin.fileno(), data)
         except (BrokenPipeError, ValueError):
-            raise MachineFailure(FailureKind.LOST, "the program has ended") from None
+            raise ended_early(self.ending().errors) from None
 
     def close_writing(self) -> None:
         """End its standard input."""

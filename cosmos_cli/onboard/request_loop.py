@@ -135,6 +135,7 @@ class PatientInput(io.RawIOBase):
         """Wait for bytes; 0, the end, also when none came in time."""
         wait_s = PatientInput.patience_s
         if wait_s is not None and not select.select([self._descriptor], [], [], wait_s)[0]:
+            sys.stderr.write(f"nothing was asked for {wait_s:g} s\n")
             return 0
         return os.readv(self._descriptor, [buffer])
 

@@ -172,6 +172,15 @@ def install_environment(
     return bool(told["changed"])
 
 
+def pack_wheels(environment: Environment) -> None:
+    """
+    Pack an environment's wheels as they are sent, if they are not yet.
+
+    A slow operator compiles for minutes: not while it holds a machine's lock, which is given up when nothing is asked.
+    """
+    _sent_wheels(environment)
+
+
 def _sent_wheels(environment: Environment) -> list[SentWheel]:
     """Return the wheels as they are sent; those that they are made of are verified."""
     found = []

@@ -29,6 +29,7 @@ from cosmos_cli.models.machine_facts import MachineFacts
 from cosmos_cli.provision.apply import REPEAT, Applier
 from cosmos_cli.provision.desired import DesiredState, desired_state
 from cosmos_cli.provision.device_steps import reboot_notes
+from cosmos_cli.provision.environment import pack_wheels
 from cosmos_cli.provision.full_checks import machine_kind
 from cosmos_cli.provision.gather_facts import (
     Answer,
@@ -160,6 +161,10 @@ class MachineUp:
         check_possible(self._facts, steps)
         folders = tuple(step for step in steps if step.kind is Kind.DIRECTORY)
         applier.apply(folders)
+        for step in steps:
+            if step.kind is Kind.ENVIRONMENT:
+                self.teller.detail("packing what is sent")
+                pack_wheels(step.subject)
         self._lock(desired)
         can_become_root = self._facts.can_become_root
         self._look(desired, touch=True)

@@ -24,7 +24,7 @@ from cosmos_cli.fleet.answers.shapes import (
     record,
     whole,
 )
-from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure, ended_early
 from cosmos_cli.fleet.liveness import BlockingStream
 from cosmos_cli.fleet.transfer_limits import Patience, duration_words
 
@@ -133,10 +133,7 @@ class AnswerReader:
                 raise
             raise _too_late(patience, timeout_s) from None
         if not data:
-            said = self._source.errors().strip()
-            raise MachineFailure(
-                FailureKind.LOST, "what worked there ended early" + (f": {said}" if said else "")
-            )
+            raise ended_early(self._source.errors())
         patience.moved(len(data))
         self._buffer += data
 

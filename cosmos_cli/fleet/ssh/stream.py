@@ -10,7 +10,7 @@ import time
 from typing import Any
 
 from cosmos_cli.fleet.connection import StreamEnd
-from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.failure import MachineFailure, ended_early
 from cosmos_cli.fleet.local import wait_for
 from cosmos_cli.fleet.ssh.failures import lost
 from cosmos_cli.fleet.transfer_limits import BoundedOutput
@@ -171,6 +171,4 @@ class SshStream:
         return int(channel.exit_status)
 
     def _gone(self) -> MachineFailure:
-        if self._transport.is_active():
-            return MachineFailure(FailureKind.LOST, "the program there has ended")
-        return lost()
+        return ended_early(self.ending().errors) if self._transport.is_active() else lost()

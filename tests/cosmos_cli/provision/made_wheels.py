@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import hashlib
 import io
 import tarfile
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+from cosmos_cli.provision.lock import Lock, Locked
+from cosmos_cli.provision.platform import greeted_platform
+from cosmos_cli.provision.wheelhouse import Environment
 
 MACHINES = ("x86_64", "aarch64")
 RUNTIME = {
@@ -56,6 +61,34 @@ def make_wheel(
         for path, data in content.items():
             archive.writestr(zipfile.ZipInfo(path, (2020, 1, 1, 0, 0, 0)), data)
     return wheel
+
+
+class House:
+    """A wheelhouse whose wheels are made as they are asked for."""
+
+    def __init__(self, folder, greeting):
+        self.folder = folder
+        self.platform = greeted_platform(greeting)
+
+    def environment(self, *wheels, **changes):
+        locked = []
+        for path in wheels:
+            content = path.read_bytes()
+            name, version = path.name.split("-")[:2]
+            sha256 = hashlib.sha256(content).hexdigest()
+            (self.folder / sha256).mkdir(parents=True, exist_ok=True)
+            (self.folder / sha256 / path.name).write_bytes(content)
+            locked.append(
+                Locked(
+                    name=name,
+                    version=version,
+                    sha256=sha256,
+                    filename=path.name,
+                    size_bytes=len(content),
+                )
+            )
+        content = Lock(platform=self.platform, wheels=tuple(locked))
+        return Environment(content=dataclasses.replace(content, **changes), wheels=self.folder)
 
 
 def make_runtime_wheels(folder: Path, *pythons: str, machines: Sequence[str] = MACHINES) -> None:

@@ -15,12 +15,14 @@ from fake_system import (
     make_system,
     up,
 )
+from made_wheels import House, make_wheel
 from provision_machines import machine_of
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.local import LocalConnection
 from cosmos_cli.provision import HELPER_PARTS
+from cosmos_cli.provision.sent_wheels import sent_wheel
 from cosmos_cli.provision.trees import TreeFile, tree_of
 
 pytestmark = pytest.mark.process
@@ -203,6 +205,42 @@ def test_helper_gives_up_the_lock_when_nobody_asks(place):
                 assert failure.kind is FailureKind.BUSY
                 assert time.monotonic() < until_s
                 time.sleep(0.02)
+
+
+def test_helper_that_gave_up_says_so_to_who_asks_afterwards(place):
+    with Helper.start(connection_to(place / "cosmos")) as board:
+        board.call("lock", {"path": f"{place}/lock", "patience_s": 0.05})
+        time.sleep(0.2)
+        with pytest.raises(MachineFailure, match="ended early: nothing was asked for 0.05 s"):
+            while True:  # on a busy machine it has not noticed yet
+                board.call("lock", {"path": f"{place}/lock"})
+                time.sleep(0.2)
+
+
+def test_wheels_are_packed_before_the_lock_is_taken_however_long_that_takes(place, monkeypatch):
+    """A helper that holds the lock gives up when nothing is asked for a minute; packing scipy takes longer on a Pi."""
+    packed = []
+
+    class Packing(FakeKit):
+        def environments(self, machine, greeting, teller):
+            house = House(place / "house", greeting)
+            return (house.environment(make_wheel(place / "made", "nav-lib")),)
+
+    def pack(path, locked, platform):
+        with Helper.start(connection) as other:
+            try:
+                other.call("lock", {"path": f"{place}/cosmos/state/lock"})
+            except MachineFailure as failure:
+                packed.append(failure.kind)
+            else:
+                packed.append("free")
+            return sent_wheel(path, locked, platform)
+
+    monkeypatch.setattr("cosmos_cli.provision.environment.sent_wheel", pack)
+    connection = connection_to(place / "cosmos")
+    brought = up(connection, machine_at(place), Packing())
+
+    assert (brought.failure, packed) == (None, ["free", FailureKind.BUSY])
 
 
 def small_tree(text="print(1)\n"):

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import errno
-import hashlib
 import os
 import shutil
 import subprocess
@@ -13,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from made_wheels import make_runtime_wheels, make_wheel, only_index
+from made_wheels import House, make_runtime_wheels, make_wheel, only_index
 from onboard_machine import OwnMachine, snapshot
 
 import madns_runtime
@@ -30,11 +29,11 @@ from cosmos_cli.provision.environment import (
     installed_request,
     modules_of,
 )
-from cosmos_cli.provision.lock import Distributed, Lock, Locked
+from cosmos_cli.provision.lock import Distributed
 from cosmos_cli.provision.platform import greeted_platform
 from cosmos_cli.provision.sent_wheels import sent_wheel
 from cosmos_cli.provision.trees import runtime_tree, send_tree
-from cosmos_cli.provision.wheelhouse import Environment, prepare
+from cosmos_cli.provision.wheelhouse import prepare
 
 pytestmark = pytest.mark.process
 
@@ -46,38 +45,10 @@ def machine(tmp_path):
     return OwnMachine(tmp_path / "root")
 
 
-class House:
-    """A wheelhouse whose wheels are made as they are asked for."""
-
-    def __init__(self, folder, machine):
-        self.folder = folder
-        with machine.board() as board:
-            self.platform = greeted_platform(board.greeting)
-
-    def environment(self, *wheels, **changes):
-        locked = []
-        for path in wheels:
-            content = path.read_bytes()
-            name, version = path.name.split("-")[:2]
-            sha256 = hashlib.sha256(content).hexdigest()
-            (self.folder / sha256).mkdir(parents=True, exist_ok=True)
-            (self.folder / sha256 / path.name).write_bytes(content)
-            locked.append(
-                Locked(
-                    name=name,
-                    version=version,
-                    sha256=sha256,
-                    filename=path.name,
-                    size_bytes=len(content),
-                )
-            )
-        content = Lock(platform=self.platform, wheels=tuple(locked))
-        return Environment(content=dataclasses.replace(content, **changes), wheels=self.folder)
-
-
 @pytest.fixture
 def house(tmp_path, machine):
-    return House(tmp_path / "house", machine)
+    with machine.board() as board:
+        return House(tmp_path / "house", board.greeting)
 
 
 @pytest.fixture
