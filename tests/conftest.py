@@ -10,6 +10,7 @@ import subprocess
 import sys
 
 import pytest
+from harness.wheel_cache import VARIABLE
 from hypothesis import HealthCheck, settings
 
 pytest_plugins = ["tower.fixtures"]  # of tests/tower; costs nothing where no test asks for a tower
@@ -71,6 +72,17 @@ def private_register(tmp_path_factory):
     platform.platform()  # starts `uname` the first time
     patch = pytest.MonkeyPatch()
     patch.setenv("COSMOS_STATE_DIR", str(tmp_path_factory.mktemp("state")))
+    yield
+    patch.undo()
+
+
+@pytest.fixture(autouse=True, scope="session")
+def shared_wheels(request, tmp_path_factory):
+    """Name the folder of wheels that all workers of a session share."""
+    base = tmp_path_factory.getbasetemp()
+    is_worker = hasattr(request.config, "workerinput")
+    patch = pytest.MonkeyPatch()
+    patch.setenv(VARIABLE, str((base.parent if is_worker else base) / "wheelhouse"))
     yield
     patch.undo()
 

@@ -15,6 +15,7 @@ from typing import Any
 import yaml
 from harness.cosmos_command import CosmosCommand
 from harness.talking_process import TalkingProcess, find_marked
+from harness.wheel_cache import begin_cache
 from tower import Tower
 
 PATIENCE_S = 150.0
@@ -47,7 +48,7 @@ class RunTower(TalkingProcess):
         self.cosmos = CosmosCommand(
             folder,
             **tower.operator_environment(),
-            **{"COSMOS_CACHE": str(cache), MARK: str(folder)},
+            **{"COSMOS_CACHE": str(begin_cache(cache)), MARK: str(folder)},
         )
         self.environment = self.cosmos.environment
         self.boards: tuple[str, ...] = ()

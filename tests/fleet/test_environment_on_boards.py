@@ -9,6 +9,7 @@ import threading
 import time
 
 import pytest
+from harness.wheel_cache import begin_cache
 from tower import BoardSpec
 from tower.roots import why_unavailable
 
@@ -65,7 +66,7 @@ print(count, bad[:5])
 def cache(tmp_path_factory):
     """One cache of wheels for all of these tests."""
     patch = pytest.MonkeyPatch()
-    patch.setenv("COSMOS_CACHE", str(tmp_path_factory.mktemp("cache")))
+    patch.setenv("COSMOS_CACHE", str(begin_cache(tmp_path_factory.mktemp("cache"))))
     yield
     patch.undo()
 

@@ -4,6 +4,7 @@ import json
 import subprocess
 
 import pytest
+from harness.wheel_cache import begin_cache
 from up_tower import COSMOS, UpTower
 
 pytestmark = pytest.mark.root
@@ -21,7 +22,7 @@ exit 3
 
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory):
-    return tmp_path_factory.mktemp("cache")
+    return begin_cache(tmp_path_factory.mktemp("cache"))
 
 
 @pytest.fixture

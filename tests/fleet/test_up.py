@@ -1,6 +1,7 @@
 """`cosmos up` on virtual boards: what it makes, that the second one makes nothing, and everything that can go wrong."""
 
 import pytest
+from harness.wheel_cache import begin_cache
 from tower import BoardSpec
 from up_tower import UpTower
 
@@ -60,7 +61,7 @@ exec(program, {"__name__": "__main__"})
 @pytest.fixture(scope="session")
 def cache(tmp_path_factory):
     """Return the folder of wheels that the tests of a session share."""
-    return tmp_path_factory.mktemp("cache")
+    return begin_cache(tmp_path_factory.mktemp("cache"))
 
 
 @pytest.fixture
