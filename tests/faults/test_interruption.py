@@ -25,11 +25,13 @@ from madns_runtime.recording.reader import read_stream
 pytestmark = pytest.mark.process
 
 LONG = ("--set", "time.duration_s=60")
+CLEAN = ("--set", "timeouts.shutdown_s=60")
+"""Records come to a busy machine's disk, too."""
 STUCK = {"side": "agent", "method": "step", "action": "sleep", "sleep_s": 300.0}
 
 
 def started(laboratory: Laboratory, *arguments: str) -> Run:
-    run = laboratory.start(*LONG, *arguments, new_group=True)
+    run = laboratory.start(*LONG, *CLEAN, *arguments, new_group=True)
     run.wait_until_running()
     return run
 
