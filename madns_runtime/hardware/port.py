@@ -12,6 +12,7 @@ from typing import Any, Final
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.contract import Channel, Value
+from madns_runtime.hardware.count_table import missed_name
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.profiles import pack_points
 from madns_runtime.hardware.status import StatusLimits
@@ -42,6 +43,7 @@ class DevicePort:
         shared: Its page, and this agent's end of their pair.
         limits: Ages from which it is stale and lost.
         now_s: Returns the present on this machine's clock, s; in lockstep simulated time.
+        agent: Whose end it is; empty where nothing is given up before it comes.
     """
 
     def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
@@ -52,6 +54,7 @@ class DevicePort:
         shared: tuple[DevicePage, socket.socket],
         limits: StatusLimits,
         now_s: Callable[[], float] = monotonic,
+        agent: str = "",
     ) -> None:
         self.full_name = full_name
         self.name = full_name.rpartition("/")[2]
@@ -83,6 +86,8 @@ class DevicePort:
         """Values for an output that the device's process had no room for."""
         self.points_lost = 0
         """Points of profiles that it had no room for."""
+        self._missed_name = missed_name(agent)
+        self._missed_before = self._missed()
 
     @property
     def status(self) -> DeviceStatus:
@@ -209,9 +214,14 @@ class DevicePort:
         if not messages.send(self._end, [messages.FAULT, number, action, value]):
             self._answered(number, f"{self.full_name}: its process does not listen")
 
+    def _missed(self) -> int:
+        """Return how many messages the device's process has given up, as this agent did not take them."""
+        return self._page.counts.read().get(self._missed_name, 0)
+
     def losses(self) -> dict[str, int]:
         """Return the counts of what found no room on its way from or to the device; empty where nothing was lost."""
         counts = {
+            "frames_missed": self._missed() - self._missed_before,
             "frames_dropped": self.frames_dropped,
             "writes_lost": self.writes_lost,
             "points_lost": self.points_lost,
