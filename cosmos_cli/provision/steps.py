@@ -42,11 +42,11 @@ def check_possible(facts: MachineFacts, steps: tuple[Step, ...]) -> None:
     """
     Refuse a plan that would fail midway: no room, no right to write, nobody becomes root.
 
+    A disk that takes nothing is refused where there is nothing to be done, too: runs record on it.
+
     Raises:
         MachineFailure: DISK_FULL, READ_ONLY, STEP or NO_SUDO; nothing was changed.
     """
-    if not steps:
-        return
     disk = facts.disk
     if disk.is_read_only:
         raise MachineFailure(
@@ -60,6 +60,8 @@ def check_possible(facts: MachineFacts, steps: tuple[Step, ...]) -> None:
             f"{facts.user} may not write in {disk.path}",
             "choose another cosmos_root, or make that folder and give it to the user",
         )
+    if not steps:
+        return
     needed_bytes = sum(step.size_bytes for step in steps) + RESERVE_BYTES
     if needed_bytes > disk.free_bytes:
         raise MachineFailure(
