@@ -87,7 +87,7 @@ class DevicePort:
         self.points_lost = 0
         """Points of profiles that it had no room for."""
         self._missed_name = missed_name(agent)
-        self._missed_before = self._missed()
+        """Under which the device's process counts what it gave up as this agent did not take it, in all its incarnations."""
 
     @property
     def status(self) -> DeviceStatus:
@@ -214,14 +214,10 @@ class DevicePort:
         if not messages.send(self._end, [messages.FAULT, number, action, value]):
             self._answered(number, f"{self.full_name}: its process does not listen")
 
-    def _missed(self) -> int:
-        """Return how many messages the device's process has given up, as this agent did not take them."""
-        return self._page.counts.read().get(self._missed_name, 0)
-
     def losses(self) -> dict[str, int]:
         """Return the counts of what found no room on its way from or to the device; empty where nothing was lost."""
         counts = {
-            "frames_missed": self._missed() - self._missed_before,
+            "frames_missed": self._page.counts.read().get(self._missed_name, 0),
             "frames_dropped": self.frames_dropped,
             "writes_lost": self.writes_lost,
             "points_lost": self.points_lost,
