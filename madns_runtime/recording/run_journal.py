@@ -63,7 +63,7 @@ class RunJournal:
     def device_losses(self, losses: Mapping[str, Mapping[str, int]]) -> dict[str, Any]:
         """Tell what devices, by name, and an agent had no room for, by kind; also in the log. Return it for the host."""
         for device, counts in losses.items():
-            self.event(DEVICE_LOSSES, device=device, **counts)
+            self.event("device_losses", device=device, **counts)
             told = ", ".join(f"{name} {count}" for name, count in counts.items())
             self.say("warning", f"device {device}: there was no room for all: {told}")
         return {DEVICE_LOSSES: losses} if losses else {}
