@@ -103,7 +103,7 @@ class Context(Protocol):
     base_directory: Path
     """Root of the scenario, its folder if it names none: relative files are found from here."""
     random: np.random.Generator
-    """Seeded from the run's seed and `name`."""
+    """Seeded from the run's seed and `name`; an agent that is started anew begins it anew."""
     is_lockstep: bool
     """Whether simulated time waits for everybody: nothing recorded may then depend on the wall clock."""
 
