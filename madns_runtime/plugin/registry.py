@@ -62,6 +62,24 @@ PARTS = (
 )
 """Fields of a descriptor that name a part of the simulation, the halves first."""
 
+KEPT_NAMES = [
+    "schema",
+    "runs",
+    "simulation",
+    "same",
+    "identical",
+    "settings",
+    "versions",
+    "summaries",
+    "timing",
+    "streams",
+    "streams_only_a",
+    "streams_only_b",
+    "missing",
+    "remarks",
+]
+"""Keys of a comparison as JSON, where what a simulation tells of itself stands under its name: none may be called so."""
+
 Role = Literal["host", "agent"]
 CONTRACTS: Mapping[Role, tuple[type, tuple[str, ...]]] = {
     "host": (
@@ -328,6 +346,9 @@ def _checked(descriptor: Any, where: str, module: ModuleType) -> Simulation:
             f"{where}: expected a madns_runtime.plugin.api.Simulation, got {type(descriptor).__name__}"
         )
     faults = []
+    name: Any = descriptor.name
+    if not isinstance(name, str) or not name or name in KEPT_NAMES:
+        faults.append(f"name: expected a text, none of {', '.join(KEPT_NAMES)}; got {name!r:.80}")
     parameters: Any = descriptor.parameters
     if not (isinstance(parameters, type) and dataclasses.is_dataclass(parameters)):
         faults.append("parameters: expected a dataclass (the class itself)")
