@@ -7,6 +7,7 @@ What comes back is checked here, so that a slip in a plug-in is told as such and
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 import inspect
 import itertools
@@ -71,20 +72,22 @@ def ask_check(  # noqa: PLR0913 - what a scenario is; all but two by name
         base_directory: Folder of the scenario.
         parameters: An instance of the simulation's parameters.
         agents: How many there are.
-        names: Their names, for a `check` whose fourth parameter is called names.
-        duration_s: Of the run, for one whose fifth is called duration_s.
-        is_lockstep: Whether simulated time waits for everybody, for one whose sixth is called so.
-        tick_hz: Rate of every agent's loop, for one whose seventh is called so.
+        names: Their names; this and the others are for a `check` that takes them, see `_more_taken`.
+        duration_s: Of the run.
+        is_lockstep: Whether simulated time waits for everybody.
+        tick_hz: Rate of every agent's loop.
 
     Raises:
         PluginError: It cannot be found, raised, or did not return a list of texts.
         MissingExtraError: It needs an optional dependency that is not installed.
     """
     function = load_function(where, base_directory)
-    arguments = [parameters, agents, base_directory]
     more = dict(zip(CHECK_MORE, (names, duration_s, is_lockstep, tick_hz), strict=True))
-    arguments += [value for _, value in zip(_more_taken(function), more.values(), strict=False)]
-    return _asked_texts("check", function, arguments)
+    in_order, by_name = _more_taken(function)
+    arguments = [parameters, agents, base_directory, *(more[name] for name in in_order)]
+    named = {name: more[name] for name in by_name}
+    ask = functools.wraps(function)(lambda *given: function(*given, **named))
+    return _asked_texts("check", ask if named else function, arguments)
 
 
 def ask_check_actions(
@@ -315,14 +318,18 @@ def _streams_fault(found: Any) -> str | None:
     return None
 
 
-def _more_taken(function: Callable[..., Any]) -> tuple[str, ...]:
-    """Return which of CHECK_MORE a `check` takes after its first three arguments, in that order."""
+def _more_taken(function: Callable[..., Any]) -> tuple[list[str], list[str]]:
+    """Return which of CHECK_MORE a `check` takes after its first three arguments in that order, and which by name alone."""
     try:
-        parameters = tuple(inspect.signature(function).parameters)[3:]
+        parameters = list(inspect.signature(function).parameters.values())[3:]
     except (TypeError, ValueError):  # a function written in C tells no signature
-        return ()
-    pairs = zip(CHECK_MORE, parameters, strict=False)
-    return tuple(name for name, _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
+        return [], []
+    keyword_only = inspect.Parameter.KEYWORD_ONLY
+    in_order = [each.name for each in parameters if each.kind is not keyword_only]
+    by_name = [each.name for each in parameters if each.kind is keyword_only]
+    pairs = zip(CHECK_MORE, in_order, strict=False)
+    taken = [name for name, _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs)]
+    return taken, [name for name in by_name if name in CHECK_MORE]
 
 
 def _unfolded(found: Any) -> Any:
