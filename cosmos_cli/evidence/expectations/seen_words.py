@@ -1,0 +1,55 @@
+"""Words that a stream has in the place of one that must not occur: none is told of a check that looks for a misspelt one."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from numpy.typing import NDArray
+
+from cosmos_cli.models.document import did_you_mean
+from cosmos_cli.models.expectation import Expectation
+from cosmos_cli.models.known_streams import WORDS
+from cosmos_cli.ui.foreign_text import clean_line
+from cosmos_cli.ui.plural import counted
+
+KEPT_MAX: Final = 1000
+"""Different words of one stream; of more, such as sentences, the first."""
+TOLD_MAX: Final = 10
+CHARACTERS_MAX: Final = 40
+"""Of a word that is told."""
+
+
+class SeenWords:
+    """
+    Words that one expectation has met.
+
+    Args:
+        expectation: What must be; others than of an event that must not occur keep nothing.
+    """
+
+    def __init__(self, expectation: Expectation) -> None:
+        self._expectation = expectation
+        is_open = (expectation.stream, expectation.field) not in WORDS
+        self._is_wanted = is_open and bool(expectation.event) and expectation.must == "not_occur"
+        self._words: set[str] = set()
+
+    def take(self, values: NDArray[Any]) -> None:
+        """Take the values of some records."""
+        if self._is_wanted and len(self._words) < KEPT_MAX:
+            self._words.update(each for each in values.tolist() if isinstance(each, str))
+
+    def remark(self) -> str | None:
+        """Return what is to be told; None if the word was met, or nobody knows what would have been one."""
+        expectation = self._expectation
+        if not self._words or expectation.event in self._words:
+            return None
+        words = sorted(clean_line(word, length_max=CHARACTERS_MAX) for word in self._words)
+        guess = did_you_mean(expectation.event, words)
+        if not guess.endswith("?"):
+            rest = len(words) - TOLD_MAX
+            more = f" and {counted(rest, 'other')}" if rest > 0 else ""
+            guess = f"; words seen: {', '.join(words[:TOLD_MAX])}{more}"
+        return (
+            f"{expectation.name}: no record of {expectation.stream} has {expectation.event!r:.80}"
+            f" in {expectation.field}{guess}"
+        )
