@@ -38,6 +38,7 @@ from madns_runtime.plugin.code_places import (
 from madns_runtime.plugin.columns import shape_faults
 from madns_runtime.plugin.entry_points import place_of_name, registered
 from madns_runtime.plugin.isolation import missing_extra, said
+from madns_runtime.plugin.kept_names import name_faults
 from madns_runtime.plugin.parameter_kinds import kind_faults
 from madns_runtime.plugin.time_limit import PluginStopped, hold
 from madns_runtime.timeline.kinds import kind_texts
@@ -61,24 +62,6 @@ PARTS = (
     "compare",
 )
 """Fields of a descriptor that name a part of the simulation, the halves first."""
-
-KEPT_NAMES = [
-    "schema",
-    "runs",
-    "simulation",
-    "same",
-    "identical",
-    "settings",
-    "versions",
-    "summaries",
-    "timing",
-    "streams",
-    "streams_only_a",
-    "streams_only_b",
-    "missing",
-    "remarks",
-]
-"""Keys of a comparison as JSON, where what a simulation tells of itself stands under its name: none may be called so."""
 
 Role = Literal["host", "agent"]
 CONTRACTS: Mapping[Role, tuple[type, tuple[str, ...]]] = {
@@ -345,10 +328,7 @@ def _checked(descriptor: Any, where: str, module: ModuleType) -> Simulation:
         raise PluginError(
             f"{where}: expected a madns_runtime.plugin.api.Simulation, got {type(descriptor).__name__}"
         )
-    faults = []
-    name: Any = descriptor.name
-    if not isinstance(name, str) or not name or name in KEPT_NAMES:
-        faults.append(f"name: expected a text, none of {', '.join(KEPT_NAMES)}; got {name!r:.80}")
+    faults = name_faults(descriptor.name)
     parameters: Any = descriptor.parameters
     if not (isinstance(parameters, type) and dataclasses.is_dataclass(parameters)):
         faults.append("parameters: expected a dataclass (the class itself)")

@@ -14,7 +14,7 @@ from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.report.build import build_sections, with_simulation
 from madns_runtime.analysis.values import Figure, ReportRemark, TableBlock
 from madns_runtime.config import Timeouts
-from madns_runtime.plugin.registry import KEPT_NAMES
+from madns_runtime.plugin.kept_names import KEPT_NAMES
 from madns_runtime.recording.records import Field, StreamSchema
 
 pytestmark = pytest.mark.process  # code that is not shipped is asked in a fork
