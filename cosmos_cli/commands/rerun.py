@@ -109,7 +109,7 @@ def _fly(
         streams = compare(before, after, Selection(), progress)
         remarks += leave_out_after_ends(streams.streams, flown.ends, before.tick_hz)
         return RerunOutcome(
-            devices=compare_devices(recorded, summary.run.path),
+            devices=compare_devices(recorded, summary.run.path, flown.ends),
             streams=streams,
             remarks=(*remarks, *action_remarks(recorded.run, summary.run, flown.left_out)),
             unlike=flown.unlike,
