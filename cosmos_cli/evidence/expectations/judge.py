@@ -55,7 +55,7 @@ class JudgedExpectations:
     not_judged: Mapping[str, str] = field(default_factory=dict)
     """By name of the others: why."""
     unseen: tuple[str, ...] = ()
-    """Remarks on events that must not occur and that no record has, where any word may come: it may be misspelt."""
+    """Remarks on words that are looked for and that no record has, where any may come: they may be misspelt."""
 
     def remarks(self) -> tuple[str, ...]:
         """Return a remark per expectation that was not judged, and per event whose word is nowhere."""

@@ -1,4 +1,4 @@
-"""Words that a stream has in the place of one that must not occur: none is told of a check that looks for a misspelt one."""
+"""Words that a stream has in the place of one that is looked for and is nowhere: it may be misspelt."""
 
 from __future__ import annotations
 
@@ -24,13 +24,15 @@ class SeenWords:
     Words that one expectation has met.
 
     Args:
-        expectation: What must be; others than of an event that must not occur keep nothing.
+        expectation: What must be; others than of an event, or of records that hold a text, keep nothing.
     """
 
     def __init__(self, expectation: Expectation) -> None:
         self._expectation = expectation
+        counted = None if expectation.when is None else expectation.when.text
+        self._word = expectation.event or counted or ""
         is_open = (expectation.stream, expectation.field) not in WORDS
-        self._is_wanted = is_open and bool(expectation.event) and expectation.must == "not_occur"
+        self._is_wanted = is_open and bool(self._word)
         self._words: set[str] = set()
 
     def take(self, values: NDArray[Any]) -> None:
@@ -41,15 +43,15 @@ class SeenWords:
     def remark(self) -> str | None:
         """Return what is to be told; None if the word was met, or nobody knows what would have been one."""
         expectation = self._expectation
-        if not self._words or expectation.event in self._words:
+        if not self._words or self._word in self._words:
             return None
         words = sorted(clean_line(word, length_max=CHARACTERS_MAX) for word in self._words)
-        guess = did_you_mean(expectation.event, words)
+        guess = did_you_mean(self._word, words)
         if not guess.endswith("?"):
             rest = len(words) - TOLD_MAX
             more = f" and {counted(rest, 'other')}" if rest > 0 else ""
             guess = f"; words seen: {', '.join(words[:TOLD_MAX])}{more}"
         return (
-            f"{expectation.name}: no record of {expectation.stream} has {expectation.event!r:.80}"
+            f"{expectation.name}: no record of {expectation.stream} has {self._word!r:.80}"
             f" in {expectation.field}{guess}"
         )

@@ -545,10 +545,18 @@ def test_a_word_that_must_not_occur_and_is_nowhere_is_told_with_those_that_are()
     )
 
 
+def test_a_word_that_is_counted_or_must_occur_is_told_likewise():
+    count = {"must": "occur", "statistic": "count", "bounds": ValueBounds.below(1.0)}
+    (told,) = remarks_on(**count, when=ValueBounds.equals("refusd"))
+
+    assert told.endswith("has 'refusd' in event, did you mean refused?")
+    assert remarks_on(**count, when=ValueBounds.equals("refused")) == ()
+    assert len(remarks_on(event="lost", must="occur")) == 1
+
+
 def test_a_word_that_is_there_or_could_not_be_otherwise_is_no_remark():
     assert remarks_on(event="refused") == ()
     assert remarks_on(event="refused", from_s=1.5) == (), "it is a word of the stream"
-    assert remarks_on(event="lost", must="occur") == ()
     assert remarks_on(EVENTS, event="lost") == (), "validate knows the words of events"
     nothing = FakeTable("radio", RADIO.fields, {"a": {"t_s": np.array([]), "event": objects([])}})
     assert remarks_on(nothing, event="lost") == ()
