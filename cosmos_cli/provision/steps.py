@@ -169,6 +169,7 @@ def notes_of(facts: MachineFacts, desired: DesiredState) -> tuple[str, ...]:
     """Return what is worth a word about a machine that is ready all the same, each with what to do."""
     return tuple(
         [
+            *_disk_note(facts),
             *_clock_note(facts),
             *_throttled_note(facts),
             *_priority_note(facts, desired),
@@ -176,6 +177,16 @@ def notes_of(facts: MachineFacts, desired: DesiredState) -> tuple[str, ...]:
             *boot_notes(facts, desired.needs, desired.paths),
         ]
     )
+
+
+def _disk_note(facts: MachineFacts) -> Iterator[str]:
+    """Yield a note if what a run records would not find room; a plan that needs more is refused before."""
+    disk = facts.disk
+    if disk.free_bytes < RESERVE_BYTES:
+        yield (
+            f"{megabytes(disk.free_bytes)} are free on {disk.path}: records of a run will not find room;"
+            " make some there (`cosmos wipe` removes runs that were collected), or move cosmos_root"
+        )
 
 
 def _clock_note(facts: MachineFacts) -> Iterator[str]:

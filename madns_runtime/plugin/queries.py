@@ -30,7 +30,7 @@ from madns_runtime.plugin.api import (
 from madns_runtime.plugin.code_places import place_of
 from madns_runtime.plugin.isolation import call_plugin
 from madns_runtime.plugin.registry import load_function
-from madns_runtime.recording.records import FIELD_KINDS, FRAMEWORK_STREAMS, Field
+from madns_runtime.recording.records import FIELD_KINDS, FRAMEWORK_STREAMS, HEALTH, Field
 
 OF_SCENARIOS = ("check", "check_actions", "streams", "labels", "device_uses", "place_uses")
 """Parts of a descriptor that a scenario is read with."""
@@ -315,7 +315,21 @@ def _streams_fault(found: Any) -> str | None:
             if field.kind not in FIELD_KINDS:
                 kinds = ", ".join(FIELD_KINDS)
                 return f"must give {item.name!r} fields of kind {kinds}, got {_shown(field)}"
-    return None
+    of_host = {*FRAMEWORK_STREAMS, *(name for role, name in seen if role == "host")}
+    taken = {f"machine_{HEALTH.name}", *(f"host_{name}" for name in of_host)}
+    return next(
+        (
+            f"declares the agent's stream {name!r}, whose table would be that of {_who_has(name)}"
+            for role, name in sorted(seen)
+            if role == "agent" and name in taken
+        ),
+        None,
+    )
+
+
+def _who_has(table: str) -> str:
+    role, _, stream = table.partition("_")
+    return f"the {role}'s stream {stream!r}: choose another name"
 
 
 def _more_taken(function: Callable[..., Any]) -> tuple[list[str], list[str]]:

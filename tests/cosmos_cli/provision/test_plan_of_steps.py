@@ -171,6 +171,7 @@ def test_slow_answer_makes_no_clock_wrong():
         ({"clock": {"utc_s": 1000.5 + 30}}, {}, ("30 s ahead of this computer's",)),
         ({"throttled": 0x50005}, {}, ("its supply voltage is too low and it is throttled",)),
         ({"throttled": 0x50000}, {}, ()),
+        ({"disk": {"free_bytes": 3_000_000}}, {}, ("3 MB are free on /home/pi: records of a run",)),
         ({}, {"cosmos_realtime_priority": 50}, ("is granted real-time priority 0, not 50",)),
         ({"uses_pam": False}, {"cosmos_realtime_priority": 50}, ("set `UsePAM yes` in",)),
         ({"uses_pam": True}, {"cosmos_realtime_priority": 50}, ("perhaps pam_limits is missing",)),
