@@ -171,8 +171,11 @@ class DevicePort:
             first_s = pack[0] if number else start_s
             self._packs.append([messages.PLAY, channel, first_s, pack.tobytes()])
         while len(self._packs) > PACKS_MAX:
-            self.points_lost += len(self._packs.popleft()[-1]) // 8 // (declared.size + 1)
+            self.points_lost += self._count_points(self._packs.popleft())
         self.flush()
+
+    def _count_points(self, pack: list[Any]) -> int:
+        return len(pack[-1]) // 8 // (self.channels[pack[1]].size + 1)
 
     def size_of(self, channel: str) -> int:
         """Return how many numbers an output takes; see `DeviceView`."""
@@ -215,12 +218,14 @@ class DevicePort:
             self._answered(number, f"{self.full_name}: its process does not listen")
 
     def losses(self) -> dict[str, int]:
-        """Return the counts of what found no room on its way from or to the device; empty where nothing was lost."""
+        """Return the counts of what found no room on its way from or to the device, or waits for it still; empty for none."""
         counts = {
             "frames_missed": self._page.counts.read().get(self._missed_name, 0),
             "frames_dropped": self.frames_dropped,
             "writes_lost": self.writes_lost,
             "points_lost": self.points_lost,
+            "writes_left": len(self._unsent),
+            "points_left": sum(map(self._count_points, self._packs)),
         }
         return {name: count for name, count in counts.items() if count}
 

@@ -70,7 +70,10 @@ def test_what_a_device_has_no_room_for_is_counted(device):
     for number in range(port.PACKS_MAX + 3):
         made.play("level", [(float(number), 1.0), (number + 0.5, 2.0)], from_s=float(number))
 
-    assert made.losses() == {"writes_lost": 1, "points_lost": 6}
+    made.write("level", 3.0)
+
+    left = {"writes_left": 1, "points_left": 2 * port.PACKS_MAX}
+    assert made.losses() == {"writes_lost": 1, "points_lost": 6, **left}
     assert Hardware({"line": made}).losses() == {"pi22/line": made.losses()}
 
 
