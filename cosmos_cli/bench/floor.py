@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from cosmos_cli.doctor.probe import Responder
-from cosmos_cli.fleet.connection import Connection
+from cosmos_cli.fleet.connection import NO_ADDRESS, NO_ADDRESS_CURE, Connection
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.liveness import SilenceWatch
 from cosmos_cli.models.inventory import Machine
@@ -87,42 +87,48 @@ def measure_floor(
     Raises:
         MachineFailure: It cannot be asked.
     """
-    found = []
+    found: list[Told] = []
     with Helper.start(connection, PARTS, watch=SilenceWatch(connection)) as helper:
         for question in questions(has_network=responder is not None):
             words = f"{question.way} at {question.rate_hz:g} Hz, {POLICY_WORDS[question.policy]}"
+            count = max(1, round(seconds * question.rate_hz))
+            link = None
+            if responder is not None and question.way == "network":
+                link = responder.question(connection, machine, count)
+                if link is None:
+                    say(f"{connection.target.name}: {words}: not measured: {NO_ADDRESS}")
+                    found.append(_told_of(question, _not_measured(found)))
+                    continue
             say(f"{connection.target.name}: {words}")
             arguments = {
-                "count": max(1, round(seconds * question.rate_hz)),
+                "count": count,
                 "rate_hz": question.rate_hz,
                 "policy": question.policy,
                 "priority": Scheduling().priority,
-                "link": _link(connection, responder, machine)
-                if question.way == "network"
-                else None,
+                "link": link,
             }
             told = helper.call("timing_floor", arguments, timeout_s=seconds + TIMEOUT_S).value
-            found.append(
-                {
-                    "way": question.way,
-                    "rate_hz": question.rate_hz,
-                    "policy": question.policy,
-                    **told,
-                }
-            )
+            found.append(_told_of(question, told))
     return found
 
 
-def _link(
-    connection: Connection, responder: Responder | None, machine: Machine | None
-) -> dict[str, Any] | None:
-    if responder is None:
-        return None
-    own = machine.variables.cosmos_host_address if machine else None
+def _told_of(question: FloorQuestion, told: Mapping[str, Any]) -> Told:
     return {
-        "address": own or connection.own_address,
-        "port": responder.port,
-        "nonce_hex": responder.nonce.hex(),
+        "way": question.way,
+        "rate_hz": question.rate_hz,
+        "policy": question.policy,
+        **told,
+    }
+
+
+def _not_measured(others: Sequence[Told]) -> Told:
+    """Return what stands for a measurement over the network of a machine whose way to this computer is not known."""
+    return {
+        "refusal": None,
+        **dict.fromkeys(("due", "missed", "sent", "answered"), 0),
+        **dict.fromkeys(("lateness_us", "round_trip_us")),
+        "error": f"{NO_ADDRESS}: {NO_ADDRESS_CURE}",
+        "is_preempt_rt": any(told["is_preempt_rt"] for told in others),
     }
 
 

@@ -208,7 +208,7 @@ def _unasked_words(machines: Sequence[str]) -> str:
 def _otherwise_called(which: str, known: Sequence[Doomed]) -> list[Doomed]:
     """Return the run that `last` means; or one of which nothing says that it lives: its machines are asked."""
     try:
-        run = find_run(runs_root(), which)
+        run = find_run(runs_root(), which, is_read=False)
     except InputError:
         return []
     living = [each for each in known if each.directory == str(run.path)]

@@ -146,6 +146,7 @@ def _told(
         "exit_code": int(code),
         "checks": [result.to_mapping() for result in judged.results],
         "checks_not_judged": judged.told_not_judged(),
+        "remarks": list(judged.remarks()),
         "missing": list(missing),
     }
 

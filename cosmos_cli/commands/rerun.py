@@ -18,6 +18,7 @@ from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.launch.execute import Detached, RunOptions, execute
 from cosmos_cli.rerun.actions import action_remarks
 from cosmos_cli.rerun.device_comparison import compare_devices
+from cosmos_cli.rerun.early_ends import leave_out_after_ends
 from cosmos_cli.rerun.expectations import compare_expectations
 from cosmos_cli.rerun.flown_software import recorded_software, software_remarks, version_remarks
 from cosmos_cli.rerun.outcome import RerunOutcome, print_outcome
@@ -105,9 +106,11 @@ def _fly(
         raise typer.Exit(int(summary.exit_code))
     with told_progress(console, "rerun") as progress:
         after = open_side(summary.run, summary.run.name)
+        streams = compare(before, after, Selection(), progress)
+        remarks += leave_out_after_ends(streams.streams, flown.ends, before.tick_hz)
         return RerunOutcome(
-            devices=compare_devices(recorded, summary.run.path),
-            streams=compare(before, after, Selection(), progress),
+            devices=compare_devices(recorded, summary.run.path, flown.ends),
+            streams=streams,
             remarks=(*remarks, *action_remarks(recorded.run, summary.run, flown.left_out)),
             unlike=flown.unlike,
             expectations=compare_expectations(recorded.run, summary.run),

@@ -7,7 +7,7 @@ from typing import Any
 
 from cosmos_cli.commands.run_arguments import RunsOption
 from cosmos_cli.evidence.run_directory import RunDirectory, list_runs, runs_root
-from cosmos_cli.evidence.run_documents import fault_of, text_or_none
+from cosmos_cli.evidence.run_documents import fault_of, newer_schema, text_or_none
 from cosmos_cli.evidence.verdict import is_number
 from cosmos_cli.ui.console import Column, Console, JsonOption, QuietOption
 from madns_runtime.processes import list_processes
@@ -42,7 +42,7 @@ def runs(
 def _entry(run: RunDirectory, *, is_living: bool) -> dict[str, Any]:
     is_here = run.path.is_dir()
     document = run.read_json(run.run_json) or {}
-    fault = fault_of(run.run_json) if is_here else None
+    fault = (newer_schema(document) or fault_of(run.run_json)) if is_here else None
     agents = document.get("agents")
     count, duration_s = agents.get("count") if isinstance(agents, dict) else None, None
     if is_number(document.get("duration_s")):
@@ -61,8 +61,7 @@ def _entry(run: RunDirectory, *, is_living: bool) -> dict[str, Any]:
         "agents": count if is_number(count) else None,
         "duration_s": duration_s,
         "started_utc": text_or_none(document.get("started_utc")),
-        "verdict": text_or_none(document.get("verdict"))
-        or (f"run.json: {fault}" if fault else None),
+        "verdict": f"run.json: {fault}" if fault else text_or_none(document.get("verdict")),
     }
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from cosmos_cli.doctor.case import Case
 from cosmos_cli.doctor.finding import CheckRemark, Severity
+from cosmos_cli.fleet.connection import NO_ADDRESS, NO_ADDRESS_CURE
 from madns_runtime.protocol.datagram import DATAGRAM_BYTES_MAX
 
 CAP_NET_ADMIN = 12
@@ -129,6 +130,10 @@ def udp(case: Case) -> Iterator[CheckRemark]:
     """Datagrams to this computer and back, as agents and host exchange them."""
     told = case.part("round_trips")
     if not told:
+        if not case.is_here:
+            yield CheckRemark(
+                level=Severity.WARNING, found=f"UDP not tested: {NO_ADDRESS}", cure=NO_ADDRESS_CURE
+            )
         return
     where = f"{told['address']}:{told['port']}"
     sent, answered = told["sent"], told["answered"]

@@ -63,6 +63,21 @@ class Responder(DatagramServer):
         super().close()
         self._other.close()
 
+    def question(
+        self, connection: Connection, machine: Machine | None, count: int
+    ) -> dict[str, Any] | None:
+        """Return where a machine is to send datagrams; None if it is not known how it reaches this computer."""
+        own = machine.variables.cosmos_host_address if machine else None
+        address = own or connection.own_address
+        if not address:
+            return None
+        return {
+            "address": address,
+            "port": self.port,
+            "nonce_hex": self.nonce.hex(),
+            "count": count,
+        }
+
     def _reply(self, own: socket.socket, data: bytes, where: Any) -> None:
         received_s = time.clock_gettime(time.CLOCK_REALTIME)
         asked = Datagram.decode(data)
@@ -105,13 +120,7 @@ def ask(
     layout = Layout(connection.target.root)
     arguments = {
         "wake_ups": _wake_ups(wants, wants.priority),
-        "round_trips": {
-            "address": (machine and machine.variables.cosmos_host_address)
-            or connection.own_address,
-            "port": responder.port,
-            "nonce_hex": responder.nonce.hex(),
-            "count": ROUND_TRIP_COUNT,
-        },
+        "round_trips": responder.question(connection, machine, ROUND_TRIP_COUNT),
         "root": layout.root,
         "runs": layout.runs,
         "environments": layout.environments,

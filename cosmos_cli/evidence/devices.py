@@ -12,9 +12,11 @@ from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.run_documents import read_object
 from cosmos_cli.evidence.verdict import CheckResult, at_most, is_number
 from cosmos_cli.ui.foreign_text import clean_line
+from cosmos_cli.ui.plural import counted
 from madns_runtime.config import HardwareSettings
 from madns_runtime.hardware.profiles import POINT_COUNTS
 from madns_runtime.plain_values import mapping_at
+from madns_runtime.recording.records import DEVICE_LOSSES
 
 ACCOUNT_NAME = re.compile(r"devices(?:\.([1-9][0-9]{0,8}))?\.json")
 """Accounts of a machine's devices, below machines/<machine>/: one per life of its supervisor."""
@@ -23,6 +25,8 @@ NO_REPORT = "unknown"
 WHY_MISSING = "no account of it: its supervisor did not come to its end"
 LOST_BYTES = "lost_bytes"
 """Count of bytes for which a line had no room: firmware that floods."""
+LOSSES_TOLD_MAX = 20
+"""Remarks on losses between devices and agents."""
 NEVER_PLAYED = ("skipped", "lost", "refused")
 """Counts of a profile's points that were due and never put out."""
 _TOLD_APART = frozenset(
@@ -85,6 +89,34 @@ def device_checks(
         *_stimulus_checks(devices, limits),
         *([_check(devices, "hardware.unsafe", 0, key="unsafe")] if _is_unsafe(devices) else []),
     ]
+
+
+def device_loss_remarks(
+    agents: Mapping[str, Any], devices: Mapping[str, Mapping[str, Any]]
+) -> tuple[str, ...]:
+    """
+    Return a remark per agent and device between which something found no room; at most LOSSES_TOLD_MAX, then how many more.
+
+    Args:
+        agents: What the host's result holds of each agent.
+        devices: What became of each device, by its full name: of losses that no agent has told.
+    """
+    found: list[str] = []
+    told: set[str] = set()
+    for agent in agents:
+        for device, counts in mapping_at(agents, agent, "records", DEVICE_LOSSES).items():
+            words = [f"{name} {n}" for name, n in mapping_at(counts).items() if is_number(n)]
+            told.add(device if "/" in device else f"{agent}/{device}")
+            found.append(f"{agent}: device {device}: there was no room for all: {', '.join(words)}")
+    for device, account in devices.items():
+        missed = mapping_at(account, "counts").get("frames_missed", 0)
+        if missed and device not in told:
+            found.append(
+                f"device {device}: agents did not take all in time: frames_missed {missed:g}"
+            )
+    rest = len(found) - LOSSES_TOLD_MAX
+    more = [f"{counted(rest, 'more loss')} between devices and agents"] if rest > 0 else []
+    return tuple(clean_line(text) for text in (*found[:LOSSES_TOLD_MAX], *more))
 
 
 def _lost_bytes_checks(

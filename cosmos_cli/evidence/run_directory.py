@@ -24,6 +24,7 @@ from typing import Any
 import orjson
 
 from cosmos_cli.errors import InputError, RunFailedError, check_path_is_text
+from cosmos_cli.evidence.run_documents import SCHEMA as SCHEMA
 from cosmos_cli.evidence.run_documents import read_object
 from cosmos_cli.evidence.run_index import remember_run
 from cosmos_cli.evidence.run_number import NUMBER_MAX, NoNumber, make_numbered
@@ -47,8 +48,6 @@ RESERVE_BYTES = 1024 * 1024
 FOLDERS = ("host", "agents", "machines")
 """In every run directory from its beginning."""
 BUNDLE_SUFFIX = ".tar.zst"
-SCHEMA = 1
-"""Version of run.json and manifest.json; a change that breaks a reader raises it."""
 RUNS_VARIABLE = "COSMOS_RUNS"
 RUNS_FOLDER = "runs"
 RUN_NAME = re.compile(rf"^([0-9]{{4,{len(str(NUMBER_MAX))}}})-(.+)$")

@@ -9,12 +9,15 @@ from typing import Any, Literal
 
 import orjson
 
+from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.bounded_files import read_regular_file
 from madns_runtime.config import RunConfig, from_mapping
 from madns_runtime.errors import ConfigurationError
 
 DOCUMENT_BYTES_MAX = 256 * 1024 * 1024
 """A host's result is some kilobytes an agent, a manifest some 200 bytes a file."""
+SCHEMA = 1
+"""Version of run.json and manifest.json; a change that breaks a reader raises it."""
 EXPECTATIONS = "expectations"
 """Key of plan.json."""
 MISSING = "missing"
@@ -33,6 +36,20 @@ def read_object(path: Path) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ValueError(f"expected a JSON object, got {type(value).__name__}")
     return value
+
+
+def newer_schema(document: Mapping[str, Any]) -> str | None:
+    """Say that a run.json or manifest.json is of a schema that this program does not know yet, and what to do; None if not."""
+    schema = document.get("schema")
+    if not isinstance(schema, int) or schema <= SCHEMA:
+        return None
+    versions = document.get("versions")
+    made = versions.get("cosmos-madns") if isinstance(versions, Mapping) else None
+    by = f" ({clean_line(made)})" if isinstance(made, str) else ""
+    return (
+        f"schema {schema} is of a newer COSMoS{by}, this one knows {SCHEMA}; read it with that version,"
+        " or upgrade cosmos-madns"
+    )
 
 
 def text_or_none(value: object) -> str | None:

@@ -18,22 +18,36 @@ from cosmos_cli.evidence.run_directory import (
     RunDirectory,
     list_runs,
 )
+from cosmos_cli.evidence.run_documents import newer_schema
 from cosmos_cli.evidence.run_index import remembered_runs
 
 DIGITS_MAX = 40
 EXPECTED = f"expected plan.json, or the folders {', '.join(FOLDERS)}"
 
 
-def find_run(root: Path, which: str) -> RunDirectory:
+def find_run(root: Path, which: str, *, is_read: bool = True) -> RunDirectory:
     """
     Find a run by path, full name, number (with or without zeros) or "last".
 
     A run that is not in ./runs is looked for among all that were started by this user; a folder that
     was named by --runs or COSMOS_RUNS is meant alone.
 
+    Args:
+        root: Of all runs.
+        which: The run.
+        is_read: Whether its documents are read: those of a newer program are refused then.
+
     Raises:
-        InputError: There is none, or several; the message lists what there is.
+        InputError: There is none, or several; the message lists what there is. Or a newer program wrote it.
     """
+    run = _find(root, which)
+    for path in (run.run_json, run.manifest_json) if is_read else ():
+        if fault := newer_schema(run.read_json(path) or {}):
+            raise InputError(f"{path}: {fault}")
+    return run
+
+
+def _find(root: Path, which: str) -> RunDirectory:
     if os.sep in which or which in (".", ".."):
         if not os.path.isdir(which):
             raise InputError(f"{which}: no such run directory")

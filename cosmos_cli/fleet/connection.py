@@ -89,6 +89,14 @@ class Stream(Protocol):
         """Let go of it; a program that watches its standard input ends."""
 
 
+NO_ADDRESS = (
+    "through a ProxyCommand it is not seen by which address this machine reaches this computer"
+)
+NO_ADDRESS_CURE = (
+    "name it with cosmos_host_address in the inventory, or use ProxyJump where it will do"
+)
+
+
 class Connection(Protocol):
     """A machine that answers. Made by `cosmos_cli.fleet.open_connection.connect`, closed by its owner."""
 
@@ -154,9 +162,5 @@ def address_here(connection: Connection, given: str | None) -> str:
     """
     address = given or connection.own_address
     if not address:
-        raise MachineFailure(
-            FailureKind.UNSUPPORTED,
-            "through a ProxyCommand it is not seen by which address this machine reaches this computer",
-            "name it with cosmos_host_address in the inventory, or use ProxyJump where it will do",
-        )
+        raise MachineFailure(FailureKind.UNSUPPORTED, NO_ADDRESS, NO_ADDRESS_CURE)
     return address

@@ -42,11 +42,11 @@ def check_possible(facts: MachineFacts, steps: tuple[Step, ...]) -> None:
     """
     Refuse a plan that would fail midway: no room, no right to write, nobody becomes root.
 
+    A disk that takes nothing is refused where there is nothing to be done, too: runs record on it.
+
     Raises:
         MachineFailure: DISK_FULL, READ_ONLY, STEP or NO_SUDO; nothing was changed.
     """
-    if not steps:
-        return
     disk = facts.disk
     if disk.is_read_only:
         raise MachineFailure(
@@ -60,6 +60,8 @@ def check_possible(facts: MachineFacts, steps: tuple[Step, ...]) -> None:
             f"{facts.user} may not write in {disk.path}",
             "choose another cosmos_root, or make that folder and give it to the user",
         )
+    if not steps:
+        return
     needed_bytes = sum(step.size_bytes for step in steps) + RESERVE_BYTES
     if needed_bytes > disk.free_bytes:
         raise MachineFailure(
@@ -167,6 +169,7 @@ def notes_of(facts: MachineFacts, desired: DesiredState) -> tuple[str, ...]:
     """Return what is worth a word about a machine that is ready all the same, each with what to do."""
     return tuple(
         [
+            *_disk_note(facts),
             *_clock_note(facts),
             *_throttled_note(facts),
             *_priority_note(facts, desired),
@@ -174,6 +177,16 @@ def notes_of(facts: MachineFacts, desired: DesiredState) -> tuple[str, ...]:
             *boot_notes(facts, desired.needs, desired.paths),
         ]
     )
+
+
+def _disk_note(facts: MachineFacts) -> Iterator[str]:
+    """Yield a note if what a run records would not find room; a plan that needs more is refused before."""
+    disk = facts.disk
+    if disk.free_bytes < RESERVE_BYTES:
+        yield (
+            f"{megabytes(disk.free_bytes)} are free on {disk.path}: records of a run will not find room;"
+            " make some there (`cosmos wipe` removes runs that were collected), or move cosmos_root"
+        )
 
 
 def _clock_note(facts: MachineFacts) -> Iterator[str]:

@@ -111,6 +111,7 @@ class MachineUp:
         checks = self._look(desired, also=self.resources.checks(desired, udp, depth="look"))
         steps = self._plan(desired)
         if not steps:
+            check_possible(self._facts, steps)
             self._raise_first(checks, udp)
         elif self.options.is_check:
             self._foresee(desired, steps)

@@ -99,6 +99,11 @@ def with_simulation(
     except PluginError as error:
         warn(f"{recorded.config.simulation} tells nothing itself: {error}")
         return dict(document)
+    if both := [key for key in told if key in document]:
+        warn(
+            f"document() of {recorded.config.simulation} tells {', '.join(both)}, which run.json has:"
+            " that is shown; give them other names"
+        )
     return {**told, **document}
 
 

@@ -68,12 +68,18 @@ class CarriedOver:
             if place >= len(items):
                 return False  # the end that was added here
             number = list(items)[place]
+            if key == "timeline" and _is_stand_in_entry(items[number]):
+                continue  # what it stands for is told
             self.remarks.append(f"{_told(key, number, items[number])}: left out: {text}")
             if key == "timeline":
                 self.left_out.append(str(items[number].get("action")))
-        for key, items in (("timeline", self.timeline), ("checks", self.checks)):
-            for number in [n for place, n in enumerate(items) if (key, place) in gone]:
-                del items[number]
+        for number in [n for place, n in enumerate(self.timeline) if ("timeline", place) in gone]:
+            entry = self.timeline.pop(number)
+            if not _is_stand_in_entry(entry) or "when" in entry:
+                self.timeline[number] = _without_condition(_stand_in(entry))
+        self.timeline = dict(sorted(self.timeline.items()))
+        for number in [n for place, n in enumerate(self.checks) if ("checks", place) in gone]:
+            del self.checks[number]
         return True
 
 
@@ -100,6 +106,10 @@ def is_stand_in(word: str, parameters: Mapping[str, Any]) -> bool:
     return word == ANNOTATE.word and str(parameters.get("text")).startswith(STANDS_FOR)
 
 
+def _is_stand_in_entry(entry: Item) -> bool:
+    return is_stand_in(str(entry.get("action")), entry)
+
+
 def _items(value: Mapping[str, Any], key: str) -> dict[int, Item]:
     given = value.get(key)
     listed: Iterable[Any] = given if isinstance(given, list) else ()
@@ -111,19 +121,29 @@ def _replace(found: CarriedOver, word: str, text_of: Callable[[str], str]) -> No
     for number, entry in found.timeline.items():
         if entry.get("action") == word:
             found.remarks.append(f"{_told('timeline', number, entry)}: {text_of(word)}")
-            kept = {key: entry[key] for key in (*TIMES, "when") if entry.get(key) is not None}
-            text = f"{STANDS_FOR} {word} {entry.get('device', '')} {entry.get('fault', '')}"
-            found.timeline[number] = {
-                **kept,
-                "action": ANNOTATE.word,
-                "text": text[:TEXT_CHARACTERS_MAX],
-            }
+            found.timeline[number] = _stand_in(entry)
+
+
+def _stand_in(entry: Item) -> Item:
+    """Return a remark in the place of an entry, at its times: those behind it keep their places, by which chance is drawn."""
+    if _is_stand_in_entry(entry):
+        return entry
+    kept = {key: entry[key] for key in (*TIMES, "when") if entry.get(key) is not None}
+    words = [str(entry[key]) for key in ("action", "device", "fault") if key in entry]
+    text = f"{STANDS_FOR} {' '.join(words)}"
+    return {**kept, "action": ANNOTATE.word, "text": text[:TEXT_CHARACTERS_MAX]}
+
+
+def _without_condition(entry: Item) -> Item:
+    """Return an entry that waits for no condition: what it would look at may not be recorded."""
+    return {"at_s": 0.0, **entry} if entry.pop("when", None) is not None else entry
 
 
 def _end_as_recorded(found: CarriedOver, recorded: FlownRun) -> None:
     """Have a rerun end with the last tick on record, whatever ended the run."""
-    for number in [n for n, entry in found.timeline.items() if entry.get("action") == STOP.word]:
-        del found.timeline[number]
+    for number, entry in found.timeline.items():
+        if entry.get("action") == STOP.word:
+            found.timeline[number] = _stand_in(entry)
     for check in found.checks.values():
         if check.get("stop_when_broken"):
             check["stop_when_broken"] = False

@@ -8,7 +8,7 @@ values of an output by the times at which they were due, or in their order where
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -57,13 +57,16 @@ class ChannelComparison:
         return not self.different
 
 
-def compare_devices(recorded: FlownRun, rerun: Path) -> list[ChannelComparison]:
+def compare_devices(
+    recorded: FlownRun, rerun: Path, ends: Collection[str] = ()
+) -> list[ChannelComparison]:
     """
     Compare the records of all devices with those of their playback.
 
     Args:
         recorded: The run.
         rerun: Directory of the rerun.
+        ends: Agents that ended before others: what the rerun has of their devices after that is left out.
 
     Raises:
         MachineError: A stream cannot be read.
@@ -74,12 +77,20 @@ def compare_devices(recorded: FlownRun, rerun: Path) -> list[ChannelComparison]:
             if channel.direction == "out" and not used.may_write:
                 continue
             played = rerun / "devices" / used.agent / used.name / path.name
-            found.append(_compare(recorded, used, channel, path, played))
+            found.append(
+                _compare(recorded, used, channel, path, played, is_early=used.agent in ends)
+            )
     return found
 
 
-def _compare(
-    recorded: FlownRun, used: UsedDevice, channel: Channel, path: Path, played: Path
+def _compare(  # noqa: PLR0913 - both sides of one channel
+    recorded: FlownRun,
+    used: UsedDevice,
+    channel: Channel,
+    path: Path,
+    played: Path,
+    *,
+    is_early: bool,
 ) -> ChannelComparison:
     a, b = _rows(path), _rows(played)
     agent = recorded.agents[used.agent]
@@ -99,6 +110,8 @@ def _compare(
         while pairs and pairs[-1][1] is None and (pairs[-1][0] or (0.0,))[0] > agent.last_s:
             pairs.pop()
         is_same, left_out = _is_same_output, whole - len(pairs)
+    if is_early:
+        _leave_out_after(pairs, agent, is_input=channel.direction == "in")
     differing = [pair for pair in pairs if None in pair or not is_same(*pair)]
     return ChannelComparison(
         name=f"{used.full_name}.{channel.name}",
@@ -111,6 +124,17 @@ def _compare(
         in_ticks=_count_in_ticks(agent, a) if channel.direction == "in" else 0,
         first=_told(differing[0], channel) if differing else None,
     )
+
+
+def _leave_out_after(
+    pairs: list[tuple[Row | None, Row | None]], agent: RecordedAgent, *, is_input: bool
+) -> None:
+    """Leave out the last rows that the rerun alone has, of after an agent's last tick on record."""
+    while pairs and pairs[-1][0] is None and (row := pairs[-1][1]) is not None:
+        handed_s = row[0] + row[2] * 1e-6 if is_input else row[0]
+        if handed_s <= (agent.last_wake_s if is_input else agent.last_s) + SAME_TIME_S:
+            return
+        pairs.pop()
 
 
 def _count_in_ticks(agent: RecordedAgent, rows: Sequence[Row]) -> int:

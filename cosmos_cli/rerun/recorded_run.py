@@ -65,6 +65,8 @@ class FlownRun:
     config: RunConfig
     agents: Mapping[str, RecordedAgent]
     devices: tuple[UsedDevice, ...]
+    is_cut_off: bool = False
+    """Whether it was in real time and did not complete: its agents need not have ended with the same tick."""
 
     @property
     def folder(self) -> Path:
@@ -112,7 +114,9 @@ def read_recorded_run(run: RunDirectory, given: str, as_recorded: Path | None = 
         more = len(faults) - FAULTS_SHOWN_MAX
         told = "; ".join(faults[:FAULTS_SHOWN_MAX]) + (f"; and {more} more" if more > 0 else "")
         raise InputError(f"{run.name} cannot be flown again: {told}")
-    return FlownRun(run=run, config=config, agents=agents, devices=devices)
+    status = (run.read_json(run.run_json) or {}).get("status")
+    is_cut_off = not config.time.is_lockstep and status != "complete"
+    return FlownRun(run=run, config=config, agents=agents, devices=devices, is_cut_off=is_cut_off)
 
 
 def check_collected(run: RunDirectory, given: str) -> None:

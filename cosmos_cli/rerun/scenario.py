@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,6 +17,7 @@ from cosmos_cli.models.loading import ScenarioFile, check_scenario
 from cosmos_cli.models.scenario import Scenario
 from cosmos_cli.models.separate_process import SeparateDefect, SeparateFailure, work_separately
 from cosmos_cli.rerun.carried_over import ATTEMPTS_MAX, CarriedOver, carried_over
+from cosmos_cli.rerun.early_ends import early_ends
 from cosmos_cli.rerun.recorded_run import FlownRun, UsedDevice
 from madns_runtime.config import RunConfig, ScenarioDevice, to_mapping
 from madns_runtime.errors import MadnsError
@@ -39,6 +40,8 @@ class RerunScenario:
     """Streams of the simulation that tell of computers and networks: they are not compared."""
     left_out: tuple[str, ...] = ()
     """Words of actions that are not carried over."""
+    ends: Mapping[str, float] = field(default_factory=dict)
+    """Of a run that was cut off: agents that ended before others, each with the time of its last tick, s."""
 
 
 def make_rerun(recorded: FlownRun) -> RerunScenario:
@@ -66,6 +69,7 @@ def make_rerun(recorded: FlownRun) -> RerunScenario:
         scenario=scenario,
         remarks=tuple(dict.fromkeys([*remarks, *carried.remarks])),
         left_out=tuple(carried.left_out),
+        ends=early_ends(recorded.agents) if recorded.is_cut_off else {},
         unlike=() if config.time.is_lockstep else tuple(told["unlike"]),
     )
 

@@ -50,6 +50,17 @@ class ConditionEvaluator:
         self.is_met = True
         return at_s
 
+    @property
+    def wants_earlier(self) -> bool:
+        """Whether records of an earlier incarnation count, too, and there may be more of them."""
+        return 1 < self.condition.times > self._count
+
+    def recall(self, t_s: float | None, value: object) -> None:
+        """Count the value of a record of an earlier incarnation; what it meets is met by the next one."""
+        condition = self.condition
+        if condition.times > 1 and condition.is_at(t_s):
+            self._count += condition.bounds.holds(value)
+
     def look(self, now_s: float) -> float | None:
         """
         Take the newest value for that of *now_s*, too; a condition that is to hold for a while may be met by it.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from madns_runtime.conditions.condition import AGENT, HOST, TICK, TIME, Condition, conditions_of
@@ -52,8 +52,20 @@ class ConditionTap:
         """Whether conditions that have to hold for a while are open: `look` is to be called now and then."""
         return any(each.for_s > 0.0 for own in self._by_stream.values() for each in own)
 
-    def open(self, stream: str, fields: Sequence[str]) -> Take | None:
-        """Return what is to be given every record of a stream with these fields; None if no condition names it."""
+    def open(
+        self,
+        stream: str,
+        fields: Sequence[str],
+        earlier: Callable[[], Iterable[Mapping[str, Any]]] = tuple,
+    ) -> Take | None:
+        """
+        Return what is to be given every record of a stream; None if no condition names it.
+
+        Args:
+            stream: Its name.
+            fields: Of its records, in their order.
+            earlier: Returns the records of earlier incarnations, by field; called if a condition counts them.
+        """
         own = self._by_stream.get(stream)
         if not own:
             return None
@@ -63,6 +75,7 @@ class ConditionTap:
         evaluators: dict[str, list[ConditionEvaluator]] = {}
         if not has_agents:
             evaluators[self._source] = self._evaluators(self._source, own)
+            self._recall(evaluators[self._source], when, earlier)
 
         def take(record: Any) -> None:
             if isinstance(record, Mapping):
@@ -90,6 +103,21 @@ class ConditionTap:
         made = [ConditionEvaluator(each) for each in conditions]
         self._lasting += [(who, each) for each in made if each.condition.for_s > 0.0]
         return made
+
+    def _recall(
+        self,
+        evaluators: Sequence[ConditionEvaluator],
+        when: Callable[[Callable[[str], Any]], float | None],
+        earlier: Callable[[], Iterable[Mapping[str, Any]]],
+    ) -> None:
+        counting = [each for each in evaluators if each.wants_earlier]
+        for record in earlier() if counting else ():
+            t_s = when(record.get)
+            for each in counting:
+                field = each.condition.field
+                each.recall(t_s, record.get(field) if field else 1.0)
+            if not any(each.wants_earlier for each in counting):
+                return
 
     def _note(self, who: str, evaluator: ConditionEvaluator, met_s: float | None) -> None:
         if met_s is not None:

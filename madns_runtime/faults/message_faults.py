@@ -85,6 +85,7 @@ class MessageFaults:
         self._rules.add(
             MessageRule(
                 number=action.number,
+                chance=action.chance,
                 word=action.word,
                 agents=frozenset(action.agents),
                 parameters=action.parameters,

@@ -36,6 +36,8 @@ class MessageRule:
 
     number: int
     """The action's."""
+    chance: int
+    """The action's: what is drawn for it hangs on no other."""
     word: str
     agents: frozenset[str]
     parameters: Mapping[str, Any]
@@ -119,7 +121,7 @@ class MessageRules:
         number = self._numbers[agent, direction] = self._numbers.get((agent, direction), 0) + 1
         fate, index = Fate(), self._index[agent]
         for rule in self._with_host[agent]:
-            draw = _Draws(self._key, (rule.number, index, direction, number))
+            draw = _Draws(self._key, (rule.chance, index, direction, number))
             _apply(rule, fate, draw, left_s=None if service == _BEST else rule.until_s - now_s)
         return fate
 
@@ -139,7 +141,7 @@ class MessageRules:
             if rule.word == words.PARTITION:
                 fate.is_lost = fate.is_lost or is_from != is_to
             elif is_from or is_to:
-                _apply(rule, fate, _Draws(self._key, (rule.number, *ends, number)), left_s=None)
+                _apply(rule, fate, _Draws(self._key, (rule.chance, *ends, number)), left_s=None)
         return fate
 
     def up_again_s(self, agent: str, number: int) -> float:

@@ -11,6 +11,13 @@ NAME_BYTES: Final = 56
 REST: Final = "others"
 CELL_BYTES: Final = NAME_BYTES + 8
 TABLE_BYTES: Final = CELLS_MAX * CELL_BYTES
+MISSED: Final = "missed:"
+"""Before an agent's name: how many messages were given up that it did not take."""
+
+
+def missed_name(agent: str) -> str:
+    """Return the name under which is counted what an agent did not take; of a long name the end."""
+    return f"{MISSED}{agent[len(MISSED) - NAME_BYTES :]}"
 
 
 class CountTable:

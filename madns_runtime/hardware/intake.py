@@ -10,6 +10,7 @@ from madns_runtime.errors import PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.clock import DeviceClock
 from madns_runtime.hardware.contract import Channel, Device, Sample
+from madns_runtime.hardware.count_table import MISSED
 from madns_runtime.hardware.fault_actions import check_fault_fits
 from madns_runtime.hardware.faults import InsertedFaults
 from madns_runtime.hardware.page import DevicePage
@@ -180,7 +181,7 @@ def counts_of(device_page: DevicePage) -> dict[str, Any]:
         "errors": int(header[page.ERRORS]),
         "dropped": 0,
         "frozen": frozen,
-        **{name: n for name, n in counts.items() if not name.startswith((FROZEN, PREFIX))},
+        **{name: n for name, n in counts.items() if not name.startswith((FROZEN, PREFIX, MISSED))},
         **({"stimulus": stimulus} if stimulus else {}),
     }
 

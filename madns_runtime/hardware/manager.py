@@ -127,6 +127,7 @@ class DeviceManager:
                     driven.seat.channels,
                     shared=(driven.seat.page, driven.ends[agent]),
                     limits=driven.limits,
+                    agent=agent,
                 )
                 for driven in self._devices.values()
                 if agent in driven.ends

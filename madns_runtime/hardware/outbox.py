@@ -10,6 +10,7 @@ from time import monotonic
 from typing import Any, Final
 
 from madns_runtime.hardware import messages
+from madns_runtime.hardware.count_table import CountTable, missed_name
 from madns_runtime.reactor.reactor import Reactor
 
 WAITING_MAX: Final = 10_000
@@ -25,20 +26,26 @@ class UserOutbox:
     Args:
         users: The device's ends of its pairs, by agent.
         reactor: The loop of its process.
+        counts: Where what is given up is counted by agent, for the agents to read.
     """
 
-    def __init__(self, users: Mapping[str, socket.socket], reactor: Reactor) -> None:
-        self._users: list[tuple[socket.socket, deque[list[Any]]]] = [
-            (end, deque(maxlen=WAITING_MAX)) for end in users.values()
+    def __init__(
+        self, users: Mapping[str, socket.socket], reactor: Reactor, counts: CountTable
+    ) -> None:
+        self._users: list[tuple[str, socket.socket, deque[list[Any]]]] = [
+            (missed_name(agent), end, deque(maxlen=WAITING_MAX)) for agent, end in users.items()
         ]
+        self._counts = counts
         self._timer = reactor.call_at(math.inf, self._send_waiting)
 
     def send(self, message: list[Any]) -> int:
         """Send a message to all, and return how many of them have to do without one."""
         lost = 0
-        for end, waiting in self._users:
+        for name, end, waiting in self._users:
             if waiting:
-                lost += len(waiting) == WAITING_MAX
+                if len(waiting) == WAITING_MAX:
+                    lost += 1
+                    self._counts.add(name)
                 waiting.append(message)
             elif not messages.send(end, message):
                 waiting.append(message)
@@ -46,8 +53,8 @@ class UserOutbox:
         return lost
 
     def _send_waiting(self) -> None:
-        for end, waiting in self._users:
+        for _, end, waiting in self._users:
             while waiting and messages.send(end, waiting[0]):
                 waiting.popleft()
-        is_empty = not any(waiting for _, waiting in self._users)
+        is_empty = not any(waiting for *_, waiting in self._users)
         self._timer.reschedule(math.inf if is_empty else monotonic() + PERIOD_S)

@@ -12,6 +12,7 @@ from typing import Any, Final
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.contract import Channel, Value
+from madns_runtime.hardware.count_table import missed_name
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.profiles import pack_points
 from madns_runtime.hardware.status import StatusLimits
@@ -42,6 +43,7 @@ class DevicePort:
         shared: Its page, and this agent's end of their pair.
         limits: Ages from which it is stale and lost.
         now_s: Returns the present on this machine's clock, s; in lockstep simulated time.
+        agent: Whose end it is; empty where nothing is given up before it comes.
     """
 
     def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
@@ -52,6 +54,7 @@ class DevicePort:
         shared: tuple[DevicePage, socket.socket],
         limits: StatusLimits,
         now_s: Callable[[], float] = monotonic,
+        agent: str = "",
     ) -> None:
         self.full_name = full_name
         self.name = full_name.rpartition("/")[2]
@@ -83,6 +86,8 @@ class DevicePort:
         """Values for an output that the device's process had no room for."""
         self.points_lost = 0
         """Points of profiles that it had no room for."""
+        self._missed_name = missed_name(agent)
+        """Under which the device's process counts what it gave up as this agent did not take it, in all its incarnations."""
 
     @property
     def status(self) -> DeviceStatus:
@@ -166,8 +171,11 @@ class DevicePort:
             first_s = pack[0] if number else start_s
             self._packs.append([messages.PLAY, channel, first_s, pack.tobytes()])
         while len(self._packs) > PACKS_MAX:
-            self.points_lost += len(self._packs.popleft()[-1]) // 8 // (declared.size + 1)
+            self.points_lost += self._count_points(self._packs.popleft())
         self.flush()
+
+    def _count_points(self, pack: list[Any]) -> int:
+        return len(pack[-1]) // 8 // (self.channels[pack[1]].size + 1)
 
     def size_of(self, channel: str) -> int:
         """Return how many numbers an output takes; see `DeviceView`."""
@@ -210,11 +218,14 @@ class DevicePort:
             self._answered(number, f"{self.full_name}: its process does not listen")
 
     def losses(self) -> dict[str, int]:
-        """Return the counts of what found no room on its way from or to the device; empty where nothing was lost."""
+        """Return the counts of what found no room on its way from or to the device, or waits for it still; empty for none."""
         counts = {
+            "frames_missed": self._page.counts.read().get(self._missed_name, 0),
             "frames_dropped": self.frames_dropped,
             "writes_lost": self.writes_lost,
             "points_lost": self.points_lost,
+            "writes_left": len(self._unsent),
+            "points_left": sum(map(self._count_points, self._packs)),
         }
         return {name: count for name, count in counts.items() if count}
 

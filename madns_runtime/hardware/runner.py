@@ -56,7 +56,7 @@ class DeviceRunner:
             records,
             seed=[launch.seed, *launch.full_name.encode()],
             frozen_s=launch.frozen_s,
-            pass_on=UserOutbox(seat.users, reactor).send,
+            pass_on=UserOutbox(seat.users, reactor, seat.page.counts).send,
         )
         self._outputs = DeviceOutputs(launch, seat.channels, self._intake.count)
         self.tell_error: Callable[[str], object] = lambda text: None

@@ -382,8 +382,8 @@ class Worker:
             if reason is not None:
                 agent.journal.event("emergency", reason=reason)
                 agent.journal.say("critical", f"emergency shutdown: {reason}")
-            agent.journal.device_losses(agent.devices.hardware.losses())
-            counts = agent.journal.close().to_mapping()
+            losses = agent.journal.device_losses(agent.devices.hardware.losses())
+            counts = {**losses, **agent.journal.close().to_mapping()}
             if agent.devices:
                 counts["devices"] = agent.devices.close()
             if is_told:

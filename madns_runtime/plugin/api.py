@@ -103,7 +103,7 @@ class Context(Protocol):
     base_directory: Path
     """Root of the scenario, its folder if it names none: relative files are found from here."""
     random: np.random.Generator
-    """Seeded from the run's seed and `name`."""
+    """Seeded from the run's seed and `name`; an agent that is started anew begins it anew."""
     is_lockstep: bool
     """Whether simulated time waits for everybody: nothing recorded may then depend on the wall clock."""
 
@@ -348,7 +348,7 @@ class Simulation:
     """module:function of (parameters, agents: int, base_directory: Path) -> list[str]: faults beyond bounds,
     such as a missing file, each starting with the dotted parameter name and a colon. A fourth parameter
     called names is given the agents' names, a fifth called duration_s the run's simulated duration,
-    a sixth called is_lockstep whether simulated time waits for everybody, a seventh called tick_hz the ticks' rate."""
+    a sixth called is_lockstep whether simulated time waits for everybody, a seventh called tick_hz the ticks' rate; behind a `*` any by name."""
     check_actions: str | None = None
     """module:function of (parameters, actions: tuple[PlannedAction, ...], agents: tuple[str, ...], base_directory: Path)
     -> list[str]: faults in a timeline's entries of its own `actions`, each starting with place and parameter and a colon."""

@@ -7,6 +7,7 @@ What comes back is checked here, so that a slip in a plug-in is told as such and
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 import inspect
 import itertools
@@ -29,7 +30,7 @@ from madns_runtime.plugin.api import (
 from madns_runtime.plugin.code_places import place_of
 from madns_runtime.plugin.isolation import call_plugin
 from madns_runtime.plugin.registry import load_function
-from madns_runtime.recording.records import FIELD_KINDS, FRAMEWORK_STREAMS, Field
+from madns_runtime.recording.records import FIELD_KINDS, FRAMEWORK_STREAMS, HEALTH, Field
 
 OF_SCENARIOS = ("check", "check_actions", "streams", "labels", "device_uses", "place_uses")
 """Parts of a descriptor that a scenario is read with."""
@@ -71,20 +72,22 @@ def ask_check(  # noqa: PLR0913 - what a scenario is; all but two by name
         base_directory: Folder of the scenario.
         parameters: An instance of the simulation's parameters.
         agents: How many there are.
-        names: Their names, for a `check` whose fourth parameter is called names.
-        duration_s: Of the run, for one whose fifth is called duration_s.
-        is_lockstep: Whether simulated time waits for everybody, for one whose sixth is called so.
-        tick_hz: Rate of every agent's loop, for one whose seventh is called so.
+        names: Their names; this and the others are for a `check` that takes them, see `_more_taken`.
+        duration_s: Of the run.
+        is_lockstep: Whether simulated time waits for everybody.
+        tick_hz: Rate of every agent's loop.
 
     Raises:
         PluginError: It cannot be found, raised, or did not return a list of texts.
         MissingExtraError: It needs an optional dependency that is not installed.
     """
     function = load_function(where, base_directory)
-    arguments = [parameters, agents, base_directory]
     more = dict(zip(CHECK_MORE, (names, duration_s, is_lockstep, tick_hz), strict=True))
-    arguments += [value for _, value in zip(_more_taken(function), more.values(), strict=False)]
-    return _asked_texts("check", function, arguments)
+    in_order, by_name = _more_taken(function)
+    arguments = [parameters, agents, base_directory, *(more[name] for name in in_order)]
+    named = {name: more[name] for name in by_name}
+    ask = functools.wraps(function)(lambda *given: function(*given, **named))
+    return _asked_texts("check", ask if named else function, arguments)
 
 
 def ask_check_actions(
@@ -312,17 +315,35 @@ def _streams_fault(found: Any) -> str | None:
             if field.kind not in FIELD_KINDS:
                 kinds = ", ".join(FIELD_KINDS)
                 return f"must give {item.name!r} fields of kind {kinds}, got {_shown(field)}"
-    return None
+    of_host = {*FRAMEWORK_STREAMS, *(name for role, name in seen if role == "host")}
+    taken = {f"machine_{HEALTH.name}", *(f"host_{name}" for name in of_host)}
+    return next(
+        (
+            f"declares the agent's stream {name!r}, whose table would be that of {_who_has(name)}"
+            for role, name in sorted(seen)
+            if role == "agent" and name in taken
+        ),
+        None,
+    )
 
 
-def _more_taken(function: Callable[..., Any]) -> tuple[str, ...]:
-    """Return which of CHECK_MORE a `check` takes after its first three arguments, in that order."""
+def _who_has(table: str) -> str:
+    role, _, stream = table.partition("_")
+    return f"the {role}'s stream {stream!r}: choose another name"
+
+
+def _more_taken(function: Callable[..., Any]) -> tuple[list[str], list[str]]:
+    """Return which of CHECK_MORE a `check` takes after its first three arguments in that order, and which by name alone."""
     try:
-        parameters = tuple(inspect.signature(function).parameters)[3:]
+        parameters = list(inspect.signature(function).parameters.values())[3:]
     except (TypeError, ValueError):  # a function written in C tells no signature
-        return ()
-    pairs = zip(CHECK_MORE, parameters, strict=False)
-    return tuple(name for name, _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
+        return [], []
+    keyword_only = inspect.Parameter.KEYWORD_ONLY
+    in_order = [each.name for each in parameters if each.kind is not keyword_only]
+    by_name = [each.name for each in parameters if each.kind is keyword_only]
+    pairs = zip(CHECK_MORE, in_order, strict=False)
+    taken = [name for name, _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs)]
+    return taken, [name for name in by_name if name in CHECK_MORE]
 
 
 def _unfolded(found: Any) -> Any:

@@ -38,6 +38,7 @@ from madns_runtime.plugin.code_places import (
 from madns_runtime.plugin.columns import shape_faults
 from madns_runtime.plugin.entry_points import place_of_name, registered
 from madns_runtime.plugin.isolation import missing_extra, said
+from madns_runtime.plugin.kept_names import name_faults
 from madns_runtime.plugin.parameter_kinds import kind_faults
 from madns_runtime.plugin.time_limit import PluginStopped, hold
 from madns_runtime.timeline.kinds import kind_texts
@@ -327,7 +328,7 @@ def _checked(descriptor: Any, where: str, module: ModuleType) -> Simulation:
         raise PluginError(
             f"{where}: expected a madns_runtime.plugin.api.Simulation, got {type(descriptor).__name__}"
         )
-    faults = []
+    faults = name_faults(descriptor.name)
     parameters: Any = descriptor.parameters
     if not (isinstance(parameters, type) and dataclasses.is_dataclass(parameters)):
         faults.append("parameters: expected a dataclass (the class itself)")

@@ -81,6 +81,7 @@ class AgentReport:
         """Return what the host is told once the records are closed, given their counts and the messages' before."""
         return {
             **records,
+            **self.records.device_account,
             "messages": messages,
             "network": self.port.network(),
             "loop": self.port.process.loop(),

@@ -35,6 +35,8 @@ class ProcessRecords:
             self._recorder.open_stream(schema)
         self._clock_recorded_s = 0.0
         self._usage = ProcessUsage()
+        self.device_account: dict[str, Any] = {}
+        """What the host is told of losses between devices and the agent."""
 
     def clock(self, clock: ClockEstimate, now_s: float) -> None:
         """Record the estimate of the host's clock at local time *now_s*, now and then."""
@@ -66,7 +68,7 @@ class ProcessRecords:
 
     def device_losses(self, losses: Mapping[str, Mapping[str, int]]) -> None:
         """Tell what devices, by name, and the agent had no room for, by kind."""
-        self._journal.device_losses(losses)
+        self.device_account = self._journal.device_losses(losses)
 
     def report(self) -> dict[str, Any]:
         """Return what a ping tells of the records: how many were dropped, and the disk's trouble."""

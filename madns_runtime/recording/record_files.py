@@ -6,7 +6,7 @@ The loop's thread adds files; whoever writes (a thread of its own, or in lockste
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import partial
@@ -18,7 +18,14 @@ import orjson
 from madns_runtime.errors import MachineError
 from madns_runtime.recording.encoding import ENCODING
 from madns_runtime.recording.records import StreamSchema
-from madns_runtime.recording.stream_file import StreamFile, check_name, check_schema, create_file
+from madns_runtime.recording.stream_file import (
+    StreamFile,
+    check_name,
+    check_schema,
+    create_file,
+    number_of,
+    path_of,
+)
 from madns_runtime.recording.text_file import TextFile
 
 
@@ -124,6 +131,20 @@ class RecordFiles:
         file = StreamFile(schema, path, descriptor)
         self._streams = (*self._streams, file)
         return file
+
+    def earlier_records(self, file: StreamFile) -> Iterator[dict[str, Any]]:
+        """Give what earlier lives have recorded of a stream, by field; what cannot be read is left out."""
+        from madns_runtime.recording.reader import read_stream  # few lives are not the first
+
+        number = number_of(file.path)
+        for earlier in range(1, number):
+            try:
+                stream = read_stream(path_of(self.directory, file.schema.name, earlier))
+                names = stream.field_names
+                for row in stream.records():
+                    yield row if isinstance(row, dict) else dict(zip(names, row, strict=True))
+            except MachineError:
+                continue
 
     def create_text(self, name: str) -> TextFile:
         """

@@ -7,7 +7,8 @@ thread, the loop's, may call a recorder, and a recorder does not survive a fork:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, Protocol
 
 import orjson
@@ -30,7 +31,10 @@ class StreamTap(Protocol):
     """What looks at some of the streams as they are recorded."""
 
     def open(
-        self, stream: str, fields: Sequence[str]
+        self,
+        stream: str,
+        fields: Sequence[str],
+        earlier: Callable[[], Iterable[Mapping[str, Any]]],
     ) -> Callable[[Sequence[Any] | Mapping[str, Any]], None] | None:
         """Return what is to be given every record of a stream with these fields; None if it is not looked at."""
 
@@ -78,7 +82,8 @@ class Recorder:
             raise PluginError(f"stream {schema.name}: declared twice")
         file = self._streams[schema.name] = self._files.create_stream(schema)
         if self._tap is not None:
-            take = self._tap.open(schema.name, [field.name for field in schema.fields])
+            names = [field.name for field in schema.fields]
+            take = self._tap.open(schema.name, names, partial(self._files.earlier_records, file))
             if take is not None:
                 file.tap_with(take)
 

@@ -114,6 +114,9 @@ EVENT_WORDS = (
 )  # fmt: skip
 """All that `events` of agents and of the host's half hold in `event`: a simulation records its own in streams of its own."""
 
+DEVICE_LOSSES = "device_losses"
+"""Of EVENT_WORDS, and key of an agent's account: what found no room between it and its devices."""
+
 LOG = StreamSchema(
     "log",
     (

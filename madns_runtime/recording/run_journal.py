@@ -10,7 +10,7 @@ from typing import Any
 from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.recording.record_files import RecordCounts
 from madns_runtime.recording.recorder import CLOSE_TIMEOUT_S, Recorder
-from madns_runtime.recording.records import EVENTS, LOG, LOG_LEVELS
+from madns_runtime.recording.records import DEVICE_LOSSES, EVENTS, LOG, LOG_LEVELS
 from madns_runtime.timing.clock import utc_now_iso
 
 T_S_DIGITS = 6
@@ -60,12 +60,13 @@ class RunJournal:
             with contextlib.suppress(MachineError):
                 self.recorder.record(EVENTS.name, {**when, **values})
 
-    def device_losses(self, losses: Mapping[str, Mapping[str, int]]) -> None:
-        """Tell what devices, by name, and an agent had no room for, by kind; also in the log."""
+    def device_losses(self, losses: Mapping[str, Mapping[str, int]]) -> dict[str, Any]:
+        """Tell what devices, by name, and an agent had no room for, by kind; also in the log. Return it for the host."""
         for device, counts in losses.items():
             self.event("device_losses", device=device, **counts)
             told = ", ".join(f"{name} {count}" for name, count in counts.items())
             self.say("warning", f"device {device}: there was no room for all: {told}")
+        return {DEVICE_LOSSES: losses} if losses else {}
 
     def say(self, level: str, text: str) -> None:
         """Log a sentence of the framework's own, now."""

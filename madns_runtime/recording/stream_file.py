@@ -93,7 +93,7 @@ def create_file(directory: Path, name: str, first: int) -> tuple[Path, int, int]
     """
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
     for number in range(first, first + FILES_MAX):
-        path = directory / (f"{name}.jsonl" if number == 1 else f"{name}.{number}.jsonl")
+        path = path_of(directory, name, number)
         try:
             return path, os.open(path, flags, 0o644), number
         except FileExistsError:
@@ -101,6 +101,17 @@ def create_file(directory: Path, name: str, first: int) -> tuple[Path, int, int]
         except OSError as error:
             raise MachineError(f"{path}: cannot record there: {error.strerror}") from error
     raise MachineError(f"{directory}: holds {FILES_MAX} files of stream {name}; clear it out")
+
+
+def path_of(directory: Path, name: str, number: int) -> Path:
+    """Return the file of a stream that bears a number; that of the first has none in its name."""
+    return directory / (f"{name}.jsonl" if number == 1 else f"{name}.{number}.jsonl")
+
+
+def number_of(path: Path) -> int:
+    """Return the number in the name of a stream's file."""
+    _, dot, number = path.stem.rpartition(".")
+    return int(number) if dot and number.isdecimal() else 1
 
 
 def _number_rows(schema: StreamSchema) -> NumberRows | None:

@@ -58,6 +58,8 @@ class TimelineAction:
     """Simulated time at which it was due, s."""
     for_s: float | None
     """How long it lasts, s; None for one that has no end, or none before the run's."""
+    chance: int = 0
+    """What its chance is drawn for, beside the seed; see `runner.chance_of`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -17,6 +18,21 @@ ORDERS_MAX: Final = 10_000
 """Actions of one run that conditions begin or that are ordered live; more are refused."""
 
 
+TIMES_BITS: Final = 32
+"""Of an action's chance: place of its entry, above how many actions this had before."""
+
+
+def chance_of(entry: int | None, before: int) -> int:
+    """
+    Return what an action's chance is drawn for: whatever else takes place in the run, its chance is the same.
+
+    Args:
+        entry: Place of its entry in the timeline; None for one that was ordered live.
+        before: Actions of this entry, or those ordered live, that came before it.
+    """
+    return -2 - before if entry is None else entry + (before << TIMES_BITS)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OrderedAction:
     """An action that is ordered while the run goes on."""
@@ -25,6 +41,19 @@ class OrderedAction:
     agents: tuple[str, ...] = ()
     parameters: Mapping[str, Any]
     for_s: float | None = None
+    entry: int | None = None
+    """Place in the timeline; None for one that is ordered live."""
+
+    @classmethod
+    def of_entry(cls, place: int, entry: ScheduledEntry, agents: tuple[str, ...]) -> OrderedAction:
+        """Return an action of an entry of the timeline."""
+        return cls(
+            word=entry.action,
+            agents=agents,
+            parameters=entry.parameters,
+            for_s=entry.for_s,
+            entry=place,
+        )
 
 
 class TimelineRunner:
@@ -55,6 +84,8 @@ class TimelineRunner:
         self._position = 0
         self._ends: list[tuple[float, int, TimelineAction]] = []
         self._count = self._ordered_count = 0
+        self._counts: Counter[int | None] = Counter()
+        """Actions by entry; None for those that were ordered live."""
         self._is_closed = False
         self._met: set[int] = set()
         """Conditions that were met: by one agent, others do not count any more."""
@@ -94,13 +125,7 @@ class TimelineRunner:
                 continue
             due = self._due[self._position]
             self._position += 1
-            entry = self._entries[due.entry]
-            ordered = OrderedAction(
-                word=entry.action,
-                agents=due.agents,
-                parameters=entry.parameters,
-                for_s=entry.for_s,
-            )
+            ordered = OrderedAction.of_entry(due.entry, self._entries[due.entry], due.agents)
             self._begin(ordered, due.t_s, now_s)
 
     def resume(self, agent: str) -> None:
@@ -118,14 +143,9 @@ class TimelineRunner:
         if condition in self._met:
             return
         self._met.add(condition)
-        for entry in self._entries:
+        for place, entry in enumerate(self._entries):
             if entry.condition == condition:
-                ordered = OrderedAction(
-                    word=entry.action,
-                    agents=entry.agents,
-                    parameters=entry.parameters,
-                    for_s=entry.for_s,
-                )
+                ordered = OrderedAction.of_entry(place, entry, entry.agents)
                 self.order(ordered, now_s, due_s=met_s)
 
     def order(self, ordered: OrderedAction, now_s: float, *, due_s: float | None = None) -> str:
@@ -152,8 +172,10 @@ class TimelineRunner:
             parameters=ordered.parameters,
             t_s=due_s,
             for_s=ordered.for_s,
+            chance=chance_of(ordered.entry, self._counts[ordered.entry]),
         )
         self._count += 1
+        self._counts[ordered.entry] += 1
         kind = self._kinds.get(ordered.word)
         lasts = kind is not None and (ordered.for_s is not None or kind.lasting == "may")
         refusal = self._dispatcher.begin(action, now_s, lasts=lasts)

@@ -40,7 +40,7 @@ def folder(tmp_path):
 
 def faults(folder, **rest):
     satellites = rest.pop("satellites", WALKER)
-    return find_faults(parameters(satellites, **rest), 2, folder, AGENTS)
+    return find_faults(parameters(satellites, **rest), 2, folder, names=AGENTS)
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ def faults(folder, name, text, *, count=2, duration_s=DAY_S, **rest):
     (folder / name).write_text(text)
     params = parameters({"elements": name}, **rest)
     prefix = f"parameters.satellites.elements: {folder}/"
-    found = find_faults(params, count, folder, (), duration_s)
+    found = find_faults(params, count, folder, duration_s=duration_s)
     return [fault.removeprefix(prefix) for fault in found]
 
 

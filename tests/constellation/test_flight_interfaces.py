@@ -291,6 +291,40 @@ def test_datagrams_go_to_a_place_that_is_known(tmp_path):
     board.close()
 
 
+def test_lines_that_name_their_tick_are_for_it_though_datagrams_are_lost(tmp_path):
+    board = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    board.bind(("127.0.0.1", 0))
+    transport = {
+        "kind": "udp",
+        "local": "127.0.0.1:0",
+        "remote": f"127.0.0.1:{board.getsockname()[1]}",
+    }
+
+    def answer_but_every_third():
+        while True:
+            data, sender = board.recvfrom(65536)
+            if not data:
+                return
+            told = json.loads(data)
+            if "t_s" in told and round(told["t_s"] * HZ) % 3 != 1:
+                board.sendto(b'{"t_s":%r}\n' % told["t_s"], sender)
+
+    thread = threading.Thread(target=answer_but_every_third, daemon=True)
+    thread.start()
+    flight = attached(transport, "json_lines")
+    with Attached(tmp_path, None, flight=flight, is_lockstep=False) as ship:
+        answered(ship, 20)
+        ship._next += -ship._next % 3  # one that is answered
+        answered(ship, 21)
+        summary = ship.agent._cockpit._software._interface_summary()
+    thread.join(20)
+    board.close()
+
+    assert summary["ticks_unanswered"] >= 9
+    ticks = [row[0] for row in ship.context.records["flight_answers"]]
+    assert {tick % 3 for tick in ticks} == {0, 2}
+
+
 def test_software_that_never_comes_is_named(tmp_path):
     transport = {"kind": "tcp", "address": "127.0.0.1:0", "listen": True}
     flight = attached(transport, start_s=0.2)

@@ -17,8 +17,9 @@ from madns_runtime.errors import BlamedError
 from madns_runtime.plugin.api import Tick
 from madns_runtime.simulations.constellation.agent import ConstellationAgent
 from madns_runtime.simulations.constellation.flight import process
+from madns_runtime.simulations.constellation.flight.asked_ticks import UNANSWERED_MAX
 from madns_runtime.simulations.constellation.flight.interface import program as flight_program
-from madns_runtime.simulations.constellation.flight.process import LATE_CHECK, UNANSWERED_MAX
+from madns_runtime.simulations.constellation.flight.process import LATE_CHECK
 from madns_runtime.simulations.constellation.messages import (
     Command,
     CommandResult,

@@ -98,7 +98,9 @@ def test_a_rate_divides_the_ticks_or_is_a_multiple_of_theirs(rate_hz, expected):
 def test_a_rate_without_a_whole_ratio_is_refused(tmp_path, fly, rate_hz, words):
     (tmp_path / "logger.py").write_text(LOGGER)
     given = parameters(flight={"software": "logger.py:Logger", "rate_hz": rate_hz})
-    faults = find_faults(given, 1, tmp_path, ("a",), 10.0, True, 10.0)
+    faults = find_faults(
+        given, 1, tmp_path, names=("a",), duration_s=10.0, is_lockstep=True, tick_hz=10.0
+    )
 
     assert [fault for fault in faults if fault.startswith("parameters.flight.rate_hz: ")]
     assert any(words in fault for fault in faults)

@@ -45,7 +45,7 @@ def test_what_stands_for_nothing_is_found():
 
 def faults(tmp_path, flight, **more):
     (tmp_path / "guidance.py").write_text("class G:\n    def step(self, t_s, readings): ...\n")
-    return find_faults(parameters(WALKER, flight=flight), 2, tmp_path, AGENTS, 0.0, **more)
+    return find_faults(parameters(WALKER, flight=flight), 2, tmp_path, names=AGENTS, **more)
 
 
 def program(**rest):

@@ -134,7 +134,7 @@ def test_times_are_equal_and_a_late_call_makes_up_for_nothing():
 def test_record_of_slots_that_nobody_has_is_refused(tmp_path, flight, expected):
     asked = parameters(flight=flight, record={"slots_hz": 0.01})
 
-    found = find_faults(asked, 2, tmp_path, ("agent-1", "agent-2"))
+    found = find_faults(asked, 2, tmp_path, names=("agent-1", "agent-2"))
 
     assert [each for each in found if re.match(r"parameters\.record\.slots_hz: ", each)] == [
         each for each in found if expected in each

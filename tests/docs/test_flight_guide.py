@@ -15,7 +15,7 @@ from guides import ROOT, blocks, row_keys, spans
 from madns_runtime.recording import text_file
 from madns_runtime.simulations.constellation import interface_settings
 from madns_runtime.simulations.constellation.equipment import SensorNoise, Sensors
-from madns_runtime.simulations.constellation.flight import process
+from madns_runtime.simulations.constellation.flight import asked_ticks, process
 from madns_runtime.simulations.constellation.flight.api import FlightContext, FlightSoftware
 from madns_runtime.simulations.constellation.flight.interface.content import BY_NUMBER
 from madns_runtime.simulations.constellation.flight.interface.json_lines import KEYS
@@ -148,7 +148,7 @@ def test_its_bounds_are_those_of_the_code():
     assert f"At most {commands.COMMANDS_PER_TICK_MAX} commands" in GUIDE
     assert f"{flight_context.MESSAGES_PER_TICK_MAX} messages a tick" in GUIDE
     assert f"{flight_context.PAYLOAD_BYTES_MAX:,} bytes a message" in GUIDE
-    assert f"{process.UNANSWERED_MAX} ticks unanswered" in GUIDE
+    assert f"{asked_ticks.UNANSWERED_MAX} ticks unanswered" in GUIDE
     text = " ".join(GUIDE.split())
     assert f"`agents/NAME/{process.STDERR_TEXT}.txt`" in text
     assert f"{text_file.HEAD_BYTES >> 20} MiB and the last {text_file.TAIL_BYTES >> 10} KiB" in text

@@ -21,6 +21,7 @@ BEST, RELIABLE = Service.BEST, Service.RELIABLE
 def rule(word, agents=("a",), number=1, **parameters):
     return MessageRule(
         number=number,
+        chance=number,
         word=word,
         agents=frozenset(agents),
         parameters={"traffic": "all"} | parameters,

@@ -215,3 +215,67 @@ def test_a_detached_run_takes_faults_and_ends_by_the_name_of_a_lost_device(tmp_p
     assert '"target":"agent-02/tank","action":"bias","value":1000000.0,"refusal":""' in told
     assert '"device":"agent-02/tank","status":"lost"' in told
     assert not (folder / ".orders.sock").exists()
+
+
+FLOOD = """
+import os, time
+
+from madns_runtime.hardware.contract import Channel, Device, DeviceKind, Sample
+
+
+class Flood(Device):
+    kind = DeviceKind(
+        name="flood",
+        summary="a device that has more frames than anybody keeps",
+        needs_hardware=False,
+        channels=(Channel(name="received", is_frame=True, passing="queue"),),
+    )
+
+    def open(self):
+        self.left, self.signal = 30_000, os.eventfd(1)
+        return "flood-1"
+
+    def fileno(self):
+        return self.signal
+
+    def read(self):
+        if not self.left:
+            return None
+        self.left -= 1
+        if not self.left:
+            os.eventfd_read(self.signal)
+        return Sample(values={"received": b"frame"}, taken_s=time.monotonic())
+
+    def close(self):
+        os.close(self.signal)
+"""
+UNHEARD = """
+name: unheard
+simulation: counter
+agents: {count: 1, tick_hz: 10}
+time: {duration_s: 3}
+hardware:
+  on_device_loss: continue
+  lost: 9
+  stale_ratio: 1
+  devices: [{name: line, kind: "./flood.py:Flood", rate_hz: 10}]
+"""
+
+
+def test_frames_that_an_agent_does_not_take_are_told_by_it_and_in_the_verdict(tmp_path):
+    (tmp_path / "flood.py").write_text(FLOOD)
+    (tmp_path / "unheard.yaml").write_text(UNHEARD)
+    cosmos = CosmosCommand(tmp_path)
+
+    code, document = cosmos.run(tmp_path / "unheard.yaml", *LOOSE, options=("--no-report",))
+
+    assert code == 0, document["verdict"]
+    missed = document["devices"]["agent-01/line"]["counts"]["frames_missed"]
+    assert 10_000 < missed <= 20_000
+    told = f"agent-01: device agent-01/line: there was no room for all: frames_missed {missed}"
+    assert told in document["remarks"]
+    agent = cosmos.directory(document) / "agents" / "agent-01"
+    assert f'"device_losses","device":"agent-01/line","frames_missed":{missed}' in (
+        agent / "events.jsonl"
+    ).read_text("utf-8")
+    assert f"frames_missed {missed}" in (agent / "log.jsonl").read_text("utf-8")

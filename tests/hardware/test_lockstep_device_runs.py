@@ -283,6 +283,8 @@ def test_frames_between_two_ticks_come_whole_or_are_counted(tmp_path, tick_hz, t
     events = rows(folder / "agents" / "agent-01" / "events.jsonl")
     losses = [each["frames_dropped"] for each in events if each["event"] == "device_losses"]
     assert losses == ([dropped] if dropped else [])
+    told = f"agent-01: device line: there was no room for all: frames_dropped {dropped}"
+    assert (told in run["remarks"]) == bool(dropped)
 
 
 WRITER = """

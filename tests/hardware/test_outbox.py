@@ -3,8 +3,13 @@
 import time
 
 from madns_runtime.hardware import messages, outbox
+from madns_runtime.hardware.count_table import TABLE_BYTES, CountTable, missed_name
 from madns_runtime.hardware.outbox import UserOutbox
 from madns_runtime.reactor.reactor import Reactor
+
+
+def counts_in_memory():
+    return CountTable(memoryview(bytearray(TABLE_BYTES)))
 
 
 def run(reactor, seconds):
@@ -15,7 +20,7 @@ def run(reactor, seconds):
 def test_what_finds_no_room_arrives_later_and_in_order():
     reactor = Reactor()
     agent, device = messages.make_pair()
-    box = UserOutbox({"agent-01": device}, reactor)
+    box = UserOutbox({"agent-01": device}, reactor, counts_in_memory())
 
     assert sum(box.send([messages.FRAME, number]) for number in range(5000)) == 0
     got = [number for _, number in messages.receive_all(agent)]
@@ -32,7 +37,7 @@ def test_what_finds_no_room_arrives_later_and_in_order():
 def test_what_comes_while_others_wait_does_not_put_them_off():
     reactor = Reactor()
     agent, device = messages.make_pair()
-    box = UserOutbox({"agent-01": device}, reactor)
+    box = UserOutbox({"agent-01": device}, reactor, counts_in_memory())
     sent = 0
     deadline_s = time.monotonic() + 20
     while sent < 3000:
@@ -54,10 +59,16 @@ def test_who_never_takes_anything_loses_a_counted_number(monkeypatch):
     monkeypatch.setattr(outbox, "WAITING_MAX", 10)
     reactor = Reactor()
     agent, device = messages.make_pair()
-    box = UserOutbox({"agent-01": device}, reactor)
+    counts = counts_in_memory()
+    taking, taken_from = messages.make_pair()
+    box = UserOutbox({"agent-01": device, "agent-02": taken_from}, reactor, counts)
 
-    lost = sum(box.send([messages.FRAME, number]) for number in range(5000))
+    lost = 0
+    for number in range(5000):
+        lost += box.send([messages.FRAME, number])
+        list(messages.receive_all(taking))
     taken = len(list(messages.receive_all(agent)))
     reactor.close()
 
     assert lost == 5000 - taken - 10
+    assert counts.read() == {missed_name("agent-01"): lost}

@@ -8,6 +8,7 @@ import pytest
 from madns_runtime.config import Recording
 from madns_runtime.hardware import messages, port
 from madns_runtime.hardware.contract import Channel
+from madns_runtime.hardware.count_table import missed_name
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.port import DevicePort, Hardware
 from madns_runtime.hardware.status import StatusLimits
@@ -36,6 +37,7 @@ def device(monkeypatch):
         shared=(DevicePage([CHANNELS[0]]), ours),
         limits=StatusLimits.of(0.1, 1.0),
         now_s=lambda: 0.0,
+        agent="agent-01",
     )
     with ours, theirs:
         yield made, theirs
@@ -50,6 +52,15 @@ def test_frames_that_nobody_takes_are_counted(device):
     assert made.losses() == {"frames_dropped": 3}
 
 
+def test_frames_that_did_not_even_come_are_told_by_the_agent_that_did_not_take_them(device):
+    made, _ = device
+    counts = made._page.counts
+    counts.add(missed_name("agent-01"), 7)
+    counts.add(missed_name("agent-02"), 5)
+
+    assert made.losses() == {"frames_missed": 7}
+
+
 def test_what_a_device_has_no_room_for_is_counted(device):
     made, _ = device
     for _ in range(WRITES_MAX):
@@ -59,7 +70,10 @@ def test_what_a_device_has_no_room_for_is_counted(device):
     for number in range(port.PACKS_MAX + 3):
         made.play("level", [(float(number), 1.0), (number + 0.5, 2.0)], from_s=float(number))
 
-    assert made.losses() == {"writes_lost": 1, "points_lost": 6}
+    made.write("level", 3.0)
+
+    left = {"writes_left": 1, "points_left": 2 * port.PACKS_MAX}
+    assert made.losses() == {"writes_lost": 1, "points_lost": 6, **left}
     assert Hardware({"line": made}).losses() == {"pi22/line": made.losses()}
 
 

@@ -126,6 +126,23 @@ def test_check_with_a_fifth_parameter_duration_s_is_given_the_runs_duration(plug
     assert found == ["('a',) 60.0"]
 
 
+def test_check_is_given_by_name_what_it_takes_by_name_alone(plugin):
+    path = plugin(
+        "def check(p, n, base, *, tick_hz, names, other=7): return [f'{names} {tick_hz} {other}']"
+    )
+    where = f"{path}:check"
+
+    found = ask_check(where, path.parent, parameters=None, agents=1, names=("a",), tick_hz=5.0)
+
+    assert found == ["('a',) 5.0 7"]
+
+
+def test_check_by_name_that_raises_is_told_with_its_line(plugin):
+    path = plugin("def check(p, n, base, *, names):\n    raise ValueError('late')\n")
+
+    assert refusal(path, "check") == f"{path}:{LAST_LINE + 2}: check(): ValueError: late"
+
+
 def test_check_that_raises_while_it_yields_is_told_with_its_line(plugin):
     path = plugin("def check(*_):\n    yield 'a: b'\n    raise ValueError('late')\n")
 
@@ -140,6 +157,14 @@ def test_check_that_raises_while_it_yields_is_told_with_its_line(plugin):
         ("return 2 * [D(role='host', name='a', fields=())]", "which belongs to another of them"),
         ("return [D(role='chief', name='a', fields=())]", "of role host or agent, got ('chief'"),
         ("return [D(role='host', name='a', fields=(3,))]", "fields as a tuple of Field, got (3,)"),
+        (
+            "return [D(role=r, name=n, fields=()) for r, n in (('host', 'a'), ('agent', 'host_a'))]",
+            "'host_a', whose table would be that of the host's stream 'a'",
+        ),
+        (
+            "return [D(role='agent', name='machine_health', fields=())]",
+            "would be that of the machine's stream 'health'",
+        ),
     ],
 )
 def test_streams_that_are_no_declaration_are_told(plugin, body, told):

@@ -58,6 +58,20 @@ def test_a_lockstep_run_ends_at_the_tick_that_breaks_it_and_repeats_to_the_bit(r
     assert {each["delay_s"] for each in met} == {0.0}
 
 
+def test_a_count_that_ends_a_run_goes_on_when_its_agent_is_started_anew(run):
+    few = "{name: few, stream: round_trips, statistic: count, agents: [agent-01], below: 40, stop_when_broken: true}"
+    code, document = run(
+        "lockstep",
+        few,
+        settings=("agents.restarts_max=1", "on_agent_loss=continue"),
+        timeline="timeline: [{at_s: 1, action: restart, agents: [agent-01]}]\n",
+    )
+
+    assert (code, document["status"], of_name(document, "few")["got"]) == (4, "broken", 40)
+    folder = run.cosmos.directory(document) / "agents" / "agent-01"
+    assert (folder / "round_trips.2.jsonl").exists()
+
+
 def test_a_run_in_real_time_ends_as_soon_as_the_host_has_heard(run):
     code, document = run("realtime", STOPS)
 

@@ -105,7 +105,8 @@ def test_firmware_answers_at_100_hz_what_its_processor_lets_it(cosmos):
         flight = document["simulation"]["agents"][agent]["flight"]
         # Where three emulators do not get their processors ticks are skipped, and the last answers come too late.
         assert flight["unanswered"] == 0 or flight["ticks_skipped"] > 0
-        assert flight["answers"] + flight["unanswered"] == flight["ticks_sent"]
+        given_up = flight["interface"]["ticks_unanswered"]
+        assert flight["answers"] + flight["unanswered"] + given_up == flight["ticks_sent"]
         assert flight["ticks_sent"] + flight["ticks_skipped"] == 2000
         assert set(faults_of(document, agent).values()) == {0}
         assert len(records(folder, "flight_answers", agent)) == flight["answers"]

@@ -9,7 +9,7 @@ from madns_runtime.timeline.runner import OrderedAction, TimelineRunner
 
 KINDS = {
     word: ActionKind(word=word, summary="", lasting=lasting)
-    for word, lasting in (("kill", "may"), ("annotate", "never"))
+    for word, lasting in (("kill", "may"), ("annotate", "never"), ("live", "never"))
 }
 
 
@@ -105,3 +105,37 @@ def test_orders_take_place_at_once() -> None:
 
     assert refusal == ""
     assert handler.calls == [("begin", "kill", 12.0)]
+
+
+def chances_of(*entries: ScheduledEntry, live_s: float | None = None) -> dict[str, list[int]]:
+    """Return what the chance of each action hangs on, by word, with one that is ordered live or without."""
+    found: dict[str, list[int]] = {}
+
+    class Chances:
+        def begin(self, action: TimelineAction) -> None:
+            found.setdefault(action.word, []).append(action.chance)
+
+        def end(self, action: TimelineAction) -> None:
+            pass
+
+    dispatcher = Dispatcher(dict.fromkeys(KINDS, Chances()), lambda event, **values: None)
+    runner = TimelineRunner(entries, KINDS, dispatcher, seed=1, duration_s=100.0)
+    if live_s is not None:
+        runner.run_due(live_s)
+        assert runner.order(OrderedAction(word="live", parameters={}), live_s) == ""
+    runner.run_due(99.0)
+    return found
+
+
+def test_chance_of_an_action_hangs_on_no_other_that_takes_place() -> None:
+    stands_for = ScheduledEntry(action="annotate", at_s=1.0)
+    often = ScheduledEntry(action="annotate", every_s=0.5)
+    killing = ScheduledEntry(action="kill", every_s=40.0, agents=("a",), for_s=1.0)
+
+    alone = chances_of(stands_for, killing)["kill"]
+
+    assert len(set(alone)) == 3
+    assert chances_of(stands_for, killing, live_s=5.0)["kill"] == alone
+    assert chances_of(often, killing)["kill"] == alone
+    told = chances_of(stands_for, killing, live_s=5.0)
+    assert len({each for own in told.values() for each in own}) == 5

@@ -29,6 +29,7 @@ from cosmos_cli.evidence.expectations.outcomes import (
     worst_result,
 )
 from cosmos_cli.evidence.expectations.records import Batch, RecordSource
+from cosmos_cli.evidence.expectations.seen_words import SeenWords
 from cosmos_cli.evidence.verdict import CheckResult
 from cosmos_cli.models.expectation import Expectation, scaled
 from cosmos_cli.models.known_streams import REAL_TIME_ONLY
@@ -53,10 +54,13 @@ class JudgedExpectations:
     """Of those that were judged, in their order."""
     not_judged: Mapping[str, str] = field(default_factory=dict)
     """By name of the others: why."""
+    unseen: tuple[str, ...] = ()
+    """Remarks on words that are looked for and that no record has, where any may come: they may be misspelt."""
 
     def remarks(self) -> tuple[str, ...]:
-        """Return a remark per expectation that was not judged."""
-        return tuple(f"{name}: not judged: {why}" for name, why in self.not_judged.items())
+        """Return a remark per expectation that was not judged, and per event whose word is nowhere."""
+        told = (f"{name}: not judged: {why}" for name, why in self.not_judged.items())
+        return (*told, *self.unseen)
 
     def told_not_judged(self) -> list[dict[str, str]]:
         """Return the same as run.json holds it."""
@@ -108,6 +112,7 @@ def judge_expectations(
     return JudgedExpectations(
         results=tuple(results),
         not_judged={each.name: _of_other_mode(each) for each in expectations if each not in judged},
+        unseen=tuple(filter(None, (each.words.remark() for each in followed))),
     )
 
 
@@ -151,6 +156,7 @@ class _Followed:
         self._factor = factor or 1.0
         self.unit = self._unit(recorded)
         self._accumulators: dict[str, Accumulator] = {}
+        self.words = SeenWords(expectation)
         self._held: HeldTimes | None = None
         if expectation.meanwhile is not None:
             try:
@@ -175,6 +181,7 @@ class _Followed:
     def take(self, batch: Batch) -> None:
         """Take a batch of records that have its field."""
         expectation = self.expectation
+        self.words.take(batch.values)
         wanted = np.ones(len(batch.t_s), bool)
         if expectation.from_s is not None:
             wanted &= batch.t_s >= expectation.from_s

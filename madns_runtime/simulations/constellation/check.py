@@ -39,10 +39,11 @@ FAULTS_MAX = 20
 """Satellites that are named."""
 
 
-def find_faults(  # noqa: PLR0913 - what a scenario is; see plugin.api.Simulation.check
+def find_faults(  # noqa: PLR0913 - what a scenario is, most by name; see plugin.api.Simulation.check
     parameters: ConstellationParameters,
     agents: int,
     base_directory: Path,
+    *,
     names: tuple[str, ...] = (),
     duration_s: float = 0.0,
     is_lockstep: bool = False,

@@ -2,6 +2,7 @@
 
 import json
 import signal
+import sys
 
 import psutil
 import pytest
@@ -10,9 +11,11 @@ from harness.waiting import wait_until
 
 from cosmos_cli.app import run as cosmos
 from cosmos_cli.bench import floor
+from cosmos_cli.doctor.probe import Responder
 from cosmos_cli.fleet.connection import Connection
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.local import LocalConnection
+from cosmos_cli.fleet.target import Target
 
 pytestmark = pytest.mark.process
 
@@ -101,6 +104,24 @@ def test_refused_fifo_is_told_in_the_table():
         "100",
         "SCHED_FIFO: Operation not permitted",
     )
+
+
+def test_floor_leaves_out_the_network_of_a_machine_whose_way_here_is_not_known(monkeypatch):
+    monkeypatch.setattr(LocalConnection, "own_address", "")  # as through a ProxyCommand
+    target = Target(name="pi01", address="pi01", connection="local", python=sys.executable)
+    said = []
+    with Responder() as responder:
+        told = floor.measure_floor(
+            LocalConnection(target), 0.02, responder=responder, say=said.append
+        )
+
+    network = [each for each in told if each["way"] == "network"]
+    assert [each["sent"] for each in network] == [0, 0]
+    assert all("cosmos_host_address" in each["error"] for each in network)
+    assert len([text for text in said if "not measured: through a ProxyCommand" in text]) == 2
+    rows = list(floor.rows_of("pi01", told))
+    assert len(rows) == 6
+    assert "through a ProxyCommand" in rows[-1][4]
 
 
 OF_A_MOMENT = ("vars.trip_ms_max=60000", "vars.sd_ms_max=60000", "vars.trips_hz_min=0")

@@ -217,3 +217,48 @@ def test_unknown_run_is_bad_input(made, capsys):
     assert app.run(["collect", "9"]) == 2
 
     assert "0001-synthetic" in capsys.readouterr().err
+
+
+def of_newer_schema(path):
+    document = json.loads(path.read_text())
+    path.write_text(json.dumps(document | {"schema": 2, "versions": {"cosmos-madns": "9.1"}}))
+
+
+@pytest.mark.parametrize("name", ["run.json", "manifest.json"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["collect", "1"],
+        ["report", "1"],
+        ["judge", "1"],
+        ["tabulate", "1"],
+        ["diff", "1", "1"],
+        ["rerun", "1"],
+        ["logs", "1"],
+        ["inject", "1", "--list"],
+    ],
+    ids=lambda command: command[0],
+)
+def test_run_of_a_newer_program_is_refused_and_left_as_it_is(made, capsys, command, name):
+    finish(made)
+    path = made.run.path / name
+    of_newer_schema(path)
+    before = path.read_bytes()
+
+    code = app.run(command)
+
+    told = capsys.readouterr().err
+    assert code == 2
+    assert f"{name}: schema 2 is of a newer COSMoS (9.1), this one knows 1" in told
+    assert "upgrade cosmos-madns" in told
+    assert path.read_bytes() == before
+
+
+def test_runs_tells_of_a_run_of_a_newer_program(made, capsys):
+    finish(made)
+    of_newer_schema(made.run.run_json)
+
+    assert app.run(["runs", "--json"]) == 0
+
+    (entry,) = json.loads(capsys.readouterr().out)
+    assert entry["verdict"].startswith("run.json: schema 2 is of a newer COSMoS (9.1)")

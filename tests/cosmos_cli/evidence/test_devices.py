@@ -9,7 +9,13 @@ from typing import Any
 import pytest
 
 from cosmos_cli.collect.machine_sources import RecordingMachines
-from cosmos_cli.evidence.devices import NO_REPORT, device_checks, read_devices
+from cosmos_cli.evidence.devices import (
+    LOSSES_TOLD_MAX,
+    NO_REPORT,
+    device_checks,
+    device_loss_remarks,
+    read_devices,
+)
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import find_streams
 from madns_runtime.config import HardwareSettings
@@ -179,3 +185,31 @@ def test_without_a_stimulus_there_is_no_check_of_one(tmp_path: Path) -> None:
         for name in judged(read_devices(RunDirectory(tmp_path), PLAN, None))
         if "stimulus" in name
     ]
+
+
+def test_what_found_no_room_between_devices_and_agents_is_remarked_once() -> None:
+    agents = {
+        "agent-01": {"records": {"device_losses": {"pi22/imu": {"frames_missed": 7}}}},
+        "agent-02": {"records": {"device_losses": {"line": {"frames_dropped": 3}}}},
+        "agent-03": {"records": "?"},
+    }
+    devices = {
+        "pi22/imu": {"counts": {"frames_missed": 7}},
+        "agent-02/line": {"counts": {"frames_missed": 2}},
+        "pi22/gps": {"counts": {"frames_missed": 5, "writes_lost": 1}},
+        "pi22/can": {"counts": {"writes_lost": 1}},
+    }
+
+    assert device_loss_remarks(agents, devices) == (
+        "agent-01: device pi22/imu: there was no room for all: frames_missed 7",
+        "agent-02: device line: there was no room for all: frames_dropped 3",
+        "device pi22/gps: agents did not take all in time: frames_missed 5",
+    )
+
+
+def test_remarks_on_losses_are_bounded() -> None:
+    lost = {"device_losses": {"line": {"writes_lost": 1}}}
+    remarks = device_loss_remarks({f"agent-{n}": {"records": lost} for n in range(50)}, {})
+
+    assert len(remarks) == LOSSES_TOLD_MAX + 1
+    assert remarks[-1] == "30 more losses between devices and agents"

@@ -519,3 +519,53 @@ def test_an_event_of_an_agent_may_come_after_one_of_its_device():
     ).results
 
     assert [(each.got, each.passed) for each in results] == [(4.0, True), (5.0, True), (5.0, False)]
+
+
+RADIO = FakeTable(
+    "radio",
+    (Field("t_s", "s"), Field("event", "", "str")),
+    {
+        "a": {"t_s": np.array([1.0, 2.0]), "event": objects(["refused", "sent"])},
+        "b": {"t_s": np.array([3.0]), "event": objects(["\x1b[2Jheard"])},
+    },
+)
+
+
+def remarks_on(tables=RADIO, **values):
+    given = {"name": "calm", "stream": tables.name, "field": "event", "must": "not_occur"}
+    return judge(expect(**(given | values)), tables={tables.name: tables}).remarks()
+
+
+def test_a_word_that_must_not_occur_and_is_nowhere_is_told_with_those_that_are():
+    assert remarks_on(event="refusd") == (
+        "calm: no record of radio has 'refusd' in event, did you mean refused?",
+    )
+    assert remarks_on(event="lost") == (
+        "calm: no record of radio has 'lost' in event; words seen: \\x1b[2Jheard, refused, sent",
+    )
+
+
+def test_a_word_that_is_counted_or_must_occur_is_told_likewise():
+    count = {"must": "occur", "statistic": "count", "bounds": ValueBounds.below(1.0)}
+    (told,) = remarks_on(**count, when=ValueBounds.equals("refusd"))
+
+    assert told.endswith("has 'refusd' in event, did you mean refused?")
+    assert remarks_on(**count, when=ValueBounds.equals("refused")) == ()
+    assert len(remarks_on(event="lost", must="occur")) == 1
+
+
+def test_a_word_that_is_there_or_could_not_be_otherwise_is_no_remark():
+    assert remarks_on(event="refused") == ()
+    assert remarks_on(event="refused", from_s=1.5) == (), "it is a word of the stream"
+    assert remarks_on(EVENTS, event="lost") == (), "validate knows the words of events"
+    nothing = FakeTable("radio", RADIO.fields, {"a": {"t_s": np.array([]), "event": objects([])}})
+    assert remarks_on(nothing, event="lost") == ()
+
+
+def test_of_very_many_words_few_are_told():
+    words = [f"word{number:04d}" for number in range(5000)]
+    many = {"a": {"t_s": np.arange(5000.0), "event": objects(words)}}
+    (told,) = remarks_on(FakeTable("radio", RADIO.fields, many), event="quiet")
+
+    assert told.count("word0") == 10
+    assert told.endswith("others")

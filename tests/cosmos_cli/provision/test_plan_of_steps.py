@@ -98,8 +98,13 @@ ROOTED = plan_steps(facts_of(), wanted(variables={"cosmos_wifi": False, "cosmos_
 ROOTLESS = plan_steps(facts_of(files={f"{HOME}/cosmos": None}), wanted())
 
 
-def test_plan_without_steps_is_possible_on_any_machine():
-    check_possible(facts_of(disk={"is_read_only": True, "free_bytes": 0}, sudo=False), ())
+def test_plan_without_steps_needs_no_room_and_no_root():
+    check_possible(facts_of(disk={"free_bytes": 0}, sudo=False), ())
+
+
+def test_disk_that_takes_no_records_is_refused_though_nothing_is_to_be_done():
+    assert refused((), disk={"is_read_only": True})[0] == "read_only"
+    assert refused((), disk={"is_writable": False})[0] == "step"
 
 
 def test_plan_without_root_needs_none():
@@ -166,6 +171,7 @@ def test_slow_answer_makes_no_clock_wrong():
         ({"clock": {"utc_s": 1000.5 + 30}}, {}, ("30 s ahead of this computer's",)),
         ({"throttled": 0x50005}, {}, ("its supply voltage is too low and it is throttled",)),
         ({"throttled": 0x50000}, {}, ()),
+        ({"disk": {"free_bytes": 3_000_000}}, {}, ("3 MB are free on /home/pi: records of a run",)),
         ({}, {"cosmos_realtime_priority": 50}, ("is granted real-time priority 0, not 50",)),
         ({"uses_pam": False}, {"cosmos_realtime_priority": 50}, ("set `UsePAM yes` in",)),
         ({"uses_pam": True}, {"cosmos_realtime_priority": 50}, ("perhaps pam_limits is missing",)),

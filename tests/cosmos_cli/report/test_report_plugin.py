@@ -14,6 +14,7 @@ from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.report.build import build_sections, with_simulation
 from madns_runtime.analysis.values import Figure, ReportRemark, TableBlock
 from madns_runtime.config import Timeouts
+from madns_runtime.plugin.kept_names import KEPT_NAMES
 from madns_runtime.recording.records import Field, StreamSchema
 
 pytestmark = pytest.mark.process  # code that is not shipped is asked in a fork
@@ -198,6 +199,7 @@ def test_arrays_and_numbers_that_are_not_finite_are_lists_and_null_in_the_json(
     compared = json.loads(capsys.readouterr().out)
 
     assert {name: told[name] for name in PLAIN} == compared["rover"] == PLAIN
+    assert set(compared) == {"rover", *KEPT_NAMES}, "no simulation may be called like a key"
 
 
 @pytest.mark.parametrize(
@@ -230,11 +232,14 @@ def test_numbers_of_a_simulation_stand_in_the_json_and_never_over_the_run_s_own(
         "    return {'driven_m': 5.0, 'verdict': 'fine'}"
     )
     document = made.run.read_json(made.run.run_json)
+    warnings = []
 
-    told = with_simulation(made.run, document, pytest.fail)
+    told = with_simulation(made.run, document, warnings.append)
 
     assert told["driven_m"] == 5.0
     assert told["verdict"] == document["verdict"]
+    (warning,) = warnings
+    assert "rover.py:simulation tells verdict, which run.json has" in warning
 
 
 @pytest.mark.parametrize(

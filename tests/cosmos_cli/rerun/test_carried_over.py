@@ -52,7 +52,13 @@ def test_a_run_in_real_time_that_ended_early_ends_again_with_its_last_tick(flown
     found = carried_over(flown(20.2))
 
     entries = found.values()["timeline"]
-    assert [entry["action"] for entry in entries] == ["hang", "annotate", "kill", "stop"]
+    assert [entry["action"] for entry in entries] == [
+        "hang",
+        "annotate",
+        "annotate",
+        "kill",
+        "stop",
+    ]
     assert entries[0]["at_s"] == 3
     assert entries[1] == {
         "rate_per_h": 60,
@@ -70,6 +76,7 @@ def test_a_run_in_real_time_that_came_to_its_end_is_not_stopped(flown):
     assert [e["action"] for e in carried_over(flown(59.9)).values()["timeline"]] == [
         "hang",
         "annotate",
+        "annotate",
         "kill",
     ]
 
@@ -85,7 +92,7 @@ def test_what_is_refused_is_left_out_and_told_by_its_place_on_record(flown):
     found = carried_over(flown(59.9))
 
     first = found.leave_out(
-        InputError(faults=[Fault(text="no station", path="timeline[2].station")])
+        InputError(faults=[Fault(text="no station", path="timeline[3].station")])
     )
     second = found.leave_out(InputError(faults=[Fault(text="no stream", path="checks[0].stream")]))
     other = found.leave_out(InputError(faults=[Fault(text="no gain", path="parameters.gain")]))
@@ -96,6 +103,34 @@ def test_what_is_refused_is_left_out_and_told_by_its_place_on_record(flown):
         "checks[0] (few): left out: no stream",
     ]
     assert (found.left_out, found.loses_agents, found.checks) == (["kill"], False, {})
+
+
+CONDITIONAL = """\
+name: flown
+simulation: counter
+agents: {count: 2, tick_hz: 10}
+time: {duration_s: 60}
+timeline:
+  - {when: {stream: ticks, field: tick, above: 5}, action: kill, agents: [agent-01], for_s: 1}
+  - {at_s: 5, action: stop}
+  - {at_s: 6, action: lose_messages, agents: ["*"], probability: 0.5, for_s: 1}
+"""
+
+
+def test_a_remark_keeps_the_place_of_what_is_left_out_by_which_chance_is_drawn(flown):
+    found = carried_over(flown(59.9, text=CONDITIONAL))
+    refused = InputError(faults=[Fault(text="no ticks in lockstep", path="timeline[0].when")])
+
+    assert found.leave_out(refused)
+
+    first, second, third = found.values()["timeline"]
+    assert first == {"at_s": 0.0, "for_s": 1, "action": "annotate", "text": "on record: kill"}
+    assert second == {"at_s": 5, "action": "annotate", "text": "on record: stop"}
+    assert third["action"] == "lose_messages"
+    assert found.left_out == ["kill"]
+    assert found.leave_out(refused)  # what can stand at no time at all
+    assert len(found.values()["timeline"]) == 2
+    assert (found.left_out, len(found.remarks)) == (["kill"], 1)
 
 
 def test_a_run_whose_scenario_cannot_be_read_says_so(flown):

@@ -20,8 +20,8 @@ from madns_runtime.errors import BlamedError
 from madns_runtime.hardware.clock import DeviceClock
 from madns_runtime.plugin.api import AgentContext
 from madns_runtime.simulations.constellation.flight.api import FlightContext, Readings
+from madns_runtime.simulations.constellation.flight.asked_ticks import AskedTick, AskedTicks
 from madns_runtime.simulations.constellation.flight.interface.answers import (
-    TIME_TOLERANCE_S,
     FlightAnswer,
     carry_out,
     shown,
@@ -48,8 +48,6 @@ STDERR_TEXT = "flight_stderr"
 """Name of the text that keeps a program's standard error, beside the agent's records."""
 UNMEASURED_S = 0.25
 """In lockstep the first part of the wait for an answer is not measured, and does not count."""
-UNANSWERED_MAX = 64
-"""Ticks under way to the program in real time; further ones are not sent and counted."""
 MAIL_MAX = 1024
 """Messages, results, and refusals, that wait for the next tick that is sent; older ones are dropped and counted."""
 CLOCK_S = 1.0
@@ -84,16 +82,12 @@ class ExternalFlight:
         self._present_s: Callable[[], float] = agent.now_s if is_simulated else monotonic
         self._is_recorded = interface is not None and not agent.is_lockstep
         """Whether what depends on this computer's clock is recorded: nothing is in lockstep."""
-        self._asked: deque[tuple[float, float]] = deque()
-        """Ticks without an answer: when they were sent, by the computer's clock, and their times."""
         self._mail: dict[str, deque[Any]] = {
             name: deque(maxlen=MAIL_MAX) for name in ("messages", "results", "refusals")
         }
         self._answer_s_max = 0.0
         self._listened_s = 0.0
         """Time at which answers were taken last."""
-        self._begun_s = -math.inf
-        """Time of its first answer: what it had to do before that is no lateness of the ticks asked meanwhile."""
         self._counts = {
             "ticks_sent": 0,
             "ticks_skipped": 0,
@@ -101,8 +95,6 @@ class ExternalFlight:
             "answers_late": 0,
             "mail_dropped": 0,
         }
-        self._ticks_unanswered = 0
-        """Ticks that later ones were answered before."""
         self._answers_unasked = 0
         """Answers to no tick that waits for one."""
         self._clock = DeviceClock()
@@ -121,7 +113,6 @@ class ExternalFlight:
         folder = self._agent.base_directory
         name = interface.protocol if interface else "json_lines"
         self._protocol: FlightProtocol = make_protocol(name, folder)
-        self._by_time: bool = getattr(self._protocol, "answers_by_time", True)
         self._link = FlightLink(
             settings,
             folder,
@@ -132,6 +123,11 @@ class ExternalFlight:
                 "satellite": context.satellite,
             },
             is_lockstep=self._is_lockstep,
+        )
+        self._asked = AskedTicks(
+            settings.answer_s,
+            by_time=getattr(self._protocol, "answers_by_time", True),
+            may_lose=self._link.transport.may_lose,
         )
         if self._is_recorded:
             self._agent.open_stream("flight_answers", FLIGHT_ANSWERS)
@@ -195,7 +191,7 @@ class ExternalFlight:
         """End the program, and return what came of it; in real time what was late is judged."""
         if not self._is_lockstep:
             self._await_last()
-        overdue = sum(self._is_late(sent_s, self._listened_s) for sent_s, _ in self._asked)
+        overdue = self._asked.count_overdue(self._listened_s)
         if not self._counts["answers"]:  # nobody knows whether it works at all
             overdue = len(self._asked)
         code = self._link.end()
@@ -214,15 +210,15 @@ class ExternalFlight:
         if not self._is_lockstep:  # where no summary depends on a clock
             summary["answer_s_max"] = round(self._answer_s_max, 6)
             late = counts["answers_late"] + counts["ticks_skipped"] + overdue
-            late += self._ticks_unanswered
+            late += self._asked.unanswered
             summary["checks"] = [{"name": LATE_CHECK, "limit": 0, "got": late, "passed": late == 0}]
         return summary
 
     def _await_last(self) -> None:
         """Count the answers to the last ticks; there is no tick any more in which they could be carried out."""
         began_s = monotonic()
-        oldest_s = self._asked[0][0] if self._asked else math.inf
-        is_owed = not self._is_late(oldest_s, self._present_s())  # the overdue had their time
+        oldest_s = self._asked.oldest.sent_s if self._asked else math.inf
+        is_owed = not self._asked.is_late(oldest_s, self._present_s())  # the overdue had their time
         wait_s = min(self._settings.answer_s, ExternalFlight.last_answers_s) if is_owed else 0.0
         try:
             self._account_for_last()
@@ -238,16 +234,16 @@ class ExternalFlight:
         self._listened_s = self._present_s()
         for arrival in self._link.arrivals():
             for answer in self._protocol.feed(arrival.data):
-                asked = None if self._has_own_clock else self._find_asked(answer, math.inf)
+                came_s = arrival.came_s if self._is_recorded else self._present_s()
+                asked = None if self._has_own_clock else self._find_asked(answer, came_s, math.inf)
                 if asked is not None:
-                    came_s = arrival.came_s if self._is_recorded else self._present_s()
                     self._count_answer(asked, came_s)
 
     def _interface_summary(self) -> dict[str, Any]:
         transport = self._link.transport
         summary: dict[str, Any] = {
             "transport": transport.name,
-            "ticks_unanswered": self._ticks_unanswered,
+            "ticks_unanswered": self._asked.unanswered,
             "answers_unasked": self._answers_unasked,
             "faults": dict(getattr(self._protocol, "faults", {})),
         }
@@ -267,9 +263,9 @@ class ExternalFlight:
 
     def _send(self, t_s: float, readings: Readings) -> None:
         counts = self._counts
-        if len(self._asked) >= UNANSWERED_MAX:
+        if self._asked.is_full(self._present_s()):
             if not counts["ticks_skipped"]:
-                since = f"the tick at {self._asked[0][1]:g} s"
+                since = f"the tick at {self._asked.oldest.t_s:g} s"
                 self._context.log(
                     "warning",
                     f"{self._link.who} has answered nothing since {since}: no further ones are sent"
@@ -286,7 +282,7 @@ class ExternalFlight:
         for waiting in self._mail.values():
             waiting.clear()
         if not self._has_own_clock:
-            self._asked.append((sent_s, t_s))
+            self._asked.add(sent_s, t_s)
         counts["ticks_sent"] += 1
 
     def _take_answers(self, t_s: float) -> None:
@@ -307,7 +303,7 @@ class ExternalFlight:
         counts = self._counts
         asked = None
         if not self._has_own_clock:
-            asked = self._find_asked(answer, t_s)
+            asked = self._find_asked(answer, came_s, t_s)
             if asked is None:
                 self._answers_unasked += 1
                 return
@@ -316,42 +312,31 @@ class ExternalFlight:
             counts["answers"] += 1
         if answer.board_us and self._is_recorded:
             self._clock.add(answer.board_us * 1e-6, self._agent.now_s() - (monotonic() - came_s))
-        carry_out(answer, self._context, self._link.name, t_s=asked[1] if asked else None)
+        carry_out(answer, self._context, self._link.name, t_s=asked.t_s if asked else None)
 
-    def _find_asked(self, answer: FlightAnswer, t_s: float) -> tuple[float, float] | None:
+    def _find_asked(self, answer: FlightAnswer, came_s: float, t_s: float) -> AskedTick | None:
         """Return the tick that an answer is for, and forget it and those before; None for one to nothing."""
-        if self._by_time and isinstance(answer.t_s, int | float):
-            places = (
-                place
-                for place, (_, asked_s) in enumerate(self._asked)
-                if abs(asked_s - answer.t_s) <= TIME_TOLERANCE_S
-            )
-            place = next(places, None)
-            if place is None:
-                return None
-            self._ticks_unanswered += place
-            for _ in range(place):
-                self._asked.popleft()
-        elif not self._asked:
+        asked = self._asked.find(answer, came_s)
+        if asked is None and self._asked.must_be_asked(answer):
             if answer.fault:  # such as noise without an end
                 raise BlamedError(f"{self._link.name}: {answer.fault}")
             raise BlamedError(
                 f"{self._link.name}: expected one line for each tick and none for the setup, got another "
                 f"one before {t_s:g} s: {shown(answer.source)}"
             )
-        return self._asked.popleft()
+        return asked
 
-    def _count_answer(self, asked: tuple[float, float], came_s: float) -> None:
-        sent_s, counts = asked[0], self._counts
+    def _count_answer(self, asked: AskedTick, came_s: float) -> None:
+        sent_s, counts = asked.sent_s, self._counts
         self._answer_s_max = max(self._answer_s_max, came_s - sent_s)
         if not counts["answers"]:
-            self._begun_s = came_s
+            self._asked.begun_s = came_s
         counts["answers"] += 1
-        counts["answers_late"] += self._is_late(sent_s, came_s)
+        counts["answers_late"] += self._asked.is_late(sent_s, came_s)
         if self._is_recorded:
             self._record_answer(asked, came_s)
 
-    def _record_answer(self, asked: tuple[float, float], came_s: float) -> None:
+    def _record_answer(self, asked: AskedTick, came_s: float) -> None:
         sent_s, asked_s = asked
         tick = round(asked_s * self._context.tick_hz)
         answer_us = round((came_s - sent_s) * 1e6, 1)
@@ -365,9 +350,6 @@ class ExternalFlight:
             self._clock_s = t_s
             row = (t_s, round(estimate.offset_s, 9), round(estimate.drift_ppm, 3))
             self._agent.record("flight_clock", row)
-
-    def _is_late(self, sent_s: float, now_s: float) -> bool:
-        return now_s - max(sent_s, self._begun_s) > self._settings.answer_s
 
     def _await_answer(self, t_s: float) -> None:
         limit_s = self._settings.answer_s

@@ -87,6 +87,8 @@ class SerialLink(StreamTransport):
         baud_rate: Bits per second.
     """
 
+    may_lose = True
+
     def __init__(self, port: str, baud_rate: int) -> None:
         super().__init__(f"serial {port}")
         self._given = (port, baud_rate)
@@ -138,6 +140,8 @@ class DeviceLink(Transport):
     Args:
         device: As the agent sees it.
     """
+
+    may_lose = True
 
     def __init__(self, device: DeviceView) -> None:
         super().__init__(f"device {device.name}")

@@ -160,6 +160,8 @@ class UdpLink(Transport):
         family: Of both.
     """
 
+    may_lose = True
+
     def __init__(self, name: str, local: Any, remote: Any, *, family: int) -> None:
         super().__init__(name)
         self._local = local

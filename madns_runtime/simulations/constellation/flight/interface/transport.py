@@ -40,6 +40,8 @@ class Transport(ABC):
 
     keeps_all: ClassVar[bool] = False
     """Whether what is sent before the software listens is there when it does."""
+    may_lose: ClassVar[bool] = False
+    """Whether what is sent may not arrive, and nobody tell: later packets do all the same."""
 
     def __init__(self, name: str) -> None:
         self.name = name

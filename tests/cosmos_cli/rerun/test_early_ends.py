@@ -1,0 +1,117 @@
+"""What a rerun has of agents after their last ticks on record is not compared, and told."""
+
+import pytest
+
+from cosmos_cli.diff.fields import RecordPlace
+from cosmos_cli.diff.stream import Alone, StreamDifference
+from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.rerun.device_comparison import compare_devices
+from cosmos_cli.rerun.early_ends import early_ends, leave_out_after_ends
+from cosmos_cli.rerun.recorded_run import FlownRun, RecordedAgent, UsedDevice
+from madns_runtime.config import Agents, Recording, RunConfig, TimeSettings
+from madns_runtime.recording.record_files import RecordFiles
+from madns_runtime.recording.recorder import Recorder
+from madns_runtime.recording.records import Field, StreamSchema
+
+HZ = 10.0
+
+
+def stream(source, *, by="tick", first, count=1):
+    place = RecordPlace(first)
+    return StreamDifference(
+        table="state",
+        source=source,
+        by=by,
+        rows_a=34,
+        rows_b=34 + count,
+        only_b=Alone(count=count, first=place, last=place),
+    )
+
+
+def test_agents_that_ended_before_the_last_one_are_known_with_their_times():
+    agents = {name: RecordedAgent(ticks=None, last_s=s) for name, s in (("a", 3.4), ("b", 3.3))}
+
+    assert early_ends(agents) == {"b": 3.3}
+
+
+def test_what_comes_after_an_agents_end_is_left_out_and_told_and_nothing_else():
+    after, earlier = stream("b", first=34), stream("b", first=33)
+    timed, other = stream("b", by="time", first=3.4, count=2), stream("a", first=34)
+
+    remarks = leave_out_after_ends([after, earlier, timed, other], {"b": 3.3}, HZ)
+
+    assert (after.only_b.count, after.rows_b, after.has_same_values) == (0, 34, True)
+    assert timed.only_b.count == 0
+    assert (earlier.only_b.count, other.only_b.count) == (1, 1)
+    assert remarks == (
+        "b ended with the tick of 3.3 s: 3 records of the rerun after that are not compared",
+    )
+
+
+def test_remarks_name_few_of_many_agents():
+    names = [f"agent-{number:02d}" for number in range(1, 41)]
+
+    remarks = leave_out_after_ends(
+        [stream(name, first=34) for name in names], dict.fromkeys(names, 3.3), HZ
+    )
+
+    assert len(remarks) == 6
+    assert remarks[-1] == "35 more agents ended before the last one did, likewise"
+
+
+VALVE = StreamSchema(
+    "valve", (Field("t_s", "s"), Field("lateness_us", "us", "int"), Field("valve", "1"))
+)
+IMU = StreamSchema(
+    "rate",
+    (
+        Field("t_s", "s"),
+        Field("number", "", "int"),
+        Field("age_us", "us", "int"),
+        Field("rate", "1"),
+    ),
+)
+
+
+def write(folder, source, ticks):
+    """Record a sample before each tick, and an output with it."""
+    files = RecordFiles(folder, run="r", source=source)
+    recorder = Recorder(files, Recording())
+    for schema in (VALVE, IMU):
+        recorder.open_stream(schema)
+    for tick in range(ticks):
+        recorder.record("valve", (tick / HZ, 0, 1.0))
+        recorder.record("rate", (tick / HZ - 0.01, tick + 1, 0, 2.0))
+    recorder.start()
+    recorder.close()
+
+
+@pytest.mark.parametrize(("ends", "differ"), [({"a": 3.3}, [0, 0]), ({}, [1, 1])])
+def test_what_devices_are_given_after_their_agents_end_is_left_out_too(tmp_path, ends, differ):
+    write(tmp_path / "devices/a/imu", "a/imu", 34)
+    write(tmp_path / "rerun/devices/a/imu", "a/imu", 35)
+    used = UsedDevice(
+        agent="a",
+        name="imu",
+        full_name="a/imu",
+        folder=tmp_path / "devices/a/imu",
+        may_write=True,
+    )
+    agent = RecordedAgent(ticks=tmp_path / "ticks.jsonl", last_s=3.3, last_wake_s=3.3)
+    config = RunConfig(
+        run="r",
+        scenario="r",
+        simulation="counter",
+        base_directory=".",
+        agents=Agents(count=1, tick_hz=HZ),
+        time=TimeSettings(duration_s=60.0),
+    )
+    recorded = FlownRun(
+        run=RunDirectory(tmp_path), config=config, agents={"a": agent}, devices=(used,)
+    )
+
+    found = compare_devices(recorded, tmp_path / "rerun", ends)
+
+    assert [(each.direction, each.different) for each in found] == list(
+        zip(("in", "out"), differ, strict=True)
+    )
