@@ -161,6 +161,15 @@ def test_a_run_that_diverged_differs_without_a_root_mean_square():
     assert (found.different, found.max) == (1, 1e300)
 
 
+@pytest.mark.filterwarnings("error")
+def test_runs_that_diverged_to_either_side_cost_no_warning_of_our_source():
+    found = FieldDifference(Field("x_m", "m"))
+
+    found.add(rows([0], x_m=[1.7e308]), rows([0], x_m=[-1.7e308]))
+
+    assert (found.different, found.max) == (1, float("inf"))
+
+
 def test_an_angle_that_diverged_is_not_the_same_by_whole_turns():
     found = FieldDifference(Field("slot_error_deg", "deg"))
 
