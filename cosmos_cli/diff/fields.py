@@ -119,7 +119,7 @@ class FieldDifference:
 
     def _add_texts(self, a: Rows, left: NDArray[Any], right: NDArray[Any]) -> None:
         pairs = zip(left.tolist(), right.tolist(), strict=True)
-        is_different = np.array([x != y and _plain(x) != _plain(y) for x, y in pairs], dtype=bool)
+        is_different = np.array([_differ(x, y) for x, y in pairs], dtype=bool)
         self.different += int(is_different.sum())
         self._note_first(a, is_different)
         if self.values is None and is_different.any():
@@ -158,6 +158,14 @@ def _is_large(values: NDArray[Any]) -> NDArray[np.bool_]:
 
 def _number(value: Any) -> int | float:
     return int(value) if isinstance(value, int | np.integer) else float(value)
+
+
+def _differ(left: Any, right: Any) -> bool:
+    """Tell whether two values are not the same; nested too deep to be compared, they are not."""
+    try:
+        return bool(left != right and _plain(left) != _plain(right))
+    except RecursionError:
+        return True
 
 
 def _plain(value: Any) -> Any:

@@ -186,6 +186,19 @@ def test_whole_numbers_far_apart_differ_by_what_lies_between():
     assert found.max == 2.0**64
 
 
+def test_texts_that_are_json_nested_without_end_differ():
+    found = FieldDifference(Field("text", "", "str"))
+    left, right = np.empty(1, dtype=object), np.empty(1, dtype=object)
+    left[:], right[:] = ["[" * 5000], ["[" * 5001]
+
+    found.add(
+        Rows(keys=np.zeros(1), who=np.zeros(1), columns={"text": left}),
+        Rows(keys=np.zeros(1), who=np.zeros(1), columns={"text": right}),
+    )
+
+    assert found.different == 1
+
+
 def test_json_of_a_table_and_of_a_line_is_the_same():
     found = FieldDifference(Field("details", "", "json"))
     line, table = np.empty(2, dtype=object), np.empty(2, dtype=object)
