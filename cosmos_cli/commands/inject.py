@@ -142,18 +142,30 @@ def _list(console: Console, path: Path, name: str) -> int:
         target = "AGENT" if each.get("takes_agents") else "run"
         console.data(clean_line(f"{target} {each.get('action')} {' '.join(given)}".rstrip()))
     for each in _mappings(answer.get("in_force")):
-        agents = ", ".join(map(str, each.get("agents", ()))) or "run"
+        agents = ", ".join(_agents_of(each)) or "run"
         since = f"since {each.get('since_s'):g} s" if each.get("since_s") is not None else ""
         console.data(clean_line(f"in force: {each.get('action')} of {agents} {since}".rstrip()))
+    count = answer.get("in_force_count")
+    rest = count - len(_mappings(answer.get("in_force"))) if isinstance(count, int) else 0
+    if rest > 0:
+        console.data(f"in force: {rest} more")
     console.print_json(
         {
             "run": name,
             "actions": answer.get("actions"),
             "in_force": answer.get("in_force"),
+            "in_force_count": count,
             "exit_code": 0,
         }
     )
     return int(ExitCode.OK)
+
+
+def _agents_of(in_force: Mapping[str, Any]) -> list[str]:
+    """Return the agents that are told of an action in force, and how many there are besides."""
+    names, count = list(map(str, in_force.get("agents", ()))), in_force.get("agents_count")
+    rest = count - len(names) if isinstance(count, int) else 0
+    return [*names, f"and {rest} more"] if rest > 0 else names
 
 
 def _mappings(value: Any) -> list[Mapping[str, Any]]:

@@ -93,7 +93,8 @@ class FieldDifference:
         left, right = as_array(given), as_array(other)
         is_one_null = np.isnan(left) != np.isnan(right)
         is_both = ~np.isnan(left) & ~np.isnan(right)
-        difference = np.where(is_both, left - right, 0.0)
+        with np.errstate(over="ignore"):  # of runs of which one diverged
+            difference = np.where(is_both, left - right, 0.0)
         if self.field.kind == "int":
             exact = _exact_difference(given, other)
             difference = np.where(np.isnan(exact), difference, exact)
@@ -118,7 +119,7 @@ class FieldDifference:
 
     def _add_texts(self, a: Rows, left: NDArray[Any], right: NDArray[Any]) -> None:
         pairs = zip(left.tolist(), right.tolist(), strict=True)
-        is_different = np.array([x != y and _plain(x) != _plain(y) for x, y in pairs], dtype=bool)
+        is_different = np.array([_differ(x, y) for x, y in pairs], dtype=bool)
         self.different += int(is_different.sum())
         self._note_first(a, is_different)
         if self.values is None and is_different.any():
@@ -157,6 +158,14 @@ def _is_large(values: NDArray[Any]) -> NDArray[np.bool_]:
 
 def _number(value: Any) -> int | float:
     return int(value) if isinstance(value, int | np.integer) else float(value)
+
+
+def _differ(left: Any, right: Any) -> bool:
+    """Tell whether two values are not the same; nested too deep to be compared, they are not."""
+    try:
+        return bool(left != right and _plain(left) != _plain(right))
+    except RecursionError:
+        return True
 
 
 def _plain(value: Any) -> Any:

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 from cosmos_cli.evidence.run_directory import RunDirectory
-from cosmos_cli.evidence.streams import StreamScan
+from cosmos_cli.evidence.streams import INCARNATION_MAX, StreamScan
 from madns_runtime.config import RunConfig
 from madns_runtime.plain_values import mapping_at as mapping_at
 from madns_runtime.recording.records import CLOCK, EVENTS, HEALTH, LOG, PROCESS, TICKS
@@ -81,10 +81,8 @@ def find_missing(
     _check_source(faults, HOST, found.get((HOST, HOST), ()), expected.host_streams, result)
     for name in expected.agents:
         own, agent = found.get(("agent", name), ()), mapping_at(agents, name)
-        if not _ended_on_purpose(agent):
-            _check_source(faults, name, own, expected.agent_streams, agent)
-        elif any(not is_excused(scan, agents) for scan in own):
-            kept = [scan for scan in own if not is_excused(scan, agents)]
+        kept = [scan for scan in own if not is_excused(scan, agents)]
+        if kept or _owes_records(agent):
             _check_source(faults, name, kept, expected.agent_streams, agent)
     for name in expected.machines:
         own = found.get(("machine", name), ())
@@ -106,9 +104,16 @@ def is_excused(scan: StreamScan, agents: Mapping[str, Any]) -> bool:
     return scan.file.incarnation in _ended_on_purpose(mapping_at(agents, scan.file.source))
 
 
+def _owes_records(agent: Mapping[str, Any]) -> bool:
+    """Tell whether an agent was not ended on purpose, or has lived again after that."""
+    ended, incarnations = _ended_on_purpose(agent), agent.get("incarnations")
+    return not ended or (isinstance(incarnations, int) and incarnations > max(ended))
+
+
 def _ended_on_purpose(agent: Mapping[str, Any] | None) -> tuple[int, ...]:
     ended = (agent or {}).get("ended_on_purpose")
-    return tuple(ended) if isinstance(ended, list | tuple) else ()
+    listed = ended if isinstance(ended, list | tuple) else ()
+    return tuple(n for n in listed if type(n) is int and 0 < n <= INCARNATION_MAX)
 
 
 def _has_agents(machine: object) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -23,6 +24,9 @@ from madns_runtime.recording.reader import StreamReading, read_stream
 from madns_runtime.recording.records import Field
 
 SUFFIX = ".jsonl"
+INCARNATION = re.compile(r"[1-9][0-9]{0,4}")
+"""In a file's name; what bears another number, to which no recorder counts, is a stream of that name."""
+INCARNATION_MAX = 99_999
 DETAILS = Field("details", "", "json")
 """Column of what events carry beside their fields."""
 Role = Literal["host", "agent", "machine", "device"]
@@ -137,7 +141,7 @@ def open_stream_file(path: Path, role: Role) -> RecordFile:
     """Read a stream's name and schema line; of one that cannot be read the fields are empty."""
     stem = path.name.removesuffix(SUFFIX)
     name, dot, life = stem.rpartition(".")
-    is_later = bool(dot) and life.isdecimal()
+    is_later = bool(dot) and INCARNATION.fullmatch(life) is not None
     try:
         schema: Mapping[str, Any] = read_stream(path).schema
     except MachineError:

@@ -42,7 +42,7 @@ def recall(key: str | None) -> tuple[Target, ...] | None:
     try:
         kept = json.loads(read_own_file(cache_folder() / FOLDER / key, bytes_max=BYTES_MAX))
         return tuple(Target.from_mapping(mapping) for mapping in kept)
-    except (OSError, ValueError, TypeError):
+    except (OSError, ValueError, TypeError, RecursionError):
         return None
 
 

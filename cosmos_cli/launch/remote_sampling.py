@@ -206,7 +206,7 @@ def read_answer(answers: Iterator[Answer], records: Path | None) -> tuple[dict[s
             raise malformed(VERB, "more than was asked for")
     try:
         told = json.loads(answer)
-    except ValueError:
+    except (ValueError, RecursionError):
         raise malformed(VERB, "no JSON") from None
     if not isinstance(told, dict):
         raise malformed(VERB, "no mapping")
@@ -220,7 +220,10 @@ def checked_devices(told: Mapping[str, Any], launches: Sequence[DeviceLaunch]) -
     Raises:
         MachineFailure: DATA: something is missing.
     """
-    devices = _cleaned(told.get("devices"))
+    try:
+        devices = _cleaned(told.get("devices"))
+    except RecursionError:
+        raise malformed(VERB, "values that are nested without end") from None
     for launch in launches:
         device = devices.get(launch.full_name) if isinstance(devices, dict) else None
         if not isinstance(device, dict):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from cosmos_cli.launch.request import LaunchRequest, Life
 
@@ -40,6 +40,10 @@ class Restarts:
         self.ended.add(agent)
         if not is_abnormal:
             self._done.add(agent)
+
+    def handed_over(self, agents: Iterable[str]) -> None:
+        """Note agents that a new supervisor is to start: if it ends before, they are left."""
+        self.ended.difference_update(agents)
 
     def left_on(self, machine: str) -> tuple[str, ...]:
         """Return a machine's agents of whose end nobody has heard."""

@@ -337,6 +337,7 @@ class Supervision:
         )
         assert self._listening is not None
         life = self._restarts.next_life_on(machine)
+        self._restarts.handed_over(agents)
         self._agenda.do(actions.StartAgents(machine, agents, self._listening, life))
 
     def _is_wanted(self, machine: str) -> bool:

@@ -52,8 +52,8 @@ _WORDS: dict[str, bool | None] = {
     "False": False,
     "FALSE": False,
 }
-_BARE_VARIABLE = re.compile(r"""[\[{,:]\s*([^"'\[\]{},]*)\$\{""")
-"""In a line of a flow mapping or list: there a plain text ends at the brace."""
+_FLOW_MARKS = re.compile(r"""\$\{|["'\[\]{},:]""")
+"""In a line of a flow mapping or list: what begins or ends a plain text, and a variable."""
 _UNPRINTABLE = re.compile("[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 _MEANINGS = (
@@ -313,9 +313,9 @@ def _syntax_fault(source: YamlSource, error: yaml.MarkedYAMLError) -> Fault:
         "\t"
     ):
         text = "expected spaces, got a tab: YAML is indented with spaces"
-    elif "flow" in context and (bare := _BARE_VARIABLE.search(line)):
+    elif "flow" in context and (bare := _bare_variable(line)) is not None:
         text = "a brace within braces or brackets: put ${...} in quotes"
-        return source.fault(text, line=mark.line + 1, column=bare.end(1) + 1)
+        return source.fault(text, line=mark.line + 1, column=bare + 1)
     else:
         for in_context, in_problem, is_at_start, meaning in _MEANINGS:
             if in_context in context and in_problem in problem:
@@ -323,3 +323,13 @@ def _syntax_fault(source: YamlSource, error: yaml.MarkedYAMLError) -> Fault:
                 text = meaning.format(repr(line[mark.column : mark.column + 1]))
                 break
     return source.fault(text, line=mark.line + 1, column=mark.column + 1)
+
+
+def _bare_variable(line: str) -> int | None:
+    """Return where in a line of a flow mapping or list the first ${ is that no quote keeps: there a plain text ends."""
+    is_plain = False
+    for mark in _FLOW_MARKS.finditer(line):
+        if mark[0] == "${" and is_plain:
+            return mark.start()
+        is_plain = mark[0] in ("${", "[", "{", ",", ":")
+    return None

@@ -48,7 +48,7 @@ def read_memory(fact: FileFact) -> dict[str, Any]:
         document = json.loads(fact.text or "")
         if document["schema"] == MEMORY_SCHEMA and isinstance(document["settings"], dict):
             return dict(document["settings"])
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         pass
     raise MachineFailure(
         FailureKind.DATA,

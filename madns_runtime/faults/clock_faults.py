@@ -35,6 +35,8 @@ class FaultableClock(ClockEstimate):
         self._steps.add(fault)
         self._settle_error(now_s)
         self._error_s += by_s
+        # What was asked before was asked of a clock that showed other times: none of these is still to come.
+        self._asked_s = min(self._asked_s, self.wrong_s(now_s))
         return True
 
     def drift(self, fault: int, ppm: float, now_s: float) -> bool:

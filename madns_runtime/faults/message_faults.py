@@ -152,7 +152,7 @@ class MessageFaults:
         """Return how often a message is to go on now; one that is late is kept."""
         agent, direction, service = message.agent, message.direction, message.service
         now_s = self._now_s()
-        must_wait = self._late.must_wait(agent, direction, service, now_s)
+        must_wait = self._late.must_wait(agent, direction, service)
         if not self._rules.concern(agent):
             fate = Fate()
             if not must_wait:
@@ -171,7 +171,7 @@ class MessageFaults:
             return 0
         if fate.is_held or fate.late_s or must_wait:
             due_s = math.inf if fate.is_held else now_s + fate.late_s
-            is_kept = all(self._late.put(message, due_s) for _ in range(1 + fate.is_doubled))
+            is_kept = self._late.put(message._replace(copies=1 + fate.is_doubled), due_s)
             counts["late" if is_kept else "lost"] += 1
             counts["no_room"] += not is_kept
             self._ends.held()
@@ -186,13 +186,15 @@ class MessageFaults:
             counts = self._counts[agent]
             counts["released"] += 1
             if message.direction == UP:
-                self._ends.receive(agent, message.payload)
+                for _ in range(message.copies):
+                    self._ends.receive(agent, message.payload)
                 continue
             deadline_s = message.deadline_s
             if deadline_s is not None and deadline_s < self._now_s():
                 counts["deadlines_broken"] += 1
                 deadline_s = None
-            self._pass_on(agent, message.payload, service, deadline_s)
+            for _ in range(message.copies):
+                self._pass_on(agent, message.payload, service, deadline_s)
         self._disengage()
 
     # Messages between agents ----------------------------------------------------------------------

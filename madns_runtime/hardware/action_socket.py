@@ -111,7 +111,7 @@ class ActionSocket:
         return {
             "refusal": "",
             "actions": actions,
-            "in_force": in_force[:IN_FORCE_TOLD_MAX],
+            "in_force": [_shortened(each) for each in in_force[:IN_FORCE_TOLD_MAX]],
             "in_force_count": len(in_force),
         }
 
@@ -152,6 +152,12 @@ class ActionSocket:
             shown = ", ".join(self._agents[:AGENTS_TOLD_MAX])
             raise ConfigurationError(f"no agent is named {target}; there are {shown}")
         return chosen
+
+
+def _shortened(in_force: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an action in force with the first of its agents and their number: an answer must fit the socket at once."""
+    agents = list(in_force.get("agents", ()))
+    return {**in_force, "agents": agents[:AGENTS_TOLD_MAX], "agents_count": len(agents)}
 
 
 def _length_s(kind: ActionKind, for_s: Any) -> float | None:

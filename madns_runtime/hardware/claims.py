@@ -111,5 +111,5 @@ def _holder(descriptor: int) -> str:
     try:
         told = json.loads(os.pread(descriptor, HOLDER_BYTES_MAX, 0))
         return f"run {clean_text(str(told['run']))[:200]} (pid {int(told['pid'])})"
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return "another run"

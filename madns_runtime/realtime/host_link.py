@@ -166,8 +166,12 @@ class HostPort:
         deadline_s: float | None = None,
     ) -> None:
         """Send to an agent's half; see `plugin.api.Context.send`."""
-        if self.faults is not None and self.faults.send(to, message, service, deadline_s):
-            return
+        if self.faults is not None:
+            # What cannot be sent is told to who sends it, not to nobody when its time has come.
+            is_running = self.t0_s is not None
+            check_sending(to, self.session.peers, service, deadline_s, is_running=is_running)
+            if self.faults.send(to, message, service, deadline_s):
+                return
         now_s = monotonic()
         if service is BEST and deadline_s is None:
             sealed = self.session.seal_data(to, message, now_s)

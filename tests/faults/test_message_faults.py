@@ -2,6 +2,8 @@
 
 import itertools
 import math
+import random
+from collections import defaultdict
 
 import pytest
 
@@ -200,6 +202,97 @@ def test_a_doubled_message_comes_twice_unless_its_class_promises_once():
     assert [message for _, message in rig.received] == ["up", "up", "once"]
     assert [message for _, message, _ in rig.sent] == ["down", "down"]
     assert (rig.counts()["doubled"], rig.counts()["double_discarded"]) == (2, 1)
+
+
+def test_a_doubled_message_that_is_late_is_one_in_the_account_and_comes_twice():
+    rig = Rig()
+    rig.faults.begin(action("duplicate_messages", probability=1.0))
+    rig.faults.begin(action("delay_messages", number=2, delay_s=1.0, jitter_s=0.0))
+    rig.faults.take("a", "up", BEST)
+    assert (rig.counts()["late"], rig.counts()["left"]) == (1, 1)
+
+    rig.pass_time(2.0)
+    assert [message for _, message in rig.received] == ["up", "up"]
+    assert (rig.counts()["released"], rig.counts()["left"]) == (1, 0)
+
+
+def test_what_a_link_held_does_not_overtake_what_was_late_before_it_went_down():
+    rig = Rig()
+    delay, down = (
+        action("delay_messages", delay_s=10.0, jitter_s=0.0),
+        action("link_down", number=2),
+    )
+    rig.faults.begin(delay)
+    rig.faults.take("a", "late", RELIABLE)
+    rig.faults.end(delay)
+    rig.faults.begin(down)
+    rig.faults.take("a", "held", RELIABLE)
+    rig.now_s = 1.0
+    rig.faults.end(down)
+
+    rig.pass_time(20.0)
+    assert [message for _, message in rig.received] == ["late", "held"]
+
+
+def test_what_comes_when_the_time_of_one_before_it_has_just_come_waits_behind_it():
+    rig = Rig()
+    rig.faults.begin(action("delay_messages", delay_s=1.0, jitter_s=0.0, for_s=0.5))
+    rig.faults.take("a", "late", RELIABLE)
+    rig.faults.end(action("delay_messages"))
+    rig.now_s = 1.001  # the host's loop takes a datagram before its timer
+    rig.faults.take("a", "next", RELIABLE)
+    assert rig.received == []
+
+    rig.pass_time(2.0)
+    assert [message for _, message in rig.received] == ["late", "next"]
+
+
+FAULTS = (
+    ("lose_messages", {"probability": 0.5}),
+    ("delay_messages", {"delay_s": 2.0, "jitter_s": 1.0}),
+    ("reorder_messages", {"probability": 0.5, "within_s": 3.0}),
+    ("duplicate_messages", {"probability": 0.5}),
+    ("link_down", {}),
+)
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_whatever_happens_the_account_adds_up_and_ordered_classes_keep_their_order(seed):
+    draw, rig = random.Random(seed), Rig(seed)
+    sent, in_force = defaultdict(list), []
+    for number in range(80):
+        chance = draw.random()
+        if chance < 0.1:
+            word, parameters = draw.choice(FAULTS)
+            agents = tuple(draw.sample(AGENTS, 2))
+            in_force.append(action(word, agents, number, **parameters))
+            rig.faults.begin(in_force[-1])
+        elif chance < 0.2 and in_force:
+            rig.faults.end(in_force.pop(draw.randrange(len(in_force))))
+        elif chance < 0.4:
+            rig.now_s += draw.choice((0.1, 1.0))
+            if draw.random() < 0.5:
+                rig.faults.release()
+        else:
+            agent, service = draw.choice("ab"), draw.choice(list(Service))
+            if draw.random() < 0.5:
+                sent["up", agent, service].append(number)
+                rig.faults.take(agent, ["up", service, number], service)
+            else:
+                sent["down", agent, service].append(number)
+                rig._send(agent, ["down", service, number], service, deadline_s=None)
+        counts = defaultdict(int, rig.faults.to_mapping().get("with_host", {}))
+        assert counts["seen"] == counts["passed"] + counts["lost"] + counts["late"]
+        assert counts["late"] == counts["released"] + counts["left"]
+    for each in in_force:
+        rig.faults.end(each)
+    rig.pass_time(rig.now_s + 500.0)
+
+    came = defaultdict(list)
+    for agent, (way, service, number), *_ in (*rig.received, *rig.sent):
+        came[way, agent, service].append(number)
+    ordered = {key: numbers for key, numbers in sent.items() if key[2] is not BEST}
+    assert {key: came[key] for key in ordered} == ordered
 
 
 def test_what_waits_is_as_it_was_sent():

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import socket
+from types import SimpleNamespace
 
 import pytest
 
+from madns_runtime.errors import PluginError
 from madns_runtime.protocol.bundle import BUNDLE, bundle_up, split
 from madns_runtime.protocol.datagram import OVERHEAD_BYTES
+from madns_runtime.protocol.messages import Service
 from madns_runtime.reactor.udp import UdpSocket
 from madns_runtime.realtime.host_link import HostPort
 
@@ -96,3 +100,26 @@ def test_a_malformed_bundle_is_handed_on_to_be_refused(port, agents):
     assert [data for data, _ in port.waiting()] == [bytes([BUNDLE, 1, 2])]
     port.read(lambda data, address: got.append(data))
     assert len(got) == 1
+
+
+@pytest.mark.parametrize(
+    ("to", "service", "deadline_s"),
+    [
+        ("nobody", Service.BEST, None),
+        ("agent-01", 1, None),
+        ("agent-01", Service.BEST, 5.0),
+        ("agent-01", Service.SYNC, math.nan),
+    ],
+)
+def test_what_cannot_be_sent_is_told_to_who_sends_it_also_where_a_fault_would_hold_it(
+    port, to, service, deadline_s
+):
+    held = []
+    port.session, port.t0_s = SimpleNamespace(peers={"agent-01": None}), 0.0
+    port.faults = SimpleNamespace(send=lambda *message: held.append(message) or True)
+
+    with pytest.raises(PluginError):
+        port.send(to, [1], service, deadline_s=deadline_s)
+    assert held == []
+    port.send("agent-01", [1], Service.BEST)
+    assert len(held) == 1

@@ -40,6 +40,19 @@ def test_a_step_puts_host_time_off_by_as_much_until_exchanges_contradict_it(cloc
     assert clock.offset_s(29.9) == pytest.approx(HOST_AHEAD_S - by_s, abs=1e-3)
 
 
+def test_host_time_does_not_run_backwards_after_a_step_back_while_another_is_slewed_out(clock):
+    clock.step(1, 1.0, 20.0)
+    fly(clock, 20.0, 21.0)
+    clock.to_host_s(21.0)
+    clock.step(2, -0.1, 21.0)
+    before_s = clock.to_host_s(21.0)
+
+    middle_s = HOST_AHEAD_S + 20.9
+    assert clock.add_exchange(20.8, middle_s, middle_s, 21.0)  # too long under way to contradict
+    assert clock.steps == 1
+    assert clock.to_host_s(21.0) >= before_s
+
+
 def test_host_and_local_time_are_each_others_inverse_while_a_clock_is_wrong(clock):
     clock.step(1, 0.3, 20.0)
     clock.drift(2, 400.0, 21.0)

@@ -282,6 +282,12 @@ class Occurrences(Accumulator):
         kept = found[: OCCURRENCES_KEPT - len(self.found)]
         self.found += zip(t_s[kept].tolist(), places[kept].tolist(), strict=True)
 
+    def is_open_at(self, latest_s: float | None) -> bool:
+        """Tell whether some of the event that were not kept may be of times up to *latest_s*, None for any."""
+        if self.count <= len(self.found):
+            return False
+        return latest_s is None or self.found[-1][0] <= latest_s
+
     def _found_now(self) -> Found:
         first_s = min((t_s for t_s, _ in self.found), default=None)
         return first_s, first_s

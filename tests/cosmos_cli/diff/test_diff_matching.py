@@ -161,6 +161,15 @@ def test_a_run_that_diverged_differs_without_a_root_mean_square():
     assert (found.different, found.max) == (1, 1e300)
 
 
+@pytest.mark.filterwarnings("error")
+def test_runs_that_diverged_to_either_side_cost_no_warning_of_our_source():
+    found = FieldDifference(Field("x_m", "m"))
+
+    found.add(rows([0], x_m=[1.7e308]), rows([0], x_m=[-1.7e308]))
+
+    assert (found.different, found.max) == (1, float("inf"))
+
+
 def test_an_angle_that_diverged_is_not_the_same_by_whole_turns():
     found = FieldDifference(Field("slot_error_deg", "deg"))
 
@@ -175,6 +184,19 @@ def test_whole_numbers_far_apart_differ_by_what_lies_between():
     found.add(rows([0], n=[-(2**63)]), rows([0], n=[2**63 - 1]))
 
     assert found.max == 2.0**64
+
+
+def test_texts_that_are_json_nested_without_end_differ():
+    found = FieldDifference(Field("text", "", "str"))
+    left, right = np.empty(1, dtype=object), np.empty(1, dtype=object)
+    left[:], right[:] = ["[" * 5000], ["[" * 5001]
+
+    found.add(
+        Rows(keys=np.zeros(1), who=np.zeros(1), columns={"text": left}),
+        Rows(keys=np.zeros(1), who=np.zeros(1), columns={"text": right}),
+    )
+
+    assert found.different == 1
 
 
 def test_json_of_a_table_and_of_a_line_is_the_same():

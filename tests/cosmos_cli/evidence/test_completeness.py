@@ -8,11 +8,14 @@ from harness.synthetic_run import SyntheticRun
 
 from cosmos_cli.evidence.completeness import ExpectedRecords, find_missing
 from cosmos_cli.evidence.streams import find_streams, scan_stream
+from cosmos_cli.evidence.tabulate import gather
 
 
-def missing(made: SyntheticRun) -> list[str]:
+def missing(made: SyntheticRun, **of_first_agent) -> list[str]:
     scans = [scan_stream(file) for file in find_streams(made.run.path)]
-    return find_missing(made.expected, scans, made.result())
+    result = made.result()
+    result["agents"]["agent-01"].update(of_first_agent)
+    return find_missing(made.expected, scans, result)
 
 
 def renumber(folder: Path, life: int) -> None:
@@ -39,3 +42,27 @@ def test_machine_that_runs_no_agent_owes_no_records(tmp_path):
     made.run.plan_json.write_text(json.dumps({**plan, "machines": machines}))
 
     assert ExpectedRecords.read(made.run).machines == ("pi02", "pi03")
+
+
+@pytest.mark.parametrize(
+    ("ended", "incarnations", "lines"),
+    [([1], 1, 0), ([1], 2, 1), ([1, 2], 2, 0), ([1, 2], 3, 1), ([10**15], 1, 0), (["x", -3], 1, 0)],
+)
+def test_an_agent_that_returned_owes_the_records_of_its_last_life(
+    tmp_path, ended, incarnations, lines
+):
+    made = SyntheticRun(tmp_path).write()
+
+    found = missing(made, ended_on_purpose=ended, incarnations=incarnations)
+
+    assert found == ["agent-01: no records"] * lines
+
+
+@pytest.mark.parametrize("number", ["20000000", "3000000000", "0", "01"])
+def test_a_number_to_which_no_recorder_counts_is_no_incarnation(tmp_path, number):
+    made = SyntheticRun(tmp_path).write()
+    file = made.run.path / "agents/agent-01/ticks.jsonl"
+    file.rename(file.with_name(f"ticks.{number}.jsonl"))
+
+    assert missing(made) == ["agent-01: ticks is missing"]
+    assert gather(made.run, 10.0, lambda *_: None).faults == ()

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cosmos_cli.evidence.expectations import records
+from cosmos_cli.evidence.expectations import accumulators, records
 from cosmos_cli.evidence.expectations.judge import judge_expectations
 from cosmos_cli.evidence.verdict import conclusion_of_expectations
 from cosmos_cli.models.expectation import Expectation, HeldBounds
@@ -291,6 +291,26 @@ def test_of_events_of_one_time_the_one_that_is_recorded_later_comes_after(
     by_value = judge(seen, replace(burn, after="seen"), tables=events_of(*words)).results[1]
 
     assert (by_event.passed, by_value.passed) == (passed, passed)
+
+
+@pytest.mark.parametrize(
+    ("must", "to_s", "passed", "got"),
+    [("not_occur", None, False, None), ("not_occur", 1.5, True, 0), ("occur", None, False, None)],
+)
+def test_an_event_that_occurs_too_often_to_be_followed_never_counts_as_absent(
+    must, to_s, passed, got, monkeypatch
+):
+    monkeypatch.setattr(accumulators, "OCCURRENCES_KEPT", 2)
+    common = {"stream": "events", "field": "event", "agents": ("a",)}
+    words = ("burn", "burn", "done", "burn")
+    tables = events_of(*words, t_s=[1.0, 2.0, 3.0, 4.0])
+    done = expect(name="done", event="done", **common)
+    after = expect(name="after", event="burn", after="done", must=must, to_s=to_s, **common)
+
+    found = judge(done, after, tables=tables).results[1]
+
+    assert (found.passed, found.got) == (passed, got)
+    assert ("it occurs 3 times, and the first 2 are looked at" in found.expected) is (got is None)
 
 
 def test_an_event_may_come_after_that_of_one_other_agent():

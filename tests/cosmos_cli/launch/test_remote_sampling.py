@@ -69,6 +69,13 @@ def test_more_than_the_bound_and_what_is_no_answer_is_refused(monkeypatch):
     assert "no mapping" in refusal(parts(**{"answer.json": b"[1]"}))
 
 
+def test_an_answer_that_is_nested_without_end_is_refused():
+    assert "no JSON" in refusal(parts(**{"answer.json": b"[" * 5000}))
+    deep = json.loads("[" * 600 + "]" * 600)
+    with pytest.raises(MachineFailure, match="nested without end"):
+        checked_devices({"devices": deep}, ())
+
+
 def test_texts_are_cleaned_and_numbers_finite():
     device = {**DEVICE, "identity": "g\x1b[2J1", "errors": 1, "why": "x" * 5000}
     told = json.loads(json.dumps({"devices": {"pi01/imu": device, "pi01/other": 1}}))

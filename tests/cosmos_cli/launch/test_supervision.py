@@ -494,6 +494,27 @@ def test_machine_that_returns_is_given_its_agents_again() -> None:
     assert back[1].name == f"{AGENTS} (2)"
 
 
+@pytest.mark.parametrize("is_lost", [False, True])
+def test_supervisor_that_ends_before_it_has_started_anything_again_is_told(is_lost: bool) -> None:
+    table = Table(on_agent_loss="continue", agents=Agents(count=2, restarts_max=1))
+    table.run()
+    table.play((1, ChildLost(AGENTS, "the connection broke")))
+    table.play((1, MachineReached("pi01", is_reached=True)))
+    again = f"{AGENTS} (2)"
+    table.play((0, ChildStarted(again, "pi01")), (0, ChildSaid(again, events.ProcessKnown(30))))
+
+    why = "the connection broke" if is_lost else "ended with exit code 1"
+    ended = ChildLost(again, why) if is_lost else ChildExited(again, why, 1)
+    asked = table.play((1, ended))
+
+    told_of = "machine pi01 is lost: the connection broke"
+    if not is_lost:
+        told_of = f"{again} (pid 30) {why} before its agents agent-01, agent-02 were done"
+    assert problems(asked) == [told_of]
+    assert bool(of_kind(asked, actions.QuoteLastWords)) is not is_lost
+    assert [command["agent"] for command in told(asked, HOST)] == ["agent-01", "agent-02"]
+
+
 def test_machine_that_is_not_wanted_any_more_is_reached_for_once(there: Table) -> None:
     there.play((1, ChildLost(AGENTS, "the connection broke")))
     gone = there.play((0, MachineReached("pi01", is_reached=False)))

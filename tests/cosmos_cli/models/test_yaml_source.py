@@ -141,6 +141,29 @@ def test_faults_of_syntax_have_a_place_and_plain_words(text, place, message):
     assert fault.file == "a.yaml"
 
 
+@pytest.mark.parametrize(
+    ("line", "column"),
+    [
+        ("{a: ${b}}", 5),
+        ("[a, x${b}}", 6),
+        ("{a: 'x ${b}', c: [1}", None),
+        ("[x: y ${b}}", 7),
+        ("[${b}}", 2),
+        ("['a' ${b}}", None),
+    ],
+)
+def test_a_variable_is_told_where_a_plain_text_of_a_flow_ends_at_its_brace(line, column):
+    fault = fault_of(line)
+
+    assert ("put ${...} in quotes" in fault.text) == (column is not None)
+    assert column in (None, fault.column)
+
+
+@pytest.mark.parametrize("filling", [" ", ":", "${", "a"])
+def test_a_line_of_a_million_characters_with_a_fault_does_not_hang(filling):
+    assert fault_of("a: [" + "," + filling * (1_000_000 // len(filling)) + "}\n").line == 1
+
+
 @pytest.mark.parametrize("text", ["[" * 200_000, "- " * 5000, "{a: " * 3000])
 def test_deep_nesting_is_refused_and_does_not_end_the_process(text):
     assert f"at most {DEPTH_MAX} levels" in fault_of(text).text

@@ -1,0 +1,62 @@
+"""The door for actions in a living run: what it answers comes whole, however much there is to tell."""
+
+import selectors
+import socket
+
+import orjson
+
+from madns_runtime.hardware.action_socket import (
+    AGENTS_TOLD_MAX,
+    IN_FORCE_TOLD_MAX,
+    SOCKET_NAME,
+    ActionSocket,
+)
+
+AGENTS = [f"agent-{number:04}" for number in range(1000)]
+
+
+class Loop:
+    """Calls back for what is readable now."""
+
+    def __init__(self):
+        self._selector = selectors.DefaultSelector()
+
+    def add_reader(self, fd, callback):
+        self._selector.register(fd, selectors.EVENT_READ, callback)
+
+    def remove_reader(self, fd):
+        self._selector.unregister(fd)
+
+    def turn(self):
+        for key, _ in self._selector.select(timeout=0):
+            key.data()
+
+
+def answer_to(order, folder, in_force):
+    loop = Loop()
+    door = ActionSocket(
+        folder, loop, kinds={}, agents=AGENTS, begin=lambda _: "", in_force=lambda: in_force
+    )
+    with socket.socket(socket.AF_UNIX) as visitor:
+        visitor.connect(str(folder / SOCKET_NAME))
+        visitor.sendall(orjson.dumps(order) + b"\n")
+        loop.turn()  # it is let in
+        loop.turn()  # and heard
+        heard = b""
+        while data := visitor.recv(1 << 16):
+            heard += data
+    door.close()
+    return orjson.loads(heard)
+
+
+def test_the_list_of_what_is_in_force_comes_whole_in_a_run_of_a_thousand_agents(
+    tmp_path,
+):
+    action = {"number": 1, "action": "lose_messages", "agents": AGENTS, "parameters": {}}
+
+    answer = answer_to({"list": True}, tmp_path, [action] * 250)
+
+    assert len(answer["in_force"]) == IN_FORCE_TOLD_MAX
+    assert answer["in_force_count"] == 250
+    assert answer["in_force"][0]["agents"] == AGENTS[:AGENTS_TOLD_MAX]
+    assert answer["in_force"][0]["agents_count"] == len(AGENTS)
