@@ -6,7 +6,6 @@ import dataclasses
 import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from typing import Annotated, Any, Union
 
 from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault
@@ -34,6 +33,8 @@ _EXPECTED = {
     "string_type": "a text",
     "tuple_type": "a list",
 }
+ALTERNATIVES = "alternatives"
+"""Type of an error that is made of those of a union's members."""
 _LIMITS = {
     "greater_than": ("> ", "gt"),
     "greater_than_equal": (">= ", "ge"),
@@ -91,12 +92,21 @@ def faults_of(
         model: The type that was validated; tells what keys are known.
         below: Path of the validated value within the document.
     """
-    located = [_located(document, below, error) for error in errors]
+    located = [
+        _located(document, below, error) for error in errors if not _misses_invalid_items(error)
+    ]
     return [
         # To guess what was meant takes a thousand times as long as to tell what is wrong.
         _fault(document, item, (model, below), has_hints=number < HINTS_MAX)
         for number, item in enumerate(_likeliest(located))
     ]
+
+
+def _misses_invalid_items(error: Mapping[str, Any]) -> bool:
+    """Tell whether a list is too short only because pydantic does not count the items that are invalid themselves."""
+    if error["type"] != "too_short" or not isinstance(error["input"], list):
+        return False
+    return len(error["input"]) >= int(error["ctx"]["min_length"])
 
 
 def _located(document: Document, below: Path, error: Mapping[str, Any]) -> Located:
@@ -141,9 +151,39 @@ def _likeliest(located: Sequence[Located], depth: int = 0) -> Iterator[Located]:
         choice = _common_choice(list(group.values()), depth)
         if choice:
             yield choice
-        else:
-            meant = min(group.values(), key=partial(_distance, entry))
-            yield from _likeliest(meant, depth + 1)
+            continue
+        distances = [_distance(entry, errors) for errors in group.values()]
+        nearest = min(distances)
+        meant = [
+            errors
+            for errors, distance in zip(group.values(), distances, strict=True)
+            if distance == nearest
+        ]
+        yield from _alternatives(meant, depth) or _likeliest(meant[0], depth + 1)
+
+
+def _alternatives(members: Sequence[Sequence[Located]], depth: int) -> list[Located]:
+    """Return errors that name the types of all members, where values are of none of them and nothing else is wrong."""
+    places = {tuple(item.path for item in errors) for errors in members}
+    are_types = all(
+        item.error["type"] in _EXPECTED and len(item.branches) == depth + 1
+        for errors in members
+        for item in errors
+    )
+    if len(members) < 2 or len(places) > 1 or not are_types:
+        return []
+    return [
+        Located(items[0].path, (), {**items[0].error, "type": ALTERNATIVES, "ctx": _types(items)})
+        for items in zip(*members, strict=True)
+    ]
+
+
+def _types(items: Sequence[Located]) -> Mapping[str, str]:
+    names = list(dict.fromkeys(_EXPECTED[item.error["type"]] for item in items))
+    if "a number" in names and "a whole number" in names:
+        names.remove("a whole number")
+    *before, last = names
+    return {"expected": f"{', '.join(before)} or {last}" if before else last}
 
 
 def _common_choice(members: Sequence[Sequence[Located]], depth: int) -> Located | None:
@@ -207,8 +247,8 @@ def _fault(
 def _text(
     kind: str, context: Mapping[str, Any], error: Mapping[str, Any], got: str, *, has_hints: bool
 ) -> str:
-    if kind in _EXPECTED:
-        return f"expected {_EXPECTED[kind]}, got {got}"
+    if kind in _EXPECTED or kind == ALTERNATIVES:
+        return f"expected {_EXPECTED.get(kind) or context['expected']}, got {got}"
     if kind == "string_pattern_mismatch" and context["pattern"] in _PATTERNS:
         return f"expected {_PATTERNS[context['pattern']]}, got {got}"
     if kind in _LIMITS:

@@ -19,12 +19,16 @@ from cosmos_cli.models.separate_process import SeparateDefect, SeparateFailure, 
 from cosmos_cli.rerun.carried_over import ATTEMPTS_MAX, CarriedOver, carried_over
 from cosmos_cli.rerun.early_ends import early_ends
 from cosmos_cli.rerun.recorded_run import FlownRun, UsedDevice
+from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.config import RunConfig, ScenarioDevice, to_mapping
 from madns_runtime.errors import MadnsError
 from madns_runtime.plugin.queries import ask_rerun
 from madns_runtime.plugin.registry import is_shipped, parse_parameters, resolve
 from madns_runtime.recording.reader import read_stream
 
+PLAYBACK: Final = "playback"
+TICKS: Final = ("ticks", "tick_hz", "phase_s")
+"""Settings of a player that say in which tick each sample is there."""
 RATE_HZ: Final = 10.0
 """Of a device of which nobody knows how often it was read: its age is judged by it."""
 RATE_ROWS_MAX: Final = 1000
@@ -179,7 +183,7 @@ def _devices(recorded: FlownRun, remarks: list[str]) -> tuple[ScenarioDevice, ..
             remarks.append(
                 f"{used.full_name}: its channels' limits are not on record: outputs are put out as they are given"
             )
-        found.append(_player(recorded, used, device, answer))
+        found.append(_player(recorded, used, device, answer, remarks))
     return tuple(found)
 
 
@@ -199,6 +203,7 @@ def _player(
     used: UsedDevice,
     device: ScenarioDevice | None,
     answer: KindAnswer | None,
+    remarks: list[str],
 ) -> ScenarioDevice:
     agent = recorded.agents[used.agent]
     channels = answer.channels if answer else ()
@@ -214,15 +219,33 @@ def _player(
     }
     if agent.ticks is not None:
         parameters |= {"ticks": str(agent.ticks), "phase_s": agent.phase_s}
+    elif device is not None and device.kind == PLAYBACK:
+        parameters |= _ticks_played(recorded, used, device, remarks)
     rate_hz = (device.rate_hz if device else None) or (answer.rate_hz if answer else None)
     return ScenarioDevice(
         name=used.name,
-        kind="playback",
+        kind=PLAYBACK,
         agents=(used.agent,),
         rate_hz=rate_hz or _recorded_rate(used.folder),
         parameters=parameters,
         frozen_s=device.frozen_s if device else {},
     )
+
+
+def _ticks_played(
+    recorded: FlownRun, used: UsedDevice, device: ScenarioDevice, remarks: list[str]
+) -> dict[str, Any]:
+    """Return the ticks by which a rerun's player gave its samples, which have their times, not the rerun's ticks."""
+    played = {name: device.parameters[name] for name in TICKS if name in device.parameters}
+    if played.get("ticks") is None:
+        return {}
+    if Path(recorded.folder, str(played["ticks"])).is_file():
+        return played
+    remarks.append(
+        f"{used.full_name}: {clean_line(str(played['ticks']))} is not there any more: its samples come in the first tick"
+        " at or after their times, which may be another one"
+    )
+    return {}
 
 
 def _recorded_rate(folder: Path) -> float:

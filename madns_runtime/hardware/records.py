@@ -58,6 +58,11 @@ class DeviceRecords:
         self.time = SimulatedTime()
         self.journal = journal
         self._recorder = journal.recorder
+        self._newest = {
+            each.name for each in channels if each.passing == "newest" and not each.is_frame
+        }
+        self._early: dict[str, tuple[int, float, Sequence[Any], float]] = {}
+        """Of these inputs the newest values from before simulated time is known: agents find them in their first ticks."""
         for channel in channels:
             self._recorder.open_stream(schema_of(channel))
         self._recorder.open_stream(DEVICE_STATE)
@@ -68,15 +73,25 @@ class DeviceRecords:
         if not self.time.is_known:
             self._recorder.set_t0(utc_at_iso(-t_s))
         self.time.set(local_s, t_s, rate)
+        early, self._early = self._early, {}
+        for channel, (number, taken_s, values, told_s) in early.items():
+            self.sample(channel, number, taken_s, values, told_s=told_s)
 
     def sample(
         self, channel: str, number: int, taken_s: float, values: Sequence[Any], *, told_s: float
     ) -> None:
-        """Record values of an input, taken at *taken_s* and handed on at *told_s*; before simulated time nothing."""
-        if self.time.is_known:
-            t_s = round(self.time.at(taken_s), 6)
-            age_us = round((told_s - taken_s) * 1e6)
-            self._recorder.record(channel, (t_s, number, age_us, *values))
+        """
+        Record values of an input, taken at *taken_s* and handed on at *told_s*.
+
+        Before simulated time is known nothing is, but for the newest values then, by which agents' first ticks act.
+        """
+        if not self.time.is_known:
+            if channel in self._newest and all(map(math.isfinite, values)):
+                self._early[channel] = (number, taken_s, values, told_s)
+            return
+        t_s = round(self.time.at(taken_s), 6)
+        age_us = round((told_s - taken_s) * 1e6)
+        self._recorder.record(channel, (t_s, number, age_us, *values))
 
     def written(self, channel: str, due_s: float, done_s: float, values: Sequence[Any]) -> None:
         """Record values of an output, due at *due_s* and put out at *done_s*."""

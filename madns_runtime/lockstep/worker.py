@@ -314,6 +314,7 @@ class Worker:
         if not self._goes_on:
             raise failure
         self._position[0] = agent.index * POSITIONS + frames.CLOSING
+        agent.half.abandon()
         self._agents = [other for other in self._agents if other is not agent]
         self._faults.pop(agent.index, None)
         self._losses.add(agent, clean_text(failure.reason))

@@ -1,10 +1,9 @@
 """
 The contract between the framework and a simulation.
 
-A simulation is a `Simulation` descriptor that names two classes, one for each role. Each is made
-without arguments and subclasses `HostSimulation` or `AgentSimulation` (or merely looks like it).
-All calls come from one thread, the loop's: no call may take longer than a millisecond on the host;
-longer work goes through `HostContext.submit`.
+A simulation is a `Simulation` descriptor that names two classes, one for each role. Each is made without arguments
+and subclasses `HostSimulation` or `AgentSimulation` (or merely looks like it). All calls come from one thread, the
+loop's: no call may take longer than a millisecond on the host; longer work goes through `HostContext.submit`.
 """
 
 from __future__ import annotations
@@ -130,8 +129,7 @@ class Context(Protocol):
             message: None, bool, int, float, str, bytes, lists, mappings with string keys, and
                 float64 arrays, in any nesting.
             service: BEST must fit one datagram.
-            deadline_s: SYNC only: simulated time by which it must have arrived; a broken one is
-                counted, recorded and reported.
+            deadline_s: SYNC only: simulated time by which it must have arrived; a broken one is counted and reported.
 
         Returns:
             Of a message to other agents the number by which a refusal names it.
@@ -300,9 +298,7 @@ class AgentSimulation(Protocol):
 
     def hear(self, delivery: Delivery) -> None:
         """
-        Take a message of another agent, right before the step of the first tick at or after its arrival.
-
-        Messages are taken in the order of (arrival, sender, time sent).
+        Take a message of another agent, before the first tick at or after its arrival; ordered by (arrival, sender, time sent).
 
         Raises:
             BlamedError: Always, where this is not overridden.
@@ -325,6 +321,9 @@ class AgentSimulation(Protocol):
 
     def end_action(self, action: TimelineAction) -> None:
         """Let what *action* did be over, if it lasts."""
+
+    def abandon(self) -> None:
+        """Let go at once of what outlives this object, such as programs: the agent is lost, and not to finish."""
 
     def finish(self) -> Mapping[str, Any]:
         """Return this agent's summary; a list under "checks" is judged (see `Check`)."""

@@ -7,6 +7,7 @@ told, what goes to the log, when the host half's timer is due. When a call is ma
 
 from __future__ import annotations
 
+import contextlib
 import math
 import traceback
 from collections.abc import Callable, Mapping
@@ -184,6 +185,11 @@ class Half:
             raise HalfFailed(
                 f"{self.name}.{name} returned a {type(value).__name__}: {text}"
             ) from error
+
+    def abandon(self) -> None:
+        """Have an agent's half let go of what outlives it; what it raises is in its log, and changes nothing."""
+        with contextlib.suppress(HalfFailed):
+            self.call("abandon")
 
     def _method(self, name: str) -> Callable[..., Any]:
         """Return a method; of a half that does not inherit it, and lacks it, the one that it would inherit."""

@@ -348,6 +348,7 @@ class AgentRunner:
         self._cancel_timers()
         self._journal.event("emergency", reason=reason)
         self._journal.say("critical", f"emergency shutdown: {reason}")
+        self._half.abandon()
         self._close_records()
 
     def _close_records(self) -> None:

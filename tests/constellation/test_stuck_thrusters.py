@@ -149,7 +149,9 @@ def test_while_it_is_stuck_no_other_burn_is_taken_and_after_its_end_one_is(fly):
     meanwhile, after = fly(burn_s=20.0), fly(burn_s=40.0)
 
     for star in (meanwhile, after):
-        stick(star, ends_s=30.0)
+        (burn,) = stick(star, ends_s=30.0)
+        # What is burnt later is no part of it.
+        assert burn["propellant_left_kg"] == pytest.approx(2.0 - 20.0 / EXHAUST_M_S, abs=1e-9)
 
     (refused,) = meanwhile.summaries()["agent-02"]["flight"]["told"]
     assert refused.startswith("refused")

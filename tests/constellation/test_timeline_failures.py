@@ -119,6 +119,8 @@ RADIO_ACTIONS = [
     },
     {"at_s": 30, "action": "lose_satellite", "agents": ["agent-02"], "for_s": 40},
     {"at_s": 80, "action": "darken_station", "station": "svalbard", "for_s": 30},
+    # The end of one lights no station that the other still darkens.
+    {"at_s": 85, "action": "darken_station", "station": "svalbard", "for_s": 10},
 ]
 RISE_S = 45.525
 """Of IRIDIUM 5, agent-04, over svalbard: tests/authorities/passes.json."""

@@ -281,6 +281,12 @@ class ConstellationAgent(AgentSimulation):
             self._change_left_s_min = min(self._change_left_s_min, left_s)
             self._context.record("truth_changes", (segment.revision, segment.t0_s, now_s, left_s))
 
+    def abandon(self) -> None:
+        """End the program that flies this vehicle, if it is one."""
+        cockpit: Cockpit | None = getattr(self, "_cockpit", None)  # lost before it was set up
+        if cockpit is not None:
+            cockpit.abandon()
+
     def finish(self) -> Mapping[str, Any]:
         """Return how well this vehicle was served; any underrun breaks the run's verdict."""
         buffer = self._buffer

@@ -483,3 +483,46 @@ def test_choice_that_no_member_of_a_union_knows_lists_those_of_all(see):
         "did you mean quick?"
     )
     assert len(shown.splitlines()) == 3
+
+
+ORBIT = (
+    "satellites: {keplerian: [{name: A, altitude_km: 500, e: 1.2}, {name: B, altitude_km: 500}]}"
+)
+FLYING = "satellites: {walker: '56:1/1/0', altitude_km: 500}\n  flight: {command: [f], settings: "
+
+
+@pytest.mark.parametrize(
+    ("parameters", "shown"),
+    [
+        (ORBIT, ["parameters.satellites.keplerian[0].e: expected < 1, got 1.2"]),
+        (
+            ORBIT.replace("}, {name: B, altitude_km: 500}", "}"),
+            ["parameters.satellites.keplerian[0].e: expected < 1, got 1.2"],
+        ),
+        (
+            "satellites: {keplerian: []}",
+            ["parameters.satellites.keplerian: expected at least 1 items, got a list"],
+        ),
+        (
+            FLYING + "{a: {b: 1}}}",
+            [
+                "parameters.flight.settings.a: "
+                "expected true or false, a number, a text or a list, got a mapping"
+            ],
+        ),
+        (
+            FLYING + "{a: [{b: 1}]}}",
+            ["parameters.flight.settings.a[0]: expected a number or a text, got a mapping"],
+        ),
+        (
+            FLYING + "{a: [1, x]}}",
+            ["parameters.flight.settings.a[1]: expected a number, got 'x'"],
+        ),
+    ],
+)
+def test_what_is_of_no_type_and_what_is_in_a_list_is_told_as_it_is(see, parameters, shown):
+    text = MINIMAL.replace("counter", "constellation").replace("count: 3", "count: 1")
+
+    told = see(f"{text}parameters:\n  {parameters}\n").splitlines()
+
+    assert [line.split(": ", 1)[1] for line in told if line.startswith("a.yaml:")] == shown

@@ -179,6 +179,24 @@ def test_a_run_in_real_time_has_the_same_samples_commands_and_truth_in_lockstep(
     ]
 
 
+def test_a_rerun_flown_again_has_its_samples_in_the_same_ticks(braked, tmp_path):
+    cosmos, document = braked
+    _, first, _ = rerun(cosmos, document["run"])
+
+    code, told, err = rerun(cosmos, first["rerun"])
+
+    assert code == 0, (told["devices"], told["diff"], err)
+    assert told["same"]
+    copy = tmp_path / first["rerun"]
+    shutil.copytree(first["directory"], copy)
+    plan = (copy / "plan.json").read_text()
+    assert plan.count("ticks.jsonl") >= 2
+    (copy / "plan.json").write_text(plan.replace("ticks.jsonl", "gone.jsonl"))
+    _, told, _ = rerun(cosmos, copy)
+    gone = [text for text in told["remarks"] if "gone.jsonl is not there any more" in text]
+    assert [text.partition(":")[0] for text in gone] == ["agent-01/imu", "agent-02/imu"]
+
+
 def test_a_change_of_the_flight_software_is_found_and_its_copy_is_not(braked, tmp_path):
     cosmos, document = braked
     for name in ("noisy.py", "brake.py"):

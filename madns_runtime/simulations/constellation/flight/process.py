@@ -88,13 +88,8 @@ class ExternalFlight:
         self._answer_s_max = 0.0
         self._listened_s = 0.0
         """Time at which answers were taken last."""
-        self._counts = {
-            "ticks_sent": 0,
-            "ticks_skipped": 0,
-            "answers": 0,
-            "answers_late": 0,
-            "mail_dropped": 0,
-        }
+        names = ("ticks_sent", "ticks_skipped", "answers", "answers_late", "mail_dropped")
+        self._counts = dict.fromkeys(names, 0)
         self._answers_unasked = 0
         """Answers to no tick that waits for one."""
         self._clock = DeviceClock()
@@ -182,10 +177,13 @@ class ExternalFlight:
             if self._is_lockstep and not self._is_played_back:
                 self._await_answer(t_s)
         except Exception:
-            # At once: other agents may tick in this process.
-            self._link.end(is_patient=False)
-            self._keep_talk()
+            self.abandon()
             raise
+
+    def abandon(self) -> None:
+        """End the program at once, as other agents may tick in this process, and keep what it said."""
+        self._link.end(is_patient=False)
+        self._keep_talk()
 
     def finish(self) -> Mapping[str, Any]:
         """End the program, and return what came of it; in real time what was late is judged."""
@@ -274,9 +272,10 @@ class ExternalFlight:
             counts["ticks_skipped"] += 1
             return
         mail = {name: list(waiting) for name, waiting in self._mail.items()}
-        report = TickReport(t_s=t_s, readings=readings, **mail)
         sent_s = self._present_s()
-        if not self._link.write(self._protocol.tick(report)):
+        if not self._link.write(
+            self._protocol.tick(TickReport(t_s=t_s, readings=readings, **mail))
+        ):
             counts["ticks_skipped"] += 1
             return
         for waiting in self._mail.values():
@@ -370,8 +369,7 @@ class ExternalFlight:
 
     def _keep_talk(self) -> None:
         """Keep what the program says on its standard error; in a file of its own, for no run depends on it."""
-        said = self._link.program.talk() if self._link.program else b""
-        if said:
+        if self._link.program and (said := self._link.program.talk()):
             self._agent.keep_text(STDERR_TEXT, said)
 
     def _last_words(self) -> str:

@@ -50,6 +50,8 @@ class InjectedFailures:
         self._radio = radio
         self._lost: dict[int, tuple[str, ...]] = {}
         """By action the agents whose satellites are lost."""
+        self._dark: dict[int, str] = {}
+        """By action the station that it darkens; several may darken one."""
 
     def begin(self, action: TimelineAction) -> None:
         """
@@ -131,5 +133,11 @@ class InjectedFailures:
 
     def _darken(self, action: TimelineAction, *, is_dark: bool) -> None:
         given: DarkStation = action.parameters  # type: ignore[assignment]  # an instance of its kind's class
-        if self._radio is None or not self._radio.darken(given.station, is_dark=is_dark):
+        if is_dark:
+            self._dark[action.number] = given.station
+        else:
+            self._dark.pop(action.number, None)
+        stays_dark = given.station in self._dark.values()
+        if self._radio is None or not self._radio.darken(given.station, is_dark=stays_dark):
+            self._dark.pop(action.number, None)
             raise ActionRefused(f"no ground station named {given.station!r} in this scenario")

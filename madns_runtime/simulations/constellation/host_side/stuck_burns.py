@@ -65,7 +65,8 @@ class StuckBurns:
         self._burns: list[tuple[StuckBurn, float]] = []
         """Those that go on, and when their gauges are read next."""
         self._by_failure: dict[int, list[StuckBurn]] = {}
-        self._ended: list[StuckBurn] = []
+        self._ended: list[tuple[StuckBurn, float]] = []
+        """Those that are over, and what was left in the tank then, kg."""
 
     def begin(self, failure: int, vehicles: Sequence[int], given: StuckThruster) -> None:
         """
@@ -109,7 +110,7 @@ class StuckBurns:
                 self._read_gauge(burn, min(t_s, burn.ends_s))
                 next_s = gauge_s + math.floor((t_s - gauge_s) / GAUGE_S + 1.0) * GAUGE_S
             if is_over:
-                self._ended.append(burn)
+                self._ended.append((burn, self._stuck.propellant_kg(burn, burn.ends_s)))
                 self._tell_end(burn)
             else:
                 going_on.append((burn, next_s))
@@ -120,7 +121,8 @@ class StuckBurns:
         """Return what each vehicle's thruster burnt while it was stuck; empty if none was."""
         now_s = self._context.now_s()
         summary: dict[str, list[dict[str, Any]]] = {}
-        for burn in (*self._ended, *(burn for burn, _ in self._burns)):
+        going_on = [(burn, self._stuck.propellant_kg(burn, now_s)) for burn, _ in self._burns]
+        for burn, left_kg in (*self._ended, *going_on):
             agent = self._context.agents[burn.vehicle]
             summary.setdefault(agent, []).append(
                 {
@@ -128,7 +130,7 @@ class StuckBurns:
                     "to_s": min(burn.ends_s, now_s),
                     "ended": burn.state(now_s),
                     "delta_v_m_s": self._stuck.delta_v_m_s(burn, now_s),
-                    "propellant_left_kg": self._stuck.propellant_kg(burn, now_s),
+                    "propellant_left_kg": left_kg,
                 }
             )
         return {"stuck_thrusters": summary} if summary else {}

@@ -204,6 +204,11 @@ class Cockpit:
         self._results_dropped += len(self._results) == RESULTS_MAX
         self._results.append(result)
 
+    def abandon(self) -> None:
+        """End flight software that is a program; a class ends with its vehicle."""
+        if isinstance(self._software, ExternalFlight):
+            self._software.abandon()
+
     def finish(self) -> dict[str, Any]:
         """
         Return the summary of what went in and out, and flight software's own under flight.

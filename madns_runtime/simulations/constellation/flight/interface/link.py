@@ -57,6 +57,9 @@ class FlightLink:
         self._thread: ArrivalThread | None = None
         self.transport: Transport = make_transport(given.transport, values, base_directory, devices)
         self.program: FlightProgram | None = None
+        self._has_ended = False
+        self._code: int | None = None
+        """Exit code of the program."""
         self._opened_s = monotonic()
         self.transport.open()
         if isinstance(settings, FlightProcess):
@@ -149,19 +152,21 @@ class FlightLink:
 
     def end(self, *, is_patient: bool = True) -> int | None:
         """
-        End the conversation, and the program if there is one; return its exit code.
+        End the conversation, and the program if there is one; return its exit code. Only the first call does.
 
         Args:
             is_patient: False kills it at once.
         """
+        if self._has_ended:
+            return self._code
+        self._has_ended = True
         if self._thread is not None:
             self._thread.stop()
             self._thread = None
         self._has_thread = False
-        code = None
         if self.program is not None:
             transport = self.transport
-            code = self.program.end(
+            self._code = self.program.end(
                 transport.close_input, transport.arrivals, is_patient=is_patient
             )
             if isinstance(transport, StdioLink):
@@ -169,4 +174,4 @@ class FlightLink:
         else:
             self.transport.close_input()
         self.transport.close()
-        return code
+        return self._code
