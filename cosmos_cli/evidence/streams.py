@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from madns_runtime.errors import MachineError
 from madns_runtime.recording.reader import StreamReading, read_stream
-from madns_runtime.recording.records import Field
+from madns_runtime.recording.records import SCHEMA_VERSION, Field
 
 SUFFIX = ".jsonl"
 INCARNATION = re.compile(r"[1-9][0-9]{0,4}")
@@ -49,6 +49,8 @@ class RecordFile:
     fields: tuple[Field, ...]
     """Empty when the schema line is missing or damaged."""
     is_array: bool = True
+    schema: int = SCHEMA_VERSION
+    """Version of how it is written."""
 
     @property
     def table(self) -> str:
@@ -97,6 +99,9 @@ class StreamScan:
         """Say what is wrong with the stream; None if all of it is there."""
         if self.size_bytes == 0:
             return "empty file: nothing reached the disk"
+        if self.file.schema > SCHEMA_VERSION:
+            known = f"this one knows {SCHEMA_VERSION}"
+            return f"schema {self.file.schema} is of a newer COSMoS, {known}: upgrade cosmos-madns"
         if not self.file.fields:
             return "the schema line is missing or damaged"
         if self.promised is None:
@@ -157,6 +162,7 @@ def open_stream_file(path: Path, role: Role) -> RecordFile:
         incarnation=int(life) if is_later else 1,
         fields=_fields(schema),
         is_array=schema.get("shape") == "array",
+        schema=version if isinstance(version := schema.get("schema"), int) else SCHEMA_VERSION,
     )
 
 

@@ -40,16 +40,25 @@ def read_memory(fact: FileFact) -> dict[str, Any]:
     Return what the machine remembers of the time before, by setting.
 
     Raises:
-        MachineFailure: It is damaged.
+        MachineFailure: It is damaged, or a newer program wrote it.
     """
     if fact.kind == "missing":
         return {}
+    schema: Any = None
     try:
         document = json.loads(fact.text or "")
-        if document["schema"] == MEMORY_SCHEMA and isinstance(document["settings"], dict):
+        schema = document["schema"]
+        if schema == MEMORY_SCHEMA and isinstance(document["settings"], dict):
             return dict(document["settings"])
     except (ValueError, KeyError, TypeError, RecursionError):
         pass
+    if isinstance(schema, int) and schema > MEMORY_SCHEMA:
+        raise MachineFailure(
+            FailureKind.DATA,
+            "state/settings.json in COSMoS's folder there, which remembers what settings were before,"
+            f" is of a newer COSMoS (schema {schema}, this one knows {MEMORY_SCHEMA})",
+            "use that version for this machine, or upgrade cosmos-madns here",
+        )
     raise MachineFailure(
         FailureKind.DATA,
         "state/settings.json in COSMoS's folder there, which remembers what settings were before,"

@@ -17,6 +17,7 @@ from test_flight_process import HZ, Ship, patience  # noqa: F401 - a fixture
 
 from madns_runtime.errors import BlamedError
 from madns_runtime.plugin.device_view import ChannelFrame
+from madns_runtime.simulations.constellation.flight.asked_ticks import UNANSWERED_MAX
 from madns_runtime.simulations.constellation.flight.interface.socket_transports import resolve_both
 
 pytestmark = pytest.mark.process
@@ -291,34 +292,52 @@ def test_datagrams_go_to_a_place_that_is_known(tmp_path):
     board.close()
 
 
-def test_lines_that_name_their_tick_are_for_it_though_datagrams_are_lost(tmp_path):
+@pytest.fixture
+def lossy():
+    """Return a function that plays software over UDP that answers some ticks, and returns the rule of flight for it."""
     board = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     board.bind(("127.0.0.1", 0))
-    transport = {
-        "kind": "udp",
-        "local": "127.0.0.1:0",
-        "remote": f"127.0.0.1:{board.getsockname()[1]}",
-    }
+    threads = []
 
-    def answer_but_every_third():
-        while True:
-            data, sender = board.recvfrom(65536)
-            if not data:
-                return
-            told = json.loads(data)
-            if "t_s" in told and round(told["t_s"] * HZ) % 3 != 1:
-                board.sendto(b'{"t_s":%r}\n' % told["t_s"], sender)
+    def play(answers):
+        def work():
+            while data := board.recv(65536):
+                told = json.loads(data)
+                if "t_s" in told and answers(round(told["t_s"] * HZ)):
+                    board.sendto(b'{"t_s":%r}\n' % told["t_s"], vehicle["at"])
 
-    thread = threading.Thread(target=answer_but_every_third, daemon=True)
-    thread.start()
-    flight = attached(transport, "json_lines")
+        def first_of_all():
+            _, vehicle["at"] = board.recvfrom(65536)  # the setup
+            work()
+
+        vehicle = {}
+        threads.append(threading.Thread(target=first_of_all, daemon=True))
+        threads[0].start()
+        remote = f"127.0.0.1:{board.getsockname()[1]}"
+        return attached({"kind": "udp", "local": "127.0.0.1:0", "remote": remote}, "json_lines")
+
+    yield play
+    threads[0].join(20)
+    board.close()
+
+
+def test_software_that_was_cut_off_for_very_many_ticks_is_sent_ticks_again(tmp_path, lossy):
+    flight = lossy(lambda tick: not 5 <= tick < 5 + 2 * UNANSWERED_MAX) | {"answer_s": 0.05}
+    with Attached(tmp_path, None, flight=flight, is_lockstep=False) as ship:
+        answered(ship, 30)
+        summary = ship.agent._cockpit._software._interface_summary()
+
+    assert summary["ticks_unanswered"] >= UNANSWERED_MAX
+    assert [text for _, text in ship.context.logs if "are sent but one every 0.05 s" in text]
+
+
+def test_lines_that_name_their_tick_are_for_it_though_datagrams_are_lost(tmp_path, lossy):
+    flight = lossy(lambda tick: tick % 3 != 1)
     with Attached(tmp_path, None, flight=flight, is_lockstep=False) as ship:
         answered(ship, 20)
         ship._next += -ship._next % 3  # one that is answered
         answered(ship, 21)
         summary = ship.agent._cockpit._software._interface_summary()
-    thread.join(20)
-    board.close()
 
     assert summary["ticks_unanswered"] >= 9
     ticks = [row[0] for row in ship.context.records["flight_answers"]]

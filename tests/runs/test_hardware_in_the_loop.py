@@ -107,7 +107,9 @@ def test_firmware_answers_at_100_hz_what_its_processor_lets_it(cosmos):
         assert flight["unanswered"] == 0 or flight["ticks_skipped"] > 0
         given_up = flight["interface"]["ticks_unanswered"]
         assert flight["answers"] + flight["unanswered"] + given_up == flight["ticks_sent"]
-        assert flight["ticks_sent"] + flight["ticks_skipped"] == 2000
+        # Of a tick that a busy machine let the agent miss, its computer hears nothing.
+        told = flight["ticks_sent"] + flight["ticks_skipped"]
+        assert 2000 - document["timing"]["missed"] <= told <= 2000
         assert set(faults_of(document, agent).values()) == {0}
         assert len(records(folder, "flight_answers", agent)) == flight["answers"]
     report = (folder / "report.html").read_text()

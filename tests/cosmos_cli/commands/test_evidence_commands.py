@@ -262,3 +262,14 @@ def test_runs_tells_of_a_run_of_a_newer_program(made, capsys):
 
     (entry,) = json.loads(capsys.readouterr().out)
     assert entry["verdict"].startswith("run.json: schema 2 is of a newer COSMoS (9.1)")
+
+
+def test_records_of_a_newer_program_are_named_and_make_a_run_incomplete(made, capsys):
+    path = made.stream("agent-01", "ticks")
+    path.write_text(path.read_text().replace('"schema":1', '"schema":2', 1))
+    finish(made)
+
+    assert app.run(["collect", "1"]) == 5
+    assert (
+        "agent-01: ticks schema 2 is of a newer COSMoS, this one knows 1" in capsys.readouterr().err
+    )

@@ -10,7 +10,7 @@ from provision_machines import facts_of, wanted
 from cosmos_cli.fleet.failure import MachineFailure
 from cosmos_cli.models.inventory.settings import SETTINGS
 from cosmos_cli.models.machine_facts import FileFact, Radio, SystemPaths
-from cosmos_cli.provision.settings import setting_steps
+from cosmos_cli.provision.settings import read_memory, setting_steps
 
 BUFFER = "/proc/sys/net/core/rmem_max"
 GOVERNOR = "/sys/devices/system/cpu/cpu{}/cpufreq/scaling_governor"
@@ -228,3 +228,23 @@ def test_every_setting_has_a_file_of_its_own():
 
     assert len(set(files)) == len(files) == 5
     assert all(path.startswith("/etc/") and "90-cosmos" in path for path in files)
+
+
+@pytest.mark.parametrize(
+    ("text", "told", "cure"),
+    [
+        (
+            '{"schema": 2, "settings": {}}',
+            "is of a newer COSMoS (schema 2, this one knows 1)",
+            "use",
+        ),
+        ('{"schema": "x", "settings": {}}', "is damaged", "remove it"),
+        ('{"settings": {}}', "is damaged", "remove it"),
+    ],
+)
+def test_memory_of_a_newer_program_is_not_called_damaged(text, told, cure):
+    with pytest.raises(MachineFailure) as caught:
+        read_memory(FileFact(kind="file", text=text))
+
+    assert told in caught.value.text
+    assert caught.value.advice.startswith(cure)

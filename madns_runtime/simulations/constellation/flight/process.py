@@ -264,10 +264,12 @@ class ExternalFlight:
         if self._asked.is_full(self._present_s()):
             if not counts["ticks_skipped"]:
                 since = f"the tick at {self._asked.oldest.t_s:g} s"
+                one = f" but one every {self._settings.answer_s:g} s"
+                rest = one if self._link.transport.may_lose else ""
                 self._context.log(
                     "warning",
                     f"{self._link.who} has answered nothing since {since}: no further ones are sent"
-                    f"{self._last_words()}",
+                    f"{rest}{self._last_words()}",
                 )
             counts["ticks_skipped"] += 1
             return
