@@ -124,10 +124,19 @@ class ExternalFlight:
             by_time=getattr(self._protocol, "answers_by_time", True),
             may_lose=self._link.transport.may_lose,
         )
+        try:
+            self._introduce(context)
+        except Exception:
+            self.abandon()  # nobody else knows yet that it runs
+            raise
+
+    def _introduce(self, context: FlightContext) -> None:
+        """Tell the software who it is."""
+        settings = self._settings
         if self._is_recorded:
             self._agent.open_stream("flight_answers", FLIGHT_ANSWERS)
             self._agent.open_stream("flight_clock", FLIGHT_CLOCK)
-        if interface and interface.transport.kind == "pty":
+        if settings.interface and settings.interface.transport.kind == "pty":
             context.log("info", f"flight software is expected at {self._link.transport.address}")
         told = SetupReport(
             name=context.name,
