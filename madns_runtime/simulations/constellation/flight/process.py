@@ -270,7 +270,7 @@ class ExternalFlight:
 
     def _send(self, t_s: float, readings: Readings) -> None:
         counts = self._counts
-        if self._asked.is_full(self._present_s()):
+        if self._asked.is_full(t_s):
             if not counts["ticks_skipped"]:
                 since = f"the tick at {self._asked.oldest.t_s:g} s"
                 self._context.log(
