@@ -1,14 +1,15 @@
 """
 What becomes of a message under the faults in force: decided by rules, by chance under the seed. Pure.
 
-Chance is drawn for names and numbers, not in turn: which fault, whose message, in which direction, the how manyth.
-The same messages have the same fate in real time, in lockstep, and in whatever order the host knows of them.
+Chance is drawn for names and numbers, not in turn: which fault, whose message, in which direction, and its number since
+the fault began. The same messages have the same fate in real time, in lockstep, and in whatever order the host knows of them.
 """
 
 from __future__ import annotations
 
 import math
 import struct
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
@@ -82,16 +83,19 @@ class MessageRules:
         self._rules: dict[int, MessageRule] = {}
         self._with_host: dict[str, tuple[MessageRule, ...]] = {}
         self._between: tuple[MessageRule, ...] = ()
-        self._numbers: dict[tuple[str, int], int] = {}
+        self._numbers: dict[int, Counter[tuple[str, int]]] = {}
+        """By rule how many messages of each agent it was shown, by direction: other rules have no part in its chance."""
 
     def add(self, rule: MessageRule) -> None:
         """Put a rule in force."""
         self._rules[rule.number] = rule
+        self._numbers[rule.number] = Counter()
         self._sort()
 
     def remove(self, number: int) -> MessageRule | None:
         """Lift a rule, and return it; None if it is not in force."""
         rule = self._rules.pop(number, None)
+        self._numbers.pop(number, None)
         self._sort()
         return rule
 
@@ -118,9 +122,11 @@ class MessageRules:
             service: Its class of service: what is not BEST arrives, late.
             now_s: Simulated time at which it is sent, s.
         """
-        number = self._numbers[agent, direction] = self._numbers.get((agent, direction), 0) + 1
         fate, index = Fate(), self._index[agent]
         for rule in self._with_host[agent]:
+            numbers = self._numbers[rule.number]
+            numbers[agent, direction] += 1
+            number = numbers[agent, direction]
             draw = _Draws(self._key, (rule.chance, index, direction, number))
             _apply(rule, fate, draw, left_s=None if service == _BEST else rule.until_s - now_s)
         return fate

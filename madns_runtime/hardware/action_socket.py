@@ -25,6 +25,8 @@ from madns_runtime.timeline.runner import OrderedAction
 SOCKET_NAME: Final = ".actions.sock"
 IN_FORCE_TOLD_MAX: Final = 100
 AGENTS_TOLD_MAX: Final = 20
+IN_FORCE_BYTES_MAX: Final = 150_000
+"""Of the list of what is in force: an answer must fit the socket at once; of a longer list the first half is told."""
 WHOLE_RUN: Final = "run"
 """Target of an action that acts on no agents."""
 
@@ -108,10 +110,13 @@ class ActionSocket:
             for kind in self._kinds.values()
         ]
         in_force = list(self._in_force())
+        told = [_shortened(each) for each in in_force[:IN_FORCE_TOLD_MAX]]
+        while len(orjson.dumps(told)) > IN_FORCE_BYTES_MAX:
+            told = told[: len(told) // 2]
         return {
             "refusal": "",
             "actions": actions,
-            "in_force": [_shortened(each) for each in in_force[:IN_FORCE_TOLD_MAX]],
+            "in_force": told,
             "in_force_count": len(in_force),
         }
 
@@ -155,7 +160,7 @@ class ActionSocket:
 
 
 def _shortened(in_force: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an action in force with the first of its agents and their number: an answer must fit the socket at once."""
+    """Return an action in force with the first of its agents and their number."""
     agents = list(in_force.get("agents", ()))
     return {**in_force, "agents": agents[:AGENTS_TOLD_MAX], "agents_count": len(agents)}
 

@@ -82,7 +82,7 @@ class Loss(NamedTuple):
     agent: int
     reason: str
     records: dict[str, Any]
-    """Counts of its records."""
+    """Counts of its records, and what found no room between it and its devices."""
     unheard: int
     """Messages that came for it in the same order and were not handed in."""
     deadlines_broken: int

@@ -130,9 +130,9 @@ class ProcessPort:
             if packet is None:
                 break
             self._deal_out(packet)
-        if self.after_packet is not None:
-            self.after_packet()
         self.account.add(Span(Cause.RECEIVING, NOBODY, began_s, monotonic()))
+        if self.after_packet is not None:  # whose time is its own in the account
+            self.after_packet()
 
     def _deal_out(self, packet: bytes) -> None:
         datagrams = split(packet) if is_bundle(packet) else None

@@ -68,6 +68,18 @@ def test_where_ticks_may_be_lost_one_is_sent_now_and_then_though_too_many_wait(m
     assert asked.unanswered == sent
 
 
+@pytest.mark.parametrize("late_s", [0.0, 0.003, 0.05])
+def test_which_ticks_are_sent_hangs_on_simulated_time_alone(late_s):
+    asked, sent = asked_of(0), []
+    for number in range(UNANSWERED_MAX + 40):
+        t_s = number / HZ
+        if not asked.is_full(t_s):
+            asked.add(t_s + late_s * (number % 2), t_s)
+            sent.append(number)
+
+    assert sent[UNANSWERED_MAX:] == [74, 85, 96]
+
+
 def test_software_that_answers_again_after_very_many_lost_ticks_is_sent_every_tick_again():
     asked = asked_of(UNANSWERED_MAX, by_time=True)
     now_s = UNANSWERED_MAX / HZ + 2 * ANSWER_S

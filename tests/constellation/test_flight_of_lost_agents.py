@@ -1,9 +1,15 @@
 """A program that flies a vehicle ends with its agent, also where other agents' process goes on."""
 
 import json
+import subprocess
+import sys
 
 import pytest
 from harness.cosmos_command import LOOSE, CosmosCommand
+from test_flight_process import Ship
+
+from madns_runtime.errors import BlamedError
+from madns_runtime.simulations.constellation.flight.interface import program
 
 pytestmark = pytest.mark.process
 
@@ -50,3 +56,19 @@ def test_the_program_of_an_agent_that_is_killed_is_gone_when_the_next_one_starts
     assert lives and set(lives) == {0}
     # What the first one said is kept, too.
     assert (folder / "flight_stderr.txt").read_text().count("born") == 2
+
+
+def test_a_program_that_cannot_be_told_who_it_is_does_not_live_on(tmp_path, monkeypatch):
+    started = []
+
+    class Started(subprocess.Popen):
+        def __init__(self, *arguments, **options):
+            super().__init__(*arguments, **options)
+            started.append(self)
+
+    monkeypatch.setattr(program.subprocess, "Popen", Started)
+    command = [sys.executable, "-c", "import time; time.sleep(60)"]
+    with pytest.raises(BlamedError, match="no room for its setup"):
+        Ship(tmp_path, command, flight={"settings": {"text": "x" * 2_000_000}})
+
+    assert [each.poll() is not None for each in started] == [True]

@@ -111,6 +111,19 @@ def test_chance_of_one_agent_does_not_depend_on_how_much_others_send():
     assert own == mixed
 
 
+def test_chance_of_a_fault_does_not_depend_on_messages_that_other_faults_were_shown():
+    alone, behind = rules_of(), rules_of(rule("lose_messages", number=7, probability=0.5))
+    for _ in range(3):
+        behind.of_host("a", UP, BEST)
+    fates = []
+    for rules in (alone, behind):
+        rules.add(rule("lose_messages", probability=0.5))
+        rules.remove(7)
+        fates.append([rules.of_host("a", UP, BEST).is_lost for _ in range(50)])
+
+    assert fates[0] == fates[1]
+
+
 def test_a_partition_parts_its_agents_from_all_others_and_touches_nothing_with_the_host():
     rules = rules_of(rule("partition", ("a", "b")))
 

@@ -317,3 +317,32 @@ def test_all_frames_that_an_agent_writes_in_a_tick_are_put_out(tmp_path):
         put_out == [b"%d" % number for number in range(2000)] * 3
     )  # those of the last tick are left
     assert run["devices"]["agent-01/line"]["counts"]["writes_left"] == 2000
+
+
+KILLED = """
+name: killed
+simulation: ./line.py:simulation
+agents: {count: 2, tick_hz: 10, per_process: 2}
+time: {duration_s: 11.5, mode: lockstep}
+on_agent_loss: continue
+hardware:
+  devices: [{name: line, kind: ./line.py:Line, rate_hz: 1000}]
+timeline: [{at_s: 11, action: kill, agents: [agent-01]}]
+"""
+
+
+def test_what_an_agent_did_not_take_of_a_queue_before_it_was_lost_is_told(tmp_path):
+    idle = READER.replace('.frames("received")', ".collect() or ()").replace("[-1]", "")
+    (tmp_path / "line.py").write_text(FRAMES + idle)
+    (tmp_path / "killed.yaml").write_text(KILLED)
+    cosmos = CosmosCommand(tmp_path)
+
+    code, run = cosmos.run(tmp_path / "killed.yaml", *LOOSE)
+
+    assert code == 0, run["verdict"]
+    result = json.loads((cosmos.directory(run) / "result.json").read_text())
+    lost, other = (result["agents"][name]["records"] for name in ("agent-01", "agent-02"))
+    dropped = [records["device_losses"]["line"]["frames_dropped"] for records in (lost, other)]
+    assert dropped == [901, 1401], "of those up to its last tick all but 10,000"
+    told = [text for text in run["remarks"] if "there was no room for all" in text]
+    assert [text.partition(":")[0] for text in told] == ["agent-01", "agent-02"]

@@ -11,6 +11,7 @@ from madns_runtime.config import Recording
 from madns_runtime.protocol.bundle import BUNDLE, bundle_up, split
 from madns_runtime.protocol.datagram import OVERHEAD_BYTES
 from madns_runtime.realtime.process_port import PING_INTERVAL_S, ProcessPort
+from madns_runtime.timing.late_causes import Cause
 
 
 class Loop:
@@ -68,6 +69,21 @@ def test_each_agent_gets_what_is_for_it(host):
     loop.turn()
 
     assert got == {7: [datagram(7), datagram(7, b"y")], 8: [datagram(8), datagram(8, b"z")]}
+
+
+def test_what_is_done_behind_a_packet_is_no_part_of_the_time_in_which_it_was_received(host):
+    loop, order = Loop(), []
+    port = port_of(host, 1, loop)
+    port.account.add = lambda span: order.append(span.cause)
+    port.after_packet = lambda: order.append("behind")
+    port.listen(7, lambda data: order.append("taken"))
+    port.send(b"hello")
+    _, address = host.recvfrom(2048)
+
+    host.sendto(datagram(7), address)
+    loop.turn()
+
+    assert order == ["taken", Cause.RECEIVING, "behind"]
 
 
 @pytest.mark.parametrize(

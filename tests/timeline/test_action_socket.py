@@ -60,3 +60,12 @@ def test_the_list_of_what_is_in_force_comes_whole_in_a_run_of_a_thousand_agents(
     assert answer["in_force_count"] == 250
     assert answer["in_force"][0]["agents"] == AGENTS[:AGENTS_TOLD_MAX]
     assert answer["in_force"][0]["agents_count"] == len(AGENTS)
+
+
+def test_a_list_of_long_parameters_is_cut_and_says_how_many_there_are(tmp_path):
+    action = {"number": 1, "action": "own", "agents": [], "parameters": {"text": "x" * 4000}}
+
+    answer = answer_to({"list": True}, tmp_path, [action] * 100)
+
+    assert len(answer["in_force"]) == 25
+    assert answer["in_force_count"] == 100

@@ -68,11 +68,11 @@ class AskedTicks:
         """Return how many should have been answered by now."""
         return sum(self.is_late(tick.sent_s, now_s) for tick in self._ticks)
 
-    def is_full(self, now_s: float) -> bool:
-        """Tell whether no further tick is to be sent now."""
+    def is_full(self, t_s: float) -> bool:
+        """Tell whether the tick at simulated time *t_s* is not to be sent: by such times alone, as a rerun decides alike."""
         if len(self._ticks) < UNANSWERED_MAX:
             return False
-        if not self._may_lose or not self.is_late(self._ticks[-1].sent_s, now_s):
+        if not self._may_lose or t_s - self._ticks[-1].t_s <= self._answer_s:
             return True
         self._give_up()
         return False

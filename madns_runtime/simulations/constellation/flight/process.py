@@ -124,10 +124,19 @@ class ExternalFlight:
             by_time=getattr(self._protocol, "answers_by_time", True),
             may_lose=self._link.transport.may_lose,
         )
+        try:
+            self._introduce(context)
+        except Exception:
+            self.abandon()  # nobody else knows yet that it runs
+            raise
+
+    def _introduce(self, context: FlightContext) -> None:
+        """Tell the software who it is."""
+        settings = self._settings
         if self._is_recorded:
             self._agent.open_stream("flight_answers", FLIGHT_ANSWERS)
             self._agent.open_stream("flight_clock", FLIGHT_CLOCK)
-        if interface and interface.transport.kind == "pty":
+        if settings.interface and settings.interface.transport.kind == "pty":
             context.log("info", f"flight software is expected at {self._link.transport.address}")
         told = SetupReport(
             name=context.name,
@@ -261,7 +270,7 @@ class ExternalFlight:
 
     def _send(self, t_s: float, readings: Readings) -> None:
         counts = self._counts
-        if self._asked.is_full(self._present_s()):
+        if self._asked.is_full(t_s):
             if not counts["ticks_skipped"]:
                 since = f"the tick at {self._asked.oldest.t_s:g} s"
                 one = f" but one every {self._settings.answer_s:g} s"
