@@ -383,6 +383,7 @@ class Worker:
             if reason is not None:
                 agent.journal.event("emergency", reason=reason)
                 agent.journal.say("critical", f"emergency shutdown: {reason}")
+                agent.half.abandon()
             losses = agent.journal.device_losses(agent.devices.hardware.losses())
             counts = {**losses, **agent.journal.close().to_mapping()}
             if agent.devices:

@@ -165,6 +165,9 @@ class Agent(AgentSimulation):
         if message[1] == 9:  # of the last tick: it comes when the simulated time is over
             self.context.send(HOST, ["last word", self.number])
 
+    def abandon(self):
+        self.context.keep_text("abandoned", b"once\n")
+
     def finish(self):
         self.meets("finish")
         return {"draws": self.context.random.random()}

@@ -66,6 +66,15 @@ def test_a_fault_of_a_plug_in_is_named(start_host, fault, who, expected):
     assert ends and all(end.startswith('{"end"') for end in ends)
 
 
+@pytest.mark.parametrize(("fault", "abandoned"), [("step_raise", 6), ("", 0)])
+def test_agents_let_go_of_what_outlives_them_where_a_run_ends_early(start_host, fault, abandoned):
+    run = start_host(fault=fault)
+    run.result()
+
+    told = [path.read_text() for path in run.folder.rglob("abandoned.txt")]
+    assert told == ["once\n"] * abandoned
+
+
 @pytest.mark.parametrize(
     ("fault", "who", "expected"),
     [

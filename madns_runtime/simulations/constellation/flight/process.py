@@ -124,6 +124,14 @@ class ExternalFlight:
             by_time=getattr(self._protocol, "answers_by_time", True),
             may_lose=self._link.transport.may_lose,
         )
+        try:
+            self._tell_setup(context)
+        except Exception:
+            self.abandon()
+            raise
+
+    def _tell_setup(self, context: FlightContext) -> None:
+        settings, interface = self._settings, self._settings.interface
         if self._is_recorded:
             self._agent.open_stream("flight_answers", FLIGHT_ANSWERS)
             self._agent.open_stream("flight_clock", FLIGHT_CLOCK)
