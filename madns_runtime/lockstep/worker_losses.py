@@ -23,10 +23,11 @@ class WorkerLosses:
         agent.journal.event("emergency", reason=reason)
         agent.journal.say("critical", f"emergency shutdown: {reason}")
         self._devices[agent.index] = agent.devices
+        losses = agent.journal.device_losses(agent.devices.hardware.losses())
         self._untold[agent.index] = Loss(
             agent.index,
             reason,
-            agent.journal.close().to_mapping(),
+            {**losses, **agent.journal.close().to_mapping()},
             0,
             agent.deadlines_broken,
             agent.mailbox.counts(),
