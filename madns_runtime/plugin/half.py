@@ -145,6 +145,8 @@ class Half:
     def __init__(self, make: Callable[[], Any], log: Callable[[str, str], None]) -> None:
         self._log = log
         self.name: str = getattr(make, "__name__", "the simulation's half")
+        self._has_begun = False
+        """Whether its setup was called."""
         try:
             self.simulation = make()
         except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
@@ -158,6 +160,7 @@ class Half:
         Raises:
             HalfFailed: It raised, or returned something against its contract.
         """
+        self._has_begun = self._has_begun or name == "setup"
         return self.run(name, None, *arguments)
 
     def run(self, name: str, function: Callable[..., Any] | None, *arguments: Any) -> Any:
@@ -187,9 +190,14 @@ class Half:
             ) from error
 
     def abandon(self) -> None:
-        """Have an agent's half let go of what outlives it; what it raises is in its log, and changes nothing."""
-        with contextlib.suppress(HalfFailed):
-            self.call("abandon")
+        """
+        Have an agent's half let go of what outlives it; of one whose setup was not called that is nothing.
+
+        What it raises is in its log, and changes nothing.
+        """
+        if self._has_begun:
+            with contextlib.suppress(HalfFailed):
+                self.call("abandon")
 
     def _method(self, name: str) -> Callable[..., Any]:
         """Return a method; of a half that does not inherit it, and lacks it, the one that it would inherit."""

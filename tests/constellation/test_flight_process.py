@@ -154,6 +154,23 @@ print(json.dumps(answer), flush=True)
     assert ship.summary["exit_code"] == 0
 
 
+def test_a_program_that_cannot_be_told_its_setup_is_ended(tmp_path, monkeypatch):
+    begun, begin = [], flight_program.FlightProgram.__init__
+
+    def noted(self, *arguments, **options):
+        begun.append(self)
+        begin(self, *arguments, **options)
+
+    monkeypatch.setattr(flight_program.FlightProgram, "__init__", noted)
+    settings = {"text": "x" * 2_000_000}
+
+    with pytest.raises(BlamedError, match="give fewer settings"):
+        Ship(tmp_path, program(tmp_path, ANSWER), flight={"settings": settings})
+
+    (one,) = begun
+    assert one.has_exited
+
+
 def test_it_is_told_who_it_is_and_what_it_may_know(tmp_path):
     body = """
 with open("told.json", "a") as file:

@@ -287,6 +287,27 @@ def test_frames_between_two_ticks_come_whole_or_are_counted(tmp_path, tick_hz, t
     assert (told in run["remarks"]) == bool(dropped)
 
 
+def test_frames_that_an_agent_had_no_room_for_before_it_was_killed_are_told(tmp_path):
+    (tmp_path / "line.py").write_text(FRAMES + READER)
+    killed = READ.replace("TICK_HZ", "0.0625").replace("count: 1", "count: 2")
+    killed = killed.replace("duration_s: 24", "duration_s: 48")
+    killed += """on_agent_loss: continue
+timeline: [{at_s: 20, action: kill, agents: [agent-01]}]
+"""
+    (tmp_path / "read.yaml").write_text(killed)
+    cosmos = CosmosCommand(tmp_path)
+
+    code, run = cosmos.run(tmp_path / "read.yaml", *LOOSE)
+
+    assert code == 0, run["verdict"]
+    events = rows(cosmos.directory(run) / "agents" / "agent-01" / "events.jsonl")
+    assert "killed" in [each["event"] for each in events]
+    (dropped,) = [each["frames_dropped"] for each in events if each["event"] == "device_losses"]
+    assert dropped > 0
+    told = f"agent-01: device line: there was no room for all: frames_dropped {dropped}"
+    assert told in run["remarks"]
+
+
 WRITER = """
     def write(self, values, due_s):
         pass

@@ -166,7 +166,7 @@ class Agent(AgentSimulation):
             self.context.send(HOST, ["last word", self.number])
 
     def abandon(self):
-        self.context.log("info", f"abandoned {self.number}")
+        self.context.keep_text("abandoned", b"once\n")
 
     def finish(self):
         self.meets("finish")

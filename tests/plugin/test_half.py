@@ -50,6 +50,17 @@ class Base(HostSimulation):
         self.got = (job, value)
 
 
+class Launcher(AgentSimulation):
+    """Has something to let go of once it was set up, be it by half."""
+
+    def setup(self, context: Any, initial: Any) -> None:
+        self.programs = ["running"]
+        raise ValueError("no link")
+
+    def abandon(self) -> None:
+        self.programs.pop()
+
+
 @pytest.fixture
 def logged() -> list[str]:
     return []
@@ -344,3 +355,19 @@ def test_an_agent_that_cannot_hear_says_who_sent_and_what_it_lacks(logged):
         assert str(raised.value) == f"a sent a message, and {kind.__name__} has no hear(delivery)"
         refusal = TransmissionRefusal(number=0, to="b", sent_s=0.0, reason="out_of_range")
         assert made(kind, logged).call("refused", refusal) is None
+
+
+def test_a_half_lets_go_of_what_outlives_it_if_its_setup_was_called_though_it_raised(
+    logged: list[str],
+) -> None:
+    half = made(Launcher, logged)
+    half.abandon()
+    assert logged == [], "nothing was started, and nothing went wrong"
+    with pytest.raises(HalfFailed, match="no link"):
+        half.call("setup", None, None)
+    logged.clear()
+
+    half.abandon()
+    assert (half.simulation.programs, logged) == ([], [])
+    half.abandon()
+    assert len(logged) == 1 and "IndexError" in logged[0]

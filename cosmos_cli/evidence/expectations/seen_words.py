@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
+import numpy as np
 from numpy.typing import NDArray
 
 from cosmos_cli.models.document import did_you_mean
@@ -13,7 +14,7 @@ from cosmos_cli.ui.foreign_text import clean_line
 from cosmos_cli.ui.plural import counted
 
 KEPT_MAX: Final = 1000
-"""Different words of one stream; of more, such as sentences, the first."""
+"""Different words that are kept of one stream; of more, such as sentences, the first."""
 TOLD_MAX: Final = 10
 CHARACTERS_MAX: Final = 40
 """Of a word that is told."""
@@ -29,27 +30,37 @@ class SeenWords:
 
     def __init__(self, expectation: Expectation) -> None:
         self._expectation = expectation
-        counted = None if expectation.when is None else expectation.when.text
-        self._word = expectation.event or counted or ""
+        counted_text = None if expectation.when is None else expectation.when.text
+        self._word = expectation.event or counted_text or ""
         is_open = (expectation.stream, expectation.field) not in WORDS
-        self._is_wanted = is_open and bool(self._word)
+        self._is_sought = is_open and bool(self._word)
+        """Whether the word is looked for and was not met."""
         self._words: set[str] = set()
 
     def take(self, values: NDArray[Any]) -> None:
         """Take the values of some records."""
-        if self._is_wanted and len(self._words) < KEPT_MAX:
-            self._words.update(each for each in values.tolist() if isinstance(each, str))
+        if not self._is_sought or values.dtype != object:
+            return
+        if np.any(values == self._word):
+            self._is_sought = False
+            return
+        for each in values if len(self._words) < KEPT_MAX else ():
+            if isinstance(each, str):
+                self._words.add(each)
+                if len(self._words) == KEPT_MAX:
+                    return
 
     def remark(self) -> str | None:
         """Return what is to be told; None if the word was met, or nobody knows what would have been one."""
         expectation = self._expectation
-        if not self._words or self._word in self._words:
+        if not self._is_sought or not self._words:
             return None
         words = sorted(clean_line(word, length_max=CHARACTERS_MAX) for word in self._words)
         guess = did_you_mean(self._word, words)
         if not guess.endswith("?"):
             rest = len(words) - TOLD_MAX
-            more = f" and {counted(rest, 'other')}" if rest > 0 else ""
+            others = "others" if len(words) == KEPT_MAX else counted(rest, "other")
+            more = f" and {others}" if rest > 0 else ""
             guess = f"; words seen: {', '.join(words[:TOLD_MAX])}{more}"
         return (
             f"{expectation.name}: no record of {expectation.stream} has {self._word!r:.80}"

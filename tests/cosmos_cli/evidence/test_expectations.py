@@ -588,4 +588,11 @@ def test_of_very_many_words_few_are_told():
     (told,) = remarks_on(FakeTable("radio", RADIO.fields, many), event="quiet")
 
     assert told.count("word0") == 10
-    assert told.endswith("others")
+    assert told.endswith(" and others"), "how many more there are nobody has counted"
+
+
+def test_a_word_that_comes_after_very_many_others_is_there():
+    words = [f"word{number}" for number in range(150_000)]
+    many = {"a": {"t_s": np.arange(150_001.0), "event": objects([*words, "quiet"])}}
+
+    assert remarks_on(FakeTable("radio", RADIO.fields, many), event="quiet") == ()
