@@ -7,6 +7,7 @@ What a field may be is written down in `madns_runtime.plugin.parameter_kinds`; d
 from __future__ import annotations
 
 import collections.abc
+import copy
 import dataclasses
 import functools
 import types
@@ -23,6 +24,10 @@ T = TypeVar("T")
 CLASSES_KEPT = 256
 """Of how many dataclasses the types are kept: to evaluate them takes longer than to build a small object."""
 MAPPINGS = (dict, Mapping, collections.abc.MutableMapping)
+LINE_CHARACTERS_MAX = 200
+"""Of a name or a unit that somebody declares."""
+SHOWN_CHARACTERS_MAX = 100
+"""Of a value in a message."""
 
 
 def to_mapping(value: Any) -> dict[str, Any]:
@@ -196,3 +201,34 @@ def is_whole(value: object) -> TypeGuard[int]:
     if type(value) is int:
         return True
     return issubclass(type(value), Integral) and type(value) is not bool
+
+
+def own_copy(value: T) -> T:
+    """Return a copy of a value that holds something that can be changed, such as a list; else the value itself."""
+    if not _is_changeable(value):
+        return value
+    try:
+        return copy.deepcopy(value)
+    except Exception:  # noqa: BLE001 - a class of a plug-in may keep what cannot be copied, such as a lock
+        return value
+
+
+def _is_changeable(value: Any) -> bool:
+    if dataclasses.is_dataclass(value):
+        return any(_is_changeable(getattr(value, f.name, None)) for f in dataclasses.fields(value))
+    if isinstance(value, tuple):
+        return any(map(_is_changeable, value))
+    return not isinstance(value, str | int | float | bytes | Enum | PurePath | None)
+
+
+def is_line(value: object) -> TypeGuard[str]:
+    """Tell whether a value is one line of printable text, at most LINE_CHARACTERS_MAX long: every file can hold it."""
+    return isinstance(value, str) and len(value) <= LINE_CHARACTERS_MAX and value.isprintable()
+
+
+def shown(value: object) -> str:
+    """Return a value for a message; whole numbers of thousands of digits have no text, and a class may refuse one."""
+    try:
+        return f"{value!r:.{SHOWN_CHARACTERS_MAX}}"
+    except BaseException:  # noqa: BLE001 - __repr__ of a plug-in's class may raise anything
+        return f"a {type(value).__name__} that cannot be shown"

@@ -7,7 +7,8 @@ The simulation says how its records are read; here rows become a Parquet file li
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +25,14 @@ from cosmos_cli.evidence.tables import TableLayout, TableWriter
 from madns_runtime.config import RunConfig
 from madns_runtime.errors import PluginError
 from madns_runtime.partial_file import check_replaceable
+from madns_runtime.plain_values import shown
 from madns_runtime.plugin.api import Tabulated
 from madns_runtime.plugin.code_places import place_of
+from madns_runtime.plugin.descriptor_faults import COLUMNS_OF_TABLES
 from madns_runtime.plugin.isolation import call_plugin
 from madns_runtime.plugin.registry import load_function, resolve
-from madns_runtime.recording.records import Field
+from madns_runtime.recording.records import Field, StreamSchema
+from madns_runtime.recording.stream_rules import check_schema
 
 NAME = "truth"
 TIME = Field("t_s", "s")
@@ -116,25 +120,61 @@ def _parts(
 ) -> Iterator[Tabulated]:
     """Yield what the simulation tabulates, part by part: its faults are told as its own."""
     parts = call_plugin("tabulate", function, folder, agents, times_s, finish=iter)
+    told: dict[str, None] = {}
     fields: tuple[Field, ...] | None = None
-    while (part := call_plugin("tabulate", next, parts, None)) is not None:
-        fault = _fault_of(part, fields)
-        if fault:
-            raise PluginError(f"{place_of(function)}: tabulate() {fault}")
+
+    def judge(part: object) -> Tabulated | None:
+        fault = None if part is None else _fault_of(part, fields, agents)
+        if part is None or fault:
+            missing = [agent for agent in agents if agent not in told]
+            fault = fault or (f"yielded no rows of {', '.join(missing)}" if missing else None)
+            if fault:
+                raise PluginError(f"{place_of(function)}: tabulate() {fault}")
+            return None
+        return _as_floats(part)
+
+    @wraps(function)  # whose file and line are told
+    def advance() -> object:
+        return next(parts, None)
+
+    while (part := call_plugin("tabulate", advance, finish=judge)) is not None:
         fields = part.fields
+        told[part.agent] = None
         yield part
 
 
-def _fault_of(part: object, fields: tuple[Field, ...] | None) -> str | None:
+def _fault_of(part: Any, fields: tuple[Field, ...] | None, agents: tuple[str, ...]) -> str | None:
     if not isinstance(part, Tabulated):
-        return f"must yield madns_runtime.plugin.api.Tabulated, got {part!r:.100}"
+        return f"must yield madns_runtime.plugin.api.Tabulated, got {shown(part)}"
+    if part.agent not in agents:
+        return (
+            f"must yield rows of the agents that it is asked for, got those of {shown(part.agent)}"
+        )
     if fields is not None and part.fields != fields:
         return f"must yield the same fields for every agent, got others for {part.agent}"
+    try:
+        check_schema(StreamSchema(NAME, (TIME, *part.fields)))
+    except PluginError as error:
+        return f"must give fields that a table can hold: {error}"
     names = [field.name for field in part.fields]
-    rows = {len(part.columns[name]) for name in names if name in part.columns}
-    if set(part.columns) != set(names) or rows != {len(part.times_s)}:
+    if taken := [name for name in names if name in COLUMNS_OF_TABLES]:
+        return f"must call no field {taken[0]}, as a column of tables is"
+    rows = {np.shape(part.columns[name]) for name in names if name in part.columns}
+    if set(part.columns) != set(names) or rows != {(len(part.times_s),)}:
         return f"must yield a value a time of each of {', '.join(names)}, for {part.agent}"
     return None
+
+
+def _as_floats(part: Any) -> Tabulated:
+    """Return rows with every column as floats, as their simulation should give them."""
+    rows: Tabulated = replace(
+        part,
+        times_s=np.asarray(part.times_s, dtype=np.float64),
+        columns={
+            name: np.asarray(column, dtype=np.float64) for name, column in part.columns.items()
+        },
+    )
+    return rows
 
 
 def _write(

@@ -104,6 +104,9 @@ def _parse_utc(text: object) -> datetime | None:
         return None
     try:
         told = datetime.fromisoformat(text)
-    except ValueError:
+        return told.replace(tzinfo=UTC) if told.tzinfo is None else told.astimezone(UTC)
+    except (
+        ValueError,
+        OverflowError,
+    ):  # the latter of a zone that leads out of the years 1 to 9999
         return None
-    return told.replace(tzinfo=UTC) if told.tzinfo is None else told.astimezone(UTC)

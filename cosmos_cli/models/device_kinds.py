@@ -35,9 +35,9 @@ from madns_runtime.hardware.kind_registry import GROUP, prepare, registered_kind
 from madns_runtime.plain_values import from_mapping
 from madns_runtime.plugin.code_places import blame
 from madns_runtime.plugin.entry_points import registered
-from madns_runtime.plugin.isolation import said
+from madns_runtime.plugin.isolation import is_interruption, said
 from madns_runtime.plugin.registry import is_file
-from madns_runtime.plugin.time_limit import PluginStopped, hold
+from madns_runtime.plugin.time_limit import hold
 
 SHIPPED = "madns_runtime."
 """Beginning of the modules whose code is ours."""
@@ -192,7 +192,9 @@ def _answer(
     except MadnsError as error:
         inner = ("parameters",) if question.parameters else ("kind",)
         return _to_plain(_wrong(document, question, inner, str(error)))
-    except (Exception, SystemExit, PluginStopped) as error:  # noqa: BLE001 - a kind's class may raise anything
+    except BaseException as error:  # a kind's class may raise anything
+        if is_interruption(error):
+            raise
         text = f"{blame(error, kind.parameters)}: {said(error)}"
         return _to_plain(_wrong(document, question, ("kind",), text))
     if wrong := needs_faults(program.needs):
@@ -242,7 +244,9 @@ def _parameter_faults(
         return faults_of(document, errors, kind.parameters, below=(*question.path, "parameters"))
     except MadnsError as error:
         return list(_wrong(document, question, ("kind",), str(error)).faults)
-    except (Exception, SystemExit, PluginStopped) as error:  # noqa: BLE001 - a kind's class may raise anything
+    except BaseException as error:  # a kind's class may raise anything
+        if is_interruption(error):
+            raise
         text = f"{blame(error, kind.parameters)}: {kind.parameters.__name__}: {said(error)}"
         return list(_wrong(document, question, ("kind",), text).faults)
     return []

@@ -19,6 +19,7 @@ from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
 from cosmos_cli.models.agent_rules import RULES, refused_parameters, rule_document, select_agents
 from cosmos_cli.models.document import Document
 from cosmos_cli.models.fault_place import fault_found_at
+from cosmos_cli.models.parameter_answers import ParameterAnswers, of_all_agents
 from cosmos_cli.models.parameters import adapter_of
 from cosmos_cli.models.plugin_process import Tell, ask_apart
 from cosmos_cli.models.plugin_values import changed, is_same, not_sendable
@@ -37,7 +38,7 @@ from madns_runtime.errors import ConfigurationError, MadnsError, PluginError
 from madns_runtime.plugin.api import DeclaredStream, DeviceUse, PlaceUse, Simulation
 from madns_runtime.plugin.code_places import blame, place_of
 from madns_runtime.plugin.columns import unknown_columns
-from madns_runtime.plugin.isolation import said
+from madns_runtime.plugin.isolation import is_interruption, said
 from madns_runtime.plugin.queries import (
     ask_check,
     ask_check_actions,
@@ -52,7 +53,7 @@ from madns_runtime.plugin.registry import (
     part_faults,
     resolve,
 )
-from madns_runtime.plugin.time_limit import PluginStopped, hold
+from madns_runtime.plugin.time_limit import hold
 
 T = TypeVar("T")
 
@@ -112,45 +113,6 @@ def ask_plugin(
         return PluginAnswers(faults=(fault,), parameters=None)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _OfParameters:
-    """What follows from one set of parameters."""
-
-    agents: tuple[str, ...] = ()
-    """For which it holds; empty for all others."""
-    parameters: dict[str, Any]
-    streams: tuple[DeclaredStream, ...] | None
-    device_uses: tuple[DeviceUse, ...]
-    place_uses: tuple[PlaceUse, ...]
-
-
-def with_rules(
-    found: PluginAnswers, own: _OfParameters, rules: Sequence[_OfParameters]
-) -> PluginAnswers:
-    """Return the answers of all sets of parameters together, each for its agents."""
-    ruled = {agent for rule in rules for agent in rule.agents}
-    streams = own.streams
-    for rule in rules:
-        known = {(each.role, each.name) for each in streams or ()}
-        more = [each for each in rule.streams or () if (each.role, each.name) not in known]
-        streams = None if streams is None else (*streams, *more)
-    return replace(
-        found,
-        agent_parameters=tuple(
-            AgentParameters(agents=rule.agents, parameters=rule.parameters) for rule in rules
-        ),
-        streams=streams,
-        device_uses=(
-            *(use for use in own.device_uses if use.agent not in ruled),
-            *(use for rule in rules for use in rule.device_uses if use.agent in rule.agents),
-        ),
-        place_uses=(
-            *(use for use in own.place_uses if use.agent not in ruled),
-            *(use for rule in rules for use in rule.place_uses if use.agent in rule.agents),
-        ),
-    )
-
-
 class _Asking:
     """Asks, here and now."""
 
@@ -160,6 +122,7 @@ class _Asking:
         self._document, self._agents = document, agents
         self._base_directory, self._tell = base_directory, tell
         self._faults: list[Fault] = []
+        self._omitted = 0
 
     def answers(self, spec: str, duration_s: float) -> PluginAnswers:
         """Return faults, parameters and whether there is a `demand`."""
@@ -185,22 +148,25 @@ class _Asking:
             own = self._of(simulation, parameters, self._agents, duration_s)
             found = replace(found, labels=self._labels(simulation, parameters, self._agents))
             rules = self._rules(simulation, self._agents, found, duration_s)
-            found = with_rules(found, own, rules)
+            found = replace(found, **of_all_agents(own, rules))
             self._check_actions(simulation, parameters, own_actions, found.labels)
         return self._told(found)
 
     def _told(self, found: PluginAnswers) -> PluginAnswers:
         first = self._faults[:FAULTS_SHOWN_MAX]
-        omitted = len(self._faults) - len(first)
+        omitted = self._omitted + len(self._faults) - len(first)
         return replace(found, faults=tuple(fault.clipped() for fault in first), omitted=omitted)
 
     def _of(
         self, simulation: Simulation, parameters: Any, agents: Agents, duration_s: float
-    ) -> _OfParameters:
+    ) -> ParameterAnswers:
         """Ask all that follows from one set of parameters."""
+        plain = to_mapping(
+            parameters
+        )  # before anybody is asked: lists and mappings of it can be changed
         self._check(simulation, parameters, agents, duration_s)
-        return _OfParameters(
-            parameters=to_mapping(parameters),
+        return ParameterAnswers(
+            parameters=plain,
             streams=self._streams(simulation, parameters, agents),
             device_uses=self._uses(ask_device_uses, simulation.device_uses, parameters, agents),
             place_uses=self._uses(ask_place_uses, simulation.place_uses, parameters, agents),
@@ -208,7 +174,7 @@ class _Asking:
 
     def _rules(
         self, simulation: Simulation, agents: Agents, of_all: PluginAnswers, duration_s: float
-    ) -> list[_OfParameters]:
+    ) -> list[ParameterAnswers]:
         """Ask the same of the parameters that rules give some agents."""
         given = self._document.value.get(RULES) or ()
         names = agents.resolved_names()
@@ -230,11 +196,18 @@ class _Asking:
                     of_all=of_all.parameters or {},
                 )
             self._faults += [fault for fault in asking._faults if fault not in self._faults]
+            self._omitted += asking._omitted
         return found
 
     def _blame(self, *texts: str) -> None:
         """Enter faults of the simulation itself."""
         self._faults += [self._document.fault(("simulation",), text) for text in texts]
+
+    def _blame_texts(self, texts: Sequence[str], section: str = "parameters") -> None:
+        """Enter faults that the simulation itself finds; those that are not shown are counted."""
+        first = texts[:FAULTS_SHOWN_MAX]
+        self._omitted += len(texts) - len(first)
+        self._faults += [fault_found_at(self._document, text, section=section) for text in first]
 
     def _simulation(self, spec: str) -> Simulation | None:
         self._tell(f"importing {spec}")
@@ -276,7 +249,9 @@ class _Asking:
             texts = [f"{_place(kind)}.{told}; a default must be of its field's type"]
         except MadnsError as error:
             texts = [str(error)]
-        except (Exception, SystemExit, PluginStopped) as error:  # noqa: BLE001 - a plug-in's class may raise anything
+        except BaseException as error:  # a plug-in's class may raise anything
+            if is_interruption(error):
+                raise
             texts = [f"{blame(error, kind)}: {kind.__name__}: {said(error)}"]
         else:
             made = to_mapping(parameters)
@@ -308,7 +283,7 @@ class _Asking:
         except PluginError as error:
             self._blame(str(error))
         else:
-            self._faults += [fault_found_at(self._document, text) for text in texts]
+            self._blame_texts(texts)
 
     def _check_actions(
         self,
@@ -336,9 +311,7 @@ class _Asking:
         except PluginError as error:
             self._blame(str(error))
         else:
-            self._faults += [
-                fault_found_at(self._document, text, section="timeline") for text in texts
-            ]
+            self._blame_texts(texts, section="timeline")
 
     def _streams(
         self, simulation: Simulation, parameters: Any, agents: Agents

@@ -273,7 +273,10 @@ class TableBlock:
     note: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse rows of another length than the head."""
+        """Refuse a head of other values, and rows of another length than it."""
+        heads: Sequence[Any] = self.headings
+        if wrong := [type(head).__name__ for head in heads if not isinstance(head, Heading)]:
+            raise ValueError(f"table {self.title!r}: expected a Heading per column, got {wrong[0]}")
         for number, row in enumerate(self.rows):
             if len(row) != len(self.headings):
                 raise ValueError(
@@ -286,6 +289,12 @@ class ReportRemark:
     """A sentence where a figure would say nothing."""
 
     text: str
+
+    def __post_init__(self) -> None:
+        """Refuse what is no text."""
+        text: Any = self.text
+        if not isinstance(text, str):
+            raise ValueError(f"ReportRemark: expected a text, got {type(text).__name__}")
 
 
 Block = Figure | SpaceFigure | TableBlock | ReportRemark

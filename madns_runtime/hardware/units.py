@@ -10,6 +10,8 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
+from madns_runtime.units import conversion
+
 G0_M_S2: Final = 9.80665
 """Standard gravity."""
 
@@ -62,19 +64,20 @@ def factor_of(unit: str, wanted: str) -> float | None:
 
     Args:
         unit: As a channel declares it.
-        wanted: A key of `FACTORS`.
+        wanted: A key of `FACTORS`, or any other unit of `madns_runtime.units`.
 
     Returns:
         The factor; None if it is no unit of that quantity.
     """
-    return FACTORS[wanted].get(plain_unit(unit))
+    known = FACTORS.get(wanted)
+    return conversion(unit, wanted) if known is None else known.get(plain_unit(unit))
 
 
 def unit_fault(unit: str, wanted: str) -> str | None:
     """Return what is wrong with a channel's unit where values in another are wanted; None if it converts."""
     if factor_of(unit, wanted) is not None:
         return None
-    known = ", ".join(name for name in FACTORS[wanted] if name)
+    known = ", ".join(name for name in FACTORS.get(wanted, {wanted: 1.0}) if name)
     if not unit.strip():
         return f"expected a unit of {wanted}, and the channel declares none: declare one of {known}"
     return f"expected a unit that converts to {wanted} ({known}), got {unit!r:.40}"

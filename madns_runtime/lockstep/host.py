@@ -237,6 +237,9 @@ class LockstepHost:
         limit_s = max(timeouts.complete_s, timeouts.tick_s)
         self._meeting.await_all(limit_s, "has not summed itself up")
         self._absences.take()
+        for number, service, _ in self._meeting.messages():
+            account.agents[number].up[service] += 1
+            account.agents[number].too_late += 1
         for answer in self._crew.answers():
             for number, summary, deadlines_broken, counts, newest in answer[frames.LOSSES + 1]:
                 account.agents[number].summary = summary
@@ -247,6 +250,7 @@ class LockstepHost:
         # The view's last picture stays on the terminal: without this one of some moment before the end.
         self._meeting.operator.emit(account.progress(self._clock.t_s, monotonic()))
         account.simulation = self._guarded.finish()
+        self._outbox.give_up()
 
     def _t_s(self) -> float | None:
         return None if self._account.began_s is None else self._clock.t_s

@@ -7,8 +7,8 @@ stands in memory that the host can read, so that a worker that hangs or is kille
 
 from __future__ import annotations
 
+import contextlib
 import faulthandler
-import os
 import signal
 import socket
 import sys
@@ -26,15 +26,16 @@ from madns_runtime.lockstep.assignment import Assignment
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.frames import POSITIONS, encode_frame
 from madns_runtime.lockstep.messages import decode
+from madns_runtime.lockstep.stray_forks import StrayForks
 from madns_runtime.lockstep.worker_line import HostGone, WorkerLine
 from madns_runtime.lockstep.worker_losses import WorkerLosses
 from madns_runtime.plugin.api import Tick
 from madns_runtime.plugin.context import clean_text
-from madns_runtime.plugin.half import HalfFailed, RoleProgram
+from madns_runtime.plugin.half import RoleProgram
 from madns_runtime.processes import register
 from madns_runtime.protocol.codec import unpack
 from madns_runtime.protocol.messages import ActionOrder, AgentFault, Delivery, TransmissionRefusal
-from madns_runtime.reactor.forking import leave_parent
+from madns_runtime.reactor.forking import end_child, leave_parent
 from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.watchdog import end_after_hang_up
 from madns_runtime.recording.newest_values import Value
@@ -74,10 +75,12 @@ def run_worker(assignment: Assignment, line: socket.socket) -> NoReturn:
         with register(assignment.config.run, "agent", own, assignment.directory):
             code = Worker(assignment, line).run()
     except BaseException:  # noqa: BLE001 - the last frame of a process; the host sees the line close
-        traceback.print_exc()
+        with contextlib.suppress(
+            Exception
+        ):  # a plug-in may have put anything in the place of stderr
+            traceback.print_exc()
     finally:
-        sys.stderr.flush()
-        os._exit(code)
+        end_child(code)
 
 
 class Worker:
@@ -101,6 +104,7 @@ class Worker:
         self._losses = WorkerLosses()
         self._goes_on = False
         """Whether the run goes on without an agent that fails now."""
+        self._forks = StrayForks(assignment.position)
         self._faults: dict[int, StepFaults] = {}
         self._mates: Crewmates
         self._flush_interval_s = config.recording.flush_interval_s
@@ -117,6 +121,7 @@ class Worker:
     def run(self) -> int:
         """Carry out orders until the last, and return the exit code."""
         self._line.heed_sigterm()
+        self._forks.watch()
         try:
             self._answer(self._load)
             while (order := self._line.next_order())[0] != frames.STOP:
@@ -136,6 +141,7 @@ class Worker:
             answer = carry_out()
         except AgentFailed as failure:
             answer = encode_frame(frames.FAILED, failure.index, clean_text(failure.reason))
+        self._forks.end_stray(self._line)
         self._position[0] = frames.IDLE
         self._line.say(answer)
 
@@ -178,7 +184,7 @@ class Worker:
         agent.journal.event("start")
         try:
             if not has_devices:
-                self._ask_devices(agent, agent.devices.open)
+                self._ask(agent, agent.devices.open)
             self._call(agent, "setup", agent.context, unpack(packed))
         except AgentFailed as failure:
             self._lose(agent, failure)
@@ -242,15 +248,9 @@ class Worker:
     def _look_at_devices(self, agent: LockstepAgent, t_s: float) -> None:
         """Take the devices' samples up to *t_s*, and tell the half whose status has changed."""
         self._position[0] = agent.stepping
-        for name, status in self._ask_devices(agent, partial(agent.devices.advance, t_s)):
+        for name, status in self._ask(agent, agent.devices.advance, t_s):
             agent.journal.event("device", device=name, status=status)
             self._call(agent, "device_changed", name, status)
-
-    def _ask_devices(self, agent: LockstepAgent, ask: Callable[[], Any]) -> Any:
-        try:
-            return ask()
-        except MadnsError as error:
-            raise AgentFailed(agent.index, str(error)) from error
 
     def _drain(self, messages: list[tuple[int, bytes]]) -> bytes:
         self._check_terminated()
@@ -259,7 +259,7 @@ class Worker:
         return self._done()
 
     def _finish(self) -> bytes:
-        summaries = []
+        summaries, outbox = [], self._mates.outbox
         for agent in self._agents:
             self._position[0] = agent.index * POSITIONS + frames.FINISHING
             try:
@@ -270,7 +270,9 @@ class Worker:
             counts = agent.mailbox.counts()
             newest = agent.columns.read()
             summaries.append((agent.index, summary, agent.deadlines_broken, counts, newest))
-        return encode_frame(frames.SUMMARIES, (), (), self._losses.take(), summaries)
+        answer = encode_frame(frames.SUMMARIES, outbox, (), self._losses.take(), summaries)
+        outbox.clear()
+        return answer
 
     def _done(self, newest: Sequence[tuple[int, list[Value]]] = ()) -> bytes:
         outbox = self._mates.outbox
@@ -290,15 +292,15 @@ class Worker:
             if isinstance(message, Delivery):
                 agent.mailbox.add(message)
                 continue
-            if isinstance(message, ActionOrder):
-                self._position[0] = index * POSITIONS + frames.ACTING
-                self._act(agent, message)
-                continue
+            is_action = isinstance(message, ActionOrder)
             is_refusal = isinstance(message, TransmissionRefusal)
             doing = frames.REFUSED if is_refusal else frames.RECEIVING
-            self._position[0] = index * POSITIONS + doing
+            self._position[0] = index * POSITIONS + (frames.ACTING if is_action else doing)
             try:
-                self._call(agent, frames.METHODS[doing], message)
+                if is_action:
+                    self._ask(agent, agent.actions.take, message)
+                else:
+                    self._call(agent, frames.METHODS[doing], message)
             except AgentFailed as failure:
                 self._lose(agent, failure)
 
@@ -358,16 +360,13 @@ class Worker:
     # Faults and records ------------------------------------------------------------------------------
 
     def _call(self, agent: LockstepAgent, name: str, *arguments: Any) -> Any:
-        try:
-            return agent.half.call(name, *arguments)
-        except HalfFailed as failure:
-            raise AgentFailed(agent.index, str(failure)) from failure
+        return self._ask(agent, agent.half.call, name, *arguments)
 
-    def _act(self, agent: LockstepAgent, order: ActionOrder) -> None:
+    def _ask(self, agent: LockstepAgent, ask: Callable[..., Any], *arguments: Any) -> Any:
         try:
-            agent.actions.take(order)
-        except HalfFailed as failure:
-            raise AgentFailed(agent.index, str(failure)) from failure
+            return ask(*arguments)
+        except MadnsError as error:
+            raise AgentFailed(agent.index, str(error)) from error
 
     def _flush(self) -> None:
         for agent in self._agents:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 from madns_runtime.config import HostLaunch
@@ -197,8 +198,8 @@ class Workers:
         """Have a worker that hangs write where it is, and end it."""
         with contextlib.suppress(ProcessLookupError):
             os.kill(worker.pid, STACK_SIGNAL)
-            own, until_s = GrantedClock(lambda: (worker.pid,)), time.monotonic() + STACK_WAIT_S_MAX
-            while own.now_s() < STACK_WAIT_S and time.monotonic() < until_s:
+            own, until_s = GrantedClock(lambda: (worker.pid,)), monotonic() + STACK_WAIT_S_MAX
+            while own.now_s() < STACK_WAIT_S and monotonic() < until_s:
                 time.sleep(CHECK_S)
             os.kill(worker.pid, signal.SIGKILL)
 

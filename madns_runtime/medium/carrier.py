@@ -21,10 +21,12 @@ from madns_runtime.medium.outcomes import (
     Medium,
     MessageAccount,
 )
-from madns_runtime.plain_values import is_real
+from madns_runtime.plain_values import is_line, is_real, shown
 from madns_runtime.protocol.link_settings import SendQueueFull
 from madns_runtime.protocol.messages import Delivery, Transmission, TransmissionRefusal
 
+WORDS_MAX: Final = 256
+"""Different outcomes of one channel: they are counted one by one, and told at the end."""
 LEAD_S: Final = 1.0
 """Lead of the hand-over before the arrival, s: far more than a network takes."""
 
@@ -89,7 +91,7 @@ class Carrier:
         if not isinstance(outcomes, (list, tuple)) or not all(
             isinstance(outcome, LinkOutcome) for outcome in outcomes or (None,)
         ):
-            raise PluginError(f"{outcomes!r:.200}: expected a list of one or more LinkOutcome")
+            raise PluginError(f"{shown(outcomes)}: expected a list of one or more LinkOutcome")
         outcomes = [_checked(outcome, transmission) for outcome in outcomes]
         if self.faults is not None:
             outcomes = self.faults.ways(sender, transmission, outcomes)
@@ -98,6 +100,11 @@ class Carrier:
         for outcome in outcomes:
             account = self.account(outcome.channel)
             account.enter(outcome, now_s)
+            if len(account.outcomes) > WORDS_MAX:
+                raise PluginError(
+                    f"{outcome.outcome!r}: expected words of at most {WORDS_MAX} kinds; a reason is a kind, such as"
+                    " out_of_range, and names no time, number or agent"
+                )
             if outcome.arrives_s is not None:
                 self._keep(sender, transmission, outcome, account)
             elif outcome.outcome != LOST and sender in self._agents:
@@ -184,7 +191,7 @@ def _checked(outcome: LinkOutcome, transmission: Transmission) -> LinkOutcome:
         arrives_s is None or transmission.sent_s < arrives_s < math.inf
     ):
         raise PluginError(
-            f"{outcome.outcome!r:.80} with arrives_s {arrives_s!r}: expected a message that is {DELIVERED!r} to"
+            f"{shown(outcome.outcome)} with arrives_s {shown(arrives_s)}: expected a message that is {DELIVERED!r} to"
             f" arrive later than it was sent, at {transmission.sent_s:g} s, and no other to arrive"
         )
     return outcome
@@ -194,7 +201,8 @@ def _is_plain(outcome: LinkOutcome) -> bool:
     """Tell whether an outcome holds what messages and accounts can: of most it is known by their types alone."""
     return (
         type(outcome.to) is type(outcome.outcome) is type(outcome.channel) is str
-        and outcome.outcome != ""
+        and outcome.outcome.isidentifier()
+        and outcome.outcome.isascii()
         and (outcome.arrives_s is None or type(outcome.arrives_s) is float)
         and type(outcome.size_bytes) is int
     )
@@ -219,12 +227,12 @@ def _plain(outcome: LinkOutcome) -> LinkOutcome:
         if name == "arrives_s" and value is None:
             continue
         is_fit = is_real(value) if name in _MAKE else isinstance(value, str)
-        if not is_fit or (name, value) == ("outcome", ""):
-            raise PluginError(f"a LinkOutcome with {name} {value!r:.80}: expected {wanted}")
+        if not is_fit or (name == "outcome" and (not is_line(value) or not value)):
+            raise PluginError(f"a LinkOutcome with {name} {shown(value)}: expected {wanted}")
         try:
             changed[name] = _MAKE.get(name, str)(value)
-        except (ValueError, OverflowError):  # of NaN, or a whole number without end
+        except Exception:  # noqa: BLE001 - of NaN, a whole number without end, or a class that may raise anything
             raise PluginError(
-                f"a LinkOutcome with {name} {value!r:.80}: expected {wanted}"
+                f"a LinkOutcome with {name} {shown(value)}: expected {wanted}"
             ) from None
     return dataclasses.replace(outcome, **changed)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from madns_runtime.errors import PluginError
 from madns_runtime.medium.outcomes import DELIVERED, EVERYBODY, LOST, LinkOutcome
-from madns_runtime.plain_values import is_real, is_whole
+from madns_runtime.plain_values import is_real, is_whole, shown
 from madns_runtime.protocol.codec import pack
 from madns_runtime.protocol.messages import Transmission
 
@@ -160,7 +160,7 @@ class LinkMedium:
             barrier: Any = self._reach(sender, receiver, leaves_s) if self._reach else None
             if barrier is not None and (not isinstance(barrier, str) or not barrier):
                 raise PluginError(
-                    f"reach({sender!r}, {receiver!r}, {leaves_s:g}) returned {barrier!r:.80}: expected None if the"
+                    f"reach({sender!r}, {receiver!r}, {leaves_s:g}) returned {shown(barrier)}: expected None if the"
                     " receiver can receive it, else why not, in a word such as 'out_of_range'"
                 )
             if barrier and to == EVERYBODY:
@@ -175,7 +175,7 @@ class LinkMedium:
                     delay_s = delay_s(sender, receiver, leaves_s)
                     if not _is_positive(delay_s):
                         raise PluginError(
-                            f"delay_s({sender!r}, {receiver!r}, {leaves_s:g}) returned {delay_s!r:.80}: expected"
+                            f"delay_s({sender!r}, {receiver!r}, {leaves_s:g}) returned {shown(delay_s)}: expected"
                             " seconds, more than 0"
                         )
                 arrives_s = leaves_s + duration_s + delay_s
@@ -213,7 +213,7 @@ def _check_answers(delay_s: Any, rate_byte_s: Any, loss: Any, queue_max: Any) ->
         ),
     ):
         if not is_fit:
-            raise PluginError(f"LinkMedium: {name}: expected {wanted}, got {value!r:.80}")
+            raise PluginError(f"LinkMedium: {name}: expected {wanted}, got {shown(value)}")
 
 
 def _is_positive(value: Any) -> bool:

@@ -33,7 +33,7 @@ def error_text(error: BaseException) -> str:
     """Return what an error says of itself; of one whose class cannot, that."""
     try:
         return str(error)
-    except Exception as fault:  # noqa: BLE001 - __str__ of a plug-in's class may raise anything
+    except BaseException as fault:  # noqa: BLE001 - __str__ of a plug-in's class may raise anything
         return f"(its __str__ raised {type(fault).__name__})"
 
 

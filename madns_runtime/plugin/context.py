@@ -22,14 +22,17 @@ from madns_runtime.errors import (
 from madns_runtime.medium.carrier import Carrier
 from madns_runtime.medium.mailbox import Mailbox
 from madns_runtime.medium.outcomes import LinkOutcome
-from madns_runtime.plain_values import is_real
+from madns_runtime.plain_values import is_real, shown
 from madns_runtime.plugin.code_places import error_text
 from madns_runtime.plugin.device_view import DeviceView
 from madns_runtime.protocol.codec import pack, unpack
 from madns_runtime.protocol.messages import Service, Transmission
 from madns_runtime.recording.records import FRAMEWORK_STREAMS, Field, StreamSchema
 from madns_runtime.recording.run_journal import RunJournal
+from madns_runtime.recording.stream_rules import check_agent_name, check_name
 
+FRAMEWORK = Path(__file__).parents[1]
+"""Where code stands that is nobody's plug-in, but for what is shipped below simulations."""
 TEXT_CHARACTERS_MAX = 2000
 """Of what a plug-in's exception says; the whole is in the log."""
 
@@ -98,6 +101,7 @@ class RunContext:
 
     def open_stream(self, name: str, fields: Sequence[Field]) -> None:
         """Declare a record stream; see `plugin.api.Context.open_stream`."""
+        check_name(name)
         if name in FRAMEWORK_STREAMS:
             raise PluginError(f"stream {name!r} belongs to the framework; choose another name")
         self._recorder.open_stream(StreamSchema(name, tuple(fields)))
@@ -117,6 +121,12 @@ class PeerContext(RunContext):
         self.hardware = hardware
         self.transmit = mailbox.transmit
         self.message_counts = mailbox.counts
+
+    def open_stream(self, name: str, fields: Sequence[Field]) -> None:
+        """Declare a record stream; see `plugin.api.Context.open_stream`."""
+        if isinstance(name, str):
+            check_agent_name(name)
+        super().open_stream(name, fields)
 
 
 class JobContext(RunContext):
@@ -142,7 +152,7 @@ class JobContext(RunContext):
         """See to a message of a place that is no agent; see `plugin.api.HostContext.enter`."""
         if not isinstance(sender, str) or not isinstance(transmission, Transmission):
             raise PluginError(
-                f"enter({sender!r:.80}, a {type(transmission).__name__}, ...): expected a place's name and a"
+                f"enter({shown(sender)}, a {type(transmission).__name__}, ...): expected a place's name and a"
                 " Transmission of madns_runtime.plugin.api"
             )
         # Whoever sent it may go on to change it; what a message cannot carry is told here.
@@ -158,7 +168,7 @@ class JobContext(RunContext):
 
 
 def check_sending(
-    to: str,
+    to: Any,
     receivers: Container[str],
     service: Service,
     deadline_s: float | None,
@@ -178,18 +188,20 @@ def check_sending(
     Raises:
         PluginError: There is no such receiver or class of service, or the deadline is none.
     """
-    if to not in receivers:
+    if not isinstance(to, str) or to not in receivers:
         raise PluginError(
-            f"expected a receiver (an agent sends to 'host', the host to an agent's name), got {to!r}"
+            f"expected a receiver (an agent sends to 'host', the host to an agent's name), got {shown(to)}"
         )
     if not isinstance(service, Service):
-        raise PluginError(f"expected a Service, such as Service.RELIABLE, got {service!r}")
+        raise PluginError(f"expected a Service, such as Service.RELIABLE, got {shown(service)}")
     if deadline_s is None:
         return
     if service is not Service.SYNC:
         raise PluginError(f"deadline_s goes with Service.SYNC, not with {service!r}")
     if not is_real(deadline_s) or not math.isfinite(deadline_s):
-        raise PluginError(f"deadline_s: expected a simulated time in seconds, got {deadline_s!r}")
+        raise PluginError(
+            f"deadline_s: expected a simulated time in seconds, got {shown(deadline_s)}"
+        )
     if not is_running:
         raise PluginError("deadline_s is simulated time, which has not begun")
 
@@ -210,7 +222,9 @@ def describe_exception(error: BaseException, doing: str) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     place = ""
     if frames:
-        home = Path(frames[min(1, len(frames) - 1)].filename).parent
+        # A medium of the framework's calls the plug-in, too.
+        called = [frame for frame in frames[1:] if not _is_framework(Path(frame.filename))]
+        home = Path((called or frames[1:] or frames)[0].filename).parent
         own = [frame for frame in frames[1:] if _is_below(Path(frame.filename), home)]
         frame = own[-1] if own else frames[-1]
         place = f" ({Path(frame.filename).name}:{frame.lineno})"
@@ -223,6 +237,10 @@ def clean_text(text: str) -> str:
     """Return *text* as a message and a record can carry it: no lone surrogates, and bounded."""
     text = text.encode("utf-8", "backslashreplace").decode("utf-8")
     return text if len(text) <= TEXT_CHARACTERS_MAX else f"{text[:TEXT_CHARACTERS_MAX]} [cut]"
+
+
+def _is_framework(path: Path) -> bool:
+    return path.is_relative_to(FRAMEWORK) and not path.is_relative_to(FRAMEWORK / "simulations")
 
 
 def _is_below(path: Path, home: Path) -> bool:

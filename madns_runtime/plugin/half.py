@@ -21,6 +21,7 @@ from madns_runtime.config import RunConfig
 from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.medium.carrier import Carrier
 from madns_runtime.medium.outcomes import NO_MEDIUM, LinkOutcome
+from madns_runtime.plain_values import own_copy
 from madns_runtime.plugin import time_limit, validation
 from madns_runtime.plugin.api import AgentSimulation, HostSimulation
 from madns_runtime.plugin.context import clean_text, describe_exception
@@ -29,6 +30,7 @@ from madns_runtime.plugin.host_calls import HostCalls
 from madns_runtime.plugin.registry import Role, load_function, load_half, parse_parameters, resolve
 from madns_runtime.processes import own_age_s
 from madns_runtime.protocol.messages import Service, Transmission
+from madns_runtime.reactor.forking import CAME_BACK
 from madns_runtime.timeline.action import ActionKind, ActionRefused
 
 CHECKS: Final[Mapping[str, Callable[[Any], Any]]] = {
@@ -39,6 +41,8 @@ CHECKS: Final[Mapping[str, Callable[[Any], Any]]] = {
 }
 """Checks of what methods return, by method; values of other methods are not looked at."""
 ACTION_METHODS: Final = ("begin_action", "end_action")
+STAND_S: Final = 1e-6
+"""Who asks for times that are nearer to each other lets simulated time stand."""
 REPEATS_MAX: Final = 100_000
 """Calls of the timer, or jobs, at one simulated time; more means that the half never lets time go on."""
 
@@ -74,8 +78,8 @@ class RoleProgram:
     """Parameters of each agent, parsed: one object for all that share them."""
 
     def parameters_of(self, agent: str) -> Any:
-        """Return the parameters of an agent."""
-        return self.agent_parameters.get(agent, self.parameters)
+        """Return the parameters of an agent: its own, where it could change a part that others have, too."""
+        return own_copy(self.agent_parameters.get(agent, self.parameters))
 
     @classmethod
     def load(
@@ -244,7 +248,7 @@ class HostHalf(Half):
         self.intake: Callable[[str, Any, Service], None] | None = None
         """Takes what agents sent while faults are in force, and hands it on to `take_now`."""
         self._calls = calls or HostCalls()
-        self._timer_s = -math.inf
+        self._timer_s = self._stand_s = -math.inf
         self._repeats = 0
         self._make_medium = program.medium
         self._calls.name = getattr(program.make, "__name__", "")
@@ -297,6 +301,7 @@ class HostHalf(Half):
                 raise self.failure("receive", error) from error
             finally:
                 self._calls.end("receive", began_s)
+            self._check_strays()
             return
         outcomes: Any = (LinkOutcome(to=message.to, outcome=NO_MEDIUM),)
         if self.carrier.medium is not None:
@@ -304,7 +309,12 @@ class HostHalf(Half):
         try:
             self.carrier.enter(agent, message, outcomes)
         except PluginError as error:
-            raise HalfFailed(f"{self.name}.medium.carry returned {error}") from error
+            raise HalfFailed(
+                f"{self.name}.medium.carry returned {clean_text(str(error))}"
+            ) from error
+        except Exception as error:  # of a value's own class, while it was looked at
+            text = describe_exception(error, "looking at it")
+            raise HalfFailed(f"{self.name}.medium.carry returned an outcome: {text}") from error
         self.carrier.hand_over()
 
     def run(self, name: str, function: Callable[..., Any] | None, *arguments: Any) -> Any:
@@ -316,9 +326,15 @@ class HostHalf(Half):
         """
         began_s = self._calls.begin(name)
         try:
-            return super().run(name, function, *arguments)
+            value = super().run(name, function, *arguments)
         finally:
             self._calls.end(name, began_s)
+        self._check_strays()
+        return value
+
+    def _check_strays(self) -> None:
+        if forked_in := self._calls.forked_in():
+            raise HalfFailed(f"{forked_in} {CAME_BACK}")
 
     def wake(self, t_s: float) -> None:
         """
@@ -348,7 +364,10 @@ class HostHalf(Half):
             HalfFailed: As `call`; it returned no later time, or never lets simulated time go on.
         """
         t_s = max(now_s if self.next_s is None else self.next_s, self._timer_s)
-        self._repeats = self._repeats + 1 if t_s == self._timer_s else 0
+        if t_s - self._stand_s > STAND_S:
+            self._stand_s, self._repeats = t_s, 0
+        else:
+            self._repeats += 1
         if self._repeats > REPEATS_MAX:
             raise HalfFailed(
                 f"{self.name}.timer asked {REPEATS_MAX} times in a row for t = {t_s:g} s: simulated"

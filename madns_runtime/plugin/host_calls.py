@@ -19,6 +19,8 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Final
 
+from madns_runtime.reactor.forking import end_child
+
 LONG_CALL_S: Final = 0.010
 """A call that holds the loop for longer is counted and told: ten times what a call may take by the contract."""
 STANDSTILL_S: Final = 0.5
@@ -58,6 +60,8 @@ class HostCalls:
         self._path: Path | None = None
         self._page = _own_page() if not session_hex else self._open(page_path(session_hex))
         self._pid = os.getpid()
+        self._strays = _own_page()
+        """Shared with processes that the half forks: the method that one came back from, as a line."""
         self._lines: dict[str, bytes] = {}
         self._calls = 0
         self._by_method: dict[str, list[float]] = {}
@@ -70,13 +74,21 @@ class HostCalls:
         return monotonic() if self.is_counting else 0.0
 
     def end(self, method: str, began_s: float) -> None:
-        """Note that *method*, called at *began_s*, has returned."""
+        """Note that *method*, called at *began_s*, has returned; a process that it forked is ended where it comes back."""
+        if os.getpid() != self._pid:
+            line = f"{self.name}.{method}\n".encode("utf-8", "replace")[:WHAT_BYTES]
+            self._strays[: len(line)] = line
+            end_child(1)
         self._page[0] = RETURNED
         if self.is_counting and began_s:
             self._calls += 1
             took_s = monotonic() - began_s
             if took_s > LONG_CALL_S:
                 self._enter(method, took_s)
+
+    def forked_in(self) -> str:
+        """Return the method that a process came back from which it had forked; empty if there was none."""
+        return self._strays.readline().decode("utf-8", "replace").strip() if self._strays[0] else ""
 
     def to_mapping(self) -> dict[str, Any]:
         """Return how many calls there were while simulated time ran, and which of them were long."""

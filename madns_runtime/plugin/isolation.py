@@ -7,6 +7,7 @@ process (`sys.exit`) where it meant to end itself: that is a fault of the plug-i
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from typing import Any
 
@@ -49,11 +50,19 @@ def call_plugin(
             return finish(value) if finish else value
     except MadnsError:
         raise
-    except (Exception, SystemExit, PluginStopped) as error:
+    except BaseException as error:
+        if is_interruption(error):
+            raise
         extra = missing_extra(error)
         if extra is not None:
             raise extra from error
         raise PluginError(f"{blame(error, function)}: {name}(): {said(error)}") from error
+
+
+def is_interruption(error: BaseException) -> bool:
+    """Tell whether an error is somebody's Ctrl-C: where that is not heard, a plug-in raised it."""
+    is_heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    return isinstance(error, KeyboardInterrupt) and is_heard
 
 
 def missing_extra(error: BaseException) -> MissingExtraError | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 KEPT_NAMES: Final = (
     "schema",
@@ -23,8 +23,8 @@ KEPT_NAMES: Final = (
 """Keys of a comparison as JSON, where what a simulation tells of itself stands under its name."""
 
 
-def name_faults(name: Any) -> list[str]:
-    """Return what is wrong with the name of a descriptor."""
-    if isinstance(name, str) and name and name not in KEPT_NAMES:
+def name_faults(name: str) -> list[str]:
+    """Return what is wrong with the name of a descriptor, a text."""
+    if name not in KEPT_NAMES:
         return []
     return [f"name: expected a text, none of {', '.join(KEPT_NAMES)}; got {name!r:.80}"]

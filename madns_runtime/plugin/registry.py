@@ -26,6 +26,7 @@ from typing import Any, Literal
 from madns_runtime.bounded_files import FileRefused, check_regular_file
 from madns_runtime.config import from_mapping
 from madns_runtime.errors import MadnsError, MissingExtraError, PluginError
+from madns_runtime.plain_values import shown
 from madns_runtime.plugin.api import AgentSimulation, HostSimulation, Simulation
 from madns_runtime.plugin.code_places import (
     CODE_BYTES_MAX,
@@ -35,13 +36,10 @@ from madns_runtime.plugin.code_places import (
     line_in,
     told_place,
 )
-from madns_runtime.plugin.columns import shape_faults
+from madns_runtime.plugin.descriptor_faults import descriptor_faults
 from madns_runtime.plugin.entry_points import place_of_name, registered
-from madns_runtime.plugin.isolation import missing_extra, said
-from madns_runtime.plugin.kept_names import name_faults
-from madns_runtime.plugin.parameter_kinds import kind_faults
-from madns_runtime.plugin.time_limit import PluginStopped, hold
-from madns_runtime.timeline.kinds import kind_texts
+from madns_runtime.plugin.isolation import is_interruption, missing_extra, said
+from madns_runtime.plugin.time_limit import hold
 
 GROUP = "madns.simulations"
 PARTS = (
@@ -199,7 +197,9 @@ def parse_parameters(descriptor: Simulation, mapping: Mapping[str, Any]) -> Any:
             return from_mapping(kind, mapping, "parameters")
     except MadnsError:
         raise
-    except (Exception, SystemExit, PluginStopped) as error:  # of its own __post_init__
+    except BaseException as error:  # of its own __post_init__
+        if is_interruption(error):
+            raise
         raise PluginError(f"{blame(error, kind)}: {kind.__name__}: {said(error)}") from error
 
 
@@ -245,7 +245,9 @@ def _load_module(name: str, where: str) -> ModuleType:
             return importlib.import_module(name)
     except ImportError as error:
         raise _translated(error, where) from error
-    except (Exception, SystemExit, PluginStopped) as error:  # a plug-in may raise anything
+    except BaseException as error:  # a plug-in may raise anything
+        if is_interruption(error):
+            raise
         raise PluginError(f"{where}: {last_place(error, name)}{said(error)}") from error
 
 
@@ -272,9 +274,9 @@ def _load_file(path: Path, where: str) -> ModuleType:
         del sys.modules[name]
         if isinstance(error, ImportError):
             raise _translated(error, f"{path}{line_in(error, path)}") from error
-        if isinstance(error, Exception | SystemExit | PluginStopped):
-            raise PluginError(f"{path}{line_in(error, path)}: {said(error)}") from error
-        raise
+        if is_interruption(error):
+            raise
+        raise PluginError(f"{path}{line_in(error, path)}: {said(error)}") from error
     return module
 
 
@@ -328,34 +330,23 @@ def _checked(descriptor: Any, where: str, module: ModuleType) -> Simulation:
         raise PluginError(
             f"{where}: expected a madns_runtime.plugin.api.Simulation, got {type(descriptor).__name__}"
         )
-    faults = name_faults(descriptor.name)
-    parameters: Any = descriptor.parameters
-    if not (isinstance(parameters, type) and dataclasses.is_dataclass(parameters)):
-        faults.append("parameters: expected a dataclass (the class itself)")
-    faults += shape_faults(descriptor.columns)
-    faults += [f"actions: {text}" for text in kind_texts(descriptor.actions)]
-    faults += [f"actions: {text}" for each in descriptor.actions for text in _parameter_texts(each)]
+    try:
+        faults = descriptor_faults(descriptor)
+    except Exception as error:  # a mapping's or a text's class may raise anything
+        raise PluginError(f"{where}: looking at the descriptor: {said(error)}") from error
     parts: dict[str, Any] = {}
     for part in PARTS:
         value = getattr(descriptor, part)
         if value is None and part != "agent":
             continue
-        text = str(value)
+        text = value if isinstance(value, str) else ""
         if ":" not in text:
-            faults.append(f"{part}: expected 'module:name' or ':name', got {value!r}")
+            faults.append(f"{part}: expected 'module:name' or ':name', got {shown(value)}")
         elif text.startswith(":"):
             parts[part] = f"{module.__name__}{text}"
     if faults:
         raise PluginError(f"{where}: {'; '.join(faults)}")
     return dataclasses.replace(descriptor, **parts)
-
-
-def _parameter_texts(action: Any) -> list[str]:
-    """Return what is wrong with the parameters of a declared action."""
-    kind: Any = getattr(action, "parameters", None)
-    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
-        return [f"{getattr(action, 'word', action)}.parameters: expected a dataclass (the class)"]
-    return [f"{action.word}.parameters: {text}" for text in kind_faults(kind)]
 
 
 def _contract_faults(half: Any, role: Role) -> list[str]:

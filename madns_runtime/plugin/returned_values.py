@@ -105,7 +105,7 @@ class DeviceUse:
     size: int | None = None
     """Numbers that its values must have; None for any."""
     unit: str | None = None
-    """Unit of `madns_runtime.hardware.units` that the channel's must convert to; None for any."""
+    """Unit that the channel's must convert to, such as rad/s or Hz; None for any."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

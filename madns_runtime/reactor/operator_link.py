@@ -14,9 +14,9 @@ import math
 import os
 import select
 import socket
-import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from time import monotonic
 from typing import Any
 
 import orjson
@@ -216,9 +216,9 @@ class OperatorLink:
         """
         if self._door is not None:
             return self._flush_and_hear(self._door, timeout_s)
-        deadline_s = time.monotonic() + timeout_s
+        deadline_s = monotonic() + timeout_s
         while self._out and not self.is_gone:
-            left_s = deadline_s - time.monotonic()
+            left_s = deadline_s - monotonic()
             if left_s <= 0 or not select.select([], [self._write_fd], [], left_s)[1]:
                 return False
             self._write()
@@ -329,9 +329,9 @@ class OperatorLink:
         self._take(rest)
 
     def _flush_and_hear(self, door: AttachSocket, timeout_s: float) -> bool:
-        deadline_s = time.monotonic() + timeout_s
+        deadline_s = monotonic() + timeout_s
         while self._kept and not self.is_gone:
-            left_s = (self._cut_until_s if self.is_cut else deadline_s) - time.monotonic()
+            left_s = (self._cut_until_s if self.is_cut else deadline_s) - monotonic()
             if left_s <= 0:
                 return False
             reading = [door.fileno(), *(() if self.is_cut else (self._read_fd,))]

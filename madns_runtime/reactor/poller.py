@@ -8,6 +8,7 @@ import os
 import select
 import selectors
 import time
+from time import monotonic
 from typing import Protocol
 
 from madns_runtime.reactor import libc
@@ -111,7 +112,7 @@ class EpollPoller:
         """Wait for descriptors until *until_s*; see `Poller`."""
         timeout_s = -1.0
         if until_s != self._armed_s:
-            if until_s <= time.monotonic():
+            if until_s <= monotonic():
                 timeout_s = 0.0
             else:
                 self._timer.set(until_s)
@@ -150,7 +151,7 @@ class SelectorPoller:
 
     def wait(self, until_s: float) -> list[int]:
         """Wait for descriptors until *until_s*; see `Poller`."""
-        timeout_s = min(max(0.0, until_s - time.monotonic()), WAIT_S_MAX)
+        timeout_s = min(max(0.0, until_s - monotonic()), WAIT_S_MAX)
         return [key.fd for key, _ in self._selector.select(timeout_s)[:EVENTS_MAX]]
 
     def close(self) -> None:

@@ -12,13 +12,14 @@ import os
 import signal
 import sys
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
+from time import monotonic
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 from madns_runtime.errors import MachineError
+from madns_runtime.reactor.forking import CAME_BACK, end_child
 from madns_runtime.reactor.libc import IS_LINUX
 from madns_runtime.reactor.poller import EpollPoller, Poller, SelectorPoller
 from madns_runtime.reactor.timers import Timer, TimerQueue
@@ -106,6 +107,7 @@ class Reactor:
     """
 
     def __init__(self, *, portable: bool = False) -> None:
+        self._pid = os.getpid()
         self.is_portable = portable or not IS_LINUX
         self._poller: Poller = SelectorPoller() if self.is_portable else EpollPoller()
         self._readers: dict[int, Callback] = {}
@@ -129,7 +131,7 @@ class Reactor:
 
     def now_s(self) -> float:
         """Return the time of the clock that timers are set on, s."""
-        return time.monotonic()
+        return monotonic()
 
     @property
     def timer_settings(self) -> int:
@@ -204,6 +206,8 @@ class Reactor:
         """
         try:
             while not self._is_stopping:
+                if os.getpid() != self._pid:
+                    _end_stray()
                 self._turn()
         finally:
             self._is_stopping = False
@@ -225,18 +229,18 @@ class Reactor:
 
     def _turn(self) -> None:
         until_s = self._timers.earliest_s()
-        now_s = time.monotonic()
+        now_s = monotonic()
         if until_s <= now_s:
             self._run_timers()
             if self._is_stopping:
                 return
             until_s = self._timers.earliest_s()
-            now_s = time.monotonic()
+            now_s = monotonic()
         if self._always_readable:
             until_s = 0.0
         self._added.clear()
         ready = self._poller.wait(until_s)
-        woken_s = time.monotonic()
+        woken_s = monotonic()
         self.waits += 1
         self.slept_s += woken_s - now_s
         self.last_sleep = (now_s, woken_s)
@@ -244,7 +248,7 @@ class Reactor:
 
     def _run_timers(self) -> None:
         """Run timers that are due by now, a bounded number."""
-        now_s = time.monotonic()
+        now_s = monotonic()
         for _ in range(TIMERS_BATCH_MAX):
             timer = self._timers.pop_due(now_s)
             if timer is None:
@@ -259,7 +263,7 @@ class Reactor:
             ready = ready + self._always_readable
         is_first = True
         for fd in ready:
-            if not is_first and self._timers.earliest_s() <= time.monotonic():
+            if not is_first and self._timers.earliest_s() <= monotonic():
                 self._run_timers()
             if self._is_stopping:
                 return
@@ -287,6 +291,13 @@ class Reactor:
         if not self._is_woken:
             self._is_woken = True
             os.write(self._wake_write_fd, WAKE_BYTES)
+
+
+def _end_stray() -> NoReturn:
+    """End a process that was forked in a callback and came back from it: two would run one loop."""
+    with contextlib.suppress(BaseException):
+        sys.stderr.write(f"a plug-in's method {CAME_BACK}; it was ended\n")
+    end_child(1)
 
 
 def _wake_descriptors() -> tuple[int, int]:

@@ -27,7 +27,7 @@ from madns_runtime.partial_file import write_whole
 from madns_runtime.plugin.context import clean_text
 from madns_runtime.plugin.half import RoleProgram
 from madns_runtime.processes import Registration, register
-from madns_runtime.reactor.forking import leave_parent
+from madns_runtime.reactor.forking import end_child, leave_parent
 from madns_runtime.reactor.operator_link import OPERATOR_GONE, OperatorLink, tell_loading
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.reattachment import way_back_of
@@ -176,8 +176,7 @@ class Supervisor:
             self._write_failure(agents, f"{type(error).__name__}: {error}")
             sys.excepthook(type(error), error, error.__traceback__)
         finally:
-            sys.stderr.flush()
-            os._exit(code)
+            end_child(code)
 
     def _write_failure(self, agents: Sequence[str], reason: str) -> None:
         outcome = AgentOutcome(as_ordered=False, reason=reason, may_restart=True)

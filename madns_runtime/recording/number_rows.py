@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import orjson
@@ -17,7 +17,6 @@ from madns_runtime.recording.encoding import ENCODING
 
 ROWS_TOGETHER = 128
 """Records that are encoded at once: more of them gain nothing."""
-DIGITS_MAX = 15
 _DOUBT = 2.0**-51
 """Of a number times a power of ten: twice the rounding of that product, relative."""
 
@@ -39,6 +38,10 @@ class NumberRows:
         self._kinds = [int if places is None else float for places in digits]
         self._columns = [at for at, places in enumerate(digits) if places is not None]
         self._powers = np.array([10.0 ** (places or 0) for places in digits])[self._columns]
+
+    def is_fit(self, row: object) -> TypeGuard[tuple[Any, ...]]:
+        """Tell whether a record is a tuple of the numbers that its fields hold: others are encoded, or refused, at once."""
+        return type(row) is tuple and list(map(type, row)) == self._kinds
 
     def rounded(self, row: Sequence[Any]) -> list[Any]:
         """Return one record as it is encoded."""
@@ -74,7 +77,7 @@ class NumberRows:
         the product lies within its own rounding of the middle between two; then, and for what is not finite,
         `round` decides.
         """
-        with np.errstate(over="ignore", invalid="ignore"):
+        with np.errstate(all="ignore"):  # a plug-in may have numpy raise
             scaled = values * self._powers
             whole = np.rint(scaled)
             is_clear = 0.5 - np.abs(scaled - whole) > _DOUBT * np.abs(scaled)

@@ -17,7 +17,7 @@ import orjson
 from numpy.typing import NDArray
 
 from madns_runtime.errors import MachineError
-from madns_runtime.recording.stream_file import CONTROL_KEYS
+from madns_runtime.recording.stream_rules import CONTROL_KEYS
 
 BLOCK_BYTES = 1 << 17
 """Small enough that its text and values stay in the processor's cache: eight times as much took twice the time."""

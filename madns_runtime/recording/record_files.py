@@ -18,14 +18,8 @@ import orjson
 from madns_runtime.errors import MachineError
 from madns_runtime.recording.encoding import ENCODING
 from madns_runtime.recording.records import StreamSchema
-from madns_runtime.recording.stream_file import (
-    StreamFile,
-    check_name,
-    check_schema,
-    create_file,
-    number_of,
-    path_of,
-)
+from madns_runtime.recording.stream_file import StreamFile, create_file, number_of, path_of
+from madns_runtime.recording.stream_rules import check_name, check_schema
 from madns_runtime.recording.text_file import TextFile
 
 

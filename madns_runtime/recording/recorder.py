@@ -16,6 +16,7 @@ import orjson
 from madns_runtime.config import Recording
 from madns_runtime.errors import PluginError
 from madns_runtime.recording.encoding import ENCODING, count_not_finite, explain_refusal, to_plain
+from madns_runtime.recording.number_rows import NumberRows
 from madns_runtime.recording.record_files import RecordCounts, RecordFiles
 from madns_runtime.recording.records import StreamSchema
 from madns_runtime.recording.stream_file import LINE_OVERHEAD_BYTES, StreamFile
@@ -117,7 +118,7 @@ class Recorder:
         elif len(values) != file.width:
             raise file.width_error(len(values))
         if (rows := file.rows) is not None:
-            if self._rows_together > 1 and type(values) is tuple:
+            if self._rows_together > 1 and rows.is_fit(values):
                 rows.waiting.append(values)
                 if len(rows.waiting) >= self._rows_together:
                     self._encode_rows(file)
@@ -143,14 +144,37 @@ class Recorder:
             return
         try:
             lines, not_finite = rows.encode()
-        except TypeError:  # one is something else: told, or encoded, by itself
-            waiting, rows.waiting = rows.waiting, []
-            for values in waiting:
-                self._encode(file, rows.rounded(values))
+        except TypeError:  # a whole number of more than 64 bits
+            self._encode_each(file, rows)
             return
         file.not_finite += not_finite
         for line in lines:
             self._queue(file, line)
+
+    def _encode_each(self, file: StreamFile, rows: NumberRows) -> None:
+        """
+        Encode the records that wait one by one; what cannot be is dropped and counted.
+
+        Raises:
+            PluginError: One cannot be.
+        """
+        waiting, rows.waiting = rows.waiting, []
+        fault: PluginError | None = None
+        for values in waiting:
+            try:
+                self._encode(file, rows.rounded(values))
+            except PluginError as error:
+                file.overflowed += 1
+                fault = fault or error
+        if fault is not None:
+            raise fault
+
+    def _encode_late(self, file: StreamFile) -> None:
+        """Encode what waits where nobody records just now: what cannot be is an error among those of the disk."""
+        try:
+            self._encode_rows(file)
+        except PluginError as error:
+            self._files.add_error(str(error))
 
     def _queue(self, file: StreamFile, line: bytes) -> None:
         queued_bytes = self._queued_bytes + len(line) + LINE_OVERHEAD_BYTES
@@ -195,7 +219,7 @@ class Recorder:
         file = self._streams.get(stream)
         if file is None:
             return {}
-        self._encode_rows(file)
+        self._encode_late(file)
         if not (line := file.newest):
             return {}
         record = orjson.loads(line)
@@ -222,7 +246,7 @@ class Recorder:
             timeout_s: How long to wait for the disk; after it an error is in the counts.
         """
         for file in self._streams.values():
-            self._encode_rows(file)
+            self._encode_late(file)
         self._limit_bytes = -1
         self._writer.close(timeout_s)
         return self.counts()

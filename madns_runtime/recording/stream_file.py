@@ -9,7 +9,6 @@ rest. Under that rule no lock is needed: appending to a list and cutting off its
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,62 +17,13 @@ import numpy as np
 import orjson
 
 from madns_runtime.errors import MachineError, PluginError
-from madns_runtime.recording.number_rows import DIGITS_MAX, NumberRows
-from madns_runtime.recording.records import FIELD_KINDS, Field, StreamSchema
+from madns_runtime.recording.number_rows import NumberRows
+from madns_runtime.recording.records import StreamSchema
 
 LINES_PER_WRITE_MAX = 1024
 LINE_OVERHEAD_BYTES = 56
 """Bytes that a waiting line costs beside its text: the bytes object and its place in the list."""
 FILES_MAX = 10_000
-NAME_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
-CONTROL_KEYS = ("end", "t0_utc")
-
-
-def check_name(name: Any) -> None:
-    """
-    Check that a stream or a text may be called so.
-
-    Raises:
-        PluginError: It is no file name.
-    """
-    if not isinstance(name, str) or not NAME_PATTERN.fullmatch(name):
-        raise PluginError(
-            f"stream {name!r}: expected a name of letters, digits, - and _, at most 64"
-        )
-
-
-def check_schema(schema: StreamSchema) -> None:
-    """
-    Check that a stream of this schema can be a file that is read back.
-
-    Raises:
-        PluginError: Its name is no file name, it has no fields, two of one name, one of no such kind, or some that
-            are rounded among others that are no numbers.
-    """
-    check_name(schema.name)
-    fields: tuple[Any, ...] = schema.fields  # of a plug-in
-    for field in fields:
-        if not isinstance(field, Field) or field.kind not in FIELD_KINDS:
-            raise PluginError(
-                f"stream {schema.name}: expected fields of kind {', '.join(FIELD_KINDS)}, got {field!r:.100}"
-            )
-    names = [field.name for field in schema.fields]
-    if not names or len(set(names)) != len(names):
-        raise PluginError(f"stream {schema.name}: expected fields with distinct names, got {names}")
-    digits = [field.digits for field in schema.fields]
-    is_int = [field.kind == "int" for field in schema.fields]
-    is_rounded = any(places is not None for places in digits)
-    if is_rounded and (
-        schema.shape != "array"
-        or any((places is None) != whole for places, whole in zip(digits, is_int, strict=True))
-        or not all(0 <= (places or 0) <= DIGITS_MAX for places in digits)
-    ):
-        raise PluginError(
-            f"stream {schema.name}: expected digits, 0 to {DIGITS_MAX}, of every field of kind float, ints besides,"
-            " and records that are arrays"
-        )
-    if schema.shape == "object" and len(names) == 1 and names[0] in CONTROL_KEYS:
-        raise PluginError(f"stream {schema.name}: a single field may not be named {names[0]}")
 
 
 def create_file(directory: Path, name: str, first: int) -> tuple[Path, int, int]:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, get_args
 
 from annotated_types import Ge, Le, MaxLen, MinLen
 
-from madns_runtime.timeline.action import ActionKind
+from madns_runtime.plain_values import is_line, shown
+from madns_runtime.timeline.action import ActionKind, CarriedOutBy, Lasting, TimeMode
 from madns_runtime.timeline.fault_kinds import FAULT_KINDS
 
 DeviceFaultWord = Literal["freeze", "bias", "noise", "drop", "delay", "disconnect", "clear"]
@@ -133,6 +134,41 @@ def kinds_by_word(declared: Iterable[ActionKind] = ()) -> Mapping[str, ActionKin
     return {kind.word: kind for kind in (*FRAMEWORK_ACTIONS, *declared)}
 
 
+def _field_fault(kind: ActionKind) -> str:
+    """Return the first field of an action that is not of its kind; empty if there is none."""
+    modes: Any = kind.modes
+    known = get_args(TimeMode)
+    for name, is_fit, wanted in (
+        ("word", is_line(kind.word), "a text"),
+        ("summary", isinstance(kind.summary, str), "a text"),
+        ("takes_agents", isinstance(kind.takes_agents, bool), "True or False"),
+        ("loses_agents", isinstance(kind.loses_agents, bool), "True or False"),
+        ("lasting", _is_one_of(kind.lasting, get_args(Lasting)), _told(get_args(Lasting))),
+        (
+            "carried_out_by",
+            _is_one_of(kind.carried_out_by, get_args(CarriedOutBy)),
+            "host or agent",
+        ),
+        (
+            "modes",
+            isinstance(modes, tuple | list) and all(_is_one_of(mode, known) for mode in modes),
+            f"a tuple of {_told(known)}",
+        ),
+    ):
+        if not is_fit:
+            got = shown(getattr(kind, name))
+            return f"{shown(kind.word)}: {name}: expected {wanted}, got {got}"
+    return ""
+
+
+def _is_one_of(value: object, known: tuple[str, ...]) -> bool:
+    return isinstance(value, str) and value in known
+
+
+def _told(known: tuple[str, ...]) -> str:
+    return ", ".join(known)
+
+
 def kind_texts(kinds: Iterable[Any]) -> list[str]:
     """Return what is wrong with the actions that a simulation declares."""
     own = {kind.word for kind in FRAMEWORK_ACTIONS}
@@ -140,7 +176,9 @@ def kind_texts(kinds: Iterable[Any]) -> list[str]:
     seen: set[str] = set()
     for kind in kinds:
         if not isinstance(kind, ActionKind):
-            faults.append(f"expected an ActionKind, got {kind!r}")
+            faults.append(f"expected an ActionKind, got {shown(kind)}")
+        elif fault := _field_fault(kind):
+            faults.append(fault)
         elif not (kind.word.isidentifier() and kind.word == kind.word.lower()):
             faults.append(f"{kind.word!r}: expected a word of lower-case letters, digits and _")
         elif kind.word in own or kind.word in seen:

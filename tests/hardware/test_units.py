@@ -42,3 +42,11 @@ def test_a_channel_without_a_unit_is_told_what_to_declare():
 @pytest.mark.parametrize("wanted", FACTORS)
 def test_each_quantity_holds_its_own_unit(wanted):
     assert factor_of(wanted, wanted) == 1.0
+
+
+def test_a_quantity_beyond_the_table_converts_as_recorded_values_do():
+    assert factor_of("kHz", "Hz") == 1000.0
+    assert factor_of("V", "Hz") is None
+    assert unit_fault("kHz", "Hz") is None
+    assert unit_fault("V", "Hz") == "expected a unit that converts to Hz (Hz), got 'V'"
+    assert "declare one of furlong" in unit_fault("", "furlong")

@@ -57,6 +57,10 @@ def go_wrong(fault):
         os._exit(0)
     if what == "kill":
         os.kill(os.getpid(), signal.SIGKILL)
+    if what == "fork":
+        os.fork()  # and neither process ends here
+    if what == "mute":
+        sys.stderr = None
     if what == "term":
         os.kill(os.getpid(), signal.SIGTERM)
 
@@ -126,6 +130,8 @@ class Host(HostSimulation):
 
     def finish(self):
         self.context.submit(square, 12)  # too late: nothing is called any more
+        for agent in self.context.agents if self.fault == "finish_say" else ():
+            self.context.send(agent, ["bye"])
         return {"draws": self.context.random.random()}
 
 
@@ -170,6 +176,8 @@ class Agent(AgentSimulation):
 
     def finish(self):
         self.meets("finish")
+        if self.context.parameters.fault == "finish_say":
+            self.context.send(HOST, ["bye"])
         return {"draws": self.context.random.random()}
 
 

@@ -42,6 +42,8 @@ def workers_of(run):
         ("timer_raise", "host", "Host.timer raised ValueError: told to"),
         ("timer_same", "host", "Host.timer returned -0.5, called for t = -0.5 s: expected a later"),
         ("timer_stands", "host", "Host.timer asked 100000 times in a row for t = -0.5 s"),
+        ("step_fork", "agent-04", "the agent's step forked a process that came back from the call"),
+        ("timer_fork", "host", "Host.timer forked a process that came back from the call"),
         ("job_kill", "host", "Host: job 13: a worker of the executor has died: was it"),
         ("job_raise", "host", "Host: job 13: square raised ValueError: no such job"),
         (
@@ -209,3 +211,18 @@ def test_worker_whose_end_a_plugin_has_ignored_has_ended():
         assert _await_exit(pid) == 0
     finally:
         signal.signal(signal.SIGCHLD, earlier)
+
+
+def test_words_of_a_finish_that_come_too_late_are_counted(start_host):
+    result = start_host(fault="finish_say").result()
+
+    assert result["status"] == "complete"
+    assert [agent["messages"]["too_late"] for agent in result["agents"].values()] == [2] * 6
+
+
+def test_a_worker_without_standard_error_ends_as_a_worker(start_host):
+    run = start_host(fault="step_mute")
+    result = run.result()
+
+    assert (result["status"], run.process.returncode) == ("complete", 0)
+    assert "Traceback" not in (run.folder / "stderr.txt").read_text()

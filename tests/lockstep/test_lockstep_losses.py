@@ -3,6 +3,7 @@
 import pytest
 
 from madns_runtime.config import Timeouts
+from madns_runtime.timeline.entries import ScheduledEntry
 
 pytestmark = pytest.mark.process
 
@@ -98,3 +99,33 @@ def test_a_run_that_has_lost_everybody_ends_and_says_why(start_host):
     assert result["status"] == "failed"
     assert result["who"].startswith("agent-01, agent-02")
     assert "was killed by SIGKILL in the agent's step, at t = 0.2 s" in result["reason"]
+
+
+ACTING = """
+from dataclasses import dataclass
+from madns_runtime.plugin.api import ActionKind, AgentSimulation, Simulation
+@dataclass(frozen=True)
+class Parameters:
+    pass
+class Agent(AgentSimulation):
+    def begin_action(self, action):
+        raise ValueError("told to")
+simulation = Simulation(
+    name="acting", parameters=Parameters, agent=":Agent",
+    actions=(ActionKind(word="act", summary="Acts.", carried_out_by="agent"),),
+)
+"""
+
+
+def test_an_agent_whose_action_raises_is_lost_alone(start_host, tmp_path):
+    (tmp_path / "acting.py").write_text(ACTING)
+    entry = ScheduledEntry(action="act", agents=("agent-04",), at_s=0.3, parameters={})
+    run = start_host(
+        simulation=f"{tmp_path}/acting.py:simulation", timeline=(entry,), restarts_max=0
+    )
+    result = run.result()
+
+    assert (result["status"], result["lost"]) == ("complete", ["agent-04"])
+    assert result["agents"]["agent-04"]["reason"].startswith(
+        "Agent.begin_action raised ValueError: told to"
+    )

@@ -14,6 +14,7 @@ import pytest
 
 from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.medium.carrier import Carrier
+from madns_runtime.medium.links import LinkMedium
 from madns_runtime.medium.outcomes import LinkOutcome
 from madns_runtime.plugin import validation
 from madns_runtime.plugin.api import AgentSimulation, HostSimulation
@@ -371,3 +372,106 @@ def test_a_half_lets_go_of_what_outlives_it_if_its_setup_was_called_though_it_ra
     assert (half.simulation.programs, logged) == ([], [])
     half.abandon()
     assert len(logged) == 1 and "IndexError" in logged[0]
+
+
+class Mute:
+    def __repr__(self) -> str:
+        raise ValueError("no words")
+
+
+class Reasons:
+    """A medium that finds another reason each time."""
+
+    def carry(self, sender: str, transmission: Transmission) -> Any:
+        return [LinkOutcome(to="b", outcome=f"at_{transmission.number}")]
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (Mute(), "a Mute that cannot be shown: expected a list of one or more LinkOutcome"),
+        ([LinkOutcome(to=Mute(), outcome="lost")], "expected a receiver's name"),
+        ([LinkOutcome(to="b", outcome="\ud800")], "outcome '.ud800': expected 'delivered'"),
+        ([LinkOutcome(to="b", outcome="a\nb")], "outcome 'a.nb': expected 'delivered'"),
+    ],
+)
+def test_an_outcome_that_cannot_be_told_is_the_mediums_fault(logged, answer, words):
+    half = made(Base, logged, HostHalf, lambda host, context: Air(answer))
+    half.set_up(None)
+
+    with pytest.raises(HalfFailed, match=rf"^Base.medium.carry returned .*{words}"):
+        half.take("a", Transmission(to="b", number=0, sent_s=1.0, payload=None))
+
+
+def test_reasons_of_a_medium_are_kinds_and_no_texts_of_their_own(logged):
+    half = made(Base, logged, HostHalf, lambda host, context: Reasons())
+    half.set_up(None)
+
+    with pytest.raises(HalfFailed, match="expected words of at most 256 kinds"):
+        for number in range(257):
+            half.take("a", Transmission(to="b", number=number, sent_s=1.0, payload=None))
+
+
+def test_what_a_reach_raises_is_told_with_its_own_line(logged):
+    def reach(sender: str, receiver: str, t_s: float) -> str:
+        raise ValueError("no map")
+
+    air = LinkMedium(("a", "b"), np.random.default_rng(1), delay_s=1.0, reach=reach)
+    half = made(Base, logged, HostHalf, lambda host, context: air)
+    half.set_up(None)
+
+    with pytest.raises(HalfFailed, match=r"raised ValueError: no map \(test_half.py:\d+\)$"):
+        half.take("a", Transmission(to="b", number=0, sent_s=1.0, payload=None))
+
+
+def test_a_half_that_creeps_on_is_ended_as_one_that_stands(logged, monkeypatch):
+    monkeypatch.setattr("madns_runtime.plugin.half.REPEATS_MAX", 5)
+
+    class Creeping(HostSimulation):
+        def timer(self, t_s: float) -> float:
+            return t_s + 1e-9
+
+    half = made(Creeping, logged, HostHalf)
+    half.wake(1.0)
+
+    with pytest.raises(HalfFailed, match=r"^Creeping\.timer asked 5 times in a row for t = 1 s"):
+        for _ in range(7):
+            half.call_timer(half.next_s)
+
+
+def test_a_half_with_a_timer_of_many_hertz_goes_on(logged, monkeypatch):
+    monkeypatch.setattr("madns_runtime.plugin.half.REPEATS_MAX", 5)
+
+    class Quick(HostSimulation):
+        def timer(self, t_s: float) -> float:
+            return t_s + 1e-5
+
+    half = made(Quick, logged, HostHalf)
+    half.wake(1.0)
+    for _ in range(50):
+        half.call_timer(half.next_s)
+
+    assert half.next_s == pytest.approx(1.0 + 50e-5)
+
+
+@dataclasses.dataclass(frozen=True)
+class Listed:
+    tags: list[str]
+
+
+def test_an_agent_that_changes_its_parameters_changes_nobody_elses():
+    program = RoleProgram(make=Rover, parameters=Listed(tags=["a"]))
+    program.parameters_of("agent-01").tags.append("b")
+
+    assert program.parameters_of("agent-02") == Listed(tags=["a"])
+
+
+def test_parameters_that_cannot_be_changed_are_one_object_for_all():
+    program = RoleProgram(make=Rover, parameters=Fixed(tags=("a",)))
+
+    assert program.parameters_of("agent-01") is program.parameters_of("agent-02")
+
+
+@dataclasses.dataclass(frozen=True)
+class Fixed:
+    tags: tuple[str, ...]

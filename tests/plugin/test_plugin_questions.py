@@ -1,6 +1,7 @@
 """Faults of what a plug-in does outside of a run: while it is imported, in check and in demand."""
 
 import re
+import signal
 import sys
 import textwrap
 
@@ -323,3 +324,95 @@ def test_every_faulty_part_of_a_file_is_told_with_its_line_and_not_with_a_module
     assert "there is no 'Agnt', did you mean Agent?" in faults[0]
     assert "no method initial_data()" in faults[1]
     assert code_places.MODULE_PREFIX not in "".join(faults)
+
+
+@pytest.mark.parametrize(
+    ("stream", "told"),
+    [
+        ("name='../x', fields=(F('x_m', 'm'),)", "'../x': expected a name of letters"),
+        ("name='host_x', fields=(F('x_m', 'm'),)", "cannot begin with host_ or machine_"),
+        (r"name='x', fields=(F('\ud800'),)", "expected a field's name to be a text"),
+        ("name='x', fields=(F('incarnation'),)", "none of incarnation, which tables add"),
+        ("name='x', fields=(F('x_m', None),)", "expected the unit of x_m to be a text"),
+        ("name='x', fields=(F('x_m', 'm', ['float']),)", "must give 'x' fields of kind float"),
+        ("name='x', fields=(F('x_m', digits='3'),)", "expected digits, 0 to 15"),
+        ("name='x', fields=(F('x_m'), F('x_m'))", "expected fields with distinct names"),
+        ("name='x', fields=(F('x_m'),), is_open='no'", "DeclaredStream.is_open: expected bool"),
+    ],
+)
+def test_a_declared_stream_that_could_not_be_opened_is_told_before_the_run(plugin, stream, told):
+    path = plugin(f"""
+from madns_runtime.plugin.api import DeclaredStream as D, Field as F
+def streams(parameters, agents):
+    return [D(role='agent', {stream})]
+""")
+
+    with pytest.raises(PluginError, match=re.escape(told)):
+        ask_streams(f"{path}:streams", path.parent, parameters=None, agents=("a",))
+
+
+@pytest.mark.parametrize(
+    ("label", "told"),
+    [
+        (r"'\ud800'", "must call a by a text of at most 200 printable characters"),
+        (r"'x\n'", "must call a by a text of at most 200 printable characters"),
+        ("'x' * 201", "must call a by a text of at most 200 printable characters"),
+        ("'b'", "calls a b, which is another agent's name"),
+    ],
+)
+def test_labels_that_no_file_holds_or_that_are_names_of_others_are_told(plugin, label, told):
+    path = plugin(f"def labels(parameters, agents, base):\n    return {{'a': {label}}}\n")
+
+    with pytest.raises(PluginError, match=re.escape(told)):
+        ask_labels(f"{path}:labels", path.parent, parameters=None, agents=("a", "b"))
+
+
+@pytest.mark.parametrize(
+    ("use", "told"),
+    [
+        ("agent=['a'], field='f', device='d', channel='c'", "by agents of the scenario"),
+        ("agent='a', field=5, device='d', channel='c'", "DeviceUse.field: expected str, got 5"),
+        ("agent='a', field='f', device='d', channel='c', direction='up'", "DeviceUse.direction"),
+        (r"agent='a', field='f', device='\ud800', channel='c'", "printable characters, got device"),
+    ],
+)
+def test_a_use_of_other_kinds_is_told_with_its_field(plugin, use, told):
+    path = plugin(f"""
+from madns_runtime.plugin.api import DeviceUse
+def uses(parameters, agents, base):
+    return [DeviceUse({use})]
+""")
+
+    with pytest.raises(PluginError, match=re.escape(told)):
+        ask_device_uses(f"{path}:uses", path.parent, parameters=None, agents=("a",))
+
+
+def test_an_answer_that_raises_when_it_is_looked_at_is_the_plugins_fault(plugin):
+    path = plugin("""
+class Odd(dict):
+    def items(self):
+        raise RuntimeError("no items")
+def labels(parameters, agents, base):
+    return Odd(a="x")
+""")
+
+    with pytest.raises(PluginError, match=r"plugin.py:\d+: labels\(\): RuntimeError: no items"):
+        ask_labels(f"{path}:labels", path.parent, parameters=None, agents=("a",))
+
+
+@pytest.mark.parametrize("raised", ["GeneratorExit", "KeyboardInterrupt"])
+def test_whatever_a_question_raises_is_told_where_nobody_can_have_pressed_ctrl_c(
+    plugin, monkeypatch, raised
+):
+    monkeypatch.setattr("signal.getsignal", lambda number: signal.SIG_DFL)
+    path = plugin(f"def check(*_):\n    raise {raised}\n")
+
+    assert re.search(rf"plugin.py:\d+: check\(\): {raised}$", refusal(path, "check"))
+
+
+def test_ctrl_c_during_a_question_is_no_fault_of_the_plugin(plugin, monkeypatch):
+    monkeypatch.setattr("signal.getsignal", lambda number: signal.default_int_handler)
+    path = plugin("def check(*_):\n    raise KeyboardInterrupt\n")
+
+    with pytest.raises(KeyboardInterrupt):
+        ask(path, "check")

@@ -373,3 +373,37 @@ def test_columns_that_are_no_fields_of_streams_are_told(write, tmp_path, columns
 
     with pytest.raises(PluginError, match=told):
         registry.resolve("./plugin.py:simulation", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("field", "told"),
+    [
+        ("name=5", "name: expected a text"),
+        (r"name='\ud800'", "name: expected a text"),
+        ("label_column='t_s'", "label_column: tables have a column 't_s' already"),
+        ("label_column=None", "label_column: expected a text"),
+        ("actions=5", "actions: expected a tuple of ActionKind, got 5"),
+        ("actions=(K(word=5, summary='x'),)", "actions: 5: word: expected a text, got 5"),
+        ("actions=(K(word='x', summary='x', lasting='ever'),)", "'x': lasting: expected never,"),
+        ("actions=(K(word='x', summary='x', modes='lockstep'),)", "'x': modes: expected a tuple"),
+        ("agent_parameters='gain'", "agent_parameters: expected a tuple of parameters' names"),
+        ("agent_parameters=('gian',)", "agent_parameters: there is no parameter 'gian'"),
+        ("placeholders={'gain': 'name'}", "placeholders: expected a mapping"),
+        ("check=len", "check: expected 'module:name' or ':name'"),
+    ],
+)
+def test_a_field_of_a_descriptor_that_is_no_such_value_is_told(write, tmp_path, field, told):
+    write(
+        PLUGIN.rstrip().removesuffix(")") + f", {field})\n"
+        if "name=" not in field
+        else PLUGIN.replace('name="p"', field)
+    )
+    text = (tmp_path / "plugin.py").read_text()
+    (tmp_path / "plugin.py").write_text(
+        text.replace(
+            "from dataclasses import dataclass",
+            "from dataclasses import dataclass\nfrom madns_runtime.timeline.action import ActionKind as K",
+        )
+    )
+
+    assert told in refusal("./plugin.py:simulation", tmp_path)

@@ -3,6 +3,8 @@
 import gc
 import os
 import socket
+import subprocess
+import sys
 
 import pytest
 
@@ -43,3 +45,40 @@ def _tell_whether_it_stays_open(number: int, write_fd: int) -> None:
         os.write(write_fd, b"open")
     finally:
         os._exit(0)
+
+
+STRAY = """
+import os, sys, time
+from madns_runtime.reactor.reactor import Reactor
+reactor = Reactor()
+def fork():
+    if os.fork():
+        os.wait()
+reactor.call_at(reactor.now_s(), fork)
+reactor.call_at(reactor.now_s() + 0.1, reactor.stop)
+reactor.run()
+print("ran to its end", flush=True)
+"""
+
+
+def test_a_process_that_comes_back_from_a_callback_does_not_run_the_loop_on():
+    done = subprocess.run(
+        [sys.executable, "-c", STRAY], capture_output=True, text=True, timeout=60, check=True
+    )
+
+    assert done.stdout.splitlines() == ["ran to its end"]
+    assert "forked a process that came back from the call" in done.stderr
+
+
+FROZEN = """
+import time
+from madns_runtime.reactor.reactor import Reactor
+reactor = Reactor()
+time.monotonic = lambda: 0.0
+reactor.call_at(reactor.now_s() + 0.05, reactor.stop)
+reactor.run()
+"""
+
+
+def test_a_loop_goes_on_whatever_clock_a_plugin_puts_in_the_place_of_time():
+    subprocess.run([sys.executable, "-c", FROZEN], timeout=60, check=True)

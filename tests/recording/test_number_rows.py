@@ -3,6 +3,7 @@
 import random
 from dataclasses import replace
 
+import numpy as np
 import orjson
 import pytest
 
@@ -113,3 +114,40 @@ def test_a_stream_is_rounded_in_all_its_floats_or_in_none(tmp_path, fields):
 
     with pytest.raises(PluginError, match="stream state: expected digits, 0 to 15"):
         Recorder(files, Recording()).open_stream(StreamSchema("state", fields))
+
+
+def make_rows_recorder(tmp_path):
+    files = RecordFiles(tmp_path, run="r", source="a")
+    recorder = Recorder(files, Recording(), DirectWriter(files), rows_together=128)
+    recorder.open_stream(StreamSchema("state", (FIELDS[0], FIELDS[1])))
+    return recorder
+
+
+def test_a_value_without_a_form_is_told_in_the_call_that_records_it(tmp_path):
+    recorder = make_rows_recorder(tmp_path)
+    recorder.record("state", (1, 1.0))
+
+    with pytest.raises(PluginError, match="stream state: value 1: object has no JSON form"):
+        recorder.record("state", (2, object()))
+
+
+def test_a_number_that_no_file_holds_is_counted_at_the_end_and_costs_no_other_record(tmp_path):
+    recorder = make_rows_recorder(tmp_path)
+    for number in (1, 2**70, 3):
+        recorder.record("state", (number, 1.0))
+    counts = recorder.close()
+
+    assert (counts.written, counts.dropped) == (2, 1)
+    assert "Integer exceeds 64-bit range" in counts.errors[0]
+
+
+def test_rounding_does_not_raise_whatever_a_plugin_has_numpy_do():
+    rows = NumberRows((None, 6))
+    rows.waiting = [(1, 5e-320)]
+    before = np.seterr(all="raise")
+    try:
+        lines, _ = rows.encode()
+    finally:
+        np.seterr(**before)
+
+    assert lines == [b"[1,0.0]\n"]

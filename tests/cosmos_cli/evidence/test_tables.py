@@ -430,6 +430,8 @@ def test_time_zero_is_the_epoch_of_summary_or_parameters_whatever_the_simulation
     found = TableLabels.of(config, result).zero_utc
 
     assert found.date().isoformat() == zero
+    beyond = dataclasses.replace(config, parameters={"epoch_utc": "0001-01-01T00:00:00+14:00"})
+    assert TableLabels.of(beyond, {}).zero_utc is None
     nothing = dataclasses.replace(config, parameters={"epoch_utc": None})
     assert TableLabels.of(nothing, {**result, "simulation": {}}).zero_utc is None
 

@@ -217,3 +217,32 @@ def test_a_rule_that_an_option_gives_has_its_faults_there(tmp_path, override):
         (override.partition("=")[0], "agent_parameters[0].parameters.payload_bytes"),
         (override.partition("=")[0], "agent_parameters[0].parameters.size"),
     ]
+
+
+@pytest.mark.process
+def test_a_check_that_changes_what_it_is_given_changes_no_parameters(tmp_path):
+    plugin = PLUGIN.replace("tuple[int, ...] = (1, 2)", "list[int] = field(default_factory=list)")
+    found = "    return ["
+    (tmp_path / "plug.py").write_text(
+        plugin.replace(found, f"    parameters.wheels.append(7)\n{found}", 1)
+    )
+    path = tmp_path / "a.yaml"
+    path.write_text(OWN + "  - {agents: [agent-3], parameters: {mass_kg: 3}}\n")
+
+    scenario = load_scenario(path)
+
+    assert scenario.parameters["wheels"] == []
+    assert [each.parameters["wheels"] for each in scenario.agent_parameters] == [[]]
+
+
+@pytest.mark.process
+def test_faults_by_the_hundred_thousand_are_counted(tmp_path):
+    condition = "if parameters.engine.power_w > 100 * parameters.mass_kg else []"
+    (tmp_path / "plug.py").write_text(PLUGIN.replace(condition, "* 200_000"))
+    path = tmp_path / "a.yaml"
+    path.write_text(OWN.removesuffix("agent_parameters:\n"))
+
+    with pytest.raises(InputError) as told:
+        load_scenario(path)
+
+    assert told.value.omitted == 200_000 - len(told.value.faults)

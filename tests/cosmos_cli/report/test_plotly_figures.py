@@ -169,3 +169,10 @@ def test_every_value_of_figures_draws_in_a_browser(tmp_path):
     assert 'data-inspected="yes"' in dom
     for told in ('data-failed="0"', 'data-errors=""', 'data-empty=""', 'data-violations="0"'):
         assert told in dom, dom[:500]
+
+
+def test_tables_and_remarks_of_other_values_are_refused_where_they_are_made():
+    with pytest.raises(ValueError, match="expected a Heading per column, got str"):
+        TableBlock(title="t", headings=["a"], rows=[[1]])
+    with pytest.raises(ValueError, match="ReportRemark: expected a text, got int"):
+        ReportRemark(text=5)

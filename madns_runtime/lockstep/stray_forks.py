@@ -1,0 +1,46 @@
+"""A process that a plug-in forked in a worker, and that came back from the call as if it were the worker itself."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+
+from madns_runtime.lockstep.frames import FAILED, METHODS, POSITIONS, encode_frame
+from madns_runtime.lockstep.worker_line import HostGone, WorkerLine
+from madns_runtime.reactor.forking import CAME_BACK, end_child
+
+
+class StrayForks:
+    """
+    Tells such a process from the worker; costs nothing but at a fork.
+
+    Args:
+        position: What the worker is doing, see `frames`.
+    """
+
+    def __init__(self, position: memoryview) -> None:
+        self._position = position
+        self._at = 0
+        """Position at the newest fork; that of the memory is the worker's, which goes on meanwhile."""
+        self._forked_at: int | None = None
+        """Position at which this process was forked; None in the worker."""
+
+    def watch(self) -> None:
+        """Note forks of this process from now on."""
+        os.register_at_fork(before=self._note, after_in_child=self._mark)
+
+    def end_stray(self, line: WorkerLine) -> None:
+        """End this process if it is not the worker, and tell the host who forked it: both would go on, and record twice."""
+        if self._forked_at is None:
+            return
+        index, doing = divmod(self._forked_at, POSITIONS)
+        method = METHODS[doing] or "half, as it was loaded,"
+        with contextlib.suppress(HostGone):
+            line.say(encode_frame(FAILED, index, f"the agent's {method} {CAME_BACK}"))
+        end_child(1)
+
+    def _note(self) -> None:
+        self._at = self._position[0]
+
+    def _mark(self) -> None:
+        self._forked_at = self._at

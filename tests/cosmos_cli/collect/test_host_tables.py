@@ -1,0 +1,79 @@
+"""What a simulation tabulates of its own records: what it may not yield is told, and nobody is left out without a word."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from cosmos_cli.collect.host_tables import tabulated
+from cosmos_cli.evidence.run_directory import RunDirectory
+from madns_runtime.config import Agents, RunConfig
+from madns_runtime.errors import PluginError
+
+AGENTS = ("agent-01", "agent-02")
+TIMES_S = np.arange(3.0)
+PLUGIN = """
+from dataclasses import dataclass
+import numpy as np
+from madns_runtime.plugin.api import AgentSimulation, Field, Simulation, Tabulated
+@dataclass(frozen=True)
+class Parameters:
+    pass
+class Agent(AgentSimulation):
+    pass
+def tabulate(folder, agents, times_s):
+    for agent in agents:
+        yield Tabulated(**{"agent": agent, "fields": (Field("x_m", "m"),), "times_s": times_s, "columns": {"x_m": times_s}, **CHANGE})
+simulation = Simulation(name="p", parameters=Parameters, agent=":Agent", tabulate=":tabulate")
+"""
+
+
+def rows(folder, change="{}"):
+    (folder / "plug.py").write_text(PLUGIN.replace("CHANGE", change))
+    config = RunConfig(
+        run="0001-t",
+        scenario="t",
+        simulation="./plug.py:simulation",
+        base_directory=str(folder),
+        agents=Agents(count=2),
+    )
+    return list(tabulated(RunDirectory(folder / "0001-t"), config, AGENTS, TIMES_S))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (
+            "{'agent': 'nobody'}",
+            "must yield rows of the agents that it is asked for, got those of 'nobody'",
+        ),
+        ("{'agent': 'agent-01'}", "yielded no rows of agent-02"),
+        ("{'columns': None}", "plug.py"),
+        ("{'times_s': None}", "plug.py"),
+        ("{'fields': 5}", "plug.py"),
+        ("{'fields': ()}", "must yield a value a time"),
+        (
+            "{'fields': (Field('agent'),), 'columns': {'agent': times_s}}",
+            "must call no field agent",
+        ),
+        ("{'fields': (Field('t_s'),), 'columns': {'t_s': times_s}}", "fields with distinct names"),
+        ("{'fields': (Field('x_m', 'm', 'odd'),)}", "expected fields of kind"),
+        ("{'columns': {'x_m': np.zeros((3, 2))}}", "must yield a value a time of each of x_m"),
+        ("{'columns': {'x_m': np.array(['a'] * 3, object)}}", "could not convert string to float"),
+    ],
+)
+def test_what_is_no_row_of_an_agent_is_told_with_its_place(tmp_path, change, told):
+    with pytest.raises(PluginError, match=re.escape(told)) as raised:
+        rows(tmp_path, change)
+
+    assert "plug.py:" in str(raised.value)
+
+
+def test_rows_in_lists_become_arrays(tmp_path):
+    found = rows(tmp_path, "{'times_s': [0, 1, 2], 'columns': {'x_m': [1, 2, 3]}}")
+
+    assert [part.agent for part in found] == list(AGENTS)
+    assert [part.columns["x_m"].tolist() for part in found] == [[1.0, 2.0, 3.0]] * 2
+    assert found[0].times_s.dtype == np.float64
