@@ -46,6 +46,19 @@ def test_a_biased_sensor_adds_to_its_first_values_and_a_dead_one_gives_none():
     assert not failures
 
 
+def test_a_sensor_that_sticks_again_does_so_where_it_is_though_another_failure_outlasts_the_first():
+    failures = SensorFailures()
+    failures.begin(1, SensorFault(sensor="gyro", fault="stuck"))
+    failures.begin(2, SensorFault(sensor="gyro", fault="biased", bias=(100.0,)))
+    assert failures.altered((1.0,)) == (101.0,)
+    failures.end(1)
+    assert failures.altered((2.0,)) == (102.0,)
+
+    failures.begin(3, SensorFault(sensor="gyro", fault="stuck"))
+
+    assert failures.altered((3.0,)) == failures.altered((4.0,)) == (103.0,)
+
+
 def test_a_stuck_sensor_repeats_what_it_measured_when_it_stuck_and_forgets_it_afterwards():
     failures = SensorFailures()
     failures.begin(1, SensorFault(sensor="gyro", fault="stuck"))
