@@ -22,6 +22,8 @@ class LateMessage(NamedTuple):
     service: int
     payload: Any
     deadline_s: float | None = None
+    is_copy: bool = False
+    """Whether it is the second of a message that comes twice."""
 
 
 class LateMessages:
@@ -36,6 +38,14 @@ class LateMessages:
 
     def __len__(self) -> int:
         return len(self._heap) + sum(map(len, self._held.values()))
+
+    @property
+    def messages(self) -> int:
+        """Messages held back; one that comes twice is one."""
+        waiting = [message for _, _, message in self._heap]
+        for held in self._held.values():
+            waiting += [message for _, message in held]
+        return sum(not message.is_copy for message in waiting)
 
     def must_wait(self, agent: str, direction: int, service: int, now_s: float) -> bool:
         """Tell whether one of an ordered class waits for others before it."""

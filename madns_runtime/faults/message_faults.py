@@ -5,7 +5,7 @@ What an agent sent is touched behind the seal and before it is handed in, what t
 sealed, and messages between agents where the medium hands them over. The framework's own words, by which agents live,
 keep time and end, are never touched.
 
-    seen = passed + lost + late;    late = released + left
+    seen = passed + lost + late;    late = released + left, with the host
 """
 
 from __future__ import annotations
@@ -170,8 +170,10 @@ class MessageFaults:
             return 0
         if fate.is_held or fate.late_s or must_wait:
             due_s = math.inf if fate.is_held else now_s + fate.late_s
-            is_kept = all(self._late.put(message, due_s) for _ in range(1 + fate.is_doubled))
+            is_kept = self._late.put(message, due_s)
             counts["late" if is_kept else "lost"] += 1
+            if is_kept and fate.is_doubled:
+                is_kept = self._late.put(message._replace(is_copy=True), due_s)
             counts["no_room"] += not is_kept
             self._ends.held()
             return 0
@@ -183,7 +185,7 @@ class MessageFaults:
         for message in self._late.due(self._now_s()):
             agent, service = message.agent, Service(message.service)
             counts = self._counts[agent]
-            counts["released"] += 1
+            counts["released"] += not message.is_copy
             if message.direction == UP:
                 self._ends.receive(agent, message.payload)
                 continue
@@ -226,7 +228,7 @@ class MessageFaults:
             return {}
         with_host: Counter[str] = sum(self._counts.values(), Counter())
         return {
-            "with_host": {**with_host, "left": len(self._late)},
+            "with_host": {**with_host, "left": self._late.messages},
             "between_agents": dict(self._between),
             "agents": {agent: dict(self._counts[agent]) for agent in sorted(self._counts)},
         }

@@ -201,6 +201,22 @@ def test_a_doubled_message_comes_twice_unless_its_class_promises_once():
     assert (rig.counts()["doubled"], rig.counts()["double_discarded"]) == (2, 1)
 
 
+def test_a_doubled_message_that_is_late_is_one_in_the_account():
+    rig = Rig()
+    rig.faults.begin(action("duplicate_messages", probability=1.0))
+    rig.faults.begin(action("delay_messages", number=2, delay_s=1.0, jitter_s=0.0))
+    rig.faults.take("a", "up", BEST)
+    rig.now_s = 0.5
+    rig.faults.take("a", "up later", BEST)
+
+    rig.pass_time(1.2)
+
+    assert [message for _, message in rig.received] == ["up", "up"]
+    assert rig.counts() == {"seen": 2, "late": 2, "doubled": 2, "released": 1, "left": 1}
+    rig.pass_time(2.0)
+    assert (rig.counts()["released"], rig.counts()["left"]) == (2, 0)
+
+
 def test_what_waits_is_as_it_was_sent():
     rig = Rig()
     rig.faults.begin(action("delay_messages", delay_s=1.0, jitter_s=0.0))
