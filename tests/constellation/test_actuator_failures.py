@@ -15,12 +15,11 @@ def test_thrusters_give_their_share_until_the_failure_is_lifted():
     failures.weaken(1, {0: 0.5})
     failures.weaken(2, {0: 0.5, 1: 0.0})
 
-    assert failures.given(0, (4.0, 0.0, -8.0)) == (1.0, 0.0, -2.0)
-    assert failures.given(1, (4.0, 0.0, 0.0)) == (0.0, 0.0, 0.0)
+    assert (failures.share(0), failures.share(1), failures.share(2)) == (0.25, 0.0, 1.0)
     failures.lift(2)
-    assert failures.given(0, (4.0, 0.0, -8.0)) == (2.0, 0.0, -4.0)
+    assert (failures.share(0), failures.share(1)) == (0.5, 1.0)
     failures.lift(1)
-    assert failures.given(0, (4.0, 0.0, -8.0)) == (4.0, 0.0, -8.0)
+    assert failures.share(0) == 1.0
 
 
 def test_failed_wheels_refuse_torques_of_their_vehicle_alone():
