@@ -5,7 +5,7 @@ What an agent sent is touched behind the seal and before it is handed in, what t
 sealed, and messages between agents where the medium hands them over. The framework's own words, by which agents live,
 keep time and end, are never touched.
 
-    seen = passed + lost + late;    late = released + left
+    seen = passed + lost + late;    late = released + left, with the host
 """
 
 from __future__ import annotations

@@ -15,12 +15,11 @@ def test_thrusters_give_their_share_until_the_failure_is_lifted():
     failures.weaken(1, {0: 0.5})
     failures.weaken(2, {0: 0.5, 1: 0.0})
 
-    assert failures.given(0, (4.0, 0.0, -8.0)) == (1.0, 0.0, -2.0)
-    assert failures.given(1, (4.0, 0.0, 0.0)) == (0.0, 0.0, 0.0)
+    assert (failures.share(0), failures.share(1), failures.share(2)) == (0.25, 0.0, 1.0)
     failures.lift(2)
-    assert failures.given(0, (4.0, 0.0, -8.0)) == (2.0, 0.0, -4.0)
+    assert (failures.share(0), failures.share(1)) == (0.5, 1.0)
     failures.lift(1)
-    assert failures.given(0, (4.0, 0.0, -8.0)) == (4.0, 0.0, -8.0)
+    assert failures.share(0) == 1.0
 
 
 def test_failed_wheels_refuse_torques_of_their_vehicle_alone():
@@ -44,6 +43,19 @@ def test_a_biased_sensor_adds_to_its_first_values_and_a_dead_one_gives_none():
     failures.end(2)
     failures.end(1)
     assert not failures
+
+
+def test_a_sensor_that_sticks_again_does_so_where_it_is_though_another_failure_outlasts_the_first():
+    failures = SensorFailures()
+    failures.begin(1, SensorFault(sensor="gyro", fault="stuck"))
+    failures.begin(2, SensorFault(sensor="gyro", fault="biased", bias=(100.0,)))
+    assert failures.altered((1.0,)) == (101.0,)
+    failures.end(1)
+    assert failures.altered((2.0,)) == (102.0,)
+
+    failures.begin(3, SensorFault(sensor="gyro", fault="stuck"))
+
+    assert failures.altered((3.0,)) == failures.altered((4.0,)) == (103.0,)
 
 
 def test_a_stuck_sensor_repeats_what_it_measured_when_it_stuck_and_forgets_it_afterwards():

@@ -18,6 +18,7 @@ from madns_runtime.plugin.api import Tick
 from madns_runtime.simulations.constellation.agent import ConstellationAgent
 from madns_runtime.simulations.constellation.flight import process
 from madns_runtime.simulations.constellation.flight.asked_ticks import UNANSWERED_MAX
+from madns_runtime.simulations.constellation.flight.interface import arrival_thread, transport
 from madns_runtime.simulations.constellation.flight.interface import program as flight_program
 from madns_runtime.simulations.constellation.flight.process import LATE_CHECK
 from madns_runtime.simulations.constellation.messages import (
@@ -113,7 +114,7 @@ class Ship:
         software = self.agent._cockpit._software
         self.run(1)
         while software._counts["answers"] < count:
-            software._link.wait(PATIENCE_S)
+            wait_until(lambda: software._link._thread._found)
             self.run(1)
 
     def __enter__(self):
@@ -289,10 +290,10 @@ def test_a_program_that_does_not_answer_in_lockstep_fails_the_agent(tmp_path):
 
 
 def test_in_real_time_no_tick_waits_and_answers_are_taken_when_they_come(tmp_path):
-    gate = tmp_path / "gate"
+    gate, second_gate = tmp_path / "gate", tmp_path / "second"
     body = f"""
 import os, time
-while not os.path.exists({str(gate)!r}):
+while not os.path.exists({str(second_gate)!r} if tick["t_s"] else {str(gate)!r}):
     time.sleep(0.001)
 print(json.dumps({{"estimate": {{"of_t": tick["t_s"]}}}}), flush=True)
 """
@@ -301,6 +302,8 @@ print(json.dumps({{"estimate": {{"of_t": tick["t_s"]}}}}), flush=True)
         ship.run(5)
         assert "estimates" not in ship.context.streams
         gate.touch()
+        ship.run_until(lambda: "estimates" in ship.context.streams)
+        second_gate.touch()
         ship.run_until(lambda: len(ship.context.records["estimates"]) >= 5)
 
     rows = ship.context.records["estimates"]
@@ -310,6 +313,30 @@ print(json.dumps({{"estimate": {{"of_t": tick["t_s"]}}}}), flush=True)
     assert ship.summary["answers_late"] == ship.summary["answers"] - 1 >= 4
     assert ship.late["got"] >= 4
     assert not ship.late["passed"]
+
+
+def lines_of(thread):
+    """Count the lines that lie there since the last tick."""
+    return sum(arrival.data.count(b"\n") for arrival in list(thread._found))
+
+
+def test_an_answer_that_lies_there_until_the_next_tick_is_not_late(tmp_path, monkeypatch):
+    command = program(tmp_path, ANSWER)
+    clock_s = 0.0
+    for module in (process, arrival_thread, transport):
+        monkeypatch.setattr(module, "monotonic", lambda: clock_s)
+    with Ship(tmp_path, command, is_lockstep=False, flight={"answer_s": 1.0}) as ship:
+        ship.run_until_answered(1)
+        software = ship.agent._cockpit._software
+        thread = software._link._thread
+        for _ in range(3):
+            ship.run(1)
+            wait_until(lambda: lines_of(thread) == len(software._asked))
+            clock_s += 2.0  # a tick every two seconds
+
+    assert ship.summary["answers"] >= 4
+    assert ship.summary["answers_late"] == 0
+    assert ship.late["passed"]
 
 
 def test_a_slow_start_is_no_late_answer(tmp_path, monkeypatch):
@@ -324,7 +351,8 @@ for line in sys.stdin:
 """
     command = program(tmp_path, "", text)
     clock_s = 0.0
-    monkeypatch.setattr(process, "monotonic", lambda: clock_s)
+    for module in (process, arrival_thread, transport):
+        monkeypatch.setattr(module, "monotonic", lambda: clock_s)
     with Ship(tmp_path, command, is_lockstep=False, flight={"answer_s": 1.0}) as ship:
         ship.run(3)
         clock_s = 5.0

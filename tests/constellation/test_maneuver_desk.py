@@ -1,6 +1,7 @@
 """What becomes of commands: accepted, postponed or refused with a reason, and the inequality's account."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -201,6 +202,20 @@ def test_a_thruster_does_one_burn_at_a_time():
     at = desk(at._vehicles[0])
     at.decide(0, command(20.1, number=3, vector=(0.001, 0.0, 0.0)), 10.0)
     assert "busy from 20.100 s to 20.100 s" in at.decide(0, command(20.0), 10.0).reason
+
+
+@pytest.mark.parametrize("factor", [0.0, 1e-3])
+def test_a_thruster_that_gives_next_to_nothing_takes_its_command_as_ever(factor):
+    thruster = Thruster(isp_s=220.0, propellant_kg=20.0, minimum_impulse_n_s=50.0)
+    weak = desk(replace(PLAIN, thruster=thruster))
+    weak.failures.weaken(1, {0: factor})
+
+    taken = weak.decide(0, command(20.0), 10.0)
+
+    assert (taken.status, taken.reason, taken.expected_m_s) == ("accepted", "", 1.0)
+    over = weak.execute(taken)
+    assert over.delta_v_m_s == pytest.approx(factor)
+    assert weak.account.propellant_kg == pytest.approx(0.0463 * factor, rel=1e-2)
 
 
 def test_impulses_of_one_moment_add_up():

@@ -398,6 +398,18 @@ def test_uplink_of_a_late_time_waits_for_it():
     assert segment.summary()["uplinks_waiting"] == 1
 
 
+def test_an_uplink_that_is_added_leaves_before_one_of_a_later_time():
+    segment = ground(station(rate_bit_s=BITS), uplinks=[(0.0, "v0", TEXT), (1e6, "v0", TEXT)])
+    fly(segment, 1.0)
+
+    assert segment.medium.add_uplink(Uplink(at_s=1.0, to="v0", text="added"), "here")
+    _, deliveries, events = fly(segment, SET_S, from_s=1.0)
+
+    assert [delivery.payload for _, delivery in deliveries] == [TEXT, "added"]
+    assert [event.number for event in events] == [0, 2]
+    assert segment.summary()["uplinks_waiting"] == 1
+
+
 def test_stations_and_uplinks_that_cannot_be_are_all_named():
     with pytest.raises(ConfigurationError) as caught:
         ground(station(), station(), uplinks=[(0.0, "v0", TEXT), (0.0, "nobody", TEXT)])

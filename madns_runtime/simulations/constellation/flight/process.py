@@ -241,7 +241,7 @@ class ExternalFlight:
         self._listened_s = self._present_s()
         for arrival in self._link.arrivals():
             for answer in self._protocol.feed(arrival.data):
-                came_s = arrival.came_s if self._is_recorded else self._present_s()
+                came_s = self._present_s() if self._is_lockstep else arrival.came_s
                 asked = None if self._has_own_clock else self._find_asked(answer, came_s, math.inf)
                 if asked is not None:
                     self._count_answer(asked, came_s)
@@ -300,7 +300,7 @@ class ExternalFlight:
         self._listened_s = self._present_s()
         for arrival in link.arrivals():
             for answer in self._protocol.feed(arrival.data):
-                came_s = arrival.came_s if self._is_recorded else self._present_s()
+                came_s = self._present_s() if self._is_lockstep else arrival.came_s
                 self._take(answer, came_s, t_s)
         self._keep_talk()
         if how := link.how_it_ended():

@@ -53,7 +53,7 @@ class FlightLink:
         given = settings.interface or FlightInterface()
         self._start_s = given.start_s
         self._is_lockstep = is_lockstep
-        self._has_thread = not is_lockstep and settings.interface is not None
+        self._has_thread = not is_lockstep  # what came between two ticks has its own time
         self._thread: ArrivalThread | None = None
         self.transport: Transport = make_transport(given.transport, values, base_directory, devices)
         self.program: FlightProgram | None = None

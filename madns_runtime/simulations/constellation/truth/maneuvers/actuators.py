@@ -88,7 +88,11 @@ def chance_of(seed: int, agent: str, number: int) -> np.random.Generator:
 
 
 def fire(
-    thruster: Thruster, tank: Tank, delta_v_m_s: Vector, random: np.random.Generator
+    thruster: Thruster,
+    tank: Tank,
+    delta_v_m_s: Vector,
+    random: np.random.Generator,
+    share: float = 1.0,
 ) -> Burn | ActuatorRefusal:
     """
     Return what a thruster makes of a commanded change of velocity; books nothing.
@@ -98,6 +102,7 @@ def fire(
         tank: What is left.
         delta_v_m_s: As commanded, in any frame, m/s.
         random: Three numbers are drawn.
+        share: Of the change of velocity, that a weak thruster gives; it may be nothing at all.
 
     Source: Tsiolkovsky's equation, dm = m (1 - exp(-dv / (g0 Isp))).
     """
@@ -115,7 +120,7 @@ def fire(
         return ActuatorRefusal(
             reason=f"needs {needed_kg:.4g} kg of propellant, {tank.propellant_kg:.4g} kg are left"
         )
-    given = max(0.0, 1.0 + magnitude * thruster.magnitude_error)
+    given = share * max(0.0, 1.0 + magnitude * thruster.magnitude_error)
     sigma = math.radians(thruster.direction_error_deg)
     vector = scaled(_turned(delta_v_m_s, along * sigma, across * sigma), given)
     used_kg = propellant_of(thruster, tank.mass_kg, commanded * given)
@@ -249,13 +254,9 @@ class ActuatorFailures:
         self._factors.pop(failure, None)
         self._without_wheels.pop(failure, None)
 
-    def given(self, vehicle: int, delta_v_m_s: Vector) -> Vector:
-        """Return what a vehicle's thruster makes of a commanded change of velocity, m/s, before its own errors."""
-        if not self._factors:
-            return delta_v_m_s
-        factor = math.prod(each.get(vehicle, 1.0) for each in self._factors.values())
-        x, y, z = delta_v_m_s
-        return (factor * x, factor * y, factor * z)
+    def share(self, vehicle: int) -> float:
+        """Return the share of a commanded change of velocity that a vehicle's thruster gives, before its own errors."""
+        return math.prod(each.get(vehicle, 1.0) for each in self._factors.values())
 
     def refusal(self, vehicle: int, kind: str) -> str:
         """Return why a command of a kind cannot be carried out; empty if it can."""

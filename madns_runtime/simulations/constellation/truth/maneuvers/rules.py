@@ -262,8 +262,8 @@ class ManeuverDesk:
         described = self._vehicles[vehicle]
         random = chance_of(self._rules.seed, self._agents[vehicle], command.number)
         if command.kind == "delta_v" and described.thruster is not None:
-            wanted = self.failures.given(vehicle, command.vector)
-            return fire(described.thruster, self._tanks[vehicle], wanted, random)
+            share = self.failures.share(vehicle)
+            return fire(described.thruster, self._tanks[vehicle], command.vector, random, share)
         if command.kind == "torque" and described.attitude is not None:
             momentum = self._timelines[vehicle].wheels_at(math.inf)
             wheels = described.attitude.wheels

@@ -147,6 +147,7 @@ class GroundSegment:
             return False
         queue = self._uplinks.setdefault(self._index[uplink.to], [])
         queue.append((self._uplinks_given, uplink, numbers[0]))
+        queue.sort(key=lambda waiting: waiting[1].at_s)  # before those whose time is yet to come
         self._uplinks_given += 1
         self._uplinks_waiting += 1
         return True

@@ -24,7 +24,7 @@ class SensorFailures:
     def end(self, number: int) -> None:
         """Lift a failure."""
         self._failures.pop(number, None)
-        if not self._failures:
+        if all(each.fault != "stuck" for each in self._failures.values()):
             self._last = None
 
     def altered(self, values: Measured) -> Measured | None:
