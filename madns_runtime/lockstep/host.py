@@ -224,7 +224,7 @@ class LockstepHost:
         for _ in range(DRAIN_ROUNDS_MAX):
             if not any(self._outbox.boxes):
                 break
-            self._meeting.exchange((frames.DRAIN,), self._outbox.boxes)
+            self._meeting.exchange((frames.DRAIN, self._clock.t_s), self._outbox.boxes)
             self._settle()
         self._outbox.give_up()
 

@@ -80,8 +80,13 @@ KINDS = {
         entry("kill", for_s=0.3),
         entry("hang", ("agent-01",), for_s=0.2),
     ],
+    "hang until a stop": [
+        entry("link_down", ALL, at_s=0.0),
+        entry("hang", at_s=0.44, for_s=0.3),
+        entry("stop", (), at_s=0.5),
+    ],
 }
-"""Twenty kinds of faults, by name."""
+"""Twenty kinds of faults, by name, and one that lasts until the run is stopped."""
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -102,6 +107,19 @@ def test_a_run_with_a_fault_survives_it_and_repeats_to_the_bit(run_faults, kind)
         seen = [counts.get(name, 0) for name in ("passed", "lost", "late")]
         assert counts.get("seen", 0) == sum(seen)
         assert counts.get("late", 0) == counts.get("released", 0) + counts.get("left", 0)
+
+
+def test_what_agents_record_of_a_run_that_is_stopped_bears_the_time_of_its_end(run_faults):
+    run = run_faults(entry("stop", (), at_s=0.5))
+    run.result()
+
+    assert run.events_of("agents/agent-04")[-1] == {
+        "t_s": 0.5,
+        "utc": "1970-01-01T00:00:00.500000Z",
+        "event": "end",
+    }
+    heard_s = [row[0] for row in run.records("agents/agent-04/heard.jsonl")]
+    assert max(heard_s) == 0.5
 
 
 def test_an_agent_that_is_killed_returns_when_it_is_said_and_is_not_judged(run_faults):
