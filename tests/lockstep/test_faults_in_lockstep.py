@@ -136,6 +136,16 @@ def test_an_agent_that_is_killed_returns_when_it_is_said_and_is_not_judged(run_f
     assert said == ["start", "killed", "emergency", "end"]
 
 
+@pytest.mark.parametrize("timeline", [[], [entry("stop", (), at_s=0.5)]])
+def test_an_agent_that_was_to_return_after_the_last_tick_is_not_judged(run_faults, timeline):
+    at_s = 0.45 if timeline else 0.92
+    run = run_faults(entry("kill", at_s=at_s - 0.1, for_s=0.1), *timeline)
+    result = run.result()
+
+    assert (result["status"], result["lost"]) == ("complete", [])
+    assert result["lost_on_purpose"] == ["agent-04"]
+
+
 def test_an_agent_that_is_away_is_named_and_the_others_take_part(run_faults):
     timeline = [
         entry("kill", at_s=at_s, for_s=0.4, agents=who) for at_s, who in ((0.2, A4), (0.4, SOME))
