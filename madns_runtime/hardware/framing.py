@@ -125,7 +125,7 @@ class NmeaFramer(LineFramer):
             return self._garbage(used)
         self.garbage_bytes += start
         try:
-            is_right = int(digits, 16) == _xor(body)
+            is_right = digits.isalnum() and int(digits, 16) == _xor(body)  # " 5" is a number, too
         except ValueError:
             is_right = False
         if not is_right:

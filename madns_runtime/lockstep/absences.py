@@ -158,8 +158,8 @@ class Absences:
         indices = [i for i, name in enumerate(self._account.names) if name in wanted]
         self._meeting.forget_answers()
         for worker in self._crew.workers:
+            # Those without any of the agents, too: what an agent records bears one time, whoever shares its process.
             own = [index for index in indices if index in worker.agents]
-            if own:
-                told = dataclasses.astuple(fault)
-                self._meeting.order(worker, frames.FAULT, self._clock.t_s, told, own)
+            told = dataclasses.astuple(fault)
+            self._meeting.order(worker, frames.FAULT, self._clock.t_s, told, own)
         self._meeting.await_told("has not begun a fault")

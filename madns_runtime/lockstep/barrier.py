@@ -107,7 +107,7 @@ class Meeting:
 
     # Waiting --------------------------------------------------------------------------------------
 
-    def exchange(self, order: tuple[int, ...], boxes: list[list[tuple[int, bytes]]]) -> None:
+    def exchange(self, order: tuple[float, ...], boxes: list[list[tuple[int, bytes]]]) -> None:
         """
         Give every worker *order* and what waits for its agents, and wait until all have answered.
 

@@ -21,7 +21,7 @@ SETUP: Final = 1
 TICK: Final = 2
 """[TICK, number, [[index, body], ...]]: hand out the messages, then step every agent."""
 DRAIN: Final = 3
-"""[DRAIN, [[index, body], ...]]: the simulated time is over; hand out the last messages."""
+"""[DRAIN, simulated time, [[index, body], ...]]: that is over; hand out the last messages."""
 FINISH: Final = 4
 """[FINISH]: ask every agent for its summary."""
 STOP: Final = 5
@@ -29,7 +29,8 @@ STOP: Final = 5
 RETURN: Final = 6
 """[RETURN, tick, [[index, incarnation, initial data], ...]]: make lost agents anew; *tick* is the next."""
 FAULT: Final = 7
-"""[FAULT, simulated time, values of an AgentFault, [index, ...]]: begin or end a fault of agents."""
+"""[FAULT, simulated time, values of an AgentFault, [index, ...]]: begin or end a fault of agents, of which there may be
+none: the time is every worker's."""
 
 # Worker to host.
 READY: Final = 11

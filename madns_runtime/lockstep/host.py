@@ -153,7 +153,7 @@ class LockstepHost:
                 break
             self._absences.bring_back(number, self._settle)
             self._meeting.exchange((frames.TICK, number), self._outbox.boxes)
-            self._account.ticks = number + 1
+            self._account.ticks, self._account.ticked_s = number + 1, number / tick_hz
             self._settle()
             self._settle_conditions()
         self._advance(duration_s)
@@ -224,7 +224,7 @@ class LockstepHost:
         for _ in range(DRAIN_ROUNDS_MAX):
             if not any(self._outbox.boxes):
                 break
-            self._meeting.exchange((frames.DRAIN,), self._outbox.boxes)
+            self._meeting.exchange((frames.DRAIN, self._clock.t_s), self._outbox.boxes)
             self._settle()
         self._outbox.give_up()
 

@@ -112,6 +112,8 @@ class RunAccount:
     agents: list[AgentAccount] = field(init=False)
     ticks: int = 0
     """Run by every agent."""
+    ticked_s: float = 0.0
+    """Simulated time of the last one: who was to return after it had no tick to return at."""
     lost: dict[str, str] = field(default_factory=dict)
     """Agents that were lost, and are judged by it."""
     just_lost: list[int] = field(default_factory=list)
@@ -227,7 +229,7 @@ class RunAccount:
                 }
                 for name, agent in by_name.items()
             },
-            "lost": sorted({*self.lost, *self.intended.overdue(self.duration_s, 0.0)}),
+            "lost": sorted({*self.lost, *self.intended.overdue(self.ticked_s, 0.0)}),
             "lost_on_purpose": self.intended.names(),
             "not_stopped": list(self.not_stopped),
             "network": {},

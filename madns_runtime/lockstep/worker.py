@@ -252,9 +252,9 @@ class Worker:
             agent.journal.event("device", device=name, status=status)
             self._call(agent, "device_changed", name, status)
 
-    def _drain(self, messages: list[tuple[int, bytes]]) -> bytes:
+    def _drain(self, t_s: float, messages: list[tuple[int, bytes]]) -> bytes:
         self._check_terminated()
-        self._clock.t_s = self._assignment.config.time.duration_s
+        self._clock.t_s = t_s
         self._hand_out(messages)
         return self._done()
 

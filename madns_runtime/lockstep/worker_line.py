@@ -68,7 +68,7 @@ class WorkerLine:
                 if not data:
                     raise HostGone
         except _Terminated:
-            return [frames.DRAIN, []]  # whose answer tells it
+            return [frames.DRAIN, 0.0, []]  # whose answer tells it
         except OSError as error:
             raise HostGone from error
         finally:

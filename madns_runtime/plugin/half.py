@@ -149,8 +149,7 @@ class Half:
     def __init__(self, make: Callable[[], Any], log: Callable[[str, str], None]) -> None:
         self._log = log
         self.name: str = getattr(make, "__name__", "the simulation's half")
-        self._has_begun = False
-        """Whether its setup was called."""
+        self._is_set_up = False  # or was about to be
         try:
             self.simulation = make()
         except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
@@ -164,7 +163,7 @@ class Half:
         Raises:
             HalfFailed: It raised, or returned something against its contract.
         """
-        self._has_begun = self._has_begun or name == "setup"
+        self._is_set_up |= name == "setup"
         return self.run(name, None, *arguments)
 
     def run(self, name: str, function: Callable[..., Any] | None, *arguments: Any) -> Any:
@@ -194,12 +193,8 @@ class Half:
             ) from error
 
     def abandon(self) -> None:
-        """
-        Have an agent's half let go of what outlives it; of one whose setup was not called that is nothing.
-
-        What it raises is in its log, and changes nothing.
-        """
-        if self._has_begun:
+        """Have an agent's half whose setup was called let go of what outlives it; what it raises is logged and changes nothing."""
+        if self._is_set_up:
             with contextlib.suppress(HalfFailed):
                 self.call("abandon")
 

@@ -139,3 +139,13 @@ def test_length_may_be_big_endian_and_of_four_bytes():
 
     assert framer.wrap(b"abc") == b"\0\0\0\3abc"
     assert framer.feed(b"\0\0\0\3abc") == [b"abc"]
+
+
+@pytest.mark.parametrize("digits", [b"05", b"+5", b" 5", b"5 ", b"-5", b"0x"])
+def test_a_checksum_of_nmea_is_two_hexadecimal_digits(digits: bytes) -> None:
+    framer = NmeaFramer()
+
+    found = framer.feed(b"$\x05*" + digits + b"\r\n")
+
+    assert found == ([b"\x05"] if digits == b"05" else [])
+    assert framer.bad_checksums == 1 - len(found)

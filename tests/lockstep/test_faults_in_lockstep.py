@@ -80,8 +80,13 @@ KINDS = {
         entry("kill", for_s=0.3),
         entry("hang", ("agent-01",), for_s=0.2),
     ],
+    "hang until a stop": [
+        entry("link_down", ALL, at_s=0.0),
+        entry("hang", at_s=0.44, for_s=0.3),
+        entry("stop", (), at_s=0.5),
+    ],
 }
-"""Twenty kinds of faults, by name."""
+"""Twenty kinds of faults, by name, and one that lasts until the run is stopped."""
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -104,6 +109,19 @@ def test_a_run_with_a_fault_survives_it_and_repeats_to_the_bit(run_faults, kind)
         assert counts.get("late", 0) == counts.get("released", 0) + counts.get("left", 0)
 
 
+def test_what_agents_record_of_a_run_that_is_stopped_bears_the_time_of_its_end(run_faults):
+    run = run_faults(entry("stop", (), at_s=0.5))
+    run.result()
+
+    assert run.events_of("agents/agent-04")[-1] == {
+        "t_s": 0.5,
+        "utc": "1970-01-01T00:00:00.500000Z",
+        "event": "end",
+    }
+    heard_s = [row[0] for row in run.records("agents/agent-04/heard.jsonl")]
+    assert max(heard_s) == 0.5
+
+
 def test_an_agent_that_is_killed_returns_when_it_is_said_and_is_not_judged(run_faults):
     run = run_faults(entry("kill", for_s=0.3))
     result = run.result()
@@ -116,6 +134,16 @@ def test_an_agent_that_is_killed_returns_when_it_is_said_and_is_not_judged(run_f
     assert at_host(run, kind="rejoined") == [(0.6, [])]
     said = [e["event"] for e in run.events_of("agents/agent-04")]
     assert said == ["start", "killed", "emergency", "end"]
+
+
+@pytest.mark.parametrize("timeline", [[], [entry("stop", (), at_s=0.5)]])
+def test_an_agent_that_was_to_return_after_the_last_tick_is_not_judged(run_faults, timeline):
+    at_s = 0.45 if timeline else 0.92
+    run = run_faults(entry("kill", at_s=at_s - 0.1, for_s=0.1), *timeline)
+    result = run.result()
+
+    assert (result["status"], result["lost"]) == ("complete", [])
+    assert result["lost_on_purpose"] == ["agent-04"]
 
 
 def test_an_agent_that_is_away_is_named_and_the_others_take_part(run_faults):
