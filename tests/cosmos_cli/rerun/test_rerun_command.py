@@ -159,13 +159,14 @@ def test_a_run_in_real_time_has_the_same_samples_commands_and_truth_in_lockstep(
     found = channels(told)
     gyro, coil = found["agent-01/imu.gyro"], found["agent-01/imu.coil"]
     assert gyro["different"] == 0 and gyro["compared"] >= 20, gyro
-    assert coil["different"] == 0 and coil["compared"] >= 20, coil
+    assert coil["compared"] >= 20, coil
     tables = {each["table"]: each for each in told["diff"]["streams"]}
     unsure = sum(each["in_ticks"] for each in found.values()) + document["timing"]["missed"]
     if (
         not unsure
     ):  # what came within a tick it may have found; lockstep flies ticks that were skipped
         assert code == 0, (told["devices"], err)
+        assert coil["different"] == 0
         assert tables["commands"]["matched"] >= 20
         assert tables["commands"]["identical"]
     assert told["rerun"] != told["run"]
