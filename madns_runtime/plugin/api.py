@@ -323,7 +323,7 @@ class AgentSimulation(Protocol):
         """Let what *action* did be over, if it lasts."""
 
     def abandon(self) -> None:
-        """Let go at once of what outlives this object, such as programs: it is lost, maybe in `setup` or before, and not to finish."""
+        """Let go at once of what outlives this object, such as programs: it is lost, maybe in its `setup`, and not to finish."""
 
     def finish(self) -> Mapping[str, Any]:
         """Return this agent's summary; a list under "checks" is judged (see `Check`)."""

@@ -38,6 +38,7 @@ CHECKS: Final[Mapping[str, Callable[[Any], Any]]] = {
     "finish": validation.summary,
 }
 """Checks of what methods return, by method; values of other methods are not looked at."""
+SETUP: Final = "setup"
 ACTION_METHODS: Final = ("begin_action", "end_action")
 REPEATS_MAX: Final = 100_000
 """Calls of the timer, or jobs, at one simulated time; more means that the half never lets time go on."""
@@ -145,6 +146,8 @@ class Half:
     def __init__(self, make: Callable[[], Any], log: Callable[[str, str], None]) -> None:
         self._log = log
         self.name: str = getattr(make, "__name__", "the simulation's half")
+        self._has_begun = False
+        """Whether its setup was called."""
         try:
             self.simulation = make()
         except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
@@ -167,6 +170,8 @@ class Half:
         Raises:
             HalfFailed: It raised, or returned something against its contract.
         """
+        if name == SETUP:
+            self._has_begun = True
         try:
             value = (function or self._method(name))(*arguments)
         except BaseException as error:
@@ -187,9 +192,14 @@ class Half:
             ) from error
 
     def abandon(self) -> None:
-        """Have an agent's half let go of what outlives it; what it raises is in its log, and changes nothing."""
-        with contextlib.suppress(HalfFailed):
-            self.call("abandon")
+        """
+        Have an agent's half let go of what outlives it, if its setup was called, whatever came of that.
+
+        What it raises is in its log, and changes nothing.
+        """
+        if self._has_begun:
+            with contextlib.suppress(HalfFailed):
+                self.call("abandon")
 
     def _method(self, name: str) -> Callable[..., Any]:
         """Return a method; of a half that does not inherit it, and lacks it, the one that it would inherit."""
