@@ -163,7 +163,6 @@ class Half:
         Raises:
             HalfFailed: It raised, or returned something against its contract.
         """
-        self._is_set_up |= name == "setup"
         return self.run(name, None, *arguments)
 
     def run(self, name: str, function: Callable[..., Any] | None, *arguments: Any) -> Any:
@@ -173,6 +172,7 @@ class Half:
         Raises:
             HalfFailed: It raised, or returned something against its contract.
         """
+        self._is_set_up |= name == "setup"
         try:
             value = (function or self._method(name))(*arguments)
         except BaseException as error:

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 import tty
 from pathlib import Path
 
@@ -342,6 +343,32 @@ def test_lines_that_name_their_tick_are_for_it_though_datagrams_are_lost(tmp_pat
     assert summary["ticks_unanswered"] >= 9
     ticks = [row[0] for row in ship.context.records["flight_answers"]]
     assert {tick % 3 for tick in ticks} == {0, 2}
+
+
+def test_lines_without_a_time_are_carried_out_though_their_ticks_were_given_up(tmp_path):
+    board = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    board.bind(("127.0.0.1", 0))
+    board.settimeout(20)
+    local, remote = "127.0.0.1:0", f"127.0.0.1:{board.getsockname()[1]}"
+    transport = {"kind": "udp", "local": local, "remote": remote}
+    flight = {**attached(transport, "json_lines"), "answer_s": 0.05}
+    with Attached(tmp_path, None, flight=flight, is_lockstep=False) as ship:
+        ship.run(1)
+        _, sender = board.recvfrom(65536)
+        board.sendto(b"{}\n", sender)
+        answered(ship, 1)
+        ship.run(10)
+        time.sleep(0.1)  # too late by now
+        count = ship._next - 1
+        for number in range(count):
+            board.sendto(b'{"estimate":{"number":%d}}\n' % number, sender)
+        estimates = ship.context.records["estimates"]
+        ship.run_until(lambda: len(estimates) == count)
+    board.close()
+
+    assert [row[-1] for row in estimates] == list(range(count))
+    counted = ship.summary["answers"] + ship.summary["interface"]["answers_unasked"]
+    assert counted == count + 1
 
 
 def test_software_that_never_comes_is_named(tmp_path):

@@ -108,6 +108,24 @@ def test_what_a_call_returns_against_its_contract_is_refused(logged):
         made(Rover, logged).call("finish")
 
 
+def test_a_half_lets_go_of_what_outlives_it_once_its_setup_was_called(logged):
+    class Holding(Rover):
+        def abandon(self) -> None:
+            raise ValueError("holds on")
+
+    half = made(Holding, logged)
+    half.abandon()
+    assert logged == []
+
+    with pytest.raises(HalfFailed):
+        half.call("setup", ValueError("told to"), {})
+    half.abandon()
+    assert [text.strip().splitlines()[-1] for text in logged] == [
+        "ValueError: told to",
+        "ValueError: holds on",
+    ]
+
+
 def test_a_half_that_cannot_be_made_is_named(logged, capsys):
     with pytest.raises(HalfFailed, match=r"^Broken\.__init__ raised ValueError: no board \(test_h"):
         made(Broken, logged)

@@ -316,8 +316,10 @@ class ExternalFlight:
             asked = self._find_asked(answer, came_s, t_s)
             if asked is None:
                 self._answers_unasked += 1
-                return
-            self._count_answer(asked, came_s)
+                if answer.t_s is not None:  # a second one to its tick, or after that was given up
+                    return
+            else:
+                self._count_answer(asked, came_s)
         else:
             counts["answers"] += 1
         if answer.board_us and self._is_recorded:
