@@ -25,6 +25,8 @@ from madns_runtime.timeline.runner import OrderedAction
 SOCKET_NAME: Final = ".actions.sock"
 IN_FORCE_TOLD_MAX: Final = 100
 AGENTS_TOLD_MAX: Final = 20
+IN_FORCE_BYTES_MAX: Final = 65_536
+"""Of all actions in force that are told: a socket takes more at once, by default 160 KiB on a small board."""
 WHOLE_RUN: Final = "run"
 """Target of an action that acts on no agents."""
 
@@ -111,7 +113,7 @@ class ActionSocket:
         return {
             "refusal": "",
             "actions": actions,
-            "in_force": [_shortened(each) for each in in_force[:IN_FORCE_TOLD_MAX]],
+            "in_force": _first_of(in_force),
             "in_force_count": len(in_force),
         }
 
@@ -152,6 +154,18 @@ class ActionSocket:
             shown = ", ".join(self._agents[:AGENTS_TOLD_MAX])
             raise ConfigurationError(f"no agent is named {target}; there are {shown}")
         return chosen
+
+
+def _first_of(in_force: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the first IN_FORCE_TOLD_MAX actions in force, or as many as fit an answer."""
+    told: list[dict[str, Any]] = []
+    size_bytes = 0
+    for each in map(_shortened, in_force[:IN_FORCE_TOLD_MAX]):
+        size_bytes += len(orjson.dumps(each))
+        if size_bytes > IN_FORCE_BYTES_MAX:
+            break
+        told.append(each)
+    return told
 
 
 def _shortened(in_force: Mapping[str, Any]) -> dict[str, Any]:
