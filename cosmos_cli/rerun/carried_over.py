@@ -32,7 +32,7 @@ Item = dict[str, Any]
 
 @dataclass(slots=True)
 class CarriedOver:
-    """Entries and checks as they are written, by their places on record; what is left out is no more among them."""
+    """Entries and checks as they are written, by their places on record; a remark stands for an entry that is left out."""
 
     timeline: dict[int, Item] = field(default_factory=dict)
     checks: dict[int, Item] = field(default_factory=dict)

@@ -25,8 +25,8 @@ from madns_runtime.timeline.runner import OrderedAction
 SOCKET_NAME: Final = ".actions.sock"
 IN_FORCE_TOLD_MAX: Final = 100
 AGENTS_TOLD_MAX: Final = 20
-IN_FORCE_BYTES_MAX: Final = 150_000
-"""Of the list of what is in force: an answer must fit the socket at once; of a longer list the first half is told."""
+IN_FORCE_BYTES_MAX: Final = 65_536
+"""Of all actions in force that are told: a socket takes more at once, by default 160 KiB on a small board."""
 WHOLE_RUN: Final = "run"
 """Target of an action that acts on no agents."""
 
@@ -110,13 +110,10 @@ class ActionSocket:
             for kind in self._kinds.values()
         ]
         in_force = list(self._in_force())
-        told = [_shortened(each) for each in in_force[:IN_FORCE_TOLD_MAX]]
-        while len(orjson.dumps(told)) > IN_FORCE_BYTES_MAX:
-            told = told[: len(told) // 2]
         return {
             "refusal": "",
             "actions": actions,
-            "in_force": told,
+            "in_force": _first_of(in_force),
             "in_force_count": len(in_force),
         }
 
@@ -157,6 +154,18 @@ class ActionSocket:
             shown = ", ".join(self._agents[:AGENTS_TOLD_MAX])
             raise ConfigurationError(f"no agent is named {target}; there are {shown}")
         return chosen
+
+
+def _first_of(in_force: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the first IN_FORCE_TOLD_MAX actions in force, or as many as fit an answer."""
+    told: list[dict[str, Any]] = []
+    size_bytes = 0
+    for each in map(_shortened, in_force[:IN_FORCE_TOLD_MAX]):
+        size_bytes += len(orjson.dumps(each))
+        if size_bytes > IN_FORCE_BYTES_MAX:
+            break
+        told.append(each)
+    return told
 
 
 def _shortened(in_force: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,13 +10,15 @@ from time import monotonic
 from typing import Any, Final
 
 from madns_runtime.hardware import messages
-from madns_runtime.hardware.count_table import CountTable, missed_name
+from madns_runtime.hardware.count_table import CELLS_MAX, MISSED, CountTable, missed_name
 from madns_runtime.reactor.reactor import Reactor
 
 WAITING_MAX: Final = 10_000
 """Messages that may wait for room at one agent; the oldest is given up beyond, and counted."""
 PERIOD_S: Final = 0.02
 """Between two looks for room."""
+USERS_NAMED_MAX: Final = CELLS_MAX // 2
+"""Agents of which each has a count of its own; of more they are counted together, as a device's own counts need room."""
 
 
 class UserOutbox:
@@ -26,14 +28,19 @@ class UserOutbox:
     Args:
         users: The device's ends of its pairs, by agent.
         reactor: The loop of its process.
-        counts: Where what is given up is counted by agent, for the agents to read.
+        counts: Where what is given up is counted by agent, for the first USERS_NAMED_MAX agents to read.
     """
 
     def __init__(
         self, users: Mapping[str, socket.socket], reactor: Reactor, counts: CountTable
     ) -> None:
         self._users: list[tuple[str, socket.socket, deque[list[Any]]]] = [
-            (missed_name(agent), end, deque(maxlen=WAITING_MAX)) for agent, end in users.items()
+            (
+                missed_name(agent) if place < USERS_NAMED_MAX else MISSED,
+                end,
+                deque(maxlen=WAITING_MAX),
+            )
+            for place, (agent, end) in enumerate(users.items())
         ]
         self._counts = counts
         self._timer = reactor.call_at(math.inf, self._send_waiting)

@@ -7,6 +7,7 @@ import orjson
 
 from madns_runtime.hardware.action_socket import (
     AGENTS_TOLD_MAX,
+    IN_FORCE_BYTES_MAX,
     IN_FORCE_TOLD_MAX,
     SOCKET_NAME,
     ActionSocket,
@@ -62,10 +63,10 @@ def test_the_list_of_what_is_in_force_comes_whole_in_a_run_of_a_thousand_agents(
     assert answer["in_force"][0]["agents_count"] == len(AGENTS)
 
 
-def test_a_list_of_long_parameters_is_cut_and_says_how_many_there_are(tmp_path):
-    action = {"number": 1, "action": "own", "agents": [], "parameters": {"text": "x" * 4000}}
+def test_of_actions_that_are_long_to_tell_so_many_are_told_as_fit(tmp_path):
+    action = {"number": 1, "action": "rove", "agents": ["a"], "parameters": {"text": "x" * 9000}}
 
     answer = answer_to({"list": True}, tmp_path, [action] * 100)
 
-    assert len(answer["in_force"]) == 25
+    assert len(answer["in_force"]) == IN_FORCE_BYTES_MAX // 9100
     assert answer["in_force_count"] == 100

@@ -124,16 +124,19 @@ def _of_other_mode(expectation: Expectation) -> str:
 
 
 def _give(batch: Batch, followed: Sequence[_Followed]) -> None:
-    """Give a batch to those that look at its agent; each field is cleaned once."""
+    """Give a batch to those that look at its agent, and its words to those that miss one; each field is cleaned once."""
     clean: dict[str, Batch | None] = {}
     for each in followed:
-        if not each.is_about(batch):
+        is_about = each.is_about(batch)
+        if not (is_about or each.words.is_sought):
             continue
         name = each.expectation.field
         if name not in clean:
             clean[name] = batch.all() if not name else batch.of(name) if batch.has(name) else None
         if (found := clean[name]) is not None:
-            each.take(found)
+            each.words.take(found.values)
+            if is_about:
+                each.take(found)
 
 
 class _Followed:
@@ -181,7 +184,6 @@ class _Followed:
     def take(self, batch: Batch) -> None:
         """Take a batch of records that have its field."""
         expectation = self.expectation
-        self.words.take(batch.values)
         wanted = np.ones(len(batch.t_s), bool)
         if expectation.from_s is not None:
             wanted &= batch.t_s >= expectation.from_s

@@ -22,7 +22,7 @@ CHARACTERS_MAX: Final = 40
 
 class SeenWords:
     """
-    Words that one expectation has met.
+    Words that the stream of one expectation has, whoever recorded them.
 
     Args:
         expectation: What must be; others than of an event, or of records that hold a text, keep nothing.
@@ -33,16 +33,16 @@ class SeenWords:
         counted_text = None if expectation.when is None else expectation.when.text
         self._word = expectation.event or counted_text or ""
         is_open = (expectation.stream, expectation.field) not in WORDS
-        self._is_sought = is_open and bool(self._word)
+        self.is_sought = is_open and bool(self._word)
         """Whether the word is looked for and was not met."""
         self._words: set[str] = set()
 
     def take(self, values: NDArray[Any]) -> None:
         """Take the values of some records."""
-        if not self._is_sought or values.dtype != object:
+        if not self.is_sought or values.dtype != object:
             return
         if np.any(values == self._word):
-            self._is_sought = False
+            self.is_sought = False
             return
         for each in values if len(self._words) < KEPT_MAX else ():
             if isinstance(each, str):
@@ -53,7 +53,7 @@ class SeenWords:
     def remark(self) -> str | None:
         """Return what is to be told; None if the word was met, or nobody knows what would have been one."""
         expectation = self._expectation
-        if not self._is_sought or not self._words:
+        if not self.is_sought or not self._words:
             return None
         words = sorted(clean_line(word, length_max=CHARACTERS_MAX) for word in self._words)
         guess = did_you_mean(self._word, words)

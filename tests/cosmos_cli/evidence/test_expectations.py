@@ -582,6 +582,13 @@ def test_a_word_that_is_there_or_could_not_be_otherwise_is_no_remark():
     assert remarks_on(nothing, event="lost") == ()
 
 
+def test_a_word_that_other_agents_have_is_not_misspelt():
+    assert remarks_on(event="sent", agents=("b",)) == ()
+    (told,) = remarks_on(event="snt", agents=("b",))
+
+    assert told.endswith("did you mean sent?")
+
+
 def test_of_very_many_words_few_are_told():
     words = [f"word{number:04d}" for number in range(5000)]
     many = {"a": {"t_s": np.arange(5000.0), "event": objects(words)}}
