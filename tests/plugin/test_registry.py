@@ -249,11 +249,20 @@ def test_every_fault_of_a_descriptor_is_named(write, tmp_path):
     assert "host: expected" in message
 
 
-@pytest.mark.parametrize("name", ["streams", "", 3])
-def test_simulation_that_is_called_like_a_key_of_a_comparison_is_refused(write, tmp_path, name):
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("streams", ", none of schema, runs,"),
+        ("", " of at most 200 printable characters, got ''"),
+        (3, " of at most 200 printable characters, got 3"),
+    ],
+)
+def test_simulation_that_is_called_like_a_key_of_a_comparison_or_nothing_is_refused(
+    write, tmp_path, name, words
+):
     write(PLUGIN + f"    bad = Simulation(name={name!r}, parameters=Parameters, agent=':Agent')\n")
 
-    assert "name: expected a text, none of schema, runs," in refusal("./plugin.py:bad", tmp_path)
+    assert f"name: expected a text{words}" in refusal("./plugin.py:bad", tmp_path)
 
 
 def test_agent_without_the_methods_of_the_contract_is_refused(write, tmp_path):
