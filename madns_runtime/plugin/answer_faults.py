@@ -19,7 +19,6 @@ from madns_runtime.plugin.api import DeclaredStream, Demand, DeviceUse, Flow, Pl
 from madns_runtime.recording.records import (
     FIELD_KINDS,
     FRAMEWORK_STREAMS,
-    HEALTH,
     Field,
     StreamSchema,
 )
@@ -123,22 +122,7 @@ def streams_fault(found: Any) -> str | None:
         fields: Any = item.fields
         if not isinstance(fields, tuple | list) or not all(isinstance(f, Field) for f in fields):
             return f"must give {item.name!r} fields as a tuple of Field, got {shown(fields)}"
-    faults = (_table_fault(seen), *map(_stream_fault, found))
-    return next(filter(None, faults), None)
-
-
-def _table_fault(declared: set[tuple[str, str]]) -> str | None:
-    """Return which agent's stream would have the table of another role's; those are called after the role."""
-    of_host = {*FRAMEWORK_STREAMS, *(name for role, name in declared if role == "host")}
-    taken = {f"machine_{HEALTH.name}", *(f"host_{name}" for name in of_host)}
-    for role, name in sorted(declared):
-        if role == "agent" and name in taken:
-            whose, _, stream = name.partition("_")
-            return (
-                f"declares the agent's stream {name!r}, whose table would be that of the {whose}'s"
-                f" stream {stream!r}: choose another name"
-            )
-    return None
+    return next(filter(None, map(_stream_fault, found)), None)
 
 
 def _stream_fault(item: DeclaredStream) -> str | None:

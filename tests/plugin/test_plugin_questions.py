@@ -158,14 +158,6 @@ def test_check_that_raises_while_it_yields_is_told_with_its_line(plugin):
         ("return 2 * [D(role='host', name='a', fields=())]", "which belongs to another of them"),
         ("return [D(role='chief', name='a', fields=())]", "of role host or agent, got ('chief'"),
         ("return [D(role='host', name='a', fields=(3,))]", "fields as a tuple of Field, got (3,)"),
-        (
-            "return [D(role=r, name=n, fields=()) for r, n in (('host', 'a'), ('agent', 'host_a'))]",
-            "'host_a', whose table would be that of the host's stream 'a'",
-        ),
-        (
-            "return [D(role='agent', name='machine_health', fields=())]",
-            "would be that of the machine's stream 'health'",
-        ),
     ],
 )
 def test_streams_that_are_no_declaration_are_told(plugin, body, told):
