@@ -161,7 +161,8 @@ def figures_of(folder: Path) -> dict[str, Any]:
 
 
 def _input_figures(records: list[Any]) -> dict[str, Any]:
-    """Return the figures of one input: of [t_s, number, age_us] per sample."""
+    """Return the figures of one input: of [t_s, number, age_us] per sample, but for one from before the beginning."""
+    records = [record for record in records if record[0] >= 0.0]
     times = [record[0] for record in records]
     gaps = sorted(later - earlier for earlier, later in pairwise(times))
     ages = sorted(record[2] for record in records)

@@ -22,8 +22,11 @@ BYTES_S = 8_192
 ANSWER_BYTES_MAX = 400
 ANSWERS_LATE = "constellation.flight_answers_late"
 """Broken by a flight computer that falls silent for a time; that of a sound one has a minute."""
-BUSY = {"constellation.maneuver_deadlines_broken", "messages.sync.deadlines_broken"}
-"""Also broken where a command takes long on its way: on a busy machine by any vehicle."""
+BUSY = {
+    *("constellation.maneuver_deadlines_broken", "messages.sync.deadlines_broken"),
+    "hardware.stale_ratio",
+}
+"""Also broken where a command, or an emulator, waits for a processor: on a busy machine by any vehicle."""
 
 
 @pytest.fixture(scope="module")

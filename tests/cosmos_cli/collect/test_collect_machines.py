@@ -340,7 +340,7 @@ def test_file_that_is_damaged_here_after_it_came_is_named_every_time(split):
     split.retrieve()
     path = split.run.path / "agents/agent-01/ticks.jsonl"
     whole = path.read_bytes()
-    path.write_bytes(whole.replace(b"1", b"2", 1))
+    path.write_bytes(whole.replace(b"\n[1,", b"\n[7,", 1))
 
     for _ in range(2):
         assert app.run(["collect"]) == 5

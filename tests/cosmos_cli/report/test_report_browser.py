@@ -81,10 +81,8 @@ def page(tmp_path):
 def hostile_page(tmp_path):
     """Return the report of a run that says markup, placeholders and ends of scripts wherever it may speak."""
     made = SyntheticRun(tmp_path / "runs", make_config(2, ticks=60)).write()
-    stream = StreamSchema("mine", (Field("tick", "", "int"), Field(HOSTILE, HOSTILE)))
-    recorder = made.recorder("agents/agent-01", "agent-01", stream, LOG)
-    for tick in range(60):
-        recorder.record("mine", (tick, float(tick)))
+    recorder = made.recorder("agents/agent-01", "agent-01", LOG)
+    write_stream(made, "agents/agent-01/mine.jsonl")
     recorder.record("log", {"t_s": 0.0, "utc": T0_UTC, "level": "error", "text": HOSTILE})
     made.records["agent-01"] = recorder.close().to_mapping()
     check = {"name": HOSTILE, "limit": 0, "got": 1, "passed": False}
@@ -94,6 +92,16 @@ def hostile_page(tmp_path):
     document |= {"verdict": HOSTILE, "scenario": HOSTILE, "versions": {HOSTILE: HOSTILE}}
     write_report(made.run, document)
     return watched(made.run.report_html, tmp_path)
+
+
+def write_stream(made, name):
+    """Write records whose field no recorder would take: a run may come from anywhere."""
+    schema = StreamSchema("mine", (Field("tick", "", "int"), Field(HOSTILE, HOSTILE)))
+    lines = [schema.header(run=made.run.name, source="agent-01", t0_utc=T0_UTC)]
+    lines += [[tick, float(tick)] for tick in range(60)]
+    lines += [{"end": {"records": 60, "dropped": 0, "not_finite": 0}}]
+    path = made.run.path / name
+    path.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
 
 
 def watched(report, folder):
