@@ -11,9 +11,9 @@ LEAD_S_MAX = 100e-6
 """The most that a loop may wake too early and wait for without sleeping, s."""
 WAIT_S_MAX = 2 * LEAD_S_MAX
 """The most that it then waits, s: meanwhile the estimate of the host's clock may have moved the deadline."""
-RAISE_S = 3e-6
-LOWER_S = 1e-6
-"""Steps by which the lead follows: three to one, so that three wake-ups of four come before their deadline."""
+RAISE_S = 4.5e-6
+LOWER_S = 0.5e-6
+"""Steps by which the lead follows: nine to one, so that nine wake-ups of ten come before their deadline."""
 OVERSLEPT_S = 1e-3
 """A wake-up that is later still was held up by something else, s."""
 
@@ -22,7 +22,7 @@ class WakeLead:
     """
     What most wake-ups of one loop take, learned from each.
 
-    It follows the upper quartile of them: one that was late by milliseconds says nothing of the others. On a computer that
+    It follows their upper tenth: one that was late by milliseconds says nothing of the others. On a computer that
     always takes longer than LEAD_S_MAX, that is the lead.
     """
 
