@@ -237,7 +237,8 @@ def _is_fixed(value: Any, parts: dict[int, Any]) -> bool:
     """Tell whether a value cannot be changed; the largest parts that cannot be of one that can are entered in *parts*."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         own = [getattr(value, each.name, None) for each in dataclasses.fields(value)]
-        may_be = bool(type(value).__dataclass_params__.frozen)
+        kind: Any = type(value)
+        may_be = bool(kind.__dataclass_params__.frozen)
     elif isinstance(value, tuple | list | dict):
         own = list(value.values() if isinstance(value, dict) else value)
         may_be = isinstance(value, tuple)
