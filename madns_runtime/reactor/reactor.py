@@ -206,7 +206,6 @@ class Reactor:
         """
         try:
             while not self._is_stopping:
-                self.end_if_stray()
                 self._turn()
         finally:
             self._is_stopping = False
@@ -246,6 +245,7 @@ class Reactor:
         if self._always_readable:
             until_s = 0.0
         self._added.clear()
+        self.end_if_stray()  # before it takes a wake-up, which is its parent's
         ready = self._poller.wait(until_s)
         woken_s = monotonic()
         self.waits += 1

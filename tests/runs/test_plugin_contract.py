@@ -86,11 +86,11 @@ class A(AgentSimulation):
             os._exit(0)
         if self.evil == "crash" and self.context.name == "agent-01" and tick.index >= 3:
             os.kill(os.getpid(), signal.SIGSEGV)
-        if self.evil == "fork" and self.context.name == "agent-01" and not self.has_forked:
+        is_forking = self.evil.startswith("fork") and not self.has_forked
+        if is_forking and self.context.name == "agent-01":
             self.has_forked = True
-            if not os.fork():
+            if not os.fork() and self.evil == "fork_exit":
                 sys.exit(0)
-            os.wait()
         if self.evil == "text" and tick.index == 3:
             raise ValueError("\\udcff" + "x" * 100_000)
         if self.evil == "wake" and self.context.name == "agent-01" and tick.index == 3:
@@ -150,10 +150,9 @@ def test_an_agent_that_ends_its_process_is_named(tmp_path):
     assert reason in result["reason"]
 
 
-def test_a_process_that_leaves_a_call_by_an_error_is_not_taken_for_the_agent_that_forked_it(
-    tmp_path,
-):
-    result = run(tmp_path, "fork")
+@pytest.mark.parametrize("evil", ["fork_exit", "fork_return"])
+def test_an_agent_goes_on_alone_whose_fork_comes_back_from_the_call(tmp_path, evil):
+    result = run(tmp_path, evil, "agents.per_process=2")
 
     assert (result["exit_code"], result["reason"]) == (0, None)
 
