@@ -24,6 +24,8 @@ T = TypeVar("T")
 CLASSES_KEPT = 256
 """Of how many dataclasses the types are kept: to evaluate them takes longer than to build a small object."""
 MAPPINGS = (dict, Mapping, collections.abc.MutableMapping)
+ATOMS = (str, int, float, bool, bytes, type(None))
+"""Types of values that no copy makes anew."""
 LINE_CHARACTERS_MAX = 200
 """Of a name or a unit that somebody declares."""
 SHOWN_CHARACTERS_MAX = 100
@@ -203,22 +205,52 @@ def is_whole(value: object) -> TypeGuard[int]:
     return issubclass(type(value), Integral) and type(value) is not bool
 
 
-def own_copy(value: T) -> T:
-    """Return a copy of a value that holds something that can be changed, such as a list; else the value itself."""
-    if not _is_changeable(value):
-        return value
+class OwnCopies:
+    """Makes copies of values for many owners: what can be changed is each one's own, what cannot be is shared by all."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, tuple[Any, dict[int, Any] | None]] = {}
+        """By the id of a value: itself, and its parts that cannot be changed, by theirs; None if none of it can be."""
+
+    def of(self, value: T) -> T:
+        """Return a copy of a value that holds something that can be changed, such as a list; else the value itself."""
+        found = self._known.get(id(value))
+        if found is None:
+            found = self._known[id(value)] = value, _shared_parts(value)
+        if found[1] is None:
+            return value
+        try:
+            return copy.deepcopy(value, dict(found[1]))
+        except Exception:  # noqa: BLE001 - a class of a plug-in may keep what cannot be copied, such as a lock
+            return value
+
+
+def _shared_parts(value: Any) -> dict[int, Any] | None:
+    parts: dict[int, Any] = {}
     try:
-        return copy.deepcopy(value)
-    except Exception:  # noqa: BLE001 - a class of a plug-in may keep what cannot be copied, such as a lock
-        return value
+        return None if _is_fixed(value, parts) else parts
+    except Exception:  # noqa: BLE001 - a plug-in's value may hold itself, or raise when it is looked at
+        return {}
 
 
-def _is_changeable(value: Any) -> bool:
-    if dataclasses.is_dataclass(value):
-        return any(_is_changeable(getattr(value, f.name, None)) for f in dataclasses.fields(value))
-    if isinstance(value, tuple):
-        return any(map(_is_changeable, value))
-    return not isinstance(value, str | int | float | bytes | Enum | PurePath | None)
+def _is_fixed(value: Any, parts: dict[int, Any]) -> bool:
+    """Tell whether a value cannot be changed; the largest parts that cannot be of one that can are entered in *parts*."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        own = [getattr(value, each.name, None) for each in dataclasses.fields(value)]
+        kind: Any = type(value)
+        may_be = bool(kind.__dataclass_params__.frozen)
+    elif isinstance(value, tuple | list | dict):
+        own = list(value.values() if isinstance(value, dict) else value)
+        may_be = isinstance(value, tuple)
+    else:
+        return isinstance(value, str | int | float | bytes | Enum | PurePath | None)
+    are_fixed = [_is_fixed(part, parts) for part in own]
+    if may_be and all(are_fixed):
+        return True
+    for part, is_fixed in zip(own, are_fixed, strict=True):
+        if is_fixed and type(part) not in ATOMS:
+            parts[id(part)] = part
+    return False
 
 
 def is_line(value: object) -> TypeGuard[str]:

@@ -22,6 +22,7 @@ from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import RecordFile
 from cosmos_cli.evidence.table_labels import TableLabels
 from cosmos_cli.evidence.tables import TableLayout, TableWriter
+from cosmos_cli.ui.plural import counted
 from madns_runtime.config import RunConfig
 from madns_runtime.errors import PluginError
 from madns_runtime.partial_file import check_replaceable
@@ -38,6 +39,9 @@ NAME = "truth"
 TIME = Field("t_s", "s")
 ROWS_OF_AGENT_MAX = 20_000_000
 """Times at which one agent may be tabulated: 55 hours at 100 Hz."""
+
+NAMES_MAX = 10
+"""Agents that are named in a message."""
 
 Times = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -127,7 +131,7 @@ def _parts(
         fault = None if part is None else _fault_of(part, fields, agents)
         if part is None or fault:
             missing = [agent for agent in agents if agent not in told]
-            fault = fault or (f"yielded no rows of {', '.join(missing)}" if missing else None)
+            fault = fault or (f"yielded no rows of {_some_of(missing)}" if missing else None)
             if fault:
                 raise PluginError(f"{place_of(function)}: tabulate() {fault}")
             return None
@@ -141,6 +145,11 @@ def _parts(
         fields = part.fields
         told[part.agent] = None
         yield part
+
+
+def _some_of(names: list[str]) -> str:
+    rest = len(names) - NAMES_MAX
+    return ", ".join(names[:NAMES_MAX]) + (f" and {counted(rest, 'other')}" if rest > 0 else "")
 
 
 def _fault_of(part: Any, fields: tuple[Field, ...] | None, agents: tuple[str, ...]) -> str | None:

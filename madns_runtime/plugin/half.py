@@ -21,7 +21,7 @@ from madns_runtime.config import RunConfig
 from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.medium.carrier import Carrier
 from madns_runtime.medium.outcomes import NO_MEDIUM, LinkOutcome
-from madns_runtime.plain_values import own_copy
+from madns_runtime.plain_values import OwnCopies
 from madns_runtime.plugin import time_limit, validation
 from madns_runtime.plugin.api import AgentSimulation, HostSimulation
 from madns_runtime.plugin.context import clean_text, describe_exception
@@ -76,10 +76,11 @@ class RoleProgram:
     """Number of this process of an agent."""
     agent_parameters: Mapping[str, Any] = field(default_factory=dict)
     """Parameters of each agent, parsed: one object for all that share them."""
+    copies: OwnCopies = field(default_factory=OwnCopies, compare=False)
 
     def parameters_of(self, agent: str) -> Any:
         """Return the parameters of an agent: its own, where it could change a part that others have, too."""
-        return own_copy(self.agent_parameters.get(agent, self.parameters))
+        return self.copies.of(self.agent_parameters.get(agent, self.parameters))
 
     @classmethod
     def load(

@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable
 from time import monotonic
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Any
 
 from madns_runtime.errors import MachineError
 from madns_runtime.reactor.forking import CAME_BACK, end_child
@@ -206,8 +206,6 @@ class Reactor:
         """
         try:
             while not self._is_stopping:
-                if os.getpid() != self._pid:
-                    _end_stray()
                 self._turn()
         finally:
             self._is_stopping = False
@@ -227,6 +225,14 @@ class Reactor:
         for fd in {self._wake_read_fd, self._wake_write_fd}:
             os.close(fd)
 
+    def end_if_stray(self) -> None:
+        """End this process if it was forked in a callback and came back from it: two would run one loop."""
+        if os.getpid() == self._pid:
+            return
+        with contextlib.suppress(BaseException):
+            sys.stderr.write(f"a plug-in's method {CAME_BACK}; it was ended\n")
+        end_child(1)
+
     def _turn(self) -> None:
         until_s = self._timers.earliest_s()
         now_s = monotonic()
@@ -239,6 +245,7 @@ class Reactor:
         if self._always_readable:
             until_s = 0.0
         self._added.clear()
+        self.end_if_stray()  # before it takes a wake-up, which is its parent's
         ready = self._poller.wait(until_s)
         woken_s = monotonic()
         self.waits += 1
@@ -291,13 +298,6 @@ class Reactor:
         if not self._is_woken:
             self._is_woken = True
             os.write(self._wake_write_fd, WAKE_BYTES)
-
-
-def _end_stray() -> NoReturn:
-    """End a process that was forked in a callback and came back from it: two would run one loop."""
-    with contextlib.suppress(BaseException):
-        sys.stderr.write(f"a plug-in's method {CAME_BACK}; it was ended\n")
-    end_child(1)
 
 
 def _wake_descriptors() -> tuple[int, int]:

@@ -385,16 +385,16 @@ class AgentRunner:
 
     def _call(self, name: str, *arguments: Any) -> Any:
         """Call the plug-in; what it raises, or returns against its contract, ends this agent by name."""
-        calls = self._calls
-        calls[AGENT], calls[METHOD] = self._seat, NUMBER_OF[name]
+        self._calls[AGENT], self._calls[METHOD] = self._seat, NUMBER_OF[name]
         try:
             return self._half.call(name, *arguments)
         except HalfFailed as failure:
             self._fail(failure)
             return None
         finally:
-            calls[METHOD] = IDLE
+            self._calls[METHOD] = IDLE
 
     def _fail(self, failure: HalfFailed) -> None:
+        self._reactor.end_if_stray()  # by sys.exit, say: whoever forked it goes on
         self._session.emergency(str(failure), monotonic())
         self._port.must_flush = True

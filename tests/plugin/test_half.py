@@ -484,12 +484,51 @@ def test_an_agent_that_changes_its_parameters_changes_nobody_elses():
     assert program.parameters_of("agent-02") == Listed(tags=["a"])
 
 
+@dataclasses.dataclass(frozen=True)
+class Fixed:
+    tags: tuple[str, ...]
+
+
+@dataclasses.dataclass
+class Loose:
+    gain: float = 1.0
+
+
+def test_an_agent_that_sets_a_parameter_of_a_class_that_is_not_frozen_sets_nobody_elses():
+    program = RoleProgram(make=Rover, parameters=Loose())
+    program.parameters_of("agent-01").gain = 2.0
+
+    assert program.parameters_of("agent-02") == Loose(gain=1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Mixed:
+    orbits: tuple[Fixed, ...]
+    settings: dict[str, Any]
+
+
+def test_what_cannot_be_changed_of_an_agents_parameters_is_copied_for_nobody():
+    parameters = Mixed(
+        orbits=(Fixed(tags=("a",)),), settings={"fixed": Fixed(tags=("b",)), "list": []}
+    )
+    program = RoleProgram(make=Rover, parameters=parameters)
+    first, second = program.parameters_of("agent-01"), program.parameters_of("agent-02")
+    first.settings["list"].append(1)
+
+    assert second == parameters == program.parameters
+    assert first.orbits is second.orbits is parameters.orbits
+    assert first.settings["fixed"] is parameters.settings["fixed"]
+
+
+def test_parameters_that_hold_themselves_are_copied_all_the_same():
+    parameters = Listed(tags=[])
+    parameters.tags.append(parameters.tags)
+    program = RoleProgram(make=Rover, parameters=parameters)
+
+    assert program.parameters_of("agent-01").tags is not parameters.tags
+
+
 def test_parameters_that_cannot_be_changed_are_one_object_for_all():
     program = RoleProgram(make=Rover, parameters=Fixed(tags=("a",)))
 
     assert program.parameters_of("agent-01") is program.parameters_of("agent-02")
-
-
-@dataclasses.dataclass(frozen=True)
-class Fixed:
-    tags: tuple[str, ...]

@@ -51,6 +51,12 @@ STRAY = """
 import os, sys, time
 from madns_runtime.reactor.reactor import Reactor
 reactor = Reactor()
+own, wait = os.getpid(), reactor._poller.wait
+def told_wait(until_s):
+    if os.getpid() != own:
+        print("took a wake-up", flush=True)
+    return wait(until_s)
+reactor._poller.wait = told_wait
 def fork():
     if os.fork():
         os.wait()

@@ -13,6 +13,7 @@ pytestmark = pytest.mark.process
 PLUGIN = """
 import os
 import signal
+import sys
 import time
 from dataclasses import dataclass
 from madns_runtime.plugin.api import HOST, AgentSimulation, HostSimulation, Simulation
@@ -75,6 +76,8 @@ class H(HostSimulation):
         return None if self.evil == "host_finish" else {}
 
 class A(AgentSimulation):
+    has_forked = False
+
     def setup(self, context, initial):
         self.context, self.evil = context, context.parameters.evil
 
@@ -83,6 +86,11 @@ class A(AgentSimulation):
             os._exit(0)
         if self.evil == "crash" and self.context.name == "agent-01" and tick.index >= 3:
             os.kill(os.getpid(), signal.SIGSEGV)
+        is_forking = self.evil.startswith("fork") and not self.has_forked
+        if is_forking and self.context.name == "agent-01":
+            self.has_forked = True
+            if not os.fork() and self.evil == "fork_exit":
+                sys.exit(0)
         if self.evil == "text" and tick.index == 3:
             raise ValueError("\\udcff" + "x" * 100_000)
         if self.evil == "wake" and self.context.name == "agent-01" and tick.index == 3:
@@ -140,6 +148,13 @@ def test_an_agent_that_ends_its_process_is_named(tmp_path):
     assert (result["exit_code"], result["who"]) == (1, "agent-01")
     reason = "its process ended by itself, exit code 0 in the step of agent-01 at t = 0.15 s"
     assert reason in result["reason"]
+
+
+@pytest.mark.parametrize("evil", ["fork_exit", "fork_return"])
+def test_an_agent_goes_on_alone_whose_fork_comes_back_from_the_call(tmp_path, evil):
+    result = run(tmp_path, evil, "agents.per_process=2")
+
+    assert (result["exit_code"], result["reason"]) == (0, None)
 
 
 def test_an_agent_that_is_killed_in_a_call_is_told_with_the_call(tmp_path):

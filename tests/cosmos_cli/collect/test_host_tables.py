@@ -30,7 +30,7 @@ simulation = Simulation(name="p", parameters=Parameters, agent=":Agent", tabulat
 """
 
 
-def rows(folder, change="{}"):
+def rows(folder, change="{}", agents=AGENTS):
     (folder / "plug.py").write_text(PLUGIN.replace("CHANGE", change))
     config = RunConfig(
         run="0001-t",
@@ -39,7 +39,7 @@ def rows(folder, change="{}"):
         base_directory=str(folder),
         agents=Agents(count=2),
     )
-    return list(tabulated(RunDirectory(folder / "0001-t"), config, AGENTS, TIMES_S))
+    return list(tabulated(RunDirectory(folder / "0001-t"), config, agents, TIMES_S))
 
 
 @pytest.mark.parametrize(
@@ -69,6 +69,13 @@ def test_what_is_no_row_of_an_agent_is_told_with_its_place(tmp_path, change, tol
         rows(tmp_path, change)
 
     assert "plug.py:" in str(raised.value)
+
+
+def test_of_very_many_agents_without_rows_the_first_are_named(tmp_path):
+    agents = tuple(f"agent-{number:03d}" for number in range(500))
+
+    with pytest.raises(PluginError, match=r"no rows of agent-001, .*agent-010 and 489 others$"):
+        rows(tmp_path, "{'agent': 'agent-000'}", agents)
 
 
 def test_rows_in_lists_become_arrays(tmp_path):
