@@ -162,7 +162,8 @@ def _fault_of(part: Any, fields: tuple[Field, ...] | None, agents: tuple[str, ..
     if fields is not None and part.fields != fields:
         return f"must yield the same fields for every agent, got others for {part.agent}"
     # Whether numbers were rounded for a stream of the host's is nothing to a table.
-    plain = (replace(f, digits=None) if isinstance(f, Field) else f for f in part.fields)
+    stated: Any = part.fields
+    plain = (replace(f, digits=None) if isinstance(f, Field) else f for f in stated)
     try:
         check_schema(StreamSchema(NAME, (TIME, *plain)))
     except PluginError as error:

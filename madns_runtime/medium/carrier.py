@@ -25,8 +25,6 @@ from madns_runtime.plain_values import is_line, is_real, shown
 from madns_runtime.protocol.link_settings import SendQueueFull
 from madns_runtime.protocol.messages import Delivery, Transmission, TransmissionRefusal
 
-WORDS_MAX: Final = 256
-"""Different outcomes of one channel: they are counted one by one, and told at the end."""
 LEAD_S: Final = 1.0
 """Lead of the hand-over before the arrival, s: far more than a network takes."""
 
@@ -100,11 +98,6 @@ class Carrier:
         for outcome in outcomes:
             account = self.account(outcome.channel)
             account.enter(outcome, now_s)
-            if len(account.outcomes) > WORDS_MAX:
-                raise PluginError(
-                    f"{outcome.outcome!r}: expected words of at most {WORDS_MAX} kinds; a reason is a kind, such as"
-                    " out_of_range, and names no time, number or agent"
-                )
             if outcome.arrives_s is not None:
                 self._keep(sender, transmission, outcome, account)
             elif outcome.outcome != LOST and sender in self._agents:

@@ -11,6 +11,10 @@ from madns_runtime.protocol.messages import Transmission
 
 DELIVERED: Final = "delivered"
 LOST: Final = "lost"
+OTHERS: Final = "others"
+"""Under this word those are counted for which WORDS_MAX others left no room."""
+WORDS_MAX: Final = 256
+"""Different outcomes of one channel: they are counted one by one, and told at the end."""
 NO_MEDIUM: Final = "no_medium"
 """Refused: this run of the simulation has no medium."""
 EVERYBODY: Final = "*"
@@ -79,7 +83,9 @@ class MessageAccount:
     def enter(self, outcome: LinkOutcome, now_s: float) -> None:
         """Count one way of a message of which the host knows from *now_s* on."""
         self.sent += 1
-        self.outcomes[outcome.outcome] += 1
+        word, known = outcome.outcome, self.outcomes
+        is_told = word in known or word in (DELIVERED, LOST) or len(known) < WORDS_MAX
+        known[word if is_told else OTHERS] += 1
         if outcome.arrives_s is not None:
             self.delivered_bytes += outcome.size_bytes
             self.heard_late += outcome.arrives_s < now_s

@@ -9,7 +9,13 @@ from madns_runtime.errors import MessageTooLarge, PluginError
 from madns_runtime.medium.carrier import LEAD_S, Carrier
 from madns_runtime.medium.links import LinkMedium
 from madns_runtime.medium.mailbox import HELD_MAX, NUMBERS_PER_LIFE, Mailbox
-from madns_runtime.medium.outcomes import EVERYBODY, LinkOutcome, between_agents
+from madns_runtime.medium.outcomes import (
+    EVERYBODY,
+    WORDS_MAX,
+    LinkOutcome,
+    MessageAccount,
+    between_agents,
+)
 from madns_runtime.protocol.codec import pack
 from madns_runtime.protocol.link_settings import SendQueueFull
 from madns_runtime.protocol.messages import (
@@ -396,3 +402,15 @@ def test_a_delay_that_is_none_is_told_with_whom_it_was_asked_for(answer):
         PluginError, match=r"delay_s\('car-1', 'car-2', 0\) returned .* expected sec"
     ):
         medium.carry("car-1", Transmission("car-2", 0, 0.0, PAYLOAD))
+
+
+def test_reasons_beyond_a_number_are_counted_together_and_what_arrives_by_itself():
+    account = MessageAccount()
+    words = [f"out of range by {metres} m" for metres in range(WORDS_MAX + 10)]
+    for word in (*words, words[0], "delivered", "lost"):
+        account.enter(LinkOutcome(to="b", outcome=word), now_s=0.0)
+
+    assert account.sent == account.outcomes.total() == WORDS_MAX + 13
+    assert account.outcomes["others"] == 10
+    assert account.outcomes[words[0]] == 2
+    assert account.outcomes["delivered"] == account.outcomes["lost"] == 1

@@ -397,13 +397,6 @@ class Mute:
         raise ValueError("no words")
 
 
-class Reasons:
-    """A medium that finds another reason each time."""
-
-    def carry(self, sender: str, transmission: Transmission) -> Any:
-        return [LinkOutcome(to="b", outcome=f"at_{transmission.number}")]
-
-
 @pytest.mark.parametrize(
     ("answer", "words"),
     [
@@ -419,15 +412,6 @@ def test_an_outcome_that_cannot_be_told_is_the_mediums_fault(logged, answer, wor
 
     with pytest.raises(HalfFailed, match=rf"^Base.medium.carry returned .*{words}"):
         half.take("a", Transmission(to="b", number=0, sent_s=1.0, payload=None))
-
-
-def test_reasons_of_a_medium_are_kinds_and_no_texts_of_their_own(logged):
-    half = made(Base, logged, HostHalf, lambda host, context: Reasons())
-    half.set_up(None)
-
-    with pytest.raises(HalfFailed, match="expected words of at most 256 kinds"):
-        for number in range(257):
-            half.take("a", Transmission(to="b", number=number, sent_s=1.0, payload=None))
 
 
 def test_what_a_reach_raises_is_told_with_its_own_line(logged):
