@@ -77,12 +77,10 @@ def private_register(tmp_path_factory):
 
 
 @pytest.fixture(autouse=True, scope="session")
-def shared_wheels(request, tmp_path_factory):
-    """Name the folder of wheels that all workers of a session share."""
-    base = tmp_path_factory.getbasetemp()
-    is_worker = hasattr(request.config, "workerinput")
+def shared_wheels(tmp_path_factory):
+    """Name the folder of wheels that all tests of a worker share."""
     patch = pytest.MonkeyPatch()
-    patch.setenv(VARIABLE, str((base.parent if is_worker else base) / "wheelhouse"))
+    patch.setenv(VARIABLE, str(tmp_path_factory.getbasetemp() / "wheelhouse"))
     yield
     patch.undo()
 

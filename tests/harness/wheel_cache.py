@@ -1,4 +1,4 @@
-"""One cache of wheels for all tests of a session: to fetch and pack scipy takes ten seconds of a processor."""
+"""One cache of wheels for all tests of a worker: to fetch and pack scipy takes ten seconds of a processor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SHARED = ("locks", "wheels")
 
 
 def begin_cache(folder: Path) -> Path:
-    """Make *folder* an operator's cache whose wheels are those of the session."""
+    """Make *folder* an operator's cache whose wheels are those of all tests of this worker."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in SHARED:
         kept = Path(os.environ[VARIABLE], name)
