@@ -84,12 +84,13 @@ def see_verified(path: Path, locked: Locked) -> None:
     Read a wheel before it is sent; once for all machines.
 
     Raises:
-        MachineFailure: It is no longer what was downloaded. It is thrown away, so that it is fetched anew.
+        MachineFailure: It is gone, or no longer what was downloaded. It is thrown away, so that it is fetched anew.
     """
     try:
         is_verified = _has_hash(path, locked.sha256, path.stat().st_mtime_ns)
     except FileNotFoundError:
-        is_verified = False
+        text = f"{path} is gone: another command may have cleared the cache of this computer"
+        raise MachineFailure(FailureKind.DATA, text, "repeat: it is downloaded again") from None
     if not is_verified:
         path.unlink(missing_ok=True)
         raise MachineFailure(

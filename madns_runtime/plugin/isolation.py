@@ -50,7 +50,7 @@ def call_plugin(
             return finish(value) if finish else value
     except MadnsError:
         raise
-    except BaseException as error:
+    except BaseException as error:  # a plug-in may raise anything
         if is_interruption(error):
             raise
         extra = missing_extra(error)

@@ -329,6 +329,15 @@ def test_wheel_that_rots_in_the_operators_cache_is_thrown_away(machine, house, n
     assert not any(verb == "wheel" for verb, _, _ in machine.calls)
 
 
+def test_wheel_that_another_command_cleared_away_is_told_as_gone(machine, house, navlib):
+    environment = house.environment(navlib)
+    environment.wheel(environment.lock[0]).unlink()
+
+    with pytest.raises(MachineFailure, match="is gone: another command") as failed:
+        install(machine, environment)
+    assert failed.value.advice == "repeat: it is downloaded again"
+
+
 def test_wheel_that_changed_on_its_way_is_refused(machine, house, navlib, monkeypatch):
     environment = house.environment(navlib)
     monkeypatch.setattr(module, "see_verified", lambda *_: None)

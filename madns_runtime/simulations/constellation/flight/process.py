@@ -126,8 +126,8 @@ class ExternalFlight:
         )
         try:
             self._introduce(context)
-        except Exception:
-            self.abandon()  # nobody else knows yet that it runs
+        except Exception:  # whatever it is, it is raised again
+            self.abandon()  # nobody else knows yet that the program runs
             raise
 
     def _introduce(self, context: FlightContext) -> None:
