@@ -28,7 +28,7 @@ from cosmos_cli.fleet.answers.reader import READ_BYTES, AnswerReader, ExpectedAn
 from cosmos_cli.fleet.answers.verbs import BODY_BYTES_MAX, answer_shape, failure_of
 from cosmos_cli.fleet.connection import EXIT_STATUS_TIMEOUT_S, Connection, Stream
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure, runs_no_commands
-from cosmos_cli.fleet.liveness import BlockingStream, SilenceWatch
+from cosmos_cli.fleet.liveness import BlockingStream, SilenceWatch, SilentMachine
 from cosmos_cli.fleet.shell import for_login_shell
 from cosmos_cli.fleet.transfer_limits import Patience, duration_words
 from cosmos_cli.ui.step_times import timed
@@ -152,10 +152,14 @@ class Helper:
             return board
 
     def _greet(self, package: bytes, timeout_s: float) -> None:
-        self._link.write_all(package, timeout_s=timeout_s)
-        self.greeting = self._read_answer(
-            ExpectedAnswer(shape=greeting, what="its start"), timeout_s=timeout_s
-        )[0]["value"]
+        expected = ExpectedAnswer(shape=greeting, what="its start")
+        try:
+            self._link.write_all(package, timeout_s=timeout_s)
+        except MachineFailure as failure:
+            if failure.kind is FailureKind.LOST and not isinstance(failure, SilentMachine):
+                self._read_answer(expected, timeout_s=EXIT_STATUS_TIMEOUT_S)  # its words tell more
+            raise
+        self.greeting = self._read_answer(expected, timeout_s=timeout_s)[0]["value"]
 
     def call(
         self,

@@ -1,5 +1,6 @@
 """The process that works on a machine, over a real SSH connection."""
 
+import contextlib
 import os
 import shutil
 import subprocess
@@ -7,6 +8,7 @@ import time
 
 import pytest
 from ssh_harness import target_of
+from sshd import Sshd
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
@@ -101,6 +103,54 @@ def test_start_up_file_that_talks_is_told(own_sshd, known_hosts):
 
     assert caught.value.kind is FailureKind.DATA
     assert "must be silent" in caught.value.advice
+
+
+class LateStream:
+    """A stream into which nothing is written before its program has ended."""
+
+    def __init__(self, stream, ends_by_s):
+        self._stream = stream
+        self._ends_by_s = ends_by_s
+        self._read = b""
+
+    def __getattr__(self, name):
+        return getattr(self._stream, name)
+
+    def write(self, data, *, timeout_s=0.0):
+        while data := self._stream.read(4096, timeout_s=self._ends_by_s):
+            self._read += data
+        with contextlib.suppress(MachineFailure):
+            self._stream.ending(timeout_s=self._ends_by_s)
+            while True:
+                self._stream.write(b"x", timeout_s=self._ends_by_s)
+        return self._stream.write(b"x", timeout_s=self._ends_by_s)
+
+    def read(self, count, *, timeout_s=0.0):
+        if self._read:
+            data, self._read = self._read, b""
+            return data
+        return self._stream.read(count, timeout_s=timeout_s)
+
+
+def test_account_without_commands_that_is_gone_before_the_helper_is_sent_is_told(
+    tmp_path, known_hosts, monkeypatch
+):
+    says = "ForceCommand echo This account is currently not available.; exit 1"
+    with Sshd(tmp_path / "nologin", extra=says) as server:
+        known_hosts.write_text(server.known_hosts_line())
+        connection = connect(target_of(server))
+        monkeypatch.setattr(
+            connection, "open", lambda command, open=connection.open: LateStream(open(command), 20.0)
+        )
+        try:
+            with pytest.raises(MachineFailure) as caught:
+                Helper.start(connection)
+        finally:
+            connection.close()
+
+    assert caught.value.kind is FailureKind.AUTHENTICATION
+    assert "exit status 1" in caught.value.text
+    assert "This account is currently not available." in caught.value.text
 
 
 def test_machine_that_dies_in_the_midst_of_an_answer_is_lost(own_sshd, known_hosts, tmp_path):
