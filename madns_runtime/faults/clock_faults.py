@@ -88,9 +88,9 @@ class FaultableClock(ClockEstimate):
         """Return how far the estimate may be from the truth, s, as far as it knows."""
         return super().error_s(self.wrong_s(at_local_s))
 
-    def settle(self, now_s: float) -> None:
+    def settle(self, now_s: float, *, is_unused: bool = False) -> None:
         """Serve the estimate as it stands, at once."""
-        super().settle(self.wrong_s(now_s))
+        super().settle(self.wrong_s(now_s), is_unused=is_unused)
 
     def _to_host_s_when_wrong(self, local_s: float) -> float:
         """Return what is taken for the host's time, s."""

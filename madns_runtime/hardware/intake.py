@@ -37,6 +37,8 @@ class Intake:
         seed: Of inserted faults.
         frozen_s: By input: values unchanged for so long are frozen.
         pass_on: Sends a message to all agents that use it, and returns how many had no room.
+        handed_s: Of the time at which a sample was taken up, returns when agents have it: asked right after
+            it was handed over, for which a busy machine may take its time. In lockstep no time passes.
     """
 
     def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
@@ -48,11 +50,13 @@ class Intake:
         seed: Sequence[int],
         frozen_s: Mapping[str, float],
         pass_on: Callable[[list[Any]], int],
+        handed_s: Callable[[float], float] = float,
     ) -> None:
         self._inputs = {each.name: each for each in channels if each.direction == "in"}
         self._page = device_page
         self._records = records
         self._pass_on = pass_on
+        self._handed_s = handed_s
         self.faults = InsertedFaults(seed)
         self.clock = DeviceClock()
         self._changes = {name: _LastChange(limit_s) for name, limit_s in frozen_s.items()}
@@ -149,9 +153,10 @@ class Intake:
             if channel.limits is not None and hold_to_limits(channel, numbers)[1]:
                 self.count(f"{name}_beyond_limits")
             number = self._page.write(name, sample.taken_s, device_s, numbers)
-            self._records.sample(name, number, sample.taken_s, numbers, told_s=now_s)
             if channel.passing == "queue":
                 self._send([messages.FRAME, name, number, sample.taken_s, list(numbers)])
+            told_s = self._handed_s(now_s)
+            self._records.sample(name, number, sample.taken_s, numbers, told_s=told_s)
             if name in self._changes and self._changes[name].is_frozen(numbers, now_s):
                 self.count(f"{FROZEN}{name}")
                 self.event("frozen", now_s, channel=name, for_s=self._changes[name].limit_s)
@@ -164,8 +169,8 @@ class Intake:
     def _tell_frame(self, channel: Channel, data: bytes, taken_s: float, now_s: float) -> None:
         number = self._frame_numbers[channel.name] = self._frame_numbers.get(channel.name, 0) + 1
         told = (len(data), data.hex())
-        self._records.sample(channel.name, number, taken_s, told, told_s=now_s)
         self._send([messages.FRAME, channel.name, number, taken_s, data])
+        self._records.sample(channel.name, number, taken_s, told, told_s=self._handed_s(now_s))
 
     def _send(self, message: list[Any]) -> None:
         self.count("frames_missed", self._pass_on(message))

@@ -57,6 +57,7 @@ class DeviceRunner:
             seed=[launch.seed, *launch.full_name.encode()],
             frozen_s=launch.frozen_s,
             pass_on=UserOutbox(seat.users, reactor, seat.page.counts).send,
+            handed_s=lambda taken_up_s: monotonic(),
         )
         self._outputs = DeviceOutputs(launch, seat.channels, self._intake.count)
         self.tell_error: Callable[[str], object] = lambda text: None

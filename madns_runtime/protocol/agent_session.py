@@ -28,11 +28,11 @@ from madns_runtime.protocol.events import AgentSessionEvent
 from madns_runtime.protocol.link import Link
 from madns_runtime.protocol.link_settings import PLUGIN_CHANNEL, LinkSettings
 from madns_runtime.protocol.messages import ConditionMet, Message, Service, Transmission
+from madns_runtime.protocol.ping_plan import PingPlan
 from madns_runtime.protocol.silence_limits import Wakefulness, host_silence_limit_s
 from madns_runtime.protocol.states import AGENT_LIVE, AgentEvent, AgentState, agent_machine
 from madns_runtime.timing.clocksync import ClockEstimate
 
-PING_INTERVAL_S = 0.25
 PING_INTERVAL_FIRST_S = 0.02
 REPORT_INTERVAL_S = 0.9
 """So often a ping tells how the agent fares; making that up costs more than the exchange of times."""
@@ -41,40 +41,16 @@ PINGS_FIRST = 12
 CLOCK_ERROR_S_MAX = 0.02
 CLOCK_WAIT_S = 2.0
 """An agent is ready once it knows the host's clock this well, or has tried for this long."""
+CLOCK_ERROR_S_FINE = 0.001
+"""Of what is known less well when the start is ordered, more is learnt before simulated time begins ..."""
+UNUSED_S = 0.02
+"""... and until so long before, when nothing relies on it yet, it is believed at once."""
 LINGER_S = 1.0
 """Longest wait of an agent at its end for its last words to be acknowledged."""
 HELD_MAX = 1024
 """Messages that may wait for the agent's half to be set up."""
 
 _RUNNING = AgentState.RUN_SIMULATION
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PingPlan:
-    """
-    When an agent exchanges times with the host.
-
-    Agents of one process share one clock: the first brings it up, and the others only keep it, and tell of themselves,
-    so that a thousand agents that start at once do not all ask at once.
-    """
-
-    brings_clock_up: bool = True
-    """The first exchanges follow closely."""
-    delay_s: float = 0.0
-    """From the start to the first of one that does not bring the clock up."""
-    interval_s: float = PING_INTERVAL_S
-
-    def next_s(self, started_s: float, now_s: float) -> float:
-        """
-        Return when to ping after a ping at *now_s*: in the agent's own place within the interval.
-
-        Counted from the start, so that agents that all pinged at once, as after set-up, do not go on doing so:
-        pings of a whole pack take more than a packet, and their answers a wake-up more.
-        """
-        first_s = started_s + self.delay_s
-        return first_s + self.interval_s * max(
-            0, math.ceil((now_s - first_s) / self.interval_s + 0.5)
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,6 +118,8 @@ class AgentSession:
         )
         self._ready_due_s: float | None = None
         """Until when readiness waits for the clock; None while it does not wait."""
+        self._t0_host_s = -math.inf
+        """Simulated time zero on the host's clock."""
         self._started_s = now_s
         self._held: list[told.HostDataReceived] = []
         self.held_dropped_count = 0
@@ -305,6 +283,8 @@ class AgentSession:
                 self._take_data(message)
             case messages.Pong(t_agent_s, t_host_received_s, t_host_sent_s):
                 self.clock.add_exchange(t_agent_s, t_host_received_s, t_host_sent_s, now_s)
+                if self._is_clock_unused(now_s):
+                    self.clock.settle(now_s, is_unused=True)
                 self._events.append(told.ClockEstimated())
                 if self._ready_due_s is not None and self._is_clock_known(now_s):
                     self._say_ready(now_s)
@@ -313,6 +293,7 @@ class AgentSession:
             case messages.SimulationStart(t0_host_s):
                 if self._machine.allows(AgentEvent.START_RECEIVED):
                     self.clock.settle(now_s)
+                    self._start_is_near(t0_host_s, now_s)
                 self._move(AgentEvent.START_RECEIVED, told.StartReceived(t0_host_s))
             case messages.SystemStop():
                 self._move(AgentEvent.STOP_RECEIVED, told.StopReceived())
@@ -347,6 +328,16 @@ class AgentSession:
 
     def _is_clock_known(self, now_s: float) -> bool:
         return self.clock.is_valid and self.clock.error_s(now_s) <= CLOCK_ERROR_S_MAX
+
+    def _start_is_near(self, t0_host_s: float, now_s: float) -> None:
+        self._t0_host_s = t0_host_s
+        is_coarse = self.clock.error_s(now_s) > CLOCK_ERROR_S_FINE
+        if self._pings.brings_clock_up and is_coarse and self._is_clock_unused(now_s):
+            self.ping_due_s, self._pings_closely = now_s, PINGS_FIRST
+
+    def _is_clock_unused(self, now_s: float) -> bool:
+        """Whether simulated time is ordered to begin, and is not about to."""
+        return self.clock.is_valid and self.clock.to_host_s(now_s) < self._t0_host_s - UNUSED_S
 
     def _say_ready(self, now_s: float) -> None:
         self._ready_due_s = None

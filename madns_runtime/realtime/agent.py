@@ -36,6 +36,7 @@ from madns_runtime.realtime.agent_calls import (
 from madns_runtime.realtime.agent_faults import AgentFaults
 from madns_runtime.realtime.agent_link import AgentPort
 from madns_runtime.realtime.agent_report import AgentOutcome, AgentReport
+from madns_runtime.realtime.device_time import DeviceTime
 from madns_runtime.realtime.loop_account import Span
 from madns_runtime.realtime.ordered_actions import OrderedActions
 from madns_runtime.realtime.packs import Pack
@@ -112,6 +113,7 @@ class AgentRunner:
         self._hardware = seat.hardware
         self._hardware.use_clock(self._port.local_s)
         self._has_devices = bool(seat.hardware)
+        self._device_time = DeviceTime(seat.hardware, self._port)
         self._half = half = Half(program.make, self._journal.say)
         self._receive = half.simulation.receive  # called often: without a layer between
         self._spans = process.account.add
@@ -221,6 +223,9 @@ class AgentRunner:
             case told.ClockEstimated():
                 if self._session.state is AgentState.RUN_SIMULATION:
                     self._records.clock(self._session.clock, monotonic())
+                    if self._port.now_s() < 0.0:  # what is known better now moves the start
+                        self._pack.arm()
+                        self._device_time.tell()
             case told.AgentStateEntered(state):
                 self._journal.event("state", state=state.value)
             case told.SetupReceived(initial, t_s):
@@ -280,7 +285,7 @@ class AgentRunner:
         self._ticks.begin(now_s)
         self._pack.arm()
         self._records.begin_usage()
-        self._tell_time()
+        self._device_time.tell()
         self._usage_timer.reschedule(monotonic() + self._config.health.period_s)
 
     def _ticks_over(self) -> None:
@@ -317,6 +322,7 @@ class AgentRunner:
 
     def _look_at_devices(self) -> bool:
         """Tell the half whose status has changed; return whether the agent goes on."""
+        self._device_time.follow()
         for name, status in self._hardware.changes():
             self._journal.event("device", device=name, status=status)
             self._call("device_changed", name, status)
@@ -324,13 +330,6 @@ class AgentRunner:
                 self._pump()
                 return False
         return True
-
-    def _tell_time(self) -> None:
-        """Tell the devices' processes how simulated time runs on this machine's clock."""
-        if self._has_devices:
-            t_s = self._port.now_s()
-            rate = 1.0 + self._session.clock.drift_ppm * 1e-6
-            self._hardware.tell_time(self._port.local_s(t_s), t_s, rate)
 
     def _finish_run(self) -> None:
         if self._session.state is not AgentState.RUN_SIMULATION:
@@ -377,7 +376,7 @@ class AgentRunner:
             began_s = monotonic()
             self._records.usage()
             self._port.process.account.look()
-            self._tell_time()
+            self._device_time.tell()
             self._spans(Span(Cause.HOUSEKEEPING, self._seat, began_s, monotonic()))
             self._usage_timer.reschedule(monotonic() + self._config.health.period_s)
 

@@ -11,9 +11,9 @@ from time import monotonic
 
 from madns_runtime.config import AgentLaunch
 from madns_runtime.faults.clock_faults import FaultableClock
-from madns_runtime.protocol.agent_session import PING_INTERVAL_S, PingPlan
 from madns_runtime.protocol.bundle import bundle_up, is_bundle, split
 from madns_runtime.protocol.datagram import agent_index_of
+from madns_runtime.protocol.ping_plan import PING_INTERVAL_S, PingPlan
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.udp import UdpSocket

@@ -207,14 +207,18 @@ class ClockEstimate:
         """Return how far the estimate itself may be from the truth, s, whatever is served meanwhile."""
         return math.inf if self._line is None else self._line.error_at(at_local_s)
 
-    def settle(self, now_s: float) -> None:
+    def settle(self, now_s: float, *, is_unused: bool = False) -> None:
         """
         Serve the estimate as it stands, at once; for the moment before anything relies on the clock.
 
         Exchanges that waited behind a long piece of work may have been far off; what they taught is not
         slewed out of a run that has only just begun. Of several that share the clock the first does this.
+
+        Args:
+            now_s: Local clock.
+            is_unused: Whether nothing relies on it still, whoever has settled it before.
         """
-        if self._line is not None and not self._is_settled:
+        if self._line is not None and (is_unused or not self._is_settled):
             self._is_settled = True
             self._served, self._asked_s = None, -math.inf
             self._serve(self._line, now_s, may_jump_ahead=False)

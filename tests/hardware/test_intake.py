@@ -51,6 +51,36 @@ def test_nested_rows_become_numbers_row_by_row():
     assert to_numbers(matrix, [(1, 2), [3, 4]]) == (1.0, 2.0, 3.0, 4.0)
 
 
+def test_a_sample_is_on_record_as_handed_over_when_agents_have_it_however_long_that_took():
+    sent, told = [], {}
+    line = Channel(name="line", is_frame=True, passing="queue")
+    queued = Channel(name="queued", passing="queue")
+    device_page = DevicePage([LEVEL, queued])
+
+    class Told:
+        def sample(self, channel, number, taken_s, values, *, told_s):
+            told[channel] = told_s
+
+    def handed_s(taken_up_s):
+        assert sent or device_page.read("level").number  # agents have it already
+        return taken_up_s + 0.3
+
+    intake = Intake(
+        (LEVEL, queued, line),
+        device_page,
+        Told(),
+        seed=[1],
+        frozen_s={},
+        pass_on=lambda message: sent.append(message) or 0,
+        handed_s=handed_s,
+    )
+    for name, value in (("level", 2.0), ("queued", 3.0), ("line", b"x")):
+        sent.clear()
+        intake.take(Sample(values={name: value}, taken_s=1.0), 1.1)
+
+    assert told == pytest.approx({"level": 1.4, "queued": 1.4, "line": 1.4})
+
+
 def test_a_sample_that_holds_no_number_is_on_record_and_no_newest_sample():
     intake, device_page, kept = make_intake()
     intake.take(Sample(values={"field": (1.0, 2.0, 3.0)}, taken_s=1.0), 1.0)

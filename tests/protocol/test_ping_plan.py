@@ -2,7 +2,7 @@
 
 import pytest
 
-from madns_runtime.protocol.agent_session import PingPlan
+from madns_runtime.protocol.ping_plan import PingPlan
 
 STARTED_S = 1000.0
 PLAN = PingPlan(brings_clock_up=False, delay_s=0.3, interval_s=0.8)

@@ -72,7 +72,7 @@ def running(count=1, **options):
         w.join(name)
     while any(p.phase is not Phase.RUNNING for p in w.host.peers.values()):
         w.run_for(0.05)
-    w.run_for(0.2)
+    w.run_for(0.6)  # until simulated time runs, and clocks are no longer learnt in haste
     return w
 
 

@@ -12,6 +12,7 @@ from madns_runtime.protocol import events as h
 from madns_runtime.protocol.agent_session import (
     CLOCK_ERROR_S_MAX,
     CLOCK_WAIT_S,
+    UNUSED_S,
     AgentIdentity,
     AgentSession,
 )
@@ -239,6 +240,43 @@ def test_clock_estimate_stands_before_time_zero():
         assert session.clock.is_valid
         uncertainty_s = session.clock.uncertainty_s(w.now_s)
         assert abs(session.clock.offset_s(w.now_s)) <= uncertainty_s + STEP_S
+
+
+class SlowAtTheStart(World):
+    """One whose agents know the host's clock from answers that took 19 ms on one way, as of a busy machine."""
+
+    def __init__(self, names):
+        super().__init__(names)
+        self.taught = set()
+
+    def step_agent(self, name, session):
+        super().step_agent(name, session)
+        if session.state is AgentState.AGENT_SIMULATION_READY and name not in self.taught:
+            self.taught.add(name)
+            session.clock = ClockEstimate()
+            for _ in range(3):
+                session.clock.add_exchange(self.now_s - 0.019, self.now_s, self.now_s, self.now_s)
+
+
+def test_a_clock_that_is_known_badly_is_learnt_anew_before_time_zero_and_never_jumps_behind_it():
+    names = ("agent-1", "agent-2")
+    w = SlowAtTheStart(names)
+    for name in names:
+        w.join(name)
+    offsets_s = {name: [] for name in names}
+
+    while w.t0_s is None or w.now_s < w.t0_s + 2.0:
+        w.run_for(STEP_S / 2)
+        if w.t0_s is not None and w.now_s > w.t0_s - UNUSED_S / 2:
+            for name, session in w.agents.items():
+                offsets_s[name].append(session.clock.offset_s(w.now_s))
+
+    for name, found_s in offsets_s.items():
+        assert name in w.taught
+        assert abs(found_s[0]) < 0.003  # both clocks are one here, and were told to be 9.5 ms apart
+        steps_s = [abs(b - a) for a, b in zip(found_s, found_s[1:], strict=False)]
+        assert max(steps_s) < 1e-4
+        assert len(steps_s) > 300
 
 
 def test_data_reaches_the_other_half_in_both_directions():

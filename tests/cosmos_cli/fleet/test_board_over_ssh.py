@@ -140,7 +140,9 @@ def test_account_without_commands_that_is_gone_before_the_helper_is_sent_is_told
         known_hosts.write_text(server.known_hosts_line())
         connection = connect(target_of(server))
         monkeypatch.setattr(
-            connection, "open", lambda command, open=connection.open: LateStream(open(command), 20.0)
+            connection,
+            "open",
+            lambda command, open=connection.open: LateStream(open(command), 20.0),
         )
         try:
             with pytest.raises(MachineFailure) as caught:

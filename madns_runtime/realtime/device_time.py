@@ -1,0 +1,44 @@
+"""What an agent's devices are told of simulated time: how it runs on this machine's clock, by the agent's estimate."""
+
+from __future__ import annotations
+
+from time import monotonic
+
+from madns_runtime.hardware.port import Hardware
+from madns_runtime.realtime.agent_link import AgentPort
+
+ERROR_S_MAX = 10e-6
+"""What was told holds until the estimate has moved away from it by more, s."""
+SLOPE_SPAN_S = 0.1
+
+
+class DeviceTime:
+    """
+    Keeps the simulated time of an agent's devices, by which they record and play, that of the agent.
+
+    Args:
+        hardware: The devices.
+        port: Knows simulated time.
+    """
+
+    def __init__(self, hardware: Hardware, port: AgentPort) -> None:
+        self._hardware = hardware
+        self._port = port
+        self._local_s = self._t_s = 0.0
+        self._rate = 1.0
+
+    def tell(self) -> None:
+        """Tell the devices' processes how simulated time runs; it must have begun to be known."""
+        if self._hardware:
+            port, local_s = self._port, monotonic()
+            offset_s = port.session.clock.offset_s
+            slope = (offset_s(local_s + SLOPE_SPAN_S) - offset_s(local_s)) / SLOPE_SPAN_S
+            self._local_s, self._t_s, self._rate = local_s, port.at(local_s), 1.0 + slope
+            self._hardware.tell_time(local_s, self._t_s, self._rate)
+
+    def follow(self) -> None:
+        """Tell it anew if what was told holds no longer: the estimate has learnt, is slewed, or was put wrong."""
+        local_s = monotonic()
+        told_s = self._t_s + (local_s - self._local_s) * self._rate
+        if abs(told_s - self._port.at(local_s)) > ERROR_S_MAX:
+            self.tell()
