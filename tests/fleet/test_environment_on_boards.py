@@ -269,7 +269,7 @@ def test_closed_udp_is_told_with_the_address(tower):
 
     assert caught.value.text == f"no UDP from here to {tower.address}:9"
     assert "is a firewall closing it?" in caught.value.advice
-    assert time.monotonic() - started_s < 10
+    assert time.monotonic() - started_s < 120  # of 240
 
 
 @pytest.mark.nightly

@@ -232,7 +232,7 @@ def test_interrupt_while_a_machine_does_not_answer_is_heard_at_once(inventory):
             start_s = time.monotonic()
             process.send_signal(signal.SIGINT)
             assert process.wait(WAIT_S) == 130
-            assert time.monotonic() - start_s < 5.0
+            assert time.monotonic() - start_s < WAIT_S / 2
 
 
 @pytest.mark.parametrize("arguments", [["ping"], ["up"], ["packages", "upgrade"]])

@@ -313,7 +313,7 @@ def test_silent_server_is_frozen_and_costs_no_more_than_the_deadline():
         with failing(FailureKind.FROZEN):
             connect(Target(name="pi", address="127.0.0.1", port=port), BRIEF)
 
-        assert time.monotonic() - start_s < 5.0
+        assert time.monotonic() - start_s < DEFAULT.timeout_s
 
 
 def test_stopped_server_is_frozen(own_sshd, known_hosts):
@@ -614,7 +614,7 @@ def test_frozen_machine_gives_none_within_the_deadline(own_sshd, known_hosts):
     try:
         start_s = time.monotonic()
         assert not connection.is_alive(timeout_s=0.5)
-        assert time.monotonic() - start_s < 5.0
+        assert time.monotonic() - start_s < DEFAULT.timeout_s
         own_sshd.thaw()
         assert connection.is_alive(timeout_s=10.0)
     finally:

@@ -21,14 +21,14 @@ def echo():
 @pytest.fixture
 def link():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
-        link.settimeout(0.2)
+        link.settimeout(10.0)
         yield link
 
 
 def test_round_trip_is_measured_and_counted(echo):
     question = echo.question("127.0.0.1")
 
-    assert 0 < runtime_check.round_trip_ms(question) < 300
+    assert 0 < runtime_check.round_trip_ms(question) < runtime_check.ECHO_WAIT_S * 1000
     assert echo.heard(question) == 1
 
 
@@ -54,6 +54,7 @@ def test_strangers_get_no_answer(echo, link):
     for packet in (b"", b"x" * 16, b"y" * 1000, nonce[:15], nonce + b"z" * 1000):
         link.sendto(packet, ("127.0.0.1", echo.port))
 
+    link.settimeout(0.2)
     with pytest.raises(TimeoutError):
         link.recv(100)
     assert echo.heard(question) == 0
@@ -68,7 +69,7 @@ def test_answer_has_no_more_bytes_than_the_question(echo, link):
 
 def test_lost_datagrams_are_sent_again(monkeypatch, echo):
     """The first two go nowhere, as on a lossy link."""
-    monkeypatch.setattr(runtime_check, "ECHO_WAIT_S", 0.05)
+    monkeypatch.setattr(runtime_check, "ECHO_WAIT_S", 0.5)
     question = echo.question("127.0.0.1")
     sent = []
 
