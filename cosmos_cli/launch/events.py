@@ -108,6 +108,9 @@ class AgentExited:
     pid: int
     how: str
     is_abnormal: bool
+    is_on_purpose: bool = False
+    """Whether a fault has ended it, which counts as no failure."""
+    will_restart: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,6 +229,8 @@ def _exited(d: Mapping[str, Any]) -> Event:
         int(d["pid"]),
         str(how),
         is_abnormal=signal_name is not None or code != 0,
+        is_on_purpose=bool(d.get("on_purpose")),
+        will_restart=bool(d.get("will_restart")),
     )
 
 

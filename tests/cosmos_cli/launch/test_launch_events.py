@@ -68,6 +68,18 @@ def test_exit_is_abnormal_unless_its_code_is_zero(
     assert event == AgentExited("a", 7, how, is_abnormal=is_abnormal)
 
 
+def test_exit_on_purpose_is_told_as_such() -> None:
+    line = (
+        b'{"event":"exited","agent":"a","pid":7,"code":null,"signal":"SIGKILL",'
+        b'"on_purpose":true,"will_restart":true}'
+    )
+
+    expected = AgentExited(
+        "a", 7, "killed by SIGKILL", is_abnormal=True, is_on_purpose=True, will_restart=True
+    )
+    assert parse_event(line) == expected
+
+
 @given(st.binary(max_size=200))
 def test_any_other_bytes_are_noise_of_bounded_length(line: bytes) -> None:
     event = parse_event(line)

@@ -494,6 +494,26 @@ def test_machine_that_returns_is_given_its_agents_again() -> None:
     assert back[1].name == f"{AGENTS} (2)"
 
 
+def test_machine_that_returns_is_given_agents_that_were_ended_on_purpose_and_were_to_return() -> (
+    None
+):
+    table = Table(on_agent_loss="continue", agents=Agents(count=2, restarts_max=1))
+    table.run()
+    for agent, returns in (("agent-01", True), ("agent-02", False)):
+        ended = {"how": "killed by SIGKILL", "is_abnormal": True, "is_on_purpose": True}
+        event = events.AgentExited(agent, 1000, **ended, will_restart=returns)
+        table.play((0, ChildSaid(AGENTS, event)))
+    table.play((0, started("agent-01", 2)), (1, ChildLost(AGENTS, "the connection broke")))
+    back = table.play((0, MachineReached("pi01", is_reached=True)))
+
+    life = Life(
+        number=2,
+        incarnations={"agent-01": 3, "agent-02": 2},
+        killed={"agent-01": 1, "agent-02": 1},
+    )
+    assert back[1] == actions.StartAgents("pi01", ("agent-01",), LISTENING, life)
+
+
 @pytest.mark.parametrize("is_lost", [False, True])
 def test_supervisor_that_ends_before_it_has_started_anything_again_is_told(is_lost: bool) -> None:
     table = Table(on_agent_loss="continue", agents=Agents(count=2, restarts_max=1))
