@@ -133,8 +133,8 @@ class DeviceChanged:
 class FaultInserted:
     """A supervisor's answer to the order to insert a fault; *refusal* is empty if it is in force."""
 
-    target: str
-    action: str
+    number: int
+    """Of the order."""
     refusal: str
 
 
@@ -257,9 +257,7 @@ _PARSERS: Mapping[str, Callable[[Mapping[str, Any]], Event]] = {
     "device": lambda d: DeviceChanged(
         _line(d["device"]), _line(d["status"]), _line(d.get("why") or "")
     ),
-    "injected": lambda d: FaultInserted(
-        _line(d["target"]), _line(d["action"]), _line(d.get("refusal") or "")
-    ),
+    "injected": lambda d: FaultInserted(int(d["number"]), _line(d.get("refusal") or "")),
     "process": lambda d: ProcessKnown(int(d["pid"])),
     "loading": lambda d: Loading(str(d["doing"])),
     "pong": lambda d: PingAnswered(int(d["n"])),

@@ -10,6 +10,7 @@ from cosmos_cli.launch.events import (
     AgentChanged,
     AgentExited,
     AgentStarted,
+    FaultInserted,
     Finished,
     Listening,
     Logged,
@@ -78,6 +79,12 @@ def test_exit_on_purpose_is_told_as_such() -> None:
         "a", 7, "killed by SIGKILL", is_abnormal=True, is_on_purpose=True, will_restart=True
     )
     assert parse_event(line) == expected
+
+
+def test_what_became_of_an_order_bears_its_number() -> None:
+    line = b'{"event":"injected","number":3,"refusal":null,"target":"pi01/imu","action":"freeze"}'
+
+    assert parse_event(line) == FaultInserted(3, "")
 
 
 @given(st.binary(max_size=200))

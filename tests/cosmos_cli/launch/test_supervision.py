@@ -767,10 +767,10 @@ def test_a_fault_is_passed_to_who_drives_the_device_and_its_answer_told_and_reco
     table.run()
 
     asked = table.play((1, ordered(1)))
-    told = table.play((1, ChildSaid(AGENTS, events.FaultInserted("pi01/imu", "freeze", ""))))
+    told = table.play((1, ChildSaid(AGENTS, events.FaultInserted(1, ""))))
 
     order = {"command": "inject", "target": "pi01/imu", "action": "freeze", "value": None}
-    assert actions.Send(AGENTS, order) in asked
+    assert actions.Send(AGENTS, {**order, "number": 1}) in asked
     assert not answers(asked)
     assert answers(told) == [(1, "")]
     assert orders(told, "inject") == [{**order, "refusal": ""}]
@@ -791,10 +791,24 @@ def test_a_supervisor_that_does_not_answer_is_not_waited_for() -> None:
     table.play((1, ordered(1)))
 
     done = table.wait(6.0)
-    late = table.play((0, ChildSaid(AGENTS, events.FaultInserted("pi01/imu", "freeze", ""))))
+    late = table.play((0, ChildSaid(AGENTS, events.FaultInserted(1, ""))))
 
     assert answers(done) == [(1, "pi01 has not answered within 5 s")]
     assert not answers(late)
+
+
+def test_a_late_answer_is_not_taken_for_that_of_the_same_order_given_again() -> None:
+    table = Table(devices={"pi01": (IMU,)})
+    table.run()
+    table.play((1, ordered(1)))
+    table.wait(6.0)
+    table.play((1, ordered(2)))
+
+    late = table.play((0, ChildSaid(AGENTS, events.FaultInserted(1, ""))))
+    own = table.play((1, ChildSaid(AGENTS, events.FaultInserted(2, "it is lost"))))
+
+    assert not answers(late)
+    assert answers(own) == [(2, "it is lost")]
 
 
 def test_a_fault_is_refused_while_nobody_drives_the_device() -> None:
