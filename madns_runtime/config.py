@@ -386,6 +386,8 @@ class AgentLaunch(Launch):
     """Number of this supervisor on its machine: more than 1 when the machine was lost and has returned."""
     first_incarnations: Mapping[str, int] = field(default_factory=dict)
     """The number that an agent's first process here gets; 1 where none is named."""
+    killed_before: Mapping[str, int] = field(default_factory=dict)
+    """How many processes of an agent a fault had ended on purpose before; 0 where none is named."""
 
     def first_incarnation(self, agents: Iterable[str]) -> int:
         """Return the number of the first process of *agents*: their others were of an earlier supervisor."""

@@ -21,6 +21,8 @@ from cosmos_cli.ui.plural import counted
 from cosmos_cli.ui.progress import told_progress
 
 AGENTS_NAMED_MAX = 5
+SUFFIXES = (".parquet", ".pq", "")
+"""Of what is written; any other would tell readers of another format."""
 
 
 def tabulate(
@@ -38,7 +40,7 @@ def tabulate(
         typer.Option(
             "--output",
             metavar="FILE",
-            help="The Parquet file; by default truth.parquet of the run.",
+            help="The Parquet file, NAME.parquet; by default truth.parquet of the run.",
         ),
     ] = None,
     folder: RunsOption = None,
@@ -51,6 +53,10 @@ def tabulate(
     An agent that was lost has its rows here, too. Ends with 5 if nothing is on record at some of the times.
     """
     console = Console(json=as_json, quiet=quiet, instead="the table is written all the same")
+    if output is not None and output.suffix.lower() not in SUFFIXES:
+        raise InputError(
+            f"--output {output}: the table is a Parquet file; expected a name such as {output.stem}.parquet"
+        )
     found = find_run(runs_root(folder), run)
     config, document = found.read_config(), found.read_json(found.run_json)
     if config is None or document is None or document.get("status") == "running":

@@ -48,7 +48,7 @@ def validate(
             omitted += error.omitted
         else:
             found.append(scenario_file)
-            for note in place_notes(scenario_file):
+            for note in (*place_notes(scenario_file), *map(Fault.render, scenario_file.remarks)):
                 console.say(f"note: {note}")
             if resolved:
                 console.data(f"# {path}: ok: {_summary(scenario_file)}")

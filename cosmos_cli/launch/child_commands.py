@@ -35,7 +35,12 @@ def device_changed(event: DeviceChanged) -> Command:
 
 
 def inject(order: FaultOrdered) -> Command:
-    """Return the order to insert a fault around a device."""
+    """Return the order to insert a fault around a device; its answer bears the same number."""
+    return {**fault_recorded(order), "number": order.number}
+
+
+def fault_recorded(order: FaultOrdered) -> Command:
+    """Return such an order as the host records it, with what became of it."""
     return {
         "command": "inject",
         "target": order.target,

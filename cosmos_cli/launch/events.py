@@ -108,6 +108,9 @@ class AgentExited:
     pid: int
     how: str
     is_abnormal: bool
+    is_on_purpose: bool = False
+    """Whether a fault has ended it, which counts as no failure."""
+    will_restart: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,8 +133,8 @@ class DeviceChanged:
 class FaultInserted:
     """A supervisor's answer to the order to insert a fault; *refusal* is empty if it is in force."""
 
-    target: str
-    action: str
+    number: int
+    """Of the order."""
     refusal: str
 
 
@@ -226,6 +229,8 @@ def _exited(d: Mapping[str, Any]) -> Event:
         int(d["pid"]),
         str(how),
         is_abnormal=signal_name is not None or code != 0,
+        is_on_purpose=bool(d.get("on_purpose")),
+        will_restart=bool(d.get("will_restart")),
     )
 
 
@@ -252,9 +257,7 @@ _PARSERS: Mapping[str, Callable[[Mapping[str, Any]], Event]] = {
     "device": lambda d: DeviceChanged(
         _line(d["device"]), _line(d["status"]), _line(d.get("why") or "")
     ),
-    "injected": lambda d: FaultInserted(
-        _line(d["target"]), _line(d["action"]), _line(d.get("refusal") or "")
-    ),
+    "injected": lambda d: FaultInserted(int(d["number"]), _line(d.get("refusal") or "")),
     "process": lambda d: ProcessKnown(int(d["pid"])),
     "loading": lambda d: Loading(str(d["doing"])),
     "pong": lambda d: PingAnswered(int(d["n"])),

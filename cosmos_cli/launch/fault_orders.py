@@ -7,7 +7,7 @@ from functools import partial
 
 from cosmos_cli.launch import actions
 from cosmos_cli.launch.actions import Agenda
-from cosmos_cli.launch.child_commands import inject
+from cosmos_cli.launch.child_commands import fault_recorded, inject
 from cosmos_cli.launch.children import Children
 from cosmos_cli.launch.events import FaultInserted
 from cosmos_cli.launch.run_events import FaultOrdered
@@ -58,18 +58,17 @@ class FaultOrders:
         self._agenda.after(self._name(order), ANSWER_S, partial(self._answer, order, late))
 
     def answered(self, event: FaultInserted) -> None:
-        """Take a supervisor's answer: it answers in the order in which it is asked."""
-        for order in self._waiting.values():
-            if (order.target, order.action) == (event.target, event.action):
-                self._answer(order, event.refusal)
-                return
+        """Take a supervisor's answer; of an order that is not waited for any more it is no other's."""
+        order = self._waiting.get(event.number)
+        if order is not None:
+            self._answer(order, event.refusal)
 
     def _answer(self, order: FaultOrdered, refusal: str) -> None:
         """Tell who has ordered it what became of it, and record that."""
         self._waiting.pop(order.number, None)
         self._agenda.cancel(self._name(order))
         self._agenda.do(actions.AnswerOrder(order.number, refusal))
-        self._children.tell_host({**inject(order), "refusal": refusal})
+        self._children.tell_host({**fault_recorded(order), "refusal": refusal})
         value = "" if order.value is None else f" {order.value:g}"
         became = f"refused: {refusal}" if refusal else "in force"
         self._agenda.say(f"fault {order.target} {order.action}{value}: {became}", "warning")

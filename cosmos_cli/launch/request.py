@@ -36,6 +36,8 @@ class Life:
     number: int = 1
     incarnations: Mapping[str, int] = field(default_factory=dict)
     """The number of an agent's first process of this life; 1 where none is named."""
+    killed: Mapping[str, int] = field(default_factory=dict)
+    """How many processes of an agent's earlier lives were ended on purpose; 0 where none is named."""
 
 
 FIRST_LIFE = Life()
@@ -173,6 +175,7 @@ class LaunchRequest:
             reattach_s=self._reattach_s(place),
             life=life.number,
             first_incarnations=life.incarnations,
+            killed_before=life.killed,
             devices=devices_at(self.devices.get(machine, ()), self.config, place),
         )
         return to_mapping(launch)

@@ -21,6 +21,8 @@ class Restarts:
         config = request.config
         self._restarts_max = config.agents.restarts_max if config.on_agent_loss == "continue" else 0
         self._incarnations: dict[str, int] = {}
+        self._killed: dict[str, int] = {}
+        """How many of them a fault has ended on purpose: no failures."""
         self._done: set[str] = set()
         self._lives: dict[str, int] = {}
         self.ended: set[str] = set()
@@ -41,6 +43,11 @@ class Restarts:
         if not is_abnormal:
             self._done.add(agent)
 
+    def killed(self, agent: str, *, will_return: bool) -> None:
+        """Note that a fault has ended an agent's process on purpose."""
+        self._killed[agent] = self._killed.get(agent, 0) + 1
+        self.exited(agent, is_abnormal=will_return)
+
     def handed_over(self, agents: Iterable[str]) -> None:
         """Note agents that a new supervisor is to start: if it ends before, they are left."""
         self.ended.difference_update(agents)
@@ -56,16 +63,19 @@ class Restarts:
         return tuple(
             agent
             for agent in self.supervised_on(machine)
-            if agent not in self._done and self._count(agent) <= self._restarts_max
+            if agent not in self._done
+            and self._count(agent) - self._killed.get(agent, 0) <= self._restarts_max
         )
 
     def next_life_on(self, machine: str) -> Life:
         """Return what a new supervisor of a machine is told of those before it."""
         number = self._lives.get(machine, 1) + 1
         self._lives[machine] = number
+        agents = self.supervised_on(machine)
         return Life(
             number=number,
-            incarnations={agent: self._count(agent) + 1 for agent in self.supervised_on(machine)},
+            incarnations={agent: self._count(agent) + 1 for agent in agents},
+            killed={agent: self._killed[agent] for agent in agents if agent in self._killed},
         )
 
     def _count(self, agent: str) -> int:

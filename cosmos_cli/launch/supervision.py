@@ -218,7 +218,10 @@ class Supervision:
         if isinstance(event, events.AgentStarted):
             self._restarts.started(event.agent, event.incarnation)
         elif isinstance(event, events.AgentExited):
-            self._restarts.exited(event.agent, is_abnormal=event.is_abnormal)
+            if event.is_on_purpose:
+                self._restarts.killed(event.agent, will_return=event.will_restart)
+            else:
+                self._restarts.exited(event.agent, is_abnormal=event.is_abnormal)
             if event.is_abnormal:
                 self._tell_host_exited(event.agent, event.how, event.pid)
         elif isinstance(event, events.DeviceChanged):

@@ -77,6 +77,8 @@ class ScenarioFile:
     """What its checks expect of these agents and streams."""
     placeholders: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Words that the simulation replaces itself, by field."""
+    remarks: tuple[Fault, ...] = ()
+    """What the simulation finds odd in its parameters, and no fault."""
 
     @property
     def text(self) -> str:
@@ -254,6 +256,7 @@ def _check(
         place_uses=answers.place_uses,
         timeline=timeline,
         placeholders=answers.placeholders,
+        remarks=answers.remarks,
         expectations=checks.expectations,
     )
 

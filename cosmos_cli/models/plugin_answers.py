@@ -32,6 +32,7 @@ from cosmos_cli.models.timeline_actions import (
 )
 from cosmos_cli.models.translate import faults_of
 from cosmos_cli.models.variables import judge_open_texts
+from cosmos_cli.ui.plural import counted
 from madns_runtime.agent_parameters import AgentParameters
 from madns_runtime.config import Agents, to_mapping
 from madns_runtime.errors import ConfigurationError, MadnsError, PluginError
@@ -56,6 +57,8 @@ from madns_runtime.plugin.registry import (
 from madns_runtime.plugin.time_limit import hold
 
 T = TypeVar("T")
+REMARK = "remark: "
+"""With this a text of `check` begins that tells of no fault."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,6 +85,8 @@ class PluginAnswers:
     """Actions that a timeline may name, and the parameters of the entries of this one."""
     omitted: int = 0
     """Number of further faults."""
+    remarks: tuple[Fault, ...] = ()
+    """What its check finds odd, and no fault."""
 
 
 def ask_plugin(
@@ -122,6 +127,7 @@ class _Asking:
         self._document, self._agents = document, agents
         self._base_directory, self._tell = base_directory, tell
         self._faults: list[Fault] = []
+        self._remarks: list[Fault] = []
         self._omitted = 0
 
     def answers(self, spec: str, duration_s: float) -> PluginAnswers:
@@ -155,7 +161,12 @@ class _Asking:
     def _told(self, found: PluginAnswers) -> PluginAnswers:
         first = self._faults[:FAULTS_SHOWN_MAX]
         omitted = self._omitted + len(self._faults) - len(first)
-        return replace(found, faults=tuple(fault.clipped() for fault in first), omitted=omitted)
+        return replace(
+            found,
+            faults=tuple(fault.clipped() for fault in first),
+            omitted=omitted,
+            remarks=tuple(remark.clipped() for remark in self._remarks),
+        )
 
     def _of(
         self, simulation: Simulation, parameters: Any, agents: Agents, duration_s: float
@@ -283,7 +294,11 @@ class _Asking:
         except PluginError as error:
             self._blame(str(error))
         else:
-            self._blame_texts(texts)
+            self._blame_texts([text for text in texts if not text.startswith(REMARK)])
+            remarks = [text.removeprefix(REMARK) for text in texts if text.startswith(REMARK)]
+            if (more := len(remarks) - FAULTS_SHOWN_MAX) > 0:
+                remarks[FAULTS_SHOWN_MAX:] = [f"{counted(more, 'more remark')}"]
+            self._remarks += [fault_found_at(self._document, text) for text in remarks]
 
     def _check_actions(
         self,

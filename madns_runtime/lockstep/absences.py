@@ -82,7 +82,7 @@ class Absences:
             self._log("warning", f"{name} is lost on purpose: {reason}")
         else:
             self._account.lost[name] = reason
-            if agent.incarnations <= self._restarts_max:
+            if agent.incarnations - len(intended.incarnations(name)) <= self._restarts_max:
                 returns_s = self._clock.t_s + RESTART_DELAY_S
                 heapq.heappush(self._returns, (returns_s, number))
             self._journal.event("agent", **told, reason=reason)

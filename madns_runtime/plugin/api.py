@@ -345,7 +345,7 @@ class Simulation:
     """module:function of (parameters, agents: int, tick_hz: float, base_directory: Path) -> Demand, or None."""
     check: str | None = None
     """module:function of (parameters, agents: int, base_directory: Path) -> list[str]: faults beyond bounds,
-    such as a missing file, each starting with the dotted parameter name and a colon. A fourth parameter
+    such as a missing file, each starting with the dotted parameter name and a colon, remarks with "remark: " before. A fourth parameter
     called names is given the agents' names, a fifth called duration_s the run's simulated duration,
     a sixth called is_lockstep whether simulated time waits for everybody, a seventh called tick_hz the ticks' rate; behind a `*` any by name."""
     check_actions: str | None = None

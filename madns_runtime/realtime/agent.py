@@ -25,14 +25,7 @@ from madns_runtime.protocol.messages import (
 )
 from madns_runtime.protocol.states import AgentState
 from madns_runtime.reactor.reactor import Reactor
-from madns_runtime.realtime.agent_calls import (
-    AGENT,
-    IDLE,
-    METHOD,
-    NUMBER_OF,
-    RECEIVE,
-    LoopSeat,
-)
+from madns_runtime.realtime.agent_calls import AGENT, IDLE, METHOD, NUMBER_OF, RECEIVE, LoopSeat
 from madns_runtime.realtime.agent_faults import AgentFaults
 from madns_runtime.realtime.agent_link import AgentPort
 from madns_runtime.realtime.agent_report import AgentOutcome, AgentReport
@@ -148,6 +141,7 @@ class AgentRunner:
         calls = TickCalls(
             prepare=self._prepare_tick if has_inputs else None,
             step=self._half.simulation.step,
+            came_back=self._reactor.end_if_stray,
             failed=self._step_failed,
             ended=self._ticks_over,
             is_running=self._is_running,
@@ -190,6 +184,7 @@ class AgentRunner:
                 self._receive(message)
             except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
                 self._fail(self._half.failure("receive", error))
+            self._reactor.end_if_stray()
             calls[METHOD] = IDLE
             if not self._port.must_flush:
                 return
@@ -391,6 +386,7 @@ class AgentRunner:
             self._fail(failure)
             return None
         finally:
+            self._reactor.end_if_stray()
             self._calls[METHOD] = IDLE
 
     def _fail(self, failure: HalfFailed) -> None:

@@ -53,6 +53,8 @@ class SupervisedProcess:
     pid: int
     incarnation: int
     calls: AgentCalls
+    killed_before: int = 0
+    """How many processes of these agents a fault had ended on purpose before it: no failures, see agents.restarts_max."""
     reason: str | None = None
     may_restart: bool = True
     """Permission to start it again: granted to a killed one, not to one that ended by order or with the run."""
@@ -113,6 +115,7 @@ class Supervisor:
             way_back=way_back_of(launch, machine_directory, launch.life),
         )
         for child in started:
+            child.killed_before = launch.killed_before.get(child.agents[0], 0)
             self._tell_started(child)
 
     def run(self) -> int:
@@ -258,6 +261,7 @@ class Supervisor:
                     "code": code if code >= 0 and not (has_failed and code == 0) else None,
                     "signal": signal_name,
                     "how": how,
+                    "on_purpose": child.is_killed,
                     "will_restart": will_restart,
                 }
             )
@@ -273,7 +277,7 @@ class Supervisor:
             child.may_restart
             and not self._operator.is_silent  # a cut link: the operator will start them again
             and self._launch.config.on_agent_loss == "continue"
-            and child.incarnation <= self._launch.config.agents.restarts_max
+            and child.incarnation - child.killed_before <= self._launch.config.agents.restarts_max
         )
 
     def _restart_soon(self, child: SupervisedProcess) -> None:
@@ -286,7 +290,9 @@ class Supervisor:
         elif self._operator.is_cut:  # it comes back first, or all is over
             self._restart_soon(child)
         else:
-            self._tell_started(self._fork(child.agents, incarnation=child.incarnation + 1))
+            anew = self._fork(child.agents, incarnation=child.incarnation + 1)
+            anew.killed_before = child.killed_before + child.is_killed
+            self._tell_started(anew)
 
     def _tell_started(self, child: SupervisedProcess) -> None:
         if child.agents in self._to_fork:
@@ -315,8 +321,8 @@ class Supervisor:
         """Put a fault in force around a device, and say what became of the order."""
         target, action, value = command.get("target"), command.get("action"), command.get("value")
         refusal = self._devices.insert_fault(str(target), str(action), value)
-        told = {"event": "injected", "target": target, "action": action, "refusal": refusal}
-        self._operator.emit(told)
+        told = {"event": "injected", "number": command.get("number"), "refusal": refusal}
+        self._operator.emit({**told, "target": target, "action": action})
 
     def _end(self, reason: str) -> None:
         """Close the life line; who does not end by it in time is killed."""

@@ -31,6 +31,8 @@ class TickCalls:
     prepare: Callable[[float], bool] | None
     """Hands in what comes with the tick at a simulated time, s; False if the agent has ended over it. None: nothing ever does."""
     step: Callable[[Tick], None]
+    came_back: Callable[[], None]
+    """Called once it has: ends a process that the step forked, before that does more of its parent's work."""
     failed: Callable[[BaseException], None]
     """Told what the step raised."""
     ended: Callable[[], None]
@@ -84,6 +86,7 @@ class PacedTicks:
         self._calls = calls
         # Called every tick: without a layer between.
         self._prepare, self._step, self._is_running = calls.prepare, calls.step, calls.is_running
+        self._came_back = calls.came_back
         self._faults = StepFaults()
         self.say_how_it_is = calls.say_how_it_is
         self._look = port.conditions.look if port.conditions.must_look else None
@@ -167,9 +170,11 @@ class PacedTicks:
             try:
                 self._step(Tick(index, t_s, self.period_s, lateness_s, missed, deadline_s))
             except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
+                self._came_back()
                 page[METHOD] = IDLE
                 self._calls.failed(error)
                 return
+            self._came_back()
             page[METHOD] = IDLE
             if self._look is not None:
                 self._look(t_s)

@@ -203,6 +203,26 @@ def test_a_missing_extra_is_named_with_the_command_that_installs_it(
     assert f"pip install 'cosmos-madns[{extra}]'" in found
 
 
+@pytest.mark.parametrize(
+    ("duration_s", "times_s", "told"),
+    [
+        (100.0, (0, 99.9), None),
+        (0.0, (0, 1e6), None),
+        (100.0, (0, 100), "remark: parameters.uplinks[1].at_s: 100 s is no time before the end"),
+        (100.0, (300, 0, 200, 400), "it never leaves, and 2 more"),
+    ],
+)
+def test_an_uplink_whose_time_never_comes_is_remarked(folder, duration_s, times_s, told):
+    given = parameters(
+        stations=[{"name": "A", "latitude_deg": 0, "longitude_deg": 0}],
+        uplinks=[{"at_s": at_s, "to": "agent-01", "text": "x"} for at_s in times_s],
+    )
+    found = find_faults(given, 2, folder, names=AGENTS, duration_s=duration_s)
+
+    assert len(found) == (told is not None)
+    assert all(told in text for text in found)
+
+
 def test_without_names_globs_are_not_judged(folder):
     params = parameters(vehicles=[{"agents": ["X*"]}])
 

@@ -87,6 +87,38 @@ def test_processes_that_are_killed_on_purpose_return_and_cost_no_verdict(laborat
     assert result["messages"]["reliable"]["lost"] == result["messages"]["sync"]["lost"] == 0
 
 
+ACTING = """
+from dataclasses import dataclass
+from madns_runtime.plugin.api import ActionKind, AgentSimulation, Simulation
+@dataclass(frozen=True)
+class Parameters:
+    pass
+class Agent(AgentSimulation):
+    def begin_action(self, action):
+        raise ValueError("told to")
+simulation = Simulation(
+    name="acting", parameters=Parameters, agent=":Agent",
+    actions=(ActionKind(word="act", summary="Acts.", carried_out_by="agent"),),
+)
+"""
+
+
+def test_an_end_on_purpose_takes_no_return_from_an_agent_that_fails_later(laboratory):
+    (laboratory.folder / "acting.py").write_text(ACTING)
+    result, _ = run_faults(
+        laboratory,
+        [
+            {"at_s": 1, "action": "restart", "agents": ["agent-01"]},
+            {"at_s": 4, "action": "act", "agents": ["agent-01"]},
+        ],
+        duration_s=7,
+        simulation="./acting.py:simulation",
+        agents={"count": 2, "tick_hz": 10, "restarts_max": 1},
+    )
+
+    assert result["agents"]["incarnations"] == {"agent-01": 3}, result["verdict"]
+
+
 def test_of_a_process_that_others_share_only_the_half_is_dropped_and_it_returns_there(laboratory):
     result, folder = run_faults(
         laboratory,

@@ -129,3 +129,17 @@ def test_an_agent_whose_action_raises_is_lost_alone(start_host, tmp_path):
     assert result["agents"]["agent-04"]["reason"].startswith(
         "Agent.begin_action raised ValueError: told to"
     )
+
+
+def test_an_end_on_purpose_takes_no_return_from_an_agent_that_is_lost_later(start_host, tmp_path):
+    (tmp_path / "acting.py").write_text(ACTING)
+    timeline = tuple(
+        ScheduledEntry(action=action, agents=("agent-04",), at_s=at_s, parameters={})
+        for action, at_s in (("restart", 0.1), ("act", 0.5))
+    )
+    run = start_host(
+        simulation=f"{tmp_path}/acting.py:simulation", timeline=timeline, restarts_max=1
+    )
+    agent = run.result()["agents"]["agent-04"]
+
+    assert (agent["state"], agent["incarnations"]) == ("stopped", 3)

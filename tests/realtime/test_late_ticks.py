@@ -72,6 +72,7 @@ class Loop:
         calls = TickCalls(
             prepare=None,
             step=self._step,
+            came_back=lambda: None,
             failed=lambda error: pytest.fail(str(error)),
             ended=lambda: None,
             is_running=lambda: True,

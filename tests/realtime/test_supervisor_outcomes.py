@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
+from types import SimpleNamespace
 
-from madns_runtime.realtime.supervisor import Supervisor, make_reason_pipe
+import pytest
+
+from madns_runtime.config import Agents
+from madns_runtime.realtime.agent_calls import AgentCalls
+from madns_runtime.realtime.supervisor import SupervisedProcess, Supervisor, make_reason_pipe
 
 
 def test_a_reader_that_finds_nothing_after_reaping_does_not_wait():
@@ -24,3 +29,22 @@ def test_a_reader_that_finds_nothing_after_reaping_does_not_wait():
         signal.alarm(0)
         os.close(supervisor._reason_read_fd)
         os.close(write_fd)
+
+
+@pytest.mark.parametrize(
+    ("incarnation", "killed_before", "may"),
+    [(1, 0, True), (2, 0, False), (2, 1, True), (3, 1, False), (4, 3, True)],
+)
+def test_ends_on_purpose_are_no_failures_after_which_an_agent_is_not_started_again(
+    incarnation, killed_before, may
+):
+    supervisor = Supervisor.__new__(Supervisor)
+    supervisor._operator = SimpleNamespace(is_silent=False)
+    agents = Agents(count=1, restarts_max=1)
+    config = SimpleNamespace(on_agent_loss="continue", agents=agents)
+    supervisor._launch = SimpleNamespace(config=config)
+    child = SupervisedProcess(
+        ("agent-01",), 1, incarnation, AgentCalls(), killed_before=killed_before
+    )
+
+    assert supervisor._may_restart(child) is may

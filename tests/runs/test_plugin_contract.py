@@ -16,6 +16,7 @@ import signal
 import sys
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from madns_runtime.plugin.api import HOST, AgentSimulation, HostSimulation, Simulation
 from madns_runtime.protocol.messages import Service
 
@@ -79,9 +80,11 @@ class A(AgentSimulation):
     has_forked = False
 
     def setup(self, context, initial):
-        self.context, self.evil = context, context.parameters.evil
+        self.context, self.evil, self.pid = context, context.parameters.evil, os.getpid()
 
     def step(self, tick):
+        if os.getpid() != self.pid:
+            Path(__file__).with_name("stepped_by_a_fork").touch()
         if self.evil == "exit" and self.context.name == "agent-01" and tick.index == 3:
             os._exit(0)
         if self.evil == "crash" and self.context.name == "agent-01" and tick.index >= 3:
@@ -155,6 +158,7 @@ def test_an_agent_goes_on_alone_whose_fork_comes_back_from_the_call(tmp_path, ev
     result = run(tmp_path, evil, "agents.per_process=2")
 
     assert (result["exit_code"], result["reason"]) == (0, None)
+    assert not (tmp_path / "stepped_by_a_fork").exists()  # by the other agent of the process
 
 
 def test_an_agent_that_is_killed_in_a_call_is_told_with_the_call(tmp_path):

@@ -39,6 +39,7 @@ from madns_runtime.simulations.constellation.orbit.constants import (
 )
 from madns_runtime.simulations.constellation.orbit.elements import element_numbers
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
+from madns_runtime.simulations.constellation.record_rates import RecordedTicks
 from madns_runtime.simulations.constellation.streams import ATTITUDE, ELEMENTS, STATE, TRUTH_CHANGES
 from madns_runtime.simulations.constellation.vehicle.device_commands import (
     DEVICE_NUMBER_FIRST,
@@ -77,10 +78,10 @@ class ConstellationAgent(AgentSimulation):
         self._context = context
         self._satellite = first.satellite
         self._mu_m3_s2 = GRAVITY_MODELS[parameters.gravity].mu_m3_s2
-        self._stride = max(1, round(context.tick_hz / parameters.record.elements_hz))
+        record, tick_hz = parameters.record, context.tick_hz
+        self._elements_ticks = RecordedTicks(record.elements_hz, tick_hz)
         # A day at 1 Hz is 8 MB an agent: long runs may record less than every tick.
-        state_hz = parameters.record.state_hz or context.tick_hz
-        self._state_stride = max(1, round(context.tick_hz / state_hz))
+        self._state_ticks = RecordedTicks(record.state_hz or tick_hz, tick_hz)
         self._state_tick = 0
         self._elements_tick = 0
         self._served = 0
@@ -177,7 +178,7 @@ class ConstellationAgent(AgentSimulation):
                 self._cockpit.take(self._sensors.news())
 
     def _record_state(self, tick: int, state: tuple[float, ...]) -> None:
-        self._state_tick = tick - tick % self._state_stride + self._state_stride
+        self._state_tick = self._state_ticks.after(tick)
         if len(state) == 6:
             self._context.record("state", (tick, *state))
         else:
@@ -347,7 +348,7 @@ class ConstellationAgent(AgentSimulation):
         }
 
     def _record_elements(self, tick: int, state: tuple[float, ...]) -> None:
-        self._elements_tick = tick - tick % self._stride + self._stride
+        self._elements_tick = self._elements_ticks.after(tick)
         try:
             a_m, e, *angles_rad = element_numbers(state[:6], self._mu_m3_s2)
         except ValueError:

@@ -50,7 +50,7 @@ def find_faults(  # noqa: PLR0913 - what a scenario is, most by name; see plugin
     tick_hz: float = 0.0,
 ) -> list[str]:
     """
-    Return every fault as a line that starts with the dotted parameter name and a colon.
+    Return every fault as a line that starts with the dotted parameter name and a colon; of a remark "remark: " is before that.
 
     Args:
         parameters: Of the scenario, within their bounds.
@@ -78,6 +78,7 @@ def find_faults(  # noqa: PLR0913 - what a scenario is, most by name; see plugin
     faults += flight_faults(parameters, pairs, folder, is_lockstep=is_lockstep)
     faults += rate_faults(parameters, tick_hz)
     faults += _slot_faults(parameters)
+    faults += _late_uplinks(parameters, duration_s)
     if parameters.recorded_agents is not None and not is_lockstep:
         faults.append(
             "parameters.recorded_agents: expected time.mode lockstep: in real time results come when they come"
@@ -149,6 +150,18 @@ def _propagator_faults(parameters: ConstellationParameters, base_directory: Path
     return [
         f"parameters.propagator.kind: {propagator.kind} needs element sets, give satellites.elements; "
         "patterns and Keplerian elements need kind: scipy"
+    ]
+
+
+def _late_uplinks(parameters: ConstellationParameters, duration_s: float) -> list[str]:
+    """Return a remark on uplinks whose time never comes: a run may be a shortened one."""
+    late = [n for n, uplink in enumerate(parameters.uplinks) if uplink.at_s >= duration_s > 0.0]
+    if not late:
+        return []
+    more = f", and {len(late) - 1} more" if len(late) > 1 else ""
+    return [
+        f"remark: parameters.uplinks[{late[0]}].at_s: {parameters.uplinks[late[0]].at_s:g} s is no time before the end"
+        f" (time.duration_s, {duration_s:g} s): it never leaves{more}"
     ]
 
 

@@ -81,8 +81,14 @@ def flight_faults(
 
 
 def rate_faults(parameters: ConstellationParameters, tick_hz: float) -> list[str]:
-    """Return rates of flight software that have no whole ratio to the ticks'; none are judged without theirs."""
+    """Return rates that have no place among the ticks, such as flight software's without a whole ratio; none are judged without theirs."""
     faults = []
+    state_hz = parameters.record.state_hz
+    if state_hz is not None and 0.0 < tick_hz < state_hz:
+        faults.append(
+            f"parameters.record.state_hz: expected at most agents.tick_hz, {tick_hz:g} Hz, got {state_hz:g}: a tick"
+            " has one state; leave it out for every tick"
+        )
     for number, rule in enumerate(flight_rules(parameters) if tick_hz > 0.0 else ()):
         try:
             flight_rate(rule.rate_hz, tick_hz)

@@ -300,9 +300,10 @@ class RecordSettings:
     """Whether the host records the truth that it sends, to the bit: `cosmos tabulate` makes a table of it."""
 
     state_hz: Annotated[float, Gt(0), Le(10_000)] | None = None
-    """Rate at which agents record their state, Hz; none for every tick."""
+    """Rate at which agents record their state, Hz, at most the tick rate, each in the tick nearest to its time; none for
+    every tick."""
     elements_hz: Annotated[float, Gt(0), Le(1000)] = 1.0
-    """Rate at which agents record their osculating elements, Hz; at most the tick rate."""
+    """Rate at which agents record their osculating elements, Hz, each in the tick nearest to its time; at most the tick rate."""
     slots_hz: Annotated[float, Gt(0), Le(1)] | None = None
     """Rate at which the host records slot errors by truth, Hz, of flight software whose settings say slots: even; none
     for no record."""

@@ -197,6 +197,17 @@ def test_file_in_place_of_the_folder_of_runs_is_bad_input(tmp_path, capsys, comm
     assert "file: expected the folder of all runs: Not a directory" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["t.csv", "t.json", "t.parquet.gz"])
+def test_table_is_not_written_under_the_suffix_of_another_format(made, tmp_path, capsys, name):
+    finish(made)
+
+    assert app.run(["tabulate", "1", "--output", str(tmp_path / name)]) == 2
+
+    told = capsys.readouterr().err
+    assert f"{name}: the table is a Parquet file; expected a name such as " in told
+    assert not (tmp_path / name).exists()
+
+
 @pytest.mark.slow
 def test_linked_run_is_neither_collected_nor_written_into(made, tmp_path, capsys):
     finish(made)

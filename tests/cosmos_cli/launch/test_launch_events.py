@@ -10,6 +10,7 @@ from cosmos_cli.launch.events import (
     AgentChanged,
     AgentExited,
     AgentStarted,
+    FaultInserted,
     Finished,
     Listening,
     Logged,
@@ -66,6 +67,24 @@ def test_exit_is_abnormal_unless_its_code_is_zero(
     event = parse_event(json.dumps(document).encode())
 
     assert event == AgentExited("a", 7, how, is_abnormal=is_abnormal)
+
+
+def test_exit_on_purpose_is_told_as_such() -> None:
+    line = (
+        b'{"event":"exited","agent":"a","pid":7,"code":null,"signal":"SIGKILL",'
+        b'"on_purpose":true,"will_restart":true}'
+    )
+
+    expected = AgentExited(
+        "a", 7, "killed by SIGKILL", is_abnormal=True, is_on_purpose=True, will_restart=True
+    )
+    assert parse_event(line) == expected
+
+
+def test_what_became_of_an_order_bears_its_number() -> None:
+    line = b'{"event":"injected","number":3,"refusal":null,"target":"pi01/imu","action":"freeze"}'
+
+    assert parse_event(line) == FaultInserted(3, "")
 
 
 @given(st.binary(max_size=200))

@@ -163,12 +163,16 @@ def test_launch_lines_speak_of_the_machines_own_places() -> None:
     listening: Any = SimpleNamespace(address="0.0.0.0", port=4711)
 
     launch = request.agent_launch(
-        "pi2", ("agent-01",), listening, Life(number=2, incarnations={"agent-01": 3})
+        "pi2",
+        ("agent-01",),
+        listening,
+        Life(number=2, incarnations={"agent-01": 3}, killed={"agent-01": 1}),
     )
 
     assert (launch["host_address"], launch["host_port"]) == ("10.0.0.1", 4711)
     assert (launch["directory"], launch["is_detached"]) == ("/d", True)
     assert (launch["life"], launch["first_incarnations"]) == (2, {"agent-01": 3})
+    assert launch["killed_before"] == {"agent-01": 1}
     assert request.host_launch()["directory"] == "/d/host"
     assert request.run_key_hex not in repr(request)
 
@@ -239,6 +243,21 @@ def test_nobody_starts_again_when_the_scenario_does_not_say_so(
 
 def test_hand_started_agents_are_nobodys_to_restart() -> None:
     assert "agent-01" not in roll(1, manual=("agent-01",)).restartable_on("pi2")
+
+
+def test_agents_that_were_ended_on_purpose_have_lost_no_start() -> None:
+    made = roll(1)
+    made.started("agent-01", 1)
+    made.killed("agent-01", will_return=True)
+    made.started("agent-01", 2)
+    made.started("agent-02", 1)
+    made.killed("agent-02", will_return=False)
+
+    assert made.restartable_on("pi2") == ("agent-01", "agent-03")
+    assert made.left_on("pi2") == ("agent-01", "agent-03")
+    life = made.next_life_on("pi2")
+    assert life.incarnations == {"agent-01": 3, "agent-02": 2, "agent-03": 1}
+    assert life.killed == {"agent-01": 1, "agent-02": 1}
 
 
 def test_each_life_of_a_machine_counts_on_from_what_its_agents_had() -> None:

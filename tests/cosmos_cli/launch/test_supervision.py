@@ -494,6 +494,26 @@ def test_machine_that_returns_is_given_its_agents_again() -> None:
     assert back[1].name == f"{AGENTS} (2)"
 
 
+def test_machine_that_returns_is_given_agents_that_were_ended_on_purpose_and_were_to_return() -> (
+    None
+):
+    table = Table(on_agent_loss="continue", agents=Agents(count=2, restarts_max=1))
+    table.run()
+    for agent, returns in (("agent-01", True), ("agent-02", False)):
+        ended = {"how": "killed by SIGKILL", "is_abnormal": True, "is_on_purpose": True}
+        event = events.AgentExited(agent, 1000, **ended, will_restart=returns)
+        table.play((0, ChildSaid(AGENTS, event)))
+    table.play((0, started("agent-01", 2)), (1, ChildLost(AGENTS, "the connection broke")))
+    back = table.play((0, MachineReached("pi01", is_reached=True)))
+
+    life = Life(
+        number=2,
+        incarnations={"agent-01": 3, "agent-02": 2},
+        killed={"agent-01": 1, "agent-02": 1},
+    )
+    assert back[1] == actions.StartAgents("pi01", ("agent-01",), LISTENING, life)
+
+
 @pytest.mark.parametrize("is_lost", [False, True])
 def test_supervisor_that_ends_before_it_has_started_anything_again_is_told(is_lost: bool) -> None:
     table = Table(on_agent_loss="continue", agents=Agents(count=2, restarts_max=1))
@@ -747,10 +767,10 @@ def test_a_fault_is_passed_to_who_drives_the_device_and_its_answer_told_and_reco
     table.run()
 
     asked = table.play((1, ordered(1)))
-    told = table.play((1, ChildSaid(AGENTS, events.FaultInserted("pi01/imu", "freeze", ""))))
+    told = table.play((1, ChildSaid(AGENTS, events.FaultInserted(1, ""))))
 
     order = {"command": "inject", "target": "pi01/imu", "action": "freeze", "value": None}
-    assert actions.Send(AGENTS, order) in asked
+    assert actions.Send(AGENTS, {**order, "number": 1}) in asked
     assert not answers(asked)
     assert answers(told) == [(1, "")]
     assert orders(told, "inject") == [{**order, "refusal": ""}]
@@ -771,10 +791,24 @@ def test_a_supervisor_that_does_not_answer_is_not_waited_for() -> None:
     table.play((1, ordered(1)))
 
     done = table.wait(6.0)
-    late = table.play((0, ChildSaid(AGENTS, events.FaultInserted("pi01/imu", "freeze", ""))))
+    late = table.play((0, ChildSaid(AGENTS, events.FaultInserted(1, ""))))
 
     assert answers(done) == [(1, "pi01 has not answered within 5 s")]
     assert not answers(late)
+
+
+def test_a_late_answer_is_not_taken_for_that_of_the_same_order_given_again() -> None:
+    table = Table(devices={"pi01": (IMU,)})
+    table.run()
+    table.play((1, ordered(1)))
+    table.wait(6.0)
+    table.play((1, ordered(2)))
+
+    late = table.play((0, ChildSaid(AGENTS, events.FaultInserted(1, ""))))
+    own = table.play((1, ChildSaid(AGENTS, events.FaultInserted(2, "it is lost"))))
+
+    assert not answers(late)
+    assert answers(own) == [(2, "it is lost")]
 
 
 def test_a_fault_is_refused_while_nobody_drives_the_device() -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from cosmos_cli import app
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.loading import load_scenario
 from madns_runtime.config import Deadline, RunConfig, from_mapping, to_mapping
@@ -47,6 +48,8 @@ def check(parameters, agents, base_directory):
         faults.append("parameters.method.steps: expected more with spare: 0")
     if parameters.spare == 1:
         faults.append("spare and mass_kg do not fit together")
+    if parameters.spare and parameters.spare > 1:
+        faults += ["remark: spare: odd"] * parameters.spare
     return faults
 
 class Agent(AgentSimulation):
@@ -526,3 +529,30 @@ def test_what_is_of_no_type_and_what_is_in_a_list_is_told_as_it_is(see, paramete
     told = see(f"{text}parameters:\n  {parameters}\n").splitlines()
 
     assert [line.split(": ", 1)[1] for line in told if line.startswith("a.yaml:")] == shown
+
+
+@pytest.mark.process
+def test_a_remark_of_the_simulation_is_no_fault_and_told_at_its_place(see, capsys):
+    scenario = "name: a\nsimulation: ./p.py:simulation\nagents: {count: 2}\nparameters: {mass_kg: 1, spare: 2}\n"
+    Path("a.yaml").write_text(scenario)
+
+    assert app.run(["validate", "a.yaml"]) == 0
+
+    told = capsys.readouterr()
+    assert told.out.startswith("a.yaml: ok: ")
+    assert told.err.count("note: a.yaml:4:33: parameters.spare: odd") == 2
+    assert see(scenario, "parameters.mass_kg=3").count("odd") == 0
+
+
+@pytest.mark.process
+def test_of_very_many_remarks_the_first_are_told_and_the_rest_is_counted(see, capsys):
+    Path("a.yaml").write_text(
+        "name: a\nsimulation: ./p.py:simulation\nagents: {count: 2}\nparameters: {mass_kg: 1, spare: 9999}\n"
+    )
+
+    assert app.run(["validate", "a.yaml"]) == 0
+
+    notes = capsys.readouterr().err.count(": odd")
+    assert 0 < notes < 9999
+    assert app.run(["validate", "a.yaml"]) == 0
+    assert f"{9999 - notes} more remarks" in capsys.readouterr().err
