@@ -65,9 +65,13 @@ def fetch(
     """
     Return wheels with their sizes; those that are not there are downloaded, verified, and kept.
 
+    Nothing that is remembered needs them yet: until then they are kept from other commands that clear the cache.
+
     Raises:
         MachineFailure: The index cannot be reached, or gives something else.
     """
+    for each in chosen:
+        _spare(wheel_path(folder, each.locked).parent)
     wanted = [each for each in chosen if lacking([each.locked], folder)]
     if wanted:
         progress(f"downloading {len(wanted)} wheels for {platform.label}", 0.5)
@@ -167,6 +171,12 @@ def remove_unused(cache: Path, *, now_s: float) -> None:
                 shutil.rmtree(path)
 
 
+def _spare(folder: Path) -> None:
+    """Make a wheel's folder one that somebody is just using, for `remove_unused` of other commands."""
+    with contextlib.suppress(OSError):  # not there yet, or another user's
+        os.utime(folder)
+
+
 def _is_there(path: Path, locked: Locked) -> bool:
     try:
         size_bytes = path.stat().st_size
@@ -218,6 +228,7 @@ def _kept_of_folder(folder: Path, text: str, say: Callable[[str], None]) -> Path
     note = cache_folder() / "built" / tree.hash
     try:
         kept = Path(read_regular_file(note, bytes_max=NOTE_BYTES_MAX).decode())
+        _spare(kept.parent)
         if kept.is_file():
             return kept
     except OSError:
@@ -272,6 +283,7 @@ def _keep_own(path: Path, text: str) -> Path:
     except OSError as error:
         raise InputError(f"requirements: {text}: {error.strerror or error}") from error
     kept = cache_folder() / "wheels" / hashlib.sha256(content).hexdigest() / path.name
+    _spare(kept.parent)
     if not kept.is_file() or kept.stat().st_size != len(content):
         if not zipfile.is_zipfile(path):
             raise InputError(f"requirements: {text}: expected a wheel, got another kind of file")

@@ -21,6 +21,7 @@ from cosmos_cli.provision.wheelhouse import (
     prepare,
     sees_system_packages,
 )
+from cosmos_cli.provision.wheels import remove_unused, requirements_of
 
 pytestmark = pytest.mark.process
 
@@ -156,6 +157,27 @@ def test_cache_forgets_what_was_not_used_for_long_when_something_new_comes(index
     assert {path.name for path in wheels.iterdir()} == {*needed, ".new-of-somebody"}
     assert len(list(locks.glob("*.json"))) == 2
     assert prepare(PI, ["pyproj"]).key == old.key
+
+
+def test_wheels_that_a_new_environment_takes_from_the_cache_are_kept_while_it_is_made(
+    index, tmp_path, monkeypatch
+):
+    wheels = tmp_path / "cache/wheels"
+    make_wheel(index, "pyproj")
+    prepare(PI, ["pyproj"])
+    for path in (tmp_path / "cache/locks").glob("*"):
+        path.unlink()
+    for path in wheels.iterdir():
+        age(path, 91)
+
+    def clear_as_another_command(path):
+        remove_unused(tmp_path / "cache", now_s=time.clock_gettime(time.CLOCK_REALTIME))
+        return requirements_of(path)
+
+    monkeypatch.setattr(wheelhouse, "requirements_of", clear_as_another_command)
+    again = prepare(PI, ["pyproj"])
+
+    assert all(again.wheel(wheel).is_file() for wheel in again.lock)
 
 
 def test_key_needs_no_wheels(index, no_process):
