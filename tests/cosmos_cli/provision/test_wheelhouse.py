@@ -1,5 +1,6 @@
 """Environments are resolved and fetched on the operator's machine, from any index, once."""
 
+import errno
 import json
 import os
 import subprocess
@@ -178,6 +179,28 @@ def test_wheels_that_a_new_environment_takes_from_the_cache_are_kept_while_it_is
     again = prepare(PI, ["pyproj"])
 
     assert all(again.wheel(wheel).is_file() for wheel in again.lock)
+
+
+def test_cache_that_cannot_be_written_is_told_as_this_computers_fault(index, tmp_path, monkeypatch):
+    monkeypatch.setenv("COSMOS_CACHE", str(tmp_path / "taken"))
+    (tmp_path / "taken").touch()
+
+    with pytest.raises(
+        MachineFailure, match="cache of this computer.*taken.*COSMOS_CACHE"
+    ) as failed:
+        prepare(PI, [])
+
+    assert failed.value.kind is FailureKind.STEP
+
+
+def test_full_disk_under_the_cache_is_told_as_this_computers_fault(index, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(wheelhouse, "write_whole", refuse)
+
+    with pytest.raises(MachineFailure, match="cache of this computer.*No space left"):
+        prepare(PI, [])
 
 
 def test_key_needs_no_wheels(index, no_process):
