@@ -12,6 +12,7 @@ import errno
 import os
 import stat
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Final
 
 PIECE_BYTES: Final = 1024 * 1024
@@ -37,6 +38,11 @@ class NotARegularFile(FileRefused):
 
 class FileTooLarge(FileRefused):
     """The file is longer than its reader can use."""
+
+
+def real_path(path: str | os.PathLike[str]) -> Path:
+    """Return where a path leads; unlike `Path.resolve` no RuntimeError for a link to itself, of which its reader tells."""
+    return Path(os.path.realpath(path))
 
 
 def read_regular_file(path: str | os.PathLike[str], *, bytes_max: int) -> bytes:

@@ -30,6 +30,7 @@ from cosmos_cli.testing.terminal import (
 )
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
 from cosmos_cli.ui.plural import counted
+from madns_runtime.bounded_files import real_path
 
 JOBS_MAX = 256
 SECONDS_MAX = 86_400.0 * 30
@@ -174,7 +175,7 @@ def _seeds_of(
 ) -> Callable[[Path], Sequence[int | None]]:
     """Return the function that tells a scenario's seeds; none for one that did not fail last time."""
     given: Sequence[int | None] = parse_seeds(text) if text else (None,)
-    known = {str(outline.path.resolve()) for outline in found.outlines}
+    known = {str(real_path(outline.path)) for outline in found.outlines}
     # Other folders' failures are remembered, too.
     failed = [each for each in read_failed() if each[0] in known] if last_failed else []
     if not failed:
@@ -185,7 +186,7 @@ def _seeds_of(
     for place, seed in failed:
         by_path.setdefault(place, []).append(seed)
     return lambda path: [
-        seed for seed in by_path.get(str(path.resolve()), []) if text is None or seed in given
+        seed for seed in by_path.get(str(real_path(path)), []) if text is None or seed in given
     ]
 
 
@@ -230,7 +231,7 @@ def _check_owners(cases: Sequence[SuiteCase]) -> None:
     for case in cases:
         if case.baseline is None:
             continue
-        other = owners.setdefault(case.baseline.path.resolve(), case)
+        other = owners.setdefault(real_path(case.baseline.path), case)
         if other is not case:
             text = f"is the baseline of {other.name} and of {case.name}: each needs its own"
             raise InputError(f"{case.baseline.path}: {text}")

@@ -9,11 +9,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from cosmos_cli.errors import MachinesError
+from cosmos_cli.errors import InputError, MachinesError
 from cosmos_cli.fleet.connection import Connection, ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
@@ -54,6 +54,8 @@ class Prepared(Protocol):
 
 
 Prepare = Callable[[Target, Helper], Prepared]
+Identity = tuple[str, str, str]
+"""Boot, name that a machine has for itself, and folder of COSMoS there."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,7 +108,7 @@ class RemoteMachine:
         self._board: Helper | None = board
         self._lock = threading.Lock()
         self._connecting = threading.Lock()
-        self._boot_id = str(board.greeting["boot_id"])
+        self.identity = identity_of(board.greeting, connection.target.root)
 
     @property
     def name(self) -> str:
@@ -152,7 +154,7 @@ class RemoteMachine:
             MachineFailure: It does not answer.
         """
         asked = self.connection.run(f"cat {BOOT_ID_FILE}", timeout_s=ASK_TIMEOUT_S)
-        return asked.stdout.decode(errors="replace").strip() != self._boot_id
+        return asked.stdout.decode(errors="replace").strip() != self.identity[0]
 
     def connect_again(self) -> None:
         """
@@ -222,6 +224,7 @@ def reach_machines(  # noqa: PLR0913 - how machines are reached and prepared; al
 
     Raises:
         MachinesError: Some failed, each is named; the others are closed again.
+        InputError: Two are one.
     """
 
     def reach(target: Target) -> RemoteMachine:
@@ -246,10 +249,39 @@ def reach_machines(  # noqa: PLR0913 - how machines are reached and prepared; al
         raise_if_failed(
             for_each(targets, reach, forks=forks, on_done=done), "the run was not started"
         )
-    except (KeyboardInterrupt, MachinesError):
+        refuse_twins((target, reached[target.name].identity) for target in targets)
+    except (KeyboardInterrupt, MachinesError, InputError):
         close_machines(tuple(reached.values()))
         raise
     return {target.name: reached[target.name] for target in targets}
+
+
+def identity_of(greeting: Mapping[str, Any], root: str) -> Identity:
+    """Return what two names of one machine with one folder have in common; containers of one boot differ in node."""
+    return (
+        str(greeting["boot_id"]),
+        str(greeting["node"]),
+        expanded(root, str(greeting["home"])),
+    )
+
+
+def refuse_twins(machines: Iterable[tuple[Target, Identity]]) -> None:
+    """
+    Refuse machines that are one, by whatever addresses they were reached: each would offer the other's records.
+
+    Raises:
+        InputError: Two are one.
+    """
+    known: dict[Identity, Target] = {}
+    for target, identity in machines:
+        boot_id, node, root = identity
+        other = known.setdefault(identity, target)
+        if other is not target and boot_id:  # of no boot: not known
+            raise InputError(
+                f"{other.label} and {target.label} are one machine, which calls itself {node}, with one"
+                f" cosmos_root, {root}: correct ansible_host, leave one of them out (--limit), or give each a"
+                " cosmos_root of its own"
+            )
 
 
 def close_machines(machines: Sequence[RemoteMachine]) -> None:

@@ -24,6 +24,7 @@ from cosmos_cli.fleet.open_connection import connect
 from cosmos_cli.fleet.outcome import Outcome
 from cosmos_cli.fleet.pool import for_each
 from cosmos_cli.fleet.target import Target, target_of
+from cosmos_cli.launch.machines import Identity, identity_of, refuse_twins
 from cosmos_cli.launch.plan import LaunchPlan
 from cosmos_cli.launch.preparation import says_address
 from cosmos_cli.models.inventory import Machine
@@ -61,6 +62,7 @@ class Obstacle:
 class MachineRehearsal:
     """State of one machine against all that the run needs."""
 
+    identity: Identity
     agents: int
     is_host: bool
     opening_ms: float
@@ -147,7 +149,7 @@ class Rehearsal:
         Ask every other computer of the plan at once.
 
         Raises:
-            InputError: The scenario's folder cannot be sent.
+            InputError: The scenario's folder cannot be sent, or two machines are one.
         """
         if not self.plan.elsewhere:
             return []
@@ -158,12 +160,14 @@ class Rehearsal:
                 with contextlib.closing(connect(target, self.options)) as connection:
                     return self._ask(connection, self.plan.involved[target.name], cargo, responder)
 
-            return for_each(
-                [target_of(machine) for machine in self.plan.elsewhere],
-                work,
-                forks=self.forks,
-                on_done=on_done,
-            )
+            targets = [target_of(machine) for machine in self.plan.elsewhere]
+            asked = for_each(targets, work, forks=self.forks, on_done=on_done)
+        refuse_twins(
+            (target, outcome.value.identity)
+            for target, outcome in zip(targets, asked, strict=True)
+            if outcome.value is not None
+        )
+        return asked
 
     def obstacles_here(self) -> list[Obstacle]:
         """Return what this computer lacks: room, a folder that can be written, a port that is free."""
@@ -214,6 +218,7 @@ class Rehearsal:
             processes = board.call("processes", {"state": layout.state}, timeout_s=TIMEOUT_S).value
             trips = self._trips(board, connection, machine, responder)
         return MachineRehearsal(
+            identity=identity_of(board.greeting, layout.root),
             agents=agents,
             is_host=is_host,
             opening_ms=connection.opening_s * 1e3,

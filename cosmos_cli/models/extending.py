@@ -19,6 +19,7 @@ from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.document import Document, SourcePlace, kind_of, read_document
 from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.yaml_source import read_source
+from madns_runtime.bounded_files import real_path
 
 FILES_MAX: Final = 8
 """Of one chain, the scenario with it."""
@@ -81,16 +82,16 @@ def read_scenario_source(path: Path) -> ScenarioSource:
 
 def _chain(path: Path) -> list[_File]:
     """Return the scenario and its bases, each followed by what it extends."""
-    chain = [_read(str(path), path.resolve())]
+    chain = [_read(str(path), real_path(path))]
     while (extends := chain[-1].extends) is not None:
         last = chain[-1]
         faults = [fault for file in chain for fault in file.document.faults]
         wrong = _extends_fault(extends, last, chain)
         if wrong:
             raise InputError(faults=[*faults, last.fault("extends", wrong)])
-        target = (last.path.parent / extends).resolve()
+        target = real_path(last.path.parent / extends)
         label = os.path.normpath(Path(last.label).parent / extends)
-        if Path(label).resolve() != target:  # a link on the way
+        if real_path(Path(label)) != target:  # a link on the way
             label = str(target)
         try:
             chain.append(_read(label, target))
@@ -109,7 +110,7 @@ def _extends_fault(extends: str, last: _File, chain: Sequence[_File]) -> str:
         return f"expected the path of a scenario from this file's folder, got {extends!r}"
     if len(chain) == FILES_MAX:
         return f"expected at most {FILES_MAX} files that extend each other"
-    target = (last.path.parent / extends).resolve()
+    target = real_path(last.path.parent / extends)
     for number, file in enumerate(chain):
         if file.path == target:
             names = [each.label for each in chain[number:]]
@@ -152,7 +153,7 @@ def _root(chain: Sequence[_File]) -> Path:
                 f"expected {', '.join(ROOTS)}: this file's folder, or one of the two above it"
             )
             raise InputError(faults=[file.fault("root", f"{expected}; got {file.root!r}")])
-        root = (file.path.parent / file.root).resolve()
+        root = real_path(file.path.parent / file.root)
         if root.parent == root:
             text = "expected a folder of one's own, got that of all files: a root travels whole"
             raise InputError(faults=[file.fault("root", text)])

@@ -37,6 +37,7 @@ from cosmos_cli.models.variables import (
 )
 from cosmos_cli.models.yaml_source import YamlSource
 from madns_runtime.agent_parameters import AgentParameters
+from madns_runtime.bounded_files import real_path
 from madns_runtime.config import RunConfig, to_mapping
 from madns_runtime.plugin.api import DeclaredStream, Demand, PlaceUse
 
@@ -176,7 +177,7 @@ def check_scenario(text: str, path: Path) -> ScenarioFile:
         MissingExtraError: The simulation needs an optional dependency that is not installed.
     """
     document = read_document(YamlSource.of(str(path), text))
-    source = ScenarioSource(document=document, root=path.resolve().parent, files=(str(path),))
+    source = ScenarioSource(document=document, root=real_path(path).parent, files=(str(path),))
     return _check(source, path, (), list(document.faults))
 
 

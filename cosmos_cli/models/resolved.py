@@ -11,6 +11,7 @@ from typing import Any, Final
 from cosmos_cli.models.document import Document, Path, SourcePlace, dotted
 from cosmos_cli.models.loading import ScenarioFile
 from cosmos_cli.models.variables import SECTION
+from madns_runtime.bounded_files import real_path
 
 DEFAULT: Final = "default"
 COMMENT_COLUMN: Final = 44
@@ -75,7 +76,7 @@ def resolved_lines(scenario: ScenarioFile) -> Iterator[str]:
 
 def relative_root(scenario: ScenarioFile) -> str:
     """Return the folder that travels with a scenario, from the scenario's own."""
-    return os.path.relpath(scenario.root, scenario.path.resolve().parent)
+    return os.path.relpath(scenario.root, real_path(scenario.path).parent)
 
 
 def origins(scenario: ScenarioFile) -> dict[str, Any]:

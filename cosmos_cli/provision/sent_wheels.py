@@ -9,29 +9,35 @@ nothing. Modules travel compiled as well, when this computer's Python writes wha
 counts by the hash that RECORD has of it (PEP 552, unchecked), as every file of the environment is looked at before a run.
 Every file is verified here by what RECORD says of it, so that a machine, which verifies the hash of the whole, need only
 see that each comes out as it was packed. A wheel that is not as it should be is sent as it came, and refused there.
+
+The same wheel packed twice has not the same bytes: what Python compiles depends on what else it has in memory. So one
+command packs it while others wait, and it appears together with its note: nobody reads the one with the other's hash.
 """
 
 from __future__ import annotations
 
 import base64
+import contextlib
 import csv
 import hashlib
 import importlib.util
 import io
 import json
 import marshal
+import shutil
 import struct
 import sys
 import tempfile
-import threading
 import warnings
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.provision.lock import Locked
 from cosmos_cli.provision.platform import Platform
+from cosmos_cli.system import file_lock
 from madns_runtime.bounded_files import read_regular_file
 
 RULE = 1
@@ -50,8 +56,9 @@ NOTE_BYTES_MAX = 4096
 SENT_TIME = (1980, 1, 1, 0, 0, 0)
 UNCHECKED_HASH = 1
 """Flags of a compiled module that Python takes without a look at its source (PEP 552)."""
-
-_making = threading.Lock()
+LOCK = "sent.lock"
+LOCK_TIMEOUT_S = 900.0
+"""A slow operator compiles numpy for some minutes, once."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,22 +74,36 @@ class SentWheel:
 
 def sent_wheel(path: Path, locked: Locked, platform: Platform) -> SentWheel:
     """
-    Return a wheel as a machine is sent it; made when it is first wanted.
+    Return a wheel as a machine is sent it; made when it is first wanted. Safe for threads and processes.
 
     Args:
         path: The wheel; verified.
         locked: What it is.
         platform: Of the machine.
+
+    Raises:
+        MachineFailure: BUSY: another command packed it all the time.
     """
     python = sys.implementation.cache_tag if _writes_for(platform) else "sources"
     folder = path.parent / f"sent-{RULE}-{python}"
-    with _making:
-        found = _noted(folder, locked)
-        if found is None:
-            found = _make(path, locked, folder, platform)
+    found = _noted(folder, locked) or _make_once(path, locked, folder, platform)
     if found is None:
         return SentWheel(locked=locked, path=path, is_verified=False)
     return SentWheel(locked=found, path=folder / locked.filename, is_verified=True)
+
+
+def _make_once(path: Path, locked: Locked, folder: Path, platform: Platform) -> Locked | None:
+    """Make it unless another thread or command has just done so."""
+    lock = path.parent / LOCK
+    try:
+        with file_lock.locked(lock, timeout_s=LOCK_TIMEOUT_S):
+            return _noted(folder, locked) or _make(path, locked, folder, platform)
+    except file_lock.LockHeld as held:
+        raise MachineFailure(
+            FailureKind.BUSY,
+            f"another command on this computer packs {locked.filename}, and holds {lock}: {held}",
+            "wait for its end, then repeat",
+        ) from None
 
 
 def _writes_for(platform: Platform) -> bool:
@@ -113,11 +134,13 @@ def _make(path: Path, locked: Locked, folder: Path, platform: Platform) -> Locke
     made = replace(locked, sha256=hashlib.sha256(whole).hexdigest(), size_bytes=len(whole))
     note = {"sha256": made.sha256, "size_bytes": made.size_bytes}
     with tempfile.TemporaryDirectory(prefix=".sent-", dir=path.parent) as private:
-        Path(private, locked.filename).write_bytes(whole)
-        Path(private, NOTE).write_text(json.dumps(note), encoding="utf-8")
-        folder.mkdir(exist_ok=True)
-        for name in (locked.filename, NOTE):  # the note last: with it the wheel counts
-            Path(private, name).replace(folder / name)
+        complete = Path(private, folder.name)
+        complete.mkdir()
+        (complete / locked.filename).write_bytes(whole)
+        (complete / NOTE).write_text(json.dumps(note), encoding="utf-8")
+        with contextlib.suppress(FileNotFoundError):
+            shutil.rmtree(folder)  # what is there has lost its wheel or its note
+        complete.rename(folder)  # both at once
     return made
 
 

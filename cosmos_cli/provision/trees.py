@@ -24,7 +24,7 @@ from cosmos_cli.evidence.run_directory import BUNDLE_SUFFIX, RUN_NAME
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
-from madns_runtime.bounded_files import FileRefused, read_regular_file
+from madns_runtime.bounded_files import FileRefused, read_regular_file, real_path
 
 if TYPE_CHECKING:  # importing the scenario's model takes longer than all that is done with it here
     from cosmos_cli.models.loading import ScenarioFile
@@ -152,7 +152,7 @@ def folder_tree(label: str, folder: Path) -> Tree:
     total_bytes = 0
     for path, name in _walk(folder, folder):
         found.append((path, name))
-        total_bytes += path.stat().st_size
+        total_bytes += _size_bytes(path)
         if len(found) > FILES_MAX or total_bytes > TREE_BYTES_MAX:
             raise _too_large(folder, found)
     return tree_of(label, [read_tree_file(*each) for each in found])
@@ -286,13 +286,25 @@ def _walk(folder: Path, top: Path, above: tuple[Path, ...] = ()) -> Iterator[tup
             raise InputError(f"{str(path)!r}: expected a file name of printable characters")
         if entry.is_symlink():
             _refuse_outside(path, top)
-        if entry.is_dir():
-            if path.resolve() not in above and is_folder_of_tree(path):
-                yield from _walk(path, top, above)
-        elif entry.is_file():
-            yield path, path.relative_to(top).as_posix()
-        elif entry.is_symlink():
+        try:
+            kind = _kind(entry, path, above)
+        except OSError as error:  # such as a link to itself
+            raise InputError(f"{path}: cannot be read: {error.strerror}; remove it") from error
+        if kind == "link":
             raise InputError(f"{path}: a link that leads nowhere; remove it")
+        if kind == "folder":
+            yield from _walk(path, top, above)
+        elif kind:
+            yield path, path.relative_to(top).as_posix()
+
+
+def _kind(entry: os.DirEntry[str], path: Path, above: tuple[Path, ...]) -> str:
+    """Return what an entry is: a folder or file that belongs to the tree, a link to nothing, or empty for the rest."""
+    if entry.is_dir():
+        return "folder" if real_path(path) not in above and is_folder_of_tree(path) else ""
+    if entry.is_file():
+        return "file"
+    return "link" if entry.is_symlink() else ""
 
 
 def is_name_of_tree(name: str) -> bool:
@@ -303,19 +315,26 @@ def is_name_of_tree(name: str) -> bool:
 
 def is_folder_of_tree(path: Path) -> bool:
     """Tell whether a folder belongs to a tree: no cache, virtual environment or run."""
-    return not (_is_run(path) or path.name in CACHE_FOLDERS or (path / "pyvenv.cfg").exists())
+    return not (_is_run(path) or path.name in CACHE_FOLDERS or os.path.exists(path / "pyvenv.cfg"))
 
 
 def _is_run(path: Path) -> bool:
     """Tell whether a folder is a run's: by its name and part of what it holds, or renamed, as a copy is, by all of it."""
-    is_planned = (path / "plan.json").exists()
-    has_records = (path / "host").is_dir() and (path / "agents").is_dir()
+    is_planned = os.path.exists(path / "plan.json")  # of a folder that may not be entered: False
+    has_records = os.path.isdir(path / "host") and os.path.isdir(path / "agents")
     is_named = RUN_NAME.match(path.name) is not None
     return (is_planned or has_records) if is_named else (is_planned and has_records)
 
 
+def _size_bytes(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError as error:  # removed since the folder was listed
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+
+
 def _refuse_outside(path: Path, top: Path) -> None:
-    real = path.resolve()
+    real = real_path(path)
     if not real.is_relative_to(top.resolve()):
         raise InputError(
             f"{path}: a link that leads out of the scenario's folder, to {real}; machines are sent"
@@ -324,7 +343,7 @@ def _refuse_outside(path: Path, top: Path) -> None:
 
 
 def _too_large(folder: Path, found: Sequence[tuple[Path, str]]) -> InputError:
-    sizes = sorted(((path.stat().st_size, name) for path, name in found), reverse=True)
+    sizes = sorted(((_size_bytes(path), name) for path, name in found), reverse=True)
     largest = ", ".join(f"{name} ({size / 1e6:.1f} MB)" for size, name in sizes[:LARGEST_SHOWN])
     return InputError(
         f"{folder}: expected a scenario's folder of at most {FILES_MAX} files and"

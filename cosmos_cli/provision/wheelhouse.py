@@ -43,6 +43,7 @@ from cosmos_cli.provision.lock import (
 from cosmos_cli.provision.platform import Platform, greeted_platform, wheel_rank
 from cosmos_cli.provision.trees import DISTRIBUTION, Progress, no_progress
 from cosmos_cli.provision.wheels import (
+    cache_failures,
     fetch,
     is_own_wheel,
     lacking,
@@ -136,12 +137,12 @@ def prepare(
 
 
 def prepare_needed(need: EnvironmentNeed, progress: Progress = no_progress) -> Environment:
-    """Return what is needed, its wheels downloaded; see `prepare`."""
+    """Return what is needed, its wheels downloaded; see `prepare`. Also fails when the cache takes nothing."""
     cache = cache_folder()
     path = need.path(cache)
     content = _read_lock(path)
     if content is None or lacking(content.wheels, cache / "wheels"):
-        with _locked(path.with_suffix(".lock")):
+        with cache_failures(), _locked(path.with_suffix(".lock")):
             content = _read_lock(path) or _make_lock(path, need, cache, progress)
             chosen = [Chosen(locked=wheel) for wheel in content.wheels]
             fetch(chosen, cache / "wheels", need.platform, progress)

@@ -11,6 +11,7 @@ requirement is written `name @ file:///...` from here on.
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import hashlib
 import json
@@ -19,13 +20,13 @@ import shutil
 import subprocess
 import tempfile
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from email.parser import HeaderParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-from cosmos_cli.cache import cache_folder
+from cosmos_cli.cache import CACHE_VARIABLE, cache_folder
 from cosmos_cli.errors import InputError
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.models.text_forms import is_own_requirement
@@ -35,7 +36,7 @@ from cosmos_cli.provision.platform import Platform
 from cosmos_cli.provision.trees import Progress, folder_tree
 from cosmos_cli.system.bounded_process import run_bounded
 from cosmos_cli.ui.step_times import HERE, timed
-from madns_runtime.bounded_files import read_regular_file
+from madns_runtime.bounded_files import read_regular_file, real_path
 from madns_runtime.partial_file import write_whole
 
 UNUSED_S_MAX = 90 * 86_400.0
@@ -47,6 +48,32 @@ BUILD_TIMEOUT_S = 600.0
 LAST_LINES = 8
 NOTE_BYTES_MAX = 4096
 SCHEME = "file://"
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+"""Of a write, which names no file."""
+
+
+@contextlib.contextmanager
+def cache_failures() -> Iterator[None]:
+    """
+    Turn what the operator's system says of the cache into a failure of this computer.
+
+    Raises:
+        MachineFailure: The cache cannot be read or written, or its disk is full.
+    """
+    try:
+        yield
+    except OSError as error:
+        folder = cache_folder()
+        path = (
+            Path(os.fsdecode(error.filename)) if isinstance(error.filename, str | bytes) else None
+        )
+        if error.errno not in DISK_ERRORS and not (path and path.is_relative_to(folder)):
+            raise
+        raise MachineFailure(
+            FailureKind.STEP,
+            f"the cache of this computer, {path or folder}: {error.strerror}",
+            f"make room for it or let this user write there, or name another folder with {CACHE_VARIABLE}",
+        ) from error
 
 
 def wheel_path(folder: Path, locked: Locked) -> Path:
@@ -65,9 +92,13 @@ def fetch(
     """
     Return wheels with their sizes; those that are not there are downloaded, verified, and kept.
 
+    Nothing that is remembered needs them yet: until then they are kept from other commands that clear the cache.
+
     Raises:
         MachineFailure: The index cannot be reached, or gives something else.
     """
+    for each in chosen:
+        _spare(wheel_path(folder, each.locked).parent)
     wanted = [each for each in chosen if lacking([each.locked], folder)]
     if wanted:
         progress(f"downloading {len(wanted)} wheels for {platform.label}", 0.5)
@@ -167,6 +198,12 @@ def remove_unused(cache: Path, *, now_s: float) -> None:
                 shutil.rmtree(path)
 
 
+def _spare(folder: Path) -> None:
+    """Make a wheel's folder one that somebody is just using, for `remove_unused` of other commands."""
+    with contextlib.suppress(OSError):  # not there yet, or another user's
+        os.utime(folder)
+
+
 def _is_there(path: Path, locked: Locked) -> bool:
     try:
         size_bytes = path.stat().st_size
@@ -207,7 +244,7 @@ def _has_hash(path: Path, sha256: str, _changed_ns: int) -> bool:
 
 
 def _wheel_of(path: Path, text: str, say: Callable[[str], None]) -> str:
-    path = path.resolve()
+    path = real_path(path)
     kept = _kept_of_folder(path, text, say) if path.is_dir() else _keep_own(path, text)
     name = kept.name.split("-")[0].replace("_", "-")
     return f"{name} @ {kept.as_uri()}"
@@ -218,6 +255,7 @@ def _kept_of_folder(folder: Path, text: str, say: Callable[[str], None]) -> Path
     note = cache_folder() / "built" / tree.hash
     try:
         kept = Path(read_regular_file(note, bytes_max=NOTE_BYTES_MAX).decode())
+        _spare(kept.parent)
         if kept.is_file():
             return kept
     except OSError:
@@ -233,8 +271,9 @@ def _kept_of_folder(folder: Path, text: str, say: Callable[[str], None]) -> Path
         with timed(HERE, f"build a wheel of {text}"):
             wheel = _built(source, made, text)
         kept = _keep_own(wheel, text)
-    note.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(note, str(kept).encode())
+    with _own_failures(text):
+        note.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(note, str(kept).encode())
     return kept
 
 
@@ -272,9 +311,21 @@ def _keep_own(path: Path, text: str) -> Path:
     except OSError as error:
         raise InputError(f"requirements: {text}: {error.strerror or error}") from error
     kept = cache_folder() / "wheels" / hashlib.sha256(content).hexdigest() / path.name
+    _spare(kept.parent)
     if not kept.is_file() or kept.stat().st_size != len(content):
         if not zipfile.is_zipfile(path):
             raise InputError(f"requirements: {text}: expected a wheel, got another kind of file")
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(kept, content)
+        with _own_failures(text):
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(kept, content)
     return kept
+
+
+@contextlib.contextmanager
+def _own_failures(text: str) -> Iterator[None]:
+    """Tell of a cache that takes no wheel before any machine is worked on."""
+    try:
+        with cache_failures():
+            yield
+    except MachineFailure as failure:
+        raise InputError(f"requirements: {text}: {failure}") from failure

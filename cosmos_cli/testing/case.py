@@ -12,6 +12,7 @@ from cosmos_cli.models.baseline import Baseline
 from cosmos_cli.models.loading import ScenarioFile
 from cosmos_cli.models.scenario_outline import ScenarioOutline, with_seed
 from cosmos_cli.models.scenario_test import ExpectedOutcome, override_of
+from madns_runtime.bounded_files import real_path
 
 END_S: Final = 60.0
 """Beyond the waits of the run itself: start of the program, tables, package and verdict."""
@@ -57,7 +58,7 @@ class SuiteCase:
     @property
     def key(self) -> tuple[str, int | None]:
         """The test as it is remembered: absolute path of its file, and its seed if that was given."""
-        return str(self.path.resolve()), self.seed if self.has_given_seed else None
+        return str(real_path(self.path)), self.seed if self.has_given_seed else None
 
     def arguments(self) -> list[str]:
         """Return the words behind `cosmos run`, with the seed even if it is the scenario's own."""

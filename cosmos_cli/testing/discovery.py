@@ -16,7 +16,7 @@ from cosmos_cli.models.yaml_source import FILE_BYTES_MAX, read_source
 from cosmos_cli.provision.trees import is_folder_of_tree, is_name_of_tree
 from cosmos_cli.testing.case import CaseSettings, SuiteCase, make_cases
 from cosmos_cli.testing.expression import Matcher
-from madns_runtime.bounded_files import read_regular_file
+from madns_runtime.bounded_files import read_regular_file, real_path
 from madns_runtime.errors import MissingExtraError
 
 SUFFIXES: Final = (".yaml", ".yml")
@@ -56,8 +56,8 @@ def find_scenarios(paths: Sequence[Path]) -> FoundScenarios:
     seen: set[Path] = set()
     for path in paths or (next(each for each in DEFAULT_FOLDERS if each.is_dir()),):
         for file, is_named in [(path, True)] if path.is_file() else _files_below(path):
-            if file.resolve() not in seen:
-                seen.add(file.resolve())
+            if real_path(file) not in seen:
+                seen.add(real_path(file))
                 _add(found, file, is_named=is_named)
     return found
 

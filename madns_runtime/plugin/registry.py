@@ -23,7 +23,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
 
-from madns_runtime.bounded_files import FileRefused, check_regular_file
+from madns_runtime.bounded_files import FileRefused, check_regular_file, real_path
 from madns_runtime.config import from_mapping
 from madns_runtime.errors import MadnsError, MissingExtraError, PluginError
 from madns_runtime.plain_values import shown
@@ -252,7 +252,7 @@ def _load_module(name: str, where: str) -> ModuleType:
 
 
 def _load_file(path: Path, where: str) -> ModuleType:
-    path = path.resolve()
+    path = real_path(path)
     name = module_name(path)
     if name in sys.modules:
         return sys.modules[name]
@@ -262,6 +262,8 @@ def _load_file(path: Path, where: str) -> ModuleType:
         raise PluginError(f"{where}: no file {path}") from None
     except FileRefused as error:
         raise PluginError(f"{where}: {error}") from None
+    except OSError as error:  # such as a link to itself
+        raise PluginError(f"{where}: {path}: cannot be read: {error.strerror}") from None
     specification = importlib.util.spec_from_file_location(name, path)
     if specification is None or specification.loader is None:
         raise PluginError(f"{where}: expected a Python file ending in .py, got {path.name}")
@@ -295,7 +297,7 @@ def _neighbours_importable(folder: Path) -> Iterator[None]:
 
 def module_name(path: Path) -> str:
     """Return the module name of a plug-in file: readable, importable, and one for each path."""
-    digest = hashlib.blake2b(str(path.resolve()).encode(), digest_size=8).hexdigest()
+    digest = hashlib.blake2b(str(real_path(path)).encode(), digest_size=8).hexdigest()
     return f"{MODULE_PREFIX}{re.sub(r'[^0-9A-Za-z_]', '_', path.stem)}_{digest}"
 
 

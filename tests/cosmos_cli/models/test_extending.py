@@ -190,6 +190,27 @@ def test_a_link_that_leads_out_of_the_root_is_outside(write, tmp_path_factory):
     assert "lies outside of" in refusal(folder / "a.yaml")
 
 
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("loop.yaml", "loop.yaml: cannot be read: Too many levels of symbolic links"),
+        ("extends.yaml", "extends: loop.yaml: cannot be read: Too many levels"),
+        pytest.param(
+            "plugin.yaml", "loop.py: cannot be read: Too many levels", marks=pytest.mark.process
+        ),
+    ],
+)
+def test_a_link_to_itself_is_told_as_a_file_that_cannot_be_read(write, name, told):
+    folder = write(
+        extends="extends: loop.yaml\n",
+        plugin="name: a\nsimulation: ./loop.py:simulation\nagents: {count: 1}\n",
+    )
+    for loop in ("loop.yaml", "loop.py"):
+        (folder / loop).symlink_to(loop)
+
+    assert told in refusal(folder / name)
+
+
 def test_a_chain_has_a_bound(write):
     chain = {f"c{n}": f"extends: c{n + 1}.yaml\n" for n in range(FILES_MAX)}
     folder = write(**chain, **{f"c{FILES_MAX}": BASE})

@@ -92,6 +92,14 @@ def test_sources_that_cannot_be_built_are_told_with_pips_last_words(tmp_path):
         with_own_wheels(["./cars"], tmp_path)
 
 
+def test_cache_that_takes_no_wheel_is_told_with_the_requirement(folder, cache):
+    make_wheel(folder / "dist", "motor", "0.2")
+    cache.touch()
+
+    with pytest.raises(InputError, match=r"requirements: ./dist/motor-.*COSMOS_CACHE"):
+        with_own_wheels(["./dist/motor-0.2-py3-none-any.whl"], folder)
+
+
 HANGING = """
 import os, subprocess, sys, time
 def build_wheel(*everything, **more):

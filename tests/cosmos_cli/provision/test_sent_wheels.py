@@ -5,15 +5,22 @@ import csv
 import dataclasses
 import hashlib
 import io
+import json
+import os
+import subprocess
 import sys
 import zipfile
+from pathlib import Path
 
 import pytest
 from made_wheels import make_wheel
 
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.provision import sent_wheels
 from cosmos_cli.provision.lock import Locked
 from cosmos_cli.provision.platform import Platform
 from cosmos_cli.provision.sent_wheels import sent_wheel
+from cosmos_cli.system import file_lock
 
 HERE = Platform(python=sys.version_info[:2], machine="x86_64", libc_version=(2, 36))
 OTHER = dataclasses.replace(HERE, python=(3, 99))
@@ -118,3 +125,66 @@ def test_wheel_that_record_contradicts_is_sent_as_it_came(made):
     sent = sent_wheel(path, locked, HERE)
 
     assert (sent.path, sent.locked, sent.is_verified) == (path, locked, False)
+
+
+PACK = """
+import json, os, sys, time
+from pathlib import Path
+from cosmos_cli.provision import sent_wheels
+from cosmos_cli.provision.lock import Locked
+from cosmos_cli.provision.platform import Platform
+
+path, known, meeting = Path(sys.argv[1]), json.loads(sys.argv[2]), Path(sys.argv[3])
+dumps, noted = sent_wheels.marshal.dumps, sent_wheels._noted
+sent_wheels.marshal.dumps = lambda code: dumps(code) + str(os.getpid()).encode()  # as other memory would
+
+def noted_by_both(*arguments):
+    found = noted(*arguments)
+    (meeting / str(os.getpid())).touch()
+    until_s = time.monotonic() + 60.0
+    while len(list(meeting.iterdir())) < 2 and time.monotonic() < until_s:
+        time.sleep(0.01)
+    return found
+
+sent_wheels._noted = noted_by_both
+here = Platform(python=sys.version_info[:2], machine="x86_64", libc_version=(2, 36))
+sent = sent_wheels.sent_wheel(path, Locked(**known), here)
+print(json.dumps([str(sent.path), sent.locked.sha256]))
+"""
+"""Packs a wheel once both commands have seen that nobody has packed it."""
+
+
+@pytest.mark.process
+def test_two_commands_that_pack_the_same_wheel_send_the_same(made, tmp_path):
+    path, locked = made("navlib")
+    meeting = tmp_path / "meeting"
+    meeting.mkdir()
+    command = [sys.executable, "-c", PACK, path, json.dumps(dataclasses.asdict(locked)), meeting]
+    commands = [subprocess.Popen(command, stdout=subprocess.PIPE) for _ in range(2)]
+    told = [json.loads(each.communicate(timeout=120.0)[0]) for each in commands]
+
+    assert told[0] == told[1]
+    sent_path, sha256 = told[0]
+    assert hashlib.sha256(Path(sent_path).read_bytes()).hexdigest() == sha256
+
+
+def test_packed_wheel_that_lost_its_note_is_packed_anew(made):
+    path, locked = made("navlib")
+    sent = sent_wheel(path, locked, OTHER)
+    (sent.path.parent / "sent.json").unlink()
+
+    assert sent_wheel(path, locked, OTHER) == sent
+
+
+def test_wheel_that_another_command_packs_without_end_is_told_with_who_it_is(made, monkeypatch):
+    monkeypatch.setattr(sent_wheels, "LOCK_TIMEOUT_S", 0.0)
+    path, locked = made("navlib")
+    with (
+        file_lock.locked(path.parent / "sent.lock", timeout_s=1.0),
+        pytest.raises(
+            MachineFailure, match=f"packs {locked.filename}.*pid {os.getpid()}"
+        ) as failed,
+    ):
+        sent_wheel(path, locked, OTHER)
+
+    assert failed.value.kind is FailureKind.BUSY

@@ -171,6 +171,13 @@ def test_links_that_lead_outside_or_nowhere_are_refused_by_name(folder, target):
         the_tree(folder)
 
 
+def test_link_to_itself_is_refused_by_name(folder):
+    (folder / "link").symlink_to("link")
+
+    with pytest.raises(InputError, match=r"link: cannot be read: Too many levels"):
+        the_tree(folder)
+
+
 def test_too_large_a_folder_is_refused_with_what_makes_it_large(folder, monkeypatch):
     monkeypatch.setattr(trees, "TREE_BYTES_MAX", 1000)
     (folder / "huge.bin").write_bytes(bytes(1001))

@@ -1,5 +1,6 @@
 """Environments are resolved and fetched on the operator's machine, from any index, once."""
 
+import errno
 import json
 import os
 import subprocess
@@ -21,6 +22,7 @@ from cosmos_cli.provision.wheelhouse import (
     prepare,
     sees_system_packages,
 )
+from cosmos_cli.provision.wheels import remove_unused, requirements_of
 
 pytestmark = pytest.mark.process
 
@@ -156,6 +158,49 @@ def test_cache_forgets_what_was_not_used_for_long_when_something_new_comes(index
     assert {path.name for path in wheels.iterdir()} == {*needed, ".new-of-somebody"}
     assert len(list(locks.glob("*.json"))) == 2
     assert prepare(PI, ["pyproj"]).key == old.key
+
+
+def test_wheels_that_a_new_environment_takes_from_the_cache_are_kept_while_it_is_made(
+    index, tmp_path, monkeypatch
+):
+    wheels = tmp_path / "cache/wheels"
+    make_wheel(index, "pyproj")
+    prepare(PI, ["pyproj"])
+    for path in (tmp_path / "cache/locks").glob("*"):
+        path.unlink()
+    for path in wheels.iterdir():
+        age(path, 91)
+
+    def clear_as_another_command(path):
+        remove_unused(tmp_path / "cache", now_s=time.clock_gettime(time.CLOCK_REALTIME))
+        return requirements_of(path)
+
+    monkeypatch.setattr(wheelhouse, "requirements_of", clear_as_another_command)
+    again = prepare(PI, ["pyproj"])
+
+    assert all(again.wheel(wheel).is_file() for wheel in again.lock)
+
+
+def test_cache_that_cannot_be_written_is_told_as_this_computers_fault(index, tmp_path, monkeypatch):
+    monkeypatch.setenv("COSMOS_CACHE", str(tmp_path / "taken"))
+    (tmp_path / "taken").touch()
+
+    with pytest.raises(
+        MachineFailure, match="cache of this computer.*taken.*COSMOS_CACHE"
+    ) as failed:
+        prepare(PI, [])
+
+    assert failed.value.kind is FailureKind.STEP
+
+
+def test_full_disk_under_the_cache_is_told_as_this_computers_fault(index, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(wheelhouse, "write_whole", refuse)
+
+    with pytest.raises(MachineFailure, match="cache of this computer.*No space left"):
+        prepare(PI, [])
 
 
 def test_key_needs_no_wheels(index, no_process):

@@ -53,6 +53,14 @@ def test_a_folders_scenarios_are_found_and_what_is_none_is_counted(folder):
     assert found.faults == []
 
 
+def test_a_link_to_itself_is_no_scenario(folder):
+    before = find_scenarios([folder])
+    (folder / "loop.yaml").symlink_to("loop.yaml")
+    found = find_scenarios([folder])
+
+    assert found.outlines == before.outlines
+
+
 def test_the_copies_that_runs_keep_and_installed_packages_are_no_tests(folder):
     for place in ("runs/0001-a", "runs/tests/0002-a", "venv"):
         copy = folder / place / "flown/a.yaml"
