@@ -531,6 +531,15 @@ def test_commands_before_the_first_tick_are_refused(tmp_path):
         ("class G: pass", "at least one of the methods setup, step"),
         ("class G:\n    def __init__(self, x): pass\n    def step(self, t, r): pass", "arguments"),
         ("class G:\n    def step(self, t_s): pass", r"step\(\) must take \(self, t_s, readings\)"),
+        (
+            "class G:\n    async def step(self, t_s, readings): pass",
+            r"step\(\) must be a plain def",
+        ),
+        ("class G:\n    def step(self, t_s, readings): yield", r"step\(\) must not yield"),
+        (
+            "class G:\n    async def receive(self, message): pass",
+            r"receive\(\) must be a plain def",
+        ),
         ("class H: pass", "no 'G'|has no"),
         ("import no_such_module_here", "no_such_module_here"),
     ],
@@ -538,6 +547,12 @@ def test_commands_before_the_first_tick_are_refused(tmp_path):
 def test_what_is_no_flight_software_is_named_at_set_up(tmp_path, text, words):
     with pytest.raises(BlamedError, match=f"parameters.flight: .*({words})"):
         Ship(tmp_path, text)
+
+
+def test_what_is_cut_off_a_long_sentence_is_counted(tmp_path):
+    ship = Ship(tmp_path, body("self.context.log('info', 'x' * 2005)")).run(0.1)
+
+    assert ship.context.logs[0] == ("info", "x" * 2000 + "... (5 more characters)")
 
 
 def test_a_vehicle_that_only_coasts_counts_what_nobody_hears(tmp_path):
