@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from constellation_fakes import WALKER, FakeContext, parameters, tell, tick
 
-from madns_runtime.errors import BlamedError
+from madns_runtime.errors import BlamedError, MachineError
 from madns_runtime.plugin.api import Tick
 from madns_runtime.plugin.context import describe_exception
 from madns_runtime.protocol.messages import Service
@@ -505,6 +505,28 @@ def test_an_error_names_class_method_file_and_line_once(tmp_path):
 
     told = describe_exception(caught.value, "ConstellationAgent.step")
     assert told == "G.step raised ZeroDivisionError: division by zero (guidance.py:7)"
+
+
+@pytest.mark.parametrize(
+    "kind", ["KeyboardInterrupt", "GeneratorExit", "SystemExit", "BaseException"]
+)
+def test_whatever_it_raises_is_blamed_on_its_own_line(tmp_path, kind):
+    ship = Ship(tmp_path, body(f"raise {kind}('enough')"))
+
+    with pytest.raises(BlamedError, match=rf"^G.step raised {kind}: enough \(guidance.py:5\)$"):
+        ship.run(0.1)
+
+
+def test_a_disk_that_is_full_is_not_blamed_on_it(tmp_path):
+    ship = Ship(tmp_path, body("self.context.estimate({'a_m': 1.0})"))
+
+    def refuse(name, fields):
+        raise MachineError("estimates.jsonl: cannot record there: No space left on device")
+
+    ship.context.open_stream = refuse
+
+    with pytest.raises(MachineError, match=r"^estimates.jsonl: cannot record there"):
+        ship.run(0.1)
 
 
 def test_what_making_it_raises_is_blamed_on_its_own_line(tmp_path):
