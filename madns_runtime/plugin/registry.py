@@ -36,6 +36,7 @@ from madns_runtime.plugin.code_places import (
     line_in,
     told_place,
 )
+from madns_runtime.plugin.deferred_calls import deferral_fault
 from madns_runtime.plugin.descriptor_faults import descriptor_faults
 from madns_runtime.plugin.entry_points import place_of_name, registered
 from madns_runtime.plugin.isolation import is_interruption, missing_extra, said
@@ -363,6 +364,9 @@ def _contract_faults(half: Any, role: Role) -> list[str]:
         wanted = tuple(inspect.signature(agreed).parameters)
         if callable(method) and not _takes(method, wanted):
             faults.append(f"{name}() must take ({', '.join(wanted)})")
+    for name in (each for each in vars(contract) if not each.startswith("_")):
+        if fault := deferral_fault(getattr(half, name, None)):
+            faults.append(f"{name}() {fault}")
     if not _takes(half, ()):
         faults.append("it must be made without arguments; take what it needs in setup()")
     return faults

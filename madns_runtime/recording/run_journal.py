@@ -86,10 +86,10 @@ class RunJournal:
         """
         if not isinstance(text, str):
             raise PluginError(f"log: expected a text, got {type(text).__name__}; str() it")
-        number = LOG_LEVELS.get(level)
+        number = LOG_LEVELS.get(level) if isinstance(level, str) else None
         if number is None:
             raise PluginError(
-                f"unknown log level {level!r}; expected one of {', '.join(LOG_LEVELS)}"
+                f"unknown log level {level!r:.80}; expected one of {', '.join(LOG_LEVELS)}"
             )
         if number < self._level:
             return

@@ -535,6 +535,25 @@ TALK = [sys.executable, "-c", "import sys\nfor line in sys.stdin: print('A', flu
         ("feed", "return None", "Wrong.feed: expected a list of FlightAnswer, got None"),
         ("feed", "return ['x']", r"Wrong.feed: expected a list of FlightAnswer, got \['x'\]"),
         ("feed", "raise ValueError('odd')", r"Wrong.feed raised ValueError: odd \(own.py:2\d\)"),
+        *[
+            (
+                "feed",
+                f"return [FlightAnswer({part}={given})]",
+                rf"Wrong.feed: expected FlightAnswer.{part} to be",
+            )
+            for part, given in (
+                ("t_s", "'now'"),
+                ("commands", "None"),
+                ("commands", "('burn',)"),
+                ("sends", "(('agent-02', 1, 2),)"),
+                ("logs", "('hello',)"),
+                ("board_us", "'1'"),
+                ("fault", "None"),
+                ("source", "'text'"),
+            )
+        ],
+        ("feed", "raise KeyboardInterrupt", r"Wrong.feed raised KeyboardInterrupt \(own.py:2\d\)"),
+        ("__init__", "pass", r"interface.protocol: own.py:Wrong: making it, .* raised TypeError"),
         ("tick", "return 'T'", "Wrong.tick: expected a list of bytes, got 'T'"),
         ("tick", "return b'T'", "Wrong.tick: expected a list of bytes, got b'T'"),
         ("setup", "return {}['x']", r"Wrong.setup raised KeyError: 'x' \(own.py:2\d\)"),

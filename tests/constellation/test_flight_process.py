@@ -20,6 +20,7 @@ from madns_runtime.simulations.constellation.flight import process
 from madns_runtime.simulations.constellation.flight.asked_ticks import UNANSWERED_MAX
 from madns_runtime.simulations.constellation.flight.interface import arrival_thread, transport
 from madns_runtime.simulations.constellation.flight.interface import program as flight_program
+from madns_runtime.simulations.constellation.flight.interface.local_transports import StdioLink
 from madns_runtime.simulations.constellation.flight.process import LATE_CHECK
 from madns_runtime.simulations.constellation.messages import (
     Command,
@@ -523,3 +524,21 @@ def test_the_example_in_c_holds_its_semi_major_axis(tmp_path):
     reached_m = 1.0 / (2.0 / CIRCULAR[0] - after_m_s**2 / mu)
     assert reached_m == pytest.approx(7_160_000, abs=2.0)
     assert ship.summary["exit_code"] == 0
+
+
+def test_its_end_closes_no_descriptor_that_somebody_else_has_by_then(tmp_path):
+    process = flight_program.FlightProgram(["sh", "-c", "cat; sleep 0.1"], tmp_path)
+    way = StdioLink("stdio")
+    way.use(*process.pipes)
+    number = process.pipes[1]
+    null_fd = os.open(os.devnull, os.O_RDONLY)
+
+    def read():
+        os.dup2(null_fd, number)  # as a writer of records may get it for a file of its own
+
+    code = process.end(way.close_input, read)
+    os.close(null_fd)
+
+    assert code == 0
+    assert os.fstat(number).st_rdev == os.stat(os.devnull).st_rdev
+    os.close(number)

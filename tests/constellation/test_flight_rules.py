@@ -115,6 +115,19 @@ FAULTS_OF_FLIGHT = [
         "${address}, got ${nmae}; $${ stands for ${ itself",
     ),
     (program(environment={"A": "${pty}"}), "parameters.flight.environment.A: expected one of"),
+    (
+        program(environment={"A=B": "x"}),
+        "parameters.flight.environment: expected the name of a variable, without '=' in it, got 'A=B'",
+    ),
+    (program(environment={"": "x"}), "parameters.flight.environment: expected the name of a var"),
+    (
+        program(environment={"A": "x\0y"}),
+        "parameters.flight.environment.A: expected a text without null characters",
+    ),
+    (
+        {"command": [sys.executable, "x\0y"]},
+        "parameters.flight.command[1]: expected a text without null characters",
+    ),
     ({"interface": {}}, "parameters.flight.interface.transport: stdio is that of a program"),
     (
         {"interface": {"transport": TCP, "protocol": "morse"}},

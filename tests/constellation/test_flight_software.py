@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from constellation_fakes import WALKER, FakeContext, parameters, tell, tick
 
-from madns_runtime.errors import BlamedError
+from madns_runtime.errors import BlamedError, MachineError
 from madns_runtime.plugin.api import Tick
 from madns_runtime.plugin.context import describe_exception
 from madns_runtime.protocol.messages import Service
@@ -507,6 +507,28 @@ def test_an_error_names_class_method_file_and_line_once(tmp_path):
     assert told == "G.step raised ZeroDivisionError: division by zero (guidance.py:7)"
 
 
+@pytest.mark.parametrize(
+    "kind", ["KeyboardInterrupt", "GeneratorExit", "SystemExit", "BaseException"]
+)
+def test_whatever_it_raises_is_blamed_on_its_own_line(tmp_path, kind):
+    ship = Ship(tmp_path, body(f"raise {kind}('enough')"))
+
+    with pytest.raises(BlamedError, match=rf"^G.step raised {kind}: enough \(guidance.py:5\)$"):
+        ship.run(0.1)
+
+
+def test_a_disk_that_is_full_is_not_blamed_on_it(tmp_path):
+    ship = Ship(tmp_path, body("self.context.estimate({'a_m': 1.0})"))
+
+    def refuse(name, fields):
+        raise MachineError("estimates.jsonl: cannot record there: No space left on device")
+
+    ship.context.open_stream = refuse
+
+    with pytest.raises(MachineError, match=r"^estimates.jsonl: cannot record there"):
+        ship.run(0.1)
+
+
 def test_what_making_it_raises_is_blamed_on_its_own_line(tmp_path):
     text = (
         "class G:\n    def __init__(self):\n        1 / 0\n    def step(self, t_s, readings): pass"
@@ -531,6 +553,15 @@ def test_commands_before_the_first_tick_are_refused(tmp_path):
         ("class G: pass", "at least one of the methods setup, step"),
         ("class G:\n    def __init__(self, x): pass\n    def step(self, t, r): pass", "arguments"),
         ("class G:\n    def step(self, t_s): pass", r"step\(\) must take \(self, t_s, readings\)"),
+        (
+            "class G:\n    async def step(self, t_s, readings): pass",
+            r"step\(\) must be a plain def",
+        ),
+        ("class G:\n    def step(self, t_s, readings): yield", r"step\(\) must not yield"),
+        (
+            "class G:\n    async def receive(self, message): pass",
+            r"receive\(\) must be a plain def",
+        ),
         ("class H: pass", "no 'G'|has no"),
         ("import no_such_module_here", "no_such_module_here"),
     ],
@@ -538,6 +569,12 @@ def test_commands_before_the_first_tick_are_refused(tmp_path):
 def test_what_is_no_flight_software_is_named_at_set_up(tmp_path, text, words):
     with pytest.raises(BlamedError, match=f"parameters.flight: .*({words})"):
         Ship(tmp_path, text)
+
+
+def test_what_is_cut_off_a_long_sentence_is_counted(tmp_path):
+    ship = Ship(tmp_path, body("self.context.log('info', 'x' * 2005)")).run(0.1)
+
+    assert ship.context.logs[0] == ("info", "x" * 2000 + "... (5 more characters)")
 
 
 def test_a_vehicle_that_only_coasts_counts_what_nobody_hears(tmp_path):

@@ -51,18 +51,19 @@ def test_a_propagator_of_ones_own_may_be_an_installed_module(folder):
     assert np.array_equal(found, propagate(orbits(), 0.0, np.array([1.0]), sgp4.parameters()))
 
 
-def test_what_a_propagator_of_ones_own_raises_is_told_with_its_line(folder):
+@pytest.mark.parametrize("kind", ["SystemExit", "KeyboardInterrupt", "ValueError"])
+def test_what_a_propagator_of_ones_own_raises_is_told_with_its_line(folder, kind):
     (folder / "own.py").write_text(
         "class Mine:\n"
         "    def propagate(self, states, t0_s, knots_s, parameters):\n"
         "        states[:] = 0.0\n"
-        "        raise SystemExit('no thrust')\n"
+        f"        raise {kind}('no thrust')\n"
     )
     states = orbits()
 
     with pytest.raises(
         BlamedError,
-        match=r"^own.py:Mine.propagate at 7 s raised SystemExit: no thrust \(own.py:4\)$",
+        match=rf"^own.py:Mine.propagate at 7 s raised {kind}: no thrust \(own.py:4\)$",
     ):
         propagate(states, 7.0, np.array([8.0]), make_kind("custom", folder).parameters())
 

@@ -170,6 +170,15 @@ def test_days_of_fast_ticks_lose_no_sample():
     assert all("clock" in reading for reading in bench.run(range(first, first + 500), hz=hz))
 
 
+def test_measurements_still_under_way_at_the_end_are_counted():
+    bench = Bench(clock={"rate_hz": HZ, "latency_s": 0.25}, sun_sensor={})
+    bench.run(range(10), LIT)
+
+    summary = bench.suite.summary()
+    assert summary["clock"] == {"samples": 7, "dropped": 0, "blind": 0, "under_way": 3}
+    assert "under_way" not in summary["sun_sensor"]
+
+
 def test_latency_delays_a_measurement_and_keeps_its_time():
     bench = Bench(clock={"rate_hz": 5.0, "latency_s": 0.25})
 

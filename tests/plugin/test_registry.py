@@ -294,6 +294,27 @@ def test_method_with_other_parameters_is_refused(write, tmp_path):
     assert "step() must take (self, tick)" in message
 
 
+@pytest.mark.parametrize(
+    ("method", "words"),
+    [
+        ("async def step(self, tick): pass", "step() must be a plain def: nobody awaits it"),
+        ("def step(self, tick): yield", "step() must not yield: nobody asks it for values"),
+        ("async def hear(self, delivery): yield", "hear() must not yield"),
+    ],
+)
+def test_method_whose_call_runs_nothing_is_refused(write, tmp_path, method, words):
+    message = half_refusal(
+        write,
+        tmp_path,
+        f"""
+        class Agent(AgentSimulation):
+            {method}
+        """,
+    )
+
+    assert words in message
+
+
 def test_class_with_arguments_is_refused(write, tmp_path):
     message = half_refusal(
         write,

@@ -458,9 +458,13 @@ def test_verbosity_decides_what_is_logged(tmp_path, verbosity, expected):
     assert all(record["t_s"] == 1.5 and record["utc"].endswith("Z") for record in records)
 
 
-def test_unknown_level_is_refused(tmp_path):
-    with pytest.raises(PluginError, match="unknown log level 'warn'; expected one of critical"):
-        make_journal(tmp_path).log("warn", "x", None)
+@pytest.mark.parametrize(
+    ("level", "told"),
+    [("warn", "'warn'"), (["info"], r"\['info'\]"), ({}, "{}"), ("w" * 1000, "'w{79}")],
+)
+def test_unknown_level_is_refused(tmp_path, level, told):
+    with pytest.raises(PluginError, match=f"unknown log level {told}; expected one of critical"):
+        make_journal(tmp_path).log(level, "x", None)
 
 
 def test_log_takes_text_that_is_no_unicode(tmp_path):

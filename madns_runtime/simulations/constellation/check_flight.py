@@ -129,8 +129,18 @@ def _substitution_faults(field: str, rule: FlightProcess) -> Iterator[str]:
     known = (*NAMES, *(PLACES if is_pty else PLACES[:1]))
     for number, word in enumerate(rule.command):
         yield from substitution_faults(f"{field}.command[{number}]", word, known)
+        yield from _null_faults(f"{field}.command[{number}]", word)
     for name, text in rule.environment.items():
         yield from substitution_faults(f"{field}.environment.{name}", text, known)
+        yield from _null_faults(f"{field}.environment.{name}", text)
+        if not name or "=" in name or "\0" in name:
+            yield f"{field}.environment: expected the name of a variable, without '=' in it, got {name!r:.80}"
+
+
+def _null_faults(field: str, text: str) -> Iterator[str]:
+    """Yield what no program can be given."""
+    if "\0" in text:
+        yield f"{field}: expected a text without null characters, got {text!r:.80}"
 
 
 def _interface_faults(

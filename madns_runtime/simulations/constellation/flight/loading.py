@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from madns_runtime.errors import BlamedError, PluginError
+from madns_runtime.plugin.deferred_calls import deferral_fault
 from madns_runtime.plugin.registry import load_function
 from madns_runtime.simulations.constellation.flight.api import FlightSoftware
 
@@ -52,6 +53,8 @@ def contract_faults(found: Any) -> list[str]:
     except ValueError:  # a class written in C tells no signature
         return []
     for name in there:
+        if fault := deferral_fault(getattr(found, name)):
+            faults.append(f"{name}() {fault}")
         wanted = list(inspect.signature(getattr(FlightSoftware, name)).parameters)
         try:
             inspect.signature(getattr(found, name)).bind(*wanted)

@@ -170,7 +170,10 @@ class VehicleContext:
 
     def log(self, level: str, text: str) -> None:
         """Log a sentence."""
-        self._context.log(level, str(text)[:LOG_CHARACTERS_MAX])
+        told = str(text)
+        if (rest := len(told) - LOG_CHARACTERS_MAX) > 0:
+            told = f"{told[:LOG_CHARACTERS_MAX]}... ({rest} more characters)"
+        self._context.log(level, told)
 
     # What the vehicle itself calls -------------------------------------------------------------
 

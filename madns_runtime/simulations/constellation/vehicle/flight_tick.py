@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from madns_runtime.errors import BlamedError, PluginError
+from madns_runtime.errors import BlamedError, MachineError, PluginError
 from madns_runtime.plugin import validation
 from madns_runtime.plugin.api import AgentContext
 from madns_runtime.plugin.context import describe_exception
@@ -249,9 +249,9 @@ class Cockpit:
     def _call(self, name: str, method: Callable[..., Any], *arguments: Any) -> Any:
         try:
             return method(*arguments)
-        except BlamedError:
+        except (BlamedError, MachineError):  # a full disk: no fault of flight software's
             raise
-        except (Exception, SystemExit) as error:
+        except BaseException as error:  # it may raise anything
             raise BlamedError(describe_exception(error, f"{self._name}.{name}")) from error
 
 

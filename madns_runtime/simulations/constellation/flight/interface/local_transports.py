@@ -33,13 +33,10 @@ class StdioLink(StreamTransport):
         """Wait for the program."""
 
     def close_input(self) -> None:
-        """Close the program's standard input alone."""
+        """Leave the program's standard input to the program's owner, who closes it: another would close it twice."""
         self._waiting.clear()
         self._is_over = True
-        if self._out >= 0:
-            with contextlib.suppress(OSError):
-                os.close(self._out)
-            self._out = -1
+        self._out = -1
 
     def push(self) -> None:
         """Send what waits."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from madns_runtime.errors import BlamedError, PluginError
+from madns_runtime.plugin.context import describe_exception
 from madns_runtime.plugin.registry import load_function
 from madns_runtime.simulations.constellation import interface_settings as settings
 from madns_runtime.simulations.constellation.flight.interface.answers import FlightAnswer
@@ -74,9 +75,9 @@ def make_protocol(name: str, base_directory: Path) -> FlightProtocol:
         protocol = (made or load_function(name, base_directory))()
     except PluginError as error:
         raise BlamedError(f"interface.protocol: {error}") from error
-    except Exception as error:
+    except BaseException as error:  # of a user's class
         raise BlamedError(
-            f"interface.protocol: {name}: it must be made without arguments: {error}"
+            f"interface.protocol: {describe_exception(error, f'{name}: making it, without arguments,')}"
         ) from error
     lacking = [each for each in METHODS if not callable(getattr(protocol, each, None))]
     if lacking:

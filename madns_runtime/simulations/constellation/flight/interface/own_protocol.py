@@ -4,13 +4,37 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 from madns_runtime.errors import BlamedError
-from madns_runtime.plain_values import is_real
+from madns_runtime.plain_values import is_real, is_whole
 from madns_runtime.plugin.context import describe_exception
-from madns_runtime.simulations.constellation.flight.interface.answers import FlightAnswer
+from madns_runtime.simulations.constellation.flight.interface.answers import (
+    CommandRequest,
+    FlightAnswer,
+)
 from madns_runtime.simulations.constellation.flight.interface.reports import SetupReport, TickReport
+
+
+def _are_pairs(given: Any) -> bool:
+    kinds = list | tuple
+    return isinstance(given, kinds) and all(isinstance(x, kinds) and len(x) == 2 for x in given)
+
+
+def _are_commands(given: Any) -> bool:
+    return isinstance(given, list | tuple) and all(isinstance(x, CommandRequest) for x in given)
+
+
+PARTS: Final[Mapping[str, tuple[str, Callable[[Any], bool]]]] = {
+    "t_s": ("a number or None", lambda given: given is None or is_real(given)),
+    "commands": ("a list of CommandRequest", _are_commands),
+    "sends": ("a list of pairs", _are_pairs),
+    "logs": ("a list of pairs", _are_pairs),
+    "board_us": ("a whole number", is_whole),
+    "fault": ("a text", lambda given: isinstance(given, str)),
+    "source": ("bytes", lambda given: isinstance(given, bytes)),
+}
+"""Parts of an answer that are no values for flight software to command: what they are to be, and whether they are."""
 
 
 class OwnProtocol:
@@ -61,6 +85,11 @@ class OwnProtocol:
         told = self._called("feed", self._protocol.feed, data)
         if not isinstance(told, list | tuple) or not all(isinstance(x, FlightAnswer) for x in told):
             raise self._wrong("feed", "a list of FlightAnswer", told)
+        for answer in told:
+            for part, (expected, is_right) in PARTS.items():
+                given = getattr(answer, part)
+                if not is_right(given):
+                    raise self._wrong("feed", f"FlightAnswer.{part} to be {expected}", given)
         return told
 
     def _packets(self, method: str, call: Callable[[Any], Any], report: Any) -> Sequence[bytes]:
@@ -73,7 +102,7 @@ class OwnProtocol:
     def _called(self, method: str, call: Callable[[Any], Any], argument: Any) -> Any:
         try:
             return call(argument)
-        except Exception as error:  # of a user's class: told by its name
+        except BaseException as error:  # of a user's class: told by its name
             raise BlamedError(describe_exception(error, f"{self._name}.{method}")) from error
 
     def _wrong(self, method: str, expected: str, told: Any) -> BlamedError:

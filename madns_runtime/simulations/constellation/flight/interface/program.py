@@ -15,6 +15,7 @@ import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from time import monotonic
+from typing import IO
 
 from madns_runtime.errors import BlamedError
 from madns_runtime.plugin.context import clean_text
@@ -148,21 +149,24 @@ class FlightProgram:
         still writes meanwhile is read and kept.
 
         Args:
-            close_input: Closes the way to it.
+            close_input: Closes the way to it, but for its standard input, which is closed here.
             read: Reads what it says on the way to the vehicle: it may not be able to end before its words are read.
             is_patient: False kills it at once.
         """
         process = self._process
-        gentle = (close_input, process.terminate) if is_patient else ()
+
+        def end_input() -> None:
+            close_input()
+            _close(process.stdin)
+
+        gentle = (end_input, process.terminate) if is_patient else ()
         if not any(self._goes_by_itself(stop, read) for stop in gentle):
             self._kill_all()
             self._has_gone_within(END_S, read)
         self._kill_all()  # what it started and left behind
         self._err.read()
-        for stream in (process.stdin, process.stdout):
-            if stream is not None:
-                with contextlib.suppress(OSError):
-                    stream.close()
+        _close(process.stdin)
+        _close(process.stdout)
         self._err.close()
         return process.returncode
 
@@ -198,6 +202,13 @@ class FlightProgram:
         """Kill it and what it started: they are a group of their own."""
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
+
+
+def _close(stream: IO[bytes] | None) -> None:
+    """Close a pipe; once more is nothing, however its descriptor's number is used by then."""
+    if stream is not None:
+        with contextlib.suppress(OSError):
+            stream.close()
 
 
 def wait_for(fds: Sequence[int], timeout_s: float) -> None:

@@ -42,7 +42,7 @@ class Custom:
         propagator = load_custom(settings.implementation, parameters.base_directory)
         try:
             return propagator.propagate(states.copy(), t0_s, knots_s.copy(), parameters)
-        except (Exception, SystemExit) as error:  # a class of one's own may raise anything
+        except BaseException as error:  # a class of one's own may raise anything
             doing = f"{settings.implementation}.propagate at {t0_s:g} s"
             raise BlamedError(describe_exception(error, doing)) from error
 
@@ -62,7 +62,7 @@ def load_custom(implementation: str, base_directory: str) -> Propagator:
     made = load_function(implementation, Path(base_directory))
     try:
         propagator: Propagator = made()
-    except Exception as error:  # noqa: BLE001 - a class of one's own may raise anything
+    except BaseException as error:  # noqa: BLE001 - a class of one's own may raise anything
         raise BlamedError(describe_exception(error, implementation)) from error
     if not callable(getattr(propagator, "propagate", None)):
         raise BlamedError(

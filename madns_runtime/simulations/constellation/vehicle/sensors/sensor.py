@@ -125,7 +125,9 @@ class Sensor:
 
     def counts(self) -> dict[str, int]:
         """Return what became of its measurements."""
-        return {"samples": self.samples, "dropped": self.dropped, "blind": self.blind}
+        counts = {"samples": self.samples, "dropped": self.dropped, "blind": self.blind}
+        under_way = len(self._pending)
+        return counts | ({"under_way": under_way} if under_way else {})
 
     def read(self, tick: int, t_s: float) -> Reading | None:
         """Return the newest measurement that has become known by *t_s*, and record all that have."""
