@@ -15,6 +15,20 @@ CAME_BACK: Final = (
 """Said of a plug-in's method: two processes would go on as the same one."""
 _exit = os._exit
 """The true one: a plug-in may put another in its place."""
+_generation = 0
+
+
+def generation() -> int:
+    """Return how many forks by Python lie between this process and its first one; costs no system call."""
+    return _generation
+
+
+def _count_fork() -> None:
+    global _generation  # noqa: PLW0603 - it is the process's
+    _generation += 1
+
+
+os.register_at_fork(after_in_child=_count_fork)
 
 
 def leave_parent(keep: set[int]) -> None:

@@ -19,7 +19,7 @@ from types import FrameType
 from typing import Any
 
 from madns_runtime.errors import MachineError
-from madns_runtime.reactor.forking import CAME_BACK, end_child
+from madns_runtime.reactor.forking import CAME_BACK, end_child, generation
 from madns_runtime.reactor.libc import IS_LINUX
 from madns_runtime.reactor.poller import EpollPoller, Poller, SelectorPoller
 from madns_runtime.reactor.timers import Timer, TimerQueue
@@ -108,6 +108,7 @@ class Reactor:
 
     def __init__(self, *, portable: bool = False) -> None:
         self._pid = os.getpid()
+        self._generation = generation()
         self.is_portable = portable or not IS_LINUX
         self._poller: Poller = SelectorPoller() if self.is_portable else EpollPoller()
         self._readers: dict[int, Callback] = {}
@@ -224,6 +225,11 @@ class Reactor:
         self._poller.close()
         for fd in {self._wake_read_fd, self._wake_write_fd}:
             os.close(fd)
+
+    def end_if_forked(self) -> None:
+        """As `end_if_stray`, often and without a system call; a fork that Python did not do is found by that alone."""
+        if generation() != self._generation:
+            self.end_if_stray()
 
     def end_if_stray(self) -> None:
         """End this process if it was forked in a callback and came back from it: two would run one loop."""

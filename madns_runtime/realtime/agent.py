@@ -141,7 +141,7 @@ class AgentRunner:
         calls = TickCalls(
             prepare=self._prepare_tick if has_inputs else None,
             step=self._half.simulation.step,
-            came_back=self._reactor.end_if_stray,
+            came_back=self._reactor.end_if_forked,
             failed=self._step_failed,
             ended=self._ticks_over,
             is_running=self._is_running,
@@ -184,7 +184,7 @@ class AgentRunner:
                 self._receive(message)
             except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
                 self._fail(self._half.failure("receive", error))
-            self._reactor.end_if_stray()
+            self._reactor.end_if_forked()
             calls[METHOD] = IDLE
             if not self._port.must_flush:
                 return
@@ -386,7 +386,7 @@ class AgentRunner:
             self._fail(failure)
             return None
         finally:
-            self._reactor.end_if_stray()
+            self._reactor.end_if_forked()
             self._calls[METHOD] = IDLE
 
     def _fail(self, failure: HalfFailed) -> None:
