@@ -65,6 +65,11 @@ def is_interruption(error: BaseException) -> bool:
     return isinstance(error, KeyboardInterrupt) and is_heard
 
 
+def is_from_outside(error: BaseException) -> bool:
+    """Tell whether an error that left a plug-in's code is none of its own: somebody's Ctrl-C, or the end of its time."""
+    return isinstance(error, PluginStopped) or is_interruption(error)
+
+
 def missing_extra(error: BaseException) -> MissingExtraError | None:
     """Return the error that names the command to install what is missing; None if it is something else."""
     if not isinstance(error, ModuleNotFoundError):

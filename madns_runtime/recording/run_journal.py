@@ -72,7 +72,7 @@ class RunJournal:
         """Log a sentence of the framework's own, now."""
         self.log(level, text, self._now_s())
 
-    def log(self, level: str, text: str, t_s: float | None = None) -> None:
+    def log(self, level: object, text: object, t_s: float | None = None) -> None:
         """
         Log a sentence, if it is loud enough for recording.verbosity.
 

@@ -17,6 +17,7 @@ import pytest
 from test_flight_process import HZ, Ship, patience  # noqa: F401 - a fixture
 
 from madns_runtime.errors import BlamedError
+from madns_runtime.plugin import isolation
 from madns_runtime.plugin.device_view import ChannelFrame
 from madns_runtime.simulations.constellation.flight.asked_ticks import UNANSWERED_MAX
 from madns_runtime.simulations.constellation.flight.interface.socket_transports import resolve_both
@@ -559,7 +560,12 @@ TALK = [sys.executable, "-c", "import sys\nfor line in sys.stdin: print('A', flu
         ("setup", "return {}['x']", r"Wrong.setup raised KeyError: 'x' \(own.py:2\d\)"),
     ],
 )
-def test_what_a_protocol_of_ones_own_does_wrong_is_told_by_its_name(tmp_path, method, body, told):
+def test_what_a_protocol_of_ones_own_does_wrong_is_told_by_its_name(
+    tmp_path, method, body, told, monkeypatch
+):
+    monkeypatch.setattr(
+        isolation, "is_interruption", lambda error: False
+    )  # as in an agent's process
     (tmp_path / "own.py").write_text(OWN.replace("METHOD", method).replace("BODY", body))
     flight = attached({"kind": "stdio"}, "own.py:Wrong") | {"command": TALK}
 

@@ -9,8 +9,10 @@ import pytest
 from constellation_fakes import WALKER, FakeContext, parameters, tell, tick
 
 from madns_runtime.errors import BlamedError, MachineError
+from madns_runtime.plugin import isolation
 from madns_runtime.plugin.api import Tick
 from madns_runtime.plugin.context import describe_exception
+from madns_runtime.plugin.time_limit import PluginStopped
 from madns_runtime.protocol.messages import Service
 from madns_runtime.simulations.constellation.agent import ConstellationAgent
 from madns_runtime.simulations.constellation.messages import (
@@ -510,10 +512,22 @@ def test_an_error_names_class_method_file_and_line_once(tmp_path):
 @pytest.mark.parametrize(
     "kind", ["KeyboardInterrupt", "GeneratorExit", "SystemExit", "BaseException"]
 )
-def test_whatever_it_raises_is_blamed_on_its_own_line(tmp_path, kind):
+def test_whatever_it_raises_is_blamed_on_its_own_line(tmp_path, kind, monkeypatch):
+    monkeypatch.setattr(
+        isolation, "is_interruption", lambda error: False
+    )  # as in an agent's process
     ship = Ship(tmp_path, body(f"raise {kind}('enough')"))
 
     with pytest.raises(BlamedError, match=rf"^G.step raised {kind}: enough \(guidance.py:5\)$"):
+        ship.run(0.1)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, PluginStopped])
+def test_ctrl_c_and_the_end_of_its_time_are_no_errors_of_it(tmp_path, error):
+    place = f"from {error.__module__} import {error.__name__} as stop"
+    ship = Ship(tmp_path, body(f"{place}\n        raise stop"))
+
+    with pytest.raises(error):
         ship.run(0.1)
 
 

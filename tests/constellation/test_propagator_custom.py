@@ -5,6 +5,7 @@ import pytest
 from propagator_kinds import OWN, make_kind, orbits
 
 from madns_runtime.errors import BlamedError, ConfigurationError, PluginError
+from madns_runtime.plugin import isolation
 from madns_runtime.simulations.constellation.parameters import CustomPropagator
 from madns_runtime.simulations.constellation.truth.propagation import propagate
 
@@ -52,7 +53,8 @@ def test_a_propagator_of_ones_own_may_be_an_installed_module(folder):
 
 
 @pytest.mark.parametrize("kind", ["SystemExit", "KeyboardInterrupt", "ValueError"])
-def test_what_a_propagator_of_ones_own_raises_is_told_with_its_line(folder, kind):
+def test_what_a_propagator_of_ones_own_raises_is_told_with_its_line(folder, kind, monkeypatch):
+    monkeypatch.setattr(isolation, "is_interruption", lambda error: False)  # as in its process
     (folder / "own.py").write_text(
         "class Mine:\n"
         "    def propagate(self, states, t0_s, knots_s, parameters):\n"

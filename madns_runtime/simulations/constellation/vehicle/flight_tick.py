@@ -20,6 +20,7 @@ from madns_runtime.errors import BlamedError, MachineError, PluginError
 from madns_runtime.plugin import validation
 from madns_runtime.plugin.api import AgentContext
 from madns_runtime.plugin.context import describe_exception
+from madns_runtime.plugin.isolation import is_from_outside
 from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.flight.api import (
     MASS,
@@ -252,6 +253,8 @@ class Cockpit:
         except (BlamedError, MachineError):  # a full disk: no fault of flight software's
             raise
         except BaseException as error:  # it may raise anything
+            if is_from_outside(error):
+                raise
             raise BlamedError(describe_exception(error, f"{self._name}.{name}")) from error
 
 

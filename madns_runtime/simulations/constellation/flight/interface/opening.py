@@ -9,6 +9,7 @@ from typing import Any, Final, Protocol
 
 from madns_runtime.errors import BlamedError, PluginError
 from madns_runtime.plugin.context import describe_exception
+from madns_runtime.plugin.isolation import is_from_outside
 from madns_runtime.plugin.registry import load_function
 from madns_runtime.simulations.constellation import interface_settings as settings
 from madns_runtime.simulations.constellation.flight.interface.answers import FlightAnswer
@@ -76,6 +77,8 @@ def make_protocol(name: str, base_directory: Path) -> FlightProtocol:
     except PluginError as error:
         raise BlamedError(f"interface.protocol: {error}") from error
     except BaseException as error:  # of a user's class
+        if is_from_outside(error):
+            raise
         raise BlamedError(
             f"interface.protocol: {describe_exception(error, f'{name}: making it, without arguments,')}"
         ) from error

@@ -9,6 +9,7 @@ from typing import Any, Final
 from madns_runtime.errors import BlamedError
 from madns_runtime.plain_values import is_real, is_whole
 from madns_runtime.plugin.context import describe_exception
+from madns_runtime.plugin.isolation import is_from_outside
 from madns_runtime.simulations.constellation.flight.interface.answers import (
     CommandRequest,
     FlightAnswer,
@@ -17,7 +18,7 @@ from madns_runtime.simulations.constellation.flight.interface.reports import Set
 
 
 def _are_pairs(given: Any) -> bool:
-    kinds = list | tuple
+    kinds = (list, tuple)
     return isinstance(given, kinds) and all(isinstance(x, kinds) and len(x) == 2 for x in given)
 
 
@@ -103,6 +104,8 @@ class OwnProtocol:
         try:
             return call(argument)
         except BaseException as error:  # of a user's class: told by its name
+            if is_from_outside(error):
+                raise
             raise BlamedError(describe_exception(error, f"{self._name}.{method}")) from error
 
     def _wrong(self, method: str, expected: str, told: Any) -> BlamedError:

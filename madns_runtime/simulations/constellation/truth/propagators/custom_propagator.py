@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from madns_runtime.errors import BlamedError
 from madns_runtime.plugin.context import describe_exception
+from madns_runtime.plugin.isolation import is_from_outside
 from madns_runtime.plugin.registry import load_function
 from madns_runtime.simulations.constellation.parameters import CustomPropagator
 from madns_runtime.simulations.constellation.truth.propagation import (
@@ -43,6 +44,8 @@ class Custom:
         try:
             return propagator.propagate(states.copy(), t0_s, knots_s.copy(), parameters)
         except BaseException as error:  # a class of one's own may raise anything
+            if is_from_outside(error):
+                raise
             doing = f"{settings.implementation}.propagate at {t0_s:g} s"
             raise BlamedError(describe_exception(error, doing)) from error
 
@@ -62,7 +65,9 @@ def load_custom(implementation: str, base_directory: str) -> Propagator:
     made = load_function(implementation, Path(base_directory))
     try:
         propagator: Propagator = made()
-    except BaseException as error:  # noqa: BLE001 - a class of one's own may raise anything
+    except BaseException as error:  # a class of one's own may raise anything
+        if is_from_outside(error):
+            raise
         raise BlamedError(describe_exception(error, implementation)) from error
     if not callable(getattr(propagator, "propagate", None)):
         raise BlamedError(
