@@ -310,6 +310,7 @@ class _Placing:
                 stream=held.stream, field=held.field, bounds=held.bounds(), unit=held.unit
             ),
             event=rule.event or "",
+            has_known_words=bool(around.streams.words(self._stream, self._field)),
             must=rule.must or "occur",
             after=rule.after or "",
             within_s=rule.within_s,

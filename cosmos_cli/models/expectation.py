@@ -48,6 +48,8 @@ class Expectation:
     meanwhile: HeldBounds | None = None
     event: str = ""
     """Word that a record holds in `field`; empty where values are judged."""
+    has_known_words: bool = False
+    """Whether all texts of `field` are known: then none that is looked for is misspelt."""
     must: Literal["occur", "not_occur"] = "occur"
     after: str = ""
     within_s: float | None = None

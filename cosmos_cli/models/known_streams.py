@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from cosmos_cli.models.document import did_you_mean
@@ -13,6 +13,7 @@ from madns_runtime.hardware.stream_schemas import DEVICE_CLOCK, DEVICE_STATE, sc
 from madns_runtime.plugin.api import DeclaredStream
 from madns_runtime.recording.records import (
     CLOCK,
+    DEVICE_EVENT_WORDS,
     EVENT_WORDS,
     EVENTS,
     HEALTH,
@@ -66,6 +67,10 @@ class KnownDevice:
     def known_streams(self) -> list[KnownStream]:
         """Return all that it records: its channels, and its own state."""
         own = {schema.name: schema.fields for schema in (DEVICE_STATE, DEVICE_CLOCK, EVENTS, LOG)}
+        own[EVENTS.name] = tuple(
+            replace(field, words=DEVICE_EVENT_WORDS) if field.name == "event" else field
+            for field in EVENTS.fields
+        )
         return [
             KnownStream(
                 role="device",
@@ -166,13 +171,23 @@ class KnownStreams:
 
     def word_fault(self, stream: str, field: str, word: object) -> str | None:
         """Return what is wrong with a text that is waited for in a field; None if it may come."""
-        words = WORDS.get((stream, field))
-        if words is None or not isinstance(word, str) or word in words:
+        words = self.words(stream, field)
+        if not words or not isinstance(word, str) or word in words:
             return None
         guess = did_you_mean(word, words)
         if stream == EVENTS.name and not guess.endswith("?"):
             guess += "; a simulation's own words stand in its own streams: name one under stream"
         return f"stream {stream} never holds {word!r:.40} in {field}{guess}"
+
+    def words(self, stream: str, field: str) -> tuple[str, ...]:
+        """Return all texts that a field ever holds; empty if any may come."""
+        if found := WORDS.get((stream, field)):
+            return found
+        known = []
+        for on in self.of(stream):
+            own = [each.words for each in on.fields if each.name == field]
+            known += own or ([()] if on.is_open else [])
+        return tuple(dict.fromkeys(word for words in known for word in words)) if all(known) else ()
 
     def field(self, stream: str, name: str) -> Field | None:
         """Return a field; None if it is not known."""

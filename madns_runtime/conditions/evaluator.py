@@ -14,12 +14,13 @@ class ConditionEvaluator:
         condition: What is waited for.
     """
 
-    __slots__ = ("_count", "_since_s", "condition", "is_met")
+    __slots__ = ("_since_s", "condition", "count", "is_met")
 
     def __init__(self, condition: Condition) -> None:
         self.condition = condition
         self.is_met = False
-        self._count = 0
+        self.count = 0
+        """Records in which it held, those of earlier incarnations with them."""
         self._since_s: float | None = None
 
     def take(self, t_s: float | None, value: object) -> float | None:
@@ -42,10 +43,10 @@ class ConditionEvaluator:
         at_s = 0.0 if t_s is None else t_s
         if self._since_s is None:
             self._since_s = at_s
-        self._count += 1
+        self.count += 1
         if condition.for_s > 0.0:
             return self.look(at_s)
-        if self._count < condition.times:
+        if self.count < condition.times:
             return None
         self.is_met = True
         return at_s
@@ -53,13 +54,13 @@ class ConditionEvaluator:
     @property
     def wants_earlier(self) -> bool:
         """Whether records of an earlier incarnation count, too, and there may be more of them."""
-        return 1 < self.condition.times > self._count
+        return 1 < self.condition.times > self.count
 
     def recall(self, t_s: float | None, value: object) -> None:
         """Count the value of a record of an earlier incarnation; what it meets is met by the next one."""
         condition = self.condition
         if condition.times > 1 and condition.is_at(t_s):
-            self._count += condition.bounds.holds(value)
+            self.count += condition.bounds.holds(value)
 
     def look(self, now_s: float) -> float | None:
         """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 from madns_runtime.conditions.condition import AGENT, HOST, TICK, TIME, Condition, conditions_of
@@ -24,9 +25,10 @@ class ConditionTap:
         tick_hz: Rate of agents' ticks: a record of a tick is of its time.
         now_s: Returns the simulated time, s, for records that tell none.
         report: Told of each condition that is met.
+        counted: Of an earlier incarnation in this process what `counts` returned: its records are not read again.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
         self,
         source: str,
         conditions: Sequence[Condition],
@@ -34,6 +36,7 @@ class ConditionTap:
         tick_hz: float,
         now_s: Callable[[], float | None],
         report: Report,
+        counted: Mapping[int, int] = MappingProxyType({}),
     ) -> None:
         self._source = source
         self._tick_hz = tick_hz
@@ -43,9 +46,16 @@ class ConditionTap:
         for condition in conditions_of(source, conditions):
             self._by_stream.setdefault(condition.stream, []).append(condition)
         self._lasting: list[tuple[str, ConditionEvaluator]] = []
+        self._counted = counted
+        self._counting: list[ConditionEvaluator] = []
 
     def __bool__(self) -> bool:
         return bool(self._by_stream)
+
+    def counts(self) -> dict[int, int]:
+        """Return by number of a condition that counts in how many records it held so far."""
+        own = {each.condition.number: each.count for each in self._counting}
+        return {**self._counted, **own}
 
     @property
     def must_look(self) -> bool:
@@ -111,6 +121,10 @@ class ConditionTap:
         earlier: Callable[[], Iterable[Mapping[str, Any]]],
     ) -> None:
         counting = [each for each in evaluators if each.wants_earlier]
+        self._counting += counting
+        for each in counting:
+            each.count = self._counted.get(each.condition.number, 0)
+        counting = [each for each in counting if each.condition.number not in self._counted]
         for record in earlier() if counting else ():
             t_s = when(record.get)
             for each in counting:

@@ -62,6 +62,7 @@ class AgentRunner:
         pack: Whom it ticks with.
         on_ended: Called once, with how it ended.
         on_killed: Called when a fault is to end it: with its name, why, and the time until its return, s.
+        counted: What conditions have counted in its earlier incarnation in this process.
 
     Raises:
         MachineError: It cannot record.
@@ -79,6 +80,7 @@ class AgentRunner:
         pack: Pack,
         on_ended: Callable[[str, AgentOutcome], None],
         on_killed: Callable[[str, str, float | None], None],
+        counted: Mapping[int, int],
     ) -> None:
         self.name = name = seat.name
         self._calls, self._seat = seat.calls.page, seat.number
@@ -94,7 +96,9 @@ class AgentRunner:
             process=process,
             on_due=self._session_due,
             report=lambda: self._report.ping(),
+            counted=counted,
         )
+        self.counted = self._port.conditions.counts
         self._session = self._port.session
         directory = Path(launch.directory) / "agents" / name
         files = RecordFiles(directory, run=config.run, source=name, life=program.life)

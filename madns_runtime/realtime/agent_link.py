@@ -38,6 +38,7 @@ class AgentPort:
         process: The socket, and the clock, of the agent's process.
         on_due: Called when the session's timer is due.
         report: Returns what a ping tells of the agent.
+        counted: What conditions have counted in its earlier incarnation in this process.
     """
 
     def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
@@ -50,6 +51,7 @@ class AgentPort:
         process: ProcessPort,
         on_due: Callable[[], None],
         report: Callable[[], Mapping[str, Any]],
+        counted: Mapping[int, int],
     ) -> None:
         config = launch.config
         self.process = process
@@ -85,6 +87,7 @@ class AgentPort:
             tick_hz=config.agents.tick_hz,
             now_s=self.t_s,
             report=self._condition_met,
+            counted=counted,
         )
         """What is waited for in this agent's records."""
         self.t0_host_s: float | None = None

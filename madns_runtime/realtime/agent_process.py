@@ -63,6 +63,8 @@ class AgentProcess:
         """Those of them that have ended and will return."""
         self._packs: dict[str, Pack] = {}
         self._lives: dict[str, int] = {}
+        self._counted: dict[str, dict[int, int]] = {}
+        """What conditions have counted of an agent: one that returns would read that in its records, while others wait."""
         self._is_ending = False
         self._grant: dict[str, Any] = {}
 
@@ -107,6 +109,7 @@ class AgentProcess:
             pack=self._packs[seat.name],
             on_ended=self._ended,
             on_killed=self._killed,
+            counted=self._counted.get(seat.name, {}),
         )
 
     # Faults that end an agent ---------------------------------------------------------------------
@@ -147,7 +150,7 @@ class AgentProcess:
         self._stop_if_done()
 
     def _ended(self, name: str, outcome: AgentOutcome) -> None:
-        del self._runners[name]
+        self._counted[name] = self._runners.pop(name).counted()
         self._outcomes[name] = outcome
         if name in self._dropped:
             self._outcomes[name] = replace(outcome, as_ordered=True, may_restart=False)

@@ -27,6 +27,8 @@ class Field:
     digits: int | None = None
     """Decimal places that are recorded of a float; None for all. In a stream that has such a field every other
     one is an int: `number_rows` then rounds and encodes many records at once."""
+    words: tuple[str, ...] = ()
+    """All texts that a field of kind str ever holds; empty where any may come. A check of another is refused before a run."""
 
 
 FIELD_KINDS = ("float", "int", "str", "bool", "json", "packed")
@@ -113,6 +115,11 @@ EVENT_WORDS = (
     "fault",
 )  # fmt: skip
 """All that `events` of agents and of the host's half hold in `event`: a simulation records its own in streams of its own."""
+
+DEVICE_EVENT_WORDS = (
+    "opened", "closed", "made_safe", "ending", "end", "fault", "error", "frozen", "refused", "underrun", "empty_reads",
+)  # fmt: skip
+"""All that `events` of a device hold in `event`."""
 
 DEVICE_LOSSES = "device_losses"
 """Of EVENT_WORDS, and key of an agent's account: what found no room between it and its devices."""

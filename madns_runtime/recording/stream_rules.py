@@ -89,7 +89,7 @@ def check_field(stream: str, field: Field) -> None:
 
     Raises:
         PluginError: Its name or unit is no text that can be written, tables have a column of that name for
-            themselves, or it has no such number of digits.
+            themselves, it has no such number of digits, or its words are no texts.
     """
     name: Any = field.name
     unit: Any = field.unit
@@ -107,4 +107,13 @@ def check_field(stream: str, field: Field) -> None:
     if places is not None and not (is_whole(places) and 0 <= places <= DIGITS_MAX):
         raise PluginError(
             f"stream {stream}: expected digits, 0 to {DIGITS_MAX}, or None of {name}, got {shown(places)}"
+        )
+    words: Any = field.words
+    if not (isinstance(words, tuple) and all(isinstance(word, str) for word in words)):
+        raise PluginError(
+            f"stream {stream}: expected words of {name} to be a tuple of texts, got {shown(words)}"
+        )
+    if words and field.kind != "str":
+        raise PluginError(
+            f"stream {stream}: {name} has words, and is of kind {field.kind}, not str"
         )

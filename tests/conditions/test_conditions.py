@@ -81,11 +81,10 @@ def test_a_condition_on_a_number_of_records_is_met_by_the_last_of_them():
     assert [evaluator.take(t, 11.0) for t in range(3)] == [None, None, 2.0]
 
 
-def tapped(conditions, source="a"):
+def tapped(conditions, source="a", **more):
     told = []
-    tap = ConditionTap(
-        source, conditions, tick_hz=10.0, now_s=lambda: 99.0, report=lambda *met: told.append(met)
-    )
+    report = lambda *met: told.append(met)  # noqa: E731
+    tap = ConditionTap(source, conditions, tick_hz=10.0, now_s=lambda: 99.0, report=report, **more)
     return tap, told
 
 
@@ -167,6 +166,30 @@ def test_a_number_of_records_is_counted_over_all_incarnations(tmp_path, schema):
 
     # The incarnation before met it; should the host not have heard of it, the next record tells.
     assert [met[2] for met in told] == [0.1]
+
+
+def test_who_returns_to_its_process_counts_on_without_reading_its_records():
+    told = []
+
+    def opened(counted):
+        counting = [condition(times=5), condition(number=1, stream="rest", times=2)]
+        tap, found = tapped(counting, counted=counted)
+        names = [field.name for field in DRIVE.fields]
+        return tap, found, tap.open("drive", names, lambda: pytest.fail("they are read again"))
+
+    tap, _ = tapped([condition(times=5)])
+    take = tap.open("drive", [field.name for field in DRIVE.fields])
+    for tick in range(3):
+        take((tick, 11.0))
+    counted = {**tap.counts(), 1: 1}
+    for life, met in ((2, 0), (3, 1)):
+        tap, told, take = opened(counted)
+        take((10 * life, 11.0))
+        take((10 * life + 1, 5.0))
+        assert len(told) == met
+        counted = tap.counts()
+
+    assert counted == {0: 5, 1: 1}, "of a stream that was not opened, too"
 
 
 def test_a_condition_that_counts_nothing_begins_anew_with_each_incarnation(tmp_path):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import madns_runtime
 from madns_runtime.faults.step_faults import HANG, SLOW
-from madns_runtime.recording.records import EVENT_WORDS
+from madns_runtime.recording.records import DEVICE_EVENT_WORDS, EVENT_WORDS
 from madns_runtime.timeline.dispatcher import BEGAN, ENDED, REFUSED, RESUMED
 
 
@@ -21,3 +21,13 @@ def test_all_words_of_events_are_known_and_no_others():
     written.update(f"{word}_{what}" for word in (HANG, SLOW) for what in ("begins", "ends"))
 
     assert set(EVENT_WORDS) == written
+
+
+def test_all_words_of_the_events_of_devices_are_known_and_no_others():
+    folder = Path(madns_runtime.__file__).parent / "hardware"
+    texts = [path.read_text("utf-8") for path in folder.rglob("*.py")]
+    written = {
+        word for text in texts for word in re.findall(r"(?:event|_tell)\(\s*\"(\w+)\"", text)
+    }
+
+    assert set(DEVICE_EVENT_WORDS) == {*written, "end"}  # which closing a journal records

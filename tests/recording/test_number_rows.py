@@ -101,6 +101,21 @@ def test_a_value_without_a_json_form_is_told_with_its_place(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("field", "told"),
+    [
+        (Field("x_m", "m", words=("a",)), "x_m has words, and is of kind float, not str"),
+        (Field("state", "", "str", words="ab"), "expected words of state to be a tuple of texts"),
+        (Field("state", "", "str", words=(1,)), "expected words of state to be a tuple of texts"),
+    ],
+)
+def test_words_are_texts_of_a_field_of_texts(tmp_path, field, told):
+    files = RecordFiles(tmp_path, run="r", source="a")
+
+    with pytest.raises(PluginError, match=told):
+        Recorder(files, Recording()).open_stream(StreamSchema("state", (field,)))
+
+
+@pytest.mark.parametrize(
     "fields",
     [
         (*FIELDS, Field("reason", "", "str")),

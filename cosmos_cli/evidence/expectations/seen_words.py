@@ -32,8 +32,8 @@ class SeenWords:
         self._expectation = expectation
         counted_text = None if expectation.when is None else expectation.when.text
         self._word = expectation.event or counted_text or ""
-        is_open = (expectation.stream, expectation.field) not in WORDS
-        self.is_sought = is_open and bool(self._word)
+        is_known = expectation.has_known_words or (expectation.stream, expectation.field) in WORDS
+        self.is_sought = bool(self._word) and not is_known
         """Whether the word is looked for and was not met."""
         self._words: set[str] = set()
 

@@ -12,6 +12,15 @@ from madns_runtime.plugin.api import DeclaredStream
 from madns_runtime.recording.records import Field
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
 
+COMMAND_KINDS = ("delta_v", "torque", "ballistic", "dipole")
+COMMAND_FRAMES = ("inertial", "rtn", "body")
+COMMAND_STATUSES = ("accepted", "executed", "postponed", "refused")
+LINK_OUTCOMES = (
+    "delivered", "no_line_of_sight", "out_of_range", "no_contact", "lost", "queue_full", "unknown_receiver",
+    "out_of_order", "no_truth",
+)  # fmt: skip
+"""All words of their fields, as the types say that have no place here, see `messages` and `truth.radio`."""
+
 STATE = (
     Field("tick", "", "int"),
     Field("x_teme_m", "m", digits=6),
@@ -58,9 +67,9 @@ ATTITUDE = (
 COMMANDS = (
     Field("tick", "", "int"),
     Field("number", "", "int"),
-    Field("kind", "", "str"),
+    Field("kind", "", "str", words=COMMAND_KINDS),
     Field("at_s", "s"),
-    Field("frame", "", "str"),
+    Field("frame", "", "str", words=COMMAND_FRAMES),
     Field("x", "m/s | N m | m^2/kg"),
     Field("y", "m/s | N m"),
     Field("z", "m/s | N m"),
@@ -72,7 +81,7 @@ also be in A m^2: see `commands_fields`."""
 COMMAND_RESULTS = (
     Field("tick", "", "int"),
     Field("number", "", "int"),
-    Field("status", "", "str"),
+    Field("status", "", "str", words=COMMAND_STATUSES),
     Field("at_s", "s"),
     Field("revision", "", "int"),
     Field("delta_v_m_s", "m/s"),
@@ -83,7 +92,7 @@ COMMAND_RESULTS = (
 
 MESSAGES = (
     Field("tick", "", "int"),
-    Field("way", "", "str"),
+    Field("way", "", "str", words=("sent", "received")),
     Field("peer", "", "str"),
     Field("sent_s", "s"),
     Field("arrives_s", "s"),
@@ -132,7 +141,7 @@ LINKS = (
     Field("sender", "", "str"),
     Field("number", "", "int"),
     Field("to", "", "str"),
-    Field("outcome", "", "str"),
+    Field("outcome", "", "str", words=LINK_OUTCOMES),
     Field("arrives_s", "s"),
     Field("distance_m", "m"),
     Field("size_bytes", "B", "int"),
@@ -140,7 +149,7 @@ LINKS = (
 """Stream "links": one record a LinkEvent."""
 
 CONTACTS = (
-    Field("event", "", "str"),
+    Field("event", "", "str", words=("rise", "set")),
     Field("agent", "", "str"),
     Field("station", "", "str"),
     Field("rise_s", "s"),
@@ -153,8 +162,8 @@ MANEUVERS = (
     Field("commanded_s", "s"),
     Field("agent", "", "str"),
     Field("number", "", "int"),
-    Field("kind", "", "str"),
-    Field("status", "", "str"),
+    Field("kind", "", "str", words=COMMAND_KINDS),
+    Field("status", "", "str", words=COMMAND_STATUSES),
     Field("heard_s", "s"),
     Field("at_s", "s"),
     Field("executed_s", "s"),
@@ -172,7 +181,7 @@ is T_p, network_s T_n, slack_s (T_m - T_s) - (T_p + 2 T_n), for a finite burn wi
 STUCK_THRUSTERS = (
     Field("t_s", "s"),
     Field("agent", "", "str"),
-    Field("state", "", "str"),
+    Field("state", "", "str", words=("open", "closed", "empty", "mended")),
     Field("dv_given_m_s", "m/s"),
     Field("propellant_kg", "kg"),
 )

@@ -578,6 +578,7 @@ def test_a_word_that_is_there_or_could_not_be_otherwise_is_no_remark():
     assert remarks_on(event="refused") == ()
     assert remarks_on(event="refused", from_s=1.5) == (), "it is a word of the stream"
     assert remarks_on(EVENTS, event="lost") == (), "validate knows the words of events"
+    assert remarks_on(event="lost", has_known_words=True) == (), "as declared"
     nothing = FakeTable("radio", RADIO.fields, {"a": {"t_s": np.array([]), "event": objects([])}})
     assert remarks_on(nothing, event="lost") == ()
 

@@ -108,6 +108,7 @@ BROKEN = [
     ("name: a, event: emergancy, must: not_occur", "emergancy", "did you mean emergency?"),
     ("name: a, event: burn", "burn", "own words stand in its own streams: name one under stream"),
     ("name: a, stream: log, event: eror, field: level", "eror", "did you mean error?"),
+    ("name: a, stream: imu.events, event: opend", "opend", "did you mean opened?"),
     ("name: a, stream: log, field: level, statistic: count, when: {equals: eror}, below: 1", "eror", "mean error?"),
     ("name: a, stream: events, field: event, equals: strt, at_end: true", "strt", "did you mean start?"),
     (f"{TICKS}, below: 3, while: {{stream: events, field: event, equals: strt}}", "strt", "did you mean start?"),
@@ -284,3 +285,33 @@ def test_checks_are_plain_values_that_a_scenario_can_be_written_from(tmp_path):
 
     (written,) = scenario.to_mapping()["checks"]
     assert written["while"]["stream"] == "clock"
+
+
+WORDY = """
+from dataclasses import dataclass
+from madns_runtime.plugin.api import AgentSimulation, DeclaredStream, Simulation
+from madns_runtime.recording.records import Field
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Parameters:
+    pass
+class Agent(AgentSimulation):
+    pass
+def streams(parameters, agents):
+    word = Field("state", "", "str", words=("open", "shut"))
+    fields = (Field("t_s", "s"), word, Field("why", "", "str"))
+    return [DeclaredStream(role="agent", name="doors", fields=fields)]
+simulation = Simulation(name="wordy", parameters=Parameters, agent=":Agent", streams=":streams")
+"""
+
+
+@pytest.mark.process
+def test_a_word_is_known_where_the_simulation_declares_all_of_a_field(tmp_path):
+    (tmp_path / "wordy.py").write_text(WORDY)
+    head = "name: a\nsimulation: ./wordy.py:simulation\nagents: {count: 1}\nchecks:\n"
+    rules = ("field: state, event: shut", "field: why, event: shut", "field: state, event: shutt")
+    checks = [f"{head}  - {{name: a, stream: doors, {rule}, must: not_occur}}\n" for rule in rules]
+    declared, free = (check_scenario(text, tmp_path / "a.yaml") for text in checks[:2])
+
+    assert [each.expectations[0].has_known_words for each in (declared, free)] == [True, False]
+    with pytest.raises(InputError, match=r"never holds 'shutt' in state, did you mean shut\?"):
+        check_scenario(checks[2], tmp_path / "a.yaml")
