@@ -48,6 +48,7 @@ from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.inventory.machine import LOOPBACK
 from cosmos_cli.models.loading import ScenarioFile
 from cosmos_cli.system.import_turn import IMPORT_TURN
+from cosmos_cli.ui.name_ranges import compact
 from cosmos_cli.ui.plural import counted
 from madns_runtime.config import DeviceLaunch, to_mapping
 from madns_runtime.lockstep.partition import processors_here
@@ -318,7 +319,9 @@ def _retrieve(
     if not prepared.remote:
         return ()
     if not is_wanted:
-        text = f"its records were not fetched; fetch them with: cosmos collect {prepared.run.shell_path}"
+        fetch = f"fetch them with: cosmos collect {prepared.run.shell_path}"
+        view.say(f"records on {compact(prepared.remote)} were not fetched; {fetch}", "warning")
+        text = f"its records were not fetched; {fetch}"
         return tuple(Problem(text=text, machine=name, step="collect") for name in prepared.remote)
     # Imported late: agents run meanwhile on the same processors, and a run on this computer needs none of it.
     with IMPORT_TURN:

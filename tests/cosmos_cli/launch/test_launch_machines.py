@@ -470,6 +470,7 @@ def test_second_ctrl_c_kills_on_all_machines_and_leaves_their_records_for_later(
     assert fleet.living() == []
     assert any("on the operator's word" in text for text in fleet.problems("pi01"))
     assert any("its records were not fetched" in text for text in fleet.problems("pi02"))
+    assert "records on pi01, pi02 were not fetched; fetch them with: cosmos collect" in fleet.talk
     collected = fleet.cosmos("collect", "last")
     assert collected.returncode in (0, 5), collected.stderr
     assert (fleet.directory / "agents" / "agent-03" / "ticks.jsonl").exists()
