@@ -111,7 +111,8 @@ class AgentRunner:
         self._hardware.use_clock(self._port.local_s)
         self._has_devices = bool(seat.hardware)
         self._device_time = DeviceTime(seat.hardware, self._port)
-        self._half = half = Half(program.make, self._journal.say)
+        self.half = half = Half(program.make, self._journal.say)
+        """The plug-in's part."""
         self._receive = half.simulation.receive  # called often: without a layer between
         self._spans = process.account.add
         self._pack = pack
@@ -144,7 +145,7 @@ class AgentRunner:
         has_inputs = self._program.has_medium or self._has_devices
         calls = TickCalls(
             prepare=self._prepare_tick if has_inputs else None,
-            step=self._half.simulation.step,
+            step=self.half.simulation.step,
             came_back=self._reactor.end_if_forked,
             failed=self._step_failed,
             ended=self._ticks_over,
@@ -187,7 +188,7 @@ class AgentRunner:
             try:
                 self._receive(message)
             except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
-                self._fail(self._half.failure("receive", error))
+                self._fail(self.half.failure("receive", error))
             self._reactor.end_if_forked()
             calls[METHOD] = IDLE
             if not self._port.must_flush:
@@ -292,7 +293,7 @@ class AgentRunner:
         self._end_timer.reschedule(self._port.local_s(end_s))
 
     def _step_failed(self, error: BaseException) -> None:
-        self._fail(self._half.failure("step", error))
+        self._fail(self.half.failure("step", error))
         self._pump()
 
     def _is_running(self) -> bool:
@@ -346,7 +347,7 @@ class AgentRunner:
         self._cancel_timers()
         self._journal.event("emergency", reason=reason)
         self._journal.say("critical", f"emergency shutdown: {reason}")
-        self._half.abandon()
+        self.half.abandon()
         self._close_records()
 
     def _close_records(self) -> None:
@@ -385,7 +386,7 @@ class AgentRunner:
         """Call the plug-in; what it raises, or returns against its contract, ends this agent by name."""
         self._calls[AGENT], self._calls[METHOD] = self._seat, NUMBER_OF[name]
         try:
-            return self._half.call(name, *arguments)
+            return self.half.call(name, *arguments)
         except HalfFailed as failure:
             self._fail(failure)
             return None

@@ -23,6 +23,8 @@ from madns_runtime.realtime.process_port import ProcessPort
 
 RESTART_S = 0.2
 """Least time from an agent's end by a fault to its return to the same process."""
+ABANDON_S = 5
+"""For an agent that a fault ends with its process to let go of what outlives it, at most."""
 HANG_GRACE_S = 2.0
 """Beyond the time for shutdown: an agent that hangs in its plug-in ends itself, and leaves its stack."""
 
@@ -118,6 +120,10 @@ class AgentProcess:
         """End the process if it is the agent's alone, else drop the agent's half."""
         if len(self._seats) == 1:
             self._tell_killed(name, reason, after_s)
+            # What it has started would live on; one that hangs in letting go of it ends by the alarm.
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+            signal.alarm(ABANDON_S)
+            self._runners[name].half.abandon()
             os.kill(os.getpid(), signal.SIGKILL)
         self._dropped[name] = after_s
         # In the loop's next turn: the order came with messages that others of the process share.

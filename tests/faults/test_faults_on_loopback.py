@@ -119,6 +119,45 @@ def test_an_end_on_purpose_takes_no_return_from_an_agent_that_fails_later(labora
     assert result["agents"]["incarnations"] == {"agent-01": 3}, result["verdict"]
 
 
+HELPED = """
+import dataclasses
+import subprocess
+from fault_simulation import *
+
+
+class HelpedAgent(FaultAgent):
+    def setup(self, context, initial):
+        super().setup(context, initial)
+        self.helper = subprocess.Popen(["sleep", "600"])
+
+    def abandon(self):
+        self.helper.kill()
+        self.helper.wait()
+
+    def finish(self):
+        self.abandon()
+        return super().finish()
+
+
+simulation = dataclasses.replace(simulation, agent=":HelpedAgent")
+"""
+
+
+def test_who_is_killed_on_purpose_leaves_nothing_behind_that_it_has_started(laboratory):
+    (laboratory.folder / "helped.py").write_text(HELPED)
+    result, folder = run_faults(
+        laboratory,
+        [{"at_s": 1, "action": "kill", "agents": ["agent-01"], "for_s": 1}],
+        duration_s=4,
+        simulation="./helped.py:simulation",
+        agents={"count": 2, "tick_hz": 10, "per_process": 1},
+    )
+
+    assert (result["exit_code"], result["status"]) == (0, "complete"), result["verdict"]
+    reasons = [e["reason"] for e in events(folder, "host") if e.get("state") == "lost"]
+    assert reasons == ["killed by SIGKILL"]
+
+
 def test_of_a_process_that_others_share_only_the_half_is_dropped_and_it_returns_there(laboratory):
     result, folder = run_faults(
         laboratory,
