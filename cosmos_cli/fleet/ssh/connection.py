@@ -35,6 +35,7 @@ from cosmos_cli.fleet.ssh.failures import (
     jump_failure,
     lost,
     opening_failure,
+    unrecorded_failure,
 )
 from cosmos_cli.fleet.ssh.host_certificate import read_certificate
 from cosmos_cli.fleet.ssh.keys import FewKeys
@@ -274,9 +275,12 @@ class _StrictHostKeys(MissingHostKeyPolicy):
         ):
             return
         if verdict.standing is Standing.UNKNOWN and self._accepts_new:
-            verdict = self._known.record(
-                settings.names[0], shown, is_hashed=settings.hashes_known_hosts
-            )
+            try:
+                verdict = self._known.record(
+                    settings.names[0], shown, is_hashed=settings.hashes_known_hosts
+                )
+            except OSError as error:
+                raise unrecorded_failure(error, settings.known_hosts[0], settings.where) from error
         if verdict.standing is not Standing.KNOWN:
             raise host_key_failure(verdict, shown, settings.names, settings.where)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import socket
+from pathlib import Path
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.ssh.known_hosts import HostKey, KeyVerdict, KnownHost, Standing
@@ -79,6 +80,16 @@ def opening_failure(
         FailureKind.LOST,
         f"{where}: the connection broke while it was opened ({text or type(error).__name__})",
         "look into the log of sshd there",
+    )
+
+
+def unrecorded_failure(error: OSError, file: Path, where: str) -> MachineFailure:
+    """Say that this computer's list of host keys takes no new one."""
+    return MachineFailure(
+        FailureKind.HOST_KEY_UNKNOWN,
+        f"{where}: its host key is not known, and cannot be recorded in {file} of this computer:"
+        f" {error.strerror or error}",
+        "mend that file, or name another as UserKnownHostsFile in the ssh configuration",
     )
 
 

@@ -29,7 +29,13 @@ JUMPS_MAX = 8
 TAKES_UNKNOWN_KEYS = ("accept-new", "no", "off")
 """A changed key is refused whatever stands here."""
 
+TIME_UNITS_S = {"": 1, "s": 1, "m": 60, "h": 3600, "d": 86_400, "w": 604_800}
+"""Of ssh_config's TIME FORMATS."""
+CONNECT_TIMEOUT_S_MAX = 65_535
+
 _READING = threading.Lock()
+_TIME = re.compile(r"(?:[0-9]{1,9}[smhdw]?)+", re.IGNORECASE)
+_TIME_PART = re.compile(r"([0-9]+)([smhdw]?)", re.IGNORECASE)
 _HOP = re.compile(
     r"(?:ssh://)?(?:(?P<user>[^@]+)@)?(?P<host>\[[^]]+\]|[^:@]+)(?::(?P<port>\d+))?/?"
 )
@@ -102,8 +108,21 @@ def settings_of(target: Target) -> SshSettings:
         hashes_known_hosts=value("hashknownhosts").lower() == "yes",
         jumps=() if is_direct else _jumps(target.name, jump),
         proxy_command=command if is_direct and command.lower() != "none" else None,
-        connect_timeout_s=None if timeout == "none" else _number(timeout, "ConnectTimeout"),
+        connect_timeout_s=_timeout_s(timeout),
     )
+
+
+def _timeout_s(text: str) -> int | None:
+    """Return a ConnectTimeout as ssh reads it: seconds, or numbers with units (1m30s); none and 0 are no bound."""
+    if text.lower() == "none":
+        return None
+    if not _TIME.fullmatch(text):
+        raise InputError(
+            f"ssh configuration: ConnectTimeout: expected a time such as 10 or 1m30s, got {text!r}"
+        )
+    parts = _TIME_PART.findall(text)
+    seconds = sum(int(number) * TIME_UNITS_S[unit.lower()] for number, unit in parts)
+    return min(seconds, CONNECT_TIMEOUT_S_MAX) or None
 
 
 def _number(text: str, keyword: str) -> int:

@@ -67,6 +67,19 @@ def test_unknown_host_key_is_recorded_when_that_is_wanted_and_known_from_then_on
     assert sshd.known_hosts_line() == known_hosts.read_text()
 
 
+@pytest.mark.parametrize("is_link", [False, True])
+def test_known_hosts_that_takes_no_key_is_told_as_this_computers_fault(sshd, known_hosts, is_link):
+    if is_link:
+        known_hosts.symlink_to(known_hosts)
+    else:
+        known_hosts.mkdir()
+
+    with failing(FailureKind.HOST_KEY_UNKNOWN) as caught:
+        connect(target_of(sshd), ACCEPT)
+
+    assert f"cannot be recorded in {known_hosts} of this computer" in caught.value.text
+
+
 def test_accept_new_of_the_ssh_configuration_counts_as_wanted(sshd, home, known_hosts):
     write_configuration(home / ".ssh" / "config", "StrictHostKeyChecking accept-new")
 

@@ -140,13 +140,27 @@ def test_home_of_nobody_leads_nowhere(configure):
     assert settings().key_files == (Path("~no-such-user/key"),)
 
 
-def test_connect_timeout_is_a_number(configure):
-    configure("ConnectTimeout 3")
-    assert settings().connect_timeout_s == 3
+@pytest.mark.parametrize(
+    ("written", "seconds"),
+    [
+        ("3", 3),
+        ("5S", 5),
+        ("1m30", 90),
+        ("1h2m3s", 3723),
+        ("none", None),
+        ("0", None),
+        ("99999w", 65_535),
+    ],
+)
+def test_connect_timeout_is_a_time_as_ssh_writes_it(configure, written, seconds):
+    configure(f"ConnectTimeout {written}")
 
-    configure("ConnectTimeout none")
-    assert settings_again().connect_timeout_s is None
+    assert settings().connect_timeout_s == seconds
 
-    configure("ConnectTimeout soon")
-    with pytest.raises(InputError, match="ConnectTimeout: expected a number, got 'soon'"):
-        settings_again()
+
+@pytest.mark.parametrize("written", ["soon", "1mm", "10x", "-1", "1.5"])
+def test_connect_timeout_that_is_no_time_is_refused(configure, written):
+    configure(f"ConnectTimeout {written}")
+
+    with pytest.raises(InputError, match=f"ConnectTimeout: expected a time .*got '{written}'"):
+        settings()
