@@ -291,9 +291,14 @@ def _is_header(value: Any) -> bool:
     if not isinstance(value, dict) or not {"schema", "stream", "shape", "fields"} <= value.keys():
         return False
     fields = value["fields"]
-    return isinstance(fields, list) and all(
-        isinstance(field, dict) and {"name", "kind"} <= field.keys() for field in fields
-    )
+    if not isinstance(fields, list) or not all(_is_field(field) for field in fields):
+        return False
+    # A record's values are told apart by their names.
+    return len({field["name"] for field in fields}) == len(fields)
+
+
+def _is_field(value: Any) -> bool:
+    return isinstance(value, dict) and "kind" in value and isinstance(value.get("name"), str)
 
 
 def _is_control(value: Any) -> bool:
