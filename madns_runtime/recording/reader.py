@@ -7,6 +7,7 @@ or holds lines that are no records, is taken line by line.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from madns_runtime.bounded_files import open_regular_file
 from madns_runtime.errors import MachineError
 from madns_runtime.recording.stream_rules import CONTROL_KEYS
 
@@ -60,7 +62,7 @@ class StreamReading:
             of its own.
 
     Raises:
-        MachineError: The file cannot be opened.
+        MachineError: The file cannot be opened, or is none: a pipe is waited for without end.
     """
 
     def __init__(self, path: Path, take: Callable[[bytes], None] | None = None) -> None:
@@ -275,7 +277,7 @@ def _whole_lines(file: BinaryIO, take: Callable[[bytes], None]) -> Iterator[byte
 
 def _open(path: Path) -> BinaryIO:
     try:
-        return path.open("rb")
+        return os.fdopen(open_regular_file(path), "rb")
     except OSError as error:
         raise MachineError(f"{path}: cannot be read: {error.strerror}") from error
 
