@@ -17,7 +17,7 @@ from cosmos_cli.collect.remote_manifest import MANIFEST_NAME, RETRIEVED_NAME
 from cosmos_cli.collect.retrieval_state import retrieved_files
 from cosmos_cli.evidence.manifest import file_entry
 from cosmos_cli.evidence.run_directory import RunDirectory
-from cosmos_cli.evidence.streams import SUFFIX, StreamScan
+from cosmos_cli.evidence.streams import SUFFIX, StreamScan, is_linked
 
 MADE_ANEW = ("run.json", "report.html", "manifest.json")
 """Written by every collection, as are the tables."""
@@ -57,7 +57,7 @@ class Earlier:
         """Return what happened to each file that is no stream and is not what it was, by name; *unread* are left out."""
         return self._changed(
             {
-                name: _entry_now(run.path / name)
+                name: _entry_now(run, name)
                 for name in self.entries
                 if not name.endswith(SUFFIX) and run.path / name not in unread
             }
@@ -72,7 +72,7 @@ class Earlier:
             {
                 name: {"sha256": scans[path].sha256, "records": scans[path].records}
                 if path in scans
-                else _entry_now(path)  # a plug-in's own, in a folder of its own
+                else _entry_now(run, name)  # a plug-in's own, in a folder of its own
                 for name, path in paths.items()
                 if path not in unread
             }
@@ -83,8 +83,22 @@ class Earlier:
         return {name: change for name, change in changes.items() if change}
 
 
-def _entry_now(path: Path) -> Mapping[str, Any] | None:
-    return file_entry(path) if path.is_file() else None
+def is_there(run: RunDirectory, name: str) -> bool:
+    """Tell whether a name of a manifest is that of a file of the run, or of a link in its place."""
+    if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+        return False  # nothing of the run; a manifest can be written by anybody
+    try:
+        return (run.path / name).is_file()
+    except OSError:  # no file has such a name: it is too long
+        return False
+
+
+def _entry_now(run: RunDirectory, name: str) -> Mapping[str, Any] | None:
+    """Return the entry of a file of the run, empty of a link, which is neither read nor packaged; None if it is gone."""
+    if not is_there(run, name):
+        return None
+    path = run.path / name
+    return {} if is_linked(path, run.path) else file_entry(path)
 
 
 def _is_made_anew(name: str) -> bool:
@@ -100,8 +114,10 @@ def _change(now: Mapping[str, Any] | None, was: Mapping[str, Any]) -> str:
     """Return what happened to a file; empty if it is what it was."""
     if now is None:
         return "missing; it was there when the run was collected"
+    if not now:
+        return "a link, which is not followed; it was there when the run was collected"
     if now["sha256"] == was.get("sha256"):
         return ""
-    has_others = "records" in was and now.get("records") != was["records"]
+    has_others = "records" in was and now.get("records", was["records"]) != was["records"]
     counts = f" ({now['records']} records, were {was['records']})" if has_others else ""
     return f"changed since the run was collected{counts}"

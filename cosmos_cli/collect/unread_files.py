@@ -1,5 +1,5 @@
 """
-Files of a run on this computer that are not read: they claim more than the run can have recorded.
+Files of a run on this computer that are not read: they claim more than the run can have recorded, or have no name in text.
 
 A file with holes, such as a core dump, may say to be larger than any disk, and would be hashed and packed
 without end. A file without holes is bounded by the disk, and is read however large.
@@ -7,6 +7,7 @@ without end. A file without holes is bounded by the disk, and is read however la
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,11 @@ def find_unread(
         bytes_max = recordable_bytes(config, config.agents.count if config else 0, is_host=True)
     sizes = _sizes_with_holes(run, (earlier or Earlier.read(run)).entries)
     total = sum(sizes.values())
-    found: dict[Path, str] = {}
+    found: dict[Path, str] = {
+        path: f"not read: its name is no UTF-8; rename it, then repeat with: cosmos collect {run.shell_path}"
+        for path in run_files(run)
+        if not _is_text(str(path))
+    }
     for path in sorted(sizes, key=lambda path: (-sizes[path], path)):
         if total <= bytes_max:
             break
@@ -64,6 +69,17 @@ def _sizes_with_holes(run: RunDirectory, known: Mapping[str, Mapping[str, Any]])
     return sizes
 
 
+def _is_text(name: str) -> bool:
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def told_unread(run: RunDirectory, unread: Mapping[Path, str]) -> dict[str, str]:
-    """Return the same by the name within the run."""
-    return {path.relative_to(run.path).as_posix(): why for path, why in unread.items()}
+    """Return the same by the name within the run; bytes that are no text are escaped."""
+    return {
+        os.fsencode(path.relative_to(run.path)).decode(errors="backslashreplace"): why
+        for path, why in unread.items()
+    }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,8 +18,9 @@ from cosmos_cli.evidence.expectations.of_run import (
     judge_run,
     planned_expectations,
 )
+from cosmos_cli.evidence.manifest import file_entry
 from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
-from cosmos_cli.evidence.run_documents import fault_of_summary
+from cosmos_cli.evidence.run_documents import fault_of, fault_of_summary
 from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.evidence.tables import open_tables
 from cosmos_cli.evidence.verdict import conclusion_of_expectations
@@ -96,7 +98,14 @@ def _collected(run: RunDirectory) -> Mapping[str, Any]:
     if fault is not None or run.read_config() is None:
         what = f"{run.run_json}: {fault}" if fault else f"{run.plan_json}: not to be read"
         raise InputError(f"{what}; make it anew with: cosmos collect {run.shell_path}")
-    cut = [name for name, size in _listed_tables(run) if _size_of(run.path / name) != size]
+    fault = fault_of(
+        run.manifest_json
+    )  # without it, a table that is gone would be one without records
+    if fault is not None:
+        raise InputError(
+            f"{run.manifest_json}: {fault}; make it anew with: cosmos collect {run.shell_path}"
+        )
+    cut = [name for name, entry in _listed_tables(run) if not _is_as(entry, run.path / name)]
     if cut:
         what = f"{run.path / cut[0]}" + (f" and {len(cut) - 1} more" if cut[1:] else "")
         text = "missing, or not as it was collected"
@@ -104,19 +113,22 @@ def _collected(run: RunDirectory) -> Mapping[str, Any]:
     return document
 
 
-def _listed_tables(run: RunDirectory) -> Iterator[tuple[str, object]]:
-    """Yield the tables that the manifest lists, below the run's directory, and the size of each."""
+def _listed_tables(run: RunDirectory) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield the tables that the manifest lists, below the run's directory, and the entry of each."""
     files = (run.read_json(run.manifest_json) or {}).get("files")
     for name, entry in files.items() if isinstance(files, dict) else ():
         if name.startswith(f"{run.tables.name}/") and isinstance(entry, dict):
-            yield name, entry.get("bytes")
+            yield name, entry
 
 
-def _size_of(path: Path) -> int | None:
+def _is_as(entry: Mapping[str, Any], path: Path) -> bool:
+    """Tell whether a file is what its entry says: a value that was damaged is no value to judge by."""
     try:
-        return path.stat().st_size
+        status = path.lstat()
+        is_whole = stat.S_ISREG(status.st_mode) and status.st_size == entry.get("bytes")
+        return is_whole and file_entry(path)["sha256"] == entry.get("sha256")
     except OSError:
-        return None
+        return False
 
 
 def _not_finite(document: Mapping[str, Any]) -> int:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from cosmos_cli.collect.previous_manifest import Earlier
+from cosmos_cli.collect.previous_manifest import Earlier, is_there
 from cosmos_cli.diff.recorded import Key, Recorded, recorded_streams
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.completeness import mapping_at
@@ -102,7 +102,7 @@ def _changed_since(run: RunDirectory) -> Iterator[str]:
         if not name.endswith(SUFFIX):
             continue
         path, was = run.path / name, entry.get("bytes")
-        if not path.is_file():
+        if not is_there(run, name):
             yield f"{name}: missing; it was there when the run was collected"
         elif (now := path.stat().st_size) != was:
             yield f"{name}: changed since the run was collected ({now} bytes, were {was})"

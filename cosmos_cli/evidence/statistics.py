@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from cosmos_cli.evidence.completeness import mapping_at
+from cosmos_cli.evidence.completeness import is_excused, mapping_at
 from cosmos_cli.evidence.datagrams import SERVICES, whole_count
 from cosmos_cli.evidence.streams import StreamScan
 from madns_runtime.analysis.distribution import Distribution, Summary, rounded
@@ -205,11 +205,12 @@ def worst_sources(
         agents: What the host told of each agent, by name.
         scans: Of all streams.
     """
+    judged = [scan for scan in scans if not is_excused(scan, agents)]
     found = {
         "deadline.miss_ratio": _largest((name, of.miss_ratio) for name, of in ticks.items()),
         "deadline.overrun_ratio": _largest((name, of.overrun_ratio) for name, of in ticks.items()),
-        "records.dropped": _largest((scan.file.label, scan.dropped) for scan in scans),
-        "records.truncated": _largest((scan.file.label, int(scan.truncated)) for scan in scans),
+        "records.dropped": _largest((scan.file.label, scan.dropped) for scan in judged),
+        "records.truncated": _largest((scan.file.label, int(scan.truncated)) for scan in judged),
         "records.not_finite": _largest((scan.file.label, scan.not_finite) for scan in scans),
     }
     counts = {name: mapping_at(agents, name, "messages") for name in agents}

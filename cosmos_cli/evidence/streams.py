@@ -21,12 +21,13 @@ from numpy.typing import NDArray
 
 from madns_runtime.errors import MachineError
 from madns_runtime.recording.reader import StreamReading, read_stream
-from madns_runtime.recording.records import SCHEMA_VERSION, Field
+from madns_runtime.recording.records import FRAMEWORK_SCHEMAS, SCHEMA_VERSION, Field, StreamSchema
 
 SUFFIX = ".jsonl"
 INCARNATION = re.compile(r"[1-9][0-9]{0,4}")
 """In a file's name; what bears another number, to which no recorder counts, is a stream of that name."""
 INCARNATION_MAX = 99_999
+NUMBER_KINDS = ("float", "int")
 DETAILS = Field("details", "", "json")
 """Column of what events carry beside their fields."""
 Role = Literal["host", "agent", "machine", "device"]
@@ -131,12 +132,12 @@ def find_streams(run_path: Path) -> list[RecordFile]:
         open_stream_file(path, role)
         for role, folder in places
         for path in run_path.glob(f"{folder}/*{SUFFIX}")
-        if path.is_file() and not _is_linked(path, run_path)
+        if path.is_file() and not is_linked(path, run_path)
     ]
     return sorted(found, key=_order)
 
 
-def _is_linked(path: Path, run_path: Path) -> bool:
+def is_linked(path: Path, run_path: Path) -> bool:
     """Tell whether a file, or a folder between it and the run's, is a link."""
     inner = itertools.takewhile(lambda folder: folder != run_path, path.parents)
     return path.is_symlink() or any(folder.is_symlink() for folder in inner)
@@ -154,13 +155,15 @@ def open_stream_file(path: Path, role: Role) -> RecordFile:
     source = path.parent.name
     if role == "device":
         source = f"{path.parent.parent.name}/{source}"
+    stream = name if is_later else stem
+    own = FRAMEWORK_SCHEMAS.get(stream) if role != "device" else None  # a channel may bear any name
     return RecordFile(
         path=path,
         role=role,
         source=source,
-        stream=name if is_later else stem,
+        stream=stream,
         incarnation=int(life) if is_later else 1,
-        fields=_fields(schema),
+        fields=_fields(schema, own),
         is_array=schema.get("shape") == "array",
         schema=version if isinstance(version := schema.get("schema"), int) else SCHEMA_VERSION,
     )
@@ -242,14 +245,18 @@ def _objects(values: list[Any]) -> NDArray[Any]:
     return column
 
 
-def _fields(schema: Mapping[str, Any]) -> tuple[Field, ...]:
+def _fields(schema: Mapping[str, Any], own: StreamSchema | None) -> tuple[Field, ...]:
+    """Return the fields of a schema line; none where it has text for numbers of the framework's *own*, or the reverse."""
     try:
-        return tuple(
+        fields = tuple(
             Field(str(f["name"]), str(f.get("unit", "")), _kind(f.get("kind")))
             for f in schema.get("fields", ())
         )
     except (KeyError, TypeError, AttributeError):
         return ()
+    is_number = {f.name: f.kind in NUMBER_KINDS for f in own.fields} if own else {}
+    fit = (is_number.get(f.name) in (None, f.kind in NUMBER_KINDS) for f in fields)
+    return fields if all(fit) else ()
 
 
 def _kind(value: object) -> Kind:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shlex
 import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.arrow_values import ARROW_TYPES, as_floats, to_arrow
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import DETAILS, Columns, RecordFile
@@ -224,12 +226,12 @@ class TableReader:
     Reads a table source by source.
 
     Args:
-        path: The Parquet file.
+        path: The Parquet file. Damage of it is told where it is met, by an InputError.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._file = pq.ParquetFile(path)
+        self._file = pq.ParquetFile(path, page_checksum_verification=True)
         note = json.loads(self._file.schema_arrow.metadata[METADATA_KEY])
         self.name: str = note["table"]
         self.role: str = note["role"]
@@ -278,23 +280,40 @@ class TableReader:
         Numbers come as float64 with null as NaN (ints without null as int64), the rest as objects.
         """
         wanted = list(names)
-        table = self._file.read_row_groups(self._groups.get(source, []), columns=wanted)
-        return {name: table.column(name).to_numpy() for name in wanted}
+        with self._damage_told():
+            table = self._file.read_row_groups(self._groups.get(source, []), columns=wanted)
+            return {name: table.column(name).to_numpy() for name in wanted}
 
     def batches(self, source: str, names: Iterable[str], rows_max: int) -> Iterator[Columns]:
         """Yield columns of one source as `read` returns them, at most *rows_max* records at a time."""
         wanted = list(names)
         for group in self._groups.get(source, []):
             # One group after the other: given all at once, pyarrow reads ahead without bound.
-            for batch in self._file.iter_batches(rows_max, row_groups=[group], columns=wanted):
-                table = pa.Table.from_batches([batch])
-                yield {name: table.column(name).to_numpy() for name in wanted}
+            batches = self._file.iter_batches(rows_max, row_groups=[group], columns=wanted)
+            while True:
+                with self._damage_told():
+                    batch = next(batches, None)
+                    if batch is None:
+                        break
+                    columns = {name: batch.column(name).to_numpy(False) for name in wanted}
+                yield columns
 
     def each(self, names: Iterable[str]) -> Iterator[tuple[str, Columns]]:
         """Yield every source with its columns."""
         wanted = list(names)
         for source in self.sources:
             yield source, self.read(source, wanted)
+
+    @contextlib.contextmanager
+    def _damage_told(self) -> Iterator[None]:
+        """Turn damage that shows when values are read into a fault of the file."""
+        try:
+            yield
+        except (OSError, pa.ArrowException) as error:
+            run = shlex.quote(str(self.path.parent.parent))
+            raise InputError(
+                f"{self.path}: damaged ({str(error):.80}); it is made anew with: cosmos collect {run}"
+            ) from error
 
 
 def open_tables(folder: Path) -> dict[str, TableReader]:
@@ -339,7 +358,12 @@ def _open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
         elif not pa.types.is_boolean(field.type):
             dictionary.append(field.name)
     return pq.ParquetWriter(
-        path, schema, compression="zstd", use_dictionary=dictionary, column_encoding=encodings
+        path,
+        schema,
+        compression="zstd",
+        use_dictionary=dictionary,
+        column_encoding=encodings,
+        write_page_checksum=True,
     )
 
 

@@ -136,7 +136,7 @@ def _gaps(run: RunDirectory, recorded: RecordedRun) -> list[Section]:
     listed = mapping_at(run.read_json(run.manifest_json) or {}, "files")
     paths = [PurePosixPath(name) for name in listed]
     folder, tables = run.tables.name, recorded.tables
-    unread = [str(p) for p in paths if p.parts[0] == folder and p.stem not in tables]
+    unread = [str(p) for p in paths if p.parts[:1] == (folder,) and p.stem not in tables]
     unread += (f"{folder}/{name}" for name in no_tables(run.tables))
     if not unread:
         return []

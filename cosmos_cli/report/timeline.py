@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -9,6 +10,7 @@ from typing import Any, Final
 import orjson
 
 from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.streams import is_linked
 from madns_runtime.analysis.values import (
     SIMULATED_TIME,
     EventBand,
@@ -17,6 +19,7 @@ from madns_runtime.analysis.values import (
     Section,
     TableBlock,
 )
+from madns_runtime.bounded_files import open_regular_file
 from madns_runtime.timeline.dispatcher import BEGAN, ENDED, REFUSED
 
 BANDS_MAX: Final = 40
@@ -60,7 +63,7 @@ def read_actions(run: RunDirectory) -> list[ActionTold]:
     found: dict[Any, ActionTold] = {}
     for event in _events(run):
         number, t_s = event.get("number"), event.get("t_s")
-        if not isinstance(t_s, int | float):
+        if not isinstance(t_s, int | float) or not isinstance(number, int):
             continue
         if event.get("event") == ENDED and number in found:
             found[number].end_s = float(t_s)
@@ -79,8 +82,11 @@ def read_actions(run: RunDirectory) -> list[ActionTold]:
 
 
 def _events(run: RunDirectory) -> Iterator[Mapping[str, Any]]:
+    path = run.path / "host" / "events.jsonl"
+    if is_linked(path, run.path):
+        return
     try:
-        with (run.path / "host" / "events.jsonl").open("rb") as file:
+        with os.fdopen(open_regular_file(path), "rb") as file:
             for _ in range(EVENTS_MAX):
                 line = file.readline(LINE_BYTES_MAX)
                 if not line:

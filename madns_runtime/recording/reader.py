@@ -7,6 +7,7 @@ or holds lines that are no records, is taken line by line.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from madns_runtime.bounded_files import open_regular_file
 from madns_runtime.errors import MachineError
 from madns_runtime.recording.stream_rules import CONTROL_KEYS
 
@@ -60,7 +62,7 @@ class StreamReading:
             of its own.
 
     Raises:
-        MachineError: The file cannot be opened.
+        MachineError: The file cannot be opened, or is none: a pipe is waited for without end.
     """
 
     def __init__(self, path: Path, take: Callable[[bytes], None] | None = None) -> None:
@@ -275,7 +277,7 @@ def _whole_lines(file: BinaryIO, take: Callable[[bytes], None]) -> Iterator[byte
 
 def _open(path: Path) -> BinaryIO:
     try:
-        return path.open("rb")
+        return os.fdopen(open_regular_file(path), "rb")
     except OSError as error:
         raise MachineError(f"{path}: cannot be read: {error.strerror}") from error
 
@@ -291,9 +293,14 @@ def _is_header(value: Any) -> bool:
     if not isinstance(value, dict) or not {"schema", "stream", "shape", "fields"} <= value.keys():
         return False
     fields = value["fields"]
-    return isinstance(fields, list) and all(
-        isinstance(field, dict) and {"name", "kind"} <= field.keys() for field in fields
-    )
+    if not isinstance(fields, list) or not all(_is_field(field) for field in fields):
+        return False
+    # A record's values are told apart by their names.
+    return len({field["name"] for field in fields}) == len(fields)
+
+
+def _is_field(value: Any) -> bool:
+    return isinstance(value, dict) and "kind" in value and isinstance(value.get("name"), str)
 
 
 def _is_control(value: Any) -> bool:

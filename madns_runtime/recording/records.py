@@ -202,7 +202,8 @@ PROCESS = StreamSchema(
 )
 """Use of resources by a process of the run: CPU since its last record, memory, and counters since its start."""
 
-FRAMEWORK_STREAMS = frozenset(
-    schema.name for schema in (TICKS, LATE_TICKS, CLOCK, EVENTS, LOG, HEALTH, PROCESS)
-)
+FRAMEWORK_SCHEMAS = {
+    schema.name: schema for schema in (TICKS, LATE_TICKS, CLOCK, EVENTS, LOG, HEALTH, PROCESS)
+}
+FRAMEWORK_STREAMS = frozenset(FRAMEWORK_SCHEMAS)
 """Names that no simulation's stream can have."""

@@ -1,5 +1,6 @@
 import json
 import math
+import os
 
 import numpy as np
 import pytest
@@ -352,3 +353,11 @@ def test_a_damaged_end_line_ends_nothing(tmp_path, end):
 
     assert list(reading.records()) == [[1.5]]
     assert (reading.state.is_cut, reading.state.truncated_lines) == (True, 1)
+
+
+@pytest.mark.timeout(60)
+def test_pipe_in_the_place_of_a_stream_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "ticks.jsonl")
+
+    with pytest.raises(MachineError, match="expected a file, got a pipe"):
+        read_stream(tmp_path / "ticks.jsonl")

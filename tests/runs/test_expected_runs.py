@@ -150,18 +150,32 @@ def test_a_run_whose_tables_are_cut_is_not_judged_by_what_is_left(run):
     _, document = run("lockstep", LASTING)
     tables = run.cosmos.directory(document) / "tables"
     (table,) = tables.glob("round_trips*")
-    table.write_bytes(table.read_bytes()[:-100])
+    whole = table.read_bytes()
+    table.write_bytes(whole[:-100])
 
     cut = run.cosmos("judge", document["run"])
+    table.write_bytes(bytes(len(whole)))
+    other = run.cosmos("judge", document["run"])
     table.unlink()
     gone = run.cosmos("judge", document["run"])
     run.cosmos("collect", document["run"])
     anew = run.cosmos("judge", document["run"])
 
-    assert (cut.returncode, gone.returncode) == (2, 2)
-    for refused in (cut, gone):
+    assert (cut.returncode, other.returncode, gone.returncode) == (2, 2, 2)
+    for refused in (cut, other, gone):
         assert "not as it was collected; make it anew with: cosmos collect" in refused.stderr
     assert (anew.returncode, "PASSED" in anew.stdout) == (0, True)
+
+
+def test_a_run_whose_manifest_is_gone_is_not_judged(run):
+    """A table that is gone, too, would be one without records: no event of it occurred, and its count is 0."""
+    _, document = run("lockstep", LASTING)
+    (run.cosmos.directory(document) / "manifest.json").unlink()
+
+    refused = run.cosmos("judge", document["run"])
+
+    assert refused.returncode == 2
+    assert "manifest.json: missing; make it anew with: cosmos collect" in refused.stderr
 
 
 def test_a_run_without_checks_is_judged_by_none(run):

@@ -576,3 +576,38 @@ def test_stream_that_was_shortened_and_closed_again_is_named_every_time(tmp_path
 
     path.write_bytes(whole)
     assert again(made).exit_code == 0
+
+
+@pytest.mark.parametrize("name", ["agents/agent-01/ticks.jsonl", "note.txt", "flown"])
+def test_link_in_the_place_of_what_was_collected_is_named_and_not_followed(tmp_path, name):
+    """What a link leads to is not packaged: it may be the same file today and gone tomorrow, or not of the run at all."""
+    made = SyntheticRun(tmp_path / "runs").write()
+    (made.run.path / "note.txt").write_text("as it was")
+    (made.run.path / "flown").mkdir()
+    (made.run.path / "flown/code.py").write_text("as it was")
+    assert finish(made).exit_code == 0
+    path = made.run.path / name
+    path.rename(tmp_path / "elsewhere")
+    path.symlink_to(tmp_path / "elsewhere")
+
+    for _ in range(2):
+        summary = again(made)
+
+        assert summary.exit_code == 5
+        assert any(
+            line.startswith(name) and "a link, which is not followed" in line
+            for line in summary.missing
+        )
+
+
+def test_link_to_another_file_in_the_place_of_a_stream_is_named(tmp_path):
+    made = SyntheticRun(tmp_path / "runs").write()
+    finish(made)
+    (tmp_path / "foreign").write_text("nobody's records\n")
+    made.stream("agent-01", "ticks").unlink()
+    made.stream("agent-01", "ticks").symlink_to(tmp_path / "foreign")
+
+    summary = again(made)
+
+    assert summary.exit_code == 5
+    assert "agent-01: ticks is missing" in summary.missing

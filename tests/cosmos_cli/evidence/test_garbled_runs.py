@@ -200,6 +200,42 @@ def test_pipes_in_the_place_of_files_hold_nobody_up(made, capsys, name):
     collect_run(made.run, processes=lambda: [])
 
 
+@pytest.mark.parametrize(
+    "name",
+    ["x" * 300, "agents/" + "y" * 300 + "/z.jsonl", "a/" * 3000 + "b", "", ".", "../outside"],
+)
+def test_name_of_a_manifest_that_no_file_of_the_run_can_have_is_missing(made, capsys, name):
+    (made.run.path.parent / "outside").write_text("not of the run")
+    manifest = made.run.read_json(made.run.manifest_json)
+    entry = {"bytes": 14, "sha256": "0" * 64}
+    write_json(made.run.manifest_json, manifest | {"files": manifest["files"] | {name: entry}})
+
+    for _ in range(2):
+        assert app.run(["report", "1"]) == 0
+        assert app.run(["diff", "1", "1"]) == 0
+        summary = collect_run(made.run, processes=lambda: [])
+
+        assert summary.exit_code == 5
+        assert f"{name}: missing; it was there when the run was collected" in summary.missing
+    assert "defect" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", [b"agents/agent-01/\xe9tat.bin", b"agents/agent-01/\xe9.jsonl"])
+def test_file_whose_name_is_no_text_is_named_and_costs_no_verdict(made, name):
+    """As flight software leaves it that knows Latin-1 alone."""
+    path = os.path.join(os.fsencode(made.run.path), name)
+    shutil.copy(made.stream("agent-01", "ticks"), path)
+
+    summary = collect_run(made.run, processes=lambda: [])
+
+    (line,) = summary.missing
+    assert summary.exit_code == 5
+    assert line.startswith("agents/agent-01/\\xe9")
+    assert "its name is no UTF-8; rename it" in line
+    os.rename(path, made.run.path / "agents/agent-01/state.bin")
+    assert collect_run(made.run, processes=lambda: []).exit_code == 0
+
+
 def test_file_that_is_too_large_is_not_read(made, monkeypatch):
     monkeypatch.setattr(run_documents, "DOCUMENT_BYTES_MAX", 100)
 

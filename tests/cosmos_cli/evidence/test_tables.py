@@ -12,6 +12,7 @@ import pytest
 from harness.synthetic_run import MACHINE, SyntheticRun, make_config
 
 from cosmos_cli.collect.finish import finish_run
+from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import write_json
 from cosmos_cli.evidence.streams import find_streams, open_stream_file, scan_stream
 from cosmos_cli.evidence.table_labels import NEVER_US, TableLabels
@@ -479,3 +480,44 @@ def test_lockstep_tells_no_wall_time(tmp_path):
     assert TableLabels.of(config, {"t0_utc": "2024-05-06T07:08:09Z"}).zero_utc == (
         datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
     )
+
+
+def test_value_that_was_damaged_in_a_table_is_told_and_not_taken(tmp_path):
+    """Parquet's own decoders take what is stored: another number, as good as any."""
+    made = SyntheticRun(tmp_path)
+    record(made, "agent-01", MIXED, [(i / 7, i, i / 3, "a", True, {}) for i in range(500)])
+    table = gathered_table(made, "mixed")
+    place = pq.ParquetFile(table.path).metadata.row_group(0).column(4)
+    assert place.path_in_schema == "level"
+    whole = bytearray(table.path.read_bytes())
+    whole[place.data_page_offset + place.total_compressed_size - 20] ^= 1
+    table.path.write_bytes(whole)
+
+    (damaged,) = open_tables(made.run.tables).values()
+    with pytest.raises(InputError, match=r"mixed\.parquet: damaged .*cosmos collect"):
+        damaged.read("agent-01", ["level"])
+    with pytest.raises(InputError, match=r"mixed\.parquet: damaged .*cosmos collect"):
+        list(damaged.batches("agent-01", ["level"], 100))
+
+
+@pytest.mark.parametrize(
+    ("stream", "was", "wrong"),
+    [
+        ("ticks", b'"lateness_us","unit":"us","kind":"int"', b'"lateness_us","unit":"us","kind":"str"'),
+        ("clock", b'"offset_us","unit":"us","kind":"float"', b'"offset_us","unit":"us","kind":"flobt"'),
+        ("ticks", b'"name":"missed"', b'"name":"tick"'),
+        ("round_trips", b'"name":"round_trip_us"', b'"name":[]'),
+    ],
+)  # fmt: skip
+def test_schema_line_that_was_damaged_makes_its_stream_one_that_cannot_be_read(
+    tmp_path, stream, was, wrong
+):
+    made = SyntheticRun(tmp_path).write()
+    path = made.stream("agent-01", stream)
+    assert was in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(was, wrong))
+
+    summary = finish_run(made.run, made.result(), made.expected)
+
+    assert summary.exit_code == 5
+    assert summary.missing == (f"agent-01: {stream} the schema line is missing or damaged",)

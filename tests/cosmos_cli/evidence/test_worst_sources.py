@@ -43,3 +43,9 @@ def test_others_with_the_same_are_counted():
 
 def test_nobody_is_named_where_nothing_is_wrong():
     assert worst_sources(ticks(a=0, b=0), {"a": {"messages": 3}}, [scan("a")]) == {}
+
+
+def test_what_was_lost_on_purpose_is_nobodys_worst():
+    agents = {"a": {"ended_on_purpose": [1]}}
+
+    assert worst_sources({}, agents, [scan("a", promised=None, dropped=3)]) == {}

@@ -1,7 +1,10 @@
 """What a timeline did, as a report shows it: rows of a table, and bands in figures over simulated time."""
 
 import json
+import os
 from types import SimpleNamespace
+
+import pytest
 
 from cosmos_cli.report.timeline import read_actions, timeline_sections, with_bands
 from madns_runtime.analysis.values import (
@@ -91,3 +94,18 @@ def test_a_run_without_a_timeline_has_no_chapter_of_one(tmp_path):
 
 def test_events_that_cannot_be_read_tell_of_nothing(tmp_path):
     assert read_actions(SimpleNamespace(path=tmp_path)) == []
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")])
+def test_events_that_are_no_file_are_not_waited_for(tmp_path, make):
+    (tmp_path / "host").mkdir()
+    make(tmp_path / "host/events.jsonl")
+
+    assert read_actions(SimpleNamespace(path=tmp_path)) == []
+
+
+def test_event_whose_number_is_none_is_no_action(tmp_path):
+    garbled = EVENTS[1] | {"number": [0]}
+
+    assert len(read_actions(a_run(tmp_path, [garbled, *EVENTS]))) == 3
