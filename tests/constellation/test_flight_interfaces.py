@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -102,7 +103,9 @@ def test_the_same_guidance_gives_the_same_maneuvers_to_the_bit_by_every_way(tmp_
     agents = json.loads((run / "run.json").read_text())["simulation"]["agents"]
     for name in names:
         told = agents[name]["flight"]
-        assert told["answers"] == 90 and told["exit_code"] == 0, name
+        assert told["answers"] == 90, name
+        # Who needs longer to end than it is given, on a busy machine, is asked to.
+        assert told["exit_code"] in (0, -signal.SIGTERM), name
         assert not any(told["interface"]["faults"].values()), name
     lines = (run / "host/maneuvers.jsonl").read_text().splitlines()
     rows = [row for row in map(json.loads, lines) if isinstance(row, list)]
