@@ -347,6 +347,7 @@ class AgentRunner:
         self._journal.event("emergency", reason=reason)
         self._journal.say("critical", f"emergency shutdown: {reason}")
         self._half.abandon()
+        self._reactor.end_if_stray()
         self._close_records()
 
     def _close_records(self) -> None:
