@@ -25,6 +25,8 @@ LONG_CALL_S: Final = 0.010
 """A call that holds the loop for longer is counted and told: ten times what a call may take by the contract."""
 STANDSTILL_S: Final = 0.5
 """One that takes this long is told at once: agents lose a silent host."""
+SWEPT_AFTER_S: Final = 86_400.0
+"""So long a page of a host that has ended is left for whoever started it: longer than most runs."""
 FOLDER: Final = Path("/dev/shm")
 PREFIX: Final = "madns-host-"
 WHAT_BYTES: Final = 120
@@ -134,7 +136,6 @@ class HostCalls:
             entry[1:] = [took_s, math.nan if t_s is None else t_s - took_s]
 
     def _open(self, path: Path) -> mmap.mmap:
-        _sweep()
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
         try:
             fd = os.open(path, flags, 0o600)
@@ -142,6 +143,7 @@ class HostCalls:
             return _own_page()
         try:
             os.write(fd, b" " * (LINE_BYTES - 1) + b"\n")
+            _sweep(os.fstat(fd).st_mtime - SWEPT_AFTER_S)
             page = mmap.mmap(fd, LINE_BYTES)
         except (OSError, ValueError):
             path.unlink(missing_ok=True)
@@ -199,13 +201,21 @@ def _read(path: Path) -> bytes | None:
         os.close(fd)
 
 
-def _sweep() -> None:
-    """Remove the pages that dead hosts of this user have left: on a machine nobody may have read them."""
+def _sweep(before_s: float) -> None:
+    """
+    Remove the pages that dead hosts of this user have left: on a machine nobody may have read them.
+
+    Args:
+        before_s: Pages made since then, as files tell it, are left: who started that host may be about to read its page.
+    """
     try:
         paths = [path for path in FOLDER.iterdir() if path.name.startswith(PREFIX)]
     except OSError:
         return
     for path in paths:
+        with contextlib.suppress(OSError):
+            if path.lstat().st_mtime > before_s:
+                continue
         words = (_read(path) or b"").split()
         if not words or not words[-1].isdigit() or Path(f"/proc/{int(words[-1])}").exists():
             continue

@@ -257,8 +257,9 @@ class AgentRunner:
         elif isinstance(message, AgentFault):
             self._faults.take(message)
         elif self._takes_data:
-            is_refusal = isinstance(message, TransmissionRefusal)
-            self._call("refused" if is_refusal else "receive", message)
+            self._call(
+                "refused" if isinstance(message, TransmissionRefusal) else "receive", message
+            )
 
     def _set_up(self, initial: Any) -> None:
         context = PeerContext(
@@ -348,6 +349,7 @@ class AgentRunner:
         self._journal.event("emergency", reason=reason)
         self._journal.say("critical", f"emergency shutdown: {reason}")
         self.half.abandon()
+        self._reactor.end_if_forked()
         self._close_records()
 
     def _close_records(self) -> None:

@@ -8,7 +8,13 @@ import pytest
 
 from cosmos_cli.evidence.remarks import long_call_remarks
 from madns_runtime.plugin import host_calls
-from madns_runtime.plugin.host_calls import HostCalls, interrupted_call, page_path, take_page
+from madns_runtime.plugin.host_calls import (
+    SWEPT_AFTER_S,
+    HostCalls,
+    interrupted_call,
+    page_path,
+    take_page,
+)
 from madns_runtime.realtime.agent_calls import AGENT, METHOD, STEP, T_S, AgentCalls
 
 
@@ -67,15 +73,17 @@ def test_a_page_is_never_made_through_a_link(session, tmp_path):
 
 
 @pytest.mark.process
-def test_pages_of_dead_hosts_are_swept(session):
+@pytest.mark.parametrize("age_s", [0.0, 2 * SWEPT_AFTER_S])
+def test_pages_of_hosts_that_died_long_ago_are_swept_and_others_left_to_be_read(session, age_s):
     script = f"from madns_runtime.plugin.host_calls import HostCalls\nHostCalls({session!r}).begin('x')\n"
     subprocess.run([sys.executable, "-c", script], check=True)
-    assert page_path(session).exists()
+    made_s = page_path(session).stat().st_mtime
+    os.utime(page_path(session), (made_s - age_s, made_s - age_s))
 
     other = os.urandom(8).hex()
     HostCalls(other).close()
 
-    assert not page_path(session).exists()
+    assert page_path(session).exists() is (age_s == 0.0)
 
 
 class Clock:
