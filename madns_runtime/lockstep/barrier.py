@@ -132,19 +132,22 @@ class Meeting:
         try:
             self._crew.order(worker, encode_frame(*parts), limit_s)
         except TimeoutError:
-            ending = self._blame(worker, limit_s, "does not read")
+            ending = self._blame(worker, limit_s, "does not read", "tick_s")
             if ending is not None:
                 self._note(ending)
                 raise RunEnds from None
 
-    def await_all(self, limit_s: float, late: str = "has not answered") -> None:
+    def await_all(
+        self, limit_s: float, late: str = "has not answered", setting: str = "tick_s"
+    ) -> None:
         """
-        Wait until every worker has answered; *late* says what one has not done.
+        Wait until every worker has answered; *late* says what one has not done, *setting* whose limit that is.
 
         Raises:
             RunEnds: One of them cannot, or something else ends the run.
         """
-        self.wait(lambda: self._crew.awaited is None, limit_s, partial(self._blame, late=late))
+        blame = partial(self._blame, late=late, setting=setting)
+        self.wait(lambda: self._crew.awaited is None, limit_s, blame)
         for answer in self._crew.answers():
             if answer[0] == frames.FAILED:
                 self.fail(self._account.names[answer[1]], answer[2])
@@ -277,14 +280,17 @@ class Meeting:
 
     # Blame ----------------------------------------------------------------------------------------
 
-    def _blame(self, worker: WorkerProcess | None, limit_s: float, late: str) -> EarlyEnd | None:
+    def _blame(
+        self, worker: WorkerProcess | None, limit_s: float, late: str, setting: str
+    ) -> EarlyEnd | None:
         """Return who of a worker that does not answer is to blame, if the run ends by it, and end the worker."""
         assert worker is not None, "somebody is awaited"
         number, method = worker.at
         what = f"the agent's {method} has not returned" if method else ""
         what = what or f"{self._process(worker)} {late}"
         stopped = " (it is stopped)" if is_stopped(worker.pid) else ""
-        reason = f"{what} within {limit_s:g} s{self.when()}{stopped}; {STACK_HINT}"
+        told = f"{what} within {limit_s:g} s{self.when()}{stopped}"
+        reason = f"{told}; {STACK_HINT} (limit: timeouts.{setting})"
         self._crew.tell_stack(worker)
         self._lose(worker, reason)
         if self.goes_on:

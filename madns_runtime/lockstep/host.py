@@ -163,7 +163,9 @@ class LockstepHost:
 
     def _set_up(self) -> None:
         timeouts, meeting = self._config.timeouts, self._meeting
-        meeting.await_all(timeouts.agents_ready_s, "has not loaded the agent's half")
+        meeting.await_all(
+            timeouts.agents_ready_s, "has not loaded the agent's half", "agents_ready_s"
+        )
         self._account.set_states("ready")
         self._fire(HostEvent.AGENTS_READY)
         limit_s = timeouts.host_setup_s
@@ -189,7 +191,7 @@ class LockstepHost:
         self._absences.begin()
         for worker in self._crew.workers:
             meeting.order(worker, frames.SETUP, [initial[number] for number in worker.agents])
-        meeting.await_all(timeouts.agent_setup_s, "has not set itself up")
+        meeting.await_all(timeouts.agent_setup_s, "has not set itself up", "agent_setup_s")
         self._settle()
 
     def _start(self) -> None:
@@ -234,8 +236,8 @@ class LockstepHost:
         self._fire(HostEvent.AGENTS_COMPLETE)
         for worker in self._crew.workers:
             self._meeting.order(worker, frames.FINISH)
-        limit_s = max(timeouts.complete_s, timeouts.tick_s)
-        self._meeting.await_all(limit_s, "has not summed itself up")
+        limit_s, setting = max((timeouts.tick_s, "tick_s"), (timeouts.complete_s, "complete_s"))
+        self._meeting.await_all(limit_s, "has not summed itself up", setting)
         self._absences.take()
         for number, service, _ in self._meeting.messages():
             account.agents[number].up[service] += 1

@@ -257,9 +257,7 @@ class AgentRunner:
         elif isinstance(message, AgentFault):
             self._faults.take(message)
         elif self._takes_data:
-            self._call(
-                "refused" if isinstance(message, TransmissionRefusal) else "receive", message
-            )
+            self._call("refused" if type(message) is TransmissionRefusal else "receive", message)
 
     def _set_up(self, initial: Any) -> None:
         context = PeerContext(

@@ -86,12 +86,11 @@ class RunJournal:
         """
         if not isinstance(text, str):
             raise PluginError(f"log: expected a text, got {type(text).__name__}; str() it")
-        number = LOG_LEVELS.get(level) if isinstance(level, str) else None
-        if number is None:
+        if level not in tuple(LOG_LEVELS):  # compared, not looked up: it may be anything
             raise PluginError(
                 f"unknown log level {level!r:.80}; expected one of {', '.join(LOG_LEVELS)}"
             )
-        if number < self._level:
+        if LOG_LEVELS[level] < self._level:
             return
         if (rest := len(text) - LOG_CHARACTERS_MAX) > 0:
             text = f"{text[:LOG_CHARACTERS_MAX]}... ({rest} more characters)"

@@ -290,6 +290,41 @@ def test_a_program_that_does_not_answer_in_lockstep_fails_the_agent(tmp_path):
     assert not Path(f"/proc/{ship.process.pid}").exists()
 
 
+def test_an_answer_without_the_end_of_its_line_is_told_with_the_wait_for_it(tmp_path):
+    command = program(tmp_path, "sys.stdout.write('{}')\nsys.stdout.flush()")
+    ship = Ship(tmp_path, command, flight={"answer_s": 2.0})
+
+    with pytest.raises(BlamedError, match=r"; it wrote '\{\}' without the end of a line$"):
+        ship.run(1)
+
+
+FOREIGN = """
+import json, socket, sys
+host, port = sys.argv[1].split(":")
+way = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+way.connect((host, int(port)))
+way.send(b"")
+setup = way.recv(65536)
+while line := way.recv(65536):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.sendto(b"{}\\n", (host, int(port)))
+    way.send(b"{}\\n")
+"""
+
+
+def test_what_others_send_is_counted_in_lockstep_too(tmp_path):
+    command = [*program(tmp_path, "", FOREIGN), "${address}"]
+    transport = {"kind": "udp", "local": "127.0.0.1:0"}
+    flight = {"answer_s": 20.0, "interface": {"transport": transport, "start_s": 60}}
+
+    with Ship(tmp_path, command, flight=flight) as ship:
+        ship.run(3)
+
+    interface = ship.summary["interface"]
+    assert (ship.summary["answers"], interface["packets_foreign"]) == (3, 3)
+    assert not {"bytes_sent", "packets_unsent", "floods"} & set(interface)
+
+
 def test_in_real_time_no_tick_waits_and_answers_are_taken_when_they_come(tmp_path):
     gate, second_gate = tmp_path / "gate", tmp_path / "second"
     body = f"""

@@ -96,6 +96,8 @@ def test_who_hangs_is_named_with_the_place(start_host, fault, who, expected):
     if fault != "job_hang":
         assert "host/stderr.txt shows where it hung" in result["reason"]
         assert "in go_wrong" in (run.folder / "stderr.txt").read_text()
+    if (setting := {"step_hang": "tick_s", "setup_hang": "agent_setup_s"}.get(fault)) is not None:
+        assert result["reason"].endswith(f" (limit: timeouts.{setting})")
 
 
 @pytest.mark.parametrize(

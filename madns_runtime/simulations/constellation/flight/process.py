@@ -254,6 +254,10 @@ class ExternalFlight:
             "answers_unasked": self._answers_unasked,
             "faults": dict(getattr(self._protocol, "faults", {})),
         }
+        # Traffic depends on clocks, which nothing in lockstep does; what was lost is told all the same.
+        lost = ("packets_", "peers_", "bytes_dropped")
+        counts = transport.counts.items()
+        summary |= {name: n for name, n in counts if n and name.startswith(lost)}
         if not self._is_lockstep:
             summary |= transport.counts
             estimate = self._clock.estimate()
@@ -390,4 +394,6 @@ class ExternalFlight:
         line = self._link.program.last_line if self._link.program else ""
         name = self._context.name
         words = f"; its last words: {line!r} (agents/{name}/{STDERR_TEXT}.txt)" if line else ""
-        return told_faults(getattr(self._protocol, "faults", {})) + words
+        rest = getattr(self._protocol, "rest", b"")
+        cut = f"; it wrote {shown(rest)} without the end of a line" if rest else ""
+        return told_faults(getattr(self._protocol, "faults", {})) + cut + words

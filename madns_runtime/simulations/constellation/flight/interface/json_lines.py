@@ -112,7 +112,8 @@ class JsonLines:
     def __init__(self) -> None:
         self.faults: dict[str, int] = {}
         """None: a line that is no answer is a fault of whoever wrote it."""
-        self._rest = b""
+        self.rest = b""
+        """Of a line under way."""
 
     def setup(self, setup: SetupReport) -> list[bytes]:
         """Return the first line."""
@@ -140,11 +141,11 @@ class JsonLines:
 
     def feed(self, data: bytes) -> list[FlightAnswer]:
         """Take what came, and return the answers that are whole now; what has no end is one, too, with its fault."""
-        *lines, self._rest = (self._rest + data).split(b"\n")
+        *lines, self.rest = (self.rest + data).split(b"\n")
         answers = [OVERLONG if len(line) > LINE_BYTES_MAX else read_answer(line) for line in lines]
-        if len(self._rest) > LINE_BYTES_MAX:
+        if len(self.rest) > LINE_BYTES_MAX:
             answers.append(OVERLONG)
-            self._rest = b""
+            self.rest = b""
         return answers
 
 

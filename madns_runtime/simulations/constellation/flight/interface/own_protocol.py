@@ -18,8 +18,9 @@ from madns_runtime.simulations.constellation.flight.interface.reports import Set
 
 
 def _are_pairs(given: Any) -> bool:
-    kinds = (list, tuple)
-    return isinstance(given, kinds) and all(isinstance(x, kinds) and len(x) == 2 for x in given)
+    return isinstance(given, list | tuple) and all(
+        isinstance(x, list | tuple) and len(x) == 2 for x in given
+    )
 
 
 def _are_commands(given: Any) -> bool:
