@@ -1,3 +1,4 @@
+import errno
 import os
 import shutil
 import tarfile
@@ -8,8 +9,9 @@ import pytest
 import zstandard
 from harness.synthetic_run import SyntheticRun, make_config
 
+from cosmos_cli.collect import finish as finish_module
 from cosmos_cli.collect.finish import collect_run, finish_run
-from cosmos_cli.errors import InputError
+from cosmos_cli.errors import InputError, RunFailedError
 from cosmos_cli.evidence.run_documents import Problem
 from madns_runtime.config import Deadline
 from madns_runtime.processes import ProcessEntry
@@ -611,3 +613,19 @@ def test_link_to_another_file_in_the_place_of_a_stream_is_named(tmp_path):
 
     assert summary.exit_code == 5
     assert "agent-01: ticks is missing" in summary.missing
+
+
+@pytest.mark.parametrize(("number", "has_cure"), [(errno.ENOSPC, True), (errno.EROFS, False)])
+def test_summary_that_cannot_be_written_asks_for_room_where_that_helps(
+    tmp_path, monkeypatch, number, has_cure
+):
+    made = SyntheticRun(tmp_path).write()
+
+    def refuse(*_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(finish_module, "write_json", refuse)
+
+    with pytest.raises(RunFailedError, match="the verdict was: PASSED") as caught:
+        finish(made)
+    assert ("make room" in str(caught.value)) == has_cure
