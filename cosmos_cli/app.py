@@ -150,6 +150,9 @@ def _report_unexpected(error: Exception, wants_json: bool) -> int:
             _plain("memory", memory_text(), int(ExitCode.MACHINES)), memory_text(), wants_json
         )
 
+    if isinstance(error, FileNotFoundError) and _is_here_gone():
+        text = "the current folder is gone: it was deleted; change to another one with cd"
+        return _report(_plain(InputError.kind, text, ExitCode.BAD_INPUT), text, wants_json)
     head = f"unexpected {type(error).__name__}: {error}"
     if os.environ.get("COSMOS_DEBUG"):
         print_error(traceback.format_exc().rstrip(), bare=True)
@@ -158,6 +161,15 @@ def _report_unexpected(error: Exception, wants_json: bool) -> int:
         advice = f"this is a defect of COSMoS; please report it {_kept_traceback()}"
     text = f"{head}\n{advice}"
     return _report(_plain("unexpected", text, ExitCode.RUN_FAILED), text, wants_json)
+
+
+def _is_here_gone() -> bool:
+    """Tell whether the current folder was deleted: no path can be made out of there, not even an absolute one."""
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return True
+    return False
 
 
 def _kept_traceback() -> str:

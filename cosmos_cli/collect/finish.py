@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime
+import errno
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -363,9 +364,10 @@ def _write_summary(run: RunDirectory, gathered: Gathered, evidence: Evidence) ->
         manifest = build_manifest(run, gathered.by_path(), gathered.was, without=gathered.unread)
         write_json(run.manifest_json, manifest)
     except OSError as error:
+        cure = "make room and repeat" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "repeat"
         raise RunFailedError(
             f"{run.path}: the summary cannot be written: {error.strerror or error}; the verdict was: "
-            f"{verdict.text}; make room and repeat with: cosmos collect {run.shell_path}"
+            f"{verdict.text}; {cure} with: cosmos collect {run.shell_path}"
         ) from error
     return RunSummary(run=run, verdict=verdict, document=document)
 

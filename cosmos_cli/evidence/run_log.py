@@ -105,7 +105,7 @@ def _source_of(path: str) -> str:
 def _line_of(path: str, source: str, line: str) -> LogLine | None:
     """Return a line of a file; None for what is no sentence, such as a stream's schema and its end."""
     if path.endswith(".txt"):
-        return LogLine(utc=None, t_s=None, source=source, level=STDERR, text=_cut(line))
+        return LogLine(utc=None, t_s=None, source=source, level=STDERR, text=cut_text(line))
     try:
         record = json.loads(line)
         if not isinstance(record, dict):
@@ -118,12 +118,13 @@ def _line_of(path: str, source: str, line: str) -> LogLine | None:
             t_s=float(t_s) if isinstance(t_s, int | float) and math.isfinite(t_s) else None,
             source=source,
             level=str(record.get("level"))[:NAME_CHARACTERS_MAX],
-            text=_cut(str(record["text"])),
+            text=cut_text(str(record["text"])),
         )
     except (ValueError, OverflowError, RecursionError):
         return _DAMAGED
 
 
-def _cut(text: str) -> str:
+def cut_text(text: str) -> str:
+    """Return a sentence as people are told it: of one without end the beginning, and how much follows."""
     rest = len(text) - TEXT_CHARACTERS_MAX
     return f"{text[:TEXT_CHARACTERS_MAX]}... ({rest} more characters)" if rest > 0 else text

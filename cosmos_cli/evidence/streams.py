@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, get_args
@@ -19,6 +19,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.errors import MachineError
 from madns_runtime.recording.reader import StreamReading, read_stream
 from madns_runtime.recording.records import FRAMEWORK_SCHEMAS, SCHEMA_VERSION, Field, StreamSchema
@@ -48,10 +49,12 @@ class RecordFile:
     stream: str
     incarnation: int
     fields: tuple[Field, ...]
-    """Empty when the schema line is missing or damaged."""
+    """Empty when the schema line is missing or damaged, or tells of something else."""
     is_array: bool = True
     schema: int = SCHEMA_VERSION
     """Version of how it is written."""
+    stray: str = ""
+    """Whose records these are by their schema line, where that is not what the file's place says."""
 
     @property
     def table(self) -> str:
@@ -103,6 +106,8 @@ class StreamScan:
         if self.file.schema > SCHEMA_VERSION:
             known = f"this one knows {SCHEMA_VERSION}"
             return f"schema {self.file.schema} is of a newer COSMoS, {known}: upgrade cosmos-madns"
+        if self.file.stray:
+            return f"holds records of {self.file.stray}, which do not belong here"
         if not self.file.fields:
             return "the schema line is missing or damaged"
         if self.promised is None:
@@ -116,11 +121,15 @@ class StreamScan:
         return None
 
 
-def find_streams(run_path: Path) -> list[RecordFile]:
+def find_streams(run_path: Path, runs: Collection[str] = ()) -> list[RecordFile]:
     """
     Return every stream file of a run: host first, then agents, machines and devices, each in order.
 
     Links are no records: they would be read and not packaged.
+
+    Args:
+        run_path: The run's directory, which may have been renamed.
+        runs: By what names its schema lines may call the run; empty for any.
     """
     places: list[tuple[Role, str]] = [
         ("host", "host"),
@@ -129,7 +138,7 @@ def find_streams(run_path: Path) -> list[RecordFile]:
         ("device", "devices/*/*"),
     ]
     found = [
-        open_stream_file(path, role)
+        open_stream_file(path, role, runs)
         for role, folder in places
         for path in run_path.glob(f"{folder}/*{SUFFIX}")
         if path.is_file() and not is_linked(path, run_path)
@@ -143,8 +152,8 @@ def is_linked(path: Path, run_path: Path) -> bool:
     return path.is_symlink() or any(folder.is_symlink() for folder in inner)
 
 
-def open_stream_file(path: Path, role: Role) -> RecordFile:
-    """Read a stream's name and schema line; of one that cannot be read the fields are empty."""
+def open_stream_file(path: Path, role: Role, runs: Collection[str] = ()) -> RecordFile:
+    """Read a stream's name and schema line; of one that cannot be read, or is of none of *runs*, the fields are empty."""
     stem = path.name.removesuffix(SUFFIX)
     name, dot, life = stem.rpartition(".")
     is_later = bool(dot) and INCARNATION.fullmatch(life) is not None
@@ -157,13 +166,15 @@ def open_stream_file(path: Path, role: Role) -> RecordFile:
         source = f"{path.parent.parent.name}/{source}"
     stream = name if is_later else stem
     own = FRAMEWORK_SCHEMAS.get(stream) if role != "device" else None  # a channel may bear any name
+    stray = _stray(schema, source, stream, runs)
     return RecordFile(
         path=path,
         role=role,
         source=source,
         stream=stream,
+        stray=stray,
         incarnation=int(life) if is_later else 1,
-        fields=_fields(schema, own),
+        fields=() if stray else _fields(schema, own),
         is_array=schema.get("shape") == "array",
         schema=version if isinstance(version := schema.get("schema"), int) else SCHEMA_VERSION,
     )
@@ -243,6 +254,18 @@ def _objects(values: list[Any]) -> NDArray[Any]:
     column = np.empty(len(values), dtype=object)
     column[:] = values
     return column
+
+
+def _stray(schema: Mapping[str, Any], source: str, stream: str, runs: Collection[str]) -> str:
+    """Return whose records a schema line tells of if not of these: copied from elsewhere, they would be taken for them."""
+    told = {key: schema.get(key) for key in ("source", "stream", "run")}
+    named = {key: name for key, name in told.items() if isinstance(name, str)}
+    is_own = named.get("source", source) == source and named.get("stream", stream) == stream
+    of_run = named.get("run")
+    if is_own and (of_run is None or not runs or of_run in runs):
+        return ""
+    whose = f"{named.get('source', source)}/{named.get('stream', stream)}"
+    return clean_line(whose if of_run is None or of_run in runs else f"{whose} of run {of_run}")
 
 
 def _fields(schema: Mapping[str, Any], own: StreamSchema | None) -> tuple[Field, ...]:

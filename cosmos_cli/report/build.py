@@ -9,6 +9,7 @@ from typing import Any
 from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.evidence.datagrams import WORDS
 from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.run_log import cut_text
 from cosmos_cli.evidence.simulation_calls import call_simulation, check_blocks, json_document
 from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.evidence.tables import no_tables, open_recorded_run
@@ -223,7 +224,7 @@ def _sentences(tables: Tables, name: str) -> Iterator[list[object]]:
     for who, columns in table.each(("utc", "level", "text")):
         for utc, level, text in zip(*columns.values(), strict=True):
             if level in LEVELS_TOLD:
-                yield [utc, who, level, text]
+                yield [utc, who, level, cut_text(str(text))]
 
 
 def figures_of(document: Mapping[str, Any]) -> list[tuple[str, str, str]]:

@@ -251,7 +251,7 @@ class _Decoder:
             return True
         end = value["end"]
         counts: list[Any] = [end.get(name) for name in END_COUNTS] if isinstance(end, dict) else []
-        if not counts or not all(type(count) is int for count in counts):
+        if not counts or not all(type(count) is int and count >= 0 for count in counts):
             return False
         self.state.recorded, self.state.dropped, self.state.not_finite = counts
         self.state.is_cut = False

@@ -62,6 +62,7 @@ class SyntheticRun:
         self.names = self.config.agents.resolved_names()
         self.ticks = round(self.config.time.duration_s * self.config.agents.tick_hz)
         self.run: RunDirectory = create_run(root, self.config.scenario)
+        self.config = dataclasses.replace(self.config, run=self.run.name)
         begin_run(self.run, self.config, {"machines": {MACHINE: list(self.names)}})
         self.expected = ExpectedRecords.of(self.config, (MACHINE,))
         self.records: dict[str, dict] = {}

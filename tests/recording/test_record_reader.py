@@ -332,7 +332,16 @@ GOOD = HEADER % '[{"name":"a","kind":"float"}]'
 
 @pytest.mark.parametrize(
     "line",
-    [HEADER % "3", HEADER % '["a"]', HEADER % '[{"name":"a"}]', HEADER % "null", "7", "[]"],
+    [
+        HEADER % "3",
+        HEADER % '["a"]',
+        HEADER % '[{"name":"a"}]',
+        HEADER % '[{"name":[],"kind":"float"}]',
+        HEADER % '[{"name":"a","kind":"float"},{"name":"a","kind":"int"}]',
+        HEADER % "null",
+        "7",
+        "[]",
+    ],
 )
 def test_a_damaged_header_makes_a_file_without_schema_not_an_error(tmp_path, line):
     path = tmp_path / "own.jsonl"
@@ -344,7 +353,15 @@ def test_a_damaged_header_makes_a_file_without_schema_not_an_error(tmp_path, lin
 
 
 @pytest.mark.parametrize(
-    "end", ["3", "{}", '{"records":1,"dropped":"x","not_finite":0}', '{"records":1}', "null"]
+    "end",
+    [
+        "3",
+        "{}",
+        '{"records":1,"dropped":"x","not_finite":0}',
+        '{"records":1,"dropped":-3,"not_finite":0}',
+        '{"records":1}',
+        "null",
+    ],
 )
 def test_a_damaged_end_line_ends_nothing(tmp_path, end):
     path = tmp_path / "own.jsonl"

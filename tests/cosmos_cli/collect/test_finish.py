@@ -1,3 +1,4 @@
+import errno
 import os
 import shutil
 import tarfile
@@ -8,8 +9,10 @@ import pytest
 import zstandard
 from harness.synthetic_run import SyntheticRun, make_config
 
+from cosmos_cli.collect import finish as finish_module
 from cosmos_cli.collect.finish import collect_run, finish_run
-from cosmos_cli.errors import InputError
+from cosmos_cli.errors import InputError, RunFailedError
+from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.run_documents import Problem
 from madns_runtime.config import Deadline
 from madns_runtime.processes import ProcessEntry
@@ -611,3 +614,52 @@ def test_link_to_another_file_in_the_place_of_a_stream_is_named(tmp_path):
 
     assert summary.exit_code == 5
     assert "agent-01: ticks is missing" in summary.missing
+
+
+@pytest.mark.parametrize(("number", "has_cure"), [(errno.ENOSPC, True), (errno.EROFS, False)])
+def test_summary_that_cannot_be_written_asks_for_room_where_that_helps(
+    tmp_path, monkeypatch, number, has_cure
+):
+    made = SyntheticRun(tmp_path).write()
+
+    def refuse(*_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(finish_module, "write_json", refuse)
+
+    with pytest.raises(RunFailedError, match="the verdict was: PASSED") as caught:
+        finish(made)
+    assert ("make room" in str(caught.value)) == has_cure
+
+
+@pytest.mark.parametrize(
+    ("origin", "place", "told"),
+    [
+        ("agents/agent-02/ticks.jsonl", "agents/agent-01/ticks.jsonl", "agent-02/ticks"),
+        ("agents/agent-01/clock.jsonl", "agents/agent-01/ticks.jsonl", "agent-01/clock"),
+        ("agents/agent-01/ticks.jsonl", "agents/agent-09/ticks.jsonl", "agent-01/ticks"),
+        ("../else", "agents/agent-01/ticks.jsonl", "agent-01/ticks of run 0007-else"),
+    ],
+)
+def test_records_of_others_are_named_and_not_taken_for_ones_own(tmp_path, origin, place, told):
+    """Nothing in them is cut: by their end line alone they are whole."""
+    made = SyntheticRun(tmp_path / "runs").write()
+    ticks = made.stream("agent-01", "ticks").read_bytes()
+    (made.run.path.parent / "else").write_bytes(ticks.replace(b"0001-synthetic", b"0007-else"))
+    (made.run.path / place).parent.mkdir(exist_ok=True)
+    shutil.copy(made.run.path / origin, made.run.path / place)
+
+    summary = finish(made)
+
+    assert summary.exit_code == 5
+    (line,) = summary.missing
+    who = place.split("/")[1]
+    assert line == f"{who}: ticks holds records of {told}, which do not belong here"
+
+
+def test_run_that_was_renamed_holds_its_own_records(tmp_path):
+    made = SyntheticRun(tmp_path / "runs").write()
+    made.run.path.rename(tmp_path / "runs/0042-moved")
+    made.run = RunDirectory(tmp_path / "runs/0042-moved")
+
+    assert finish(made).exit_code == 0

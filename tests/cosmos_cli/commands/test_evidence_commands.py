@@ -284,3 +284,15 @@ def test_records_of_a_newer_program_are_named_and_make_a_run_incomplete(made, ca
     assert (
         "agent-01: ticks schema 2 is of a newer COSMoS, this one knows 1" in capsys.readouterr().err
     )
+
+
+@pytest.mark.parametrize("arguments", [["report", "1"], ["runs"], ["runs", "--json"]])
+def test_current_folder_that_was_deleted_is_told_as_such(tmp_path, monkeypatch, capsys, arguments):
+    monkeypatch.delenv("COSMOS_RUNS", raising=False)
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+
+    assert app.run(arguments) == 2
+    assert "the current folder is gone" in capsys.readouterr().err

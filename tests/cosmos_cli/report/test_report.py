@@ -242,6 +242,20 @@ def test_warnings_and_errors_are_told_in_words(tmp_path):
     assert "the &lt;battery&gt; is low" in page
 
 
+def test_sentence_without_end_is_cut_and_says_so(tmp_path):
+    made = SyntheticRun(tmp_path)
+    made.write()
+    log = made.recorder("agents/agent-01", "agent-01", LOG)
+    log.record("log", (1.0, T0_UTC, "error", "x" * 100_000))
+    log.close()
+
+    _, sections = build(made)
+
+    (row,) = table_of(sections["What was said"], "Warnings").rows
+    assert row[3] == "x" * 4000 + "... (96000 more characters)"
+    assert made.run.report_html.read_text().count("x" * 5000) == 0
+
+
 def test_failed_run_is_red_and_names_who_why_and_what_is_missing(tmp_path):
     made = SyntheticRun(tmp_path).write()
     made.kill("agent-02")
@@ -361,7 +375,9 @@ def test_pieces_are_thinned_by_themselves_with_a_break_between():
 
 def test_no_line_is_drawn_through_the_time_that_an_agent_was_away(tmp_path):
     made = SyntheticRun(tmp_path, make_config(1)).write(with_states=True)
-    again = RecordFiles(made.run.path / "agents/agent-01", run="x", source="agent-01", life=2)
+    again = RecordFiles(
+        made.run.path / "agents/agent-01", run=made.run.name, source="agent-01", life=2
+    )
     recorder = Recorder(again, RECORDING)
     for schema in (STATE, ELEMENTS):
         recorder.open_stream(schema)
