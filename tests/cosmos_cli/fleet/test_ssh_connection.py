@@ -644,16 +644,16 @@ def test_addresses_are_those_of_both_ends(known):
 
 
 def test_nothing_is_left_behind_by_a_connection(known):
-    threads = threading.active_count()
+    before = set(threading.enumerate())  # of which one of an earlier test may just end
     files = len(os.listdir("/proc/self/fd"))
 
     for _ in range(3):
         says(target_of(known))
     until_s = time.monotonic() + 5.0
-    while threading.active_count() > threads and time.monotonic() < until_s:
+    while set(threading.enumerate()) - before and time.monotonic() < until_s:
         time.sleep(0.01)
 
-    assert threads == threading.active_count()
+    assert set(threading.enumerate()) <= before
     assert files == len(os.listdir("/proc/self/fd"))
 
 
