@@ -125,7 +125,12 @@ def down(
     exit_code = ExitCode.RUN_FAILED if is_left else ExitCode.MACHINES if bad else ExitCode.OK
     retry = offer_retry_of(console, inventory, targets, [outcome.machine for outcome in bad])
     console.print_json(
-        {"runs": [_mapping(one) for one in ended], "retry": retry, "exit_code": int(exit_code)}
+        {
+            "runs": [_mapping(one) for one in ended],
+            "machines": [outcome.to_mapping() for outcome in outcomes],
+            "retry": retry,
+            "exit_code": int(exit_code),
+        }
     )
     return int(exit_code)
 

@@ -9,7 +9,7 @@ per command where 2.3 ms do), and its `sudo` answers prompts, of which `sudo -n`
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
@@ -27,6 +27,7 @@ from cosmos_cli.fleet.connection import (
     ConnectOptions,
 )
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.liveness import SIGN_S, SilentMachine
 from cosmos_cli.fleet.local import LOOPBACK
 from cosmos_cli.fleet.ssh.failures import (
     babble_failure,
@@ -52,6 +53,8 @@ TIMEOUT_S_MIN = 0.5
 OPEN_TIMEOUT_S = 20.0
 """To start a command; a busy board takes seconds."""
 INPUT_POLL_S = 0.005
+QUIET_S = 5.0
+"""After so long without output of a command its machine is asked for a sign of life."""
 LIMITS_POLL_S = 0.25
 """Between looks at the limits of a command that writes to standard error alone, or nothing."""
 
@@ -117,7 +120,11 @@ class SshConnection:
         limits = OutputLimits(timeout_s=timeout_s, said_bytes_max=said_bytes_max)
         try:
             _converse(
-                stream, None if stdin is None else memoryview(stdin), (output, errors), limits
+                stream,
+                None if stdin is None else memoryview(stdin),
+                (output, errors),
+                limits,
+                gives_sign=self.transport.gives_sign,
             )
             status = stream.ending(timeout_s=EXIT_STATUS_TIMEOUT_S).exit_status
         finally:
@@ -173,9 +180,17 @@ def _converse(
     pending: memoryview | None,
     outputs: tuple[BoundedOutput, BoundedOutput],
     limits: OutputLimits,
+    *,
+    gives_sign: Callable[..., bool],
 ) -> None:
-    """Feed a command, unless *pending* is None, and read what it says until it has ended."""
+    """
+    Feed a command, unless *pending* is None, and read what it says until it has ended.
+
+    It may be silent as long as it likes, a machine may not: *gives_sign* asks that.
+    """
     until_s = time.monotonic() + limits.timeout_s
+    heard_s = time.monotonic()
+    is_dead = False
     while True:
         remaining_s = until_s - time.monotonic()
         limits.check(remaining_s, outputs)
@@ -186,10 +201,16 @@ def _converse(
             wait_s = INPUT_POLL_S if pending else LIMITS_POLL_S
             data = stream.read(READ_BYTES, timeout_s=min(wait_s, remaining_s))
         except BlockingIOError:
+            if is_dead:  # and nothing came while it was asked
+                raise SilentMachine from None
+            if pending is None and time.monotonic() - heard_s >= QUIET_S:
+                is_dead = remaining_s > SIGN_S and not gives_sign(timeout_s=SIGN_S)
+                heard_s = time.monotonic()
             continue
         if not data:
             return
         outputs[0].add(data)
+        heard_s, is_dead = time.monotonic(), False
 
 
 def _feed(stream: SshStream, pending: memoryview) -> memoryview:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from harness.ports import free_port
 from harness.waiting import is_alive, wait_until
 
 from cosmos_cli.app import run as cosmos
@@ -258,6 +259,23 @@ def test_name_that_fits_runs_in_two_folders_asks_for_the_directory(
     assert (refused, accepted) == (2, 0)
     assert f"give the directory: {tmp_path / 'here' / '0001-a'}" in error
     assert [is_alive(first.pid), is_alive(second.pid)] == [True, False]
+
+
+def test_down_json_names_the_machine_that_could_not_be_asked_and_why(
+    start: Start,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "config").touch()
+    monkeypatch.setenv("COSMOS_SSH_CONFIG", str(tmp_path / "config"))
+    inventory = f"127.0.0.1:{free_port('127.0.0.1')},"
+
+    code = cosmos(["down", "--all", "-i", inventory, "--json"])
+
+    told = json.loads(capsys.readouterr().out)
+    assert (code, told["exit_code"], told["runs"]) == (3, 3, [])
+    assert [machine["failure"]["kind"] for machine in told["machines"]] == ["refused"]
 
 
 def test_down_fails_when_something_is_left(

@@ -13,12 +13,15 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from harness.ports import free_port
+from harness.waiting import wait_until
 from ssh_harness import needs_sshd, target_of, write_configuration
 from sshd import Sshd, make_key, public, silent_server
 
 from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.open_connection import connect
+from cosmos_cli.fleet.ssh import connection as connection_module
+from cosmos_cli.fleet.ssh.transport import SshTransport
 from cosmos_cli.fleet.target import Target
 
 pytestmark = pytest.mark.process
@@ -329,6 +332,49 @@ def test_silent_server_is_frozen_and_costs_no_more_than_the_deadline():
         assert time.monotonic() - start_s < DEFAULT.timeout_s
 
 
+def test_command_on_a_machine_that_froze_meanwhile_is_given_up_long_before_its_deadline(
+    own_sshd, known_hosts, monkeypatch
+):
+    known_hosts.write_text(own_sshd.known_hosts_line())
+    monkeypatch.setattr(connection_module, "QUIET_S", 0.05)
+    monkeypatch.setattr(connection_module, "SIGN_S", 2.0)
+    connection = connect(target_of(own_sshd))
+
+    def freeze_when_it_runs():
+        wait_until(lambda: own_sshd.left("6123.5"), "no command")
+        own_sshd.freeze()
+
+    freezing = threading.Thread(target=freeze_when_it_runs)
+    try:
+        freezing.start()
+        with pytest.raises(MachineFailure, match="the machine stopped answering") as caught:
+            connection.run("sleep 6123.5", timeout_s=60.0)
+    finally:
+        freezing.join()
+        own_sshd.thaw()
+        connection.close()
+
+    assert caught.value.kind is FailureKind.LOST
+
+
+def test_command_that_says_nothing_is_waited_for_while_its_machine_lives(
+    sshd, known_hosts, monkeypatch
+):
+    known_hosts.write_text(sshd.known_hosts_line())
+    monkeypatch.setattr(connection_module, "QUIET_S", 0.05)
+    asked = []
+    gives_sign = SshTransport.gives_sign
+
+    def count(self, **how):
+        asked.append(how)
+        return gives_sign(self, **how)
+
+    monkeypatch.setattr(SshTransport, "gives_sign", count)
+
+    assert says(target_of(sshd), "sleep 1; echo done") == b"done\n"
+    assert asked
+
+
 def test_stopped_server_is_frozen(own_sshd, known_hosts):
     known_hosts.write_text(own_sshd.known_hosts_line())
     own_sshd.freeze()
@@ -598,16 +644,16 @@ def test_addresses_are_those_of_both_ends(known):
 
 
 def test_nothing_is_left_behind_by_a_connection(known):
-    threads = threading.active_count()
+    before = set(threading.enumerate())  # of which one of an earlier test may just end
     files = len(os.listdir("/proc/self/fd"))
 
     for _ in range(3):
         says(target_of(known))
     until_s = time.monotonic() + 5.0
-    while threading.active_count() > threads and time.monotonic() < until_s:
+    while set(threading.enumerate()) - before and time.monotonic() < until_s:
         time.sleep(0.01)
 
-    assert threads == threading.active_count()
+    assert set(threading.enumerate()) <= before
     assert files == len(os.listdir("/proc/self/fd"))
 
 
