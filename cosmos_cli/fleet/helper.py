@@ -157,9 +157,17 @@ class Helper:
             self._link.write_all(package, timeout_s=timeout_s)
         except MachineFailure as failure:
             if failure.kind is FailureKind.LOST and not isinstance(failure, SilentMachine):
-                self._read_answer(expected, timeout_s=EXIT_STATUS_TIMEOUT_S)  # its words tell more
+                raise self._last_words(expected) or failure from None
             raise
         self.greeting = self._read_answer(expected, timeout_s=timeout_s)[0]["value"]
+
+    def _last_words(self, expected: ExpectedAnswer) -> MachineFailure | None:
+        """Return what one that has ended said instead of a greeting, which tells more than that it has; None for nothing."""
+        try:
+            self._read_answer(expected, timeout_s=EXIT_STATUS_TIMEOUT_S)
+        except MachineFailure as failure:
+            return failure if failure.kind in (FailureKind.DATA, FailureKind.PYTHON) else None
+        return None
 
     def call(
         self,

@@ -193,10 +193,8 @@ class RunAccount:
             for name, agent in zip(self.names, self.agents, strict=True)
             if agent.columns is not None
         ]
-        counts = {
-            state: sum(agent.state == state for agent in self.agents)
-            for state in ("ready", "running", "complete")
-        }
+        states = [agent.state.replace("stopped", "complete") for agent in self.agents]
+        counts = {state: states.count(state) for state in ("ready", "running", "complete")}
         return {
             "event": "progress",
             "is_lockstep": True,

@@ -56,7 +56,7 @@ def run_on_small_disk(laboratory: Laboratory, *arguments: str, **faults: int) ->
         f' cp -r "{laboratory.runs}" "{kept}"; exit $code'
     )
     prefix = ("unshare", "--mount", "sh", "-c", script, "sh")
-    run = laboratory.start(*arguments, "--set", "time.duration_s=3", faults=faults, prefix=prefix)
+    run = laboratory.start(*arguments, "--set", "time.duration_s=5", faults=faults, prefix=prefix)
     run.finish()
     return run, kept / "0001-fault"
 
@@ -74,7 +74,7 @@ def test_full_disk_ends_with_5_names_the_source_and_counts_what_was_dropped(
     laboratory, source, stream, faults
 ):
     run, directory = run_on_small_disk(laboratory, **faults)
-    records_due = {"agent-02": 60, "host": 180}
+    records_due = {"agent-02": 100, "host": 300}
 
     assert run.finish() == 5, run.describe()
     document = json.loads((directory / "run.json").read_text())

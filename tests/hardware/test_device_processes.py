@@ -345,7 +345,7 @@ def test_a_healthy_process_is_not_given_up_when_its_owner_ends(tmp_path):
 
 
 def test_a_disconnected_device_stays_so_for_longer_than_a_hang_and_through_a_new_process(tmp_path):
-    with line_bench(tmp_path, launch={"hang_s": 0.5}) as (bench, _):
+    with line_bench(tmp_path, launch={"hang_s": 2.0}) as (bench, _):
         line = bench.hardware["line"]
         bench.until(lambda: line.status == "ok")
         bench.manager.insert_fault("pi22/line", "disconnect", None)
