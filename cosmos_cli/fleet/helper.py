@@ -157,8 +157,12 @@ class Helper:
             self._link.write_all(package, timeout_s=timeout_s)
         except MachineFailure as failure:
             if failure.kind is FailureKind.LOST and not isinstance(failure, SilentMachine):
-                self._read_answer(expected, timeout_s=EXIT_STATUS_TIMEOUT_S)  # its words tell more
-            raise
+                try:
+                    self._read_answer(expected, timeout_s=EXIT_STATUS_TIMEOUT_S)
+                except MachineFailure as words:  # tell more, if there are any
+                    if words.kind is not FailureKind.TIMEOUT:
+                        raise
+            raise failure
         self.greeting = self._read_answer(expected, timeout_s=timeout_s)[0]["value"]
 
     def call(
