@@ -16,7 +16,7 @@ from cosmos_cli.ui.plural import counted
 from madns_runtime.config import HardwareSettings
 from madns_runtime.hardware.profiles import POINT_COUNTS
 from madns_runtime.plain_values import mapping_at
-from madns_runtime.recording.records import DEVICE_LOSSES, EARLY_UNRECORDED
+from madns_runtime.recording.records import DEVICE_LOSSES
 
 ACCOUNT_NAME = re.compile(r"devices(?:\.([1-9][0-9]{0,8}))?\.json")
 """Accounts of a machine's devices, below machines/<machine>/: one per life of its supervisor."""
@@ -113,11 +113,6 @@ def device_loss_remarks(
         if missed and device not in told:
             found.append(
                 f"device {device}: agents did not take all in time: frames_missed {missed:g}"
-            )
-        if early := mapping_at(account, "counts").get(EARLY_UNRECORDED, 0):
-            found.append(
-                f"device {device}: more came through queues before simulated time than is kept for the record:"
-                f" {EARLY_UNRECORDED} {early:g}"
             )
     rest = len(found) - LOSSES_TOLD_MAX
     more = [f"{counted(rest, 'more loss')} between devices and agents"] if rest > 0 else []

@@ -17,7 +17,6 @@ from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.profiles import PREFIX, counts_by_channel
 from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.values import are_finite, hold_to_limits, to_frame, to_numbers
-from madns_runtime.recording.records import EARLY_UNRECORDED
 
 FROZEN: Final = "frozen:"
 """Before an input's name: how often it stood still."""
@@ -148,7 +147,7 @@ class Intake:
                 # On record, where the check records.not_finite finds it, and in nobody's hands.
                 self.count(f"{name}{NOT_FINITE}")
                 last = self._page.read(name).number
-                self._record(name, last, sample.taken_s, numbers, told_s=now_s)
+                self._records.sample(name, last, sample.taken_s, numbers, told_s=now_s)
                 continue
             is_told = True
             if channel.limits is not None and hold_to_limits(channel, numbers)[1]:
@@ -157,7 +156,7 @@ class Intake:
             if channel.passing == "queue":
                 self._send([messages.FRAME, name, number, sample.taken_s, list(numbers)])
             told_s = self._handed_s(now_s)
-            self._record(name, number, sample.taken_s, numbers, told_s=told_s)
+            self._records.sample(name, number, sample.taken_s, numbers, told_s=told_s)
             if name in self._changes and self._changes[name].is_frozen(numbers, now_s):
                 self.count(f"{FROZEN}{name}")
                 self.event("frozen", now_s, channel=name, for_s=self._changes[name].limit_s)
@@ -171,13 +170,7 @@ class Intake:
         number = self._frame_numbers[channel.name] = self._frame_numbers.get(channel.name, 0) + 1
         told = (len(data), data.hex())
         self._send([messages.FRAME, channel.name, number, taken_s, data])
-        self._record(channel.name, number, taken_s, told, told_s=self._handed_s(now_s))
-
-    def _record(
-        self, channel: str, number: int, taken_s: float, values: Sequence[Any], *, told_s: float
-    ) -> None:
-        given_up = self._records.sample(channel, number, taken_s, values, told_s=told_s)
-        self.count(EARLY_UNRECORDED, given_up)
+        self._records.sample(channel.name, number, taken_s, told, told_s=self._handed_s(now_s))
 
     def _send(self, message: list[Any]) -> None:
         self.count("frames_missed", self._pass_on(message))

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Mapping, Sequence
 from time import monotonic
-from typing import Any, Final
+from typing import Any
 
 from madns_runtime.hardware.contract import Channel
 from madns_runtime.hardware.stream_schemas import DEVICE_CLOCK, DEVICE_STATE, schema_of
 from madns_runtime.recording.run_journal import RunJournal
 from madns_runtime.timing.clock import utc_at_iso
-
-EARLY_QUEUED_MAX: Final = 10_000
-"""Values of queues from before simulated time that are kept for the record: as many as an agent keeps of one."""
-EARLY_BYTES_MAX: Final = 2 * 1024 * 1024
-"""Of their frames, as they stand in a record: half of what a recorder's buffer takes at once by default."""
-_Early = tuple[str, int, float, Sequence[Any], float]
-"""What `DeviceRecords.sample` is told."""
 
 
 class SimulatedTime:
@@ -69,11 +61,8 @@ class DeviceRecords:
         self._newest = {
             each.name for each in channels if each.passing == "newest" and not each.is_frame
         }
-        self._early: dict[str, _Early] = {}
+        self._early: dict[str, tuple[int, float, Sequence[Any], float]] = {}
         """Of these inputs the newest values from before simulated time is known: agents find them in their first ticks."""
-        self._early_queued: deque[_Early] = deque()
-        """What came through the others, the queues, before that: agents are given it in their first ticks."""
-        self._early_bytes = 0
         for channel in channels:
             self._recorder.open_stream(schema_of(channel))
         self._recorder.open_stream(DEVICE_STATE)
@@ -84,44 +73,25 @@ class DeviceRecords:
         if not self.time.is_known:
             self._recorder.set_t0(utc_at_iso(-t_s))
         self.time.set(local_s, t_s, rate)
-        early, self._early = [*self._early_queued, *self._early.values()], {}
-        self._early_queued.clear()
-        for channel, number, taken_s, values, told_s in early:
+        early, self._early = self._early, {}
+        for channel, (number, taken_s, values, told_s) in early.items():
             self.sample(channel, number, taken_s, values, told_s=told_s)
 
     def sample(
         self, channel: str, number: int, taken_s: float, values: Sequence[Any], *, told_s: float
-    ) -> int:
+    ) -> None:
         """
         Record values of an input, taken at *taken_s* and handed on at *told_s*.
 
-        Before simulated time is known they wait for it: by the newest values then agents' first ticks act, and what came
-        through queues they are given.
-
-        Returns:
-            How many earlier values that wait were given up for it: they will be on no record.
+        Before simulated time is known nothing is, but for the newest values then, by which agents' first ticks act.
         """
         if not self.time.is_known:
-            return self._keep_early((channel, number, taken_s, values, told_s))
+            if channel in self._newest and all(map(math.isfinite, values)):
+                self._early[channel] = (number, taken_s, values, told_s)
+            return
         t_s = round(self.time.at(taken_s), 6)
         age_us = round((told_s - taken_s) * 1e6)
         self._recorder.record(channel, (t_s, number, age_us, *values))
-        return 0
-
-    def _keep_early(self, early: _Early) -> int:
-        channel, _, _, values, _ = early
-        if not all(isinstance(value, str) or math.isfinite(value) for value in values):
-            return 0  # in nobody's hands
-        if channel in self._newest:
-            self._early[channel] = early
-            return 0
-        waiting, given_up = self._early_queued, 0
-        waiting.append(early)
-        self._early_bytes += _text_bytes(values)
-        while len(waiting) > EARLY_QUEUED_MAX or self._early_bytes > EARLY_BYTES_MAX:
-            self._early_bytes -= _text_bytes(waiting.popleft()[3])
-            given_up += 1
-        return given_up
 
     def written(self, channel: str, due_s: float, done_s: float, values: Sequence[Any]) -> None:
         """Record values of an output, due at *due_s* and put out at *done_s*."""
@@ -152,7 +122,3 @@ class DeviceRecords:
     def close(self, timeout_s: float) -> Mapping[str, Any]:
         """Close the streams, and return the counts of their records."""
         return self.journal.close(timeout_s).to_mapping()
-
-
-def _text_bytes(values: Sequence[Any]) -> int:
-    return sum(len(value) for value in values if isinstance(value, str))

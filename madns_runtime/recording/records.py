@@ -123,8 +123,6 @@ DEVICE_EVENT_WORDS = (
 
 DEVICE_LOSSES = "device_losses"
 """Of EVENT_WORDS, and key of an agent's account: what found no room between it and its devices."""
-EARLY_UNRECORDED = "early_unrecorded"
-"""In a device's counts: values of its queues from before simulated time that are on no record, though agents may have had them."""
 
 LOG = StreamSchema(
     "log",

@@ -24,7 +24,6 @@ class Kept:
 
     def sample(self, channel, number, taken_s, values, *, told_s):
         self.samples.append((channel, number, tuple(values)))
-        return 0
 
 
 def make_intake():
@@ -61,7 +60,6 @@ def test_a_sample_is_on_record_as_handed_over_when_agents_have_it_however_long_t
     class Told:
         def sample(self, channel, number, taken_s, values, *, told_s):
             told[channel] = told_s
-            return 0
 
     def handed_s(taken_up_s):
         assert sent or device_page.read("level").number  # agents have it already
