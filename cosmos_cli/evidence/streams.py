@@ -262,10 +262,11 @@ def _stray(schema: Mapping[str, Any], source: str, stream: str, runs: Collection
     named = {key: name for key, name in told.items() if isinstance(name, str)}
     is_own = named.get("source", source) == source and named.get("stream", stream) == stream
     of_run = named.get("run")
-    if is_own and (of_run is None or not runs or of_run in runs):
+    is_of_run = of_run is None or not runs or of_run in runs
+    if is_own and is_of_run:
         return ""
     whose = f"{named.get('source', source)}/{named.get('stream', stream)}"
-    return clean_line(whose if of_run is None or of_run in runs else f"{whose} of run {of_run}")
+    return clean_line(whose if is_of_run else f"{whose} of run {of_run}")
 
 
 def _fields(schema: Mapping[str, Any], own: StreamSchema | None) -> tuple[Field, ...]:

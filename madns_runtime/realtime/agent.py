@@ -85,9 +85,7 @@ class AgentRunner:
         self.name = name = seat.name
         self._calls, self._seat = seat.calls.page, seat.number
         self._config = config = launch.config
-        self._program = program
-        self._reactor = reactor
-        self._on_ended = on_ended
+        self._program, self._reactor, self._on_ended = program, reactor, on_ended
         self._port = AgentPort(
             name,
             launch,

@@ -24,7 +24,7 @@ ANSWERS_LATE = "constellation.flight_answers_late"
 """Broken by a flight computer that falls silent for a time; that of a sound one has a minute."""
 BUSY = {
     *("constellation.maneuver_deadlines_broken", "messages.sync.deadlines_broken"),
-    "hardware.stale_ratio",
+    *("hardware.stale_ratio", "hardware.stimulus_underruns"),
 }
 """Also broken where a command, or an emulator, waits for a processor: on a busy machine by any vehicle."""
 

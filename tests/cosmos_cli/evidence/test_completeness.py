@@ -64,5 +64,6 @@ def test_a_number_to_which_no_recorder_counts_is_no_incarnation(tmp_path, number
     file = made.run.path / "agents/agent-01/ticks.jsonl"
     file.rename(file.with_name(f"ticks.{number}.jsonl"))
 
-    assert missing(made) == ["agent-01: ticks is missing"]
+    stray = f"ticks.{number} holds records of agent-01/ticks, which do not belong here"
+    assert missing(made) == [f"agent-01: ticks is missing, {stray}"]
     assert gather(made.run, 10.0, lambda *_: None).faults == ()
