@@ -57,9 +57,8 @@ def go_wrong(fault):
         os._exit(0)
     if what == "kill":
         os.kill(os.getpid(), signal.SIGKILL)
-    if what == "fork":
-        if child := os.fork():  # and neither process ends here
-            os.waitpid(child, 0)  # on a busy machine the run would be over before it came back
+    if what == "fork" and (child := os.fork()):  # and neither process ends here
+        os.waitpid(child, 0)  # on a busy machine the run would be over before it came back
     if what == "mute":
         sys.stderr = None
     if what == "term":
