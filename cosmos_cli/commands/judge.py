@@ -98,9 +98,8 @@ def _collected(run: RunDirectory) -> Mapping[str, Any]:
     if fault is not None or run.read_config() is None:
         what = f"{run.run_json}: {fault}" if fault else f"{run.plan_json}: not to be read"
         raise InputError(f"{what}; make it anew with: cosmos collect {run.shell_path}")
-    fault = fault_of(
-        run.manifest_json
-    )  # without it, a table that is gone would be one without records
+    # Without it, a table that is gone would be one without records.
+    fault = fault_of(run.manifest_json)
     if fault is not None:
         raise InputError(
             f"{run.manifest_json}: {fault}; make it anew with: cosmos collect {run.shell_path}"

@@ -193,7 +193,8 @@ class RunAccount:
             for name, agent in zip(self.names, self.agents, strict=True)
             if agent.columns is not None
         ]
-        states = [agent.state.replace("stopped", "complete") for agent in self.agents]
+        # Who has stopped was complete before, and stays so in the last picture.
+        states = ["complete" if a.state == "stopped" else a.state for a in self.agents]
         counts = {state: states.count(state) for state in ("ready", "running", "complete")}
         return {
             "event": "progress",
