@@ -24,9 +24,9 @@ AUTHORIZED = f"/home/{USER}/.ssh/authorized_keys"
 HOST_KEY = "/etc/ssh/ssh_host_ed25519_key"
 OWN_KEY = f"{HOST_KEY}.own"
 NO_SSHD = "/run/tower/no-sshd"
-CUTS = "/run/tower/cuts"
+DONE = "/run/tower/done"
 """Grows by one line each time that connections were cut."""
-CUT_PATIENCE_S = 20.0
+PATIENCE_S = 20.0
 READ_ONLY = kernel.MS_REMOUNT | kernel.MS_BIND | kernel.MS_RDONLY
 WRITABLE = kernel.MS_REMOUNT | kernel.MS_BIND
 
@@ -191,7 +191,7 @@ def _set_host_key(scene: Scene, is_own: bool) -> None:
         os.chmod(HOST_KEY, 0o600)
 
     _edit(scene, act)
-    scene.board.signal(signal.SIGHUP)
+    _ask(scene, signal.SIGHUP)
 
 
 def _set_sshd(scene: Scene, is_running: bool) -> None:
@@ -203,20 +203,26 @@ def _set_sshd(scene: Scene, is_running: bool) -> None:
 
     _edit(scene, act)
     if not is_running:
-        scene.board.signal(signal.SIGHUP)
+        _ask(scene, signal.SIGHUP)
 
 
 def _cut_connections(scene: Scene) -> None:
-    """Break them, and return when that is done: the board's first process may have to wait for a processor."""
+    _ask(scene, signal.SIGUSR1)
+
+
+def _ask(scene: Scene, number: int) -> None:
+    """Signal the board's first process, and return when it has done what that asks: it may have to wait for a processor."""
 
     def count() -> int:
-        return scene.board.run_inside(lambda: len(read_lines(CUTS)))  # type: ignore[no-any-return]
+        return scene.board.run_inside(lambda: len(read_lines(DONE)))  # type: ignore[no-any-return]
 
-    before, until_s = count(), time.monotonic() + CUT_PATIENCE_S
-    scene.board.signal(signal.SIGUSR1)
+    before, until_s = count(), time.monotonic() + PATIENCE_S
+    scene.board.signal(number)
     while count() == before:
         if time.monotonic() > until_s:
-            raise BoardError(f"{scene.board.name}: not cut in {CUT_PATIENCE_S:g} s; is it frozen?")
+            raise BoardError(
+                f"{scene.board.name}: not done in {PATIENCE_S:g} s: {signal.strsignal(number)}; is it frozen?"
+            )
         time.sleep(0.02)
 
 
