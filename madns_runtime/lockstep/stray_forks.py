@@ -7,7 +7,10 @@ import os
 
 from madns_runtime.lockstep.frames import FAILED, METHODS, POSITIONS, encode_frame
 from madns_runtime.lockstep.worker_line import HostGone, WorkerLine
-from madns_runtime.reactor.forking import CAME_BACK, end_child
+from madns_runtime.reactor.forking import CAME_BACK, ForkedCopies, end_child
+
+WAIT_S = 1.0
+"""So long the end of a run waits for processes that a plug-in forked and that may come back yet."""
 
 
 class StrayForks:
@@ -22,18 +25,25 @@ class StrayForks:
         self._position = position
         self._at = 0
         """Position at the newest fork; that of the memory is the worker's, which goes on meanwhile."""
-        self._forked_at: int | None = None
+        self.forked_at: int | None = None
         """Position at which this process was forked; None in the worker."""
+        self._copies: ForkedCopies | None = None
 
     def watch(self) -> None:
         """Note forks of this process from now on."""
+        self._copies = ForkedCopies()
         os.register_at_fork(before=self._note, after_in_child=self._mark)
+
+    def wait(self) -> None:
+        """Wait until no forked process may come back any more, at most `WAIT_S`: it has something to tell before the end."""
+        if self._copies is not None:
+            self._copies.wait_until_gone(WAIT_S)
 
     def end_stray(self, line: WorkerLine) -> None:
         """End this process if it is not the worker, and tell the host who forked it: both would go on, and record twice."""
-        if self._forked_at is None:
+        if self.forked_at is None:
             return
-        index, doing = divmod(self._forked_at, POSITIONS)
+        index, doing = divmod(self.forked_at, POSITIONS)
         method = METHODS[doing] or "half, as it was loaded,"
         with contextlib.suppress(HostGone):
             line.say(encode_frame(FAILED, index, f"the agent's {method} {CAME_BACK}"))
@@ -43,4 +53,4 @@ class StrayForks:
         self._at = self._position[0]
 
     def _mark(self) -> None:
-        self._forked_at = self._at
+        self.forked_at = self._at

@@ -75,9 +75,8 @@ def run_worker(assignment: Assignment, line: socket.socket) -> NoReturn:
         with register(assignment.config.run, "agent", own, assignment.directory):
             code = Worker(assignment, line).run()
     except BaseException:  # noqa: BLE001 - the last frame of a process; the host sees the line close
-        with contextlib.suppress(
-            Exception
-        ):  # a plug-in may have put anything in the place of stderr
+        # A plug-in may have put anything in the place of stderr.
+        with contextlib.suppress(Exception):
             traceback.print_exc()
     finally:
         end_child(code)
@@ -208,7 +207,7 @@ class Worker:
     def _step_all(self, agents: Iterator[LockstepAgent], tick: Tick) -> bool:
         """Step one agent after the other; return False after one that is lost by it."""
         t_s, position, has_medium = tick.t_s, self._position, self._mates.program.has_medium
-        agent = None
+        agent, forks = None, self._forks
         try:
             for agent in agents:
                 if has_medium and (heard := agent.mailbox.due(t_s)):
@@ -217,6 +216,8 @@ class Worker:
                     self._look_at_devices(agent, t_s)
                 position[0] = agent.stepping
                 agent.step(tick)
+                if forks.forked_at is not None:
+                    forks.end_stray(self._line)
                 if agent.look is not None:
                     agent.look(t_s)
         except AgentFailed as failure:
@@ -270,16 +271,15 @@ class Worker:
             counts = agent.mailbox.counts()
             newest = agent.columns.read()
             summaries.append((agent.index, summary, agent.deadlines_broken, counts, newest))
+        self._forks.wait()
         answer = encode_frame(frames.SUMMARIES, outbox, (), self._losses.take(), summaries)
         outbox.clear()
         return answer
 
     def _done(self, newest: Sequence[tuple[int, list[Value]]] = ()) -> bytes:
         outbox = self._mates.outbox
-        if self._losses:
-            answer = encode_frame(frames.DONE, outbox, newest, self._losses.take())
-        else:
-            answer = encode_frame(frames.DONE, outbox, newest)
+        losses = (self._losses.take(),) if self._losses else ()
+        answer = encode_frame(frames.DONE, outbox, newest, *losses)
         outbox.clear()
         return answer
 
@@ -293,8 +293,7 @@ class Worker:
                 agent.mailbox.add(message)
                 continue
             is_action = isinstance(message, ActionOrder)
-            is_refusal = isinstance(message, TransmissionRefusal)
-            doing = frames.REFUSED if is_refusal else frames.RECEIVING
+            doing = frames.REFUSED if isinstance(message, TransmissionRefusal) else frames.RECEIVING
             self._position[0] = index * POSITIONS + (frames.ACTING if is_action else doing)
             try:
                 if is_action:
@@ -313,6 +312,7 @@ class Worker:
         Raises:
             AgentFailed: The run does not go on without it.
         """
+        self._forks.end_stray(self._line)
         if not self._goes_on:
             raise failure
         self._position[0] = agent.index * POSITIONS + frames.CLOSING
@@ -367,6 +367,8 @@ class Worker:
             return ask(*arguments)
         except MadnsError as error:
             raise AgentFailed(agent.index, str(error)) from error
+        finally:
+            self._forks.end_stray(self._line)
 
     def _flush(self) -> None:
         for agent in self._agents:

@@ -19,7 +19,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Final
 
-from madns_runtime.reactor.forking import end_child
+from madns_runtime.reactor.forking import ForkedCopies, end_child
 
 LONG_CALL_S: Final = 0.010
 """A call that holds the loop for longer is counted and told: ten times what a call may take by the contract."""
@@ -35,6 +35,9 @@ LINE: Final = b">%-120s %s %12d\n"
 LINE_BYTES: Final = len(LINE % (b"", b"%20.6f" % 0.0, 0))
 RETURNED: Final = ord(" ")
 """Stands in the place of the mark once the call has returned."""
+LAST: Final = "finish"
+FORKS_WAIT_S: Final = 1.0
+"""So long the last call waits for processes that the half forked and that may come back yet."""
 
 
 def page_path(session_hex: str) -> Path:
@@ -64,6 +67,8 @@ class HostCalls:
         self._pid = os.getpid()
         self._strays = _own_page()
         """Shared with processes that the half forks: the method that one came back from, as a line."""
+        self._copies: ForkedCopies | None = None
+        """From the first call on: what is forked before is no half's."""
         self._lines: dict[str, bytes] = {}
         self._calls = 0
         self._by_method: dict[str, list[float]] = {}
@@ -82,6 +87,8 @@ class HostCalls:
             self._strays[: len(line)] = line
             end_child(1)
         self._page[0] = RETURNED
+        if method == LAST and self._copies is not None:
+            self._copies.wait_until_gone(FORKS_WAIT_S)
         if self.is_counting and began_s:
             self._calls += 1
             took_s = monotonic() - began_s
@@ -118,6 +125,7 @@ class HostCalls:
 
     def _make_line(self, method: str) -> bytes:
         """Return a method's line, which lacks the time alone: made once, as calls are many."""
+        self._copies = self._copies or ForkedCopies()
         what = f"{self.name}.{method}".encode("utf-8", "replace")[:WHAT_BYTES].replace(b"%", b"_")
         line = LINE % (what, b"%20.6f", self._pid)
         self._lines[method] = line

@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
+import select
 import signal
 import sys
 from typing import Final, NoReturn
+from weakref import WeakSet
 
 CAME_BACK: Final = (
     "forked a process that came back from the call; let such a process end itself by os._exit(0)"
@@ -29,6 +31,49 @@ def _count_fork() -> None:
 
 
 os.register_at_fork(after_in_child=_count_fork)
+
+
+class ForkedCopies:
+    """
+    The processes that Python forks from this one from now on, as long as they are copies of it.
+
+    Each holds an end of a pipe, which the system closes when it ends or becomes another program. A process that a
+    copy forks counts, too. Costs nothing but at a fork.
+    """
+
+    def __init__(self) -> None:
+        self._pid = os.getpid()
+        self._read_fd = self._held_fd = -1
+        _watched.add(self)
+
+    def wait_until_gone(self, limit_s: float) -> bool:
+        """Wait until there is none, at most so long, and return whether that is so; those forked later are not known."""
+        if self._read_fd < 0 or os.getpid() != self._pid:
+            return True
+        os.close(self._held_fd)
+        poll = select.poll()
+        poll.register(self._read_fd, 0)  # its hang-up is told unasked
+        is_gone = bool(poll.poll(limit_s * 1e3))
+        os.close(self._read_fd)
+        self._read_fd = self._held_fd = -1
+        return is_gone
+
+    def prepare(self) -> None:
+        """Open the pipe for the process that is about to be forked."""
+        if self._read_fd < 0 and os.getpid() == self._pid:
+            with contextlib.suppress(OSError):  # without a descriptor left nobody is waited for
+                self._read_fd, self._held_fd = os.pipe2(os.O_CLOEXEC)
+
+
+_watched: WeakSet[ForkedCopies] = WeakSet()
+
+
+def _prepare_fork() -> None:
+    for copies in list(_watched):
+        copies.prepare()
+
+
+os.register_at_fork(before=_prepare_fork)
 
 
 def leave_parent(keep: set[int]) -> None:

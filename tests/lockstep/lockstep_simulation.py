@@ -12,6 +12,8 @@ from madns_runtime.recording.records import Field
 
 WORK_S = 0.5
 """What a call that works needs of a processor."""
+FORKED_S = 0.3
+"""What a forked process that comes back from a call does before."""
 SERVICES = (Service.BEST, Service.RELIABLE, Service.SYNC)
 
 
@@ -57,8 +59,8 @@ def go_wrong(fault):
         os._exit(0)
     if what == "kill":
         os.kill(os.getpid(), signal.SIGKILL)
-    if what == "fork" and (child := os.fork()):  # and neither process ends here
-        os.waitpid(child, 0)  # on a busy machine the run would be over before it came back
+    if what == "fork" and not os.fork():  # and neither process ends here
+        time.sleep(FORKED_S)  # as on a busy machine: all that is left of the run takes less
     if what == "mute":
         sys.stderr = None
     if what == "term":
@@ -129,6 +131,7 @@ class Host(HostSimulation):
         self.note("rejoined", agent)
 
     def finish(self):
+        self.meets("hostfinish")
         self.context.submit(square, 12)  # too late: nothing is called any more
         for agent in self.context.agents if self.fault == "finish_say" else ():
             self.context.send(agent, ["bye"])

@@ -43,7 +43,9 @@ def workers_of(run):
         ("timer_same", "host", "Host.timer returned -0.5, called for t = -0.5 s: expected a later"),
         ("timer_stands", "host", "Host.timer asked 100000 times in a row for t = -0.5 s"),
         ("step_fork", "agent-04", "the agent's step forked a process that came back from the call"),
+        ("finish_fork", "agent-04", "the agent's finish forked a process that came back from"),
         ("timer_fork", "host", "Host.timer forked a process that came back from the call"),
+        ("hostfinish_fork", "host", "Host.finish forked a process that came back from the call"),
         ("job_kill", "host", "Host: job 13: a worker of the executor has died: was it"),
         ("job_raise", "host", "Host: job 13: square raised ValueError: no such job"),
         (

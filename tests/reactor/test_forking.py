@@ -2,13 +2,14 @@
 
 import gc
 import os
+import signal
 import socket
 import subprocess
 import sys
 
 import pytest
 
-from madns_runtime.reactor.forking import leave_parent
+from madns_runtime.reactor.forking import ForkedCopies, leave_parent
 
 pytestmark = pytest.mark.process
 
@@ -88,3 +89,40 @@ reactor.run()
 
 def test_a_loop_goes_on_whatever_clock_a_plugin_puts_in_the_place_of_time():
     subprocess.run([sys.executable, "-c", FROZEN], timeout=60, check=True)
+
+
+def test_copies_are_gone_once_they_have_ended_or_are_another_program():
+    copies = ForkedCopies()
+    assert copies.wait_until_gone(0.0)
+
+    children = [_fork_that(_becomes_sleep), _fork_that(_ends)]
+    assert copies.wait_until_gone(60.0)
+    os.kill(children[0], signal.SIGKILL)
+
+    children.append(_fork_that(_stays))
+    assert not copies.wait_until_gone(0.01)
+    os.kill(children[2], signal.SIGKILL)
+    for child in children:
+        os.waitpid(child, 0)
+
+
+def _fork_that(goes_on):
+    child = os.fork()
+    if not child:
+        try:
+            goes_on()
+        finally:
+            os._exit(1)
+    return child
+
+
+def _becomes_sleep():
+    os.execvp("sleep", ["sleep", "600"])  # noqa: S606, S607 - whichever there is
+
+
+def _ends():
+    os._exit(0)
+
+
+def _stays():
+    signal.pause()
