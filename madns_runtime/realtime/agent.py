@@ -104,7 +104,7 @@ class AgentRunner:
             files, config.recording, process.writer.writes(files), tap=self._port.conditions
         )
         self._journal = RunJournal(recorder, config.recording.verbosity, t_s=self._port.t_s)
-        self._records = ProcessRecords(self._journal)
+        self._records = ProcessRecords(self._journal, self._config.health.period_s)
         self._hardware = seat.hardware
         self._hardware.use_clock(self._port.local_s)
         self._has_devices = bool(seat.hardware)
@@ -281,9 +281,9 @@ class AgentRunner:
         self._session.ping_slack_s = min(2 * self._ticks.period_s, PING_SLACK_S_MAX)
         self._ticks.begin(now_s)
         self._pack.arm()
-        self._records.begin_usage()
+        self._records.begin_usage(monotonic())
         self._device_time.tell()
-        self._usage_timer.reschedule(monotonic() + self._config.health.period_s)
+        self._usage_timer.reschedule(self._records.usage_due_s + self._session.ping_slack_s)
 
     def _ticks_over(self) -> None:
         end_s = self._ticks.duration_s + DRAIN_S
@@ -307,6 +307,8 @@ class AgentRunner:
             self._session.handle_timer(now_s)
             self._pump()
             self._spans(Span(Cause.HOUSEKEEPING, self._seat, now_s, monotonic()))
+        if now_s >= self._records.usage_due_s:
+            self._record_usage()
 
     def _hear(self, t_s: float) -> bool:
         """Hand in what other agents' messages bring in the tick at *t_s*; return whether the agent goes on."""
@@ -372,11 +374,11 @@ class AgentRunner:
     def _record_usage(self) -> None:
         if self._session.state is AgentState.RUN_SIMULATION:
             began_s = monotonic()
-            self._records.usage()
+            self._records.usage(began_s)
             self._port.process.account.look()
             self._device_time.tell()
             self._spans(Span(Cause.HOUSEKEEPING, self._seat, began_s, monotonic()))
-            self._usage_timer.reschedule(monotonic() + self._config.health.period_s)
+            self._usage_timer.reschedule(self._records.usage_due_s + self._session.ping_slack_s)
 
     # Towards the simulation ------------------------------------------------------------------------
 

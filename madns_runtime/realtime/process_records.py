@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -22,12 +23,13 @@ class ProcessRecords:
 
     Args:
         journal: Of the agent; these streams lie beside its own.
+        period_s: How often to record what the process uses, s.
 
     Raises:
         MachineError: The directory takes no new file.
     """
 
-    def __init__(self, journal: RunJournal) -> None:
+    def __init__(self, journal: RunJournal, period_s: float) -> None:
         self._journal = journal
         self._recorder = journal.recorder
         self._t_s = journal.t_s
@@ -35,6 +37,9 @@ class ProcessRecords:
             self._recorder.open_stream(schema)
         self._clock_recorded_s = 0.0
         self._usage = ProcessUsage()
+        self._usage_period_s = period_s
+        self.usage_due_s = math.inf
+        """When to record next what the process uses, s of the local clock: in a wake-up that is for a tick anyway."""
         self.device_account: dict[str, Any] = {}
         """What the host is told of losses between devices and the agent."""
 
@@ -55,12 +60,14 @@ class ProcessRecords:
             ),
         )
 
-    def begin_usage(self) -> None:
+    def begin_usage(self, now_s: float) -> None:
         """Count what this process uses from now on."""
         self._usage = ProcessUsage()
+        self.usage_due_s = now_s + self._usage_period_s
 
-    def usage(self) -> None:
+    def usage(self, now_s: float) -> None:
         """Record what this process has used since the last time."""
+        self.usage_due_s = now_s + self._usage_period_s
         t_s = self._t_s()
         self._recorder.record(
             PROCESS.name, self._usage.read(None if t_s is None else round(t_s, 3))

@@ -108,7 +108,7 @@ def test_a_device_with_room_for_all_tells_nothing(device):
 def test_losses_are_an_event_and_a_warning_of_the_agent(tmp_path):
     recorder = Recorder(RecordFiles(tmp_path, run="r", source="agent-01"), Recording())
     journal = RunJournal(recorder, 5, t_s=lambda: 1.0)
-    records = ProcessRecords(journal)
+    records = ProcessRecords(journal, 5.0)
     recorder.start()
 
     records.device_losses({"pi22/line": {"writes_lost": 7}})
