@@ -265,8 +265,13 @@ def log_in(
     except (SSHException, OSError, EOFError) as error:
         if wire.has_babbled:
             raise babble_failure(settings.where, wire.came_bytes) from error
-        has_spoken = bool(transport.remote_version)
-        raise opening_failure(error, settings.where, timeout_s, has_spoken=has_spoken) from error
+        raise opening_failure(
+            error,
+            settings.where,
+            timeout_s,
+            has_spoken=bool(transport.remote_version),
+            came_bytes=wire.came_bytes,
+        ) from error
     finally:
         if connection.transport is None:
             connection.client.close()

@@ -24,7 +24,7 @@ NOT_ALLOWED = 1
 
 
 def opening_failure(
-    error: Exception, where: str, timeout_s: float, *, has_spoken: bool = True
+    error: Exception, where: str, timeout_s: float, *, has_spoken: bool = True, came_bytes: int = 0
 ) -> MachineFailure:
     """
     Say why a connection could not be opened.
@@ -34,6 +34,7 @@ def opening_failure(
         where: Address and port.
         timeout_s: How long it was waited for.
         has_spoken: Whether a word of SSH was heard.
+        came_bytes: What was heard, of SSH or not.
     """
     if isinstance(error, MachineFailure):
         return error
@@ -54,8 +55,9 @@ def opening_failure(
     text = str(error)
     if BANNER_ERROR in text:
         # The text is the same for silence and for an end; what paramiko was handling tells.
-        is_silence = isinstance(error.__context__, TimeoutError)
-        return _frozen(where, timeout_s) if is_silence else _silent(where)
+        if not isinstance(error.__context__, TimeoutError):
+            return _silent(where)
+        return babble_failure(where, came_bytes) if came_bytes else _frozen(where, timeout_s)
     if isinstance(error, TimeoutError):
         return MachineFailure(
             FailureKind.UNREACHABLE,

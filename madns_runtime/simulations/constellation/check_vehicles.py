@@ -236,7 +236,7 @@ def code_faults(
         return []
     path = base_directory / place
     try:
-        tree = ast.parse(read_regular_file(path, bytes_max=CODE_BYTES_MAX), str(path))
+        tree = _parse(read_regular_file(path, bytes_max=CODE_BYTES_MAX), path)
     except FileNotFoundError:
         return [f"{field}: no such file: {path}"]
     except SyntaxError as error:
@@ -259,6 +259,14 @@ def code_faults(
         told = f"; it has {', '.join(classes)}" if classes else ""
         faults.append(f"{field}: {path} has no class {name!r}{told}")
     return faults
+
+
+def _parse(code: bytes, path: Path) -> ast.Module:
+    """Return the syntax tree of a file's code; CPython 3.11 may lose count in it while another thread parses (its issue 106905)."""
+    try:
+        return ast.parse(code, str(path))
+    except SystemError:
+        return ast.parse(code, str(path))
 
 
 def _imports(tree: ast.Module) -> Iterator[tuple[int, str]]:

@@ -188,7 +188,8 @@ def test_who_writes_there_is_alive_without_being_registered(tmp_path):
     with path.open("rb"), split.visit() as visit:
         reading = visit.find_living()
 
-    assert writing == {"pi01": [f"pid {os.getpid()} writes agents/agent-01/ticks.jsonl"]}
+    # A process that another test has forked at this moment has it open, too, until it is another program.
+    assert f"pid {os.getpid()} writes agents/agent-01/ticks.jsonl" in writing["pi01"]
     assert reading == {}
 
 

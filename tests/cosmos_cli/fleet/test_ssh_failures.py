@@ -104,6 +104,16 @@ def test_silence_before_a_word_was_heard_is_a_frozen_machine():
     assert "nothing was said in 10 s" in failure.text
 
 
+def test_words_that_are_none_of_ssh_are_no_silence():
+    error = SSHException("Error reading SSH protocol banner")
+    error.__context__ = TimeoutError()
+
+    failure = opening_failure(error, WHERE, 10.0, has_spoken=False, came_bytes=23)
+
+    assert failure.kind is FailureKind.DATA
+    assert "23 bytes came before a login" in failure.text
+
+
 @pytest.mark.parametrize(
     "error", [EOFError(), ConnectionResetError(104, "reset"), BrokenPipeError()]
 )
