@@ -137,6 +137,8 @@ def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; five a
     fault = fault_of_plan(run.plan_json)
     if fault is not None:
         changed.setdefault(run.plan_json.name, f"{fault}; what was planned is not known")
+    if earlier.fault:
+        changed[run.manifest_json.name] = earlier.fault
     gathered = dataclasses.replace(
         gathered,
         faults=(*gathered.faults, *(f"{name}: {what}" for name, what in changed.items())),

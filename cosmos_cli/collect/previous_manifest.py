@@ -17,6 +17,7 @@ from cosmos_cli.collect.remote_manifest import MANIFEST_NAME, RETRIEVED_NAME
 from cosmos_cli.collect.retrieval_state import retrieved_files
 from cosmos_cli.evidence.manifest import file_entry
 from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.run_documents import MISSING, fault_of
 from cosmos_cli.evidence.streams import SUFFIX, StreamScan, is_linked
 
 MADE_ANEW = ("run.json", "report.html", "manifest.json")
@@ -24,6 +25,7 @@ MADE_ANEW = ("run.json", "report.html", "manifest.json")
 TABLES = "tables/"
 MACHINES = "machines/"
 WAS = "was"
+NOT_KNOWN = "what has changed since it was written is not known"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,11 +33,16 @@ class Earlier:
     """The evidence of a run as its manifest listed it first; empty for a run that was not collected yet."""
 
     entries: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    fault: str = ""
+    """Why there are none though there was a manifest: it is written anew, and this is not told again."""
 
     @classmethod
     def read(cls, run: RunDirectory) -> Earlier:
         """Return what the manifest of *run* says."""
+        fault = fault_of(run.manifest_json)
         files = (run.read_json(run.manifest_json) or {}).get("files")
+        if fault is None and not isinstance(files, Mapping):
+            fault = "cannot be used: expected the run's files under files"
         entries = {
             name: entry.get(WAS, entry)
             for name, entry in (files.items() if isinstance(files, Mapping) else ())
@@ -46,7 +53,8 @@ class Earlier:
             # A machine may have gone on with a file since: its last word counts.
             if entries.get(name, {}).get("sha256") != entry["sha256"]:
                 entries[name] = entry
-        return cls(entries=entries)
+        is_lost = fault not in (None, MISSING)
+        return cls(entries=entries, fault=f"{fault}; {NOT_KNOWN}" if is_lost else "")
 
     def sources(self, folder: str) -> tuple[str, ...]:
         """Return whose records were below a folder, such as agents."""

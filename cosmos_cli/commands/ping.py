@@ -21,6 +21,7 @@ from cosmos_cli.ui.console import Console, JsonOption, QuietOption
 from cosmos_cli.ui.plural import counted
 
 COMMAND_TIMEOUT_S = 10.0
+WORD = "cosmos-ping"
 
 Times = tuple[float, float]
 """Milliseconds to be logged in, and of a command there and back."""
@@ -63,9 +64,11 @@ def ping(
 
 def _ask(connection: Connection) -> Times:
     start_s = time.monotonic()
-    done = connection.run("true", timeout_s=COMMAND_TIMEOUT_S, said_bytes_max=SMALL_BYTES_MAX)
+    done = connection.run(
+        f"echo {WORD}", timeout_s=COMMAND_TIMEOUT_S, said_bytes_max=SMALL_BYTES_MAX
+    )
     exec_s = time.monotonic() - start_s
-    if done.exit_status:
+    if done.exit_status or WORD.encode() not in done.stdout:  # a login shell may be /bin/true
         raise runs_no_commands(
             done.exit_status, (done.stderr or done.stdout).decode(errors="replace")
         )

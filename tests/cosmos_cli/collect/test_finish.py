@@ -539,6 +539,22 @@ def test_agent_and_plan_are_named_even_without_the_manifest(tmp_path):
     assert {line.split(":")[0] for line in again(made).missing} == {"agent-02", "plan.json"}
 
 
+@pytest.mark.parametrize(
+    ("text", "told"), [("{", "cannot be used: "), ('{"files": 3}', "expected the run's files")]
+)
+def test_manifest_that_cannot_be_read_is_named(tmp_path, text, told):
+    made = SyntheticRun(tmp_path).write()
+    finish(made)
+    made.run.manifest_json.write_text(text)
+
+    summary = again(made)
+
+    assert summary.exit_code == 5
+    (line,) = summary.missing
+    assert line.startswith("manifest.json: ") and told in line
+    assert line.endswith("; what has changed since it was written is not known")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["plan.json", "scenario.yaml"])
 def test_input_that_was_deleted_is_named_and_limits_stay(tmp_path, name):
