@@ -82,7 +82,10 @@ def test_ping_of_machines_that_fail_says_why_and_hides_nobody(inventory, capsys,
     assert lines[-1] == "6 machines: 4 answered, 2 failed"
 
 
-NO_LOGIN = ("echo This account is currently not available.; exit 1", "exit status 1: This account")
+NO_LOGIN = (
+    "echo This account is currently not available.; exit 1",
+    ("exit status 1", "This account is"),
+)
 """What a login shell such as /usr/sbin/nologin says and does, and what is told of it."""
 
 
@@ -91,7 +94,7 @@ NO_LOGIN = ("echo This account is currently not available.; exit 1", "exit statu
     [
         ("ping", *NO_LOGIN),
         ("facts", *NO_LOGIN),
-        ("ping", "true", "exit status 0"),  # as a login shell /bin/true has it
+        ("ping", "true", ("exit status 0",)),  # as a login shell /bin/true has it
     ],
 )
 def test_user_who_may_run_no_commands_is_a_failure(
@@ -105,7 +108,8 @@ def test_user_who_may_run_no_commands_is_a_failure(
 
     failure = json.loads(capsys.readouterr().out)["machines"][0]["failure"]
     assert failure["kind"] == "authentication"
-    assert f"no command does: {told}" in failure["text"]
+    assert "no command does" in failure["text"]
+    assert all(words in failure["text"] for words in told)
 
 
 def test_empty_command_is_refused(inventory, capsys):
