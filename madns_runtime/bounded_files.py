@@ -41,8 +41,11 @@ class FileTooLarge(FileRefused):
 
 
 def real_path(path: str | os.PathLike[str]) -> Path:
-    """Return where a path leads; unlike `Path.resolve` no RuntimeError for a link to itself, of which its reader tells."""
-    return Path(os.path.realpath(path))
+    """Return where a path leads; unlike `Path.resolve` no error for a link to itself or a NUL in it, of which its reader tells."""
+    try:
+        return Path(os.path.realpath(path))
+    except ValueError:
+        return Path(path)
 
 
 def read_regular_file(path: str | os.PathLike[str], *, bytes_max: int) -> bytes:

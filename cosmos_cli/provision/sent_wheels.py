@@ -28,6 +28,7 @@ import shutil
 import struct
 import sys
 import tempfile
+import threading
 import warnings
 import zipfile
 from collections.abc import Iterator
@@ -59,6 +60,8 @@ UNCHECKED_HASH = 1
 LOCK = "sent.lock"
 LOCK_TIMEOUT_S = 900.0
 """A slow operator compiles numpy for some minutes, once."""
+_compiling = threading.Lock()
+"""The filters of warnings are the process's: two threads that set and restore them leave those of one behind."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -190,7 +193,7 @@ def _compiled(name: str, content: bytes) -> Iterator[tuple[str, bytes]]:
     if not file.endswith(".py") or ".data/" in name:
         return
     try:
-        with warnings.catch_warnings(action="ignore"):
+        with _compiling, warnings.catch_warnings(action="ignore"):
             code = compile(content, name, "exec", dont_inherit=True)
     except (SyntaxError, ValueError):  # a template, or of another Python
         return

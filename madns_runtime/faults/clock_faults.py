@@ -80,6 +80,10 @@ class FaultableClock(ClockEstimate):
         """Return the host's clock minus this one, s, as it is served."""
         return super().offset_s(self.wrong_s(at_local_s))
 
+    def rate(self, at_local_s: float, span_s: float) -> float:
+        """Return how fast what is taken for the host's time runs against the real local clock, s/s."""
+        return super().rate(self.wrong_s(at_local_s), span_s) * (1.0 + self._rate)
+
     def uncertainty_s(self, at_local_s: float) -> float:
         """Return how far `offset_s` may be from the truth, s, as far as the estimate knows."""
         return super().uncertainty_s(self.wrong_s(at_local_s))

@@ -222,7 +222,7 @@ class AgentRunner:
                 if self._session.state is AgentState.RUN_SIMULATION:
                     self._records.clock(self._session.clock, monotonic())
                     if self._port.now_s() < 0.0:  # what is known better now moves the start
-                        self._pack.arm()
+                        self._port.process.follow_clock()
                         self._device_time.tell()
             case told.AgentStateEntered(state):
                 self._journal.event("state", state=state.value)

@@ -98,6 +98,7 @@ class AgentProcess:
             phase_s = phase_of(number, names, self._launch.config.agents)
             pack = Pack(phase_s, reactor=self._reactor, process=process)
             self._packs |= dict.fromkeys(names, pack)
+            process.arms.append(pack.arm)
         return [self._make_runner(seat) for seat in self._seats]
 
     def _make_runner(self, seat: LoopSeat) -> AgentRunner:

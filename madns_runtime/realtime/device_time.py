@@ -9,7 +9,7 @@ from madns_runtime.realtime.agent_link import AgentPort
 
 ERROR_S_MAX = 10e-6
 """What was told holds until the estimate has moved away from it by more, s."""
-SLOPE_SPAN_S = 0.1
+RATE_SPAN_S = 0.1
 
 
 class DeviceTime:
@@ -31,9 +31,8 @@ class DeviceTime:
         """Tell the devices' processes how simulated time runs; it must have begun to be known."""
         if self._hardware:
             port, local_s = self._port, monotonic()
-            offset_s = port.session.clock.offset_s
-            slope = (offset_s(local_s + SLOPE_SPAN_S) - offset_s(local_s)) / SLOPE_SPAN_S
-            self._local_s, self._t_s, self._rate = local_s, port.at(local_s), 1.0 + slope
+            self._local_s, self._t_s = local_s, port.at(local_s)
+            self._rate = port.session.clock.rate(local_s, RATE_SPAN_S)
             self._hardware.tell_time(local_s, self._t_s, self._rate)
 
     def follow(self) -> None:

@@ -6,6 +6,7 @@ What its agents send together leaves as one packet, and what comes is dealt out.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from time import monotonic
 
@@ -32,6 +33,8 @@ PING_SLOWED_MAX = 4.0
 """... down to so many times more rarely."""
 PACKETS_BATCH_MAX = 64
 """Packets taken from the socket in a row before timers get their turn."""
+MOVED_S = 10e-6
+"""A clock that has moved by more before simulated time begins has the first ticks' timers set anew."""
 
 
 class ProcessPort:
@@ -72,6 +75,9 @@ class ProcessPort:
         """Called when packets that came have been dealt out."""
         self._waiting: list[bytes] = []
         self._depth = 0
+        self.arms: list[Callable[[], None]] = []
+        """Each sets the timer of a pack's next tick by the clock."""
+        self._armed_offset_s = math.nan
 
     def pings(self) -> PingPlan:
         """Return when the next agent, of those that are made one after the other, exchanges times with the host."""
@@ -84,6 +90,14 @@ class ProcessPort:
             delay_s=interval_s * (number + 1) / self.agents,
             interval_s=interval_s,
         )
+
+    def follow_clock(self) -> None:
+        """Set the timers of all ticks anew if the clock has moved, whichever agent has learnt it: before simulated time begins."""
+        offset_s = self.clock.offset_s(monotonic())
+        if not abs(offset_s - self._armed_offset_s) <= MOVED_S:
+            self._armed_offset_s = offset_s
+            for arm in self.arms:
+                arm()
 
     def freeze(self) -> None:
         """Take what set-up made out of the collector's way, so that it is not walked in mid-run: once for all agents."""

@@ -197,6 +197,12 @@ class ClockEstimate:
         """
         return self._known().offset_at(at_local_s)
 
+    def rate(self, at_local_s: float, span_s: float) -> float:
+        """Return how fast the host's time, as it is served, runs from a local time on, s/s: the mean over a span."""
+        served = self._known()
+        ahead_s = served.offset_at(at_local_s + span_s) - served.offset_at(at_local_s)
+        return 1.0 + ahead_s / span_s
+
     def uncertainty_s(self, at_local_s: float) -> float:
         """Return how far `offset_s` may be from the truth, s; infinite before the first exchange."""
         if self._line is None or self._served is None:

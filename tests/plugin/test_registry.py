@@ -171,6 +171,10 @@ def test_missing_file_is_named(tmp_path):
     assert str(tmp_path / "no.py") in refusal("./no.py:simulation", tmp_path)
 
 
+def test_path_that_no_file_can_have_is_told(tmp_path):
+    assert "expected a path without NUL characters" in refusal("./a\0b.py:simulation", tmp_path)
+
+
 def test_syntax_error_is_shown_with_file_and_line(write, tmp_path):
     path = write("x = 1\ndef broken(:\n")
 

@@ -2,8 +2,14 @@
 
 from types import SimpleNamespace
 
+import pytest
+
+from madns_runtime.config import Agents
 from madns_runtime.plugin.half import RoleProgram
+from madns_runtime.protocol.events import ClockEstimated
+from madns_runtime.protocol.states import AgentState
 from madns_runtime.realtime import agent_process
+from madns_runtime.realtime.agent import AgentRunner
 from madns_runtime.realtime.agent_process import AgentProcess
 from madns_runtime.realtime.agent_report import AgentOutcome
 
@@ -34,3 +40,37 @@ def test_an_agent_that_returns_is_given_what_its_conditions_had_counted(monkeypa
         process._ended("a", AgentOutcome(as_ordered=False, reason="on purpose"))
 
     assert given == [(1, {}), (2, {3: 10}), (3, {3: 20})]
+
+
+def test_every_pack_of_a_process_is_timed_anew_with_the_clock_that_they_share(monkeypatch):
+    process_port = SimpleNamespace(agents=9, arms=[])
+    monkeypatch.setattr(agent_process, "ProcessPort", lambda *_: process_port)
+    monkeypatch.setattr(agent_process, "AgentRunner", lambda seat, *_, **more: more["pack"])
+    config = SimpleNamespace(agents=Agents(count=9, tick_hz=10.0, per_process=9))
+    process = AgentProcess.__new__(AgentProcess)
+    process._reactor = SimpleNamespace(call_at=lambda due_s, call: None)
+    process._launch = SimpleNamespace(config=config)
+    process._seats = [SimpleNamespace(name=name) for name in config.agents.resolved_names()]
+    process._program = RoleProgram(make=object, parameters=None)
+    process._packs, process._lives, process._counted = {}, {}, {}
+
+    packs = process._make_runners()
+
+    assert len(packs) == 9
+    assert process_port.arms == [pack.arm for pack in dict.fromkeys(packs)]
+    assert len(process_port.arms) == 2
+
+
+@pytest.mark.parametrize(("t_s", "times"), [(-0.2, 1), (0.0, 0)])
+def test_what_an_agent_learns_of_the_clock_is_followed_until_simulated_time_begins(t_s, times):
+    followed, told_devices = [], []
+    runner = AgentRunner.__new__(AgentRunner)
+    runner._session = SimpleNamespace(state=AgentState.RUN_SIMULATION, clock=None)
+    runner._records = SimpleNamespace(clock=lambda clock, now_s: None)
+    process = SimpleNamespace(follow_clock=lambda: followed.append(t_s))
+    runner._port = SimpleNamespace(now_s=lambda: t_s, process=process)
+    runner._device_time = SimpleNamespace(tell=lambda: told_devices.append(t_s))
+
+    runner._handle(ClockEstimated())
+
+    assert followed == told_devices == [t_s] * times

@@ -10,7 +10,7 @@ import pytest
 from madns_runtime.config import Recording
 from madns_runtime.protocol.bundle import BUNDLE, bundle_up, split
 from madns_runtime.protocol.datagram import OVERHEAD_BYTES
-from madns_runtime.realtime.process_port import PING_INTERVAL_S, ProcessPort
+from madns_runtime.realtime.process_port import MOVED_S, PING_INTERVAL_S, ProcessPort
 from madns_runtime.timing.late_causes import Cause
 
 
@@ -69,6 +69,24 @@ def test_each_agent_gets_what_is_for_it(host):
     loop.turn()
 
     assert got == {7: [datagram(7), datagram(7, b"y")], 8: [datagram(8), datagram(8, b"z")]}
+
+
+def test_a_clock_that_moves_has_the_ticks_of_all_packs_timed_anew_and_one_that_stands_those_of_none(
+    host,
+):
+    port, armed = port_of(host, 9), []
+    port.arms += [lambda: armed.append("first pack"), lambda: armed.append("second pack")]
+
+    def learn(offset_s):
+        port.clock.offset_s = lambda local_s: offset_s
+        port.follow_clock()
+        told, armed[:] = list(armed), []
+        return told
+
+    assert learn(-0.0095) == ["first pack", "second pack"]
+    assert learn(-0.0095 + MOVED_S / 2) == []
+    assert learn(0.0) == ["first pack", "second pack"]
+    assert learn(MOVED_S / 2) == []
 
 
 def test_what_is_done_behind_a_packet_is_no_part_of_the_time_in_which_it_was_received(host):

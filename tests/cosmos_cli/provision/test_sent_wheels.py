@@ -9,6 +9,8 @@ import json
 import os
 import subprocess
 import sys
+import threading
+import time
 import zipfile
 from pathlib import Path
 
@@ -166,6 +168,40 @@ def test_two_commands_that_pack_the_same_wheel_send_the_same(made, tmp_path):
     assert told[0] == told[1]
     sent_path, sha256 = told[0]
     assert hashlib.sha256(Path(sent_path).read_bytes()).hexdigest() == sha256
+
+
+def test_wheels_that_are_packed_at_once_take_turns_with_the_filters_of_warnings(
+    made, tmp_path, monkeypatch
+):
+    """As for machines of two kinds; each is made of code that Python warns of."""
+    inside, most = [], []
+    catch = sent_wheels.warnings.catch_warnings
+
+    class Caught(catch):
+        def __enter__(self):
+            inside.append(self)
+            most.append(len(inside))
+            time.sleep(0.05)
+            return super().__enter__()
+
+        def __exit__(self, *what):
+            super().__exit__(*what)
+            inside.remove(self)
+
+    monkeypatch.setattr(sent_wheels.warnings, "catch_warnings", Caught)
+    threads = []
+    for name in ("one", "two"):
+        path, locked = made(name)
+        (tmp_path / name).mkdir()
+        path = path.rename(tmp_path / name / path.name)
+        threads.append(threading.Thread(target=sent_wheel, args=(path, locked, HERE)))
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60.0)
+
+    assert len(most) >= 4
+    assert max(most) == 1
 
 
 def test_packed_wheel_that_lost_its_note_is_packed_anew(made):
