@@ -6,7 +6,8 @@ The simulation says how its records are read; here rows become a Parquet file li
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
@@ -71,12 +72,13 @@ def times_of(config: RunConfig, ran_s: float | None, rate_hz: float) -> Times:
         InputError: They are too many.
     """
     duration_s = config.time.duration_s if ran_s is None else min(config.time.duration_s, ran_s)
-    count = int(duration_s * rate_hz + 1e-6) + 1
-    if count > ROWS_OF_AGENT_MAX:
+    last = duration_s * rate_hz + 1e-6
+    if last >= ROWS_OF_AGENT_MAX:
         raise InputError(
-            f"--rate-hz {rate_hz:g}: {count} times of each agent are more than {ROWS_OF_AGENT_MAX}; "
-            "take a lower rate"
+            f"--rate-hz {rate_hz:g}: {math.floor(last) + 1 if last < math.inf else last} times of each agent are"
+            f" more than {ROWS_OF_AGENT_MAX}; take a lower rate"
         )
+    count = int(last) + 1
     # As a tick's time is made of its number, so that both have the same digits.
     return np.arange(count) / rate_hz
 
@@ -124,18 +126,16 @@ def _parts(
 ) -> Iterator[Tabulated]:
     """Yield what the simulation tabulates, part by part: its faults are told as its own."""
     parts = call_plugin("tabulate", function, folder, agents, times_s, finish=iter)
-    told: dict[str, None] = {}
+    told: dict[str, int] = {}
     fields: tuple[Field, ...] | None = None
 
     def judge(part: object) -> Tabulated | None:
-        fault = None if part is None else _fault_of(part, fields, agents)
-        if part is None or fault:
-            missing = [agent for agent in agents if agent not in told]
-            fault = fault or (f"yielded no rows of {_some_of(missing)}" if missing else None)
-            if fault:
-                raise PluginError(f"{place_of(function)}: tabulate() {fault}")
-            return None
-        return _as_floats(part)
+        fault = _missing(told, agents, times_s)
+        if part is not None:
+            fault = _fault_of(part, fields, agents) or _fault_of_times(part, told, times_s)
+        if fault:
+            raise PluginError(f"{place_of(function)}: tabulate() {fault}")
+        return None if part is None else _as_floats(part)
 
     @wraps(function)  # whose file and line are told
     def advance() -> object:
@@ -143,8 +143,32 @@ def _parts(
 
     while (part := call_plugin("tabulate", advance, finish=judge)) is not None:
         fields = part.fields
-        told[part.agent] = None
+        told[part.agent] = told.get(part.agent, 0) + len(part.times_s)
         yield part
+
+
+def _missing(told: Mapping[str, int], agents: tuple[str, ...], times_s: Times) -> str | None:
+    """Return whose rows are not there, or not all; *told* has how many there are."""
+    if missing := [agent for agent in agents if agent not in told]:
+        return f"yielded no rows of {_some_of(missing)}"
+    if short := [agent for agent in agents if told[agent] < len(times_s)]:
+        return (
+            f"must yield a row for each of {len(times_s)} times, with NaN where nothing is on record;"
+            f" yielded {told[short[0]]} of {_some_of(short)}"
+        )
+    return None
+
+
+def _fault_of_times(part: Tabulated, told: Mapping[str, int], times_s: Times) -> str | None:
+    first = told.get(part.agent, 0)
+    if np.array_equal(part.times_s, times_s[first : first + len(part.times_s)]):
+        return None
+    return (
+        f"must yield rows at the times that it is asked for, in their order; of {part.agent} row"
+        f" {first} is wanted for {times_s[first]:g} s"
+        if first < len(times_s)
+        else f"yielded more rows of {part.agent} than the {len(times_s)} times that it is asked for"
+    )
 
 
 def _some_of(names: list[str]) -> str:
@@ -202,7 +226,7 @@ def _write(
                 writer = TableWriter(path, layout(part.fields))
             if file is None or file.source != part.agent:
                 done += file is not None
-                progress(f"tabulating {part.agent}", done / agents)
+                progress(f"tabulating {part.agent}", min(done / agents, 1.0))
                 if file is not None:
                     writer.end_file(file)
                 file = _source(part, path)

@@ -18,7 +18,7 @@ from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.launch.execute import Detached, RunOptions, execute
 from cosmos_cli.rerun.actions import action_remarks
 from cosmos_cli.rerun.device_comparison import compare_devices
-from cosmos_cli.rerun.early_ends import leave_out_after_ends
+from cosmos_cli.rerun.early_ends import leave_out_after_ends, leave_out_after_simulated_time
 from cosmos_cli.rerun.expectations import compare_expectations
 from cosmos_cli.rerun.flown_software import recorded_software, software_remarks, version_remarks
 from cosmos_cli.rerun.outcome import RerunOutcome, print_outcome
@@ -108,6 +108,9 @@ def _fly(
         after = open_side(summary.run, summary.run.name)
         streams = compare(before, after, Selection(), progress)
         remarks += leave_out_after_ends(streams.streams, flown.ends, before.tick_hz)
+        if not recorded.config.time.is_lockstep:
+            end_s = float(summary.document["duration_s"])
+            remarks += leave_out_after_simulated_time(streams.streams, end_s)
         return RerunOutcome(
             devices=compare_devices(recorded, summary.run.path, flown.ends),
             streams=streams,

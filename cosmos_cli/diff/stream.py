@@ -11,6 +11,7 @@ import numpy as np
 
 from cosmos_cli.diff.fields import FieldDifference, RecordPlace, place_of
 from cosmos_cli.diff.recorded import ROWS_READ_MAX, Recorded
+from cosmos_cli.evidence.streams import NUMBER_KINDS
 from madns_runtime.analysis.matching import Matched, Rows, joined, match
 from madns_runtime.analysis.sampling import as_array
 from madns_runtime.analysis.values import Floats
@@ -122,17 +123,18 @@ def choose_pairing(a: Sequence[Field], b: Sequence[Field], tick_hz: tuple[float,
     By tick where both runs tick alike, at different rates by the instant that a tick means; what has no
     tick by its time, to half a tick; what has no time by its number.
     """
-    common = {f.name: f for f in a if any(f.name == other.name for other in b)}
+    common = {f.name: f for f in a if any((f.name, f.unit) == (o.name, o.unit) for o in b)}
     identity = tuple(n for n in IDENTITY if n in common and common[n].kind == "str")
+    numbers = {name for name, one in common.items() if one.kind in NUMBER_KINDS}
     for name in ("tick", "packet"):
-        if name in common and tick_hz[0] == tick_hz[1]:
+        if name in numbers and tick_hz[0] == tick_hz[1]:
             return Pairing(by="tick", column=name, identity=identity)
-        if name in common:
+        if name in numbers:
             scales = (1.0 / tick_hz[0], 1.0 / tick_hz[1])
             return Pairing(
                 by="time", column=name, scales=scales, tolerance=SAME_TIME_S, identity=identity
             )
-    time = next((name for name in TIMES if name in common), None)
+    time = next((name for name in TIMES if name in numbers), None)
     if time is not None:
         return Pairing(by="time", column=time, tolerance=0.5 / max(tick_hz), identity=identity)
     return Pairing(by="order", column="", identity=())
@@ -157,7 +159,8 @@ def diff_stream(
     Raises:
         MachineError: A file cannot be read.
     """
-    names = tuple(n for n in a.names() if n in b.names())
+    units_a, units_b = ({f.name: f.unit for f in one.fields} for one in (a, b))
+    names = tuple(n for n in a.names() if n in b.names() and units_a[n] == units_b[n])
     keys = (pairing.column, *pairing.identity)
     values = [f for f in a.fields if f.name in names and f.name not in keys]
     found = StreamDifference(
@@ -165,8 +168,8 @@ def diff_stream(
         source=a.source,
         by=pairing.by,
         fields={f.name: FieldDifference(f) for f in values},
-        fields_only_a=tuple(n for n in a.names() if n not in names),
-        fields_only_b=tuple(n for n in b.names() if n not in names),
+        fields_only_a=_others_of(a, names, units_b),
+        fields_only_b=_others_of(b, names, units_a),
     )
     sides = (
         _rows(a, names, pairing, scale=pairing.scales[0], agents=agents),
@@ -176,6 +179,17 @@ def diff_stream(
         _take(found, piece)
     found.is_identical = found.has_same_values and not (a.files or b.files)
     return found
+
+
+def _others_of(
+    recorded: Recorded, names: Sequence[str], known: Mapping[str, str]
+) -> tuple[str, ...]:
+    """Return the fields that only this run has; of those that the other has in another unit with theirs, as `x (km)`."""
+    return tuple(
+        f"{field.name} ({field.unit})" if field.name in known else field.name
+        for field in recorded.fields
+        if field.name not in names
+    )
 
 
 def identical_stream(a: Recorded, by: By, records: int) -> StreamDifference:
@@ -212,6 +226,7 @@ def _rows(
 ) -> Iterator[Rows]:
     """Give a stream's records in batches, the first of them empty if there are none."""
     owner = next((n for n in OWNERS if n in names), None) if recorded.role == "host" else None
+    names = names or recorded.names()[:1]  # without a common field records are counted all the same
     chosen: dict[str, bool] = {}
     counted = 0
 

@@ -58,7 +58,10 @@ def call_simulation(config: RunConfig, part: Part, *arguments: Any) -> tuple[str
         raise PluginError(str(defect).strip().rpartition("\n")[2]) from None
     if "fault" in found:
         raise PluginError(found["fault"])
-    name, value = from_plain(found["value"])
+    try:
+        name, value = from_plain(found["value"])
+    except ValueError as error:  # it was changed after it had been made
+        raise PluginError(f"{part}() of {config.simulation}: {error}") from None
     return name, value
 
 

@@ -68,7 +68,7 @@ class TableLayout:
         """Name of the column with the second name of each record's agent; None if there is none."""
         is_of_agents = self.role == "agent" or AGENT in self._names
         labels = self.labels.agents
-        is_free = labels.column not in self._names
+        is_free = labels.column not in (*self._names, self.source_column)
         return labels.column if is_of_agents and labels.names and is_free else None
 
     def arrow_schema(self) -> pa.Schema:
@@ -114,10 +114,13 @@ def plan_table(
             merged[field.name] = field if known is None else _wider(known, field)
     role = files[0].role
     needs_time = "tick" in merged and "t_s" not in merged and role == "agent"
+    source_column = role
+    while source_column in merged:
+        source_column += "_name"
     return TableLayout(
         name=files[0].table,
         role=role,
-        source_column=role if role not in merged else f"{role}_name",
+        source_column=source_column,
         fields=tuple(f for f in merged.values() if f.name != INCARNATION and f.kind != "packed"),
         tick_hz=tick_hz if needs_time else None,
         labels=labels,

@@ -137,7 +137,8 @@ class _Drawn:
             return "remark", ReportRemark(text=text)
 
     def _figure(self, figure: Figure | SpaceFigure) -> dict[str, Any]:
-        made = to_plotly(figure)
+        with np.errstate(all="ignore"):  # numbers of anybody's, as large as they may be
+            made = to_plotly(figure)
         group = getattr(figure, "group", "")
         choices = [{"name": name, "traces": self._encode(traces)} for name, traces in made.choices]
         layout = self._encode(made.layout)

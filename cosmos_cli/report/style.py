@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -69,9 +70,11 @@ def log_axis(low: float, high: float) -> dict[str, Any]:
     Ticks stand at 1, 2, 5 of each decade if there are few decades, else at 1; plotly's own would show
     a 200 as a small 2.
     """
-    first, last = math.floor(math.log10(max(low, 1e-12))), math.ceil(math.log10(max(high, 1e-12)))
+    first = math.floor(math.log10(max(low, 1e-12)))
+    last = min(math.ceil(math.log10(max(high, 1e-12))), sys.float_info.max_10_exp)
     steps = (1, 2, 5) if last - first <= DECADES_FINE_MAX else (1,)
     ticks = [step * 10.0**decade for decade in range(first, last + 1) for step in steps]
+    ticks = [tick for tick in ticks if tick < math.inf]
     return {"type": "log", "tickvals": ticks, "ticktext": [f"{tick:g}" for tick in ticks]}
 
 

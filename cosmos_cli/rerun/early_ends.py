@@ -1,13 +1,14 @@
-"""Agents whose records end before others' of a run that was cut off: what a rerun has of them after that. Pure."""
+"""Ends of a recorded run that lockstep does not have: agents that ended before others, and a host that went on. Pure."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from cosmos_cli.diff.stream import TICK_TOLERANCE, Alone, StreamDifference
+from cosmos_cli.diff.stream import SAME_TIME_S, TICK_TOLERANCE, Alone, StreamDifference
 from cosmos_cli.rerun.recorded_run import RecordedAgent
 from cosmos_cli.ui.plural import counted
 
+HOST = "host"
 AGENTS_NAMED_MAX = 5
 """In one remark each; of more it is told how many."""
 
@@ -50,4 +51,32 @@ def leave_out_after_ends(
     ]
     if rest := len(found) - len(remarks):
         remarks.append(f"{counted(rest, 'more agent')} ended before the last one did, likewise")
+    return tuple(remarks)
+
+
+def leave_out_after_simulated_time(
+    streams: Iterable[StreamDifference], end_s: float
+) -> tuple[str, ...]:
+    """
+    Leave out of a comparison what the host recorded, on record alone, when simulated time was over; return remarks.
+
+    In real time its half's timer is called on while agents listen for what is still under way; in lockstep nothing is.
+
+    Args:
+        streams: Altered: one per stream and source.
+        end_s: Of simulated time, s.
+    """
+    remarks = []
+    for one in streams:
+        first = one.only_a.first
+        if one.source != HOST or one.by != "time" or first is None:
+            continue
+        # Of a timer that is due at the end itself rounding decides whether lockstep calls it.
+        if first.key > end_s - SAME_TIME_S:
+            remarks.append(
+                f"{one.table}: {counted(one.only_a.count, 'record')} of the host from the end of simulated time on,"
+                f" {end_s:g} s, are not compared"
+            )
+            one.rows_a -= one.only_a.count
+            one.only_a = Alone()
     return tuple(remarks)

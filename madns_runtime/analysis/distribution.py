@@ -106,8 +106,11 @@ class Distribution:
         position = quantile * (int(cumulated[-1]) - 1)
         low = math.floor(position)
         lower, upper = np.searchsorted(cumulated, (low, math.ceil(position)), "right")
-        below, above = self._values[lower], self._values[upper]
-        return float(below + (position - low) * (above - below))
+        below, above = float(self._values[lower]), float(self._values[upper])
+        share = position - low
+        if math.isinf(above - below):  # they are farther apart than a float can tell
+            return below * (1.0 - share) + above * share
+        return below + share * (above - below)
 
 
 def summarise(samples: NDArray[Any]) -> Summary | None:

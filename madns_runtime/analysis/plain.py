@@ -27,7 +27,7 @@ def to_plain(value: Any) -> Any:
     Raises:
         TypeError: It holds what no figure is made of.
     """
-    if type(value).__name__ in KINDS and dataclasses.is_dataclass(value):
+    if KINDS.get(type(value).__name__) is type(value):
         fields = {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return {KIND: type(value).__name__, "fields": fields}
     if isinstance(value, np.ndarray):

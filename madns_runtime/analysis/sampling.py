@@ -40,7 +40,7 @@ def thin(x: Floats, y: Floats, points_max: int) -> tuple[Floats, Floats]:
     """
     Keep the smallest and the largest sample of each of points_max / 2 buckets, in their order.
 
-    No peak is lost. NaN marks a gap and is kept where a whole bucket is NaN.
+    No peak is lost. What is not finite marks a gap and is kept where a whole bucket is none.
 
     Args:
         x: Abscissae, shape (N,).
@@ -53,8 +53,9 @@ def thin(x: Floats, y: Floats, points_max: int) -> tuple[Floats, Floats]:
     starts = edges[:-1]
     bucket = np.repeat(np.arange(len(starts)), np.diff(edges))
     # Sorted by bucket, then value; NaN sorts last, so the last finite value is looked up by count.
-    order = np.lexsort((y, bucket))
-    finite = np.add.reduceat(np.isfinite(y), starts)
+    is_finite = np.isfinite(y)
+    order = np.lexsort((np.where(is_finite, y, np.nan), bucket))
+    finite = np.add.reduceat(is_finite, starts)
     lowest = order[starts]
     highest = order[starts + np.maximum(finite, 1) - 1]
     chosen = np.unique(np.concatenate((lowest, highest)))
@@ -116,7 +117,8 @@ class TimeEnvelope:
         self._largest = np.full(buckets, -np.inf)
 
     def add(self, t_s: Floats, values: Floats) -> None:
-        """Count samples, shape (N,) each."""
+        """Count samples, shape (N,) each; where either is NaN there is none."""
+        t_s, values = _told(t_s, values)
         buckets, levels = self._counts.shape
         row = np.clip(np.searchsorted(self._edges_s, t_s, "right") - 1, 0, buckets - 1)
         column = np.clip(np.searchsorted(self._levels, values, "right") - 1, 0, levels - 1)
@@ -146,8 +148,14 @@ def envelope_series(envelope: TimeEnvelope) -> list[Series]:
     return [Series(x=middles, y=curves[n], name=n, tone=tone) for n, tone in tones.items()]
 
 
+def _told(t_s: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """Return the samples without those that are NaN, as what was not recorded is: they lie in no bin."""
+    is_told = ~(np.isnan(t_s) | np.isnan(values))
+    return (t_s, values) if is_told.all() else (t_s[is_told], values[is_told])
+
+
 class BinCounts:
-    """Counts in fixed bins; what lies outside goes into the outermost ones."""
+    """Counts in fixed bins; what lies outside goes into the outermost ones, and NaN into none."""
 
     def __init__(self, edges: Floats) -> None:
         self.edges = edges
@@ -155,6 +163,8 @@ class BinCounts:
 
     def add(self, values: NDArray[Any]) -> None:
         """Count samples, shape (N,)."""
+        if values.dtype.kind == "f":
+            values = values[~np.isnan(values)]
         bins = np.clip(np.searchsorted(self.edges, values, "right") - 1, 0, len(self.counts) - 1)
         self.counts += np.bincount(bins, minlength=len(self.counts))
 
@@ -180,7 +190,8 @@ class BinnedRms:
         self._largest = np.zeros(bins)
 
     def add(self, t_s: Floats, values: Floats) -> None:
-        """Take values, shape (N,), at times, s."""
+        """Take values, shape (N,), at times, s; where either is NaN there is none."""
+        t_s, values = _told(t_s, values)
         bins = np.clip(np.searchsorted(self._edges_s, t_s, "right") - 1, 0, self._bins - 1)
         self._counts += np.bincount(bins, minlength=self._bins)
         self._squares += np.bincount(bins, weights=values * values, minlength=self._bins)

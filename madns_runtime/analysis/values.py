@@ -7,36 +7,33 @@ line that made it. Texts are shown as they are: markup in them is none.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from types import NoneType
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from madns_runtime.analysis.field_checks import (
+    as_number,
+    hold_arrays,
+    hold_kind,
+    hold_list,
+    hold_numbers,
+    hold_same,
+    hold_texts,
+    hold_whole,
+    hold_word,
+    table_rows,
+)
+
 Floats = NDArray[np.float64]
 Tone = Literal["palette", "main", "warm", "bad", "pale", "muted"]
 """Colour by meaning; palette: by the place among a figure's marks."""
-
-
-def _hold(owner: Any, shapes: Mapping[str, int]) -> None:
-    """Turn fields of *owner* into arrays of so many dimensions."""
-    for name, dimensions in shapes.items():
-        array = np.asarray(getattr(owner, name), dtype=np.float64)
-        if array.ndim != dimensions:
-            raise ValueError(
-                f"{type(owner).__name__}.{name}: expected {dimensions} dimensions, got {array.ndim}"
-            )
-        object.__setattr__(owner, name, array)
-
-
-def _hold_same(owner: Any, *names: str) -> None:
-    """Turn fields of *owner* into arrays of one dimension and one length."""
-    _hold(owner, dict.fromkeys(names, 1))
-    lengths = {name: len(getattr(owner, name)) for name in names}
-    if len(set(lengths.values())) > 1:
-        told = ", ".join(f"{name} {length}" for name, length in lengths.items())
-        raise ValueError(f"{type(owner).__name__}: expected one length, got {told}")
+Form = Literal["line", "dotted", "steps", "points", "joined points"]
+"""How values are joined."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +46,10 @@ class Axis:
     is_logarithmic: bool = False
     from_zero: bool = False
     """Whether zero is shown in any case."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is no text."""
+        hold_texts(self, "quantity", "unit")
 
     @property
     def label(self) -> str:
@@ -66,7 +67,7 @@ class Series:
     x: Floats
     y: Floats
     name: str = ""
-    form: Literal["line", "dotted", "steps", "points", "joined points"] = "line"
+    form: Form = "line"
     tone: Tone = "palette"
     panel: int = 0
     """Number of the figure's panel that it is in."""
@@ -75,7 +76,9 @@ class Series:
 
     def __post_init__(self) -> None:
         """Refuse what does not fit together."""
-        _hold_same(self, "x", "y")
+        hold_same(self, "x", "y")
+        _hold_mark(self, "name", "note")
+        hold_word(self, "form", get_args(Form))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,7 +94,8 @@ class Band:
 
     def __post_init__(self) -> None:
         """Refuse what does not fit together."""
-        _hold_same(self, "x", "low", "high")
+        hold_same(self, "x", "low", "high")
+        _hold_mark(self, "name")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -108,12 +112,13 @@ class Histogram:
 
     def __post_init__(self) -> None:
         """Refuse what does not fit together."""
-        _hold(self, {"edges": 1, "counts": 1})
+        hold_arrays(self, {"edges": 1, "counts": 1})
         if len(self.edges) != len(self.counts) + 1:
             raise ValueError(
                 f"Histogram: expected one edge more than counts, got {len(self.edges)} edges"
                 f" and {len(self.counts)} counts"
             )
+        _hold_mark(self, "name")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,8 +134,13 @@ class Bars:
 
     def __post_init__(self) -> None:
         """Refuse what does not fit together."""
+        hold_list(self, "names", str, "a text")
+        hold_list(self, "values", object, "a number or None")
         if len(self.names) != len(self.values):
             raise ValueError(f"Bars: {len(self.names)} names and {len(self.values)} values")
+        values = [None if v is None else as_number(v, "Bars.values") for v in self.values]
+        object.__setattr__(self, "values", values)
+        _hold_mark(self, "name")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -146,14 +156,24 @@ class HeatMap:
 
     def __post_init__(self) -> None:
         """Refuse what does not fit together."""
-        _hold(self, {"x": 1, "y": 1, "values": 2})
+        hold_arrays(self, {"x": 1, "y": 1, "values": 2})
         if self.values.shape != (len(self.y), len(self.x)):
             raise ValueError(
                 f"HeatMap: expected values of shape {(len(self.y), len(self.x))}, got {self.values.shape}"
             )
+        hold_kind(self, "scale", Axis, "an Axis")
+        _hold_mark(self)
 
 
 Mark = Series | Band | Histogram | Bars | HeatMap
+
+
+def _hold_mark(mark: Mark, *texts: str) -> None:
+    """Refuse what marks have in common where it is something else, and fields that are no texts."""
+    hold_texts(mark, *texts)
+    if not isinstance(mark, HeatMap):
+        hold_word(mark, "tone", get_args(Tone))
+    hold_whole(mark, "panel")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -166,6 +186,11 @@ class LimitLine:
     """Whether smaller values are the bad ones."""
     is_of_x: bool = False
     """Whether it is one of the abscissa."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is no number or no text."""
+        hold_numbers(self, "value")
+        hold_texts(self, "name")
 
     def is_broken_by(self, values: Floats) -> NDArray[np.bool_]:
         """Tell which values lie beyond."""
@@ -181,6 +206,12 @@ class EventBand:
     name: str = ""
     tone: Tone = "warm"
 
+    def __post_init__(self) -> None:
+        """Refuse what is no number, no text or no tone."""
+        hold_numbers(self, "start", "end")
+        hold_texts(self, "name")
+        hold_word(self, "tone", get_args(Tone))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FigureChoice:
@@ -188,6 +219,20 @@ class FigureChoice:
 
     marks: Sequence[Mark]
     name: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse what is no mark or no text."""
+        hold_list(self, "marks", get_args(Mark), "a mark, such as a Series")
+        hold_texts(self, "name")
+
+
+FIGURE_LISTS = {
+    "panels": Axis,
+    "choices": FigureChoice,
+    "limits": LimitLine,
+    "events": EventBand,
+}
+"""Of what a figure has several."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -211,7 +256,15 @@ class Figure:
     events: Sequence[EventBand] = ()
 
     def __post_init__(self) -> None:
-        """Refuse a figure that shows nothing, or marks in panels that are not there."""
+        """Refuse a figure that shows nothing, other values in it, or marks in panels that are not there."""
+        hold_texts(self, "title", "note", "group")
+        hold_kind(self, "x", Axis, "an Axis")
+        hold_kind(self, "y", Axis, "an Axis")
+        for name, kind in FIGURE_LISTS.items():
+            hold_list(self, name, kind, kind.__name__)
+        hold_whole(self, "columns")
+        if self.columns < 1:
+            raise ValueError(f"figure {self.title!r}: expected columns, got {self.columns}")
         if not self.choices or not all(choice.marks for choice in self.choices):
             raise ValueError(
                 f"figure {self.title!r}: expected a mark in each of at least one choice"
@@ -234,9 +287,11 @@ class SpacePath:
 
     def __post_init__(self) -> None:
         """Refuse what is no line in space."""
-        _hold(self, {"points": 2})
+        hold_arrays(self, {"points": 2})
         if self.points.shape[1] != 3:
             raise ValueError(f"SpacePath: expected shape (N, 3), got {self.points.shape}")
+        hold_texts(self, "name")
+        hold_word(self, "tone", get_args(Tone))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -254,6 +309,19 @@ class SpaceFigure:
     sphere_radius: float | None = None
     """Of a body about the origin."""
 
+    def __post_init__(self) -> None:
+        """Refuse other values, and a sphere without an extent."""
+        hold_texts(self, "title", "note", "unit")
+        hold_list(self, "paths", SpacePath, "a SpacePath")
+        hold_kind(self, "spots", (SpacePath, NoneType), "a SpacePath or None")
+        hold_list(self, "spot_names", str, "a text")
+        if self.sphere_radius is not None:
+            hold_numbers(self, "sphere_radius")
+            if not 0.0 < self.sphere_radius < math.inf:
+                raise ValueError(
+                    f"SpaceFigure.sphere_radius: expected more than 0, got {self.sphere_radius:g}"
+                )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Heading:
@@ -261,6 +329,10 @@ class Heading:
 
     text: str
     is_number: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse what is no text."""
+        hold_texts(self, "text")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -273,15 +345,10 @@ class TableBlock:
     note: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse a head of other values, and rows of another length than it."""
-        heads: Sequence[Any] = self.headings
-        if wrong := [type(head).__name__ for head in heads if not isinstance(head, Heading)]:
-            raise ValueError(f"table {self.title!r}: expected a Heading per column, got {wrong[0]}")
-        for number, row in enumerate(self.rows):
-            if len(row) != len(self.headings):
-                raise ValueError(
-                    f"table {self.title!r}: row {number} has {len(row)} cells, the head {len(self.headings)}"
-                )
+        """Turn arrays into rows; refuse a head of other values, and rows of another length than it."""
+        hold_texts(self, "title", "note")
+        hold_list(self, "headings", Heading, "a Heading")
+        object.__setattr__(self, "rows", table_rows(self.rows, len(self.headings), self.title))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -292,9 +359,7 @@ class ReportRemark:
 
     def __post_init__(self) -> None:
         """Refuse what is no text."""
-        text: Any = self.text
-        if not isinstance(text, str):
-            raise ValueError(f"ReportRemark: expected a text, got {type(text).__name__}")
+        hold_texts(self, "text")
 
 
 Block = Figure | SpaceFigure | TableBlock | ReportRemark
@@ -309,6 +374,11 @@ class Section:
     intro: str = ""
     tables: Sequence[str] = ()
     """Names of the tables that it tells of: they are not drawn again."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is no text; blocks are looked at where they are shown."""
+        hold_texts(self, "title", "intro")
+        hold_list(self, "tables", str, "a table's name")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

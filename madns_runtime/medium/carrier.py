@@ -16,6 +16,7 @@ from typing import Any, Final, Protocol
 from madns_runtime.errors import MessageTooLarge, PluginError
 from madns_runtime.medium.outcomes import (
     DELIVERED,
+    EVERYBODY,
     LOST,
     LinkOutcome,
     Medium,
@@ -187,6 +188,10 @@ def _checked(outcome: LinkOutcome, transmission: Transmission) -> LinkOutcome:
             f"{shown(outcome.outcome)} with arrives_s {shown(arrives_s)}: expected a message that is {DELIVERED!r} to"
             f" arrive later than it was sent, at {transmission.sent_s:g} s, and no other to arrive"
         )
+    if arrives_s is not None and outcome.to == EVERYBODY:
+        raise PluginError(
+            f"a LinkOutcome that delivers to {EVERYBODY!r}: expected one for each receiver, by name"
+        )
     return outcome
 
 
@@ -198,6 +203,7 @@ def _is_plain(outcome: LinkOutcome) -> bool:
         and outcome.outcome.isascii()
         and (outcome.arrives_s is None or type(outcome.arrives_s) is float)
         and type(outcome.size_bytes) is int
+        and outcome.size_bytes >= 0
     )
 
 
@@ -223,7 +229,9 @@ def _plain(outcome: LinkOutcome) -> LinkOutcome:
         if not is_fit or (name == "outcome" and (not is_line(value) or not value)):
             raise PluginError(f"a LinkOutcome with {name} {shown(value)}: expected {wanted}")
         try:
-            changed[name] = _MAKE.get(name, str)(value)
+            changed[name] = made = _MAKE.get(name, str)(value)
+            if name == "size_bytes" and made < 0:
+                raise ValueError
         except Exception:  # noqa: BLE001 - of NaN, a whole number without end, or a class that may raise anything
             raise PluginError(
                 f"a LinkOutcome with {name} {shown(value)}: expected {wanted}"

@@ -178,7 +178,8 @@ class LinkMedium:
                             f"delay_s({sender!r}, {receiver!r}, {leaves_s:g}) returned {shown(delay_s)}: expected"
                             " seconds, more than 0"
                         )
-                arrives_s = leaves_s + duration_s + delay_s
+                # A delay may be less than what tells two times apart.
+                arrives_s = max(leaves_s + duration_s + delay_s, math.nextafter(sent_s, math.inf))
                 found.append(outcome(to=receiver, outcome=DELIVERED, arrives_s=arrives_s))
         return found or [outcome(to=to, outcome=NOBODY_IN_REACH)]
 

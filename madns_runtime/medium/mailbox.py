@@ -14,13 +14,15 @@ from typing import Any, Final
 
 from madns_runtime.errors import PluginError
 from madns_runtime.medium.outcomes import EVERYBODY
-from madns_runtime.plain_values import is_whole
+from madns_runtime.plain_values import is_whole, shown
 from madns_runtime.protocol.messages import Delivery, Service, Transmission
 
 HELD_MAX: Final = 4096
 """Messages held at a time; further ones are dropped and counted."""
 TIME_EPSILON_S: Final = 1e-9
 """Rounding of tick times: what arrives at a tick's own time is received in it."""
+NUMBER_END: Final = 2**62
+"""Numbers that senders give themselves lie below: what counts on from one fits 64 bits, as chance by number must."""
 NUMBERS_PER_LIFE: Final = 2**32
 """Messages of an agent's process after it, started anew, are numbered from the next multiple of this."""
 WHAT_TO_DECLARE: Final = (
@@ -100,8 +102,10 @@ class Mailbox:
             raise PluginError(f"expected a receiver's name, got {to!r:.80}")
         if number is None:
             number = self._number
-        elif not is_whole(number):
-            raise PluginError(f"number: expected a whole number, got {number!r:.80}")
+        elif not is_whole(number) or not -NUMBER_END < number < NUMBER_END:
+            raise PluginError(
+                f"number: expected a whole number of less than 2**62, got {shown(number)}"
+            )
         else:
             number = int(number)
         self._post(Transmission(to, number, self.tick_s, message))
@@ -113,7 +117,8 @@ class Mailbox:
         if len(self._held) >= HELD_MAX:
             self._refused += 1
             return
-        self._late += delivery.arrives_s <= self.tick_s + TIME_EPSILON_S
+        is_over = delivery.arrives_s <= self.tick_s + TIME_EPSILON_S
+        self._late += is_over and delivery.sent_s < self.tick_s  # none is received in its own tick
         self._serial += 1
         entry = (delivery.arrives_s, delivery.sender, delivery.sent_s, self._serial, delivery)
         heapq.heappush(self._held, entry)
@@ -124,9 +129,15 @@ class Mailbox:
         held = self._held
         if not held:  # as in most ticks
             return ()
-        found = []
+        found, own = [], []
         while held and held[0][0] <= t_s + TIME_EPSILON_S:
-            found.append(heapq.heappop(held)[-1])
+            entry = heapq.heappop(held)
+            if entry[2] < t_s:
+                found.append(entry[-1])
+            else:  # sent in this tick, and nearer than a rounding
+                own.append(entry)
+        for entry in own:
+            heapq.heappush(held, entry)
         self._received += len(found)
         return found
 

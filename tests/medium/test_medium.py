@@ -99,7 +99,8 @@ def test_what_cannot_be_sent_to_agents_is_told():
     [
         (5, None, "receiver's name, got 5"),
         (None, None, "name"),
-        ("kiosk", "7", "whole number, got"),
+        ("kiosk", "7", "whole number of less than 2..62, got '7'"),
+        ("kiosk", 2**63 - 1, "less than 2..62, got 9223372036854775807"),
     ],
 )
 def test_a_receiver_or_number_that_is_none_is_the_senders_fault(to, number, told):
@@ -120,6 +121,18 @@ def test_a_message_is_held_until_the_first_tick_at_or_after_its_arrival():
     heard = {t_s: [one.sender for one in box.due(t_s)] for t_s in (0.1, 0.2, 0.3, 0.4)}
 
     assert heard == {0.1: [], 0.2: ["car-2", "car-3"], 0.3: [], 0.4: ["car-2"]}
+    assert box.counts() == {"received": 3, "held": 0, "late": 0, "no_room": 0}
+
+
+def test_a_message_from_nearby_is_received_in_the_tick_after_its_own_and_is_not_late():
+    box, _ = mailbox()
+    before, after = delivery(0.1 + 1e-10, sent_s=0.1), delivery(0.1 + 2e-10, "car-3")
+    box.add(before)
+    box.add(after)
+
+    assert box.due(0.1) == [after]
+    box.add(delivery(0.1 + 1e-10, "car-3", sent_s=0.1))
+    assert [one.sender for one in box.due(0.2)] == ["car-2", "car-3"]
     assert box.counts() == {"received": 3, "held": 0, "late": 0, "no_room": 0}
 
 
@@ -258,6 +271,12 @@ def test_a_message_takes_its_turn_its_length_and_its_delay():
     assert arrivals == [1.25, 3.25, 5.25]
 
 
+def test_a_delay_below_what_tells_times_apart_still_arrives_later():
+    (outcome,) = carried(medium(delay_s=1e-300), sent_s=2.5)
+
+    assert outcome.arrives_s == math.nextafter(2.5, math.inf)
+
+
 def test_a_full_transmitter_refuses():
     air = medium(rate_byte_s=BYTES, queue_max=1)
 
@@ -332,12 +351,20 @@ def test_losses_are_the_share_wanted_and_hang_on_the_seed_alone():
             r"size_bytes '9': expected a number",
         ),
         (LinkOutcome(to="car-2", outcome="lost", size_bytes=math.nan), r"size_bytes nan: expected"),
+        (
+            LinkOutcome(to="car-2", outcome="lost", size_bytes=-1),
+            r"size_bytes -1: expected a number",
+        ),
+        (
+            LinkOutcome(to="*", outcome="delivered", arrives_s=5.0),
+            r"that delivers to '\*': expected one for each receiver, by name",
+        ),
     ],
 )
 def test_an_outcome_of_other_values_is_the_mediums_fault_and_enters_no_account(outcome, told):
     desk = Desk()
 
-    with pytest.raises(PluginError, match=f"a LinkOutcome with {told}"):
+    with pytest.raises(PluginError, match=f"a LinkOutcome (with )?{told}"):
         desk.enter(outcome)
     assert desk.carrier.to_mapping() == {}
 

@@ -7,7 +7,8 @@ import re
 import numpy as np
 import pytest
 
-from cosmos_cli.collect.host_tables import tabulated
+from cosmos_cli.collect.host_tables import tabulated, times_of
+from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import RunDirectory
 from madns_runtime.config import Agents, RunConfig
 from madns_runtime.errors import PluginError
@@ -49,7 +50,17 @@ def rows(folder, change="{}", agents=AGENTS):
             "{'agent': 'nobody'}",
             "must yield rows of the agents that it is asked for, got those of 'nobody'",
         ),
-        ("{'agent': 'agent-01'}", "yielded no rows of agent-02"),
+        (
+            "{'agent': agents[0], 'times_s': times_s[agents.index(agent)][None], 'columns': {'x_m': times_s[:1]}}",
+            "yielded no rows of agent-02",
+        ),
+        ("{'agent': 'agent-01'}", "yielded more rows of agent-01 than the 3 times"),
+        (
+            "{'times_s': times_s[:2], 'columns': {'x_m': times_s[:2]}}",
+            "must yield a row for each of 3 times, with NaN where nothing is on record; yielded 2 of agent-01, agent-02",
+        ),
+        ("{'times_s': times_s + 0.5}", "of agent-01 row 0 is wanted for 0 s"),
+        ("{'times_s': times_s * np.nan}", "must yield rows at the times that it is asked for"),
         ("{'columns': None}", "plug.py"),
         ("{'times_s': None}", "plug.py"),
         ("{'fields': 5}", "plug.py"),
@@ -73,9 +84,34 @@ def test_what_is_no_row_of_an_agent_is_told_with_its_place(tmp_path, change, tol
 
 def test_of_very_many_agents_without_rows_the_first_are_named(tmp_path):
     agents = tuple(f"agent-{number:03d}" for number in range(500))
+    row = "times_s[agents.index(agent) :][:1]"
+    change = f"{{'agent': 'agent-000', 'times_s': {row}, 'columns': {{'x_m': {row}}}}}"
 
     with pytest.raises(PluginError, match=r"no rows of agent-001, .*agent-010 and 489 others$"):
-        rows(tmp_path, "{'agent': 'agent-000'}", agents)
+        rows(tmp_path, change, agents)
+
+
+def test_rows_come_in_parts_of_several_agents_in_turn(tmp_path):
+    (tmp_path / "parts").mkdir()
+    halves = PLUGIN.replace(
+        "for agent in agents:",
+        "for times_s in (times_s[:1], times_s[1:]):\n      for agent in agents:",
+    )
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(f"{__name__}.PLUGIN", halves)
+        found = rows(tmp_path / "parts")
+
+    assert [part.agent for part in found] == [*AGENTS, *AGENTS]
+
+
+@pytest.mark.parametrize("rate_hz", [1e9, 1e308])
+def test_more_times_than_a_table_holds_are_refused(rate_hz):
+    config = RunConfig(
+        run="r", scenario="s", simulation="x", base_directory=".", agents=Agents(count=2)
+    )
+    with pytest.raises(InputError, match="times of each agent are more than 20000000"):
+        times_of(config, None, rate_hz)
 
 
 def test_rows_in_lists_become_arrays(tmp_path):

@@ -135,6 +135,41 @@ def test_different_tick_rates_are_matched_by_time_and_said(make, capsys):
     assert state["fields"]["x_m"]["max"] < 1e-6  # the same orbit at the same instants
 
 
+@pytest.mark.parametrize("table", ["as it is", "gone"])
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ((Field("x_m", "m"), Field("x_km", "km")), ("x_m", "x_km")),
+        ((Field("x", "m"), Field("x", "km")), ("x (m)", "x (km)")),
+    ],
+)
+def test_the_same_numbers_under_another_name_or_in_another_unit_are_different(
+    make, capsys, table, fields, told
+):
+    def recorded_as(field):
+        def change(made):
+            recorder = made.recorder("agents/agent-01", "agent-01", StreamSchema("way", (field,)))
+            for tick in range(TICKS):
+                recorder.record("way", (float(tick),))
+            recorder.close()
+
+        return change
+
+    made = [make(recorded_as(field)) for field in fields]
+    if table == "gone":
+        for one in made:
+            (one.run.tables / "way.parquet").unlink()
+
+    code, document = diff(capsys, "1", "2", "--expect-same")
+    app.run(["diff", "1", "2", "--quiet"])
+
+    way = streams_of(document)["way"]
+    assert code == 1
+    assert (way["fields_only_a"], way["fields_only_b"]) == ([told[0]], [told[1]])
+    assert (way["rows"], way["matched"]) == ([TICKS, TICKS], TICKS)
+    assert f"way: {told[0]} only recorded in A" in capsys.readouterr().out
+
+
 def test_different_simulations_are_refused(make, capsys):
     def rename(made):
         plan = json.loads(made.run.plan_json.read_text())

@@ -226,6 +226,9 @@ def test_records_are_paired_by_tick_by_time_or_by_their_order():
     assert (by_instant.by, by_instant.scales) == ("time", (0.1, 0.2))
     assert (by_time.by, by_time.tolerance, by_time.identity) == ("time", 0.05, ("agent",))
     assert by_order.by == "order"
+    words = [Field("tick", "", "str"), Field("t_s", "", "json"), Field("value")]
+    assert choose_pairing(words, words, same).by == "order"
+    assert choose_pairing([TICK], words, same).by == "tick"
 
 
 def test_settings_differ_by_dotted_key():

@@ -18,6 +18,7 @@ from cosmos_cli.evidence.streams import find_streams, open_stream_file, scan_str
 from cosmos_cli.evidence.table_labels import NEVER_US, TableLabels
 from cosmos_cli.evidence.tables import TableReader, TableWriter, no_tables, open_tables, plan_table
 from cosmos_cli.evidence.tabulate import gather
+from cosmos_cli.models.agent_labels import AgentLabels
 from madns_runtime.errors import MachineError
 from madns_runtime.recording import reader
 from madns_runtime.recording.records import Field, StreamSchema
@@ -214,6 +215,19 @@ def test_field_named_as_our_own_column_is_kept_beside_it(tmp_path):
 
     assert table.sources == ("agent-01",)
     assert table.read("agent-01", ("agent",))["agent"].tolist() == ["agent-02"]
+
+
+def test_every_column_has_a_name_of_its_own_whatever_fields_are_called(tmp_path):
+    made = SyntheticRun(tmp_path)
+    taken = StreamSchema("told", (Field("agent", "", "str"), Field("agent_name", "", "str")))
+    record(made, "agent-01", taken, [("car", "driver")])
+    labels = AgentLabels(column="agent_name_name", names={"agent-01": "one"})
+
+    gather(made.run, 10.0, quiet, labels=TableLabels(agents=labels))
+
+    told = pq.read_table(made.run.tables / "told.parquet")
+    assert told.column_names == ["agent_name_name", "incarnation", "agent", "agent_name"]
+    assert [column[0].as_py() for column in told.columns] == ["agent-01", 1, "car", "driver"]
 
 
 def test_stream_whose_schema_line_is_damaged_is_counted_and_not_guessed(tmp_path):

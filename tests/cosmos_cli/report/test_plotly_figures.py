@@ -1,6 +1,7 @@
 """Values of figures as plotly.js gets them: quantity, unit, limits, and what cannot be drawn."""
 
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from madns_runtime.analysis.values import (
     EventBand,
     Figure,
     FigureChoice,
+    Heading,
     HeatMap,
     Histogram,
     LimitLine,
@@ -31,6 +33,7 @@ from madns_runtime.analysis.values import (
 )
 
 X = np.arange(5.0)
+LINE = Series(x=X, y=X)
 
 
 def figure(*marks, **more):
@@ -131,6 +134,45 @@ def test_values_come_through_a_process_of_their_own_as_they_were():
             lambda: TableBlock(title="t", headings=headings("a"), rows=[[1, 2]]),
             "2 cells, the head 1",
         ),
+        (lambda: Section(title=None, blocks=[]), "Section.title: expected a text, got NoneType"),
+        (lambda: Section(title="s", blocks=[], tables="path"), "Section.tables: expected a list"),
+        (
+            lambda: Section(title="s", blocks=[], tables=[[]]),
+            r"Section.tables\[0\]: expected a table",
+        ),
+        (lambda: Series(x=X, y=X, name=3), "Series.name: expected a text, got int"),
+        (lambda: Series(x=X, y=X, tone="mauve"), "Series.tone: expected one of palette, .*'mauve'"),
+        (lambda: Series(x=X, y=X, form="dots"), "Series.form: expected one of line, .*'dots'"),
+        (lambda: Series(x=X, y=X, panel=0.0), "Series.panel: expected a whole number, got 0.0"),
+        (lambda: FigureChoice(marks=[1]), r"FigureChoice.marks\[0\]: expected a mark, .*got int"),
+        (lambda: FigureChoice(marks=Series(x=X, y=X)), "FigureChoice.marks: expected a list"),
+        (lambda: FigureChoice(marks=[], name=3), "FigureChoice.name: expected a text, got int"),
+        (lambda: figure(LINE, x="time"), "Figure.x: expected an Axis, got str"),
+        (lambda: figure(LINE, events=None), "Figure.events: expected a list, got NoneType"),
+        (lambda: figure(LINE, limits=[1.0]), r"limits\[0\]: expected LimitLine, got float"),
+        (lambda: figure(LINE, columns=0), "expected columns, got 0"),
+        (lambda: Axis(quantity=3), "Axis.quantity: expected a text, got int"),
+        (lambda: LimitLine(value=None), "LimitLine.value: expected a number, got None"),
+        (lambda: LimitLine(value=10**400), "LimitLine.value: expected a number, got 1000"),
+        (lambda: EventBand(start="0", end=1.0), "EventBand.start: expected a number, got '0'"),
+        (lambda: Bars(names=["a"], values=["x"]), "Bars.values: expected a number, got 'x'"),
+        (lambda: Bars(names=[1], values=[1]), r"Bars.names\[0\]: expected a text, got int"),
+        (lambda: HeatMap(x=X, y=X, values=np.ones((5, 5)), scale="m"), "scale: expected an Axis"),
+        (lambda: SpaceFigure(title="t", unit="m", paths=[1]), r"paths\[0\]: expected a SpacePath"),
+        (
+            lambda: SpaceFigure(title="t", unit="m", paths=[], sphere_radius=0),
+            "sphere_radius: expected more than 0, got 0",
+        ),
+        (lambda: Heading(text=3), "Heading.text: expected a text, got int"),
+        (lambda: TableBlock(title=3, headings=[], rows=[]), "TableBlock.title: expected a text"),
+        (
+            lambda: TableBlock(title="t", headings=headings("a"), rows=["x"]),
+            "row 0: expected a list of cells, got str",
+        ),
+        (
+            lambda: TableBlock(title="t", headings=[], rows={}),
+            "expected a list of rows, got dict",
+        ),
     ],
 )
 def test_what_does_not_fit_together_is_refused_where_it_is_made(make, told):
@@ -139,7 +181,8 @@ def test_what_does_not_fit_together_is_refused_where_it_is_made(make, told):
 
 
 def test_figure_that_cannot_be_drawn_costs_a_remark_and_not_the_page():
-    odd = figure(Series(x=X, y=X, tone="mauve"))
+    odd = figure(Series(x=X, y=X))
+    object.__setattr__(odd.choices[0].marks[0], "tone", "mauve")
 
     page = render_page({"run": "r"}, [Section(title="s", blocks=[odd, EVERY[1]])])
 
@@ -153,6 +196,34 @@ def test_every_value_of_figures_is_drawn_here():
 
     assert drawn == {kind.__name__ for kind in values.Mark.__args__}
     assert all(dataclasses.is_dataclass(kind) for kind in (*values.Block.__args__, ReportRemark))
+
+
+def test_numbers_of_any_size_are_drawn_without_a_word_of_our_source():
+    huge = np.array([-1.7e308, 5e-324, 1.7e308])
+    axes = {"x": Axis(is_logarithmic=True), "y": Axis(is_logarithmic=True)}
+    drawn = [
+        figure(Series(x=huge, y=huge), limits=[LimitLine(value=10**20)], **axes),
+        figure(Histogram(edges=huge[1:], counts=[1e308]), events=[EventBand(start=0, end=10**30)]),
+        figure(Bars(names=["a", "b"], values=[2**70, np.inf])),
+    ]
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        page = render_page({"run": "r"}, [Section(title="s", blocks=drawn)])
+
+    assert "The figure speed" not in page
+    assert page.count('class="plot"') == len(drawn)
+
+
+def test_arrays_are_rows_of_a_table_and_columns_of_bars():
+    whole = TableBlock(title="t", headings=headings("a", "b"), rows=np.array([[1, 2], [3, 4]]))
+    single = TableBlock(title="t", headings=headings("a", "b"), rows=[np.array([1.5, 2.5])])
+    bars = Bars(names=np.array(["x", "y"]), values=np.array([1, 2]))
+
+    assert whole.rows == [[1, 2], [3, 4]]
+    assert single.rows == [[1.5, 2.5]]
+    assert (bars.names, bars.values) == (["x", "y"], [1.0, 2.0])
+    assert "<td" in render_page({"run": "r"}, [Section(title="s", blocks=[whole, single])])
 
 
 @pytest.mark.browser
@@ -172,7 +243,7 @@ def test_every_value_of_figures_draws_in_a_browser(tmp_path):
 
 
 def test_tables_and_remarks_of_other_values_are_refused_where_they_are_made():
-    with pytest.raises(ValueError, match="expected a Heading per column, got str"):
+    with pytest.raises(ValueError, match=r"headings\[0\]: expected a Heading, got str"):
         TableBlock(title="t", headings=["a"], rows=[[1]])
-    with pytest.raises(ValueError, match="ReportRemark: expected a text, got int"):
+    with pytest.raises(ValueError, match="ReportRemark.text: expected a text, got int"):
         ReportRemark(text=5)

@@ -13,7 +13,15 @@ from cosmos_cli.report.cells import format_cell
 from cosmos_cli.report.html import encode_array, render_page
 from cosmos_cli.report.plotly_figures import to_plotly
 from madns_runtime.analysis.chapters import Chapter
-from madns_runtime.analysis.sampling import BinCounts, TimeEnvelope, evenly, thin, thin_pieces
+from madns_runtime.analysis.distribution import summarise
+from madns_runtime.analysis.sampling import (
+    BinCounts,
+    BinnedRms,
+    TimeEnvelope,
+    evenly,
+    thin,
+    thin_pieces,
+)
 from madns_runtime.analysis.values import (
     Figure,
     FigureChoice,
@@ -399,6 +407,36 @@ def test_no_line_is_drawn_through_the_time_that_an_agent_was_away(tmp_path):
         assert [np.isnan(mark.y).sum() for mark in figure.choices[0].marks] == [
             1 for _ in figure.choices[0].marks
         ]
+
+
+def test_thinning_keeps_every_peak_beside_what_is_infinite():
+    decibels = np.tile([-np.inf, 1.0, 5.0, np.inf, 2.0], 20)
+
+    kept = thin(np.arange(100.0), decibels, 20)[1]
+
+    np.testing.assert_array_equal(kept, np.tile([1.0, 5.0], 10))
+
+
+def test_values_that_are_none_lie_in_no_bin():
+    t_s, values = np.array([1.0, 2.0, np.nan, 9.0]), np.array([1.0, np.nan, 7.0, 3.0])
+    histogram, rms = BinCounts(np.array([0.0, 2.0, 8.0])), BinnedRms(10.0, bins=2)
+    envelope = TimeEnvelope(10.0, 0.1, 10.0, samples=4)
+
+    for each in (rms, envelope):
+        each.add(t_s, values)
+    histogram.add(values)
+
+    assert histogram.counts.tolist() == [1, 2]
+    assert rms.rows() == [(5.0, 1.0, 1.0), (10.0, 3.0, 3.0)]
+    middles, curves = envelope.curves()
+    assert middles.tolist() == [1.5, 9.5]
+    assert curves["max"].tolist() == [1.0, 3.0]
+
+
+def test_quantiles_of_numbers_as_far_apart_as_they_can_be_lie_between_them():
+    summary = summarise(np.array([-1.5e308, 1.5e308]))
+
+    assert (summary.p50, summary.max) == (0.0, 1.5e308)
 
 
 def test_few_samples_are_not_thinned():

@@ -130,6 +130,23 @@ BROKEN = {
         "figures(), in section 's', must give blocks as a list of Figure, SpaceFigure, TableBlock and ReportRemark,"
         " got Series",
     ),
+    "has a class of its own by the name of one of ours": (
+        "from dataclasses import dataclass\n"
+        "from madns_runtime.analysis.values import Section, TableBlock, headings\n"
+        "@dataclass\nclass Axis:\n    length_m: float\n"
+        "def figures(run):\n"
+        "    table = TableBlock(title='t', headings=headings('a'), rows=[[Axis(3.0)]])\n"
+        "    return [Section(title='s', blocks=[table])]",
+        "figures hold numbers, texts and values of theirs, got Axis",
+    ),
+    "changes a table that was made": (
+        "from madns_runtime.analysis.values import *\n"
+        "def figures(run):\n"
+        "    table = TableBlock(title='t', headings=headings('a'), rows=[[1]])\n"
+        "    table.rows.append([1, 2])\n"
+        "    return [Section(title='s', blocks=[table])]",
+        "figures() of ./rover.py:simulation: table 't': row 1 has 2 cells, the head 1",
+    ),
     "draws what does not fit together": (
         "from madns_runtime.analysis.values import *\n"
         "def figures(run):\n    return [Series(x=[1, 2], y=[1])]",

@@ -6,7 +6,11 @@ from cosmos_cli.diff.fields import RecordPlace
 from cosmos_cli.diff.stream import Alone, StreamDifference
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.rerun.device_comparison import compare_devices
-from cosmos_cli.rerun.early_ends import early_ends, leave_out_after_ends
+from cosmos_cli.rerun.early_ends import (
+    early_ends,
+    leave_out_after_ends,
+    leave_out_after_simulated_time,
+)
 from cosmos_cli.rerun.recorded_run import FlownRun, RecordedAgent, UsedDevice
 from madns_runtime.config import Agents, Recording, RunConfig, TimeSettings
 from madns_runtime.recording.record_files import RecordFiles
@@ -45,6 +49,26 @@ def test_what_comes_after_an_agents_end_is_left_out_and_told_and_nothing_else():
     assert (earlier.only_b.count, other.only_b.count) == (1, 1)
     assert remarks == (
         "b ended with the tick of 3.3 s: 3 records of the rerun after that are not compared",
+    )
+
+
+def test_what_the_host_recorded_after_simulated_time_is_left_out_and_told_and_nothing_else():
+    def of_host(first_s, *, by="time", source="host"):
+        place = RecordPlace(first_s)
+        alone = Alone(count=3, first=place, last=place)
+        return StreamDifference(
+            table="host_truth", source=source, by=by, rows_a=37, rows_b=34, only_a=alone
+        )
+
+    after, within = of_host(3.4 - 1e-15), of_host(3.39)
+    others = of_host(3.45, by="order"), of_host(3.45, source="a")
+
+    remarks = leave_out_after_simulated_time([after, within, *others], 3.4)
+
+    assert (after.only_a.count, after.rows_a, after.has_same_values) == (0, 34, True)
+    assert [one.only_a.count for one in (within, *others)] == [3, 3, 3]
+    assert remarks == (
+        "host_truth: 3 records of the host from the end of simulated time on, 3.4 s, are not compared",
     )
 
 
