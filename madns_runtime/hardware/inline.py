@@ -197,6 +197,7 @@ class InlineDevice:
         self._intake.count("writes_left", self._outputs.clear())
         self._make_safe(self._now_s())
         self._tried("close", self._device.close)
+        self._intake.close()
         account = self._account
         return {
             "status": account.status,

@@ -196,6 +196,7 @@ class DeviceRunner:
         self._records.event("ending", monotonic(), why=reason)
         self._intake.count("writes_left", self._outputs.clear())
         self._close_device()
+        self._intake.close()
         if not self._header[page.MOVED]:  # else the guardian tries what the driver could not
             self._header[page.STATE] = page.SAFE
         told = {**self._intake.summary(), **self._outputs.summary(self._seat.page.counts.read())}
