@@ -63,7 +63,6 @@ class Intake:
         self._changes = {name: _LastChange(limit_s) for name, limit_s in frozen_s.items()}
         for name in frozen_s:
             self.count(f"{FROZEN}{name}", 0)
-        self._frame_numbers: dict[str, int] = {}
         self._dropped = 0
         """Samples that inserted faults have dropped, as far as they are counted."""
 
@@ -187,7 +186,7 @@ class Intake:
         header[page.ARRIVED_S] = now_s
 
     def _tell_frame(self, channel: Channel, data: bytes, taken_s: float, now_s: float) -> None:
-        number = self._frame_numbers[channel.name] = self._frame_numbers.get(channel.name, 0) + 1
+        number = self._page.count_frame(channel.name)
         told = (len(data), data.hex())
         self._send([messages.FRAME, channel.name, number, taken_s, data])
         self._records.sample(channel.name, number, taken_s, told, told_s=self._handed_s(now_s))

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import select
 import signal
 import socket
 from collections.abc import Callable, Mapping, Sequence
@@ -29,6 +28,7 @@ from madns_runtime.hardware.driven import (
     NOT_MADE_SAFE,
     DeviceProcess,
     DrivenDevice,
+    allow_descriptors_of,
     exit_text,
 )
 from madns_runtime.hardware.guardian import guard_outputs
@@ -69,6 +69,7 @@ class DeviceManager:
         shared: list[DrivenDevice] = []
         self._processes: list[DeviceProcess] = []
         self._claims = DeviceClaims(launch.config.run)
+        allow_descriptors_of(launch.devices)
         for each in launch.devices:
             tell(f"importing the kind of device {each.kind}")
             program = prepare(each.kind, each.parameters, Path(each.base_directory))
@@ -297,7 +298,7 @@ class DeviceManager:
                 driven.loss = driven.why
                 self._look_at(process, driven, monotonic())
             elif code:
-                driven.blame(exit_text(code))
+                driven.blame(process.gave_up_why or exit_text(code))
         if self._is_ending or self._reactor is None:
             return
         process.failures = 0 if monotonic() - process.started_s > 10.0 else process.failures + 1
@@ -334,7 +335,7 @@ class DeviceManager:
         status = driven.seat.page.status(driven.limits, now_s)
         if status == "ok":
             driven.forgive()
-        elif process.control is not None and select.select([process.control], [], [], 0)[0]:
+        elif process.has_words():
             self._hear(process)  # why it was closed may wait
         if driven.account.counted_s is None and driven.seat.page.time.read() is not None:
             driven.account.begin(now_s)  # an agent has told that simulated time runs

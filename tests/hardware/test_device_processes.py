@@ -279,6 +279,17 @@ def test_counts_survive_the_process_that_counted(tmp_path):
     assert report["unreported"] == 1  # its records have no end
 
 
+def test_a_process_that_cannot_begin_is_lost_for_what_kept_it(tmp_path):
+    (tmp_path / "devices").write_text("in the way")
+    with line_bench(tmp_path) as (bench, _):
+        bench.until(lambda: "lost" in bench.statuses("line"))
+        lost = next(each for each in bench.events if each.get("status") == "lost")
+        result = bench.close()["pi22/line"]
+
+    assert "pi22/line: cannot record there" in lost["why"]
+    assert "pi22/line: cannot record there" in result["why"]
+
+
 def test_the_owners_end_makes_outputs_safe_while_the_device_goes_on(tmp_path):
     with line_bench(tmp_path) as (bench, terminal):
         bench.start_time()

@@ -55,7 +55,7 @@ def test_a_sample_is_on_record_as_handed_over_when_agents_have_it_however_long_t
     sent, told = [], {}
     line = Channel(name="line", is_frame=True, passing="queue")
     queued = Channel(name="queued", passing="queue")
-    device_page = DevicePage([LEVEL, queued])
+    device_page = DevicePage([LEVEL, queued, line])
 
     class Told:
         def sample(self, channel, number, taken_s, values, *, told_s):
@@ -160,7 +160,7 @@ def test_frames_that_are_the_same_for_too_long_are_frozen_and_pass_a_fault_of_nu
 
     intake = Intake(
         (line, LEVEL),
-        DevicePage([LEVEL]),
+        DevicePage([line, LEVEL]),
         Told(),
         seed=[1],
         frozen_s={"line": 2.0},
@@ -173,6 +173,24 @@ def test_frames_that_are_the_same_for_too_long_are_frozen_and_pass_a_fault_of_nu
     assert sent == [b"one", b"two", b"two", b"two", b"two", b"one"]
     assert events == [("frozen", 3.0, "line")]
     assert intake.summary()["frozen"] == {"line": 1}
+
+
+def test_frames_are_numbered_on_by_the_process_that_takes_the_place_of_another():
+    line = Channel(name="line", is_frame=True, passing="queue")
+    device_page, sent = DevicePage([LEVEL, line]), []
+    for _ in range(2):
+        intake = Intake(
+            (line,),
+            device_page,
+            Kept(),
+            seed=[1],
+            frozen_s={},
+            pass_on=lambda m: sent.append(m) or 0,
+        )
+        for _ in range(2):
+            intake.take(Sample(values={"line": b"x"}, taken_s=1.0), 1.0)
+
+    assert [number for _, _, number, *_ in sent] == [1, 2, 3, 4]
 
 
 def test_a_sample_that_is_refused_is_not_counted_as_one():
