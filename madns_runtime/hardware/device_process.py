@@ -126,7 +126,7 @@ class DeviceLoop:
                 self._runners[rest[0]].owner_gone()
             elif word == messages.FAULT:
                 self._runners[rest[0]].insert_fault(*rest[1:])
-        if not has_heard:
+        if not has_heard and messages.is_over(self._control):
             self._stop("its supervisor is gone")
 
     def _stop(self, why: str) -> None:

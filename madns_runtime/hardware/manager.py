@@ -7,9 +7,7 @@ constructor, before anybody is forked.
 
 from __future__ import annotations
 
-import contextlib
 import os
-import signal
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -20,7 +18,7 @@ from typing import Any, Final
 
 from madns_runtime.config import AgentLaunch
 from madns_runtime.hardware import guardian, messages, page
-from madns_runtime.hardware.child_process import fork_with_pair, wait_for
+from madns_runtime.hardware.child_process import fork_with_pair, kill, wait_for
 from madns_runtime.hardware.claims import DeviceClaims
 from madns_runtime.hardware.contract import Device
 from madns_runtime.hardware.device_process import GONE, REPORT, run_devices
@@ -249,7 +247,7 @@ class DeviceManager:
                 self._devices[rest[0]].note_fault(rest[1], rest[2])
             elif word == GONE:
                 process.gave_up_why = clean_text(str(rest[0]))
-        if not has_heard:
+        if not has_heard and messages.is_over(process.control):  # a look may have heard all before
             self._hang_up(process)
 
     def _hang_up(self, process: DeviceProcess) -> None:
@@ -351,15 +349,13 @@ class DeviceManager:
                     "why": driven.loss if status == "lost" else "",
                 }
             )
-        if (
-            driven.account.counted_s is not None
-        ):  # behind its reason: who reads the count finds that
+        # Behind its reason: who reads the count finds that.
+        if driven.account.counted_s is not None:
             driven.seat.page.header[page.LOSSES] = driven.account.times_lost
         silent_s = now_s - driven.seat.page.header[page.ACTIVE_S]
         if process.pid and silent_s > driven.limits.hang_s and not process.killed_why:
             process.killed_why = f"its driver did not return within {driven.limits.hang_s:g} s"
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process.pid, signal.SIGKILL)
+            kill(process.pid)
 
     # The end ------------------------------------------------------------------------------------
 
@@ -392,9 +388,13 @@ class DeviceManager:
 
     def _wait(self, process: DeviceProcess, deadline_s: float) -> None:
         if process.pid and not wait_for(process.pid, deadline_s):
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process.pid, signal.SIGKILL)
+            kill(process.pid)
             wait_for(process.pid, monotonic() + KILL_WAIT_S)
+            for driven in process.devices:
+                driven.blame(f"its driver did not return within {END_S:g} s of the run's end")
+                self._emit(
+                    {"event": "log", "level": "error", "text": f"{driven.name}: {driven.why}"}
+                )
         process.pid = 0
         self._hear(process)
         self._hang_up(process)

@@ -62,7 +62,9 @@ def receive_all(end: socket.socket) -> Iterator[list[Any]]:
     for _ in range(DATAGRAMS_MAX):
         try:
             data = end.recv(BYTES_MAX)
-        except (BlockingIOError, OSError):
+        except ConnectionResetError:
+            continue  # told once, of one that has ended without reading all: what it said before comes behind that
+        except OSError:
             return
         if not data:
             return
@@ -72,3 +74,13 @@ def receive_all(end: socket.socket) -> Iterator[list[Any]]:
             continue
         if isinstance(message, list) and message:
             yield message
+
+
+def is_over(end: socket.socket) -> bool:
+    """Tell whether the other end is gone, and all that it said was received."""
+    try:
+        return not end.recv(1, socket.MSG_PEEK)
+    except (BlockingIOError, ConnectionResetError):
+        return False
+    except OSError:
+        return True

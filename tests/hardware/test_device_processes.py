@@ -11,8 +11,10 @@ import pytest
 
 from madns_runtime.config import DeviceLaunch
 from madns_runtime.errors import PluginError
+from madns_runtime.hardware import page
 from madns_runtime.hardware.guardian import ATTEMPTS_MAX
 from tests.hardware.bench import AGENT, DeviceBench, line_bench
+from tests.harness.waiting import is_alive, wait_until
 
 pytestmark = pytest.mark.process
 
@@ -277,6 +279,37 @@ def test_counts_survive_the_process_that_counted(tmp_path):
     assert report["valve_limited"] == 1
     assert report["samples"] == result["samples"] > 0
     assert report["unreported"] == 1  # its records have no end
+
+
+def test_a_process_whose_words_were_heard_by_another_look_is_not_taken_for_gone(tmp_path):
+    with line_bench(tmp_path) as (bench, _):
+        bench.until(lambda: bench.statuses("line") == ["ok"])
+        pid = bench.pid_of()
+        # As where its words and others' come at once: a timer between the two has heard them all.
+        bench.manager._hear(bench.manager._processes[0])
+        number = bench.hardware["line"]["time"].number
+        bench.until(lambda: bench.hardware["line"]["time"].number > number + 5)
+        assert bench.pid_of() == pid
+        result = bench.close()["pi22/line"]
+
+    assert (result["restarts"], result["why"]) == (0, "")
+
+
+def test_a_driver_whose_close_does_not_return_is_named_at_the_end_and_made_safe_once(tmp_path):
+    with line_bench(tmp_path, close_s=600.0) as (bench, terminal):
+        guardian_pid = bench.manager._guardian_pid
+        bench.until(lambda: bench.statuses("line") == ["ok"])
+        bench.hardware["line"].write("valve", 0.5)
+        bench.until(lambda: bench.manager.page_of("pi22/line").header[page.MOVED] == 1.0)
+        result = bench.close()["pi22/line"]
+        wait_until(lambda: not is_alive(guardian_pid), "the guardian has ended")
+        heard = terminal.heard()
+
+    told = [event["text"] for event in bench.events if event["event"] == "log"]
+    assert result["why"] == "its driver did not return within 3 s of the run's end"
+    assert f"pi22/line: {result['why']}" in told
+    assert result["unsafe"] == 0
+    assert heard == ["OPEN", "VALVE 0.5", "SAFE", "OPEN", "SAFE"]  # the guardian has tried once
 
 
 def test_a_process_that_cannot_begin_is_lost_for_what_kept_it(tmp_path):
