@@ -127,7 +127,8 @@ class InlineDevice:
             if self._intake.faults.is_disconnected:
                 self._intake.count("passed_while_closed")
                 continue
-            self._intake.take(sample, due_s if sample.handed_s is None else sample.handed_s)
+            handed_s = due_s if sample.handed_s is None else sample.handed_s
+            self._intake.take(sample, handed_s, ahead_s=1.0 / self._rate_hz)
         else:
             raise PluginError(
                 f"device {self.name}: {SAMPLES_MAX} samples and outputs by {t_s:g} s, and no end: {STANDS_STILL}"

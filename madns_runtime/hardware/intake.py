@@ -97,7 +97,8 @@ class Intake:
             raise PluginError(f"expected a Sample or None, got {type(sample).__name__}")
         if not math.isfinite(sample.taken_s) or sample.taken_s > now_s + ahead_s:
             raise PluginError(
-                f"taken_s: expected a time of time.monotonic(), got {sample.taken_s!r}"
+                f"taken_s: expected a time until now, {now_s:.6f} s of time.monotonic() (in lockstep simulated), got"
+                f" {sample.taken_s!r}"
             )
         sample = self._checked(sample)
         self._page.header[page.ACTIVE_S] = now_s
