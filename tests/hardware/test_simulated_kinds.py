@@ -177,9 +177,12 @@ def test_lines_of_a_recording_that_are_none_are_counted_and_records_of_another_k
 
     assert (found, counts) == (398, {"damaged_lines": 2})
     path.write_text("\n".join([head, '["soon",1,30,1.0]']))
-    with pytest.raises(
-        PluginError, match=r"level.jsonl: expected records \[t_s, number, age_us, .*'soon'"
-    ), opened("playback", tmp_path, directory="."):
+    with (
+        pytest.raises(
+            PluginError, match=r"level.jsonl: expected records \[t_s, number, age_us, .*'soon'"
+        ),
+        opened("playback", tmp_path, directory="."),
+    ):
         pass
 
 
