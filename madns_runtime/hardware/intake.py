@@ -63,6 +63,8 @@ class Intake:
         self._changes = {name: _LastChange(limit_s) for name, limit_s in frozen_s.items()}
         for name in frozen_s:
             self.count(f"{FROZEN}{name}", 0)
+        self.withheld_s = -math.inf
+        """When an inserted fault kept a sample back: the device is not silent."""
         self._dropped = 0
         """Samples that inserted faults have dropped, as far as they are counted."""
 
@@ -109,7 +111,9 @@ class Intake:
             self.count("dropped", self.faults.dropped - self._dropped)
             self._dropped = self.faults.dropped
         self.tell_held(now_s)  # what waits no longer, as its delay was lifted, came before it
-        if altered is not None:
+        if altered is None:
+            self.withheld_s = now_s
+        else:
             self._tell(altered, now_s)
         self._page.header[page.SAMPLES] += 1
 

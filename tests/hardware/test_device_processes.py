@@ -312,6 +312,25 @@ def test_a_driver_whose_close_does_not_return_is_named_at_the_end_and_made_safe_
     assert heard == ["OPEN", "VALVE 0.5", "SAFE", "OPEN", "SAFE"]  # the guardian has tried once
 
 
+@pytest.mark.parametrize(("action", "value"), [("drop", 1.0), ("delay", 600.0)])
+def test_a_device_whose_samples_a_fault_keeps_back_is_not_opened_anew(tmp_path, action, value):
+    with line_bench(tmp_path, launch={"hang_s": 0.2}) as (bench, terminal):
+        bench.start_time()
+        bench.until(lambda: bench.statuses("line") == ["ok"])
+        bench.manager.insert_fault("pi22/line", action, value)
+        states = tmp_path / "devices" / "pi22" / "line" / "device_state.jsonl"
+        bench.until(lambda: bench.hardware["line"].status == "lost")
+        # Silence is looked for when a state is recorded: once more, and it would have been found.
+        count = states.read_bytes().count(b"\n")
+        bench.until(lambda: states.read_bytes().count(b"\n") > count + 1)
+        result = bench.close()["pi22/line"]
+        heard = terminal.heard()
+
+    assert (result["errors"], heard) == (0, ["OPEN", "SAFE"])
+    name = {"drop": "dropped", "delay": "delayed_left"}[action]
+    assert result["report"][name] > 0
+
+
 def test_a_process_that_cannot_begin_is_lost_for_what_kept_it(tmp_path):
     (tmp_path / "devices").write_text("in the way")
     with line_bench(tmp_path) as (bench, _):
