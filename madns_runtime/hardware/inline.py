@@ -16,7 +16,7 @@ from madns_runtime.hardware.outputs import DeviceOutputs, DueOutput
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.port import DevicePort
 from madns_runtime.hardware.records import DeviceRecords
-from madns_runtime.hardware.simulated import STANDS_STILL
+from madns_runtime.hardware.simulated import STANDS_STILL, next_of
 from madns_runtime.hardware.status import StatusAccount, StatusLimits
 from madns_runtime.plugin.context import describe_exception
 
@@ -112,7 +112,7 @@ class InlineDevice:
         """
         self._hear()
         for _ in range(SAMPLES_MAX):
-            next_s = self._call("next_s", self._device.next_s)
+            next_s = self._call("next_s", next_of, self._device)
             due_s = self._count / self._rate_hz if next_s is None else max(next_s, 0.0)
             output_s = min(self._outputs.next_write_s(), self._outputs.next_point_s())
             if min(due_s, output_s) > t_s:
