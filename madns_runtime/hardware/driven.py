@@ -13,7 +13,7 @@ from madns_runtime.config import DeviceLaunch
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.fault_actions import check_fault_fits
-from madns_runtime.hardware.intake import NOT_FINITE, counts_of
+from madns_runtime.hardware.intake import NOT_FINITE, counts_of, silent_inputs
 from madns_runtime.hardware.kind_declaration import CHANNELS_MAX
 from madns_runtime.hardware.kind_registry import DeviceProgram
 from madns_runtime.hardware.page import DevicePage
@@ -127,6 +127,7 @@ class DrivenDevice:
             "lost": account.times_lost,
             "restarts": self.restarts,
             "unsafe": int(header[page.MOVED]),
+            "silent_inputs": silent_inputs(self.seat.channels, self.seat.page),
             "why": NOT_MADE_SAFE if header[page.MOVED] else self.loss or self.why,
             "report": dict(self.report) if self.report is not None else self._counts(),
         }

@@ -10,7 +10,7 @@ from madns_runtime.errors import BlamedError, PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.contract import SimulatedDevice
 from madns_runtime.hardware.driver_answers import identity_of
-from madns_runtime.hardware.intake import Intake
+from madns_runtime.hardware.intake import Intake, silent_inputs
 from madns_runtime.hardware.kind_registry import DeviceProgram
 from madns_runtime.hardware.outputs import DeviceOutputs, DueOutput
 from madns_runtime.hardware.page import DevicePage
@@ -206,6 +206,7 @@ class InlineDevice:
             "lost": account.times_lost,
             "restarts": 0,
             "unsafe": int(self._page.header[page.MOVED]),
+            "silent_inputs": silent_inputs(self.port.channels.values(), self._page),
             "why": self._why,
             **self._intake.summary(),
             **self._outputs.summary(self._page.counts.read()),

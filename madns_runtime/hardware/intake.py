@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 from madns_runtime.errors import PluginError
@@ -221,6 +221,18 @@ def counts_of(device_page: DevicePage) -> dict[str, Any]:
         **{name: n for name, n in counts.items() if not name.startswith((FROZEN, PREFIX, MISSED))},
         **({"stimulus": stimulus} if stimulus else {}),
     }
+
+
+def silent_inputs(channels: Iterable[Channel], device_page: DevicePage) -> list[str]:
+    """Return the inputs of numbers of which no value ever came; queues are left out, for nothing may have happened."""
+    return [
+        each.name
+        for each in channels
+        if each.direction == "in"
+        and not each.is_frame
+        and each.passing == "newest"
+        and not device_page.read(each.name).number
+    ]
 
 
 class _LastChange:
