@@ -40,6 +40,7 @@ _TOLD_APART = frozenset(
         "why",
         "frozen",
         "unsafe",
+        "silent_inputs",
         "report",
     )
 )
@@ -91,6 +92,13 @@ def device_checks(
     ]
 
 
+def device_remarks(
+    agents: Mapping[str, Any], devices: Mapping[str, Mapping[str, Any]]
+) -> tuple[str, ...]:
+    """Return all remarks on devices; arguments as of `device_loss_remarks`."""
+    return (*device_loss_remarks(agents, devices), *silent_input_remarks(devices))
+
+
 def device_loss_remarks(
     agents: Mapping[str, Any], devices: Mapping[str, Mapping[str, Any]]
 ) -> tuple[str, ...]:
@@ -117,6 +125,18 @@ def device_loss_remarks(
     rest = len(found) - LOSSES_TOLD_MAX
     more = [f"{counted(rest, 'more loss')} between devices and agents"] if rest > 0 else []
     return tuple(clean_line(text) for text in (*found[:LOSSES_TOLD_MAX], *more))
+
+
+def silent_input_remarks(devices: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
+    """Return a remark per device that gave samples, and never a value of some input; at most LOSSES_TOLD_MAX, then how many more."""
+    found = [
+        f"device {device}: no value ever came of {', '.join(silent)}"
+        for device, account in devices.items()
+        if (silent := account.get("silent_inputs"))
+    ]
+    rest = len(found) - LOSSES_TOLD_MAX
+    more = [f"{counted(rest, 'more device')} with an input of which no value ever came"]
+    return (*found[:LOSSES_TOLD_MAX], *(more if rest > 0 else ()))
 
 
 def _lost_bytes_checks(
@@ -213,6 +233,7 @@ def _joined(told: Sequence[Mapping[str, Any]], lives: int) -> dict[str, Any]:
         "unsafe": int(any(each.get("unsafe") for each in flat[-1:])),
         "why": clean_line(next((str(e["why"]) for e in reversed(flat) if e.get("why")), "")),
         "counts": _counts(flat),
+        **({"silent_inputs": silent} if (silent := _silent_inputs(flat)) else {}),
         **({"stimulus": stimulus} if (stimulus := _stimulus(flat)) else {}),
     }
 
@@ -233,6 +254,15 @@ def _stimulus(told: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
                 if is_number(value):
                     lateness[name] = max(lateness.get(name, 0), int(value))
     return found
+
+
+def _silent_inputs(told: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the inputs that gave nothing in any life of a device that gave samples."""
+    if not _sum(told, "samples"):
+        return []
+    lists = [each.get("silent_inputs") for each in told]
+    sets = [{str(name) for name in names} if isinstance(names, list) else set() for names in lists]
+    return sorted(map(clean_line, set.intersection(*sets)))
 
 
 def _sum(told: Iterable[Mapping[str, Any]], key: str) -> int | None:

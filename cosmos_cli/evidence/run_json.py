@@ -17,7 +17,7 @@ from cosmos_cli.evidence.datagrams import (
     duplicates_by_service,
     packet_counts,
 )
-from cosmos_cli.evidence.devices import device_checks, device_loss_remarks
+from cosmos_cli.evidence.devices import device_checks, device_remarks
 from cosmos_cli.evidence.expectations.judge import JudgedExpectations
 from cosmos_cli.evidence.flown_files import KEY as FLOWN
 from cosmos_cli.evidence.flown_files import flown_remarks
@@ -182,7 +182,7 @@ class Evidence:
             remarks=(
                 *(causes.remarks(self._lateness_limit_s()) if causes else ()),
                 *result_remarks(result, self._summaries()),
-                *device_loss_remarks(mapping_at(result, "agents"), self.devices),
+                *device_remarks(mapping_at(result, "agents"), self.devices),
                 *datagram_remarks(datagram_account(result)),
                 *undeclared_remarks(self.declared, self.scans),
                 *flown_remarks(self.started),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import signal
 import socket
 import sys
 from collections.abc import Callable
@@ -32,6 +33,12 @@ def fork_with_pair(run: Callable[[socket.socket], None]) -> tuple[int, socket.so
         run(other)
     other.close()
     return pid, own
+
+
+def kill(pid: int) -> None:
+    """Kill a child that may have ended by itself."""
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGKILL)
 
 
 def wait_for(pid: int, deadline_s: float) -> bool:

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 WINDOW_S = 120.0
 POINTS_MAX = 1024
 """Of the window: one per WINDOW_S / POINTS_MAX is kept, that with the least delay."""
+RATE_MAX = 2.0
+"""Of one clock by the other: beyond, samples were not taken as the device stamped them, as of a buffer that was read at once."""
 SPAN_S_MIN = 2.0
 """Before so much time has passed, a rate would be noise."""
 
@@ -60,10 +62,10 @@ class DeviceClock:
         """Tell whether a sample may be of the same clock: it goes on, and less than twice as fast as the machine's."""
         before_device_s, before_taken_s = self._points[-1]
         passed_s, elapsed_s = device_s - before_device_s, taken_s - before_taken_s
-        return 0 <= passed_s <= 2.0 * elapsed_s + 1.0
+        return 0 <= passed_s <= RATE_MAX * elapsed_s + 1.0
 
     def estimate(self) -> DeviceClockEstimate | None:
-        """Return the estimate; None while too little time has passed."""
+        """Return the estimate; None while too little time has passed, or the times are those of no clock."""
         points = self._points
         if len(points) < 3 or points[-1][0] - points[0][0] < SPAN_S_MIN:
             return None
@@ -72,6 +74,8 @@ class DeviceClock:
         below = next(number for number, (device_s, _) in enumerate(hull[1:]) if device_s >= mean_s)
         (a_device_s, a_taken_s), (b_device_s, b_taken_s) = hull[below], hull[below + 1]
         rate = (b_taken_s - a_taken_s) / (b_device_s - a_device_s)
+        if not 1.0 / RATE_MAX <= rate <= RATE_MAX:
+            return None
         newest_s = points[-1][0]
         offset_s = a_taken_s + (newest_s - a_device_s) * rate - newest_s
         return DeviceClockEstimate(offset_s=offset_s, drift_ppm=(1.0 / rate - 1.0) * 1e6)

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from typing import Final
 
+from madns_runtime.errors import PluginError
+
 CELLS_MAX: Final = 64
 """Names of one device; what is counted under more is counted under REST."""
+NUMBER_MAX: Final = 1e15
+"""Counted at once: whole numbers of a float64 reach further, and sums of them do."""
 NAME_BYTES: Final = 56
 """Of a name; a longer one is cut."""
 REST: Final = "others"
@@ -35,7 +39,16 @@ class CountTable:
         """Places of the names that this process knows."""
 
     def add(self, name: str, number: int = 1) -> int:
-        """Add to a count, and return what it has come to."""
+        """
+        Add to a count, and return what it has come to.
+
+        Raises:
+            PluginError: It has no name, or is no number: who reads the count would fail at that.
+        """
+        if not name or not abs(number) <= NUMBER_MAX:
+            raise PluginError(
+                f"expected a name and a number to count, got {name!r:.80}, {number!r:.40}"
+            )
         cell = self._cells.get(name)
         if cell is None:
             cell = self._cells[name] = self._cell_of(name)

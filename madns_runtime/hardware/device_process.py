@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from madns_runtime.config import RunConfig
+from madns_runtime.errors import MadnsError
 from madns_runtime.hardware import messages
 from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.runner import DeviceRunner
 from madns_runtime.hardware.seat import DeviceSeat
+from madns_runtime.plugin.isolation import said
 from madns_runtime.reactor.forking import leave_parent
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import apply as apply_scheduling
@@ -51,6 +53,7 @@ def run_devices(
         messages.send(control, [REPORT, report])
         code = 0
     except BaseException as error:  # noqa: BLE001 - the last frame of a process
+        messages.send(control, [GONE, str(error) if isinstance(error, MadnsError) else said(error)])
         traceback.print_exception(error)
     finally:
         os._exit(code)
@@ -123,7 +126,7 @@ class DeviceLoop:
                 self._runners[rest[0]].owner_gone()
             elif word == messages.FAULT:
                 self._runners[rest[0]].insert_fault(*rest[1:])
-        if not has_heard:
+        if not has_heard and messages.is_over(self._control):
             self._stop("its supervisor is gone")
 
     def _stop(self, why: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -13,13 +13,21 @@ from madns_runtime.config import DeviceLaunch
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.fault_actions import check_fault_fits
-from madns_runtime.hardware.intake import NOT_FINITE, counts_of
+from madns_runtime.hardware.intake import NOT_FINITE, counts_of, silent_inputs
+from madns_runtime.hardware.kind_declaration import CHANNELS_MAX
 from madns_runtime.hardware.kind_registry import DeviceProgram
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.seat import DeviceSeat
 from madns_runtime.hardware.status import StatusAccount, StatusLimits
+from madns_runtime.reactor.descriptors import allow_descriptors, ready
 
 NOT_MADE_SAFE: Final = "could not be made safe: its driver failed, look at the device"
+DESCRIPTORS_BESIDE: Final = 256
+"""Of a process that drives devices or looks after them, beside what it has for each."""
+DESCRIPTORS_EACH: Final = CHANNELS_MAX + 16
+"""For one device: a file per channel, and others."""
+DESCRIPTORS_PER_USER: Final = 3
+"""For one agent that uses it."""
 TELLING: Final = (NOT_FINITE, "received_bytes", "garbage_bytes", "bad_checksums")
 """Ends of the names of counts that tell why there may be no sample: values that are no numbers, bytes that make no frame."""
 
@@ -119,6 +127,7 @@ class DrivenDevice:
             "lost": account.times_lost,
             "restarts": self.restarts,
             "unsafe": int(header[page.MOVED]),
+            "silent_inputs": silent_inputs(self.seat.channels, self.seat.page),
             "why": NOT_MADE_SAFE if header[page.MOVED] else self.loss or self.why,
             "report": dict(self.report) if self.report is not None else self._counts(),
         }
@@ -137,12 +146,22 @@ class DeviceProcess:
     gave_up_why: str = ""
     """What it told itself before its end."""
 
+    def has_words(self) -> bool:
+        """Tell whether it has said something that nobody has heard, or has closed its end."""
+        return self.control is not None and bool(ready([self.control.fileno()], [], 0)[0])
+
     def is_opening(self) -> bool:
         """Tell whether it lives and has a device that was neither opened nor has failed."""
         headers = [driven.seat.page.header for driven in self.devices]
         if not any(h[page.STATE] == page.OPENING and not h[page.ERRORS] for h in headers):
             return False
         return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
+
+
+def allow_descriptors_of(devices: Iterable[DeviceLaunch]) -> None:
+    """Let this process, and those that it forks, have as many descriptors as such devices need."""
+    each = (DESCRIPTORS_EACH + DESCRIPTORS_PER_USER * len(device.users) for device in devices)
+    allow_descriptors(DESCRIPTORS_BESIDE + sum(each))
 
 
 def exit_text(code: int) -> str:

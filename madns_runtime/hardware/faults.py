@@ -99,6 +99,12 @@ class InsertedFaults:
             found.append(self._held.popleft())
         return found
 
+    def forget_held(self) -> int:
+        """Forget the delayed samples that wait, and return how many they were."""
+        count = len(self._held)
+        self._held.clear()
+        return count
+
     def next_due_s(self) -> float:
         """Return when the next delayed sample is due; infinity if none waits."""
         if not self._held:

@@ -36,6 +36,11 @@ class Framer:
         self.bad_checksums = 0
         """Frames whose checksum was wrong."""
 
+    @property
+    def waiting_bytes(self) -> int:
+        """Bytes of a frame whose rest has not come."""
+        return len(self._buffer)
+
     def feed(self, data: bytes) -> list[bytes]:
         """Take what came, and return the frames that are whole now."""
         self._buffer += data
@@ -230,8 +235,10 @@ class LengthFramer(Framer):
         if len(buffer) < head:
             return None
         length = int.from_bytes(buffer[:head], self._order)
-        if not 0 < length <= self._max:
+        if length > self._max:
             return self._garbage(1)  # lost step: look for a length one byte on
+        if not length:
+            return None, head  # a frame of nothing, as some send to say that they are there
         if len(buffer) < head + length:
             return None
         return bytes(buffer[head : head + length]), head + length

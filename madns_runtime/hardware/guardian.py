@@ -29,6 +29,8 @@ from madns_runtime.reactor.scheduling import die_with_parent, outlive_parent
 GRACE_S: Final = 0.4
 ATTEMPT_S: Final = 5.0
 """For opening a device anew and making it safe; what takes longer is killed, and tried again."""
+CLOSE_S: Final = 0.5
+"""Then to close it: what is safe stays so, and a close that does not return is no reason to try again."""
 ATTEMPTS_MAX: Final = 3
 RETRY_S: Final = 0.1
 STAND_BY_S: Final = 1.0
@@ -103,7 +105,7 @@ class Guardian:
                 self._watch(pid, partial(self._driver_ended, name, pid))
             elif word == WATCH:
                 self._watch(pid, partial(self._owner_ended, name))
-        if not has_heard:
+        if not has_heard and messages.is_over(self._control):
             self._supervisor_ended()
 
     def _watch(self, pid: int, then: Callable[[], None]) -> None:
@@ -212,7 +214,7 @@ class Guardian:
                 continue
             name = self._helpers.pop(pid)
             header = self._seats[name].page.header
-            if os.waitstatus_to_exitcode(status) == 0:
+            if os.waitstatus_to_exitcode(status) in (0, -signal.SIGALRM):
                 header[page.SAFE_COUNT] += 1
                 messages.send(self._control, [SAFE, name, "made safe by the guardian"])
                 continue
@@ -246,6 +248,8 @@ def _open_and_make_safe(seat: DeviceSeat, go_fd: int) -> None:
             seat.page.header[page.MOVED] = 0.0
             device.make_safe()
             code = 0
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+            signal.setitimer(signal.ITIMER_REAL, CLOSE_S)
         finally:
             device.close()
     except BaseException as error:  # noqa: BLE001 - a driver may raise anything

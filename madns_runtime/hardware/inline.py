@@ -10,13 +10,13 @@ from madns_runtime.errors import BlamedError, PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.contract import SimulatedDevice
 from madns_runtime.hardware.driver_answers import identity_of
-from madns_runtime.hardware.intake import Intake
+from madns_runtime.hardware.intake import Intake, silent_inputs
 from madns_runtime.hardware.kind_registry import DeviceProgram
 from madns_runtime.hardware.outputs import DeviceOutputs, DueOutput
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.port import DevicePort
 from madns_runtime.hardware.records import DeviceRecords
-from madns_runtime.hardware.simulated import STANDS_STILL
+from madns_runtime.hardware.simulated import STANDS_STILL, next_of
 from madns_runtime.hardware.status import StatusAccount, StatusLimits
 from madns_runtime.plugin.context import describe_exception
 
@@ -112,7 +112,7 @@ class InlineDevice:
         """
         self._hear()
         for _ in range(SAMPLES_MAX):
-            next_s = self._call("next_s", self._device.next_s)
+            next_s = self._call("next_s", next_of, self._device)
             due_s = self._count / self._rate_hz if next_s is None else max(next_s, 0.0)
             output_s = min(self._outputs.next_write_s(), self._outputs.next_point_s())
             if min(due_s, output_s) > t_s:
@@ -127,7 +127,8 @@ class InlineDevice:
             if self._intake.faults.is_disconnected:
                 self._intake.count("passed_while_closed")
                 continue
-            self._intake.take(sample, due_s if sample.handed_s is None else sample.handed_s)
+            handed_s = due_s if sample.handed_s is None else sample.handed_s
+            self._intake.take(sample, handed_s, ahead_s=1.0 / self._rate_hz)
         else:
             raise PluginError(
                 f"device {self.name}: {SAMPLES_MAX} samples and outputs by {t_s:g} s, and no end: {STANDS_STILL}"
@@ -197,6 +198,7 @@ class InlineDevice:
         self._intake.count("writes_left", self._outputs.clear())
         self._make_safe(self._now_s())
         self._tried("close", self._device.close)
+        self._intake.close()
         account = self._account
         return {
             "status": account.status,
@@ -204,6 +206,7 @@ class InlineDevice:
             "lost": account.times_lost,
             "restarts": 0,
             "unsafe": int(self._page.header[page.MOVED]),
+            "silent_inputs": silent_inputs(self.port.channels.values(), self._page),
             "why": self._why,
             **self._intake.summary(),
             **self._outputs.summary(self._page.counts.read()),

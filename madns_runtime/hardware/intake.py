@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 from madns_runtime.errors import PluginError
@@ -62,7 +63,8 @@ class Intake:
         self._changes = {name: _LastChange(limit_s) for name, limit_s in frozen_s.items()}
         for name in frozen_s:
             self.count(f"{FROZEN}{name}", 0)
-        self._frame_numbers: dict[str, int] = {}
+        self.withheld_s = -math.inf
+        """When an inserted fault kept a sample back: the device is not silent."""
         self._dropped = 0
         """Samples that inserted faults have dropped, as far as they are counted."""
 
@@ -97,8 +99,10 @@ class Intake:
             raise PluginError(f"expected a Sample or None, got {type(sample).__name__}")
         if not math.isfinite(sample.taken_s) or sample.taken_s > now_s + ahead_s:
             raise PluginError(
-                f"taken_s: expected a time of time.monotonic(), got {sample.taken_s!r}"
+                f"taken_s: expected a time until now, {now_s:.6f} s of time.monotonic() (in lockstep simulated), got"
+                f" {sample.taken_s!r}"
             )
+        sample = self._checked(sample)
         self._page.header[page.ACTIVE_S] = now_s
         if sample.device_s is not None:
             self.clock.add(sample.device_s, sample.taken_s)
@@ -107,7 +111,9 @@ class Intake:
             self.count("dropped", self.faults.dropped - self._dropped)
             self._dropped = self.faults.dropped
         self.tell_held(now_s)  # what waits no longer, as its delay was lifted, came before it
-        if altered is not None:
+        if altered is None:
+            self.withheld_s = now_s
+        else:
             self._tell(altered, now_s)
         self._page.header[page.SAMPLES] += 1
 
@@ -115,6 +121,10 @@ class Intake:
         """Hand on the samples that an inserted fault has delayed until now."""
         for sample in self.faults.due(now_s):
             self._tell(sample, now_s)
+
+    def close(self) -> None:
+        """Count the samples that an inserted fault still delays: they reach nobody."""
+        self.count("delayed_left", self.faults.forget_held())
 
     def count(self, name: str, number: int = 1) -> None:
         """Count something by name, in memory that outlives this process."""
@@ -130,19 +140,35 @@ class Intake:
         """Return the counts of a run, those of earlier processes with them."""
         return counts_of(self._page)
 
-    def _tell(self, sample: Sample, now_s: float) -> None:
-        """Make a sample the newest, pass on its frames, record it."""
-        device_s = math.nan if sample.device_s is None else sample.device_s
-        is_told = not sample.values
+    def _checked(self, sample: Sample) -> Sample:
+        """
+        Return a sample with values of its own, as numbers and bytes: a driver may fill its buffers again while a fault holds it.
+
+        Raises:
+            PluginError: A value is none of an input of this device.
+        """
+        values: dict[str, Any] = {}
         for name, value in sample.values.items():
             channel = self._inputs.get(name)
             if channel is None:
                 raise PluginError(f"a sample holds {name!r}, which is no input of the device")
+            values[name] = (
+                to_frame(channel, value) if channel.is_frame else to_numbers(channel, value)
+            )
+        return dataclasses.replace(sample, values=values)
+
+    def _tell(self, sample: Sample, now_s: float) -> None:
+        """Make a sample that was checked the newest, pass on its frames, record it."""
+        device_s = math.nan if sample.device_s is None else sample.device_s
+        is_told = not sample.values
+        value: Any
+        for name, value in sample.values.items():
+            channel = self._inputs[name]
             if channel.is_frame:
-                self._tell_frame(channel, to_frame(channel, value), sample.taken_s, now_s)
+                self._tell_frame(channel, value, sample.taken_s, now_s)
                 is_told = True
                 continue
-            numbers = to_numbers(channel, value)
+            numbers = tuple(value)
             if not are_finite(numbers):
                 # On record, where the check records.not_finite finds it, and in nobody's hands.
                 self.count(f"{name}{NOT_FINITE}")
@@ -157,9 +183,7 @@ class Intake:
                 self._send([messages.FRAME, name, number, sample.taken_s, list(numbers)])
             told_s = self._handed_s(now_s)
             self._records.sample(name, number, sample.taken_s, numbers, told_s=told_s)
-            if name in self._changes and self._changes[name].is_frozen(numbers, now_s):
-                self.count(f"{FROZEN}{name}")
-                self.event("frozen", now_s, channel=name, for_s=self._changes[name].limit_s)
+            self._look_for_change(name, numbers, now_s)
         if not is_told:
             return
         header = self._page.header
@@ -167,10 +191,18 @@ class Intake:
         header[page.ARRIVED_S] = now_s
 
     def _tell_frame(self, channel: Channel, data: bytes, taken_s: float, now_s: float) -> None:
-        number = self._frame_numbers[channel.name] = self._frame_numbers.get(channel.name, 0) + 1
+        number = self._page.count_frame(channel.name)
         told = (len(data), data.hex())
         self._send([messages.FRAME, channel.name, number, taken_s, data])
         self._records.sample(channel.name, number, taken_s, told, told_s=self._handed_s(now_s))
+        self._look_for_change(channel.name, (data,), now_s)
+
+    def _look_for_change(self, name: str, values: tuple[Any, ...], now_s: float) -> None:
+        """Count and record an input that has not changed for too long."""
+        change = self._changes.get(name)
+        if change is not None and change.is_frozen(values, now_s):
+            self.count(f"{FROZEN}{name}")
+            self.event("frozen", now_s, channel=name, for_s=change.limit_s)
 
     def _send(self, message: list[Any]) -> None:
         self.count("frames_missed", self._pass_on(message))
@@ -191,16 +223,28 @@ def counts_of(device_page: DevicePage) -> dict[str, Any]:
     }
 
 
+def silent_inputs(channels: Iterable[Channel], device_page: DevicePage) -> list[str]:
+    """Return the inputs of numbers of which no value ever came; queues are left out, for nothing may have happened."""
+    return [
+        each.name
+        for each in channels
+        if each.direction == "in"
+        and not each.is_frame
+        and each.passing == "newest"
+        and not device_page.read(each.name).number
+    ]
+
+
 class _LastChange:
     """When an input last changed: one that never does although it should is frozen."""
 
     def __init__(self, limit_s: float) -> None:
         self.limit_s = limit_s
-        self._values: tuple[float, ...] | None = None
+        self._values: tuple[Any, ...] | None = None
         self._since_s = 0.0
         self._is_told = False
 
-    def is_frozen(self, values: tuple[float, ...], now_s: float) -> bool:
+    def is_frozen(self, values: tuple[Any, ...], now_s: float) -> bool:
         """Take note of values, and return whether they are now, and were not before, unchanged for too long."""
         if values != self._values:
             self._values, self._since_s, self._is_told = values, now_s, False

@@ -7,10 +7,7 @@ constructor, before anybody is forked.
 
 from __future__ import annotations
 
-import contextlib
 import os
-import select
-import signal
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -21,7 +18,7 @@ from typing import Any, Final
 
 from madns_runtime.config import AgentLaunch
 from madns_runtime.hardware import guardian, messages, page
-from madns_runtime.hardware.child_process import fork_with_pair, wait_for
+from madns_runtime.hardware.child_process import fork_with_pair, kill, wait_for
 from madns_runtime.hardware.claims import DeviceClaims
 from madns_runtime.hardware.contract import Device
 from madns_runtime.hardware.device_process import GONE, REPORT, run_devices
@@ -29,6 +26,7 @@ from madns_runtime.hardware.driven import (
     NOT_MADE_SAFE,
     DeviceProcess,
     DrivenDevice,
+    allow_descriptors_of,
     exit_text,
 )
 from madns_runtime.hardware.guardian import guard_outputs
@@ -69,6 +67,7 @@ class DeviceManager:
         shared: list[DrivenDevice] = []
         self._processes: list[DeviceProcess] = []
         self._claims = DeviceClaims(launch.config.run)
+        allow_descriptors_of(launch.devices)
         for each in launch.devices:
             tell(f"importing the kind of device {each.kind}")
             program = prepare(each.kind, each.parameters, Path(each.base_directory))
@@ -248,7 +247,7 @@ class DeviceManager:
                 self._devices[rest[0]].note_fault(rest[1], rest[2])
             elif word == GONE:
                 process.gave_up_why = clean_text(str(rest[0]))
-        if not has_heard:
+        if not has_heard and messages.is_over(process.control):  # a look may have heard all before
             self._hang_up(process)
 
     def _hang_up(self, process: DeviceProcess) -> None:
@@ -297,7 +296,7 @@ class DeviceManager:
                 driven.loss = driven.why
                 self._look_at(process, driven, monotonic())
             elif code:
-                driven.blame(exit_text(code))
+                driven.blame(process.gave_up_why or exit_text(code))
         if self._is_ending or self._reactor is None:
             return
         process.failures = 0 if monotonic() - process.started_s > 10.0 else process.failures + 1
@@ -334,7 +333,7 @@ class DeviceManager:
         status = driven.seat.page.status(driven.limits, now_s)
         if status == "ok":
             driven.forgive()
-        elif process.control is not None and select.select([process.control], [], [], 0)[0]:
+        elif process.has_words():
             self._hear(process)  # why it was closed may wait
         if driven.account.counted_s is None and driven.seat.page.time.read() is not None:
             driven.account.begin(now_s)  # an agent has told that simulated time runs
@@ -350,15 +349,13 @@ class DeviceManager:
                     "why": driven.loss if status == "lost" else "",
                 }
             )
-        if (
-            driven.account.counted_s is not None
-        ):  # behind its reason: who reads the count finds that
+        # Behind its reason: who reads the count finds that.
+        if driven.account.counted_s is not None:
             driven.seat.page.header[page.LOSSES] = driven.account.times_lost
         silent_s = now_s - driven.seat.page.header[page.ACTIVE_S]
         if process.pid and silent_s > driven.limits.hang_s and not process.killed_why:
             process.killed_why = f"its driver did not return within {driven.limits.hang_s:g} s"
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process.pid, signal.SIGKILL)
+            kill(process.pid)
 
     # The end ------------------------------------------------------------------------------------
 
@@ -391,9 +388,13 @@ class DeviceManager:
 
     def _wait(self, process: DeviceProcess, deadline_s: float) -> None:
         if process.pid and not wait_for(process.pid, deadline_s):
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process.pid, signal.SIGKILL)
+            kill(process.pid)
             wait_for(process.pid, monotonic() + KILL_WAIT_S)
+            for driven in process.devices:
+                driven.blame(f"its driver did not return within {END_S:g} s of the run's end")
+                self._emit(
+                    {"event": "log", "level": "error", "text": f"{driven.name}: {driven.why}"}
+                )
         process.pid = 0
         self._hear(process)
         self._hang_up(process)

@@ -12,6 +12,8 @@ from typing import Any, Final
 
 import msgpack
 
+from madns_runtime.errors import MachineError
+
 BYTES_MAX: Final = 65_536
 BUFFER_BYTES: Final = 262_144
 DATAGRAMS_MAX: Final = 4096
@@ -27,8 +29,19 @@ from an agent [FAULT, number, action, value] and to it [ANSWER, number, refusal]
 
 
 def make_pair() -> tuple[socket.socket, socket.socket]:
-    """Return two connected sockets that keep datagrams apart, and never wait."""
-    pair = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    """
+    Return two connected sockets that keep datagrams apart, and never wait.
+
+    Raises:
+        MachineError: The machine gives this process no more of them.
+    """
+    try:
+        pair = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    except OSError as error:
+        raise MachineError(
+            f"no socket for a device: {error.strerror}; `ulimit -Hn` tells how many files a process may have open here,"
+            " and each agent that uses a device needs three"
+        ) from error
     for end in pair:
         end.setblocking(False)
         end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
@@ -49,7 +62,9 @@ def receive_all(end: socket.socket) -> Iterator[list[Any]]:
     for _ in range(DATAGRAMS_MAX):
         try:
             data = end.recv(BYTES_MAX)
-        except (BlockingIOError, OSError):
+        except ConnectionResetError:
+            continue  # told once, of one that has ended without reading all: what it said before comes behind that
+        except OSError:
             return
         if not data:
             return
@@ -59,3 +74,13 @@ def receive_all(end: socket.socket) -> Iterator[list[Any]]:
             continue
         if isinstance(message, list) and message:
             yield message
+
+
+def is_over(end: socket.socket) -> bool:
+    """Tell whether the other end is gone, and all that it said was received."""
+    try:
+        return not end.recv(1, socket.MSG_PEEK)
+    except (BlockingIOError, ConnectionResetError):
+        return False
+    except OSError:
+        return True

@@ -57,7 +57,7 @@ class DevicePage:
     Shared memory of one device; made before the processes that share it are forked.
 
     Args:
-        channels: The device's, in the order of their slots; frames have none.
+        channels: The device's, in the order of their slots; of frames only their number is here.
     """
 
     def __init__(self, channels: Sequence[Channel]) -> None:
@@ -66,10 +66,8 @@ class DevicePage:
         time_start = HEADER_BYTES + SLOT_BYTES + TABLE_BYTES
         size = time_start + _Slot.size(TIME_NUMBERS)
         for channel in channels:
-            if channel.is_frame:
-                continue
             places.append((channel, size))
-            size += _Slot.size(channel.size)
+            size += ALIGNMENT if channel.is_frame else _Slot.size(channel.size)
         self._memory = mmap.mmap(-1, max(size, mmap.PAGESIZE))
         view = memoryview(self._memory)
         self.header = view[:HEADER_BYTES].cast("d")
@@ -80,12 +78,22 @@ class DevicePage:
         self.counts = CountTable(view[HEADER_BYTES + SLOT_BYTES : time_start])
         """What its process counts; it outlives that."""
         self.time = TimeSlot(view, time_start)
+        self._frames: dict[str, memoryview[int]] = {}
         for channel, start in places:
-            self._slots[channel.name] = _Slot(view, start, channel.size)
+            if channel.is_frame:
+                self._frames[channel.name] = view[start : start + 8].cast("Q")
+            else:
+                self._slots[channel.name] = _Slot(view, start, channel.size)
 
     def write(self, channel: str, taken_s: float, device_s: float, values: Sequence[float]) -> int:
         """Make *values* the newest of a channel, and return their number; for the device's process alone."""
         return self._slots[channel].write(taken_s, device_s, values)
+
+    def count_frame(self, channel: str) -> int:
+        """Return the number of a channel's next frame, counted on from an earlier process's; for the device's process alone."""
+        number = self._frames[channel]
+        number[0] += 1
+        return number[0]
 
     def read(self, channel: str) -> SlotReading:
         """Return the newest values of a channel; takes a few microseconds and never waits."""

@@ -126,6 +126,10 @@ class DevicePort:
     def write(self, channel: str, value: Value, *, due_s: float | None = None) -> None:
         """Hand over a value for an output, due at simulated time *due_s*; see `DeviceView`."""
         declared = self._output(channel)
+        if due_s is not None and not math.isfinite(due_s):
+            raise PluginError(
+                f"{self.name}.{channel}: due_s: expected a simulated time, s, got {due_s!r}"
+            )
         if declared.is_frame:
             sent: Any = to_frame(declared, value)
         else:
@@ -162,7 +166,7 @@ class DevicePort:
             )
         packs = pack_points(declared, points)
         start_s = packs[0][0] if from_s is None and packs[0] else from_s
-        if start_s is None or (packs[0] and not start_s <= packs[0][0]):
+        if start_s is None or math.isnan(start_s) or (packs[0] and not start_s <= packs[0][0]):
             raise PluginError(
                 f"{self.name}.{channel}: expected points, none before from_s ({from_s}); got"
                 f" {f'one at {packs[0][0]:g} s' if packs[0] else 'neither'}"

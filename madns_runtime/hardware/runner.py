@@ -196,6 +196,7 @@ class DeviceRunner:
         self._records.event("ending", monotonic(), why=reason)
         self._intake.count("writes_left", self._outputs.clear())
         self._close_device()
+        self._intake.close()
         if not self._header[page.MOVED]:  # else the guardian tries what the driver could not
             self._header[page.STATE] = page.SAFE
         told = {**self._intake.summary(), **self._outputs.summary(self._seat.page.counts.read())}
@@ -367,7 +368,8 @@ class DeviceRunner:
         now_s = monotonic()
         details: Mapping[str, Any] = {}
         header = self._header
-        silent_s = now_s - max(header[page.ARRIVED_S], header[page.OPENED_S])
+        heard_s = max(header[page.ARRIVED_S], self._intake.withheld_s)
+        silent_s = now_s - max(heard_s, header[page.OPENED_S])
         if self._device is not None and silent_s > self._hang_s:
             self._fail("read", MachineError(f"no sample within {self._hang_s:g} s"))
         if self._device is not None:

@@ -20,6 +20,27 @@ STANDS_STILL: Final = (
 )
 
 
+def next_of(device: SimulatedDevice) -> float | None:
+    """
+    Return what a device's `next_s` tells.
+
+    Raises:
+        PluginError: It is no time.
+    """
+    told: object = device.next_s()
+    if told is None:
+        return None
+    try:
+        next_s = float(told)  # type: ignore[arg-type]  # what is none is refused below
+    except (TypeError, ValueError):
+        next_s = math.nan
+    if math.isnan(next_s):
+        raise PluginError(
+            f"next_s: expected a simulated time, s, infinity for never, or None for its rate; got {told!r:.40}"
+        )
+    return next_s
+
+
 def pass_over(device: Device, time: SimulatedTime, header: memoryview[float]) -> int:
     """
     Leave out what a device had to tell while it was not open: a recording goes on, and does not begin anew.
@@ -39,7 +60,7 @@ def pass_over(device: Device, time: SimulatedTime, header: memoryview[float]) ->
         return 0
     t_s, passed = time.at(monotonic()), 0
     latest_s, still = -math.inf, 0
-    while (next_s := device.next_s()) is not None and next_s <= t_s:
+    while (next_s := next_of(device)) is not None and next_s <= t_s:
         header[page.ACTIVE_S] = monotonic()
         still = 0 if next_s > latest_s else still + 1
         latest_s = max(latest_s, next_s)
@@ -68,6 +89,6 @@ def samples_by_now(
         sample = device.sample_at(max(t_s, 0.0))
         if sample is not None:
             yield dataclasses.replace(sample, taken_s=now_s - (max(t_s, 0.0) - sample.taken_s))
-        next_s = device.next_s()
+        next_s = next_of(device)
         if next_s is None or next_s > t_s:
             return

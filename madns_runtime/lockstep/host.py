@@ -9,7 +9,6 @@ clock to what comes next. Nothing in it depends on the wall clock but how long i
 from __future__ import annotations
 
 import contextlib
-import resource
 from functools import partial
 from pathlib import Path
 from time import monotonic
@@ -38,6 +37,7 @@ from madns_runtime.plugin.host_calls import HostCalls
 from madns_runtime.protocol.codec import pack
 from madns_runtime.protocol.messages import ConditionMet, Service
 from madns_runtime.protocol.states import HostEvent, host_machine
+from madns_runtime.reactor.descriptors import allow_descriptors
 from madns_runtime.reactor.host_signals import heed_signals
 from madns_runtime.reactor.operator_link import tell_loading
 from madns_runtime.reactor.scheduling import freeze_garbage
@@ -69,7 +69,7 @@ class LockstepHost:
         self._launch, self._line_fd = launch, fds[0]
         self._names = config.agents.resolved_names()
         self._directory = Path(launch.directory)
-        _allow_many_files()
+        allow_descriptors()
         shares = share_out(config.agents, processors_here())
         # Everything that forks comes before every thread; workers load their half at the same time.
         self._crew = Workers(launch, self._directory.parent, shares)
@@ -340,11 +340,3 @@ class LockstepHost:
     def _log(self, level: str, text: str) -> None:
         self._journal.say(level, text)
         self._operator.emit({"event": "log", "level": level, "source": HOST, "text": text})
-
-
-def _allow_many_files() -> None:
-    """Raise the number of open files to what the system allows: a worker holds those of many agents."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft != hard:
-        with contextlib.suppress(OSError, ValueError):
-            resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))

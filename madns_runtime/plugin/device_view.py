@@ -91,7 +91,7 @@ class DeviceView(Protocol):
             due_s: Simulated time at which it is to be put out, s; None for at once.
 
         Raises:
-            PluginError: The device has no such output, or the value is none of its shape, or is no number.
+            PluginError: The device has no such output, the value is none of its shape, or it or the time is no number.
         """
 
     def play(

@@ -22,6 +22,7 @@ from typing import Any
 import orjson
 
 from madns_runtime.errors import ConfigurationError
+from madns_runtime.reactor.descriptors import ready
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.reattachment import (
     ATTACH_LINE_S,
@@ -62,7 +63,7 @@ def read_launch(fd: int) -> tuple[dict[str, Any], bytes]:
     parts: list[bytes] = []
     size = 0
     while not parts or b"\n" not in parts[-1]:
-        if not select.select([fd], [], [], LAUNCH_CHECK_S)[0]:
+        if not ready([fd], [], LAUNCH_CHECK_S)[0]:
             # Its writer may be waiting for a processor.
             granted = granted or GrantedClock(lambda: (os.getppid(),))
             if granted.now_s() < LAUNCH_TIMEOUT_S:
@@ -219,7 +220,7 @@ class OperatorLink:
         deadline_s = monotonic() + timeout_s
         while self._out and not self.is_gone:
             left_s = deadline_s - monotonic()
-            if left_s <= 0 or not select.select([], [self._write_fd], [], left_s)[1]:
+            if left_s <= 0 or not ready([], [self._write_fd], left_s)[1]:
                 return False
             self._write()
         return not self._out
@@ -299,7 +300,7 @@ class OperatorLink:
     def _given_up(self) -> None:
         """Take an operator for gone that has not come back; one that knocked while the loop was busy is heard."""
         assert self._door is not None
-        if select.select([self._door], [], [], 0)[0]:
+        if ready([self._door.fileno()], [], 0)[0]:
             self._door.step()
         if self.is_cut and self._door.is_visited and not self._is_last_call:
             self._is_last_call = True
@@ -336,7 +337,7 @@ class OperatorLink:
                 return False
             reading = [door.fileno(), *(() if self.is_cut else (self._read_fd,))]
             writing = [self._write_fd] if self._out and not self.is_cut else []
-            readable, writable, _ = select.select(reading, writing, [], left_s)
+            readable, writable = ready(reading, writing, left_s)
             if writable:
                 self._write()
             if door.fileno() in readable:

@@ -7,7 +7,6 @@ The parent holds the write end of a life line; every child polls its read end an
 from __future__ import annotations
 
 import os
-import select
 import signal
 import sys
 from collections.abc import Mapping, Sequence
@@ -27,6 +26,7 @@ from madns_runtime.partial_file import write_whole
 from madns_runtime.plugin.context import clean_text
 from madns_runtime.plugin.half import RoleProgram
 from madns_runtime.processes import Registration, register
+from madns_runtime.reactor.descriptors import ready
 from madns_runtime.reactor.forking import end_child, leave_parent
 from madns_runtime.reactor.operator_link import OPERATOR_GONE, OperatorLink, tell_loading
 from madns_runtime.reactor.reactor import Reactor
@@ -236,7 +236,7 @@ class Supervisor:
 
     def _child_ended(self, child: SupervisedProcess, status: int) -> None:
         code = os.waitstatus_to_exitcode(status)
-        while select.select([self._reason_read_fd], [], [], 0)[0]:
+        while ready([self._reason_read_fd], [], 0)[0]:
             self._read_outcomes()
         where = child.calls.interrupted(child.agents)
         if code == 0 and not child.has_ended_well:

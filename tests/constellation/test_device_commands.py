@@ -9,7 +9,10 @@ from madns_runtime.errors import BlamedError
 from madns_runtime.plugin.device_view import ChannelReading
 from madns_runtime.simulations.constellation.actuation import Actuation, actuation_faults
 from madns_runtime.simulations.constellation.check import device_uses, find_faults
-from madns_runtime.simulations.constellation.vehicle.device_commands import DEVICE_NUMBER_FIRST
+from madns_runtime.simulations.constellation.vehicle.device_commands import (
+    DEVICE_NUMBER_FIRST,
+    DeviceCommands,
+)
 
 BODY = {
     "inertia_kg_m2": [1.0, 1.2, 0.9],
@@ -91,6 +94,19 @@ def test_samples_that_no_tick_saw_are_counted():
     # The first that is seen is at 1.1 s: what was before it, nobody waited for.
     counts = star.summaries()["agent-01"]["actuation"]
     assert (counts["commands"], counts["samples_skipped"]) == (3, 1)
+
+
+def test_an_agent_that_is_started_anew_gives_no_command_of_its_predecessor_a_second_time():
+    star = fly([(1.0, 1.0)])
+    first = star.summaries()["agent-01"]["actuation"]["commands"]
+    context = star.contexts["agent-01"]
+    again = DeviceCommands(context, context.parameters.vehicles[0], has_flight=True)
+    again.step(41, 4.1, 0.0)
+    seen = again.finish()["commands"]
+    context.hardware["valve"].samples.append((3.0, 2.0))
+    again.step(42, 4.2, 0.0)
+
+    assert (first, seen, again.finish()["commands"]) == (1, 0, 1)
 
 
 @pytest.mark.parametrize(

@@ -115,3 +115,40 @@ def test_two_runs_record_the_same_and_the_error_of_hardware_is_a_figure(scenario
         "magnetometer  field of the device ",
     ):
         assert any(line.startswith(figure) for line in errors), compared.stdout
+
+
+HALF = """
+from madns_runtime.hardware.contract import Channel, DeviceKind, Sample, SimulatedDevice
+
+
+class Half(SimulatedDevice):
+    kind = DeviceKind(
+        name="half",
+        summary="gives one of its two inputs alone",
+        channels=(
+            Channel(name="gyro", unit="rad/s", shape=(3,)),
+            Channel(name="field", unit="uT", shape=(3,)),
+        ),
+        needs_hardware=False,
+        follows_simulated_time=True,
+    )
+
+    def sample_at(self, t_s):
+        return Sample(values={"gyro": (0.0, 0.0, t_s)}, taken_s=t_s)
+"""
+
+
+@pytest.mark.process
+def test_a_sensor_whose_channel_gives_nothing_breaks_a_check_by_its_name(scenario, tmp_path):
+    (tmp_path / "half.py").write_text(HALF)
+    head, _, _ = SCENARIO.partition("hardware:\n")
+    scenario.write_text(
+        f"{head}hardware:\n  devices: [{{name: imu, kind: ./half.py:Half, agents: [agent-01]}}]\n"
+    )
+    code, document = CosmosCommand(tmp_path).run(scenario, *LOOSE, "time.duration_s=1")
+
+    broken = [check for check in document["checks"] if not check["passed"]]
+    assert (code, document["devices"]["agent-01/imu"]["status"]) == (4, "ok")
+    assert [(each["name"], each["got"], each["worst"]) for each in broken] == [
+        ("constellation.sensors_silent", 1, "agent-01: magnetometer")
+    ]

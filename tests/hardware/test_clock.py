@@ -65,3 +65,16 @@ def test_what_is_kept_is_bounded_and_what_is_no_number_left_out():
 
     assert len(clock._points) <= POINTS_MAX
     assert clock.estimate() == before
+
+
+def test_of_a_buffer_that_is_handed_over_at_once_no_clock_is_estimated():
+    clock = DeviceClock()
+    for number in range(31):
+        clock.add(0.1 * number, 5000.0)
+    estimates = [clock.estimate()]
+    for number in range(31, 2000):
+        clock.add(0.1 * number, 5000.0 + 0.1 * (number - 30))
+    estimates.append(clock.estimate())
+
+    assert estimates[0] is None
+    assert estimates[1].drift_ppm == pytest.approx(0.0, abs=1.0)

@@ -11,8 +11,10 @@ import pytest
 
 from madns_runtime.config import DeviceLaunch
 from madns_runtime.errors import PluginError
+from madns_runtime.hardware import page
 from madns_runtime.hardware.guardian import ATTEMPTS_MAX
 from tests.hardware.bench import AGENT, DeviceBench, line_bench
+from tests.harness.waiting import is_alive, wait_until
 
 pytestmark = pytest.mark.process
 
@@ -277,6 +279,67 @@ def test_counts_survive_the_process_that_counted(tmp_path):
     assert report["valve_limited"] == 1
     assert report["samples"] == result["samples"] > 0
     assert report["unreported"] == 1  # its records have no end
+
+
+def test_a_process_whose_words_were_heard_by_another_look_is_not_taken_for_gone(tmp_path):
+    with line_bench(tmp_path) as (bench, _):
+        bench.until(lambda: bench.statuses("line") == ["ok"])
+        pid = bench.pid_of()
+        # As where its words and others' come at once: a timer between the two has heard them all.
+        bench.manager._hear(bench.manager._processes[0])
+        number = bench.hardware["line"]["time"].number
+        bench.until(lambda: bench.hardware["line"]["time"].number > number + 5)
+        assert bench.pid_of() == pid
+        result = bench.close()["pi22/line"]
+
+    assert (result["restarts"], result["why"]) == (0, "")
+
+
+def test_a_driver_whose_close_does_not_return_is_named_at_the_end_and_made_safe_once(tmp_path):
+    with line_bench(tmp_path, close_s=600.0) as (bench, terminal):
+        guardian_pid = bench.manager._guardian_pid
+        bench.until(lambda: bench.statuses("line") == ["ok"])
+        bench.hardware["line"].write("valve", 0.5)
+        bench.until(lambda: bench.manager.page_of("pi22/line").header[page.MOVED] == 1.0)
+        result = bench.close()["pi22/line"]
+        wait_until(lambda: not is_alive(guardian_pid), "the guardian has ended")
+        heard = terminal.heard()
+
+    told = [event["text"] for event in bench.events if event["event"] == "log"]
+    assert result["why"] == "its driver did not return within 3 s of the run's end"
+    assert f"pi22/line: {result['why']}" in told
+    assert result["unsafe"] == 0
+    assert heard == ["OPEN", "VALVE 0.5", "SAFE", "OPEN", "SAFE"]  # the guardian has tried once
+
+
+@pytest.mark.parametrize(("action", "value"), [("drop", 1.0), ("delay", 600.0)])
+def test_a_device_whose_samples_a_fault_keeps_back_is_not_opened_anew(tmp_path, action, value):
+    with line_bench(tmp_path, launch={"hang_s": 0.2}) as (bench, terminal):
+        bench.start_time()
+        bench.until(lambda: bench.statuses("line") == ["ok"])
+        bench.manager.insert_fault("pi22/line", action, value)
+        states = tmp_path / "devices" / "pi22" / "line" / "device_state.jsonl"
+        bench.until(lambda: bench.hardware["line"].status == "lost")
+        # Silence is looked for when a state is recorded: once more, and it would have been found.
+        count = states.read_bytes().count(b"\n")
+        bench.until(lambda: states.read_bytes().count(b"\n") > count + 1)
+        result = bench.close()["pi22/line"]
+        heard = terminal.heard()
+
+    assert (result["errors"], heard) == (0, ["OPEN", "SAFE"])
+    name = {"drop": "dropped", "delay": "delayed_left"}[action]
+    assert result["report"][name] > 0
+
+
+def test_a_process_that_cannot_begin_is_lost_for_what_kept_it(tmp_path):
+    (tmp_path / "devices").write_text("in the way")
+    with line_bench(tmp_path) as (bench, _):
+        bench.until(lambda: "lost" in bench.statuses("line"))
+        lost = next(each for each in bench.events if each.get("status") == "lost")
+        result = bench.close()["pi22/line"]
+
+    assert "pi22/line: cannot record there" in lost["why"]
+    assert "pi22/line: cannot record there" in result["why"]
 
 
 def test_the_owners_end_makes_outputs_safe_while_the_device_goes_on(tmp_path):

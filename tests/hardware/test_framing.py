@@ -134,6 +134,17 @@ def test_stuffing_that_cannot_be_is_garbage():
     assert framer.garbage_bytes == 3
 
 
+@pytest.mark.parametrize("cut", [1, 3, 100])
+def test_frames_of_nothing_between_others_cost_none_of_them(cut):
+    stream = b"".join(LengthFramer().wrap(frame) for frame in (b"", b"one", b"", b"", b"two"))
+    framer, found = LengthFramer(), []
+    for start in range(0, len(stream), cut):
+        found += framer.feed(stream[start : start + cut])
+
+    assert found == [b"one", b"two"]
+    assert framer.garbage_bytes == 0
+
+
 def test_length_may_be_big_endian_and_of_four_bytes():
     framer = LengthFramer(64, 4, "big")
 

@@ -55,7 +55,7 @@ def test_a_sample_is_on_record_as_handed_over_when_agents_have_it_however_long_t
     sent, told = [], {}
     line = Channel(name="line", is_frame=True, passing="queue")
     queued = Channel(name="queued", passing="queue")
-    device_page = DevicePage([LEVEL, queued])
+    device_page = DevicePage([LEVEL, queued, line])
 
     class Told:
         def sample(self, channel, number, taken_s, values, *, told_s):
@@ -98,6 +98,99 @@ def test_an_input_that_is_no_number_keeps_no_other_from_being_told():
 
     assert device_page.header[page.NEWEST_S] == 2.0
     assert device_page.read("level").values == (4.0,)
+
+
+@pytest.mark.parametrize("number", [NAN, float("inf"), 10**400])
+def test_a_driver_that_counts_what_is_no_number_is_refused_and_spoils_no_count(number):
+    intake, _, _ = make_intake()
+    intake.count("spikes", 2)
+    with pytest.raises(PluginError, match="expected a name and a number to count, got 'spikes', "):
+        intake.count("spikes", number)
+
+    assert intake.summary()["spikes"] == 2
+
+
+def test_a_driver_that_fills_one_buffer_again_and_again_alters_no_sample_that_a_fault_holds():
+    told = {}
+    for action, value in (("freeze", None), ("delay", 5.0)):
+        intake, device_page, _ = make_intake()
+        buffer = [1.0, 1.0, 1.0]
+        if action == "delay":
+            intake.insert_fault(action, value)
+        intake.take(Sample(values={"field": buffer}, taken_s=0.0), 0.0)
+        if action == "freeze":
+            intake.insert_fault(action, value)
+        buffer[:] = [2.0, 2.0, 2.0]
+        intake.take(Sample(values={"field": buffer}, taken_s=1.0), 1.0)
+        intake.tell_held(5.5)
+        told[action] = device_page.read("field").values
+
+    assert told == {"freeze": (1.0, 1.0, 1.0), "delay": (1.0, 1.0, 1.0)}
+
+
+@pytest.mark.parametrize("action", ["delay", "drop", "freeze", "bias"])
+def test_a_value_of_another_shape_is_refused_as_it_comes_whatever_fault_is_in_force(action):
+    intake, _, kept = make_intake()
+    intake.insert_fault(action, None if action == "freeze" else 1.0)
+    with pytest.raises(PluginError, match="field: expected 3 numbers, got 'north'"):
+        intake.take(Sample(values={"level": 1.0, "field": "north"}, taken_s=1.0), 1.0)
+    intake.tell_held(9.0)
+
+    assert kept.samples == []
+
+
+def test_samples_that_a_delay_holds_at_the_end_are_counted():
+    intake, _, kept = make_intake()
+    intake.insert_fault("delay", 5.0)
+    for number in range(3):
+        intake.take(Sample(values={"level": 1.0}, taken_s=float(number)), float(number))
+    intake.close()
+
+    assert kept.samples == []
+    assert intake.summary()["delayed_left"] == 3
+
+
+def test_frames_that_are_the_same_for_too_long_are_frozen_and_pass_a_fault_of_numbers():
+    line = Channel(name="line", is_frame=True, passing="queue")
+    events, sent = [], []
+
+    class Told(Kept):
+        def event(self, event, now_s, **values):
+            events.append((event, now_s, values["channel"]))
+
+    intake = Intake(
+        (line, LEVEL),
+        DevicePage([line, LEVEL]),
+        Told(),
+        seed=[1],
+        frozen_s={"line": 2.0},
+        pass_on=lambda message: sent.append(message[-1]) or 0,
+    )
+    intake.insert_fault("bias", 1.0)
+    for second, data in enumerate([b"one", bytearray(b"two"), b"two", b"two", b"two", b"one"]):
+        intake.take(Sample(values={"line": data}, taken_s=float(second)), float(second))
+
+    assert sent == [b"one", b"two", b"two", b"two", b"two", b"one"]
+    assert events == [("frozen", 3.0, "line")]
+    assert intake.summary()["frozen"] == {"line": 1}
+
+
+def test_frames_are_numbered_on_by_the_process_that_takes_the_place_of_another():
+    line = Channel(name="line", is_frame=True, passing="queue")
+    device_page, sent = DevicePage([LEVEL, line]), []
+    for _ in range(2):
+        intake = Intake(
+            (line,),
+            device_page,
+            Kept(),
+            seed=[1],
+            frozen_s={},
+            pass_on=lambda m: sent.append(m) or 0,
+        )
+        for _ in range(2):
+            intake.take(Sample(values={"line": b"x"}, taken_s=1.0), 1.0)
+
+    assert [number for _, _, number, *_ in sent] == [1, 2, 3, 4]
 
 
 def test_a_sample_that_is_refused_is_not_counted_as_one():

@@ -1,11 +1,13 @@
 """A device as its agent sees it: what finds no room is counted and told."""
 
 import json
+import math
 import socket
 
 import pytest
 
 from madns_runtime.config import Recording
+from madns_runtime.errors import PluginError
 from madns_runtime.hardware import messages, port
 from madns_runtime.hardware.contract import Channel
 from madns_runtime.hardware.count_table import missed_name
@@ -96,6 +98,19 @@ def test_an_older_value_that_found_no_room_does_not_come_behind_a_newer_one(devi
     made.flush()
 
     assert sent == [2.0]
+
+
+@pytest.mark.parametrize("due_s", [math.nan, math.inf, -math.inf])
+def test_a_write_at_no_time_is_refused_and_holds_up_no_other(device, due_s):
+    made, theirs = device
+    with pytest.raises(PluginError, match="line.level: due_s: expected a simulated time, s, got "):
+        made.write("level", 1.0, due_s=due_s)
+    with pytest.raises(PluginError, match="none before from_s"):
+        made.play("level", (), from_s=math.nan)
+    made.write("level", 2.0, due_s=3.0)
+    theirs.setblocking(False)
+
+    assert list(messages.receive_all(theirs)) == [[messages.WRITE, "level", 2.0, 3.0]]
 
 
 def test_a_device_with_room_for_all_tells_nothing(device):

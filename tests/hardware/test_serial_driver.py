@@ -84,6 +84,22 @@ def test_what_came_and_what_was_no_frame_outlive_the_opening(line):
     assert counts == {"received_bytes": 2006, "garbage_bytes": 2001, "bad_checksums": 0}
 
 
+def test_what_was_taken_from_a_line_and_not_handed_on_when_it_is_closed_is_counted(line):
+    device, ours = line
+    counts = {}
+    device.count = lambda name, number: counts.update({name: counts.get(name, 0) + number})
+    os.write(ours, b"one\ntwo\nthree\nhal")
+    assert wait_for(device) == b"one"
+    device.close()
+
+    assert counts == {
+        "received_bytes": 17,
+        "garbage_bytes": len(b"hal"),
+        "bad_checksums": 0,
+        "frames_left": 2,
+    }
+
+
 def test_a_line_that_is_pulled_out_is_gone(line):
     device, ours = line
     os.close(ours)

@@ -55,3 +55,19 @@ def test_what_a_device_had_to_tell_while_it_was_closed_is_passed_over_however_mu
 def test_a_driver_that_lets_time_stand_still_is_told_so():
     with pytest.raises(PluginError, match=r"more than 20 samples at 5 s: next_s\(\) should tell"):
         passed_over(Tape([5.0], stands_still=True))
+
+
+@pytest.mark.parametrize("told", [math.nan, "soon", [1.0]])
+def test_a_next_time_that_is_none_is_refused_in_real_time(told):
+    tape = Tape([0.0, 1.0])
+    tape.next_s = lambda: told
+    with pytest.raises(PluginError, match="next_s: expected a simulated time, s, infinity for nev"):
+        list(simulated.samples_by_now(tape, SimulatedTime(), COUNT_MAX))
+
+
+@pytest.mark.parametrize(("told", "time_s"), [(None, None), (2, 2.0), (math.inf, math.inf)])
+def test_a_next_time_is_a_number_or_none(told, time_s):
+    tape = Tape([])
+    tape.next_s = lambda: told
+
+    assert simulated.next_of(tape) == time_s

@@ -8,9 +8,10 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from madns_runtime.config import Agents, RunConfig
+from madns_runtime.config import Agents, DeviceLaunch, RunConfig
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware.contract import Sample
+from madns_runtime.hardware.inline import InlineDevice
 from madns_runtime.hardware.kind_registry import prepare
 from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.stream_schemas import schema_of
@@ -135,6 +136,54 @@ def test_a_playback_recorded_anew_is_the_same_to_the_microsecond(tmp_path):
         assert len(first) == 200
         assert second == first
     assert schema_of(program.channels[0]).name == "gyro"
+
+
+def test_a_sample_that_was_handed_on_before_its_own_time_is_played_back_in_lockstep(tmp_path):
+    record(tmp_path, {"gyro": -0.0015, "level": 0.0})
+    program = prepare("playback", {"directory": "."}, tmp_path)
+    again, recording = tmp_path / "again", CONFIG.recording
+    recorder = Recorder(RecordFiles(again, run="0002-r", source="agent-01/imu"), recording)
+    journal = RunJournal(recorder, recording.verbosity, t_s=lambda: None)
+    launch = DeviceLaunch(
+        name="imu", place="agent-01", kind="playback", base_directory="", rate_hz=50.0
+    )
+    device = InlineDevice(
+        launch, program, DeviceRecords(journal, program.channels), now_s=lambda: 4.0
+    )
+    recorder.start()
+    device.open()
+    device.advance(4.0)
+
+    assert device.close()["samples"] == 400
+    first, second = (
+        [record[2:] for record in read_stream(folder / "gyro.jsonl").records()]
+        for folder in (tmp_path, again)
+    )
+    assert second[1:] == first[1:]  # the first was handed on before simulated time
+
+
+def test_lines_of_a_recording_that_are_none_are_counted_and_records_of_another_kind_are_named(
+    tmp_path,
+):
+    record(tmp_path, {"gyro": 0.0015, "level": 0.03})
+    path, counts = tmp_path / "level.jsonl", {}
+    head, *lines = path.read_text().splitlines()
+    path.write_text("\n".join([head, *lines[:5], "[0.1,6", *lines[6:9], "[]", *lines[10:]]))
+    with opened("playback", tmp_path, directory=".") as device:
+        device.count = lambda name, number: counts.update({name: counts.get(name, 0) + number})
+        found = 0
+        while (next_s := device.next_s()) != math.inf:
+            found += device.sample_at(next_s) is not None
+
+    assert (found, counts) == (398, {"damaged_lines": 2})
+    path.write_text("\n".join([head, '["soon",1,30,1.0]']))
+    with (
+        pytest.raises(
+            PluginError, match=r"level.jsonl: expected records \[t_s, number, age_us, .*'soon'"
+        ),
+        opened("playback", tmp_path, directory="."),
+    ):
+        pass
 
 
 def test_a_playback_begins_where_it_is_told_and_refuses_an_empty_folder(tmp_path):

@@ -220,6 +220,7 @@ def test_shipped_kinds_pass(tmp_path, kind):
         ("READ", "return Sample(values={'level': [1, 2]}, taken_s=time.monotonic())", "shapes", "expected a number"),
         ("READ", "return 7", "shapes", "expected a Sample or None, got int"),
         ("READ", "time.sleep(0.1)", "rate", "Hz"),
+        ("READ", "return None", "rate", "0.0 Hz: 0 samples in "),
         ("WRITE", "raise ValueError('stuck')", "outputs", "ValueError: stuck"),
     ],
 )  # fmt: skip

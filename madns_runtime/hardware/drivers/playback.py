@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from madns_runtime.errors import PluginError
 from madns_runtime.hardware.contract import Channel, Sample, SimulatedDevice, Value
 from madns_runtime.hardware.kinds.playback import PlaybackParameters, streams_of
-from madns_runtime.recording.reader import read_stream
+from madns_runtime.recording.reader import StreamReading, read_stream
 
 ROUNDING_S: Final = 1e-6
 """Of recorded times and ages together."""
@@ -26,7 +27,7 @@ class PlaybackDevice(SimulatedDevice):
         found_at = _finder(self.parameters)
         self._samples = heapq.merge(
             *(
-                _samples(channel, path, start_s, found_at, has_ticks=has_ticks)
+                self._samples_of(channel, path, start_s, found_at, has_ticks=has_ticks)
                 for channel, path in streams_of(self.parameters.directory)
                 if channel.direction == "in"
             ),
@@ -34,6 +35,20 @@ class PlaybackDevice(SimulatedDevice):
         )
         self._next = next(self._samples, None)
         return str(self.parameters.directory)
+
+    def _samples_of(
+        self,
+        channel: Channel,
+        path: Path,
+        start_s: float,
+        found_at: Callable[[float], float],
+        *,
+        has_ticks: bool,
+    ) -> Iterator[tuple[float, Sample]]:
+        """Yield the samples of one input with their times, and count the lines of its file that were none."""
+        stream = read_stream(path)
+        yield from _samples(channel, stream, start_s, found_at, has_ticks=has_ticks)
+        self.count("damaged_lines", stream.state.damaged + stream.state.truncated_lines)
 
     def sample_at(self, t_s: float) -> Sample | None:
         """Return the next sample that was handed on by *t_s*."""
@@ -53,21 +68,32 @@ class PlaybackDevice(SimulatedDevice):
 
 def _samples(
     channel: Channel,
-    path: Path,
+    stream: StreamReading,
     start_s: float,
     found_at: Callable[[float], float],
     *,
     has_ticks: bool,
 ) -> Iterator[tuple[float, Sample]]:
-    """Yield the samples of one input with the simulated time at which each is handed on, s."""
-    for t_s, _, age_us, *values in read_stream(path).records():
-        taken_s = t_s - start_s
+    """
+    Yield the samples of one input with the simulated time at which each is handed on, s.
+
+    Raises:
+        PluginError: A record is no sample's.
+    """
+    for record in stream.records():
+        t_s, _, age_us, *values = record
+        try:
+            taken_s = t_s - start_s
+            handed_s = taken_s + age_us * 1e-6
+            value: Any = values if channel.shape else values[0]
+            if channel.is_frame:
+                value = bytes.fromhex(values[1])
+        except (TypeError, ValueError):
+            raise PluginError(
+                f"{stream.path}: expected records [t_s, number, age_us, values ...], got {record!r:.80}"
+            ) from None
         if None in values or (taken_s < 0 and not has_ticks):
             continue
-        value: Any = values if channel.shape else values[0]
-        if channel.is_frame:
-            value = bytes.fromhex(values[1])
-        handed_s = taken_s + age_us * 1e-6
         yield (
             found_at(handed_s),
             Sample(

@@ -139,8 +139,11 @@ class SerialDevice(Device):
             self._send(self._framer.wrap(bytes.fromhex(self.parameters.safe_frame_hex)))
 
     def close(self) -> None:
-        """Close the port."""
+        """Close the port; what was taken from it and is handed on no more is counted."""
         if self._port is not None:
+            self.count("garbage_bytes", self._framer.waiting_bytes)
+            self.count("frames_left", len(self._frames))
+            self._frames.clear()
             self._port.close()
 
     def _make_framer(self) -> Framer:

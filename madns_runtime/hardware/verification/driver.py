@@ -14,6 +14,7 @@ from typing import Any, Final
 from madns_runtime.errors import MadnsError
 from madns_runtime.hardware.contract import Channel, Device, Sample, SimulatedDevice
 from madns_runtime.hardware.kind_registry import DeviceProgram
+from madns_runtime.hardware.status import STALE_PERIODS
 from madns_runtime.hardware.values import are_finite, hold_to_limits, to_frame, to_numbers
 from madns_runtime.hardware.verification.order import (
     MEMORY_BYTES_MAX,
@@ -110,7 +111,7 @@ def take_samples(
         began_s = monotonic()
         until_s = began_s + 2 * sampling_s
         while count < wanted and monotonic() < until_s:
-            due_s = began_s + (count + 1) / rate_hz
+            due_s = began_s + (len(reads_s) + 1) / rate_hz
             if fd is not None:
                 select.select([fd], [], [], max(0.0, until_s - monotonic()))
                 sample = device.read()
@@ -134,16 +135,19 @@ def take_samples(
     # What another program of this machine costs is no fault of the driver's: half of its reads say what it needs.
     read_s = median(reads_s) if reads_s else math.inf
     keeps_rate = got_hz >= 0.99 * rate_hz * wanted / (wanted + 1) or read_s <= 1.0 / rate_hz
+    # In a run a device that gives less often is stale, and lost.
+    is_sparse = fd is None and STALE_PERIODS * count < len(reads_s)
+    of_reads = f": {count} samples in {len(reads_s)} reads" if is_sparse else ""
     told = ", ".join(f"{name} {number} times" for name, number in beyond.items())
     return [
         finding(
             "rate",
-            keeps_rate if has_rate else None,
-            "nothing came" if is_quiet else f"{got_hz:.1f} Hz{_read_text(reads_s)}",
+            keeps_rate and not is_sparse if has_rate else None,
+            "nothing came" if is_quiet else f"{got_hz:.1f} Hz{of_reads or _read_text(reads_s)}",
             f"{rate_hz:g} Hz",
         ),
-        finding("shapes", None if is_quiet else not faults, faults[0] if faults else f"{count} samples"),
-        finding("limits", None if is_quiet else not beyond, told or "within", "declared limits"),
+        finding("shapes", not faults if count else None, faults[0] if faults else f"{count} samples"),
+        finding("limits", not beyond if count else None, told or "within", "declared limits"),
     ]  # fmt: skip
 
 

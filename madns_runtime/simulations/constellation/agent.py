@@ -319,8 +319,22 @@ class ConstellationAgent(AgentSimulation):
             **({"told_early": self._recorded.overflown} if self._recorded else {}),
             **flown,
             **self._message_counts(),
-            "checks": [underruns, *(checks if isinstance(checks, list) else [checks])],
+            "checks": [
+                underruns,
+                *self._silence_checks(),
+                *(checks if isinstance(checks, list) else [checks]),
+            ],
         }
+
+    def _silence_checks(self) -> list[dict[str, Any]]:
+        """Return the check of sensors that are devices: one that gave nothing left flight software blind in a run that passed."""
+        silent = None if self._sensors is None else self._sensors.silent()
+        if silent is None:
+            return []
+        named = {"worst": f"{self._context.name}: {', '.join(silent)}"} if silent else {}
+        got = len(silent)
+        name = "constellation.sensors_silent"
+        return [{"name": name, "limit": 0, "got": got, "passed": not got, **named}]
 
     def _stimuli_summary(self) -> dict[str, Any]:
         stimuli = self._stimuli

@@ -15,6 +15,7 @@ from cosmos_cli.evidence.devices import (
     device_checks,
     device_loss_remarks,
     read_devices,
+    silent_input_remarks,
 )
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import find_streams
@@ -204,6 +205,25 @@ def test_what_found_no_room_between_devices_and_agents_is_remarked_once() -> Non
         "agent-01: device pi22/imu: there was no room for all: frames_missed 7",
         "agent-02: device line: there was no room for all: frames_dropped 3",
         "device pi22/gps: agents did not take all in time: frames_missed 5",
+    )
+
+
+def test_an_input_that_gave_nothing_in_any_life_is_remarked_where_its_device_gave_samples(
+    tmp_path: Path,
+) -> None:
+    first = {**SOUND, "silent_inputs": ["field", "gyro"]}
+    second = {**SOUND, "silent_inputs": ["field"]}
+    dead = {**SOUND, "samples": 0, "silent_inputs": ["position"]}
+    dead["report"] = {**SOUND["report"], "samples": 0}
+    write(tmp_path, "devices.json", pi22_imu=first, pi22_gps=dead)
+    write(tmp_path, "devices.2.json", pi22_imu=second, pi22_gps=dead)
+
+    devices = read_devices(RunDirectory(tmp_path), PLAN, None)
+
+    assert silent_input_remarks(devices) == ("device pi22/imu: no value ever came of field",)
+    assert devices["pi22/imu"]["silent_inputs"] == ["field"]
+    assert silent_input_remarks({f"pi{n}/a": {"silent_inputs": ["x"]} for n in range(25)})[-1] == (
+        "5 more devices with an input of which no value ever came"
     )
 
 

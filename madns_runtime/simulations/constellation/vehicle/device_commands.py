@@ -46,7 +46,8 @@ class DeviceCommands:
         first = DEVICE_NUMBER_FIRST + rejoined_tick * COMMANDS_PER_TICK_MAX
         self._desk = CommandDesk(context, vehicle, first, opens_streams=not has_flight)
         self._lines = [
-            _Line(actuation, context, place) for place, actuation in enumerate(vehicle.actuation)
+            _Line(actuation, context, place, is_rejoined=rejoined_tick > 0)
+            for place, actuation in enumerate(vehicle.actuation)
         ]
         self._results: list[CommandResult] = []
         self._counts: Counter[str] = Counter()
@@ -109,7 +110,9 @@ class DeviceCommands:
 class _Line:
     """One channel that commands."""
 
-    def __init__(self, actuation: Actuation, context: AgentContext, place: int) -> None:
+    def __init__(
+        self, actuation: Actuation, context: AgentContext, place: int, *, is_rejoined: bool
+    ) -> None:
         self.actuation = actuation
         self.skipped = 0
         """Samples that a newer one had replaced before a tick could see them."""
@@ -126,6 +129,8 @@ class _Line:
                 f"{self._field}: expected an input of {device}, {_listed(found.inputs)}, got {self._channel!r}"
             )
         self._device = found
+        if is_rejoined:  # by the newest sample so far an earlier incarnation may have commanded
+            self._number = found[self._channel].number
 
     def take(self) -> Vector | None:
         """

@@ -254,6 +254,13 @@ class SensorSuite:
         """Return by sensor all that became known in the last step, oldest first."""
         return {sensor.name: sensor.news for sensor in self._sensors if sensor.news}
 
+    def silent(self) -> list[str] | None:
+        """Return the sensors that are devices and gave no reading at all; None where all are models."""
+        if not self._has_devices:
+            return None
+        devices = (sensor for sensor in self._sensors if isinstance(sensor, DeviceSensor))
+        return [sensor.name for sensor in devices if not sensor.counts()["samples"]]
+
     def summary(self) -> dict[str, dict[str, int]]:
         """Return counts by sensor."""
         return {sensor.name: sensor.counts() for sensor in self._sensors}
