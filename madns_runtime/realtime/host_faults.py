@@ -78,7 +78,9 @@ class HostFaults:
         value = math.nan if after_s is None else after_s
         absent = []
         for agent in action.agents:
-            if self._send(agent, AgentFault(action.number, action.word, True, value, why)):
+            order = AgentFault(action.number, action.word, True, value, why)
+            # Who is being killed is as good as gone: a second order would not be heard, and says when it returns.
+            if not self.intended.is_coming(agent) and self._send(agent, order):
                 self.intended.order(agent, why, returns_s=returns_s)
             else:
                 absent.append(agent)
@@ -89,7 +91,11 @@ class HostFaults:
         """Have agents begin or end a fault of their steps; return who is not there."""
         factor = words.factor_of(action)
         order = AgentFault(action.number, action.word, begins, factor)
-        return [agent for agent in action.agents if not self._send(agent, order)]
+        return [
+            agent
+            for agent in action.agents
+            if (begins and self.intended.is_coming(agent)) or not self._send(agent, order)
+        ]
 
     def _send(self, agent: str, order: AgentFault) -> bool:
         is_there = self._port.session.send(agent, order, Service.SYNC, monotonic())
