@@ -26,7 +26,7 @@ from madns_runtime.conditions.condition import Condition
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.hardware.fault_actions import ON_NUMBERS, check_fault
 from madns_runtime.timeline.entries import ScheduledEntry
-from madns_runtime.timeline.fault_kinds import LOSSES, MUST_CONTINUE
+from madns_runtime.timeline.fault_kinds import LOSSES, MUST_CONTINUE, PARTITION
 from madns_runtime.timeline.kinds import DEVICE_FAULT
 from madns_runtime.timeline.schedule import ACTIONS_MAX, count_expected
 
@@ -192,6 +192,12 @@ class _Placing:
                     ("agents", place),
                     f"no agent is named {pattern}{did_you_mean(pattern, names)}",
                 )
+        is_drawn = self.rule.rate_per_h is not None  # each agent for itself
+        if action.word == PARTITION and not (is_drawn and len(names) > 1):
+            parted = self.labels.like_any(given, names)
+            if len(parted) == len(names):
+                text = f"expected some of the agents, got all {len(names)}: nobody is left on the other side"
+                yield ("agents",), text
 
     def awaited(self, streams: KnownStreams) -> AwaitedCondition | None:
         """Return what it waits for, if it does and agents are known."""
