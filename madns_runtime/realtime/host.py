@@ -227,7 +227,7 @@ class HostRuntime:
                 self._send_setup(agent)
             case told.AgentRejoined(agent):
                 self._losses.rejoined(agent)
-                self._timeline.runner.resume(agent)
+                self._timeline.resume(agent)
             case told.AgentsComplete():
                 self._complete()
             case told.EmergencyDeclared(who, reason):

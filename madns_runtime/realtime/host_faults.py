@@ -67,6 +67,11 @@ class HostFaults:
         elif action.word not in words.LOSSES:
             self._order(action, begins=False)
 
+    def end_at(self, end_s: float) -> None:
+        """Take simulated time *end_s* for the run's end, s: nobody waits for who was to return after it."""
+        self._duration_s = end_s
+        self._port.session.await_returns(self.intended.are_expected(end_s))
+
     # Agents ---------------------------------------------------------------------------------------
 
     def _kill(self, action: TimelineAction) -> list[str]:

@@ -44,6 +44,8 @@ class HostTimeline:
         self._reactor = core.reactor
         self.faults = HostFaults(core)
         self._door: ActionSocket | None = None
+        self._end_s: float | None = None
+        """Simulated time at which a stop ends the run, s; None without one."""
         of_agents = (STRESS.word, STEP_CLOCK.word, DRIFT_CLOCK.word)
         self.runner, self.kinds = timeline_runner(
             config,
@@ -80,6 +82,12 @@ class HostTimeline:
         except OSError as error:
             say("warning", f"no action can be ordered in this run: {error}")
 
+    def resume(self, agent: str) -> None:
+        """Let what is in force go on at an agent that has returned: a stop that it has not heard of, too."""
+        if self._end_s is not None:
+            self._post_stop(agent, self._end_s)
+        self.runner.resume(agent)
+
     def close(self) -> None:
         """Take no more orders."""
         if self._door is not None:
@@ -114,13 +122,17 @@ class HostTimeline:
         end_s = math.ceil((max(now_s, 0.0) + STOP_LEAD_S) * tick_hz) / tick_hz
         if end_s >= self._report.duration_s:
             return
-        self._report.duration_s = end_s
+        self._report.duration_s = self._end_s = end_s
         self.runner.close()
+        self.faults.end_at(end_s)
         for agent in self._config.agents.resolved_names():
-            self._post(agent, ActionOrder(-1, STOP.word, {}, end_s, None, is_end=False))
+            self._post_stop(agent, end_s)
         t0_s = self._port.t0_s
         assert t0_s is not None, "actions begin once simulated time runs"
         self._port.session.end_at(t0_s + end_s)
+
+    def _post_stop(self, agent: str, end_s: float) -> None:
+        self._post(agent, ActionOrder(-1, STOP.word, {}, end_s, None, is_end=False))
 
     def _post(self, agent: str, order: ActionOrder) -> bool:
         try:
