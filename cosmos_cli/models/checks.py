@@ -273,6 +273,9 @@ class _Placing:
         streams = self._around.streams
         if streams.roles(held) == {"host"} and not streams.names_agents(held):
             return None
+        is_of_host = HOST in self._agents(is_of_host=streams.names_agents(self._stream))
+        if is_of_host and "host" not in streams.roles(held):
+            return f"stream {held} is not recorded by the host's half, of whose records some are judged"
         if held == self._stream:
             return None
         for stream in (held, self._stream):
