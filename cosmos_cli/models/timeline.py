@@ -239,7 +239,7 @@ def _device_faults(
         check_fault(fault, value)
     except ConfigurationError as error:
         yield ("fault",) if value is None else ("value",), str(error)
-    names = device_names(scenario)
+    names = scenario.hardware.names
     device = str(entry.parameters["device"])
     if device not in names:
         hint = did_you_mean(device, names) if names else "; there is none under hardware"
@@ -266,9 +266,3 @@ def _patterns_of_users(scenario: Scenario, device: str) -> list[str]:
     uses = [use.agents for use in hardware.use if device in use.devices]
     own = [each.agents for each in hardware.devices if each.name == device]
     return [pattern for patterns in (*uses, *own) for pattern in patterns]
-
-
-def device_names(scenario: Scenario) -> Sequence[str]:
-    """Return the names by which agents know their devices."""
-    used = [name for use in scenario.hardware.use for name in use.devices]
-    return list(dict.fromkeys([*used, *(each.name for each in scenario.hardware.devices)]))

@@ -76,6 +76,7 @@ class HostTimeline:
                 self._reactor,
                 kinds=self.kinds,
                 agents=self._config.agents.resolved_names(),
+                devices=self._config.hardware.names,
                 begin=self._order,
                 in_force=self.runner.told_in_force,
             )
