@@ -34,9 +34,16 @@ class HostTimeline:
         core: Of the host.
         program: What the host's half declares.
         report: Of the run; a stop shortens its duration.
+        conditions: Tell when one is met that actions wait for.
     """
 
-    def __init__(self, core: RealtimeCore, program: RoleProgram, report: HostReport) -> None:
+    def __init__(
+        self,
+        core: RealtimeCore,
+        program: RoleProgram,
+        report: HostReport,
+        conditions: HostConditions,
+    ) -> None:
         self._config = config = core.launch.config
         self._port = core.port
         self._report = report
@@ -46,6 +53,8 @@ class HostTimeline:
         self._door: ActionSocket | None = None
         self._end_s: float | None = None
         """Simulated time at which a stop ends the run, s; None without one."""
+        self._early: list[MetCondition] = []
+        """Met before simulated time zero, as in set-up: what waits for them takes place then."""
         of_agents = (STRESS.word, STEP_CLOCK.word, DRIFT_CLOCK.word)
         self.runner, self.kinds = timeline_runner(
             config,
@@ -62,13 +71,11 @@ class HostTimeline:
         )
         # Infinite is never: the timer is made once and moved.
         self._timer = core.reactor.call_at(math.inf, self._due)
-
-    def begin(
-        self, conditions: HostConditions, folder: Path, say: Callable[[str, str], None]
-    ) -> None:
-        """Simulated time zero is set: wait for what is due, for conditions, and for orders in the run directory."""
-        for number in {e.condition for e in self._config.timeline if e.condition is not None}:
+        for number in {e.condition for e in config.timeline if e.condition is not None}:
             conditions.on_met(number, self._met)
+
+    def begin(self, folder: Path, say: Callable[[str, str], None]) -> None:
+        """Simulated time zero is set: wait for what is due, and for orders in the run directory."""
         self._arm()
         try:
             self._door = ActionSocket(
@@ -104,19 +111,25 @@ class HostTimeline:
         return refusal
 
     def _arm(self) -> None:
-        next_s, t0_s = self.runner.next_s, self._port.t0_s
+        next_s, t0_s = 0.0 if self._early else self.runner.next_s, self._port.t0_s
         self._timer.reschedule(math.inf if next_s is None or t0_s is None else t0_s + next_s)
 
     def _due(self) -> None:
         if self._port.is_in(HostState.SIMULATION_START):
-            self.runner.run_due(self._port.now_s())
+            now_s = self._port.now_s()
+            early, self._early = self._early, []
+            for met in early:
+                self.runner.met(met.condition.number, met.t_s, now_s)
+            self.runner.run_due(now_s)
             self._arm()
             self._pump()
 
     def _met(self, met: MetCondition) -> None:
-        if self._port.is_in(HostState.SIMULATION_START):
+        if self._port.t0_s is None or self._port.now_s() < 0.0:
+            self._early.append(met)
+        elif self._port.is_in(HostState.SIMULATION_START):
             self.runner.met(met.condition.number, met.t_s, self._port.now_s())
-            self._arm()
+        self._arm()
 
     def _stop(self) -> None:
         tick_hz, now_s = self._config.agents.tick_hz, self._port.now_s()

@@ -1,8 +1,12 @@
-"""The timeline of a host in real time: a stop reaches those, too, that return before the run is over."""
+"""The timeline of a host in real time: stops and those that return, and what is met before simulated time runs."""
 
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
+
+from madns_runtime.conditions.condition import Condition, ValueBounds
+from madns_runtime.conditions.reports import HostConditions
 from madns_runtime.realtime.timeline import HostTimeline
 from madns_runtime.timeline.entries import ScheduledEntry
 
@@ -29,7 +33,26 @@ class Session:
         self.end_host_s = end_host_s
 
 
-def a_timeline(session: Session, *entries: ScheduledEntry) -> tuple[HostTimeline, Any]:
+class Events:
+    """Takes events of a host."""
+
+    def __init__(self) -> None:
+        self.words: list[str] = []
+
+    def event(self, event: str, **values: object) -> None:
+        self.words.append(event)
+
+
+def some_conditions(*conditions: Condition) -> HostConditions:
+    return HostConditions(conditions, tick_hz=10.0, now_s=lambda: 0.0, end=lambda *_: None)
+
+
+def a_timeline(
+    session: Session,
+    *entries: ScheduledEntry,
+    conditions: HostConditions | None = None,
+    events: Events | None = None,
+) -> tuple[HostTimeline, Any]:
     config: Any = SimpleNamespace(
         on_agent_loss="continue",
         time=SimpleNamespace(duration_s=60.0),
@@ -52,19 +75,20 @@ def a_timeline(session: Session, *entries: ScheduledEntry) -> tuple[HostTimeline
         half=SimpleNamespace(call=None),
         guard=lambda call, *given: call(*given),
         pump=lambda: None,
-        journal=SimpleNamespace(event=lambda event, **values: None),
+        journal=events or Events(),
         reactor=SimpleNamespace(
             call_at=lambda when_s, call: SimpleNamespace(reschedule=lambda when_s: None)
         ),
     )
     report: Any = SimpleNamespace(duration_s=60.0)
+    core.report = report
     program: Any = SimpleNamespace(actions=())
-    return HostTimeline(core, program, report), report
+    return HostTimeline(core, program, report, conditions or some_conditions()), core
 
 
 def test_an_agent_that_returns_before_a_stop_takes_effect_hears_of_it() -> None:
     session = Session()
-    timeline, report = a_timeline(session, ScheduledEntry(action="stop", at_s=2.0))
+    timeline, core = a_timeline(session, ScheduledEntry(action="stop", at_s=2.0))
     timeline.resume("a")
     assert session.heard == []
 
@@ -72,7 +96,7 @@ def test_an_agent_that_returns_before_a_stop_takes_effect_hears_of_it() -> None:
     session.away.clear()
     timeline.resume("b")
 
-    assert report.duration_s == 2.3
+    assert core.report.duration_s == 2.3
     assert session.heard == [("a", "stop", 2.3), ("b", "stop", 2.3)]
     assert session.end_host_s == 102.3
 
@@ -89,3 +113,26 @@ def test_after_a_stop_nobody_waits_for_who_would_have_returned_behind_it() -> No
     timeline._due()
 
     assert session.awaited == [True, False]
+
+
+@pytest.mark.parametrize("t0_s", [None, 102.5])
+def test_what_waits_for_a_condition_that_is_met_in_set_up_takes_place_at_time_zero(
+    t0_s: float | None,
+) -> None:
+    condition = Condition(
+        number=0, name="soon", stream="x", field="y", bounds=ValueBounds.above(1.0), agents=("a",)
+    )
+    conditions, events = some_conditions(condition), Events()
+    entry = ScheduledEntry(action="annotate", condition=0, parameters={"text": "soon"})
+    timeline, core = a_timeline(Session(), entry, conditions=conditions, events=events)
+    core.port.t0_s, core.port.now_s = t0_s, lambda: -0.5
+    core.port.is_in = lambda state: t0_s is not None
+
+    conditions.hear("a", 0, 0.0)
+    conditions.settle(events)
+    assert events.words == ["condition_met"]
+    core.port.t0_s, core.port.now_s, core.port.is_in = 102.5, lambda: 0.0, lambda state: True
+    timeline._due()
+    timeline._due()
+
+    assert events.words == ["condition_met", "action_began"]

@@ -179,3 +179,19 @@ def test_what_a_timeline_asked_for_and_the_run_did_not_do_is_a_remark(cosmos, tm
         f"timeline: hang was refused 1 time by {why} hang",
         "timeline[4] (stop): its condition was never met",
     ]
+
+
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_what_waits_for_a_condition_that_is_met_in_set_up_takes_place_at_time_zero(
+    cosmos, tmp_path, mode
+):
+    started = {"stream": "events", "field": "event", "equals": "start"}
+    entry = {"when": started, "action": "annotate", "text": "started"}
+    path = written(tmp_path, [entry], mode=mode, duration_s=0.5)
+
+    code, result = cosmos.run(path, *LOOSE)
+
+    assert code == 0, result["verdict"]
+    (found,) = actions(cosmos, result)
+    assert (found["event"], found["parameters"]) == ("action_began", {"text": "started"})
+    assert found["t_s"] >= 0.0
