@@ -276,6 +276,7 @@ def test_streams_of_devices_logs_and_machines_are_known(tmp_path):
             3,
         ),
         (f"{TICKS}, statistic: count, within: [0, 3]", ValueBounds(), 4),
+        (f"{TICKS}, statistic: count, below: 1.0e+308", ValueBounds(), 2**53),
         (f"{START}, must: not_occur", ValueBounds.equals("start"), 1),
     ],
 )
