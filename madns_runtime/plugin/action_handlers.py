@@ -101,14 +101,15 @@ class AgentOrders:
         """
         return self._order(action, is_end=False)
 
-    def end(self, action: TimelineAction) -> None:
+    def end(self, action: TimelineAction) -> list[str] | None:
         """
-        Order its end.
+        Order its end: what it did to an agent that is away is over as it is.
 
         Raises:
             ActionRefused: None of its agents is there.
         """
         self._order(action, is_end=True)
+        return None
 
     def resume(self, action: TimelineAction, agent: str) -> None:
         """Order its begin of an agent that has returned."""

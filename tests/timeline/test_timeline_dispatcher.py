@@ -90,7 +90,7 @@ def test_an_action_that_lasts_is_in_force_until_its_end() -> None:
 
 def test_an_end_names_who_is_not_there_to_hear_of_it() -> None:
     class Ending(Heard):
-        def end(self, action: TimelineAction) -> list[str]:  # type: ignore[override]  # it tells more
+        def end(self, action: TimelineAction) -> list[str]:
             return ["agent-02"]
 
     events: list[dict[str, Any]] = []
