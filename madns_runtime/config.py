@@ -263,6 +263,12 @@ class HardwareSettings:
     stimulus_underruns: Annotated[int, Ge(0)] = 0
     """Times that stimuli may run out."""
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names by which agents know their devices."""
+        used = [name for use in self.use for name in use.devices]
+        return tuple(dict.fromkeys([*used, *(each.name for each in self.devices)]))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunConfig:

@@ -44,6 +44,7 @@ from cosmos_cli.evidence.table_labels import TableLabels
 from cosmos_cli.evidence.tables import open_tables
 from cosmos_cli.evidence.tabulate import Gathered, Progress, gather
 from cosmos_cli.evidence.tick_causes import recorded_causes
+from cosmos_cli.evidence.timeline_remarks import timeline_remarks
 from cosmos_cli.evidence.verdict import Verdict
 from cosmos_cli.onboard.processes import words_of
 from cosmos_cli.report.html import write_report
@@ -272,7 +273,7 @@ def _evidence(
 ) -> Evidence:
     tables = open_tables(run.tables)
     plan = run.read_json(run.plan_json) or {}
-    sources = RecordingMachines.read(run)
+    sources, config = RecordingMachines.read(run), run.read_config()
     expected = dataclasses.replace(expected, devices=expected_devices(plan))
     missing = find_missing(
         expected, gathered.scans, end.result, _unretrieved(sources, end.problems)
@@ -280,7 +281,7 @@ def _evidence(
     return Evidence(
         run=run.name,
         started=run.read_json(run.run_json) or {},
-        config=run.read_config(),
+        config=config,
         expected=expected,
         result=end.result,
         host_machine=sources.host_machine,
@@ -297,6 +298,7 @@ def _evidence(
         expectations=judge_run(
             run, tables, planned_expectations(plan), (end.result or {}).get("duration_s")
         ),
+        timeline_remarks=timeline_remarks(config, tables),
         declared=declared_streams(plan),
     )
 

@@ -76,6 +76,7 @@ class Evidence:
     missing: tuple[str, ...] = ()
     expectations: JudgedExpectations = JudgedExpectations()  # noqa: RUF009 - frozen
     """Results of what the scenario expected."""
+    timeline_remarks: tuple[str, ...] = ()
     declared: Declared | None = None
     """Streams that the simulation declared; None if it declared none."""
 
@@ -186,6 +187,7 @@ class Evidence:
                 *datagram_remarks(datagram_account(result)),
                 *undeclared_remarks(self.declared, self.scans),
                 *flown_remarks(self.started),
+                *self.timeline_remarks,
                 *self.expectations.remarks(),
             ),
         )

@@ -229,7 +229,7 @@ class _Placing:
         if rule.event is not None:
             if field is not None and field.kind != "str":
                 yield ("field",), f"{field.name} holds no words: an event is a word of a text field"
-            elif fault := streams.word_fault(stream, self._field, rule.event):
+            elif fault := streams.word_fault(stream, self._field, rule.event, rule.agents):
                 yield ("event",), fault
             return
         is_statistic = rule.kind in (*OF_TIMES, *OF_NUMBERS)
@@ -239,7 +239,7 @@ class _Placing:
             yield ("equals",), f"a {rule.kind} is a number, got {rule.equals!r}"
         if bounded is not None:
             yield from words_at(below, kind_faults(bounded, field))
-            if fault := streams.word_fault(stream, self._field, bounded.equals):
+            if fault := streams.word_fault(stream, self._field, bounded.equals, rule.agents):
                 yield (*below, "equals"), fault
         if not is_statistic and isinstance(rule.equals, str) and rule.kind not in ("each", "last"):
             yield ("statistic",), f"a text has no {rule.kind}: expected each or last"
@@ -265,7 +265,7 @@ class _Placing:
             field = streams.field(stream, name)
             yield from kind_faults(rule, field)
             yield from unit_faults(rule.unit, field)
-            if fault := streams.word_fault(stream, name, rule.equals):
+            if fault := streams.word_fault(stream, name, rule.equals, self._rule.agents):
                 yield ("equals",), fault
 
     def _unlike_fault(self, held: str) -> str | None:
@@ -273,6 +273,9 @@ class _Placing:
         streams = self._around.streams
         if streams.roles(held) == {"host"} and not streams.names_agents(held):
             return None
+        is_of_host = HOST in self._agents(is_of_host=streams.names_agents(self._stream))
+        if is_of_host and "host" not in streams.roles(held):
+            return f"stream {held} is not recorded by the host's half, of whose records some are judged"
         if held == self._stream:
             return None
         for stream in (held, self._stream):

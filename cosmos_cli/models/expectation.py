@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Final, Literal
 
 from madns_runtime.conditions.condition import HOST, Condition, ValueBounds
+
+TIMES_MAX: Final = 2**53
+"""Records that a condition counts: no run has so many, and every whole number up to it travels as it is."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,7 +109,7 @@ def _broken_bounds(expectation: Expectation) -> tuple[ValueBounds, int]:
         high = bounds.high or 0.0
         times = math.floor(high) + 1 if bounds.is_closed else math.ceil(high)
         counted = ValueBounds() if expectation.when is None else scaled(expectation.when, factor)
-        return counted, max(1, times)
+        return counted, min(max(1, times), TIMES_MAX)
     if expectation.statistic == "max":
         bounds = replace(bounds, low=None)
     elif expectation.statistic == "min":

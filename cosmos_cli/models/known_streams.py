@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from cosmos_cli.models.document import did_you_mean
-from madns_runtime.conditions.condition import AGENT, TICK, TIME
+from madns_runtime.conditions.condition import AGENT, HOST, TICK, TIME
 from madns_runtime.hardware.contract import Channel
 from madns_runtime.hardware.stream_schemas import DEVICE_CLOCK, DEVICE_STATE, schema_of
 from madns_runtime.plugin.api import DeclaredStream
 from madns_runtime.recording.records import (
+    AGENT_EVENT_WORDS,
     CLOCK,
     DEVICE_EVENT_WORDS,
     EVENT_WORDS,
     EVENTS,
     HEALTH,
+    HOST_EVENT_WORDS,
     LATE_TICKS,
     LOG,
     LOG_LEVELS,
@@ -33,7 +35,8 @@ FRAME_FIELDS = tuple(
     field.name for field in schema_of(Channel(name="any", is_frame=True)).fields[len(INPUT_HEAD) :]
 )
 """Names of what a device records of an input, before its values, and of frames as values."""
-WORDS = {(EVENTS.name, "event"): EVENT_WORDS, (LOG.name, "level"): tuple(LOG_LEVELS)}
+EVENT_PLACE = (EVENTS.name, "event")
+WORDS = {EVENT_PLACE: EVENT_WORDS, (LOG.name, "level"): tuple(LOG_LEVELS)}
 """All texts that a field of a stream of the framework's ever holds."""
 Role = Literal["agent", "host", "machine", "device"]
 APART: tuple[Role, ...] = ("machine", "device")
@@ -95,6 +98,15 @@ FRAMEWORK = (
     ),
     KnownStream(role="machine", name=HEALTH.name, fields=HEALTH.fields),
 )
+
+
+def _source_fault(word: str, sources: Collection[str]) -> str | None:
+    """Return that none of those whose events count records a word of theirs; None if one may."""
+    if word in HOST_EVENT_WORDS and HOST not in sources:
+        return f"{word} is an event of the host's half alone: write agents: [{HOST}]"
+    if word in AGENT_EVENT_WORDS and sources and not set(sources) - {HOST}:
+        return f"{word} is an event of agents alone: leave out agents: [{HOST}], or name agents"
+    return None
 
 
 def channel_fields(channels: Iterable[Channel]) -> dict[str, tuple[Field, ...]]:
@@ -169,11 +181,23 @@ class KnownStreams:
         known = list(dict.fromkeys(field.name for each in found for field in each.fields))
         return f"stream {stream} has no field {name!r}{did_you_mean(name, known)}"
 
-    def word_fault(self, stream: str, field: str, word: object) -> str | None:
-        """Return what is wrong with a text that is waited for in a field; None if it may come."""
+    def word_fault(
+        self, stream: str, field: str, word: object, sources: Collection[str] = ()
+    ) -> str | None:
+        """
+        Return what is wrong with a text that is waited for in a field; None if it may come.
+
+        Args:
+            stream: Its name.
+            field: Of its records.
+            word: The text.
+            sources: Names or globs of those whose records count: agents and `host`; empty for agents alone.
+        """
         words = self.words(stream, field)
-        if not words or not isinstance(word, str) or word in words:
+        if not words or not isinstance(word, str):
             return None
+        if word in words:
+            return _source_fault(word, sources) if (stream, field) == EVENT_PLACE else None
         guess = did_you_mean(word, words)
         if stream == EVENTS.name and not guess.endswith("?"):
             guess += "; a simulation's own words stand in its own streams: name one under stream"

@@ -26,7 +26,7 @@ from madns_runtime.conditions.condition import Condition
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.hardware.fault_actions import ON_NUMBERS, check_fault
 from madns_runtime.timeline.entries import ScheduledEntry
-from madns_runtime.timeline.fault_kinds import LOSSES, MUST_CONTINUE
+from madns_runtime.timeline.fault_kinds import LOSSES, MUST_CONTINUE, PARTITION
 from madns_runtime.timeline.kinds import DEVICE_FAULT
 from madns_runtime.timeline.schedule import ACTIONS_MAX, count_expected
 
@@ -192,6 +192,12 @@ class _Placing:
                     ("agents", place),
                     f"no agent is named {pattern}{did_you_mean(pattern, names)}",
                 )
+        is_drawn = self.rule.rate_per_h is not None  # each agent for itself
+        if action.word == PARTITION and not (is_drawn and len(names) > 1):
+            parted = self.labels.like_any(given, names)
+            if len(parted) == len(names):
+                text = f"expected some of the agents, got all {len(names)}: nobody is left on the other side"
+                yield ("agents",), text
 
     def awaited(self, streams: KnownStreams) -> AwaitedCondition | None:
         """Return what it waits for, if it does and agents are known."""
@@ -233,7 +239,7 @@ def _device_faults(
         check_fault(fault, value)
     except ConfigurationError as error:
         yield ("fault",) if value is None else ("value",), str(error)
-    names = device_names(scenario)
+    names = scenario.hardware.names
     device = str(entry.parameters["device"])
     if device not in names:
         hint = did_you_mean(device, names) if names else "; there is none under hardware"
@@ -260,9 +266,3 @@ def _patterns_of_users(scenario: Scenario, device: str) -> list[str]:
     uses = [use.agents for use in hardware.use if device in use.devices]
     own = [each.agents for each in hardware.devices if each.name == device]
     return [pattern for patterns in (*uses, *own) for pattern in patterns]
-
-
-def device_names(scenario: Scenario) -> Sequence[str]:
-    """Return the names by which agents know their devices."""
-    used = [name for use in scenario.hardware.use for name in use.devices]
-    return list(dict.fromkeys([*used, *(each.name for each in scenario.hardware.devices)]))

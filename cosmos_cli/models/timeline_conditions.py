@@ -43,7 +43,7 @@ class AwaitedCondition:
             return
         field = streams.field(rule.stream, rule.field)
         yield from kind_faults(rule, field)
-        if fault := streams.word_fault(rule.stream, rule.field, rule.equals):
+        if fault := streams.word_fault(rule.stream, rule.field, rule.equals, rule.agents):
             yield ("equals",), fault
         if field is None and rule.unit:
             yield ("unit",), "the field's unit is not declared: leave out unit"

@@ -83,24 +83,25 @@ class ConditionTap:
         when = self._time_of(fields)
         has_agents = self._source == HOST and AGENT in places
         evaluators: dict[str, list[ConditionEvaluator]] = {}
-        if not has_agents:
-            evaluators[self._source] = self._evaluators(self._source, own)
-            self._recall(evaluators[self._source], when, earlier)
+        # Of a stream that names agents, too, all records are the host's half's own.
+        whole = self._evaluators(
+            self._source, [each for each in own if not has_agents or HOST in each.agents]
+        )
+        self._recall(whole, when, earlier)
 
         def take(record: Any) -> None:
             if isinstance(record, Mapping):
                 read: Callable[[str], Any] = record.get
             else:
                 read = lambda name: record[places[name]] if name in places else None  # noqa: E731 - one of two
-            who = str(read(AGENT)) if has_agents else self._source
-            if (following := evaluators.get(who)) is None:
-                named = [each for each in own if who in each.agents]
-                following = evaluators[who] = self._evaluators(who, named)
             t_s = when(read)
-            for evaluator in following:
-                field = evaluator.condition.field
-                value = read(field) if field else 1.0
-                self._note(who, evaluator, evaluator.take(t_s, value))
+            self._give(self._source, whole, t_s, read)
+            if has_agents:
+                who = str(read(AGENT))
+                if (following := evaluators.get(who)) is None:
+                    named = [each for each in own if who in each.agents and who != HOST]
+                    following = evaluators[who] = self._evaluators(who, named)
+                self._give(who, following, t_s, read)
 
         return take
 
@@ -132,6 +133,18 @@ class ConditionTap:
                 each.recall(t_s, record.get(field) if field else 1.0)
             if not any(each.wants_earlier for each in counting):
                 return
+
+    def _give(
+        self,
+        who: str,
+        following: Sequence[ConditionEvaluator],
+        t_s: float | None,
+        read: Callable[[str], Any],
+    ) -> None:
+        for evaluator in following:
+            field = evaluator.condition.field
+            value = read(field) if field else 1.0
+            self._note(who, evaluator, evaluator.take(t_s, value))
 
     def _note(self, who: str, evaluator: ConditionEvaluator, met_s: float | None) -> None:
         if met_s is not None:

@@ -66,6 +66,11 @@ class IntendedLosses:
         absence.incarnations.append(incarnation)
         return absence.why
 
+    def is_coming(self, agent: str) -> bool:
+        """Tell whether a loss of an agent was ordered that has still to come true."""
+        absence = self._absences.get(agent)
+        return absence is not None and absence.is_awaited
+
     def returned(self, agent: str) -> None:
         """Note that an agent is back."""
         if (absence := self._absences.get(agent)) is not None:

@@ -25,7 +25,8 @@ from madns_runtime.medium.outcomes import LOST, LinkOutcome
 from madns_runtime.protocol.codec import pack, unpack
 from madns_runtime.protocol.link_settings import SendQueueFull
 from madns_runtime.protocol.messages import Service, Transmission
-from madns_runtime.timeline.action import TimelineAction
+from madns_runtime.timeline.action import ActionRefused, TimelineAction
+from madns_runtime.timeline.fault_kinds import PARTITION
 
 
 class MessageSender(Protocol):
@@ -69,6 +70,7 @@ class MessageFaults:
         now_s: Callable[[], float],
         ends: MessageEnds,
     ) -> None:
+        self._agents = frozenset(agents)
         self._rules = MessageRules(agents, seed)
         self._late = LateMessages()
         self.next_s = self._late.next_s
@@ -81,7 +83,17 @@ class MessageFaults:
     # In force -------------------------------------------------------------------------------------
 
     def begin(self, action: TimelineAction) -> None:
-        """Put a fault in force."""
+        """
+        Put a fault in force.
+
+        Raises:
+            ActionRefused: It would part nobody.
+        """
+        if action.word == PARTITION and self._agents.issubset(action.agents):
+            raise ActionRefused("all agents are on one side: nobody is left on the other")
+        began_s = max(
+            action.t_s, self._now_s()
+        )  # that of a condition is due before the host hears of it
         self._rules.add(
             MessageRule(
                 number=action.number,
@@ -89,7 +101,7 @@ class MessageFaults:
                 word=action.word,
                 agents=frozenset(action.agents),
                 parameters=action.parameters,
-                until_s=math.inf if action.for_s is None else action.t_s + action.for_s,
+                until_s=math.inf if action.for_s is None else began_s + action.for_s,
             )
         )
         self._ends.engage(True)

@@ -17,9 +17,11 @@ import orjson
 
 from madns_runtime.errors import ConfigurationError, MadnsError
 from madns_runtime.hardware.bounds import bound_faults
+from madns_runtime.hardware.fault_actions import check_fault
 from madns_runtime.hardware.order_socket import LineSocket, Readers
 from madns_runtime.plain_values import from_mapping, to_mapping
 from madns_runtime.timeline.action import ActionKind
+from madns_runtime.timeline.kinds import DEVICE_FAULT, DeviceFault
 from madns_runtime.timeline.runner import OrderedAction
 
 SOCKET_NAME: Final = ".actions.sock"
@@ -43,6 +45,7 @@ class ActionSocket:
         loop: Of the host.
         kinds: Actions that this run carries out, by word.
         agents: Names of all agents.
+        devices: Names by which agents know their devices.
         begin: Called with what is ordered.
         in_force: Returns what is in force, in plain values.
         is_immediate: Whether orders are carried out when they come; otherwise `carry_out` does it.
@@ -58,12 +61,14 @@ class ActionSocket:
         *,
         kinds: Mapping[str, ActionKind],
         agents: Sequence[str],
+        devices: Sequence[str],
         begin: Begin,
         in_force: Callable[[], Sequence[Mapping[str, Any]]],
         is_immediate: bool = True,
     ) -> None:
         self._kinds = kinds
         self._agents = agents
+        self._devices = devices
         self._begin = begin
         self._in_force = in_force
         self._is_immediate = is_immediate
@@ -135,12 +140,29 @@ class ActionSocket:
         made: Any = from_mapping(kind.parameters, given, word)
         if faults := bound_faults(made, word):
             raise ConfigurationError("; ".join(faults))
+        agents = self._chosen(kind, target)
+        if kind is DEVICE_FAULT:
+            self._check_device_fault(made)
         return OrderedAction(
             word=word,
-            agents=self._chosen(kind, target),
+            agents=agents,
             parameters=to_mapping(made),
             for_s=_length_s(kind, order.get("for_s")),
         )
+
+    def _check_device_fault(self, fault: DeviceFault) -> None:
+        """
+        Refuse a fault of a device that no agent would carry out.
+
+        Raises:
+            ConfigurationError: There is no such device, or the fault's value is none.
+        """
+        check_fault(fault.fault, fault.value)
+        if fault.device not in self._devices:
+            shown = ", ".join(self._devices[:AGENTS_TOLD_MAX]) or "none"
+            raise ConfigurationError(
+                f"no agent knows a device {fault.device!r:.80}; there are {shown}"
+            )
 
     def _chosen(self, kind: ActionKind, target: str) -> tuple[str, ...]:
         if not kind.takes_agents:

@@ -58,6 +58,7 @@ class LockstepTimeline:
                 loop,
                 kinds=self.kinds,
                 agents=self._config.agents.resolved_names(),
+                devices=self._config.hardware.names,
                 begin=lambda order: self.runner.order(order, self._clock.t_s),
                 in_force=self.runner.told_in_force,
                 is_immediate=False,

@@ -196,7 +196,7 @@ class Worker:
         if messages:
             self._hand_out(messages)
         tick = Tick(number, t_s, self._period_s, 0.0, 0, t_s)
-        agents = iter(self._agents if not self._faults else self._unhindered(number))
+        agents = self._unhindered(number, t_s) if self._faults else iter(self._agents)
         while not self._step_all(agents, tick):
             pass  # one of them is lost; the next have their turn
         if monotonic() - self._flushed_s <= self._flush_interval_s:
@@ -232,14 +232,14 @@ class Worker:
             return False
         return True
 
-    def _unhindered(self, number: int) -> list[LockstepAgent]:
-        """Return whom no fault keeps from the step of tick *number*."""
-        faults = self._faults
-        return [
-            agent
-            for agent in self._agents
-            if agent.index not in faults or not faults[agent.index].withholds(number)
-        ]
+    def _unhindered(self, number: int, t_s: float) -> Iterator[LockstepAgent]:
+        """Yield whom no fault keeps from the step of tick *number*; of the others what they recorded last still holds."""
+        for agent in self._agents:
+            faults = self._faults.get(agent.index)
+            if faults is None or not faults.withholds(number):
+                yield agent
+            elif agent.look is not None:
+                agent.look(t_s)
 
     def _hear(self, agent: LockstepAgent, heard: Sequence[Delivery]) -> None:
         for delivery in heard:

@@ -101,14 +101,15 @@ class AgentOrders:
         """
         return self._order(action, is_end=False)
 
-    def end(self, action: TimelineAction) -> None:
+    def end(self, action: TimelineAction) -> list[str] | None:
         """
-        Order its end.
+        Order its end: what it did to an agent that is away is over as it is.
 
         Raises:
             ActionRefused: None of its agents is there.
         """
         self._order(action, is_end=True)
+        return None
 
     def resume(self, action: TimelineAction, agent: str) -> None:
         """Order its begin of an agent that has returned."""
@@ -121,6 +122,48 @@ class AgentOrders:
         if len(absent) == len(action.agents):
             raise ActionRefused(f"not there at present: {_told(action.agents)}")
         return absent
+
+
+class DeviceFaults(AgentOrders):
+    """
+    Handler of device_fault: a device, and the faults around it, outlive its agent's start.
+
+    What an agent is told at a fault's end may be lost with it, on the way too: it is told once more when it returns.
+
+    Args:
+        post: Sends an agent an order; False if it is not there.
+    """
+
+    def __init__(self, post: Callable[[str, ActionOrder], bool]) -> None:
+        super().__init__(post)
+        self._ends: dict[str, dict[str, ActionOrder]] = {}
+        """By agent and device the newest end, if no fault of that device has begun there since."""
+
+    def begin(self, action: TimelineAction) -> list[str]:
+        """
+        Order it, and return who is not there.
+
+        Raises:
+            ActionRefused: None of its agents is there.
+        """
+        absent = super().begin(action)
+        for agent in set(action.agents).difference(absent):
+            self._ends.get(agent, {}).pop(str(action.parameters["device"]), None)
+        return absent
+
+    def end(self, action: TimelineAction) -> list[str]:
+        """Order its end, and return who is not there: of these it ends when they return."""
+        order = _ordered(action, is_end=True)
+        for agent in action.agents:
+            self._ends.setdefault(agent, {})[str(action.parameters["device"])] = order
+        return [agent for agent in action.agents if not self._post(agent, order)]
+
+    def returned(self, agent: str) -> None:
+        """Order the ends anew that an agent which has returned may have missed."""
+        ends = self._ends.pop(agent, {})
+        missed = {device: order for device, order in ends.items() if not self._post(agent, order)}
+        if missed:
+            self._ends[agent] = missed
 
 
 def _ordered(action: TimelineAction, *, is_end: bool) -> ActionOrder:
@@ -166,11 +209,11 @@ def timeline_runner(  # noqa: PLR0913 - the collaborators of a seam, most keywor
     """
     kinds = kinds_by_word(declared)
     of_host = HostHalfActions({kind.word: kind for kind in declared}, call, intended)
-    of_agents = AgentOrders(post)
+    of_agents, device_faults = AgentOrders(post), DeviceFaults(post)
     handlers = {
         ANNOTATE.word: Annotations(),
         STOP.word: Stops(stop),
-        DEVICE_FAULT.word: of_agents,
+        DEVICE_FAULT.word: device_faults,
         **own,
         **{kind.word: of_host if kind.carried_out_by == "host" else of_agents for kind in declared},
     }
@@ -180,8 +223,9 @@ def timeline_runner(  # noqa: PLR0913 - the collaborators of a seam, most keywor
         Dispatcher(
             handlers,
             record,
-            # Devices outlive an agent's start, and so do faults around them.
+            # Devices outlive an agent's start, and so do faults around them: only their ends may be missed.
             {kind.word: of_agents.resume for kind in declared if kind.carried_out_by == "agent"},
+            returned=device_faults.returned,
         ),
         seed=config.seed,
         duration_s=config.time.duration_s,

@@ -226,6 +226,8 @@ class HostSession:
             self._check_due_s = now_s + CHECK_INTERVAL_S
             lost = self._roster.find_silent(self.state, now_s, is_over=now_s > self._end_host_s)
             self._lose(lost, now_s)
+            if self._roster.is_empty and now_s > self._end_host_s:
+                self._progress(now_s)  # stopped while all were away: none is to return before that
             self._check_state_deadline(now_s)
 
     def next_event(self) -> HostSessionEvent | None:

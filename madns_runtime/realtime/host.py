@@ -128,7 +128,7 @@ class HostRuntime:
         self._devices = UnwatchedDevices(core)
         self._half_timer = HalfTimer(core)
         self._report = HostReport(config.time.duration_s, program.columns)
-        self._timeline = HostTimeline(core, program, self._report)
+        self._timeline = HostTimeline(core, program, self._report, self._conditions)
         self._losses = AgentLosses(
             core,
             self._report,
@@ -227,7 +227,7 @@ class HostRuntime:
                 self._send_setup(agent)
             case told.AgentRejoined(agent):
                 self._losses.rejoined(agent)
-                self._timeline.runner.resume(agent)
+                self._timeline.resume(agent)
             case told.AgentsComplete():
                 self._complete()
             case told.EmergencyDeclared(who, reason):
@@ -295,7 +295,7 @@ class HostRuntime:
         self._call("start", -lead_s)
         self._half.begin_timer(-lead_s)
         self._half_timer.call()
-        self._timeline.begin(self._conditions, self._directory.parent, self._log)
+        self._timeline.begin(self._directory.parent, self._log)
 
     def _job_done(self, job: int, future: Future[Any]) -> None:
         if not self._takes_data:

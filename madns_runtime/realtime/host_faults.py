@@ -67,6 +67,11 @@ class HostFaults:
         elif action.word not in words.LOSSES:
             self._order(action, begins=False)
 
+    def end_at(self, end_s: float) -> None:
+        """Take simulated time *end_s* for the run's end, s: nobody waits for who was to return after it."""
+        self._duration_s = end_s
+        self._port.session.await_returns(self.intended.are_expected(end_s))
+
     # Agents ---------------------------------------------------------------------------------------
 
     def _kill(self, action: TimelineAction) -> list[str]:
@@ -78,7 +83,9 @@ class HostFaults:
         value = math.nan if after_s is None else after_s
         absent = []
         for agent in action.agents:
-            if self._send(agent, AgentFault(action.number, action.word, True, value, why)):
+            order = AgentFault(action.number, action.word, True, value, why)
+            # Who is being killed is as good as gone: a second order would not be heard, and says when it returns.
+            if not self.intended.is_coming(agent) and self._send(agent, order):
                 self.intended.order(agent, why, returns_s=returns_s)
             else:
                 absent.append(agent)
@@ -89,7 +96,11 @@ class HostFaults:
         """Have agents begin or end a fault of their steps; return who is not there."""
         factor = words.factor_of(action)
         order = AgentFault(action.number, action.word, begins, factor)
-        return [agent for agent in action.agents if not self._send(agent, order)]
+        return [
+            agent
+            for agent in action.agents
+            if (begins and self.intended.is_coming(agent)) or not self._send(agent, order)
+        ]
 
     def _send(self, agent: str, order: AgentFault) -> bool:
         is_there = self._port.session.send(agent, order, Service.SYNC, monotonic())

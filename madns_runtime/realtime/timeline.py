@@ -34,9 +34,16 @@ class HostTimeline:
         core: Of the host.
         program: What the host's half declares.
         report: Of the run; a stop shortens its duration.
+        conditions: Tell when one is met that actions wait for.
     """
 
-    def __init__(self, core: RealtimeCore, program: RoleProgram, report: HostReport) -> None:
+    def __init__(
+        self,
+        core: RealtimeCore,
+        program: RoleProgram,
+        report: HostReport,
+        conditions: HostConditions,
+    ) -> None:
         self._config = config = core.launch.config
         self._port = core.port
         self._report = report
@@ -44,6 +51,10 @@ class HostTimeline:
         self._reactor = core.reactor
         self.faults = HostFaults(core)
         self._door: ActionSocket | None = None
+        self._end_s: float | None = None
+        """Simulated time at which a stop ends the run, s; None without one."""
+        self._early: list[MetCondition] = []
+        """Met before simulated time zero, as in set-up: what waits for them takes place then."""
         of_agents = (STRESS.word, STEP_CLOCK.word, DRIFT_CLOCK.word)
         self.runner, self.kinds = timeline_runner(
             config,
@@ -60,13 +71,11 @@ class HostTimeline:
         )
         # Infinite is never: the timer is made once and moved.
         self._timer = core.reactor.call_at(math.inf, self._due)
-
-    def begin(
-        self, conditions: HostConditions, folder: Path, say: Callable[[str, str], None]
-    ) -> None:
-        """Simulated time zero is set: wait for what is due, for conditions, and for orders in the run directory."""
-        for number in {e.condition for e in self._config.timeline if e.condition is not None}:
+        for number in {e.condition for e in config.timeline if e.condition is not None}:
             conditions.on_met(number, self._met)
+
+    def begin(self, folder: Path, say: Callable[[str, str], None]) -> None:
+        """Simulated time zero is set: wait for what is due, and for orders in the run directory."""
         self._arm()
         try:
             self._door = ActionSocket(
@@ -74,11 +83,18 @@ class HostTimeline:
                 self._reactor,
                 kinds=self.kinds,
                 agents=self._config.agents.resolved_names(),
+                devices=self._config.hardware.names,
                 begin=self._order,
                 in_force=self.runner.told_in_force,
             )
         except OSError as error:
             say("warning", f"no action can be ordered in this run: {error}")
+
+    def resume(self, agent: str) -> None:
+        """Let what is in force go on at an agent that has returned: a stop that it has not heard of, too."""
+        if self._end_s is not None:
+            self._post_stop(agent, self._end_s)
+        self.runner.resume(agent)
 
     def close(self) -> None:
         """Take no more orders."""
@@ -95,32 +111,42 @@ class HostTimeline:
         return refusal
 
     def _arm(self) -> None:
-        next_s, t0_s = self.runner.next_s, self._port.t0_s
+        next_s, t0_s = 0.0 if self._early else self.runner.next_s, self._port.t0_s
         self._timer.reschedule(math.inf if next_s is None or t0_s is None else t0_s + next_s)
 
     def _due(self) -> None:
         if self._port.is_in(HostState.SIMULATION_START):
-            self.runner.run_due(self._port.now_s())
+            now_s = self._port.now_s()
+            early, self._early = self._early, []
+            for met in early:
+                self.runner.met(met.condition.number, met.t_s, now_s)
+            self.runner.run_due(now_s)
             self._arm()
             self._pump()
 
     def _met(self, met: MetCondition) -> None:
-        if self._port.is_in(HostState.SIMULATION_START):
+        if self._port.t0_s is None or self._port.now_s() < 0.0:
+            self._early.append(met)
+        elif self._port.is_in(HostState.SIMULATION_START):
             self.runner.met(met.condition.number, met.t_s, self._port.now_s())
-            self._arm()
+        self._arm()
 
     def _stop(self) -> None:
         tick_hz, now_s = self._config.agents.tick_hz, self._port.now_s()
         end_s = math.ceil((max(now_s, 0.0) + STOP_LEAD_S) * tick_hz) / tick_hz
         if end_s >= self._report.duration_s:
             return
-        self._report.duration_s = end_s
+        self._report.duration_s = self._end_s = end_s
         self.runner.close()
+        self.faults.end_at(end_s)
         for agent in self._config.agents.resolved_names():
-            self._post(agent, ActionOrder(-1, STOP.word, {}, end_s, None, is_end=False))
+            self._post_stop(agent, end_s)
         t0_s = self._port.t0_s
         assert t0_s is not None, "actions begin once simulated time runs"
         self._port.session.end_at(t0_s + end_s)
+
+    def _post_stop(self, agent: str, end_s: float) -> None:
+        self._post(agent, ActionOrder(-1, STOP.word, {}, end_s, None, is_end=False))
 
     def _post(self, agent: str, order: ActionOrder) -> bool:
         try:

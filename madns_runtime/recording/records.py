@@ -108,11 +108,17 @@ EVENTS = StreamSchema(
 )
 """State changes, losses, deadlines broken, and who was the cause."""
 
+HOST_EVENT_WORDS = (
+    "agent", "agent_rejoined", "not_stopped", "condition_met", "action_began", "action_ended", "action_resumed", "fault",
+)  # fmt: skip
+"""Words of `events` that the host's half alone records."""
+AGENT_EVENT_WORDS = (
+    "start", "phase", "scheduling", "killed", "hang_begins", "hang_ends", "slow_begins", "slow_ends", "clock_stepped",
+    "clock_drift_begins", "clock_drift_ends", "device_losses",
+)  # fmt: skip
+"""Words of `events` that agents alone record."""
 EVENT_WORDS = (
-    "start", "end", "state", "phase", "scheduling", "agent", "agent_rejoined", "emergency", "not_stopped", "killed",
-    "hang_begins", "hang_ends", "slow_begins", "slow_ends", "clock_stepped", "clock_drift_begins", "clock_drift_ends",
-    "condition_met", "action_began", "action_ended", "action_refused", "action_resumed", "sync_deadline_broken", "device", "device_losses",
-    "fault",
+    "end", "state", "emergency", "action_refused", "sync_deadline_broken", "device", *HOST_EVENT_WORDS, *AGENT_EVENT_WORDS,
 )  # fmt: skip
 """All that `events` of agents and of the host's half hold in `event`: a simulation records its own in streams of its own."""
 

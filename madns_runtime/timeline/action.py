@@ -95,9 +95,12 @@ class ActionHandler(Protocol):
             ActionRefused: It cannot.
         """
 
-    def end(self, action: TimelineAction) -> None:
+    def end(self, action: TimelineAction) -> Sequence[str] | None:
         """
         Let what *action* did be over; called for those that last, once, unless the run ends before.
+
+        Returns:
+            Those of its agents that are not there, and are told when they return.
 
         Raises:
             ActionRefused: It cannot.

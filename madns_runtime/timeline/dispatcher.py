@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -26,6 +26,7 @@ class Dispatcher:
         handlers: By word. A word without one is refused: the time mode does not have it.
         record: Records an event, given its name and values.
         resume: By word, of actions whose effect ends with their agent.
+        returned: Told of each agent that has returned, before what is in force goes on there.
     """
 
     def __init__(
@@ -33,10 +34,13 @@ class Dispatcher:
         handlers: Mapping[str, ActionHandler],
         record: Callable[..., None],
         resume: Mapping[str, Resume] = _NOTHING,
+        *,
+        returned: Callable[[str], None] = lambda agent: None,
     ) -> None:
         self._handlers = handlers
         self._record = record
         self._resume = resume
+        self._returned = returned
         self._in_force: dict[int, TimelineAction] = {}
 
     @property
@@ -61,14 +65,15 @@ class Dispatcher:
         except ActionRefused as refusal:
             self._record(REFUSED, **described(action, now_s), reason=str(refusal))
             return str(refusal)
-        told = {"not_there": list(absent)} if absent else {}
-        self._record(BEGAN, **described(action, now_s), for_s=action.for_s, lasts=lasts, **told)
+        values = described(action, now_s)
+        self._record(BEGAN, **values, for_s=action.for_s, lasts=lasts, **_told_absent(absent))
         if lasts:
             self._in_force[action.number] = action
         return ""
 
     def resume(self, agent: str) -> None:
         """Let what is in force go on at an agent that has returned: what it was told is gone with its former start."""
+        self._returned(agent)
         for action in self.in_force:
             if agent in action.agents and (resume := self._resume.get(action.word)) is not None:
                 resume(action, agent)
@@ -80,12 +85,16 @@ class Dispatcher:
             return f"{action.word} is not in force"
         values = described(action, now_s, due_s)
         try:
-            self._handlers[action.word].end(action)
+            absent = self._handlers[action.word].end(action)
         except ActionRefused as refusal:
             self._record(REFUSED, **values, reason=f"to end: {refusal}")
             return str(refusal)
-        self._record(ENDED, **values)
+        self._record(ENDED, **values, **_told_absent(absent))
         return ""
+
+
+def _told_absent(agents: Sequence[str] | None) -> dict[str, list[str]]:
+    return {"not_there": list(agents)} if agents else {}
 
 
 def described(action: TimelineAction, now_s: float, due_s: float | None = None) -> dict[str, Any]:

@@ -126,7 +126,7 @@ class TimelineRunner:
             due = self._due[self._position]
             self._position += 1
             ordered = OrderedAction.of_entry(due.entry, self._entries[due.entry], due.agents)
-            self._begin(ordered, due.t_s, now_s)
+            self._begin(ordered, due.t_s, now_s, is_known=True)
 
     def resume(self, agent: str) -> None:
         """Let what is in force go on at an agent that has returned."""
@@ -164,7 +164,9 @@ class TimelineRunner:
         self._ordered_count += 1
         return self._begin(ordered, now_s if due_s is None else due_s, now_s)
 
-    def _begin(self, ordered: OrderedAction, due_s: float, now_s: float) -> str:
+    def _begin(
+        self, ordered: OrderedAction, due_s: float, now_s: float, *, is_known: bool = False
+    ) -> str:
         action = TimelineAction(
             number=self._count,
             word=ordered.word,
@@ -180,6 +182,10 @@ class TimelineRunner:
         lasts = kind is not None and (ordered.for_s is not None or kind.lasting == "may")
         refusal = self._dispatcher.begin(action, now_s, lasts=lasts)
         if not refusal and lasts and ordered.for_s is not None and not self._is_closed:
-            end_s = later_s(max(due_s, now_s), ordered.for_s)
+            end_s = later_s(due_s, ordered.for_s)
+            # What the timeline knows beforehand ends when it says, though it began a little late: what begins then comes
+            # after it. What was asked for in the run, or came too late for that, lasts as long as it is to.
+            if not is_known or end_s <= now_s:
+                end_s = later_s(max(due_s, now_s), ordered.for_s)
             heapq.heappush(self._ends, (end_s, action.number, action))
         return refusal

@@ -62,6 +62,8 @@ def count_expected(entry: ScheduledEntry, duration_s: float) -> float:
     end_s = _end_s(entry, duration_s)
     if entry.every_s is not None:
         periods = (end_s - entry.from_s) / entry.every_s
+        if math.isinf(periods):  # a period next to nothing
+            return periods
         return max(0.0, math.floor(periods * (1.0 + ROUNDING)) + 1)
     if entry.rate_per_h is not None:
         length_h = max(0.0, end_s - entry.from_s) / SECONDS_PER_HOUR

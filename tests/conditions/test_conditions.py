@@ -116,6 +116,19 @@ def test_a_hosts_records_that_name_agents_are_followed_agent_by_agent():
     assert conditions_of("a", [of_host]) == ()
 
 
+def test_all_records_of_the_host_that_name_agents_are_its_own_too():
+    whole = condition(number=0, agents=("host",), is_of_host=True)
+    each = condition(number=1, agents=("a", "b"), is_of_host=True)
+    thrice = condition(number=2, agents=("host",), is_of_host=True, times=3)
+    tap, told = tapped([whole, each, thrice], "host")
+    take = tap.open("drive", ("t_s", "agent", "speed_m_s"))
+
+    for record in ((1.0, "a", 1.0), (2.0, "c", 11.0), (3.0, "b", 11.0), (4.0, "a", 12.0)):
+        take(record)
+
+    assert told == [(0, "host", 2.0), (1, "b", 3.0), (2, "host", 4.0), (1, "a", 4.0)]
+
+
 def test_a_recorder_shows_a_tap_what_will_be_read_and_writes_what_it_would_without(tmp_path):
     conditions = [condition(stream="state", field="x_m", bounds=ValueBounds.above(1.0))]
     written = []

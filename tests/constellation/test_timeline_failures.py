@@ -249,3 +249,26 @@ def test_an_action_that_a_vehicle_cannot_carry_out_then_is_refused_on_record(cos
     assert [(e["t_s"], e["reason"]) for e in refused] == [
         (5.0, "agent-02: its thruster is stuck open already")
     ]
+
+
+def test_a_telecommand_that_nobody_can_hear_is_refused_on_record(cosmos, tmp_path):
+    text = {"action": "telecommand", "text": "report"}
+    kill = {"at_s": 3, "action": "kill", "agents": ["agent-02"], "for_s": 10}
+    timeline = [
+        kill,
+        {"at_s": 5, "agents": ["agent-02"]} | text,
+        {"at_s": 6, "agents": ["*"]} | text,
+    ]
+    path = write(tmp_path, "unheard", timeline)
+    shutil.copytree(SCENARIOS / "flight", tmp_path / "flight")
+
+    code, result = cosmos.run(
+        path,
+        "on_agent_loss=continue",
+        "parameters.flight={software: flight/beacon.py:Beacon, input: truth}",
+    )
+
+    assert code == 0, result["verdict"]
+    assert [each for each in result["remarks"] if each.startswith("timeline")] == [
+        "timeline: telecommand was refused 1 time by host: nobody hears it at present: agent-02"
+    ]

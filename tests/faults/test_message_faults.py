@@ -14,7 +14,7 @@ from madns_runtime.faults.message_rules import DOWN, UP, MessageRule, MessageRul
 from madns_runtime.faults.step_faults import StepFaults
 from madns_runtime.medium.outcomes import DELIVERED, LOST, LinkOutcome
 from madns_runtime.protocol.messages import Service, Transmission
-from madns_runtime.timeline.action import TimelineAction
+from madns_runtime.timeline.action import ActionRefused, TimelineAction
 
 AGENTS = ("a", "b", "c", "d")
 BEST, RELIABLE = Service.BEST, Service.RELIABLE
@@ -404,3 +404,27 @@ def test_a_loss_that_was_ordered_is_excused_once_and_a_return_that_failed_is_not
     assert losses.overdue(60.0) == {}
     assert not losses.are_expected(60.0)
     assert (losses.names(), losses.incarnations("a")) == (["a"], [1])
+
+
+def test_a_partition_of_all_agents_is_refused_as_it_parts_nobody():
+    rig = Rig()
+
+    with pytest.raises(ActionRefused, match="nobody is left on the other"):
+        rig.faults.begin(action("partition", AGENTS))
+    rig.faults.begin(action("partition", AGENTS[:3]))
+
+    assert rig.engaged == [True]
+
+
+def test_a_fault_that_begins_later_than_it_was_due_holds_messages_up_to_its_own_end():
+    rig = Rig()
+    rig.now_s = 3.0
+    rig.faults.begin(action("lose_messages", for_s=1.0, probability=1.0))
+
+    rig.faults.take("a", "word", RELIABLE)
+    assert rig.received == []
+    rig.pass_time(3.9)
+    assert rig.received == []
+    rig.pass_time(6.0)
+
+    assert rig.received == [("a", "word")]

@@ -150,6 +150,33 @@ def test_a_device_that_is_disconnected_in_lockstep_takes_nothing_and_is_lost_at_
     ]
 
 
+PAST = """
+on_agent_loss: continue
+timeline:
+  - {at_s: 0.5, action: device_fault, agents: ["*"], device: gps, fault: bias, value: 100, for_s: 1}
+  - {at_s: 1.2, action: kill, agents: [agent-01], for_s: 0.6}
+  - {at_s: 1.5, action: kill, agents: [agent-02], for_s: 0.3}
+checks:
+  - {name: biased, stream: gps.value, field: value, from_s: 0.6, to_s: 1.1, above: 50}
+  - {name: biased_no_more, stream: gps.value, field: value, from_s: 2, below: 50}
+"""
+
+
+def test_a_fault_that_ends_while_its_agent_is_away_is_over_when_that_returns(tmp_path):
+    (tmp_path / "past.yaml").write_text(SCENARIO + PAST)
+    cosmos = CosmosCommand(tmp_path)
+
+    code, run = cosmos.run(tmp_path / "past.yaml", *LOOSE)
+
+    assert code == 0, run["verdict"]
+    assert run["agents"]["lost_on_purpose"] == ["agent-01", "agent-02"]
+    ended = [
+        row for row in rows(cosmos.directory(run) / "host" / "events.jsonl") if "number" in row
+    ]
+    told = next(row for row in ended if row["event"] == "action_ended")
+    assert (told["action"], told["not_there"]) == ("device_fault", ["agent-01"])
+
+
 FRAMES = """
 from madns_runtime.hardware.contract import Channel, DeviceKind, Sample, SimulatedDevice
 

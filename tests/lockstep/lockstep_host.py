@@ -11,6 +11,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
+from madns_runtime.conditions.condition import Condition
 from madns_runtime.config import (
     Agents,
     ExecutorSettings,
@@ -43,6 +44,7 @@ class HostRun:
         restarts_max: int | None = None,
         simulation: str = "./lockstep_simulation.py:simulation",
         timeline: tuple[ScheduledEntry, ...] = (),
+        conditions: tuple[Condition, ...] = (),
     ) -> None:
         """With *restarts_max* the run goes on without an agent that is lost."""
         self.folder = folder
@@ -61,6 +63,7 @@ class HostRun:
             executor=ExecutorSettings(kind=executor, workers=2),
             parameters={} if timeline else {"fault": fault},
             timeline=timeline,
+            conditions=conditions,
         )
         (folder / "host").mkdir(parents=True)
         launch = HostLaunch(

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from madns_runtime.conditions.condition import Condition, ValueBounds
 from madns_runtime.timeline.entries import ScheduledEntry
 
 pytestmark = pytest.mark.process
@@ -26,8 +27,9 @@ def entry(action, agents=A4, at_s=0.3, for_s=None, **parameters):
 def run_faults(start_host):
     """Return a function that starts a run with a timeline."""
 
-    def run(*timeline, per_process=2, restarts_max=0):
+    def run(*timeline, per_process=2, restarts_max=0, conditions=()):
         return start_host(
+            conditions=conditions,
             simulation=f"{HARNESS}/fault_simulation.py:simulation",
             timeline=timeline,
             restarts_max=restarts_max,
@@ -177,6 +179,29 @@ def test_a_hung_agent_takes_no_step_and_its_records_say_which(run_faults):
     assert events["hang_begins"]["t_s"] == pytest.approx(0.3)
     assert events["hang_ends"]["t_s"] == pytest.approx(0.6)
     assert events["hang_ends"]["ticks_withheld"] == 3
+
+
+@pytest.mark.parametrize(("fault", "given"), [("hang", {}), ("slow", {"factor": 9.0})])
+def test_what_a_hung_agent_recorded_last_goes_on_to_hold(run_faults, fault, given):
+    stuck = Condition(
+        number=0,
+        name="stuck",
+        stream="steps",
+        field="tick",
+        bounds=ValueBounds.within(2.0, 2.0),
+        agents=A4,
+        for_s=0.3,
+    )
+    run = run_faults(
+        entry(fault, for_s=0.5, **given),
+        ScheduledEntry(action="annotate", condition=0, parameters={"text": "stuck"}),
+        conditions=(stuck,),
+    )
+    run.result()
+
+    assert steps(run) == [0, 1, 2, 8, 9]
+    times = {e["event"]: round(e["t_s"], 6) for e in run.events_of("host")}
+    assert times["condition_met"] == 0.5
 
 
 def test_the_end_of_a_hang_from_before_a_restart_leaves_the_next_one_in_force(run_faults):

@@ -614,3 +614,22 @@ def test_broken_sync_deadline_is_told_by_the_side_that_sent():
 
     assert w.host_event(h.SyncDeadlineBroken).agent == "agent-1"
     assert w.host.peers["agent-1"].link.counters.deadlines_broken == 1
+
+
+def test_a_run_that_is_stopped_while_all_are_away_on_purpose_is_complete_at_its_end():
+    w = world(policy="continue")
+    w.run_for(1.5)
+    w.host.await_returns(True)
+    for name in w.names:
+        w.host.agent_exited(name, "killed by SIGKILL", w.now_s)
+        del w.agents[name]
+    w.run_for(0.5)
+
+    w.host.await_returns(False)  # a stop came: none of them returns before that
+    w.host.end_at(w.now_s + 0.3)
+    w.run_for(0.2)
+    assert w.host.state is HostState.SIMULATION_START
+    w.run_for(1.0)
+
+    assert w.host_event(h.AgentsComplete) is not None
+    assert w.host_event(h.EmergencyDeclared) is None

@@ -5,7 +5,12 @@ from pathlib import Path
 
 import madns_runtime
 from madns_runtime.faults.step_faults import HANG, SLOW
-from madns_runtime.recording.records import DEVICE_EVENT_WORDS, EVENT_WORDS
+from madns_runtime.recording.records import (
+    AGENT_EVENT_WORDS,
+    DEVICE_EVENT_WORDS,
+    EVENT_WORDS,
+    HOST_EVENT_WORDS,
+)
 from madns_runtime.timeline.dispatcher import BEGAN, ENDED, REFUSED, RESUMED
 
 
@@ -21,6 +26,8 @@ def test_all_words_of_events_are_known_and_no_others():
     written.update(f"{word}_{what}" for word in (HANG, SLOW) for what in ("begins", "ends"))
 
     assert set(EVENT_WORDS) == written
+    assert len(EVENT_WORDS) == len(written)
+    assert not set(HOST_EVENT_WORDS) & set(AGENT_EVENT_WORDS)
 
 
 def test_all_words_of_the_events_of_devices_are_known_and_no_others():

@@ -152,3 +152,46 @@ def test_a_condition_is_heard_of_in_real_time_and_the_delay_recorded(cosmos, tmp
     assert [each["action"] for each in found] == ["annotate", "stop"]
     assert all(0.0 <= each["delay_s"] < 60.0 for each in found)
     assert result["duration_s"] < 100
+
+
+def test_what_a_timeline_asked_for_and_the_run_did_not_do_is_a_remark(cosmos, tmp_path):
+    late = {"stream": "round_trips", "field": "packet", "above": 4000}
+    soon = {"stream": "round_trips", "field": "packet", "above": 4}
+    path = written(
+        tmp_path,
+        [
+            {"at_s": 1, "action": "kill", "agents": ["agent-02"]},
+            {"at_s": 1, "action": "kill", "agents": ["agent-02"], "for_s": 1},
+            {"at_s": 2, "action": "kill", "agents": ["agent-02"]},
+            {"at_s": 2, "action": "hang", "agents": ["agent-02"]},
+            {"when": late, "action": "stop"},
+            {"when": soon, "action": "annotate", "text": "soon"},
+        ],
+        duration_s=3,
+    )
+
+    code, result = cosmos.run(path, "on_agent_loss=continue")
+
+    why = "host: agent-02: not running, so there is nothing to"
+    assert (code, result["status"]) == (0, "complete")
+    assert [each for each in result["remarks"] if each.startswith("timeline")] == [
+        f"timeline: kill was refused 2 times, first by {why} kill",
+        f"timeline: hang was refused 1 time by {why} hang",
+        "timeline[4] (stop): its condition was never met",
+    ]
+
+
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_what_waits_for_a_condition_that_is_met_in_set_up_takes_place_at_time_zero(
+    cosmos, tmp_path, mode
+):
+    started = {"stream": "events", "field": "event", "equals": "start"}
+    entry = {"when": started, "action": "annotate", "text": "started"}
+    path = written(tmp_path, [entry], mode=mode, duration_s=0.5)
+
+    code, result = cosmos.run(path, *LOOSE)
+
+    assert code == 0, result["verdict"]
+    (found,) = actions(cosmos, result)
+    assert (found["event"], found["parameters"]) == ("action_began", {"text": "started"})
+    assert found["t_s"] >= 0.0

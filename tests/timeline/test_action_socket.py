@@ -4,6 +4,7 @@ import selectors
 import socket
 
 import orjson
+import pytest
 
 from madns_runtime.hardware.action_socket import (
     AGENTS_TOLD_MAX,
@@ -12,6 +13,7 @@ from madns_runtime.hardware.action_socket import (
     SOCKET_NAME,
     ActionSocket,
 )
+from madns_runtime.timeline.kinds import kinds_by_word
 
 AGENTS = [f"agent-{number:04}" for number in range(1000)]
 
@@ -33,10 +35,16 @@ class Loop:
             key.data()
 
 
-def answer_to(order, folder, in_force):
+def answer_to(order, folder, in_force=(), begin=lambda _: ""):
     loop = Loop()
     door = ActionSocket(
-        folder, loop, kinds={}, agents=AGENTS, begin=lambda _: "", in_force=lambda: in_force
+        folder,
+        loop,
+        kinds=kinds_by_word(),
+        agents=AGENTS,
+        devices=("gps",),
+        begin=begin,
+        in_force=lambda: in_force,
     )
     with socket.socket(socket.AF_UNIX) as visitor:
         visitor.connect(str(folder / SOCKET_NAME))
@@ -70,3 +78,25 @@ def test_of_actions_that_are_long_to_tell_so_many_are_told_as_fit(tmp_path):
 
     assert len(answer["in_force"]) == IN_FORCE_BYTES_MAX // 9100
     assert answer["in_force_count"] == 100
+
+
+FREEZE = {"device": "gps", "fault": "freeze"}
+
+
+@pytest.mark.parametrize(
+    ("changed", "refusal"),
+    [
+        ({"device": "gsp"}, "no agent knows a device 'gsp'; there are gps"),
+        ({"fault": "bias"}, "bias needs a value: the number that is added to each element"),
+        ({"value": 3.0}, "freeze takes no value, got 3"),
+        ({}, ""),
+    ],
+)
+def test_a_fault_of_a_device_that_no_agent_would_carry_out_is_refused(tmp_path, changed, refusal):
+    ordered = []
+    order = {"action": "device_fault", "target": "agent-0*", "parameters": FREEZE | changed}
+
+    answer = answer_to(order, tmp_path, begin=lambda action: ordered.append(action) or "")
+
+    assert answer == {"refusal": refusal}
+    assert len(ordered) == (not refusal)

@@ -88,6 +88,21 @@ def test_an_action_that_lasts_is_in_force_until_its_end() -> None:
     ]
 
 
+def test_an_end_names_who_is_not_there_to_hear_of_it() -> None:
+    class Ending(Heard):
+        def end(self, action: TimelineAction) -> list[str]:
+            return ["agent-02"]
+
+    events: list[dict[str, Any]] = []
+    dispatcher = Dispatcher({"kill": Ending()}, lambda event, **values: events.append(values))
+    action = an_action(0, "kill", "agent-01", "agent-02")
+    dispatcher.begin(action, 1.0, lasts=True)
+
+    assert dispatcher.end(action, 3.0, 3.0) == ""
+
+    assert [each.get("not_there") for each in events] == [None, ["agent-02"]]
+
+
 def test_an_end_comes_once() -> None:
     dispatcher, handler, events = a_dispatcher()
     action = an_action()

@@ -63,6 +63,36 @@ def test_what_lasts_ends_and_ends_come_before_begins() -> None:
     assert runner.in_force == ()
 
 
+def test_what_begins_a_little_late_ends_before_what_begins_at_its_end() -> None:
+    runner, handler, _ = a_runner(
+        ScheduledEntry(action="kill", at_s=10.0, for_s=5.0, agents=("a",)),
+        ScheduledEntry(action="kill", at_s=15.0, for_s=5.0, agents=("a",)),
+    )
+
+    runner.run_due(10.0004)
+    assert runner.next_s == 15.0
+    runner.run_due(15.0003)
+
+    assert handler.calls == [
+        ("begin", "kill", 10.0),
+        ("end", "kill", 10.0),
+        ("begin", "kill", 15.0),
+    ]
+
+
+def test_what_begins_later_than_it_should_end_lasts_as_long_as_it_is_to() -> None:
+    runner, _, events = a_runner(
+        ScheduledEntry(action="kill", at_s=10.0, for_s=5.0, agents=("a",)),
+    )
+
+    runner.run_due(18.0)
+    runner.run_due(22.9)
+    assert len(events) == 1
+    runner.run_due(23.0)
+
+    assert [each["event"] for each in events] == ["action_began", "action_ended"]
+
+
 def test_an_end_that_is_no_binary_number_comes_at_its_tick() -> None:
     runner, _, events = a_runner(
         ScheduledEntry(action="kill", at_s=0.1, for_s=0.2, agents=("a",)),

@@ -1,5 +1,7 @@
 """When entries of a timeline are due: at, every, by chance under the seed, within the run and bounded."""
 
+import math
+
 import pytest
 
 from madns_runtime.timeline.entries import ScheduledEntry
@@ -71,3 +73,7 @@ def test_rates_keep_to_their_window_and_count_as_expected() -> None:
 
 def test_the_number_of_actions_is_bounded() -> None:
     assert len(times(ScheduledEntry(action="a", every_s=1e-3))) == ACTIONS_MAX
+
+
+def test_a_period_next_to_nothing_is_more_actions_than_can_be_counted() -> None:
+    assert count_expected(ScheduledEntry(action="a", every_s=5e-324), 100.0) == math.inf

@@ -35,6 +35,8 @@ class HeldTimes:
     def __init__(self, held: HeldBounds, source: RecordSource) -> None:
         self._changes: dict[str, list[tuple[Floats, Flags]]] = {}
         self._counts: dict[str, int] = {}
+        self._names_agents = False
+        """Whether the host's half says of whom its records are: none of them is of an agent that they do not name."""
         factor = (
             conversion(held.unit, source.unit_of(held.stream, held.field)) if held.unit else 1.0
         )
@@ -45,7 +47,9 @@ class HeldTimes:
 
     def during(self, agent: str, t_s: Floats) -> Flags:
         """Tell of each time whether the newest record of the condition until then holds."""
-        changes = self._changes.get(owner_of(agent)) or self._changes.get(HOST)
+        changes = self._changes.get(owner_of(agent))
+        if changes is None and not self._names_agents:
+            changes = self._changes.get(HOST)
         if not changes:
             return np.zeros(len(t_s), bool)
         if len(changes) > 1:
@@ -57,6 +61,7 @@ class HeldTimes:
 
     def _batches(self, held: HeldBounds, source: RecordSource) -> Iterator[Batch]:
         for batch in source.batches(held.stream, (held.field,)):
+            self._names_agents = self._names_agents or (batch.is_of_host and batch.agent != HOST)
             if batch.has(held.field):
                 yield batch.of(held.field)
 

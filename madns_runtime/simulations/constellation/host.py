@@ -117,7 +117,7 @@ class ConstellationHost(HostSimulation):
         if parameters.record.slots_hz is not None:
             self._slots = SlotErrors(context, parameters, store, fleet.names)
         self._failures = InjectedFailures(
-            self._maneuvering_now, context, vehicles=vehicles, radio=self.radio
+            self._maneuvering_now, context, vehicles=vehicles, radio=self.radio, gone=self._gone
         )
         # Truth that came after its first sending was due.
         self._late_count, self._late_s_max = 0, 0.0

@@ -210,6 +210,29 @@ def test_records_count_only_while_a_condition_on_another_stream_holds(monkeypatc
     assert result.got == np.count_nonzero(wanted)
 
 
+def test_what_the_host_says_of_one_agent_holds_for_no_other():
+    columns = {
+        "t_s": np.array([10.0, 20.0]),
+        "agent": objects(["a", "a"]),
+        "on": np.array([1.0, 0.0]),
+    }
+    fields = (Field("t_s", "s"), Field("agent", "", "str"), Field("on"))
+    tables = {**TABLES, "host_mode": FakeTable("host_mode", fields, {"host": columns}, role="host")}
+    held = HeldBounds(stream="mode", field="on", bounds=ValueBounds.equals(1.0))
+    count = {"statistic": "count", "bounds": ValueBounds.above(0.0), "meanwhile": held}
+
+    of_a, of_b, of_host = judge(
+        expect(agents=("a",), **count),
+        expect(agents=("b",), **count),
+        expect(agents=("host",), stream="mode", field="on", **count),
+        tables=tables,
+    ).results
+
+    assert of_a.got == np.count_nonzero((T_S >= 10.0) & (T_S < 20.0))
+    assert (of_b.got, of_b.passed) == (0.0, False)
+    assert of_host.got == 1.0
+
+
 def test_a_host_stream_is_judged_agent_by_agent_and_skips_what_is_not_there():
     result = result_of(
         stream="slots",

@@ -104,8 +104,15 @@ BROKEN = [
     (f"{TICKS}, below: 3, while: {{stream: tick, field: x, below: 1}}", "tick,", "did you mean tick"),
     (f"{TICKS}, below: 3, while: {{stream: clock, field: x, below: 1}}", "x,", "has no field 'x'"),
     (f"{TICKS}, below: 3, while: {{stream: clock, field: t_s}}", "{stream", "expected a limit"),
+    ("name: a, stream: log, statistic: count, below: 3, agents: [host], while: {stream: clock, field: t_s, below: 1}", "clock", "the host's half"),
+    ("name: a, stream: log, statistic: count, below: 3, agents: [host, '*'], while: {stream: ticks, field: tick, below: 1}", "ticks", "the host's half"),
     (f"{TICKS}, below: 3, whil: 3", "whil", "did you mean while?"),
     ("name: a, event: emergancy, must: not_occur", "emergancy", "did you mean emergency?"),
+    ("name: a, event: agent_rejoined, must: not_occur", "agent_rejoined", "host's half alone: write agents: [host]"),
+    ("name: a, event: fault, agents: ['agent-*']", "fault", "an event of the host's half alone"),
+    ("name: a, event: killed, must: not_occur, agents: [host]", "killed", "an event of agents alone: leave out"),
+    ("name: a, stream: events, field: event, statistic: count, when: {equals: agent}, below: 1", "agent}", "the host's half"),
+    (f"{TICKS}, below: 3, while: {{stream: events, field: event, equals: agent}}", "agent}", "of the host's half alone"),
     ("name: a, event: burn", "burn", "own words stand in its own streams: name one under stream"),
     ("name: a, stream: log, event: eror, field: level", "eror", "did you mean error?"),
     ("name: a, stream: imu.events, event: opend", "opend", "did you mean opened?"),
@@ -135,6 +142,10 @@ TIME_OF = "name: a, stream: ticks, field: lateness_us, statistic: settled, when:
         f"{TIME_OF}, below: 9, from_s: 8.5",
         "name: a, stream: ticks, statistic: count, equals: 0",
         "name: a, event: action_began, agents: [host, '*']",
+        "name: a, stream: log, statistic: count, below: 3, agents: [host], while: {stream: events, field: event, equals: agent}",
+        "name: a, event: killed, agents: [host, agent-01], must: not_occur",
+        "name: a, event: emergency, must: not_occur",
+        "name: a, event: emergency, agents: [host], must: not_occur",
         "name: a, event: anything, field: action, agents: [host]",
     ],
 )
@@ -154,7 +165,7 @@ def test_a_broken_expectation_is_refused_with_place_and_cure(tmp_path, check, at
     assert re.search(rf"scenario.yaml:{FIRST_LINE}:\d+: checks", fault.render())
 
 
-START_OF = "name: first, event: start, agents: [%s]"
+START_OF = "name: first, event: emergency, agents: [%s]"
 
 
 @pytest.mark.parametrize(
@@ -265,6 +276,7 @@ def test_streams_of_devices_logs_and_machines_are_known(tmp_path):
             3,
         ),
         (f"{TICKS}, statistic: count, within: [0, 3]", ValueBounds(), 4),
+        (f"{TICKS}, statistic: count, below: 1.0e+308", ValueBounds(), 2**53),
         (f"{START}, must: not_occur", ValueBounds.equals("start"), 1),
     ],
 )

@@ -48,6 +48,12 @@ BROKEN_WHEN = [
         "cannot hold for so long",
     ),
     ("stream: events, field: event, equals: strt", ".equals", "did you mean start?"),
+    ("stream: events, field: event, equals: agent_rejoined", ".equals", "write agents: [host]"),
+    (
+        "stream: events, field: event, equals: hang_begins, agents: [host]",
+        ".equals",
+        "an event of agents alone",
+    ),
     ("stream: imu.w, field: w, above: 1", ".stream", "recorded by a device and not by agents"),
     ("stream: health, field: ram_percent, above: 1", ".stream", "name a stream of the simulation"),
     (
@@ -100,6 +106,12 @@ BROKEN = [
         "{every_s: 0.001, action: annotate, text: a}",
         "timeline",
         "make them rarer, most of all timeline[0]",
+    ),
+    ("{every_s: 5.0e-324, action: annotate, text: a}", "timeline", "make them rarer"),
+    (
+        '{at_s: 1, action: partition, agents: ["agent-0[1-3]", agent-04]}',
+        "timeline[0].agents",
+        "expected some of the agents, got all 4",
     ),
     ("{rate_per_h: 0, action: annotate, text: a}", "timeline[0].rate_per_h", "expected > 0"),
     ("{rate_per_h: 1e9, action: annotate, text: a}", "timeline[0].rate_per_h", "expected <= 3600"),
@@ -221,6 +233,14 @@ def test_globs_become_names_and_defaults_are_filled_in(tmp_path: Path) -> None:
     assert found.agents == ("agent-01", "agent-02")
     assert found.parameters == {"device": "gps", "fault": "freeze", "value": None}
     assert (found.every_s, found.from_s, found.to_s, found.for_s) == (20.0, 0.0, None, 5.0)
+
+
+def test_a_partition_by_chance_is_of_each_agent_for_itself(tmp_path: Path) -> None:
+    entry = '{rate_per_h: 100, action: partition, agents: ["*"], for_s: 5}'
+
+    (found,) = load(tmp_path, entry).run_config("0001-x").timeline
+
+    assert len(found.agents) == 4
 
 
 def test_a_condition_travels_with_its_agents_and_in_the_unit_of_its_field(tmp_path: Path) -> None:

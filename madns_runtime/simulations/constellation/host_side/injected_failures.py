@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 from madns_runtime.plugin.api import ActionRefused, HostContext, TimelineAction
@@ -33,6 +33,7 @@ class InjectedFailures:
         context: Through which agents are told.
         vehicles: What each is like.
         radio: Knows the ground stations; None without any.
+        gone: Agents that are lost at present.
     """
 
     def __init__(
@@ -42,12 +43,14 @@ class InjectedFailures:
         *,
         vehicles: Sequence[Vehicle],
         radio: RadioMedium | None,
+        gone: Collection[str],
     ) -> None:
         self._maneuvering = maneuvering
         self._context = context
         self._index = {agent: number for number, agent in enumerate(context.agents)}
         self._vehicles = vehicles
         self._radio = radio
+        self._gone = gone
         self._lost: dict[int, tuple[str, ...]] = {}
         """By action the agents whose satellites are lost."""
         self._dark: dict[int, str] = {}
@@ -58,7 +61,7 @@ class InjectedFailures:
         Put a failure in force.
 
         Raises:
-            ActionRefused: A vehicle has no such actuator, or there is no such station.
+            ActionRefused: A vehicle has no such actuator, there is no such station, or all who would hear it are lost.
         """
         given: Any = action.parameters
         vehicles = [self._index[agent] for agent in action.agents]
@@ -111,6 +114,8 @@ class InjectedFailures:
 
     def _telecommand(self, action: TimelineAction, given: Telecommand) -> None:
         if given.station is None:
+            if all(agent in self._gone for agent in action.agents):
+                raise ActionRefused(f"nobody hears it at present: {', '.join(action.agents)}")
             text = GroundText(t_s=self._context.now_s(), text=given.text).to_message()
             for agent in action.agents:
                 self._context.send(agent, text, Service.RELIABLE)

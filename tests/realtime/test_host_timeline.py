@@ -1,0 +1,138 @@
+"""The timeline of a host in real time: stops and those that return, and what is met before simulated time runs."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from madns_runtime.conditions.condition import Condition, ValueBounds
+from madns_runtime.conditions.reports import HostConditions
+from madns_runtime.realtime.timeline import HostTimeline
+from madns_runtime.timeline.entries import ScheduledEntry
+
+
+class Session:
+    """A session of which one agent is away."""
+
+    def __init__(self) -> None:
+        self.away = {"b"}
+        self.heard: list[tuple[str, str, float]] = []
+        self.awaited: list[bool] = []
+        self.end_host_s = 0.0
+
+    def send(self, agent: str, order: Any, *_: Any) -> bool:
+        if agent in self.away:
+            return False
+        self.heard.append((agent, order.word, getattr(order, "t_s", 0.0)))
+        return True
+
+    def await_returns(self, are_expected: bool) -> None:
+        self.awaited.append(are_expected)
+
+    def end_at(self, end_host_s: float) -> None:
+        self.end_host_s = end_host_s
+
+
+class Events:
+    """Takes events of a host."""
+
+    def __init__(self) -> None:
+        self.words: list[str] = []
+
+    def event(self, event: str, **values: object) -> None:
+        self.words.append(event)
+
+
+def some_conditions(*conditions: Condition) -> HostConditions:
+    return HostConditions(conditions, tick_hz=10.0, now_s=lambda: 0.0, end=lambda *_: None)
+
+
+def a_timeline(
+    session: Session,
+    *entries: ScheduledEntry,
+    conditions: HostConditions | None = None,
+    events: Events | None = None,
+) -> tuple[HostTimeline, Any]:
+    config: Any = SimpleNamespace(
+        on_agent_loss="continue",
+        time=SimpleNamespace(duration_s=60.0),
+        seed=1,
+        agents=SimpleNamespace(resolved_names=lambda: ("a", "b"), tick_hz=10.0),
+        timeline=entries,
+    )
+    port = SimpleNamespace(
+        session=session,
+        now_s=lambda: 2.0,
+        monotonic_s=lambda: 102.0,
+        t0_s=100.0,
+        send=None,
+        must_pump=False,
+        is_in=lambda state: True,
+    )
+    core: Any = SimpleNamespace(
+        launch=SimpleNamespace(config=config),
+        port=port,
+        half=SimpleNamespace(call=None),
+        guard=lambda call, *given: call(*given),
+        pump=lambda: None,
+        journal=events or Events(),
+        reactor=SimpleNamespace(
+            call_at=lambda when_s, call: SimpleNamespace(reschedule=lambda when_s: None)
+        ),
+    )
+    report: Any = SimpleNamespace(duration_s=60.0)
+    core.report = report
+    program: Any = SimpleNamespace(actions=())
+    return HostTimeline(core, program, report, conditions or some_conditions()), core
+
+
+def test_an_agent_that_returns_before_a_stop_takes_effect_hears_of_it() -> None:
+    session = Session()
+    timeline, core = a_timeline(session, ScheduledEntry(action="stop", at_s=2.0))
+    timeline.resume("a")
+    assert session.heard == []
+
+    timeline._due()
+    session.away.clear()
+    timeline.resume("b")
+
+    assert core.report.duration_s == 2.3
+    assert session.heard == [("a", "stop", 2.3), ("b", "stop", 2.3)]
+    assert session.end_host_s == 102.3
+
+
+def test_after_a_stop_nobody_waits_for_who_would_have_returned_behind_it() -> None:
+    session = Session()
+    session.away.clear()
+    timeline, _ = a_timeline(
+        session,
+        ScheduledEntry(action="kill", at_s=1.0, for_s=30.0, agents=("a",)),
+        ScheduledEntry(action="stop", at_s=2.0),
+    )
+
+    timeline._due()
+
+    assert session.awaited == [True, False]
+
+
+@pytest.mark.parametrize("t0_s", [None, 102.5])
+def test_what_waits_for_a_condition_that_is_met_in_set_up_takes_place_at_time_zero(
+    t0_s: float | None,
+) -> None:
+    condition = Condition(
+        number=0, name="soon", stream="x", field="y", bounds=ValueBounds.above(1.0), agents=("a",)
+    )
+    conditions, events = some_conditions(condition), Events()
+    entry = ScheduledEntry(action="annotate", condition=0, parameters={"text": "soon"})
+    timeline, core = a_timeline(Session(), entry, conditions=conditions, events=events)
+    core.port.t0_s, core.port.now_s = t0_s, lambda: -0.5
+    core.port.is_in = lambda state: t0_s is not None
+
+    conditions.hear("a", 0, 0.0)
+    conditions.settle(events)
+    assert events.words == ["condition_met"]
+    core.port.t0_s, core.port.now_s, core.port.is_in = 102.5, lambda: 0.0, lambda state: True
+    timeline._due()
+    timeline._due()
+
+    assert events.words == ["condition_met", "action_began"]
