@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -119,8 +120,8 @@ def _missing_files(
         if not isinstance(given, str) or Path(given).is_absolute():
             continue
         file = base_directory / given
-        if not file.is_file():
-            has_recipe = (file.parent / "Makefile").is_file()
+        if not os.path.isfile(file):
+            has_recipe = os.path.isfile(file.parent / "Makefile")
             hint = f"make -C {file.parent} builds it" if has_recipe else "build it first"
             yield (*path, "parameters", name), f"no file {file}; {hint}"
 

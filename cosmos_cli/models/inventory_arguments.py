@@ -44,7 +44,7 @@ def split_variable(value: str) -> list[str]:
 def folder_of(source: str) -> Path:
     """Return the folder beside which group_vars and host_vars are looked for."""
     path = Path(source)
-    return path if path.is_dir() else path.parent
+    return path if os.path.isdir(path) else path.parent
 
 
 def refuse_stray_limit(limit: str | None) -> None:

@@ -8,6 +8,7 @@ agents, is left to its owner: what is missing here is told with the command that
 from __future__ import annotations
 
 import importlib.metadata
+import os
 import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -40,7 +41,7 @@ def own_requirement_faults(requirements: Sequence[str], folder: Path) -> Iterato
 
 
 def _fault(path: Path) -> str:
-    if path.is_dir():
+    if os.path.isdir(path):  # False of what cannot be looked at
         return _folder_fault(path)
     try:
         check_regular_file(path, bytes_max=WHEEL_BYTES_MAX)
@@ -59,7 +60,7 @@ def _fault(path: Path) -> str:
 
 
 def _folder_fault(folder: Path) -> str:
-    if not any((folder / name).is_file() for name in PROJECT_FILES):
+    if not any(os.path.isfile(folder / name) for name in PROJECT_FILES):
         return f"expected a folder with {' or '.join(PROJECT_FILES)}, got {folder}"
     try:
         text = read_regular_file(folder / PROJECT_FILES[0], bytes_max=PROJECT_BYTES_MAX).decode()

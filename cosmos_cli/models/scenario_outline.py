@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -86,7 +87,7 @@ class ScenarioOutline:
         if not name:
             return None
         path = self.root / name
-        if not path.exists():
+        if not os.path.exists(path):
             text = f"{path}: no such file; write the names of the figures there: docs/ci.md"
             raise InputError(faults=[self.document.fault((SECTION, "baseline"), text)])
         return read_baseline(path)

@@ -93,7 +93,7 @@ def _python_files(folder: Path) -> Iterator[Path]:
         if entry.name.startswith(".") or not entry.name.isprintable():
             continue
         if entry.is_dir(follow_symlinks=False):
-            if (path / PACKAGE_MARK).is_file():
+            if os.path.isfile(path / PACKAGE_MARK):  # of a folder that may not be entered: False
                 yield from _python_files(path)
-        elif entry.name.endswith(".py") and entry.is_file():
+        elif entry.name.endswith(".py") and os.path.isfile(path):  # a link to itself: False
             yield path

@@ -8,6 +8,7 @@ written anew into a private folder among the user's caches: what flies leaves no
 from __future__ import annotations
 
 import hashlib
+import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -98,7 +99,7 @@ def _fill(run: RunDirectory, flown: FlownFiles, folder: Path, today: Path | None
 def _put(run: RunDirectory, name: str, one: FlownFile, folder: Path, today: Path | None) -> str:
     """Put one file into the folder; return what is wrong with it."""
     top = (run.path / FOLDER) if one.is_copied else today
-    if top is None or not top.is_dir():
+    if top is None or not os.path.isdir(top):
         return f"{clean_line(name)}: {top or 'the scenario folder'} is not there"
     source = top / name
     if one.is_copied and source.resolve() != run.path.resolve() / FOLDER / name:

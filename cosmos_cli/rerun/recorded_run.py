@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -95,7 +96,7 @@ def read_recorded_run(run: RunDirectory, given: str, as_recorded: Path | None = 
         )
     if as_recorded is not None:
         config = dataclasses.replace(config, base_directory=str(as_recorded.resolve()))
-    if not Path(config.base_directory).is_dir():
+    if not os.path.isdir(config.base_directory):  # or may not be looked at
         raise InputError(
             f"{run.name}: the scenario's folder {clean_line(config.base_directory)} is not there;"
             " put it back, fly the run's own copy with --as-recorded, or name another with --as-recorded-from DIR"
@@ -137,7 +138,7 @@ def scenario_folder(run: RunDirectory) -> Path | None:
     """Return the folder of a run's scenario; None if it is not known, or not there any more."""
     config = run.read_config()
     folder = Path(config.base_directory) if config is not None else None
-    return folder if folder is not None and folder.is_dir() else None
+    return folder if folder is not None and os.path.isdir(folder) else None
 
 
 def _read_agent(folder: Path, config: RunConfig) -> RecordedAgent:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -239,7 +240,7 @@ def _ticks_played(
     played = {name: device.parameters[name] for name in TICKS if name in device.parameters}
     if played.get("ticks") is None:
         return {}
-    if Path(recorded.folder, str(played["ticks"])).is_file():
+    if os.path.isfile(Path(recorded.folder, str(played["ticks"]))):
         return played
     remarks.append(
         f"{used.full_name}: {clean_line(str(played['ticks']))} is not there any more: its samples come in the first tick"

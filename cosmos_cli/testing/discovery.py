@@ -49,13 +49,13 @@ def find_scenarios(paths: Sequence[Path]) -> FoundScenarios:
         InputError: A path is missing, or the folders hold too many files.
     """
     found = FoundScenarios()
-    missing = [path for path in paths if not path.exists()]
+    missing = [path for path in paths if not os.path.exists(path)]
     if missing:
         told = ", ".join(map(str, missing))
         raise InputError(f"{told}: no such file or folder; name scenarios or folders of them")
     seen: set[Path] = set()
     for path in paths or (next(each for each in DEFAULT_FOLDERS if each.is_dir()),):
-        for file, is_named in [(path, True)] if path.is_file() else _files_below(path):
+        for file, is_named in [(path, True)] if os.path.isfile(path) else _files_below(path):
             if real_path(file) not in seen:
                 seen.add(real_path(file))
                 _add(found, file, is_named=is_named)

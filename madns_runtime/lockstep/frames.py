@@ -50,9 +50,9 @@ FRAME_BYTES_MAX: Final = 1 << 30
 HEAD: Final = Struct("<I")
 
 # Positions: what a worker is doing, in memory that it shares with the host.
-IDLE, LOADING, SETTING_UP, RECEIVING, STEPPING, FINISHING, CLOSING, HEARING, REFUSED, ACTING = (
-    range(10)
-)
+(
+    IDLE, LOADING, SETTING_UP, RECEIVING, STEPPING, FINISHING, CLOSING, HEARING, REFUSED, ACTING, ABANDONING,
+) = range(11)  # fmt: skip
 METHODS: Final = (
     "",
     "",
@@ -64,6 +64,7 @@ METHODS: Final = (
     "hear",
     "refused",
     "begin_action",
+    "abandon",
 )
 """The plug-in's method at each position; empty where the framework is at work."""
 POSITIONS: Final = 16

@@ -315,8 +315,7 @@ class Worker:
         self._forks.end_stray(self._line)
         if not self._goes_on:
             raise failure
-        self._position[0] = agent.index * POSITIONS + frames.CLOSING
-        agent.half.abandon()
+        self._forks.abandon(agent.index, agent.half, self._line)
         self._agents = [other for other in self._agents if other is not agent]
         self._faults.pop(agent.index, None)
         self._losses.add(agent, clean_text(failure.reason))
@@ -384,7 +383,7 @@ class Worker:
             if reason is not None:
                 agent.journal.event("emergency", reason=reason)
                 agent.journal.say("critical", f"emergency shutdown: {reason}")
-                agent.half.abandon()
+                self._forks.abandon(agent.index, agent.half, self._line)
             losses = agent.journal.device_losses(agent.devices.hardware.losses())
             counts = {**losses, **agent.journal.close().to_mapping()}
             if agent.devices:

@@ -143,3 +143,45 @@ def test_an_end_on_purpose_takes_no_return_from_an_agent_that_is_lost_later(star
     agent = run.result()["agents"]["agent-04"]
 
     assert (agent["state"], agent["incarnations"]) == ("stopped", 3)
+
+
+FORKING = """
+import os
+from dataclasses import dataclass
+from madns_runtime.plugin.api import AgentSimulation, Simulation
+@dataclass(frozen=True)
+class Parameters:
+    fault: str = ""
+class Agent(AgentSimulation):
+    def setup(self, context, initial):
+        self.name = context.name
+    def step(self, tick):
+        if (self.name, tick.index) == ("agent-05", 5):
+            raise ValueError("told to")
+    def abandon(self):
+        child = os.fork() if self.name == "agent-04" else 0
+        if child:
+            os.waitpid(child, 0)
+simulation = Simulation(name="forking", parameters=Parameters, agent=":Agent")
+"""
+
+
+@pytest.mark.parametrize("is_killed", [True, False])
+def test_a_process_that_comes_back_from_abandon_is_ended_there_and_closes_no_records(
+    start_host, tmp_path, is_killed
+):
+    (tmp_path / "forking.py").write_text(FORKING)
+    kill = ScheduledEntry(action="kill", agents=("agent-04",), at_s=0.3, parameters={})
+    run = start_host(
+        simulation=f"{tmp_path}/forking.py:simulation",
+        timeline=(kill,) if is_killed else (),
+        restarts_max=0 if is_killed else None,
+        per_process=6,
+    )
+    reason = run.result()["reason"]
+
+    told = "the agent's abandon forked a process that came back" if is_killed else "told to"
+    assert told in reason
+    for agent in ("agent-04", "agent-05", "agent-06"):
+        lines = (run.folder / f"agents/{agent}/events.jsonl").read_text().splitlines()
+        assert [line.startswith('{"end"') for line in lines].count(True) == 1

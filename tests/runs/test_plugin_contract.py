@@ -79,6 +79,13 @@ class H(HostSimulation):
 class A(AgentSimulation):
     has_forked = False
 
+    def __init__(self):
+        wanted = Path(__file__).with_name("fork_as_it_is_made")
+        if wanted.exists():
+            wanted.unlink()
+            if os.fork():
+                time.sleep(0.5)  # the other process is first
+
     def setup(self, context, initial):
         self.context, self.evil, self.pid = context, context.parameters.evil, os.getpid()
 
@@ -159,6 +166,14 @@ def test_an_agent_goes_on_alone_whose_fork_comes_back_from_the_call(tmp_path, ev
 
     assert (result["exit_code"], result["reason"]) == (0, None)
     assert not (tmp_path / "stepped_by_a_fork").exists()  # by the other agent of the process
+
+
+def test_an_agent_goes_on_alone_whose_fork_comes_back_as_it_is_made(tmp_path):
+    (tmp_path / "fork_as_it_is_made").touch()
+    result = run(tmp_path, "good", "agents.per_process=2")
+
+    assert (result["exit_code"], result["reason"]) == (0, None)
+    assert not (tmp_path / "fork_as_it_is_made").exists()
 
 
 def test_an_agent_that_is_killed_in_a_call_is_told_with_the_call(tmp_path):

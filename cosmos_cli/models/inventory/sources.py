@@ -228,7 +228,7 @@ def variable_files(folder: Path, names: Iterable[str]) -> tuple[dict[str, list[P
         folder: group_vars or host_vars; need not be there.
         names: Of groups, or of machines.
     """
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         return {}, []
     there = set(_names_in(folder, 0))
     found: dict[str, list[Path]] = {}
@@ -245,7 +245,7 @@ def variable_files(folder: Path, names: Iterable[str]) -> tuple[dict[str, list[P
 
 def _may_hold_variables(path: Path) -> bool:
     ending = os.path.splitext(path.name)[1]
-    is_known = not ending or (ending in EXTENSIONS and not path.is_dir())
+    is_known = not ending or (ending in EXTENSIONS and not os.path.isdir(path))
     return is_known and not path.name.endswith("~")
 
 
@@ -260,7 +260,7 @@ def _files_at(path: Path, is_taken: Callable[[Path], bool]) -> list[Path]:
 
 
 def _walk(path: Path, is_taken: Callable[[Path], bool], depth: int) -> Iterator[Path]:
-    if not path.is_dir():
+    if not os.path.isdir(path):
         yield path
         return
     for name in _names_in(path, depth):

@@ -6,6 +6,7 @@ As in `check_vehicles`: nothing of it is run.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
@@ -118,7 +119,7 @@ def _program_faults(field: str, program: str, base_directory: Path) -> list[str]
     if find_program((program,), base_directory) is not None:
         return []
     path = base_directory / program
-    if path.is_file():
+    if os.path.isfile(path):
         return [f"{field}: {path} is not executable; chmod +x makes it so"]
     where = base_directory if "/" in program else f"{base_directory} or on PATH"
     return [f"{field}: no program {program!r} in {where}"]

@@ -556,3 +556,43 @@ def test_of_very_many_remarks_the_first_are_told_and_the_rest_is_counted(see, ca
     assert 0 < notes < 9999
     assert app.run(["validate", "a.yaml"]) == 0
     assert f"{9999 - notes} more remarks" in capsys.readouterr().err
+
+
+HEAD = "name: a\nagents: {count: 1}\nsimulation: "
+CONSTELLATION = 'constellation\nparameters: {satellites: {altitude_km: 500, walker: "53:1/1/0"}, '
+LONG = "x" * 300
+"""No file has such a name, and to look whether one has is an error, as it is in a folder that may not be entered."""
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (f"counter\nrequirements: [./{LONG}]", "requirements[0]: "),
+        (f"counter\ntest: {{baseline: {LONG}.yaml}}", "test.baseline: "),
+        (
+            "counter\nhardware: {devices: [{name: mcu, kind: emulated_mcu, agents: ['*'],"
+            f" parameters: {{firmware: {LONG}}}}}]}}",
+            "hardware.devices[0].parameters.firmware: no file ",
+        ),
+        (
+            f"{CONSTELLATION}flight: {{command: [{LONG}]}}}}",
+            "parameters.flight.command: no program",
+        ),
+    ],
+)
+def test_file_that_cannot_be_looked_for_is_told_at_its_place(tmp_path, capsys, text, told):
+    path = tmp_path / "a.yaml"
+    path.write_text(HEAD + text + "\n")
+
+    assert app.run(["validate", str(path)]) == 2
+
+    said = capsys.readouterr()
+    assert told in said.out + said.err
+    assert "defect" not in said.err
+
+
+@pytest.mark.parametrize("arguments", [["test", LONG], ["inventory", "-i", LONG]])
+def test_argument_that_no_file_can_be_called_is_bad_input(capsys, arguments):
+    assert app.run(arguments) == 2
+    assert "defect" not in capsys.readouterr().err

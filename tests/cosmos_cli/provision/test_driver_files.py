@@ -45,6 +45,14 @@ def test_python_files_beside_a_driver_and_packages_are_sent_and_nothing_else(fol
     assert found.directory("/there/trees/abc") == "/there/trees/abc"
 
 
+def test_links_beside_a_driver_that_lead_nowhere_or_to_themselves_are_not_sent(folder):
+    before = paths(files_of(folder, "./imu.py:Imu"))
+    for name in ("loop.py", "fleet.py"):
+        (folder / "fleet" / name).symlink_to("loop.py" if name == "loop.py" else "nowhere.py")
+
+    assert paths(files_of(folder, "./imu.py:Imu")) == before
+
+
 def test_a_driver_elsewhere_is_found_by_the_same_name(folder):
     found = files_of(folder, "../drivers/bus.py:Bus", "./imu.py:Imu")
 

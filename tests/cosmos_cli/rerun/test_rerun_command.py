@@ -254,10 +254,13 @@ def test_a_plan_that_names_devices_elsewhere_is_refused(braked, tmp_path):
     assert "\x1b" not in done.stderr
 
 
-def test_a_folder_that_is_not_there_any_more_is_named(braked, tmp_path):
+@pytest.mark.parametrize("name", ["gone", "x" * 300])
+def test_a_folder_that_is_not_there_any_more_or_cannot_be_looked_at_is_named(
+    braked, tmp_path, name
+):
     cosmos, document = braked
 
-    done = cosmos("rerun", document["run"], "--as-recorded-from", tmp_path / "gone")
+    done = cosmos("rerun", document["run"], "--as-recorded-from", tmp_path / name)
 
     assert done.returncode == 2
     assert "is not there; put it back, fly the run's own copy with --as-recorded" in done.stderr

@@ -17,7 +17,7 @@ def find_program(command: Sequence[str], base_directory: Path) -> list[str] | No
         base_directory: Folder of the scenario.
     """
     own = base_directory / command[0]
-    if own.is_file() and os.access(own, os.X_OK):
+    if os.path.isfile(own) and os.access(own, os.X_OK):
         return [str(own.resolve()), *command[1:]]
     found = shutil.which(command[0]) if "/" not in command[0] else None
     return [found, *command[1:]] if found else None
