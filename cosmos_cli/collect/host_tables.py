@@ -129,7 +129,7 @@ def _parts(
     told: dict[str, int] = {}
     fields: tuple[Field, ...] | None = None
 
-    def judge(part: object) -> Tabulated | None:
+    def judge(part: Any) -> Tabulated | None:
         fault = _missing(told, agents, times_s)
         if part is not None:
             fault = _fault_of(part, fields, agents) or _fault_of_times(part, told, times_s)

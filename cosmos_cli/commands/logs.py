@@ -22,6 +22,7 @@ from cosmos_cli.models.document import did_you_mean
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
 from cosmos_cli.ui.plural import counted
 
+NAMED_MAX = 5
 LINES_DEFAULT = 10_000
 LINES_MAX = 1_000_000
 NO_TIME = " " * 12
@@ -112,11 +113,19 @@ def logs(
 
 
 def _by_name(source: str | None, run: RunDirectory, names: Sequence[str]) -> str | None:
-    """Return the name of whom *source* means by its label, or itself."""
+    """
+    Return the name of whom *source* means by its label, or itself.
+
+    Raises:
+        InputError: Several bear that label.
+    """
     if source is None or source in names:
         return source
-    by_label = {label: agent for agent, label in run_labels(run).names.items()}
-    return by_label.get(source, source)
+    found = [agent for agent, label in run_labels(run).names.items() if label == source]
+    if len(found) > 1:
+        named = ", ".join(found[:NAMED_MAX]) + (", ..." if len(found) > NAMED_MAX else "")
+        raise InputError(f"{counted(len(found), 'agent')} are called {source!r}; name one: {named}")
+    return found[0] if found else source
 
 
 class _Printer:

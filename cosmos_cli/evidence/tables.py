@@ -114,7 +114,7 @@ def plan_table(
             merged[field.name] = field if known is None else _wider(known, field)
     role = files[0].role
     needs_time = "tick" in merged and "t_s" not in merged and role == "agent"
-    source_column = role
+    source_column: str = role
     while source_column in merged:
         source_column += "_name"
     return TableLayout(

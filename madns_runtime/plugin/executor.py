@@ -22,7 +22,7 @@ from typing import Any, cast
 
 from madns_runtime.config import ExecutorSettings
 from madns_runtime.errors import ConfigurationError, MachineError, PluginError
-from madns_runtime.plugin.context import describe_exception
+from madns_runtime.plugin.context import clean_text, describe_exception
 from madns_runtime.plugin.isolation import call_plugin
 from madns_runtime.plugin.registry import load_function
 from madns_runtime.reactor.reactor import Reactor
@@ -116,11 +116,22 @@ def run_job(function: Callable[..., Any], *arguments: Any) -> Any:
     Raises:
         JobFailed: The function raised.
     """
+    worker = os.getpid()
     try:
         return function(*arguments)
     except BaseException as error:  # a plug-in may raise anything
         name = getattr(function, "__qualname__", repr(function))
         raise JobFailed(describe_exception(error, name)) from error
+    finally:
+        # One that it forked would answer, too, and take the next jobs.
+        if os.getpid() != worker:
+            os._exit(0)
+
+
+def describe_broken(error: BrokenExecutor) -> str:
+    """Say why an executor works no more: a worker has died, or what a job returned cannot be unpacked."""
+    told = str(error.__cause__ or "").strip().removesuffix("'''").strip().rpartition("\n")[2]
+    return f"what it returned cannot be unpacked: {clean_text(told)}" if told else WORKER_DIED
 
 
 def pack_job(function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes | None:
@@ -207,6 +218,11 @@ class JobRunner:
             if packed is not None:
                 return self._executor.submit(run_packed_job, packed)
         return self._executor.submit(run_job, function, *arguments)
+
+    def tell_dropped(self, log: Callable[[str, str], None]) -> None:
+        """Say how many jobs are not done now that simulated time is over: their values come too late."""
+        if count := len(self._pending):
+            log("warning", f"{count} of the executor's jobs not done when simulated time was over")
 
     def close(self) -> None:
         """Let go of every job and end the workers, also one that is deep in its work."""

@@ -25,7 +25,7 @@ from madns_runtime.plain_values import OwnCopies
 from madns_runtime.plugin import time_limit, validation
 from madns_runtime.plugin.api import AgentSimulation, HostSimulation
 from madns_runtime.plugin.context import clean_text, describe_exception
-from madns_runtime.plugin.executor import WORKER_DIED, JobFailed
+from madns_runtime.plugin.executor import JobFailed, describe_broken
 from madns_runtime.plugin.host_calls import HostCalls
 from madns_runtime.plugin.registry import Role, load_function, load_half, parse_parameters, resolve
 from madns_runtime.processes import own_age_s
@@ -394,7 +394,7 @@ class HostHalf(Half):
             return
         doing = f"{self.name}: job {job}"
         if isinstance(error, BrokenExecutor):
-            raise HalfFailed(f"{doing}: {WORKER_DIED}")
+            raise HalfFailed(f"{doing}: {describe_broken(error)}")
         self._log("critical", "".join(traceback.format_exception(error)))
         is_told = isinstance(error, JobFailed)
         raise HalfFailed(f"{doing}: {error}" if is_told else describe_exception(error, doing))

@@ -307,6 +307,7 @@ class HostRuntime:
     def _complete(self) -> None:
         self._report.completed_s = self._port.now_s()
         self._takes_data = self._calls.is_counting = False  # what comes now is too late
+        self._jobs.tell_dropped(self._log)
         self._report.simulation = self._call("finish") or {}
         if self._port.is_in(HostState.SIMULATION_COMPLETE):
             self._session.order_stop(monotonic())

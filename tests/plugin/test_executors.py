@@ -21,7 +21,13 @@ from harness.waiting import wait_until
 
 from madns_runtime.config import ExecutorSettings
 from madns_runtime.errors import ConfigurationError, MachineError, MissingExtraError
-from madns_runtime.plugin.executor import JobFailed, JobRunner, make_executor, run_job
+from madns_runtime.plugin.executor import (
+    JobFailed,
+    JobRunner,
+    describe_broken,
+    make_executor,
+    run_job,
+)
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.parameters import ScipyPropagator
@@ -354,6 +360,62 @@ def test_a_job_for_workers_that_have_died_is_no_fault_of_who_submits_it():
 
     with pytest.raises(MachineError, match="a worker of the executor has died"):
         runner.submit(math.sqrt, 4.0)
+
+
+class Unloadable:
+    """Packed and not unpacked, as an exception whose class takes other arguments than it hands on."""
+
+    def __reduce__(self):
+        return int, ("no number",)
+
+
+def test_a_value_that_cannot_be_unpacked_is_told_as_such_and_no_worker_as_dead():
+    executor = make_executor(ExecutorSettings(kind="process", workers=1))
+    try:
+        with pytest.raises(BrokenExecutor) as broken:
+            executor.submit(Unloadable).result(PATIENCE_S)
+    finally:
+        JobRunner(Reactor(), executor, lambda job, future: None).close()
+
+    told = describe_broken(broken.value)
+    assert told.startswith("what it returned cannot be unpacked: ValueError: invalid literal")
+    assert told.endswith("'no number'")
+    assert "has died" in describe_broken(BrokenExecutor("terminated abruptly"))
+
+
+def fork_and_answer():
+    worker = os.getpid()
+    return os.getpid() if os.fork() else -worker
+
+
+def test_a_process_that_a_job_forks_and_that_comes_back_answers_nothing_and_ends():
+    executor = make_executor(ExecutorSettings(kind="process", workers=1))
+    worker = next(iter(executor._processes))
+    try:
+        answers = [executor.submit(run_job, fork_and_answer).result(PATIENCE_S) for _ in range(20)]
+        wait_until(
+            lambda: all(
+                child.status() == psutil.STATUS_ZOMBIE
+                for child in psutil.Process(worker).children()
+            )
+        )
+    finally:
+        JobRunner(Reactor(), executor, lambda job, future: None).close()
+
+    assert answers == [worker] * 20
+
+
+def test_jobs_that_come_too_late_are_counted():
+    runner = JobRunner(Reactor(), ThreadPoolExecutor(1), lambda job, future: None)
+    said = []
+    runner.tell_dropped(lambda *words: said.append(words))
+    for _ in range(3):
+        runner.submit(math.sqrt, 4.0)
+
+    runner.tell_dropped(lambda *words: said.append(words))
+    runner.close()
+
+    assert said == [("warning", "3 of the executor's jobs not done when simulated time was over")]
 
 
 class Stubborn(ThreadPoolExecutor):

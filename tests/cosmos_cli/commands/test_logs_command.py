@@ -95,6 +95,17 @@ def test_part_of_a_log_can_be_had(made, capsys, arguments, expected):
     assert texts(capsys, *arguments) == expected
 
 
+def test_an_agent_is_found_by_its_second_name_and_several_of_one_are_named(made, capsys):
+    labels = {"a1": "north", "a2": "south"}
+    (made / "plan.json").write_text(json.dumps({"labels": {"column": "tram", "names": labels}}))
+    assert texts(capsys, "1", "south") == ["a2 3"]
+    labels["a1"] = "south"
+    (made / "plan.json").write_text(json.dumps({"labels": {"column": "tram", "names": labels}}))
+
+    assert cosmos(["logs", "1", "south"]) == 2
+    assert "2 agents are called 'south'; name one: a1, a2" in capsys.readouterr().err
+
+
 def test_text_of_others_cannot_steer_a_terminal_nor_speak_for_another(made, capsys):
     (made / "agents/a1/log.jsonl").write_text(
         SCHEMA + record(1, "info", "\x1b[2Jgone\n00:00:05.000  host  error  forged")
