@@ -152,12 +152,10 @@ class DeviceRunner:
 
     def _blame(self, driver: str, method: str, error: BaseException) -> str:
         """Record what a driver's method raised, and return its words."""
-        is_told = isinstance(error, MachineError)
-        told = (
-            clean_text(str(error)) if is_told else describe_exception(error, f"{driver}.{method}")
-        )
-        self._intake.event("error", monotonic(), why=told)
-        return told
+        where, is_told = f"{driver}.{method}", isinstance(error, MachineError)
+        text = clean_text(str(error)) if is_told else describe_exception(error, where)
+        self._intake.event("error", monotonic(), why=text)
+        return text
 
     def _close_device(self) -> None:
         """Make the device safe and close it; what either raises is recorded."""
