@@ -20,7 +20,10 @@ from cosmos_cli.launch.device_sampling import (
 )
 from cosmos_cli.launch.remote_sampling import MachineSampler
 from cosmos_cli.ui.console import Column, Console
+from cosmos_cli.ui.plural import counted
 from madns_runtime.config import DeviceLaunch
+from madns_runtime.hardware.count_table import NOT_FINITE
+from madns_runtime.plain_values import mapping_at
 
 FIGURES = (
     Column("device"),
@@ -111,6 +114,8 @@ def test_devices(trial: Trial) -> int:
         console.data(f"{name}: {each['status']}, identity {each['identity'] or 'none'}")
         if name in bad:
             console.say(f"{name}: {each['error'] or each['why'] or 'no sample of any input'}")
+        for text in shortcomings(each):
+            console.say(f"{name}: {text}")
     failures = {each.machine: each.failure.to_mapping() for each in outcomes if each.failure}
     missed = [name for name in trial.names if name not in told]
     code = ExitCode.MACHINES if failures else ExitCode.RUN_FAILED if bad else ExitCode.OK
@@ -135,7 +140,10 @@ def record_device(trial: Trial, directory: Path) -> int:
     console.data(
         f"{directory}: recorded; kind: playback with parameters: {{directory: ...}} plays it"
     )
-    code = ExitCode.RUN_FAILED if _is_bad(told) else ExitCode.OK
+    for text in shortcomings(told):
+        console.say(f"{trial.names[0]}: {text}")
+    is_whole = not _dropped(told)
+    code = ExitCode.RUN_FAILED if _is_bad(told) or not is_whole else ExitCode.OK
     console.print_json({"directory": str(directory), "device": told, "exit_code": int(code)})
     return int(code)
 
@@ -167,6 +175,24 @@ def recorded(trial: Trial, directory: Path, *, seconds: float | None = None) -> 
         return dict(outcome.value or {})
 
     return record(trial.launches[0], seconds, directory, sample)
+
+
+def shortcomings(told: Mapping[str, Any]) -> list[str]:
+    """Return what is missing in what a device gave, though it gave samples."""
+    found = []
+    if dropped := _dropped(told):
+        found.append(f"not on record for want of room: {counted(dropped, 'record')}")
+    if told.get("silent_inputs") and told.get("samples"):
+        found.append(f"no value came of {', '.join(told['silent_inputs'])}")
+    for name, number in mapping_at(told, "report").items():
+        if name.endswith(NOT_FINITE) and number:
+            channel = name.removesuffix(NOT_FINITE)
+            found.append(f"{counted(number, 'sample')} of {channel} held what is no number")
+    return found
+
+
+def _dropped(told: Mapping[str, Any]) -> int:
+    return int(mapping_at(told, "report", "records").get("dropped", 0))
 
 
 def _is_bad(told: Mapping[str, Any]) -> bool:

@@ -21,6 +21,8 @@ from madns_runtime.errors import ConfigurationError
 from madns_runtime.hardware.fault_actions import check_fault
 
 FOR_S = "for_s"
+CONTEXT_SETTINGS = {"ignore_unknown_options": True}
+"""A value below zero is none; what else looks like one is refused by `_refuse_options`."""
 
 
 TargetArgument = Annotated[
@@ -67,6 +69,7 @@ def inject(
     """
     instead = None if listed else "the exit code tells whether the run refused"
     console = Console(json=as_json, quiet=quiet, instead=instead)
+    _refuse_options([run, target or "", action or "", *(values or ())])
     found = find_run(runs_root(folder), run)
     if listed:
         if target is not None:
@@ -101,6 +104,21 @@ def inject(
         }
     )
     return int(code)
+
+
+def _refuse_options(words: Sequence[str]) -> None:
+    """
+    Refuse words that are no options of the command, and no numbers either.
+
+    Raises:
+        InputError: One is.
+    """
+    for word in words:
+        try:
+            float(word)
+        except ValueError:
+            if word.startswith("-"):
+                raise InputError(f"no such option: {word}; see `cosmos inject --help`") from None
 
 
 def _value(action: str, values: Sequence[str]) -> float | None:

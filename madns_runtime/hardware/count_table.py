@@ -15,6 +15,8 @@ NAME_BYTES: Final = 56
 REST: Final = "others"
 CELL_BYTES: Final = NAME_BYTES + 8
 TABLE_BYTES: Final = CELLS_MAX * CELL_BYTES
+NOT_FINITE: Final = "_not_finite"
+"""Behind an input's name: how often it was no number."""
 MISSED: Final = "missed:"
 """Before an agent's name: how many messages were given up that it did not take."""
 

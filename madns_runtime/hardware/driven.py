@@ -12,8 +12,9 @@ from typing import Any, Final
 from madns_runtime.config import DeviceLaunch
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.hardware import messages, page
+from madns_runtime.hardware.count_table import NOT_FINITE
 from madns_runtime.hardware.fault_actions import check_fault_fits
-from madns_runtime.hardware.intake import NOT_FINITE, counts_of, silent_inputs
+from madns_runtime.hardware.intake import counts_of, silent_inputs
 from madns_runtime.hardware.kind_declaration import CHANNELS_MAX
 from madns_runtime.hardware.kind_registry import DeviceProgram
 from madns_runtime.hardware.page import DevicePage

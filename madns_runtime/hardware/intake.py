@@ -11,7 +11,7 @@ from madns_runtime.errors import PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.clock import DeviceClock
 from madns_runtime.hardware.contract import Channel, Device, Sample
-from madns_runtime.hardware.count_table import MISSED
+from madns_runtime.hardware.count_table import MISSED, NOT_FINITE
 from madns_runtime.hardware.fault_actions import check_fault_fits
 from madns_runtime.hardware.faults import InsertedFaults
 from madns_runtime.hardware.page import DevicePage
@@ -21,8 +21,6 @@ from madns_runtime.hardware.values import are_finite, hold_to_limits, to_frame, 
 
 FROZEN: Final = "frozen:"
 """Before an input's name: how often it stood still."""
-NOT_FINITE: Final = "_not_finite"
-"""Behind an input's name: how often it was no number."""
 EVENTS_MAX: Final = 1000
 """Of one kind of event, such as refused values; more are counted alone."""
 

@@ -26,7 +26,7 @@ from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.seat import DeviceSeat
 from madns_runtime.hardware.simulated import pass_over, samples_by_now
 from madns_runtime.hardware.status import StatusLimits, back_off_s
-from madns_runtime.plugin.context import describe_exception
+from madns_runtime.plugin.context import clean_text, describe_exception
 from madns_runtime.reactor.reactor import Reactor
 
 BURST_MAX: Final = 256
@@ -152,8 +152,8 @@ class DeviceRunner:
 
     def _blame(self, driver: str, method: str, error: BaseException) -> str:
         """Record what a driver's method raised, and return its words."""
-        is_told = isinstance(error, MachineError)
-        text = str(error) if is_told else describe_exception(error, f"{driver}.{method}")
+        where, is_told = f"{driver}.{method}", isinstance(error, MachineError)
+        text = clean_text(str(error)) if is_told else describe_exception(error, where)
         self._intake.event("error", monotonic(), why=text)
         return text
 

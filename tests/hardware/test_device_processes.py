@@ -13,6 +13,7 @@ from madns_runtime.config import DeviceLaunch
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware import page
 from madns_runtime.hardware.guardian import ATTEMPTS_MAX
+from tests.hardware import bench as bench_module
 from tests.hardware.bench import AGENT, DeviceBench, line_bench
 from tests.harness.waiting import is_alive, wait_until
 
@@ -329,6 +330,19 @@ def test_a_device_whose_samples_a_fault_keeps_back_is_not_opened_anew(tmp_path, 
     assert (result["errors"], heard) == (0, ["OPEN", "SAFE"])
     name = {"drop": "dropped", "delay": "delayed_left"}[action]
     assert result["report"][name] > 0
+
+
+def test_words_of_a_driver_that_are_no_text_are_told_and_cost_no_process(tmp_path, monkeypatch):
+    raised = 'raise ValueError(f"{method} does not work")'
+    odd = 'raise __import__("madns_runtime.errors").errors.MachineError("it said \\udc80\\x1b[2J")'
+    assert raised in bench_module.DRIVER
+    monkeypatch.setattr(bench_module, "DRIVER", bench_module.DRIVER.replace(raised, odd))
+    with line_bench(tmp_path, raises="read") as (bench, _):
+        bench.until(lambda: errors(bench) >= 3)
+        result = bench.close()["pi22/line"]
+
+    assert result["restarts"] == 0
+    assert result["why"] == "it said \\udc80\x1b[2J"
 
 
 def test_a_process_that_cannot_begin_is_lost_for_what_kept_it(tmp_path):

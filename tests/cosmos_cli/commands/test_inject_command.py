@@ -1,0 +1,44 @@
+"""`cosmos inject`: values below zero, and words that are no options."""
+
+import pytest
+
+from cosmos_cli.commands import inject as module
+from cosmos_cli.commands.command_group import load_command
+from cosmos_cli.errors import InputError
+from cosmos_cli.evidence.run_directory import RunDirectory
+
+
+@pytest.fixture
+def ordered(monkeypatch, tmp_path):
+    """What was ordered of a run that takes everything."""
+    found = []
+    monkeypatch.setattr(module, "find_run", lambda root, run: RunDirectory(tmp_path))
+    monkeypatch.setattr(module, "order_fault", lambda path, name, fault: found.append(fault) or "")
+    return found
+
+
+def inject(*words):
+    command = load_command("inject")
+    with command.make_context("inject", [*words, "--quiet"]) as context:
+        return command.invoke(context)
+
+
+@pytest.mark.parametrize("value", ["-5", "-0.5", "-1e-3", "-.25", "5"])
+def test_a_value_below_zero_is_a_value(ordered, value):
+    assert inject("last", "here/load", "bias", value) == 0
+    assert ordered == [("here/load", "bias", float(value))]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("last", "here/load", "delay", "-5"), "delay: expected the time by which"),
+        (("last", "here/load", "freeze", "--lst"), "no such option: --lst; see `cosmos inject --h"),
+        (("last", "-x"), "no such option: -x"),
+        (("--lst", "last"), "no such option: --lst"),
+    ],
+)
+def test_what_is_neither_value_nor_option_is_refused(ordered, words, told):
+    with pytest.raises(InputError, match=told):
+        inject(*words)
+    assert ordered == []
