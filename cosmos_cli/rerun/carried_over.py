@@ -152,7 +152,13 @@ def _end_as_recorded(found: CarriedOver, recorded: FlownRun) -> None:
     end_s = last_s + 0.5 * period_s
     if last_s + 1.5 * period_s < recorded.config.time.duration_s:
         found.ends = ({"at_s": end_s, "action": STOP.word},)
-        found.remarks.append(f"it ended early: so does the rerun, with the tick of {last_s:g} s")
+        told = recorded.run.read_json(recorded.run.run_json) or {}
+        is_whole = told.get("duration_s") == recorded.config.time.duration_s
+        found.remarks.append(
+            f"its last ticks were missed: the rerun ends with that of {last_s:g} s, too"
+            if is_whole and told.get("status") == "complete"
+            else f"it ended early: so does the rerun, with the tick of {last_s:g} s"
+        )
 
 
 def _told(key: str, number: int, item: Item) -> str:

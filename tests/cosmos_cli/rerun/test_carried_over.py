@@ -3,7 +3,7 @@
 import pytest
 
 from cosmos_cli.errors import Fault, InputError
-from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.run_directory import RunDirectory, write_json
 from cosmos_cli.rerun.carried_over import carried_over
 from cosmos_cli.rerun.recorded_run import FlownRun, RecordedAgent
 from madns_runtime.config import Agents, RunConfig, TimeSettings
@@ -70,6 +70,19 @@ def test_a_run_in_real_time_that_ended_early_ends_again_with_its_last_tick(flown
     assert found.loses_agents
     assert not found.checks[0]["stop_when_broken"]
     assert "it ended early: so does the rerun, with the tick of 20.2 s" in found.remarks
+
+
+def test_a_run_that_missed_its_last_ticks_is_not_said_to_have_ended_early(flown):
+    recorded = flown(59.5)
+    for document, told in (
+        ({"status": "complete", "duration_s": 60.0}, "its last ticks were missed: the rerun ends"),
+        ({"status": "complete", "duration_s": 59.6}, "it ended early: so does the rerun"),
+        ({"status": "interrupted", "duration_s": 60.0}, "it ended early: so does the rerun"),
+    ):
+        write_json(recorded.run.run_json, document)
+
+        (remark,) = [each for each in carried_over(recorded).remarks if "59.5 s" in each]
+        assert remark.startswith(told)
 
 
 def test_a_run_in_real_time_that_came_to_its_end_is_not_stopped(flown):
