@@ -111,7 +111,6 @@ class AgentRunner:
         self._device_time = DeviceTime(seat.hardware, self._port)
         self.half = half = Half(program.make, self._journal.say)
         """The plug-in's part."""
-        reactor.end_if_forked()
         self._receive = half.simulation.receive  # called often: without a layer between
         self._spans = process.account.add
         self._pack = pack

@@ -103,7 +103,7 @@ class AgentProcess:
 
     def _make_runner(self, seat: LoopSeat) -> AgentRunner:
         life = self._lives.setdefault(seat.name, self._program.life)
-        return AgentRunner(
+        runner = AgentRunner(
             seat,
             self._launch,
             replace(self._program, life=life),
@@ -114,6 +114,8 @@ class AgentProcess:
             on_killed=self._killed,
             counted=self._counted.get(seat.name, {}),
         )
+        self._reactor.end_if_forked()
+        return runner
 
     # Faults that end an agent ---------------------------------------------------------------------
 
