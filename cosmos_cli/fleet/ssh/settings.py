@@ -34,7 +34,8 @@ TIME_UNITS_S = {"": 1, "s": 1, "m": 60, "h": 3600, "d": 86_400, "w": 604_800}
 CONNECT_TIMEOUT_S_MAX = 65_535
 
 _READING = threading.Lock()
-_TIME = re.compile(r"(?:[0-9]{1,9}[smhdw]?)+", re.IGNORECASE)
+# Without two ways to read one text: a long wrong one would be tried in all of them.
+_TIME = re.compile(r"(?:[0-9]{1,9}[smhdw])+(?:[0-9]{1,9})?|[0-9]{1,9}", re.IGNORECASE)
 _TIME_PART = re.compile(r"([0-9]+)([smhdw]?)", re.IGNORECASE)
 _HOP = re.compile(
     r"(?:ssh://)?(?:(?P<user>[^@]+)@)?(?P<host>\[[^]]+\]|[^:@]+)(?::(?P<port>\d+))?/?"
