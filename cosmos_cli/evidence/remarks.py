@@ -1,8 +1,8 @@
 """
 Remarks of the verdict, which decide nothing. Pure.
 
-On processors that kernels did not grant, on calls of the host's half that held its loop for long, and on records
-that a simulation did not declare.
+On processors that kernels did not grant, on calls of the host's half that held its loop for long, on messages that
+their receivers had no room for, and on records that a simulation did not declare.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from cosmos_cli.ui.name_ranges import compact
 from cosmos_cli.ui.plural import counted
 from madns_runtime.config import from_mapping
 from madns_runtime.errors import ConfigurationError
+from madns_runtime.medium.mailbox import HELD_MAX
 from madns_runtime.plugin.api import DeclaredStream
 from madns_runtime.recording.records import FRAMEWORK_STREAMS, Field
 
@@ -42,7 +43,19 @@ def result_remarks(
     return (
         *affinity_remarks(mapping_at(result, "agents")),
         *long_call_remarks(mapping_at(result, "host_calls")),
+        *mailbox_remarks(mapping_at(result, "between_agents")),
         *malformed_check_remarks(summaries),
+    )
+
+
+def mailbox_remarks(account: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the remark on messages between agents that were delivered and dropped; none if there were none."""
+    count = mapping_at(account, "receivers").get("no_room")
+    if not is_number(count) or count <= 0:
+        return ()
+    return (
+        f"between agents: {counted(int(count), 'message')} found no room at their receivers, each of which holds"
+        f" {HELD_MAX} until their times: they were dropped, though delivered",
     )
 
 

@@ -56,7 +56,7 @@ def _fitting(
 
 def _build(table: RecordedTable, chapter: Chapter, run: RecordedRun) -> Sequence[Block]:
     try:
-        return chapter.build(table, run)
+        return list(chapter.build(table, run))  # which does its work here, if it yields them
     except Exception as error:  # noqa: BLE001 - a figure of anybody's stream must not cost a run its report
         text = f"The figures of {table.name} could not be drawn: {type(error).__name__}: {error}"
         return [ReportRemark(text=text)]

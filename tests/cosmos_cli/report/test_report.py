@@ -220,17 +220,31 @@ def test_stream_of_ones_own_plug_in_gets_a_figure_for_each_number(tmp_path):
     assert figure.choices[0].marks[0].y.tolist() == [i * 0.5 for i in range(20)]
 
 
-def test_builder_that_fails_costs_a_remark_and_not_the_report(tmp_path, monkeypatch):
-    def fail(_table, _run):
-        raise ZeroDivisionError("no reason")
+def fails(_table, _run):
+    raise ZeroDivisionError("no reason")
 
-    monkeypatch.setitem(MACHINE_CHAPTERS, "clock", Chapter("Clock", fail))
+
+def fails_when_it_is_read(_table, _run):
+    yield ReportRemark(text="a first one")
+    raise ZeroDivisionError("no reason")
+
+
+@pytest.mark.parametrize(
+    ("builder", "told"),
+    [
+        (fails, "ZeroDivisionError: no reason"),
+        (fails_when_it_is_read, "ZeroDivisionError: no reason"),
+        (lambda _table, _run: ReportRemark(text="x"), "TypeError: 'ReportRemark' object is not"),
+        (lambda _table, _run: None, "TypeError: 'NoneType' object is not iterable"),
+    ],
+)
+def test_builder_that_fails_costs_a_remark_and_not_the_report(tmp_path, monkeypatch, builder, told):
+    monkeypatch.setitem(MACHINE_CHAPTERS, "clock", Chapter("Clock", builder))
 
     _, sections = build(SyntheticRun(tmp_path).write())
 
-    assert remarks(sections["Clock"]) == [
-        "The figures of clock could not be drawn: ZeroDivisionError: no reason"
-    ]
+    (remark,) = remarks(sections["Clock"])
+    assert remark.startswith(f"The figures of clock could not be drawn: {told}")
     assert "Round trips" in sections
 
 
