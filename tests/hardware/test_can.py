@@ -99,10 +99,13 @@ def test_frames_on_the_wire_are_the_kernels(kernel):
         assert frames(device, 1) == [frame(LONG, b"xyz")]
         assert device.read() is None
         assert device.health() == {"frames_lost": 0, "frames_left_out": 1}
-        state["lost"] = 7
+        state["lost"], counted = 7, {}
+        device.count = lambda name, number: counted.update({name: counted.get(name, 0) + number})
         other.send(struct.pack("=IB3x8s", ENGINE, 0, b""))
         assert frames(device, 1) == [frame(ENGINE, b"")]
         assert device.health()["frames_lost"] == 7
+        assert device.read() is None
+        assert counted == {"frames_lost": 7}
         device.make_safe()
         assert other.recv(100)[:7] == struct.pack("=IB2x", ENGINE, 2)
         assert other.recv(100)[:4] == struct.pack("=I", LONG)

@@ -32,6 +32,7 @@ class Request:
         self.config = config
         self.values = {o: s.output_value for o, s in config.items()}
         self.events: list[Event] = []
+        self.seen = dict.fromkeys(config, 0)
         self.fd, self._other = os.pipe()
         self.is_released = self.is_pulled_out = False
 
@@ -40,6 +41,8 @@ class Request:
             raise OSError(errno.ENODEV, "No such device")
 
     def happen(self, *events):
+        for event in events:
+            event.line_seqno = self.seen[event.line_offset] = self.seen[event.line_offset] + 1
         self.events += events
         os.write(self._other, b"x" * len(events))
 
@@ -126,6 +129,21 @@ def test_edges_come_in_order_at_the_kernels_times(requests):
         assert first.taken_s == pytest.approx(now_ns * 1e-9)
         assert frames(device, 1, "pps") == [0.0]
         assert device.read() is None
+
+
+def test_edges_for_which_the_kernel_had_no_room_are_counted(requests):
+    lines = [{"name": name, "offset": o, "mode": "edges"} for o, name in ((4, "pps"), (5, "key"))]
+    with opened("gpio", lines=lines) as device:
+        [request], _ = requests
+        counts = {}
+        device.count = lambda name, number: counts.update({name: counts.get(name, 0) + number})
+        request.happen(*(Event(4, True, number) for number in range(20)), Event(5, True, 30))
+        del request.events[:5]  # as the kernel, which keeps the newest
+        taken = frames(device, 15, "pps")
+        request.happen(Event(4, True, 40))
+        taken += frames(device, 1, "key") + frames(device, 1, "pps")
+
+    assert (len(taken), counts) == (17, {"edges_lost": 5})
 
 
 @pytest.mark.parametrize("mode", ["level", "output", "edges"])

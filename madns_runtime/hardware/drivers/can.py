@@ -69,6 +69,7 @@ class CanDevice(Device):
             MachineError: There is no such interface, or it is down.
         """
         self._bus: CanBus | None = None
+        self._lost = 0
         p = self.parameters
         self._bus = _open_bus(p)
         return str(p.interface)
@@ -82,6 +83,8 @@ class CanDevice(Device):
         """Return the next frame that has come."""
         assert self._bus is not None
         received = self._bus.receive()
+        self.count("frames_lost", self._bus.frames_lost - self._lost)
+        self._lost = self._bus.frames_lost
         if received is None:
             return None
         identifier, data = received

@@ -104,11 +104,13 @@ class GnssReceiver(Device):
         self._write_rest()
         if self._rest:  # of the epoch before: the line is too slow
             self._given_up += 1
+            self.count("epochs_given_up", 1)
             return
         sent = self._send(data)
         if sent < len(data) and self._other_fd >= 0:
             termios.tcflush(self._other_fd, termios.TCIFLUSH)
             self._overwritten += 1
+            self.count("epochs_overwritten", 1)
             sent = self._send(data)
         self._rest = data[sent:]
         self._epochs += 1

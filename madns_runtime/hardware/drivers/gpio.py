@@ -43,6 +43,8 @@ class GpioDevice(Device):
         self._all = [line.offset for line in p.lines]
         self._has_edges = any(line.mode == "edges" for line in p.lines)
         self._edges: list[Sample] = []
+        self._numbers = dict.fromkeys(self._all, 0)
+        """By offset: number of the newest edge, as the kernel counts all of a line."""
         path = p.chip if "/" in p.chip else _path_of(p.chip)
         try:
             self._request = gpiod.request_lines(
@@ -137,9 +139,13 @@ class GpioDevice(Device):
         return MachineError(f"{self.parameters.chip} is gone: {error.strerror}")
 
     def _edge(self, event: Any) -> Sample:
+        offset = event.line_offset
+        # The kernel keeps 16 edges per line, and forgets the oldest of more.
+        self.count("edges_lost", max(0, event.line_seqno - self._numbers[offset] - 1))
+        self._numbers[offset] = event.line_seqno
         is_rising = event.event_type == gpiod.EdgeEvent.Type.RISING_EDGE
         taken_s = event.timestamp_ns * 1e-9  # of CLOCK_MONOTONIC, as asked for
-        return Sample(values={self._names[event.line_offset]: float(is_rising)}, taken_s=taken_s)
+        return Sample(values={self._names[offset]: float(is_rising)}, taken_s=taken_s)
 
     def _settings(self, line: GpioLine) -> Any:
         kinds = gpiod.line
