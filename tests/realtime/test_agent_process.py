@@ -26,7 +26,9 @@ def test_an_agent_that_returns_is_given_what_its_conditions_had_counted(monkeypa
         )
 
     monkeypatch.setattr(agent_process, "AgentRunner", make)
-    reactor = SimpleNamespace(now_s=lambda: 0.0, call_at=lambda due_s, call: call())
+    reactor = SimpleNamespace(
+        now_s=lambda: 0.0, call_at=lambda due_s, call: call(), end_if_forked=lambda: None
+    )
     seat = SimpleNamespace(name="a")
     program = RoleProgram(make=object, parameters=None)
     process = AgentProcess.__new__(AgentProcess)
@@ -48,7 +50,7 @@ def test_every_pack_of_a_process_is_timed_anew_with_the_clock_that_they_share(mo
     monkeypatch.setattr(agent_process, "AgentRunner", lambda seat, *_, **more: more["pack"])
     config = SimpleNamespace(agents=Agents(count=9, tick_hz=10.0, per_process=9))
     process = AgentProcess.__new__(AgentProcess)
-    process._reactor = SimpleNamespace(call_at=lambda due_s, call: None)
+    process._reactor = SimpleNamespace(call_at=lambda due_s, call: None, end_if_forked=lambda: None)
     process._launch = SimpleNamespace(config=config)
     process._seats = [SimpleNamespace(name=name) for name in config.agents.resolved_names()]
     process._program = RoleProgram(make=object, parameters=None)
