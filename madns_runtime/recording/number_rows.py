@@ -46,7 +46,9 @@ class NumberRows:
     def rounded(self, row: Sequence[Any]) -> list[Any]:
         """Return one record as it is encoded."""
         return [
-            round(float(value), places) if isinstance(value, float) else value
+            round(float(value), places)
+            if isinstance(value, float) and places is not None
+            else value  # of an int a float is no value, as elsewhere
             for value, places in zip(row, self._digits, strict=True)
         ]
 

@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import NoneType
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -314,11 +315,16 @@ def _transpose(rows: list[Any], names: tuple[str, ...], *, is_array: bool) -> di
     return {name: [row.get(name) for row in rows] for name in names}
 
 
+_NUMBERS = frozenset({float, int, bool, NoneType})
+
+
 def _column(values: list[Any], kind: str) -> NDArray[Any]:
+    # NumPy would take a text for its number, and a list for a row.
+    is_number = kind in ("float", "int") and _NUMBERS.issuperset(map(type, values))
     try:
-        if kind == "float":
+        if kind == "float" and is_number:
             return np.array(values, dtype=np.float64)
-        if kind == "int":
+        if kind == "int" and is_number:
             return _int_column(values)
         if kind == "bool" and all(type(value) is bool for value in values):
             return np.array(values, dtype=np.bool_)

@@ -49,6 +49,10 @@ def test_many_rows_are_the_lines_that_each_row_is_by_itself():
     assert (not_finite, rows.waiting) == (0, [])
 
 
+def test_a_broken_number_of_an_int_is_recorded_as_it_came_and_not_rounded():
+    assert NumberRows(DIGITS).rounded((1.5, 0.12345678, 2)) == [1.5, 0.123457, 2]
+
+
 def test_what_is_not_finite_is_null_and_counted():
     rows = NumberRows(DIGITS)
     rows.waiting = [(0, float("nan"), 1.0), (1, float("inf"), -float("inf")), (2, 0.5, 0.25)]

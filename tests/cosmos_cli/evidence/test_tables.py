@@ -136,6 +136,20 @@ def test_value_that_is_not_of_its_kind_is_null_and_reported(tmp_path):
     assert found.faults[0].startswith("tables/odd.parquet: 3 recorded values")
 
 
+@pytest.mark.parametrize("value", [np.array([1.0]), [[1.0, 2.0]], "1.5", {"a": 1}])
+def test_a_value_of_another_shape_costs_no_other_field_its_table(tmp_path, value):
+    made = SyntheticRun(tmp_path)
+    schema = StreamSchema("odd", (Field("n", "", "int"), Field("x", "m"), Field("m", "", "int")))
+    record(made, "agent-01", schema, [(number, value, value) for number in range(4)])
+
+    found = gather(made.run, 10.0, quiet)
+
+    table = pq.read_table(made.run.tables / "odd.parquet").to_pydict()
+    assert table["n"] == [0, 1, 2, 3]
+    assert table["x"] == table["m"] == [None] * 4
+    assert found.faults[0].startswith("tables/odd.parquet: 8 recorded values")
+
+
 def test_ticks_get_their_simulated_time(tmp_path):
     made = SyntheticRun(tmp_path, make_config(2, ticks=30, tick_hz=10.0)).write()
 
