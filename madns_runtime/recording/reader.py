@@ -319,13 +319,9 @@ _NUMBERS = frozenset({float, int, bool, NoneType})
 
 
 def _column(values: list[Any], kind: str) -> NDArray[Any]:
-    # NumPy would take a text for its number, and a list for a row.
-    is_number = kind in ("float", "int") and _NUMBERS.issuperset(map(type, values))
     try:
-        if kind == "float" and is_number:
-            return np.array(values, dtype=np.float64)
-        if kind == "int" and is_number:
-            return _int_column(values)
+        if kind in ("float", "int"):
+            return _number_column(values, np.float64 if kind == "float" else np.int64)
         if kind == "bool" and all(type(value) is bool for value in values):
             return np.array(values, dtype=np.bool_)
     except (TypeError, ValueError, OverflowError):
@@ -335,10 +331,18 @@ def _column(values: list[Any], kind: str) -> NDArray[Any]:
     return column
 
 
-def _int_column(values: list[Any]) -> NDArray[Any]:
+def _number_column(values: list[Any], wanted: type[np.float64 | np.int64]) -> NDArray[Any]:
+    """
+    Return numbers as an array, whole ones as floats where there are others among them, or none in a place.
+
+    Raises:
+        ValueError: A value is no number: NumPy would take a text for its number, and a list for a row.
+    """
     if not values:
-        return np.empty(0, dtype=np.int64)
+        return np.empty(0, dtype=wanted)
     column = np.array(values)
-    if column.dtype.kind in "ib":
-        return column.astype(np.int64, copy=False)
+    if column.ndim == 1 and column.dtype.kind in ("ib" if wanted is np.int64 else "fib"):
+        return column.astype(wanted, copy=False)
+    if not _NUMBERS.issuperset(map(type, values)):
+        raise ValueError("a value is no number")
     return np.array(values, dtype=np.float64)
