@@ -119,6 +119,19 @@ def test_a_sample_that_was_overtaken_is_counted():
     assert bench.suite.summary()["gyro"]["skipped"] == 2
 
 
+def test_a_sensor_is_silent_that_was_read_and_never_gave_anything():
+    bench = Bench(gyro())
+    found = [bench.suite.silent()]
+    bench.step(1)
+    found.append(bench.suite.silent())
+    bench.device.give((1.0, 0.0, 0.0), 0.15)
+    bench.step(2)
+    found.append(bench.suite.silent())
+
+    assert found == [[], ["gyro"], []]
+    assert Bench({"gyro": {"noise": 1e-3}}).suite.silent() is None
+
+
 @pytest.mark.parametrize("status", ["never", "stale", "lost"])
 def test_a_device_that_is_not_well_gives_no_reading_and_is_counted(status):
     bench = Bench(gyro())

@@ -45,10 +45,12 @@ class DeviceSensor:
         self._scene, self._history = surroundings
         self._record = context.record
         self._samples = 0
+        self._is_read = False
         context.open_stream(self._stream, OF_AGENTS[self._stream])
 
     def read(self, tick: int, t_s: float) -> Reading | None:
         """Return and record the device's newest sample if it is a fresh one; called once in a tick."""
+        self._is_read = True
         reading = self._source.take()
         self.news = [] if reading is None else [reading]
         if reading is not None:
@@ -61,6 +63,11 @@ class DeviceSensor:
                 self._beside.add(tick, reading.t_s)
         self._beside.settle(self._history, self._scene)
         return reading
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether it was read, and never gave anything."""
+        return self._is_read and not self._samples
 
     def counts(self) -> dict[str, int]:
         """Return what became of the device's samples."""

@@ -259,7 +259,7 @@ class SensorSuite:
         if not self._has_devices:
             return None
         devices = (sensor for sensor in self._sensors if isinstance(sensor, DeviceSensor))
-        return [sensor.name for sensor in devices if not sensor.counts()["samples"]]
+        return [sensor.name for sensor in devices if sensor.is_silent]
 
     def summary(self) -> dict[str, dict[str, int]]:
         """Return counts by sensor."""
