@@ -21,7 +21,7 @@ from madns_runtime.protocol.codec import (
     encode_data,
     encode_message,
 )
-from madns_runtime.protocol.datagram import BEST_BYTES_MAX
+from madns_runtime.protocol.datagram import BEST_BYTES_MAX, MESSAGE_BYTES_MAX
 from madns_runtime.protocol.link_settings import LinkLimits, SendQueueFull
 from madns_runtime.protocol.messages import (
     ActionOrder,
@@ -35,6 +35,8 @@ from madns_runtime.recording.run_journal import RunJournal
 
 BEST: Final = Service.BEST
 QUEUE_BYTES_MAX: Final = LinkLimits().send_queue_bytes_max
+LARGEST_BYTES: Final = min(QUEUE_BYTES_MAX, MESSAGE_BYTES_MAX)
+"""Of one message, as between machines."""
 
 
 def encode(message: Any, service: Service) -> bytes:
@@ -90,9 +92,9 @@ class Allowance:
             self._t_s, self._bytes, self._count = t_s, 0, 0
         self._bytes += size
         self._count += 1
-        if size > QUEUE_BYTES_MAX:
+        if size > LARGEST_BYTES:
             raise MessageTooLarge(
-                f"expected a message of at most {QUEUE_BYTES_MAX} bytes, got {size}; send it in parts"
+                f"expected a message of at most {LARGEST_BYTES} bytes, got {size}; send it in parts"
             )
         if self._bytes > QUEUE_BYTES_MAX or self._count > MESSAGES_QUEUED_MAX:
             raise SendQueueFull(

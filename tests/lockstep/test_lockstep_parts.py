@@ -13,11 +13,12 @@ from madns_runtime.errors import MachineError, MessageTooLarge, PeerError
 from madns_runtime.lockstep import frames, workers
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.frames import FRAME_BYTES_MAX, HEAD, FrameReader, encode_frame
-from madns_runtime.lockstep.messages import QUEUE_BYTES_MAX, Allowance, decode, encode
+from madns_runtime.lockstep.messages import LARGEST_BYTES, Allowance, decode, encode
 from madns_runtime.lockstep.partition import share_out
 from madns_runtime.lockstep.recorder import open_journal
 from madns_runtime.lockstep.result import EarlyEnd, RunAccount
 from madns_runtime.lockstep.workers import WorkerProcess, Workers
+from madns_runtime.protocol.datagram import MESSAGE_BYTES_MAX
 from madns_runtime.protocol.link_settings import SendQueueFull
 from madns_runtime.protocol.messages import Service
 from madns_runtime.recording import stream_file
@@ -70,12 +71,14 @@ def test_a_telemetry_message_must_fit_a_datagram_here_too():
 
 def test_what_is_sent_at_one_simulated_time_has_a_bound():
     allowance = Allowance()
-    allowance.take(QUEUE_BYTES_MAX, 1.0)
+    allowance.take(LARGEST_BYTES, 1.0)
+    allowance.take(LARGEST_BYTES, 1.0)
     with pytest.raises(SendQueueFull):
-        allowance.take(1, 1.0)
-    allowance.take(QUEUE_BYTES_MAX, 1.5)
+        allowance.take(3, 1.0)
+    allowance.take(LARGEST_BYTES, 1.5)
     with pytest.raises(MessageTooLarge):
-        Allowance().take(QUEUE_BYTES_MAX + 1, 1.0)
+        Allowance().take(LARGEST_BYTES + 1, 1.0)
+    assert LARGEST_BYTES == MESSAGE_BYTES_MAX, "as between machines"
 
 
 def config(**changes):
