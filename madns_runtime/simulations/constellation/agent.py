@@ -327,7 +327,7 @@ class ConstellationAgent(AgentSimulation):
         }
 
     def _silence_checks(self) -> list[dict[str, Any]]:
-        """Return the check of sensors that are devices: one that gave nothing left flight software blind in a run that passed."""
+        """Return the check of sensors that are devices: one that gave nothing, as others of its device did, left flight software blind."""
         silent = None if self._sensors is None else self._sensors.silent()
         if silent is None:
             return []

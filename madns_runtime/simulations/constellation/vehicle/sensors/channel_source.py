@@ -61,6 +61,8 @@ class ChannelSource:
         self._correct = _correction(name, settings, factors, scene)
         self._now_s = context.now_s
         self._number = 0
+        self.was_ok = False
+        """Whether the device gave samples, of this channel or of others, at some tick."""
         self.skipped = 0
         """Samples of which a newer one was there before any tick looked."""
         self.absent = 0
@@ -79,6 +81,7 @@ class ChannelSource:
         """Return the newest sample as a reading; None if it is no fresh one, or was returned before."""
         newest = [self._device[name] for name in self._names]
         first = newest[0]
+        self.was_ok = self.was_ok or first.status == "ok"
         if first.status != "ok" or not first.number:
             self.absent += 1
             return None

@@ -45,12 +45,10 @@ class DeviceSensor:
         self._scene, self._history = surroundings
         self._record = context.record
         self._samples = 0
-        self._is_read = False
         context.open_stream(self._stream, OF_AGENTS[self._stream])
 
     def read(self, tick: int, t_s: float) -> Reading | None:
         """Return and record the device's newest sample if it is a fresh one; called once in a tick."""
-        self._is_read = True
         reading = self._source.take()
         self.news = [] if reading is None else [reading]
         if reading is not None:
@@ -66,8 +64,8 @@ class DeviceSensor:
 
     @property
     def is_silent(self) -> bool:
-        """Whether it was read, and never gave anything."""
-        return self._is_read and not self._samples
+        """Whether it never gave anything, though its device was there: for one that was not the limits of devices hold."""
+        return self._source.was_ok and not self._samples
 
     def counts(self) -> dict[str, int]:
         """Return what became of the device's samples."""

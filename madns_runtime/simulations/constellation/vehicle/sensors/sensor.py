@@ -255,7 +255,7 @@ class SensorSuite:
         return {sensor.name: sensor.news for sensor in self._sensors if sensor.news}
 
     def silent(self) -> list[str] | None:
-        """Return the sensors that are devices and gave no reading at all; None where all are models."""
+        """Return the sensors whose devices were there and which gave no reading at all; None where all are models."""
         if not self._has_devices:
             return None
         devices = (sensor for sensor in self._sensors if isinstance(sensor, DeviceSensor))
