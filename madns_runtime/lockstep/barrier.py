@@ -244,7 +244,10 @@ class Meeting:
             return
         if kind == frames.FAILED and worker.answer is not None:  # it was not asked
             self.end(self._account.names[frame[1]], frame[2])
-        worker.answer = frame
+        if worker.answer is None or worker.answer[0] != frames.FAILED:
+            worker.answer = (
+                frame  # a process that came back told its failure before the worker answered
+            )
         if self._crew.awaited is None:
             self.reactor.stop()
 

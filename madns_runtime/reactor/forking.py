@@ -11,10 +11,13 @@ import sys
 from typing import Final, NoReturn
 from weakref import WeakSet
 
+from madns_runtime.timing.granted_clock import GrantedLimit
+
 CAME_BACK: Final = (
     "forked a process that came back from the call; let such a process end itself by os._exit(0)"
 )
 """Said of a plug-in's method: two processes would go on as the same one."""
+LOOK_MS: Final = 50
 _exit = os._exit
 """The true one: a plug-in may put another in its place."""
 _generation = 0
@@ -47,13 +50,20 @@ class ForkedCopies:
         _watched.add(self)
 
     def wait_until_gone(self, limit_s: float) -> bool:
-        """Wait until there is none, at most so long, and return whether that is so; those forked later are not known."""
+        """
+        Wait until there is none, and return whether that is so; those forked later are not known.
+
+        Args:
+            limit_s: How long to wait, in time in which no process of this one's was kept from a processor.
+        """
         if self._read_fd < 0 or os.getpid() != self._pid:
             return True
         os.close(self._held_fd)
         poll = select.poll()
         poll.register(self._read_fd, 0)  # its hang-up is told unasked
-        is_gone = bool(poll.poll(limit_s * 1e3))
+        limit, is_gone = GrantedLimit(limit_s), False
+        while not is_gone and not limit.is_over():
+            is_gone = bool(poll.poll(LOOK_MS))
         os.close(self._read_fd)
         self._read_fd = self._held_fd = -1
         return is_gone

@@ -5,12 +5,14 @@ import json
 import os
 import socket
 import subprocess
+from types import SimpleNamespace
 
 import pytest
 
-from madns_runtime.config import Agents, RunConfig, TimeSettings
+from madns_runtime.config import Agents, RunConfig, Timeouts, TimeSettings
 from madns_runtime.errors import MachineError, MessageTooLarge, PeerError
 from madns_runtime.lockstep import frames, workers
+from madns_runtime.lockstep.barrier import Meeting
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.frames import FRAME_BYTES_MAX, HEAD, FrameReader, encode_frame
 from madns_runtime.lockstep.messages import LARGEST_BYTES, Allowance, decode, encode
@@ -191,3 +193,23 @@ def test_a_run_on_a_full_disk_still_comes_to_its_end(tmp_path, monkeypatch):
 
     assert counts.dropped > 60
     assert "No space left on device" in counts.errors[0]
+
+
+def test_a_failure_stands_whatever_its_worker_answers_behind_it():
+    """As a process that came back from a plug-in's call tells it, and the worker itself its order, in one reading."""
+    heard = []
+    crew = SimpleNamespace(
+        listen=lambda reactor, *, on_frame, on_lost: heard.append(on_frame), awaited=None
+    )
+    launch = SimpleNamespace(config=SimpleNamespace(timeouts=Timeouts()), is_detached=False)
+    fds = os.pipe()
+    meeting = Meeting(launch, crew, account=None, clock=SimulatedClock(0.0), fds=fds, pending=b"")
+    worker = SimpleNamespace(answer=None)
+
+    heard[0](worker, [frames.FAILED, 3, "it forked"])
+    heard[0](worker, [frames.DONE, [], []])
+
+    assert worker.answer == [frames.FAILED, 3, "it forked"]
+    meeting.reactor.close()
+    for fd in fds:
+        os.close(fd)
