@@ -7,7 +7,7 @@ import subprocess
 import time
 
 import pytest
-from ssh_harness import target_of
+from ssh_harness import needs_sshd, target_of
 from sshd import Sshd
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
@@ -135,6 +135,7 @@ class LateStream:
 def test_account_without_commands_that_is_gone_before_the_helper_is_sent_is_told(
     tmp_path, known_hosts, monkeypatch
 ):
+    needs_sshd()
     says = "ForceCommand echo This account is currently not available.; exit 1"
     with Sshd(tmp_path / "nologin", extra=says) as server:
         known_hosts.write_text(server.known_hosts_line())
