@@ -181,7 +181,7 @@ print("{}", flush=True)
 """
     command = program(tmp_path, body)
     with Ship(tmp_path, command, crosslinks={}, flight={"settings": {"k": [1.0]}}) as ship:
-        message = Delivery(sender="agent-02", sent_s=0.0, arrives_s=0.0, payload={"b": b"\x00"})
+        message = Delivery(sender="agent-02", sent_s=-0.5, arrives_s=0.0, payload={"b": b"\x00"})
         result = CommandResult(number=4, status="refused", at_s=1.0, revision=0, reason="no fuel")
         refusal = TransmissionRefusal(number=1, to="*", sent_s=0.0, reason="no_line_of_sight")
         for one in (message, result.to_message(), refusal):
@@ -208,7 +208,7 @@ print("{}", flush=True)
     assert tick["messages"] == [
         {
             "sender": "agent-02",
-            "sent_s": 0.0,
+            "sent_s": -0.5,
             "arrives_s": 0.0,
             "payload": {"b": {"base64": "AA=="}},
         }
