@@ -281,7 +281,7 @@ class AgentRunner:
         self._session.ping_slack_s = min(2 * self._ticks.period_s, PING_SLACK_S_MAX)
         self._ticks.begin(now_s)
         self._pack.arm()
-        self._records.begin_usage(monotonic())
+        self._records.begin_usage(monotonic(), self._pack.phase_s / self._ticks.period_s)
         self._device_time.tell()
         self._usage_timer.reschedule(self._records.usage_due_s + self._session.ping_slack_s)
 

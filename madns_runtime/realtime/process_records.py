@@ -60,10 +60,17 @@ class ProcessRecords:
             ),
         )
 
-    def begin_usage(self, now_s: float) -> None:
-        """Count what this process uses from now on."""
+    def begin_usage(self, now_s: float, share: float) -> None:
+        """
+        Count what this process uses from now on.
+
+        Args:
+            now_s: Local time, s.
+            share: Of the period by which the first record comes earlier, 0 to 1: those of a machine's processes at one
+                time would keep each other's ticks waiting.
+        """
         self._usage = ProcessUsage()
-        self.usage_due_s = now_s + self._usage_period_s
+        self.usage_due_s = now_s + self._usage_period_s * (1.0 - share)
 
     def usage(self, now_s: float) -> None:
         """Record what this process has used since the last time."""
