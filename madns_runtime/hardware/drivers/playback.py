@@ -25,7 +25,7 @@ class PlaybackDevice(SimulatedDevice):
         """Begin the recording."""
         start_s, has_ticks = self.parameters.start_s, self.parameters.tick_hz is not None
         found_at = _finder(self.parameters)
-        self._samples = heapq.merge(
+        self._samples: Iterator[tuple[float, Sample]] = heapq.merge(
             *(
                 self._samples_of(channel, path, start_s, found_at, has_ticks=has_ticks)
                 for channel, path in streams_of(self.parameters.directory)
@@ -35,6 +35,10 @@ class PlaybackDevice(SimulatedDevice):
         )
         self._next = next(self._samples, None)
         return str(self.parameters.directory)
+
+    def close(self) -> None:
+        """Close the recording's files: its samples refer to this device, and would keep them open."""
+        self._samples, self._next = iter(()), None
 
     def _samples_of(
         self,
