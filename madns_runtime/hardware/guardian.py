@@ -71,8 +71,9 @@ class Guardian:
         self._drivers: dict[str, int] = {}
         """By device: process that drives it."""
         self._attempts: dict[str, int] = {}
-        self._helpers: dict[int, str] = {}
-        self._standing_by: dict[str, tuple[int, int]] = {}
+        self._helpers: dict[int, tuple[str, socket.socket]] = {}
+        """By process that makes a device safe: the device, and where it says that it is done."""
+        self._standing_by: dict[str, tuple[int, socket.socket]] = {}
         """By device: the process that stands by for it, and where it is told to go on."""
         self._retries = 0
         """Attempts that are still to be made."""
@@ -172,23 +173,22 @@ class Guardian:
         """Open a device anew in a process of its own, for `make_safe` alone."""
         self._attempts[name] = self._attempts.get(name, 0) + 1
         self._stand_by(name)
-        pid, go_fd = self._standing_by.pop(name)
-        self._helpers[pid] = name
-        with contextlib.suppress(BrokenPipeError):  # its end is seen by its exit code
-            os.write(go_fd, b"!")
-        os.close(go_fd)
+        pid, line = self._standing_by.pop(name)
+        self._helpers[pid] = name, line
+        with contextlib.suppress(OSError):  # its end is seen by itself
+            line.send(b"!")
         self._reactor.call_at(monotonic() + ATTEMPT_S, lambda: self._give_up(pid))
 
     def _stand_by(self, name: str) -> None:
         """Have a process ready that has imported the driver, if there is none."""
         if name in self._standing_by:
             return
-        read_fd, go_fd = os.pipe()
+        line, child_line = socket.socketpair()
         pid = os.fork()
         if pid == 0:
-            _open_and_make_safe(self._seats[name], read_fd)
-        os.close(read_fd)
-        self._standing_by[name] = pid, go_fd
+            _open_and_make_safe(self._seats[name], child_line)
+        child_line.close()
+        self._standing_by[name] = pid, line
 
     def _make_safe_again(self, name: str) -> None:
         self._retries -= 1
@@ -201,20 +201,21 @@ class Guardian:
 
     def _reap_standing_by(self) -> None:
         """Forget those whose driver failed before it was wanted: it is tried anew when it is."""
-        for name, (pid, go_fd) in list(self._standing_by.items()):
+        for name, (pid, line) in list(self._standing_by.items()):
             if os.waitpid(pid, os.WNOHANG)[0]:
-                os.close(go_fd)
+                line.close()
                 del self._standing_by[name]
 
     def _reap(self) -> None:
         self._reap_standing_by()
         for pid in list(self._helpers):
-            ended, status = os.waitpid(pid, os.WNOHANG)
-            if not ended:
+            if not os.waitpid(pid, os.WNOHANG)[0]:
                 continue
-            name = self._helpers.pop(pid)
+            name, line = self._helpers.pop(pid)
             header = self._seats[name].page.header
-            if os.waitstatus_to_exitcode(status) in (0, -signal.SIGALRM):
+            with line:
+                is_safe = _has_said_so(line)
+            if is_safe:
                 header[page.SAFE_COUNT] += 1
                 messages.send(self._control, [SAFE, name, "made safe by the guardian"])
                 continue
@@ -231,14 +232,21 @@ class Guardian:
             self._reactor.stop()
 
 
-def _open_and_make_safe(seat: DeviceSeat, go_fd: int) -> None:
-    """Make the driver, wait for the word, and do it; end the process with 0 if it was done."""
-    code = 1
+def _has_said_so(line: socket.socket) -> bool:
+    """Tell whether a process that has ended said before that its device is safe: how it ended tells less."""
+    try:
+        return bool(line.recv(1, socket.MSG_DONTWAIT))
+    except OSError:
+        return False
+
+
+def _open_and_make_safe(seat: DeviceSeat, line: socket.socket) -> None:
+    """Make the driver, wait for the word, do it, and say so when it is done; ends the process."""
     try:
         die_with_parent()
-        leave_parent(keep={go_fd})
+        leave_parent(keep={line.fileno()})
         device = seat.make()
-        if not os.read(go_fd, 1):
+        if not line.recv(1):
             return  # the guardian has ended, and all is safe
         outlive_parent()
         try:
@@ -247,7 +255,7 @@ def _open_and_make_safe(seat: DeviceSeat, go_fd: int) -> None:
             # Before it is done: what a process that was started anew moves meanwhile is not taken for safe.
             seat.page.header[page.MOVED] = 0.0
             device.make_safe()
-            code = 0
+            line.send(b"!", socket.MSG_NOSIGNAL)
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
             signal.setitimer(signal.ITIMER_REAL, CLOSE_S)
         finally:
@@ -255,4 +263,4 @@ def _open_and_make_safe(seat: DeviceSeat, go_fd: int) -> None:
     except BaseException as error:  # noqa: BLE001 - a driver may raise anything
         traceback.print_exception(error)
     finally:
-        os._exit(code)
+        os._exit(0)

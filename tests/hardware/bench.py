@@ -20,7 +20,7 @@ from madns_runtime.reactor.reactor import Reactor
 
 AGENT = "agent-01"
 DRIVER = """
-import os, time, tty
+import os, signal, time, tty
 from dataclasses import dataclass
 
 from madns_runtime.hardware.contract import Channel, Device, DeviceKind, Sample
@@ -76,6 +76,9 @@ class Line(Device):
     def make_safe(self):
         self.say("SAFE")
         self._raise("make_safe")
+        if self.parameters.raises == "alarm":
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+            signal.raise_signal(signal.SIGALRM)
 
     def close(self):
         time.sleep(self.parameters.close_s)

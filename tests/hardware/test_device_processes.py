@@ -219,6 +219,17 @@ def test_a_driver_that_raises_at_writing_and_making_safe_leaves_the_rest_to_the_
     assert any("Line.make_safe raised ValueError" in why for why in whys)
 
 
+def test_a_driver_that_an_alarm_of_its_own_ends_while_it_makes_safe_is_not_taken_for_safe(tmp_path):
+    with line_bench(tmp_path, raises="alarm") as (bench, terminal):
+        bench.until(lambda: bench.hardware["line"].status == "ok")
+        bench.hardware["line"].write("valve", 1.0)
+        bench.until(lambda: "VALVE 1" in terminal.heard())
+        result = bench.close()["pi22/line"]
+        assert terminal.heard().count("SAFE") == 1 + ATTEMPTS_MAX
+    assert result["unsafe"] == 1
+    assert "could not be made safe" in result["why"]
+
+
 def test_another_device_in_its_place_is_a_fault(tmp_path):
     with line_bench(tmp_path, launch={"serial": "line-2"}) as (bench, terminal):
         bench.until(lambda: bench.hardware["line"].status == "lost")
