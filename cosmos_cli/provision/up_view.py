@@ -129,8 +129,18 @@ class UpView:
     def __enter__(self) -> UpView:
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
         self.close()
+        if kind is KeyboardInterrupt:
+            self._tell_interrupted()
+
+    def _tell_interrupted(self) -> None:
+        """Say how far it came, and that nothing is lost."""
+        with self._lock:
+            done = f"{len(self._done)} of {counted(len(self._lines), 'machine')} done"
+            still = _still(self._lines, self._done)
+            self._console.say(f"{done}; {still}" if still else done)
+            self._console.say("the same command goes on from there: what is done is not done again")
 
     def _draw_if_due(self) -> None:
         now_s = self._now_s()

@@ -182,6 +182,20 @@ def test_who_is_still_at_work_is_told_now_and_then_machines_at_the_same_together
     ]
 
 
+def test_interrupt_tells_how_far_it_came_and_how_to_go_on(monkeypatch):
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    with pytest.raises(KeyboardInterrupt), UpView(Console(), ["a", "b", "c"]) as view:
+        view.done("a", "ok")
+        view.teller("b").step("package htop: install")
+        raise KeyboardInterrupt
+
+    assert stream.getvalue().splitlines()[1:] == [
+        "1 of 3 machines done; b: package htop: install; c: waiting for its answer",
+        "the same command goes on from there: what is done is not done again",
+    ]
+
+
 def test_quiet_view_says_nothing(monkeypatch):
     stream = io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
