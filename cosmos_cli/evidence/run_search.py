@@ -64,12 +64,14 @@ def _find(root: Path, which: str) -> RunDirectory:
         )
     if root == Path(RUNS_FOLDER):
         elsewhere = find_elsewhere(which)
-        if len(elsewhere) == 1:
+        paths = [str(run.path) for run in elsewhere]
+        if _holds_run(Path(which)) and str(Path(which).resolve()) not in paths:
+            paths.insert(0, os.path.join(".", which))  # as one that was unpacked
+        if len(elsewhere) == len(paths) == 1:
             return elsewhere[0]
         if elsewhere:
-            paths = ", ".join(str(run.path) for run in elsewhere)
             raise InputError(
-                f"{which}: not in {root}, and several elsewhere; give the path: {paths}"
+                f"{which}: not in {root}, and several elsewhere; give the path: {', '.join(map(shlex.quote, paths))}"
             )
     _refuse_other(root, which)
     known = ", ".join(run.name for run in runs[-5:]) or "none yet"

@@ -53,6 +53,18 @@ def test_number_that_fits_runs_in_two_other_folders_asks_for_the_path(tmp_path: 
     assert find_run(Path("runs"), str(second.path)) == second
 
 
+def test_unpacked_run_here_is_not_passed_over_for_one_of_its_name_elsewhere(tmp_path: Path) -> None:
+    first = create_run(tmp_path / "runs", "x")
+    shutil.copytree(first.path, "0001-x")
+
+    with pytest.raises(InputError, match="give the path") as refused:
+        find_run(Path("runs"), "0001-x")
+
+    assert str(refused.value).endswith(f"./0001-x, {first.path}")
+    assert find_run(Path("runs"), "./0001-x").path == Path("0001-x").resolve()
+    assert find_run(first.path.parent, "0001-x") == first
+
+
 def test_run_whose_directory_is_gone_is_forgotten(tmp_path: Path) -> None:
     gone, kept = create_run(tmp_path / "a", "x"), create_run(tmp_path / "b", "y")
     shutil.rmtree(gone.path)
