@@ -1,10 +1,10 @@
 """
 The supervision of a run, as one pure object: it takes events and the time, and returns actions.
 
-It starts the host, then one supervisor per machine, passes on whose process died, gives a machine that
-returns its agents again, and is over only when no process of the run lives: first they are asked to stop,
-then ended by force (`Children`). Every wait is a moment on its agenda. No clock, socket or process here:
-the operator's loop carries out what it returns.
+It starts the host, then one supervisor per machine, passes on whose process died, gives a machine that returns its
+agents again, and is over only when no process of the run lives: first they are asked to stop, then ended by force
+(`Children`). Every wait is a moment on its agenda. No clock, socket or process here: the operator's loop carries out
+what it returns.
 """
 
 from __future__ import annotations
@@ -210,7 +210,8 @@ class Supervision:
             self._host_finished(event.result)
 
     def _host_finished(self, result: Mapping[str, Any] | None) -> None:
-        self.host_result = result
+        told = self.host_result or {}  # by a copy of the host that its plug-in forked
+        self.host_result = told if told.get("status") == "failed" else result
         self._has_host_finished = True
         self._close_down(grace_s=STOP_GRACE_S)
 

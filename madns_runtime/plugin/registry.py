@@ -41,6 +41,7 @@ from madns_runtime.plugin.descriptor_faults import descriptor_faults
 from madns_runtime.plugin.entry_points import place_of_name, registered
 from madns_runtime.plugin.isolation import is_interruption, missing_extra, said
 from madns_runtime.plugin.time_limit import hold
+from madns_runtime.reactor.forking import CAME_BACK, generation
 
 GROUP = "madns.simulations"
 PARTS = (
@@ -231,12 +232,15 @@ def load_object(where: str, base_directory: Path) -> tuple[ModuleType, Any]:
     place, _, attribute = where.rpartition(":")
     if not place or not attribute.isidentifier():
         raise PluginError(f"{where!r}: expected module:attribute or ./file.py:attribute")
+    forks = generation()
     if is_file(where):
         module = _load_file(base_directory / place, where)
     elif place.startswith(MODULE_PREFIX) and place in sys.modules:
         module = sys.modules[place]
     else:
         module = _load_module(place, where)
+    if generation() != forks:  # this is the copy: it would go on as its parent does
+        raise PluginError(f"{told_place(where)}: when it was imported, it {CAME_BACK}")
     return module, _attribute(module, attribute, where)
 
 

@@ -441,3 +441,37 @@ def test_a_field_of_a_descriptor_that_is_no_such_value_is_told(write, tmp_path, 
     )
 
     assert told in refusal("./plugin.py:simulation", tmp_path)
+
+
+LOADING = """
+import os, sys
+from pathlib import Path
+from madns_runtime.errors import PluginError
+from madns_runtime.plugin.registry import load_object
+
+parent = os.getpid()
+try:
+    load_object("./forking.py:Half", Path(sys.argv[1]))
+except PluginError as error:
+    os.write(1, f"{error}\\n".encode())
+else:
+    os.write(1, f"loaded in the {'parent' if os.getpid() == parent else 'copy'}\\n".encode())
+"""
+
+
+@pytest.mark.process
+def test_a_module_that_forks_is_loaded_in_the_parent_and_refused_in_the_copy_that_came_back(
+    tmp_path,
+):
+    (tmp_path / "forking.py").write_text("import os\n\nos.fork()\n\n\nclass Half:\n    pass\n")
+
+    done = subprocess.run(
+        [sys.executable, "-c", LOADING, tmp_path], capture_output=True, text=True, timeout=120
+    )
+
+    assert done.stderr == ""
+    assert sorted(done.stdout.splitlines()) == [
+        "./forking.py:Half: when it was imported, it forked a process that came back from the call;"
+        " let such a process end itself by os._exit(0)",
+        "loaded in the parent",
+    ]

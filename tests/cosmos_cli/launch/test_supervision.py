@@ -223,6 +223,19 @@ def test_run_that_completes_ends_its_supervisors_and_is_over_when_all_groups_are
     assert problems(here.done) == []
 
 
+def test_failure_that_a_copy_of_the_host_has_told_stands_before_what_the_host_tells_later(
+    here: Table,
+) -> None:
+    failed = {"status": "failed", "who": HOST, "reason": "it forked a process that came back"}
+
+    here.play(
+        (1, ChildSaid(HOST, events.Finished(failed))),
+        (1, ChildSaid(HOST, events.Finished({"status": "complete"}))),
+    )
+
+    assert here.supervision.host_result == failed
+
+
 def test_supervisor_that_does_not_end_with_the_run_is_ended_by_force(here: Table) -> None:
     here.play((1, ChildSaid(HOST, events.Finished({"status": "complete"}))))
 
