@@ -53,11 +53,12 @@ def opening_failure(
             "is its SSH server enabled and started, and ansible_port right?",
         )
     text = str(error)
-    if BANNER_ERROR in text:
-        # The text is the same for silence and for an end; what paramiko was handling tells.
-        if not isinstance(error.__context__, TimeoutError):
-            return _silent(where)
-        return babble_failure(where, came_bytes) if came_bytes else _frozen(where, timeout_s)
+    # The text is the same for silence and for an end; what paramiko was handling tells.
+    if BANNER_ERROR in text and not isinstance(error.__context__, TimeoutError):
+        return _silent(where)
+    is_over_time = BANNER_ERROR in text or text == NO_SESSION or "timeout" in text.lower()
+    if is_over_time and came_bytes and not has_spoken:
+        return babble_failure(where, came_bytes)
     if isinstance(error, TimeoutError):
         return MachineFailure(
             FailureKind.UNREACHABLE,
@@ -70,7 +71,7 @@ def opening_failure(
             f"{where}: no route ({error.strerror})",
             "is it switched on, on this network, and its address right?",
         )
-    if text == NO_SESSION or "timeout" in text.lower():
+    if is_over_time:
         return _frozen(where, timeout_s)
     if "Incompatible ssh peer" in text or "Incompatible version" in text:
         return MachineFailure(

@@ -104,8 +104,11 @@ def test_silence_before_a_word_was_heard_is_a_frozen_machine():
     assert "nothing was said in 10 s" in failure.text
 
 
-def test_words_that_are_none_of_ssh_are_no_silence():
-    error = SSHException("Error reading SSH protocol banner")
+@pytest.mark.parametrize(
+    "text", ["Error reading SSH protocol banner", "No existing session", "Timeout opening channel."]
+)
+def test_words_that_are_none_of_ssh_are_no_silence(text):
+    error = SSHException(text)
     error.__context__ = TimeoutError()
 
     failure = opening_failure(error, WHERE, 10.0, has_spoken=False, came_bytes=23)
