@@ -146,6 +146,7 @@ def test_traces_are_seen_while_a_tower_runs(make_tower):
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
 def test_ended_tower_lets_its_disks_go(make_tower, how):
+    before = set(Path("/sys/block").glob("loop*"))
     names = [f"disk{secrets.token_hex(4)}-{number}" for number in range(12)]
     tower = make_tower(boards=[BoardSpec(name=name) for name in names])
     loops = [Path("/sys/block", loop) for name in names for loop in list_disks(name)]
@@ -155,8 +156,9 @@ def test_ended_tower_lets_its_disks_go(make_tower, how):
     wait_until_gone(tower.places)
 
     wait_until(lambda: not any(list_disks(name) for name in names), "disks in use")
-    # Gone, or another tower's by now, which may just be taking it.
-    wait_until(lambda: not [path for path in loops if is_idle(path)], "loop devices left")
+    # What was made for it is gone, or another tower's by now, which may just be taking it.
+    made = set(loops) - before
+    wait_until(lambda: not any(map(is_idle, made)), lambda: f"{made}: some are left")
 
 
 def test_stopped_tower_leaves_nothing(make_tower):
