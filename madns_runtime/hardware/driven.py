@@ -120,6 +120,7 @@ class DrivenDevice:
     def summary(self) -> dict[str, Any]:
         """Return what the run came to."""
         header, account = self.seat.page.header, self.account
+        is_unsafe = bool(header[page.MOVED] or header[page.ATTEMPTED])
         return {
             "status": account.status,
             "samples": int(header[page.SAMPLES]),
@@ -127,9 +128,9 @@ class DrivenDevice:
             "stale_ratio": account.stale_ratio(),
             "lost": account.times_lost,
             "restarts": self.restarts,
-            "unsafe": int(header[page.MOVED]),
+            "unsafe": int(is_unsafe),
             "silent_inputs": silent_inputs(self.seat.channels, self.seat.page),
-            "why": NOT_MADE_SAFE if header[page.MOVED] else self.loss or self.why,
+            "why": NOT_MADE_SAFE if is_unsafe else self.loss or self.why,
             "report": dict(self.report) if self.report is not None else self._counts(),
         }
 

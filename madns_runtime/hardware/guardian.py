@@ -172,6 +172,8 @@ class Guardian:
     def _make_safe(self, name: str) -> None:
         """Open a device anew in a process of its own, for `make_safe` alone."""
         self._attempts[name] = self._attempts.get(name, 0) + 1
+        header = self._seats[name].page.header
+        header[page.ATTEMPTED] = header[page.MOVED]
         self._stand_by(name)
         pid, line = self._standing_by.pop(name)
         self._helpers[pid] = name, line
@@ -219,7 +221,7 @@ class Guardian:
                 header[page.SAFE_COUNT] += 1
                 messages.send(self._control, [SAFE, name, "made safe by the guardian"])
                 continue
-            header[page.MOVED] = 1.0
+            header[page.MOVED], header[page.ATTEMPTED] = 1.0, 0.0
             if self._attempts[name] < ATTEMPTS_MAX:
                 self._retries += 1
                 self._reactor.call_at(monotonic() + RETRY_S, partial(self._make_safe_again, name))
@@ -255,6 +257,7 @@ def _open_and_make_safe(seat: DeviceSeat, line: socket.socket) -> None:
             # Before it is done: what a process that was started anew moves meanwhile is not taken for safe.
             seat.page.header[page.MOVED] = 0.0
             device.make_safe()
+            seat.page.header[page.ATTEMPTED] = 0.0
             line.send(b"!", socket.MSG_NOSIGNAL)
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
             signal.setitimer(signal.ITIMER_REAL, CLOSE_S)

@@ -30,12 +30,12 @@ ALIGNMENT: Final = 64
 
 OPENING, CLOSED, OPEN, SAFE = 0.0, 1.0, 2.0, 3.0
 """States of a device: being opened for the first time, not open, open, and left with its outputs made safe."""
-STATE, OPENED_S, ACTIVE_S, SAMPLES, ERRORS, PID, SAFE_COUNT, NEWEST_S, ARRIVED_S, MOVED, LOSSES = (
-    range(11)
-)
+STATE, OPENED_S, ACTIVE_S, SAMPLES, ERRORS, PID, SAFE_COUNT = range(7)
+NEWEST_S, ARRIVED_S, MOVED, LOSSES, ATTEMPTED = range(7, 12)
 """Places in the header, all float64: state, when it was opened and last active (monotonic, s), samples and errors
 so far, process id, how often its outputs were made safe, when its newest sample was taken and when one last arrived,
-1 if outputs have moved since they were last made safe, and how often the device was lost."""
+1 if outputs have moved since they were last made safe, how often the device was lost, and 1 while the guardian makes
+outputs safe that have moved: nobody knows yet."""
 HEADER_BYTES: Final = 128
 TIME_NUMBERS: Final = 3
 

@@ -146,9 +146,8 @@ class DeviceRunner:
         grown_bytes = resident_bytes() - self._first_bytes
         if self._first_bytes and grown_bytes > GROWTH_BYTES_MAX and not self.gave_up:
             name, grown = type(self._device).__name__, f"{grown_bytes >> 20} MiB"
-            self._give_up(
-                f"{name} leaks memory: {grown} since it was opened, so it gets a process anew"
-            )
+            why = f"{name} leaks memory: {grown} since it was opened"
+            self._give_up(f"{why}, so it gets a process anew")
 
     def _blame(self, driver: str, method: str, error: BaseException) -> str:
         """Record what a driver's method raised, and return its words."""
@@ -193,6 +192,8 @@ class DeviceRunner:
     def end(self, reason: str, timeout_s: float) -> Mapping[str, Any]:
         """Make safe, close, and return what the run came to: counts, and the account of records."""
         self._is_ending = True
+        for agent, its_end in self._seat.users.items():
+            self._hear(agent, its_end)  # what they last said is not carried out, but counted
         self._records.event("ending", monotonic(), why=reason)
         self._intake.count("writes_left", self._outputs.clear())
         self._close_device()
@@ -216,9 +217,8 @@ class DeviceRunner:
             isinstance(self._device, SimulatedDevice)
             and (next_s := self._device.next_s()) is not None
         ):
-            wait_s = (
-                self._records.time.until(next_s) if self._records.time.is_known else self._period_s
-            )
+            time = self._records.time
+            wait_s = time.until(next_s) if time.is_known else self._period_s
             self._due_s = monotonic() + min(max(wait_s, 0.0), STATE_PERIOD_S)
             self._read_timer.reschedule(self._due_s)
             return

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from harness.cosmos_command import LOOSE
 
 HERE = Path(__file__).parent
 pytestmark = pytest.mark.timeout(600)
@@ -131,9 +132,10 @@ def test_cars_are_found_by_their_plates(cosmos, lockstep):
 
 @pytest.mark.process
 def test_cars_drive_in_real_time_too_and_record_what_they_declare(cosmos):
-    loose = ("time.mode=realtime", "time.duration_s=3", "time.rtf_tolerance=1")
     settings = [
-        word for setting in (*loose, "deadline.max_miss_ratio=1") for word in ("--set", setting)
+        word
+        for setting in ("time.mode=realtime", "time.duration_s=3", *LOOSE)
+        for word in ("--set", setting)
     ]
 
     document = json.loads(

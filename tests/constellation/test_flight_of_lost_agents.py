@@ -46,7 +46,9 @@ def test_the_program_of_an_agent_that_is_killed_is_gone_when_the_next_one_starts
     (tmp_path / "lost.yaml").write_text(SCENARIO)
     cosmos = CosmosCommand(tmp_path)
 
-    code, document = cosmos.run(tmp_path / "lost.yaml", *LOOSE, f"time.mode={mode}")
+    # A busy machine needs its time to start agent and program anew.
+    times = (f"time.mode={mode}", f"time.duration_s={4 if mode == 'lockstep' else 8}")
+    code, document = cosmos.run(tmp_path / "lost.yaml", *LOOSE, *times)
 
     assert document["status"] == "complete" and code in (0, 4), document["verdict"]
     assert document["agents"]["incarnations"] == {"agent-01": 2}

@@ -12,8 +12,10 @@ import tty
 from pathlib import Path
 
 import guided_program
+import psutil
 import pytest
 from harness.cosmos_command import LOOSE, CosmosCommand
+from harness.ports import free_port
 from harness.waiting import wait_until
 
 pytestmark = pytest.mark.process
@@ -25,10 +27,13 @@ TICKS = DURATION_S * HZ
 PEERS = ("deaf", "late", "killed", "noisy", "flooding", "twice", "halves", "hanging", "well")
 
 
-def free_port(kind=socket.SOCK_STREAM):
-    with socket.socket(socket.AF_INET, kind) as one:
-        one.bind(("127.0.0.1", 0))
-        return one.getsockname()[1]
+def is_connected(pid):
+    """Return whether a process has a connection over TCP."""
+    with contextlib.suppress(psutil.Error):
+        return any(
+            one.status == psutil.CONN_ESTABLISHED for one in psutil.Process(pid).net_connections()
+        )
+    return False
 
 
 def rule(name, transport, protocol="frames", **rest):
@@ -48,8 +53,8 @@ class Peers:
         self.threads = []
         self.closing = contextlib.ExitStack()
         self.late_port, self.killed_port = free_port(), free_port()
-        self.twice_port, self.well_port = free_port(), free_port(socket.SOCK_DGRAM)
-        self.noisy_port = free_port(socket.SOCK_DGRAM)
+        self.twice_port, self.well_port = free_port(), free_port(kind=socket.SOCK_DGRAM)
+        self.noisy_port = free_port(kind=socket.SOCK_DGRAM)
         self.deaf = self.closing.enter_context(socket.create_server(("127.0.0.1", 0)))
         self.flooding = self.closing.enter_context(socket.socket(socket.AF_UNIX))
         self.flooding.bind(str(folder / "flood.sock"))
@@ -147,7 +152,11 @@ class Peers:
             if process is None or process.poll() is not None:  # nobody listened, or it was killed
                 process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
                 self.processes.append(process)
-            elif self.seen.get("well", 0.0) >= 2.0 and "killed" not in self.seen:
+            elif (
+                self.seen.get("well", 0.0) >= 2.0
+                and "killed" not in self.seen
+                and is_connected(process.pid)
+            ):
                 self.seen["killed"] = True
                 process.kill()
             time.sleep(0.05)
@@ -256,7 +265,7 @@ def flown(tmp_path_factory):
     peers.begin()
     try:
         with cosmos.start_run(folder / "peers.yaml", *LOOSE) as process:
-            _, err = process.communicate(timeout=100)
+            _, err = process.communicate(timeout=240)
     finally:
         peers.end()
     document = json.loads((folder / "runs/0001-peers/run.json").read_text())

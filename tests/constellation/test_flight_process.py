@@ -291,8 +291,9 @@ def test_a_program_that_does_not_answer_in_lockstep_fails_the_agent(tmp_path):
 
 
 def test_an_answer_without_the_end_of_its_line_is_told_with_the_wait_for_it(tmp_path):
-    command = program(tmp_path, "sys.stdout.write('{}')\nsys.stdout.flush()")
-    ship = Ship(tmp_path, command, flight={"answer_s": 2.0})
+    # A shell has begun long before the wait is over, also on a busy machine.
+    command = ["sh", "-c", "read setup; read tick; printf '{}'; cat"]
+    ship = Ship(tmp_path, command, flight={"answer_s": 3.0})
 
     with pytest.raises(BlamedError, match=r"; it wrote '\{\}' without the end of a line$"):
         ship.run(1)
@@ -437,7 +438,7 @@ def test_a_program_that_never_answers_breaks_it_though_the_run_is_shorter_than_i
 
 def test_the_first_answer_is_waited_for_at_the_end(tmp_path):
     """An agent that has rejoined just now, say: its program is still starting."""
-    command = program(tmp_path, "time.sleep(0.3)\nprint('{}', flush=True)", "import time" + ECHO)
+    command = ["sh", "-c", "read setup; read tick; sleep 0.3; echo '{}'; cat"]
     with Ship(tmp_path, command, is_lockstep=False) as ship:
         ship.run(1)
 

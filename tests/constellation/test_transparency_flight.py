@@ -136,7 +136,7 @@ def test_one_command_runs_both_and_prints_the_difference(tmp_path):
         env=environment,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=280,
         check=False,
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import socket
 import threading
@@ -121,6 +122,7 @@ def test_a_missing_file_is_told_as_ever(tmp_path: Path) -> None:
 def test_no_descriptor_is_left_behind(tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.write_bytes(b"xxx")
+    gc.collect()  # what earlier tests left is not to be closed in the midst of this one
     before = len(os.listdir("/proc/self/fd"))
     for bound in (1, 3):
         try:
@@ -128,4 +130,4 @@ def test_no_descriptor_is_left_behind(tmp_path: Path) -> None:
         except FileTooLarge:
             continue
 
-    assert len(os.listdir("/proc/self/fd")) == before
+    assert len(os.listdir("/proc/self/fd")) <= before

@@ -10,6 +10,7 @@ import signal
 import time
 import tty
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,11 @@ from madns_runtime.hardware.port import Hardware
 from madns_runtime.reactor.reactor import Reactor
 
 AGENT = "agent-01"
+PATIENCE_S = 120.0
+"""A busy machine is slow; what takes this long hangs."""
+SILENCE_S = 60.0
+"""Without a sample for so long a device of these tests is lost, unless silence is what a test is about: a busy machine
+keeps a process waiting for longer than the second of a run."""
 DRIVER = """
 import os, signal, time, tty
 from dataclasses import dataclass
@@ -79,6 +85,8 @@ class Line(Device):
         if self.parameters.raises == "alarm":
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
             signal.raise_signal(signal.SIGALRM)
+        if self.parameters.raises == "nothing":
+            time.sleep(600)
 
     def close(self):
         time.sleep(self.parameters.close_s)
@@ -110,9 +118,12 @@ class DeviceBench:
     Args:
         folder: A folder of the test's own.
         devices: What the machine drives.
+        lost_s: Without a sample for how long a device is lost, s; None as in a run.
     """
 
-    def __init__(self, folder: Path, devices: tuple[DeviceLaunch, ...]) -> None:
+    def __init__(
+        self, folder: Path, devices: tuple[DeviceLaunch, ...], *, lost_s: float | None = SILENCE_S
+    ) -> None:
         config = RunConfig(
             run="0001-devices",
             scenario="devices",
@@ -134,6 +145,8 @@ class DeviceBench:
         self.folder = folder
         self.events: list[Mapping[str, Any]] = []
         self.manager = DeviceManager(launch, tell=lambda doing: None)
+        for driven in self.manager._devices.values() if lost_s is not None else ():
+            driven.limits = replace(driven.limits, lost_s=lost_s)
         self.manager.start()
         self.reactor = Reactor()
         self.manager.watch(self.reactor, self.events.append)
@@ -141,7 +154,7 @@ class DeviceBench:
         self.manager.reap()
         self.hardware: Hardware = self.manager.hardware_of(AGENT)
 
-    def until(self, is_so: Callable[[], bool], timeout_s: float = 20.0) -> float:
+    def until(self, is_so: Callable[[], bool], timeout_s: float = PATIENCE_S) -> float:
         """Run the loop until something is so, and return how long that took, s."""
         began_s = time.monotonic()
 
@@ -221,6 +234,7 @@ def line_bench(
     *,
     rate_hz: float = 50.0,
     launch: Mapping[str, Any] | None = None,
+    lost_s: float | None = SILENCE_S,
     **parameters: Any,
 ) -> Iterator[tuple[DeviceBench, Terminal]]:
     """Run a bench with the driver above on a pseudo-terminal, as pi22/line."""
@@ -237,7 +251,7 @@ def line_bench(
         owner=AGENT,
         **{"may_move": True, **(launch or {})},
     )
-    bench = DeviceBench(folder, (device,))
+    bench = DeviceBench(folder, (device,), lost_s=lost_s)
     try:
         yield bench, terminal
     finally:

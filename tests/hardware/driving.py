@@ -27,7 +27,7 @@ def opened(
         device.close()
 
 
-def frames(device: Any, count: int, channel: str = "received", timeout_s: float = 10.0) -> list:
+def frames(device: Any, count: int, channel: str = "received", timeout_s: float = 120.0) -> list:
     """Return so many frames, waiting on the device's descriptor as its process does."""
     found: list = []
     until_s = time.monotonic() + timeout_s

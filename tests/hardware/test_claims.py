@@ -128,5 +128,5 @@ def test_a_second_run_and_a_test_of_a_device_in_use_are_refused_by_name(tmp_path
     assert second.returncode == 1, second.stderr
     assert "device here/gauge is in use by run 0001-use (pid " in second.stderr
     assert "device here/gauge is in use by run 0001-use (pid " in second.stdout  # its run.json
-    after = cosmos("devices", "test", "-i", inventory, "--seconds", "1")
+    after = cosmos("devices", "test", "-i", inventory, "--seconds", "3")
     assert after.returncode == 0, after.stderr

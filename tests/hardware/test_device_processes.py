@@ -11,7 +11,7 @@ import pytest
 
 from madns_runtime.config import DeviceLaunch
 from madns_runtime.errors import PluginError
-from madns_runtime.hardware import page
+from madns_runtime.hardware import guardian, manager, page
 from madns_runtime.hardware.guardian import ATTEMPTS_MAX
 from tests.hardware import bench as bench_module
 from tests.hardware.bench import AGENT, DeviceBench, line_bench
@@ -31,11 +31,16 @@ def test_samples_reach_the_agent_and_the_records(tmp_path):
     with line_bench(tmp_path) as (bench, _):
         line = bench.hardware["line"]
         bench.start_time()
-        bench.until(lambda: line["time"].number >= 20)
-        reading = line["time"]
-        assert reading.status == "ok"
+        read = []
+
+        def is_fresh() -> bool:
+            read[:] = [time.monotonic(), line["time"], time.monotonic()]
+            return read[1].number >= 20 and read[1].status == "ok"
+
+        bench.until(is_fresh)
+        before_s, reading, after_s = read
         assert 0 <= reading.age_s < 5.0
-        assert reading.value == pytest.approx(time.monotonic() - reading.age_s, abs=1.0)
+        assert before_s - 1e-3 <= reading.value + reading.age_s <= after_s + 1e-3
         result = bench.close()["pi22/line"]
 
     assert bench.statuses("line") == ["ok"]
@@ -72,7 +77,8 @@ def test_a_write_is_put_out_when_it_is_due_and_a_newer_one_takes_its_place(tmp_p
         line.write("valve", 0.1, due_s=due_s + 1000.0)
         line.write("valve", 0.2, due_s=due_s)
         bench.run(0.3)
-        assert "VALVE 0.2" not in terminal.heard()
+        heard, now_s = terminal.heard(), time.monotonic() - zero_s
+        assert now_s >= due_s or "VALVE 0.2" not in heard  # the loop may have slept past it
         bench.until(lambda: "VALVE 0.2" in terminal.heard())
         result = bench.close()["pi22/line"]
 
@@ -89,7 +95,8 @@ def test_nothing_moves_where_it_may_not(tmp_path):
     with line_bench(tmp_path, launch=refused) as (bench, terminal):
         bench.until(lambda: bench.hardware["line"].status == "ok")
         bench.hardware["line"].write("valve", 0.5)
-        bench.run(0.3)
+        counts = bench.manager.page_of("pi22/line").counts
+        bench.until(lambda: counts.read().get("refused") == 1)
         result = bench.close()["pi22/line"]
         assert terminal.heard() == ["OPEN"]
 
@@ -198,12 +205,18 @@ def test_a_device_that_takes_its_time_to_close_is_lost_for_what_its_driver_raise
 
 
 def errors(bench) -> int:
-    from madns_runtime.hardware import page
-
     [driven] = bench.manager._devices.values()
     return int(driven.seat.page.header[page.ERRORS])
 
 
+@pytest.fixture
+def unhurried(monkeypatch):
+    """Wait for devices' processes and the guardian until they are done, however busy the machine is."""
+    monkeypatch.setattr(guardian, "GRACE_S", 60.0)
+    monkeypatch.setattr(manager, "END_S", 60.0)
+
+
+@pytest.mark.usefixtures("unhurried")
 def test_a_driver_that_raises_at_writing_and_making_safe_leaves_the_rest_to_the_guardian(tmp_path):
     with line_bench(tmp_path, raises="make_safe") as (bench, terminal):
         bench.until(lambda: bench.hardware["line"].status == "ok")
@@ -219,6 +232,7 @@ def test_a_driver_that_raises_at_writing_and_making_safe_leaves_the_rest_to_the_
     assert any("Line.make_safe raised ValueError" in why for why in whys)
 
 
+@pytest.mark.usefixtures("unhurried")
 def test_a_driver_that_an_alarm_of_its_own_ends_while_it_makes_safe_is_not_taken_for_safe(tmp_path):
     with line_bench(tmp_path, raises="alarm") as (bench, terminal):
         bench.until(lambda: bench.hardware["line"].status == "ok")
@@ -226,6 +240,20 @@ def test_a_driver_that_an_alarm_of_its_own_ends_while_it_makes_safe_is_not_taken
         bench.until(lambda: "VALVE 1" in terminal.heard())
         result = bench.close()["pi22/line"]
         assert terminal.heard().count("SAFE") == 1 + ATTEMPTS_MAX
+    assert result["unsafe"] == 1
+    assert "could not be made safe" in result["why"]
+
+
+def test_a_device_is_not_taken_for_safe_while_the_guardian_is_still_at_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(guardian, "ATTEMPT_S", 2.0)
+    monkeypatch.setattr(manager, "END_S", 0.6)
+    with line_bench(tmp_path, raises="nothing") as (bench, terminal):
+        guardian_pid = bench.manager._guardian_pid
+        bench.until(lambda: bench.hardware["line"].status == "ok")
+        bench.hardware["line"].write("valve", 1.0)
+        bench.until(lambda: "VALVE 1" in terminal.heard())
+        result = bench.close()["pi22/line"]  # make_safe has not returned in either process
+        wait_until(lambda: not is_alive(guardian_pid), "the guardian has ended")
     assert result["unsafe"] == 1
     assert "could not be made safe" in result["why"]
 
@@ -248,10 +276,15 @@ def test_inserted_faults_act_on_what_is_read_and_are_recorded(tmp_path):
         line = bench.hardware["line"]
         bench.until(lambda: line.status == "ok")
         assert bench.manager.insert_fault("pi22/line", "freeze", None) is None
-        bench.run(0.3)
         first = line["time"]
-        bench.until(lambda: line["time"].number >= first.number + 5)
-        assert line["time"].value == first.value
+
+        def stands_still() -> bool:
+            nonlocal first
+            if line["time"].value != first.value:
+                first = line["time"]
+            return line["time"].number >= first.number + 5
+
+        bench.until(stands_still)
         bench.manager.insert_fault("pi22/line", "clear", None)
         bench.until(lambda: line["time"].value != first.value)
 
@@ -307,7 +340,11 @@ def test_a_process_whose_words_were_heard_by_another_look_is_not_taken_for_gone(
     assert (result["restarts"], result["why"]) == (0, "")
 
 
-def test_a_driver_whose_close_does_not_return_is_named_at_the_end_and_made_safe_once(tmp_path):
+def test_a_driver_whose_close_does_not_return_is_named_at_the_end_and_made_safe_once(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(guardian, "GRACE_S", 60.0)  # it makes safe itself, whenever it gets there
+    monkeypatch.setattr(manager, "KILL_WAIT_S", 60.0)
     with line_bench(tmp_path, close_s=600.0) as (bench, terminal):
         guardian_pid = bench.manager._guardian_pid
         bench.until(lambda: bench.statuses("line") == ["ok"])
@@ -326,15 +363,15 @@ def test_a_driver_whose_close_does_not_return_is_named_at_the_end_and_made_safe_
 
 @pytest.mark.parametrize(("action", "value"), [("drop", 1.0), ("delay", 600.0)])
 def test_a_device_whose_samples_a_fault_keeps_back_is_not_opened_anew(tmp_path, action, value):
-    with line_bench(tmp_path, launch={"hang_s": 0.2}) as (bench, terminal):
+    with line_bench(tmp_path, launch={"hang_s": 3.0}, lost_s=None) as (bench, terminal):
         bench.start_time()
-        bench.until(lambda: bench.statuses("line") == ["ok"])
+        bench.until(lambda: bench.statuses("line")[-1:] == ["ok"])
         bench.manager.insert_fault("pi22/line", action, value)
         states = tmp_path / "devices" / "pi22" / "line" / "device_state.jsonl"
         bench.until(lambda: bench.hardware["line"].status == "lost")
-        # Silence is looked for when a state is recorded: once more, and it would have been found.
+        # Silence is looked for when a state is recorded, once per second: by then it would have been found.
         count = states.read_bytes().count(b"\n")
-        bench.until(lambda: states.read_bytes().count(b"\n") > count + 1)
+        bench.until(lambda: states.read_bytes().count(b"\n") > count + 4)
         result = bench.close()["pi22/line"]
         heard = terminal.heard()
 
@@ -412,33 +449,36 @@ def test_what_the_owner_last_said_is_not_carried_out_after_its_end(tmp_path):
     assert result["restarts"] == 0
 
 
-def test_a_healthy_process_is_not_given_up_when_its_owner_ends(tmp_path):
+def test_a_healthy_process_is_not_given_up_when_its_owner_ends(tmp_path, monkeypatch):
     """The device is made safe before the guardian looks, and again moved by the owner that was started anew."""
+    monkeypatch.setattr(
+        guardian, "GRACE_S", 3.0
+    )  # a busy machine lets a process wait for longer than its own
     with line_bench(tmp_path) as (bench, terminal):
-        line = bench.hardware["line"]
+        line, header = bench.hardware["line"], bench.manager.page_of("pi22/line").header
         bench.until(lambda: line.status == "ok")
         for _ in range(3):
-            line.write("valve", 1.0)
             count = terminal.heard().count("VALVE 1")
-            bench.until(lambda count=count: terminal.heard().count("VALVE 1") >= count)
+            line.write("valve", 1.0)
+            bench.until(lambda count=count: terminal.heard().count("VALVE 1") > count)
             owner = os.fork()
             if owner == 0:
                 os._exit(0)
             bench.manager.agents_ended(("agent-01",))
-            bench.run(0.05)
+            bench.until(lambda: not header[page.MOVED])
             bench.manager.agents_started(("agent-01",), owner)  # which has ended already
             os.waitpid(owner, 0)
-            bench.run(0.6)
+        bench.run(3.5)
         assert bench.close()["pi22/line"]["restarts"] == 0
 
 
 def test_a_disconnected_device_stays_so_for_longer_than_a_hang_and_through_a_new_process(tmp_path):
-    with line_bench(tmp_path, launch={"hang_s": 2.0}) as (bench, _):
+    with line_bench(tmp_path, launch={"hang_s": 5.0}) as (bench, _):
         line = bench.hardware["line"]
         bench.until(lambda: line.status == "ok")
         bench.manager.insert_fault("pi22/line", "disconnect", None)
         bench.until(lambda: line.status == "lost")
-        bench.run(2.5)
+        bench.run(5.5)
         pid = bench.pid_of()
         os.kill(pid, signal.SIGKILL)
         bench.until(lambda: bench.pid_of() not in (0, pid))
@@ -478,8 +518,8 @@ def test_a_recording_that_is_opened_anew_goes_on_and_does_not_begin_anew(tmp_pat
         bench.manager.insert_fault("pi22/tape", "disconnect", None)
         bench.until(lambda: tape.status == "lost")
         bench.run(0.3)
-        bench.manager.insert_fault("pi22/tape", "clear", None)
         before = tape["v"].number
+        bench.manager.insert_fault("pi22/tape", "clear", None)
         bench.until(lambda: tape["v"].number >= before + 20)
     finally:
         result = bench.close()["pi22/tape"]

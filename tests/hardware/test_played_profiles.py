@@ -10,9 +10,13 @@ import pytest
 
 from madns_runtime.config import Agents, DeviceLaunch, RunConfig
 from madns_runtime.errors import PluginError
+from madns_runtime.hardware.driven import DrivenDevice
 from madns_runtime.hardware.inline import InlineDevice
 from madns_runtime.hardware.kind_registry import prepare
+from madns_runtime.hardware.port import DevicePort
 from madns_runtime.hardware.records import DeviceRecords
+from madns_runtime.hardware.runner import DeviceRunner
+from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.recording.reader import read_stream
 from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
@@ -127,6 +131,33 @@ def test_what_no_output_can_play_is_refused_at_once(tmp_path):
     with pytest.raises(PluginError, match="none before from_s"):
         port.play("coil", [(0.0, 1.0)], from_s=0.5)
     assert port.size_of("coil") == 1
+
+
+def test_what_an_agent_said_last_is_counted_though_the_end_was_heard_before_it(tmp_path):
+    told = DeviceLaunch(
+        name="null", place="a", kind="null", base_directory="", rate_hz=10, users=("a",),
+        owner="a", may_move=True,
+    )  # fmt: skip
+    program = prepare("null", {"outputs": ["coil"], "low": -1.0, "high": 1.0}, tmp_path)
+    driven = DrivenDevice.share(told, program)
+    recorder = Recorder(RecordFiles(tmp_path, run="0001-r", source="a/null"), CONFIG.recording)
+    journal = RunJournal(recorder, CONFIG.recording.verbosity, t_s=lambda: None)
+    reactor = Reactor()
+    runner = DeviceRunner(driven.seat, DeviceRecords(journal, program.channels), reactor)
+    recorder.start()
+    runner.open()
+    port = DevicePort(
+        "a/null", program.channels, shared=(driven.seat.page, driven.ends["a"]),
+        limits=driven.limits, agent="a",
+    )  # fmt: skip
+
+    port.write("coil", 0.5, due_s=1e9)
+    port.play("coil", [(600.0, 0.5), (601.0, 0.5)])
+    report = runner.end("the run is over", 60.0)
+    reactor.close()
+
+    assert report["writes_left"] == 1
+    assert report["stimulus"]["coil"]["unplayed"] == 2
 
 
 @pytest.mark.process

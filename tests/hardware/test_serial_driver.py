@@ -34,7 +34,7 @@ def received(device):
 
 
 def wait_for(device):
-    deadline_s = time.monotonic() + 10
+    deadline_s = time.monotonic() + 120
     while (frame := received(device)) is None:
         assert time.monotonic() < deadline_s
     return frame

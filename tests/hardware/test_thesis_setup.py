@@ -1,6 +1,7 @@
 """The thesis's set-up: boards that count, one of which reads a Sense HAT and sends its samples to the host."""
 
 import json
+from statistics import median
 
 import pytest
 from harness.cosmos_command import LOOSE, SCENARIOS, CosmosCommand
@@ -15,6 +16,8 @@ STAND_IN = """{name: hat, kind: synthetic, rate_hz: 20, parameters: {channels: [
         {name: temperature, unit: degC, elements: [{offset: 21.5}]}]}}"""
 
 
+CLOCK_ERROR_US = 20_000
+"""What a busy machine, whose messages wait at both ends, may cost the estimate."""
 LOOSE_DEVICES = (
     "hardware.stale_ratio=1",
     "hardware.lost=1000",
@@ -66,7 +69,9 @@ def test_samples_of_a_stand_in_reach_the_host_with_their_delay(tmp_path):
     gyroscope = [row for row in found if row["channel"] == "gyroscope"]
     assert len(gyroscope) > 5
     assert all(row["values"][2] == 0.5 for row in gyroscope)
-    assert all(row["delay_us"] > 0 for row in found if row["t_s"] > 0.5)
+    delays_us = [row["delay_us"] for row in found if row["t_s"] > 0.5]
+    # A sample may be taken just before its tick, and the agent's clock is an estimate.
+    assert median(delays_us) > 0 and min(delays_us) > -CLOCK_ERROR_US
     numbers = [row["number"] for row in gyroscope]
     assert numbers == sorted(set(numbers))
     assert (folder / "devices" / "pi22" / "hat" / "gyroscope.jsonl").is_file()

@@ -24,7 +24,7 @@ from madns_runtime.config import (
 from madns_runtime.timeline.entries import ScheduledEntry
 
 HERE = Path(__file__).parent
-PATIENCE_S = 60.0
+PATIENCE_S = 200.0
 """A shared machine may be slow; what takes this long hangs."""
 
 
@@ -58,7 +58,7 @@ class HostRun:
             ),
             on_agent_loss="abort" if restarts_max is None else "continue",
             time=TimeSettings(mode="lockstep", duration_s=1.0),
-            timeouts=timeouts or Timeouts(shutdown_s=5.0),
+            timeouts=timeouts or Timeouts(shutdown_s=60.0),
             seed=seed,
             executor=ExecutorSettings(kind=executor, workers=2),
             parameters={} if timeline else {"fault": fault},

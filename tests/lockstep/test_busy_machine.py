@@ -8,6 +8,7 @@ import sys
 import time
 
 import pytest
+from harness.waiting import wait_until
 from lockstep_host import HERE
 from processor_quota import make_quota, remove_quota, throttled_count
 
@@ -99,7 +100,7 @@ def test_a_call_that_is_starved_for_longer_than_its_limit_returns(start_host, qu
 def test_a_starved_hang_still_ends(start_host, quota, fault):
     timeouts = Timeouts(tick_s=0.5, shutdown_s=30.0)
     run = start_host(fault=fault, timeouts=timeouts)
-    until_s = time.monotonic() + 60.0
+    until_s = time.monotonic() + 120.0
     while not any(e.get("state") == "SIMULATION_START" for e in run.events):
         assert time.monotonic() < until_s
         time.sleep(0.01)
@@ -127,16 +128,23 @@ def children_of(pid):
 def test_a_stop_shorter_than_the_limit_costs_nothing_but_time(start_host):
     run = start_host(fault="step_pause", timeouts=Timeouts(tick_s=20.0, shutdown_s=10.0))
     pid = int(awaited_word(run, "paused"))
+    wait_until(lambda: is_stopped(pid), "its stop")
     time.sleep(1.0)
     os.kill(pid, signal.SIGCONT)
 
     assert run.result()["status"] == "complete"
 
 
+def is_stopped(pid):
+    """Return whether a process is held up by a signal."""
+    with open(f"/proc/{pid}/stat", encoding="ascii") as file:
+        return file.read().rpartition(")")[2].split()[0] == "T"
+
+
 def awaited_word(run, before):
     """Return the word that a process of a run writes behind another one, as soon as it does."""
     text = run.folder / "stderr.txt"
-    until_s = time.monotonic() + 60.0
+    until_s = time.monotonic() + 120.0
     while len(words := text.read_text().partition(f"{before} ")[2].split()) < 1:
         assert time.monotonic() < until_s, before
         time.sleep(0.005)

@@ -26,7 +26,7 @@ from madns_runtime.reactor.reattachment import Reattachment
 pytestmark = pytest.mark.process
 
 SESSION = "0123456789abcdef"
-WAIT_S = 30.0
+WAIT_S = 120.0
 """A bound, not an expectation."""
 
 

@@ -38,7 +38,8 @@ def start(stdin, grace_s: float, what: str) -> subprocess.Popen[str]:
 
 
 def test_hanging_process_ends_after_the_grace_and_leaves_its_stack():
-    with start(subprocess.PIPE, 0.1, "hang") as process:
+    # So long that it hangs by then, also where it has to wait for a processor.
+    with start(subprocess.PIPE, 2.0, "hang") as process:
         process.stdin.close()
 
         assert process.wait(PATIENCE_S) == 1

@@ -27,7 +27,7 @@ from .layer import Layer
 from .network import Network
 from .specification import BoardSpec
 
-PATIENCE_S = 20.0
+PATIENCE_S = 120.0
 POLL_S = 0.01
 EXIT_OFF = 3
 """PID 1's exit status after `poweroff`."""

@@ -26,7 +26,7 @@ OWN_KEY = f"{HOST_KEY}.own"
 NO_SSHD = "/run/tower/no-sshd"
 DONE = "/run/tower/done"
 """Grows by one line each time that connections were cut."""
-PATIENCE_S = 20.0
+PATIENCE_S = 120.0
 READ_ONLY = kernel.MS_REMOUNT | kernel.MS_BIND | kernel.MS_RDONLY
 WRITABLE = kernel.MS_REMOUNT | kernel.MS_BIND
 

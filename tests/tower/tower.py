@@ -24,8 +24,8 @@ from .inventory import format_inventory
 from .places import Places
 from .specification import BoardSpec, TowerSpec, name_boards
 
-STOP_PATIENCE_S = 60.0
-ANSWER_PATIENCE_S = 60.0
+STOP_PATIENCE_S = 150.0
+ANSWER_PATIENCE_S = 150.0
 POLL_S = 0.02
 SSH_CONFIG_VARIABLE = "COSMOS_SSH_CONFIG"
 PACKAGE_ROOT = Path(__file__).parents[1]

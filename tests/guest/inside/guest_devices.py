@@ -68,7 +68,7 @@ def driven(
         name=NAME, place=PLACE, kind=kind, base_directory=str(folder), rate_hz=rate_hz,
         parameters=parameters, users=(AGENT,), owner=AGENT, may_move=True,
     )  # fmt: skip
-    bench = DeviceBench(folder, (launch,))
+    bench = DeviceBench(folder, (launch,), lost_s=None)
     bench.start_time()
     try:
         yield bench
