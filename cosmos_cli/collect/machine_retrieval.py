@@ -23,8 +23,8 @@ from cosmos_cli.ui.plural import counted
 ROUNDS_MAX = 3
 """So often a machine's files are listed anew when they changed on the way."""
 FAULTS_SHOWN_MAX = 5
-PATIENCE_S = 3.0
-"""For what ends there at this moment, such as a sampler after its supervisor."""
+PATIENCE_S = 30.0
+"""For what ends there at this moment, such as a sampler after its supervisor: on a busy board with a slow card, too."""
 PIECE_TIMEOUT_S = 30.0
 SIZES_TIMEOUT_S = 300.0
 """For the sizes of FILES_MAX files on a slow card."""

@@ -78,7 +78,8 @@ class Fleetwide:
                 "clean_s": clean_s,
                 "forced_s": forced_s,
             }
-            timeout_s = clean_s + 2 * forced_s + ANSWER_MARGIN_S
+            # An operator there, then those that it leads, then force.
+            timeout_s = 2 * (clean_s + forced_s) + ANSWER_MARGIN_S
             return RunEnding.from_mapping(
                 board.call("end_run", arguments, timeout_s=timeout_s).value
             )

@@ -233,7 +233,9 @@ def end_entries(
         _signal(host, signal.SIGTERM)
         _wait(host, HOST_LEAD_S)
         _signal(parts, signal.SIGTERM)
-        _wait(known, clean_s if not operator else forced_s)
+        # An operator that did not heed is waited for no more; these hear of the end only now.
+        followers = [entry for entry in known if entry not in operator]
+        _wait(followers, max(clean_s, forced_s) if operator else clean_s)
     known = _with_workers(known, directory)
     killed = _living(known)
     if killed:

@@ -7,11 +7,11 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 from guides import ROOT, blocks, row_keys
+from harness.waiting import wait_until
 
 from cosmos_cli.models.inventory.devices import MachineDevice
 from madns_runtime.config import HardwareSettings
@@ -25,7 +25,9 @@ LOOSE = (
     "deadline.max_miss_ratio=1",
     "deadline.overrun_ms=1000",
     "time.rtf_tolerance=1",
+    "timeouts.agents_ready_s=120",
     "timeouts.silence_s=30",
+    "timeouts.complete_s=60",
     "hardware.stale_ratio=1",
     "hardware.lost=100",
     "hardware.on_device_loss=continue",
@@ -42,14 +44,6 @@ def written(folder):
     for text in scenarios:
         (folder / f"{text.split()[1]}.yaml").write_text(text)
     return [block.splitlines() for block in blocks(GUIDE, "sh")]
-
-
-def wait_until(is_so, timeout_s):
-    """Wait until something is so."""
-    end_s = time.monotonic() + timeout_s
-    while not is_so():
-        assert time.monotonic() < end_s
-        time.sleep(0.1)
 
 
 def start(folder, line, *settings, stdout=subprocess.DEVNULL):
@@ -107,13 +101,13 @@ def test_faults_are_inserted_into_the_example_as_the_guide_says(tmp_path):
     orders = re.findall(r"^    (cosmos inject .*)$", GUIDE, flags=re.MULTILINE)
     assert len(orders) == 2
 
-    with start(tmp_path, f"{command} --set time.duration_s=60", *LOOSE) as running:
+    with start(tmp_path, f"{command} --set time.duration_s=600", *LOOSE) as running:
         try:
             events = tmp_path / "runs" / "0001-watch" / "devices" / "here" / "load" / "events.jsonl"
-            wait_until(lambda: events.is_file() and "opened" in events.read_text(), 60)
+            wait_until(lambda: events.is_file() and "opened" in events.read_text())
             for order in orders:
-                wait_until(lambda order=order: start(tmp_path, order).wait(60) == 0, 60)
-            wait_until(lambda: "clear" in events.read_text(), 60)
+                wait_until(lambda order=order: start(tmp_path, order).wait(60) == 0)
+            wait_until(lambda: "clear" in events.read_text())
         finally:
             running.send_signal(signal.SIGINT)
             running.communicate(timeout=120)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from harness.cosmos_command import LOOSE
 
 from cosmos_cli import app
 from cosmos_cli.testing.discovery import find_scenarios
@@ -17,6 +18,7 @@ pytestmark = pytest.mark.process
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text("utf-8")
 TESTED = re.findall(r"<!-- tested -->\n```sh\n(.*?)```", README, flags=re.S)
+PATIENT = " ".join(f"--set {setting}" for setting in LOOSE)
 
 
 def run(command, folder, **variables):
@@ -40,13 +42,7 @@ def run(command, folder, **variables):
 def test_tutorial_runs_from_its_first_command_to_its_last(tmp_path):
     for block in TESTED:
         # A shared machine may miss ticks; what the tutorial shows is the way, not the verdict.
-        done = run(
-            block.replace(
-                "cosmos run ",
-                "cosmos run --set deadline.max_miss_ratio=1 --set time.rtf_tolerance=1 ",
-            ),
-            tmp_path,
-        )
+        done = run(block.replace("cosmos run ", f"cosmos run {PATIENT} "), tmp_path)
         assert done.returncode == 0, done.stdout + done.stderr
 
     assert len(TESTED) == 2
@@ -60,7 +56,7 @@ def test_tutorials_broken_rover_fails_its_check_with_code_4(tmp_path):
     assert "GAIN_1_S = 1.5" in text
     program.write_text(text.replace("GAIN_1_S = 1.5", "GAIN_1_S = 0.05"), "utf-8")
 
-    done = run("cosmos run rover/rover.yaml --no-report", tmp_path)
+    done = run(f"cosmos run rover/rover.yaml --no-report {PATIENT}", tmp_path)
 
     assert done.returncode == 4, done.stderr
     assert "error_m" in done.stdout + done.stderr

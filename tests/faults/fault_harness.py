@@ -21,6 +21,7 @@ from typing import Any
 
 import yaml
 import zstandard
+from faulty_simulation import STRUCK
 from harness.talking_process import Marked, TalkingProcess, find_marked
 from harness.waiting import wait_until
 
@@ -31,8 +32,8 @@ PLUGIN = Path(__file__).with_name("faulty_simulation.py")
 TEST_ID = "COSMOS_TEST_ID"
 PATIENCE_S = 90.0
 """A shared machine may be slow; what takes this long hangs."""
-END_S = 8.0
-"""Agents end within 5 s of their host's or operator's death; the rest is slack for a busy machine."""
+END_S = 60.0
+"""Agents end within 5 s of their host's or operator's death; the rest is slack for a busy machine. A run is longer."""
 POLL_S = 0.02
 SCENARIO: dict[str, Any] = {
     "name": "fault",
@@ -40,7 +41,7 @@ SCENARIO: dict[str, Any] = {
     "agents": {"count": 3, "tick_hz": 20},
     "time": {"duration_s": 2, "rtf_tolerance": 0.9},
     "deadline": {"overrun_ms": 1000, "max_miss_ratio": 1},
-    "timeouts": {"start_lead_s": 0.3, "shutdown_s": 5},
+    "timeouts": {"start_lead_s": 0.3, "shutdown_s": 5, "silence_s": 30},
     "recording": {"flush_interval_s": 0.1},
     "executor": {"kind": "thread"},
 }
@@ -132,9 +133,19 @@ class Run(TalkingProcess):
     # While it runs --------------------------------------------------------------------------------
 
     def wait_until_running(self, then_s: float = 0.5) -> None:
-        """Wait until simulated time has run for *then_s*."""
+        """Wait until simulated time has run for *then_s*, and every agent has recorded a tick."""
         self.wait_for("\nrunning\n")
         time.sleep(SCENARIO["timeouts"]["start_lead_s"] + then_s)
+        self.wait_until(self._all_tick, "ticks of all agents")
+
+    def _all_tick(self) -> bool:
+        paths = list(self.directory.glob("agents/*/ticks.jsonl"))
+        # The first line tells what the others hold.
+        return bool(paths) and all(path.read_bytes().count(b"\n") > 1 for path in paths)
+
+    def wait_until_struck(self) -> None:
+        """Wait until what a plug-in is to do wrong has begun."""
+        self.wait_until((self.laboratory.folder / STRUCK).exists, "fault of the plug-in")
 
     def wait_until(self, condition: Callable[[], Any], what: str) -> Any:
         """Wait for something that must come while the run lives."""

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 from madns_runtime.plugin.api import HOST, AgentSimulation, HostSimulation, Simulation, Tick
@@ -18,6 +19,8 @@ from madns_runtime.recording.records import Field
 
 INIT_DELAY = "COSMOS_TEST_INIT_S"
 """Agents take this long to be made: before they can say hello."""
+STRUCK = "struck"
+"""A file beside this one: what is to go wrong has begun to."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,6 +54,7 @@ class Fault:
         if self.method != method:
             return
         self.method = None
+        Path(__file__).with_name(STRUCK).touch()
         action = self.parameters.action
         if action == "raise":
             raise ValueError(f"{method} is broken on purpose")  # the line that messages must name

@@ -24,7 +24,7 @@ from madns_runtime.recording.reader import read_stream
 
 pytestmark = pytest.mark.process
 
-LONG = ("--set", "time.duration_s=60")
+LONG = ("--set", "time.duration_s=600")
 CLEAN = ("--set", "timeouts.shutdown_s=60")
 """Records come to a busy machine's disk, too."""
 STUCK = {"side": "agent", "method": "step", "action": "sleep", "sleep_s": 300.0}
@@ -81,7 +81,7 @@ def test_ctrl_c_before_any_agent_is_there_ends_the_run(laboratory):
 
 def test_second_ctrl_c_ends_at_once_what_hangs(laboratory):
     run = laboratory.start(*LONG, "--set", "timeouts.shutdown_s=80", faults=STUCK, new_group=True)
-    run.wait_until_running(then_s=1.0)
+    run.wait_until_struck()
     press_ctrl_c(run)
     run.wait_for("press Ctrl-C again to end at once")
     time.sleep(0.3)  # a terminal's second Ctrl-C comes no sooner
@@ -93,8 +93,9 @@ def test_second_ctrl_c_ends_at_once_what_hangs(laboratory):
 
 
 def test_one_ctrl_c_suffices_when_an_agent_hangs(laboratory):
-    run = laboratory.start(*LONG, "--set", "timeouts.shutdown_s=1", faults=STUCK, new_group=True)
-    run.wait_until_running(then_s=1.0)
+    # Long enough for the others to close their records on a busy machine.
+    run = laboratory.start(*LONG, "--set", "timeouts.shutdown_s=5", faults=STUCK, new_group=True)
+    run.wait_until_struck()
     press_ctrl_c(run)
 
     document = check_ending(run, 130, "interrupted", "agent-02 did not end in time and was killed")
@@ -161,7 +162,8 @@ def test_agent_started_by_hand_joins_the_run(laboratory):
 
 
 def test_hand_started_agent_that_is_killed_is_lost(laboratory):
-    run = laboratory.start(*LONG, "--manual", "agent-02")
+    # Nobody but the host can notice it.
+    run = laboratory.start(*LONG, "--manual", "agent-02", "--set", "timeouts.silence_s=5")
     with start_by_hand(run) as by_hand:
         run.wait_until_running()
         by_hand.kill()

@@ -29,6 +29,8 @@ SCENARIO: dict[str, Any] = {
     "deadline": {"overrun_ms": 1000, "max_miss_ratio": 1},
     "timeouts": {"shutdown_s": 5},
 }
+PATIENT = {"agents_ready_s": 120, "silence_s": 30, "complete_s": 60, "shutdown_s": 60}
+"""Timeouts of a run from which nobody is taken: boards that share this machine's processors wait for them."""
 LIVING = "pgrep -af '[m]adns_runtime|[P]ACKAGE=' || true"
 MEND = ("thaw", "up", "noloss", "poweron")
 

@@ -26,7 +26,7 @@ REGISTER = """
 import subprocess, sys, time
 {source}
 register("0007-iridium10", "supervisor", "pi01", "/home/pi/cosmos/runs/0007-iridium10-aabbccdd")
-time.sleep(60)
+time.sleep(600)
 """
 
 
@@ -148,7 +148,7 @@ def test_machine_that_cannot_be_asked_hides_nobody(care: Care) -> None:
     assert code == 3
     assert failures["pi02"]["kind"] in ("frozen", "unreachable", "timeout")
     assert failures["pi01"] is None
-    assert findings(answer, "pi01")["udp"] == "ok"
+    assert findings(answer, "pi01")["udp"] in ("ok", "warning")  # as above
 
 
 def test_reboot_waits_until_each_is_back(care: Care) -> None:

@@ -25,6 +25,14 @@ def wait_for_part(run, size_bytes):
     raise AssertionError(f"no part of {size_bytes} bytes came")
 
 
+def start_over_a_slow_link(run, tower):
+    """Start to collect, and return in the midst of a large file, most of which is still to come."""
+    tower.fault("pi01", "loss", 3)
+    process = run.cosmos.start("collect")
+    wait_for_part(run, 2_000_000)
+    return process
+
+
 def restart(tower, name, fault):
     """Do what makes a board start again, and wait until it has."""
     boots = tower.state()["boards"][name]["boots"]
@@ -47,8 +55,7 @@ def test_records_of_all_boards_come_and_are_released(tower8, tmp_path):
 @pytest.mark.nightly
 def test_link_that_is_cut_in_the_midst_of_a_large_file_is_taken_up_again(tower8, tmp_path):
     run = BoardRun(tmp_path, tower8, boards=2, noise_bytes=LARGE_BYTES)
-    process = run.cosmos.start("collect")
-    wait_for_part(run, 2_000_000)
+    process = start_over_a_slow_link(run, tower8)
     tower8.fault("pi01", "down")
 
     _, talk = process.communicate(timeout=PATIENCE_S)
@@ -57,6 +64,7 @@ def test_link_that_is_cut_in_the_midst_of_a_large_file_is_taken_up_again(tower8,
     assert run.missing() == {"pi01", "agent-01"} - {"agent-01" if run.is_here("pi01") else ""}
     assert run.is_here("pi02")
     tower8.fault("pi01", "up")
+    tower8.fault("pi01", "noloss")
     assert run.lies_on("pi01")
 
     done = run.cosmos("collect")
@@ -103,8 +111,7 @@ def test_board_that_starts_anew_in_the_midst_of_a_large_file_is_collected_whole(
 @pytest.mark.nightly
 def test_frozen_board_is_named_and_collected_once_it_thaws(tower8, tmp_path):
     run = BoardRun(tmp_path, tower8, boards=2, noise_bytes=LARGE_BYTES)
-    process = run.cosmos.start("collect")
-    wait_for_part(run, 2_000_000)
+    process = start_over_a_slow_link(run, tower8)
     tower8.fault("pi01", "freeze")
 
     _, talk = process.communicate(timeout=PATIENCE_S)
@@ -112,6 +119,7 @@ def test_frozen_board_is_named_and_collected_once_it_thaws(tower8, tmp_path):
     assert process.returncode == 5, talk
     assert "pi01" in run.missing()
     tower8.fault("pi01", "thaw")
+    tower8.fault("pi01", "noloss")
     assert run.cosmos("collect").returncode == 0
     assert run.is_here()
 
@@ -191,11 +199,11 @@ def test_read_only_disk_of_a_board_gives_its_records_and_keeps_them(tower8, tmp_
 
 def test_interrupted_collect_ends_at_once_and_is_taken_up_again(tower8, tmp_path):
     run = BoardRun(tmp_path, tower8, boards=2, noise_bytes=LARGE_BYTES)
-    process = run.cosmos.start("collect")
-    wait_for_part(run, 2_000_000)
+    process = start_over_a_slow_link(run, tower8)
     process.send_signal(signal.SIGINT)
 
     process.communicate(timeout=120)
+    tower8.fault("pi01", "noloss")
 
     assert process.returncode == 130
     assert run.lies_on("pi01")

@@ -18,6 +18,7 @@ name: fleet
 simulation: counter
 agents: {count: 4, tick_hz: 50}
 time: {mode: realtime, duration_s: DURATION}
+timeouts: {agents_ready_s: 120, silence_s: 30, complete_s: 60, shutdown_s: 60}
 """
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import pytest
 from device_tower import HOME, DeviceTower
 from harness.waiting import wait_until
+from run_tower import PATIENT
 from tower import Tower
 from tower.fixtures import need_tower
 
@@ -49,7 +50,7 @@ def events(tower: DeviceTower) -> list[str]:
 
 
 def test_a_lost_device_ends_the_run_with_3_and_both_names(tower: DeviceTower) -> None:
-    tower.start()
+    tower.start(timeouts=PATIENT)
     tower.wait_until_running()
     tower.unplug()
     code = tower.finish()
@@ -61,7 +62,7 @@ def test_a_lost_device_ends_the_run_with_3_and_both_names(tower: DeviceTower) ->
 
 
 def test_a_lost_device_that_comes_back_breaks_a_check_and_goes_on(tower: DeviceTower) -> None:
-    tower.start(hardware={"on_device_loss": "continue"}, time=SHORT)
+    tower.start(hardware={"on_device_loss": "continue"}, time=SHORT, timeouts=PATIENT)
     tower.wait_until_running()
     tower.unplug()
     tower.wait_for(f"device {HOME}/gauge: lost")
@@ -110,7 +111,7 @@ def test_a_board_lost_with_its_device_comes_back_with_it(tower: DeviceTower) -> 
 
 
 def test_a_second_run_that_opens_the_device_is_refused_by_name(tower: DeviceTower) -> None:
-    tower.start()
+    tower.start(timeouts=PATIENT)
     tower.wait_until_running()
     first = tower.directory
     second = tower.cosmos(

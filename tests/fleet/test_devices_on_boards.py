@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from device_tower import HOME, DeviceTower
+from run_tower import PATIENT
 from tower import Tower
 from tower.fixtures import need_tower
 
@@ -102,7 +103,8 @@ def test_a_board_that_is_not_ready_says_up_first(tower: DeviceTower) -> None:
 
 
 def test_a_run_uses_the_device_of_a_board(tower: DeviceTower) -> None:
-    tower.start(time={"duration_s": 4, "rtf_tolerance": 0.9}, hardware={"lost": 1000})
+    time = {"duration_s": 4, "rtf_tolerance": 0.9}
+    tower.start(time=time, timeouts=PATIENT, hardware={"lost": 1000})
     code = tower.finish()
 
     assert code == 0, tower.talk

@@ -11,7 +11,13 @@ from tower import BoardSpec
 from tower.roots import why_unavailable
 
 ARCHITECTURES = ("arm64", "armhf")
-PATIENT = {"host_setup_s": 120, "agents_ready_s": 120, "agent_setup_s": 120, "shutdown_s": 60}
+PATIENT = {
+    "host_setup_s": 120,
+    "agents_ready_s": 120,
+    "agent_setup_s": 120,
+    "shutdown_s": 60,
+    "silence_s": 60,
+}
 """An emulated interpreter takes ten times as long to start."""
 
 

@@ -11,7 +11,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from run_tower import RunTower
+from run_tower import PATIENT, RunTower
 
 PROJECT = """
 [build-system]
@@ -72,6 +72,7 @@ CHANGES = {
     "requirements": ["./cars", "./dist/motor-0.2-py3-none-any.whl"],
     "agents": {"count": 2, "tick_hz": 5},
     "time": {"duration_s": 2, "rtf_tolerance": 0.9},
+    "timeouts": PATIENT,
 }
 
 

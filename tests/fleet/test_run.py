@@ -7,14 +7,14 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from run_tower import RunTower
+from run_tower import PATIENT, RunTower
 from tower import Tower
 from tower.fixtures import need_tower
 
 pytestmark = pytest.mark.root
 
 RETURNING = {"on_agent_loss": "continue", "agents": {"count": 6, "tick_hz": 20, "restarts_max": 5}}
-QUICK = {"duration_s": 3, "rtf_tolerance": 0.9}
+QUICK = {"time": {"duration_s": 3, "rtf_tolerance": 0.9}, "timeouts": PATIENT}
 BOOT_DELAY_S = 1.0
 
 
@@ -64,6 +64,7 @@ def test_constellation_on_eight_boards_passes_with_nothing_lost(tower: RunTower)
         simulation="constellation",
         agents={"count": 8, "tick_hz": 10},
         time={"duration_s": 5, "rtf_tolerance": 0.9},
+        timeouts=PATIENT,
         parameters={"satellites": {"walker": "56:8/2/1", "altitude_km": 780}},
     )
 
@@ -77,7 +78,7 @@ def test_constellation_on_eight_boards_passes_with_nothing_lost(tower: RunTower)
 
 def test_boards_and_this_computer_run_the_same_scenario_together(tower: RunTower) -> None:
     tower.choose("pi01", "pi02", here=True, cosmos_cpu_affinity=[0])
-    tower.start(time=QUICK)
+    tower.start(**QUICK)
 
     code = tower.finish()
 
@@ -90,7 +91,7 @@ def test_boards_and_this_computer_run_the_same_scenario_together(tower: RunTower
 
 def test_host_on_a_board_serves_boards_and_this_computer(tower: RunTower) -> None:
     tower.choose("pi01", "pi02", here=True)
-    tower.start("--host", "pi01", time=QUICK)
+    tower.start("--host", "pi01", **QUICK)
 
     code = tower.finish()
 
@@ -123,7 +124,8 @@ def test_detached_run_goes_on_on_boards_and_is_ended_by_its_number(tower: RunTow
 
 
 def test_detached_run_survives_its_operators_cable_and_is_collected_whole(tower: RunTower) -> None:
-    tower.start("--detach", "--host", "pi01", time={"duration_s": 5, "rtf_tolerance": 0.9})
+    time = {"duration_s": 5, "rtf_tolerance": 0.9}
+    tower.start("--detach", "--host", "pi01", time=time, timeouts=PATIENT)
     assert tower.finish() == 0, tower.talk
 
     tower.wait_until(lambda: not tower.living(), "end by itself")
@@ -196,7 +198,7 @@ def test_power_cut_ends_the_run_by_name_and_says_what_is_missing(tower: RunTower
     ["crash", *(pytest.param(fault, marks=pytest.mark.nightly) for fault in ("reboot", "down"))],
 )
 def test_board_that_returns_is_given_its_agents_again(tower: RunTower, fault: str) -> None:
-    tower.start(**RETURNING, time={"duration_s": 20, "rtf_tolerance": 0.9})
+    tower.start(**RETURNING, time={"duration_s": 600, "rtf_tolerance": 0.9})
     tower.wait_until_running()
     tower.tower.fault("pi02", fault)
     tower.wait_until(lambda: "pi02" in tower.talk, "word of pi02")
@@ -205,6 +207,9 @@ def test_board_that_returns_is_given_its_agents_again(tower: RunTower, fault: st
         tower.tower.fault("pi02", "up")
     tower.wait_for("pi02 has returned; its agents agent-03, agent-04 rejoin")
     tower.wait_for("agent-03 has rejoined")
+    tower.wait_for("agent-04 has rejoined")
+    stopped = tower.cosmos("inject", "last", "run", "stop")
+    assert stopped.returncode == 0, stopped.stdout + stopped.stderr
 
     code = tower.finish()
 
@@ -219,7 +224,7 @@ def test_board_that_returns_is_given_its_agents_again(tower: RunTower, fault: st
 def test_lost_packets_cost_no_message_that_must_arrive(tower: RunTower) -> None:
     for name in ("pi01", "pi02", "pi03"):
         tower.tower.fault(name, "loss", 5)
-    tower.start(time={"duration_s": 6, "rtf_tolerance": 0.9})
+    tower.start(time={"duration_s": 6, "rtf_tolerance": 0.9}, timeouts=PATIENT)
 
     code = tower.finish()
 
@@ -279,9 +284,7 @@ def test_board_ends_its_agents_when_the_operator_vanishes_without_a_word(tower: 
 
 
 def test_broken_ssh_sessions_of_one_board_and_of_all_end_no_run(tower: RunTower) -> None:
-    tower.start(
-        time={"duration_s": 30, "rtf_tolerance": 0.9}, timeouts={"silence_s": 30, "shutdown_s": 5}
-    )
+    tower.start(time={"duration_s": 30, "rtf_tolerance": 0.9}, timeouts=PATIENT)
     tower.wait_until_running()
 
     for broken in (("pi02",), tower.boards):

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 import yaml
-from run_tower import RunTower
+from run_tower import PATIENT, RunTower
 from tower import Tower
 from tower.fixtures import need_tower
 from up_tower import LIST
 
 pytestmark = pytest.mark.root
 
-QUICK = {"duration_s": 3, "rtf_tolerance": 0.9}
+QUICK = {"time": {"duration_s": 3, "rtf_tolerance": 0.9}, "timeouts": PATIENT}
 TALKATIVE = Path(__file__).parents[1] / "harness" / "talkative.py"
 
 
@@ -33,7 +33,7 @@ def runs_of(tower: RunTower) -> set[str]:
 
 
 def check(tower: RunTower, *words: str) -> dict:
-    scenario = str(tower.scenario(time=QUICK))
+    scenario = str(tower.scenario(**QUICK))
     done = tower.cosmos("run", scenario, "--check", "--json", *words)
     answer = json.loads(done.stdout)
     assert answer["exit_code"] == done.returncode, done.stderr
@@ -63,7 +63,7 @@ def test_boards_are_checked_made_ready_run_and_read(tower: RunTower) -> None:
     assert after == before  # nothing was changed
     assert runs_of(tower) == runs
 
-    scenario = str(tower.scenario(time=QUICK))
+    scenario = str(tower.scenario(**QUICK))
     up = tower.cosmos("up", *both, scenario)
     assert up.returncode == 0, up.stdout + up.stderr
     ready = check(tower, *both)
@@ -90,7 +90,7 @@ def test_log_of_a_detached_run_is_followed_on_its_machines(tower: RunTower) -> N
     tower.choose("pi01", "pi02")
     (tower.scenarios / "talkative.py").write_text(TALKATIVE.read_text())
     changes = {"simulation": "./talkative.py:simulation", "agents": {"count": 2, "tick_hz": 10}}
-    scenario = str(tower.scenario(**changes, time=QUICK))
+    scenario = str(tower.scenario(**changes, **QUICK))
     where = ("-i", str(tower.inventory), "--host", "pi02")
     up = tower.cosmos("up", *where, scenario)
     assert up.returncode == 0, up.stdout + up.stderr
@@ -114,7 +114,7 @@ def test_machine_that_is_gone_hides_nobody_elses_log(tower: RunTower) -> None:
     tower.choose("pi01", "pi02")
     (tower.scenarios / "talkative.py").write_text(TALKATIVE.read_text())
     changes = {"simulation": "./talkative.py:simulation", "agents": {"count": 2, "tick_hz": 10}}
-    scenario = str(tower.scenario(**changes, time=QUICK))
+    scenario = str(tower.scenario(**changes, **QUICK))
     up = tower.cosmos("up", "-i", str(tower.inventory), scenario)
     assert up.returncode == 0, up.stdout + up.stderr
     run = tower.cosmos("run", scenario, "-i", str(tower.inventory), "--detach", "--json")

@@ -56,7 +56,7 @@ class FaultAgent(AgentSimulation):
         context.open_stream("steps", (Field("t_s"), Field("tick", "", "int")))
 
     def step(self, tick):
-        if tick.index == 20 and self.context.name == self.context.parameters.dies:
+        if tick.index >= 20 and self.context.name == self.context.parameters.dies:
             raise ValueError("told to")
         self.context.record("steps", (tick.t_s, tick.index))
         self.context.send(HOST, ["up", tick.index], SERVICES[tick.index % 3])
@@ -85,7 +85,7 @@ class Parameters:
     """Settings."""
 
     dies: str = ""
-    """An agent that raises in its twentieth tick."""
+    """An agent that raises in its twentieth tick, or in the next that it has not missed."""
 
 
 simulation = Simulation(

@@ -15,7 +15,7 @@ from madns_runtime.processes import register
 
 register(*sys.argv[1:])
 print("ready", flush=True)
-time.sleep(60)
+time.sleep(600)
 """
 
 

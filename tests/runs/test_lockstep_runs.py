@@ -2,7 +2,6 @@
 
 import json
 import signal
-import time
 
 import pytest
 from harness.cosmos_command import SCENARIOS, CosmosCommand
@@ -101,12 +100,9 @@ def running(cosmos, *options):
     raise AssertionError("it ended before it ran")
 
 
-def nobody_is_left(cosmos, monkeypatch, within_s=10.0):
+def wait_until_nobody_is_left(cosmos, monkeypatch):
     monkeypatch.setenv("COSMOS_STATE_DIR", cosmos.environment["COSMOS_STATE_DIR"])
-    until_s = time.monotonic() + within_s
-    while (left := list_processes()) and time.monotonic() < until_s:
-        time.sleep(0.05)
-    return not left
+    wait_until(lambda: not list_processes(), "the end of all processes")
 
 
 def test_ctrl_c_ends_it_in_good_order(cosmos, monkeypatch):
@@ -116,17 +112,17 @@ def test_ctrl_c_ends_it_in_good_order(cosmos, monkeypatch):
 
     assert process.returncode == 130
     assert out.startswith("INTERRUPTED by operator")
-    assert nobody_is_left(cosmos, monkeypatch)
+    wait_until_nobody_is_left(cosmos, monkeypatch)
     (result,) = cosmos.runs.glob("*/run.json")
     assert json.loads(result.read_text())["data"] == {"complete": True, "missing": []}
 
 
-def test_it_ends_within_seconds_of_its_killed_operator(cosmos, monkeypatch):
+def test_it_ends_after_its_operator_was_killed(cosmos, monkeypatch):
     process = running(cosmos)
     process.kill()
     process.communicate(timeout=60)
 
-    assert nobody_is_left(cosmos, monkeypatch)
+    wait_until_nobody_is_left(cosmos, monkeypatch)
     (result,) = cosmos.runs.glob("*/host/result.json")
     assert json.loads(result.read_text())["reason"] == "the operator's process is gone"
 
@@ -145,7 +141,7 @@ def test_it_goes_on_without_its_operator_takes_orders_and_ends_by_down(cosmos, m
     assert ordered.returncode == 0, ordered.stdout + ordered.stderr
     assert [(each["action"], each["agents"]) for each in in_force] == [("hang", ["agent-01"])]
     assert down.returncode == 0
-    assert nobody_is_left(cosmos, monkeypatch)
+    wait_until_nobody_is_left(cosmos, monkeypatch)
 
 
 def test_what_cannot_be_done_in_lockstep_is_refused_with_what_to_do(cosmos, tmp_path):

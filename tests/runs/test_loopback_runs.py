@@ -91,7 +91,7 @@ def test_counter_loses_nothing_in_any_class_of_service(tmp_path, service):
 def test_stress_and_health_run_beside_the_agents(tmp_path):
     settings = (
         "agents.count=2",
-        "time.duration_s=2",
+        "time.duration_s=4",
         "health.stress_workers=1",
         "health.period_s=0.5",
     )

@@ -4,7 +4,7 @@ import json
 import re
 
 import pytest
-from harness.cosmos_command import CosmosCommand
+from harness.cosmos_command import LOOSE, CosmosCommand
 
 from madns_runtime.plugin.host_calls import FOLDER, PREFIX
 
@@ -77,7 +77,7 @@ class H(HostSimulation):
         return None if self.evil == "host_finish" else {}
 
 class A(AgentSimulation):
-    has_forked = False
+    has_forked = has_sent = False
 
     def __init__(self):
         wanted = Path(__file__).with_name("fork_as_it_is_made")
@@ -92,7 +92,7 @@ class A(AgentSimulation):
     def step(self, tick):
         if os.getpid() != self.pid:
             Path(__file__).with_name("stepped_by_a_fork").touch()
-        if self.evil == "exit" and self.context.name == "agent-01" and tick.index == 3:
+        if self.evil == "exit" and self.context.name == "agent-01" and tick.index >= 3:
             os._exit(0)
         if self.evil == "crash" and self.context.name == "agent-01" and tick.index >= 3:
             os.kill(os.getpid(), signal.SIGSEGV)
@@ -101,9 +101,11 @@ class A(AgentSimulation):
             self.has_forked = True
             if not os.fork() and self.evil == "fork_exit":
                 sys.exit(0)
-        if self.evil == "text" and tick.index == 3:
+        if self.evil == "text" and tick.index >= 3:
             raise ValueError("\\udcff" + "x" * 100_000)
-        if self.evil == "wake" and self.context.name == "agent-01" and tick.index == 3:
+        is_first = not self.has_sent and tick.index >= 3
+        if self.evil == "wake" and self.context.name == "agent-01" and is_first:
+            self.has_sent = True
             self.context.send(HOST, 1)
         if self.evil == "service":
             self.context.send(HOST, 1, "SYNC")
@@ -156,8 +158,9 @@ def test_an_agent_that_ends_its_process_is_named(tmp_path):
     result = run(tmp_path, "exit")
 
     assert (result["exit_code"], result["who"]) == (1, "agent-01")
-    reason = "its process ended by itself, exit code 0 in the step of agent-01 at t = 0.15 s"
-    assert reason in result["reason"]
+    # A busy machine may miss the tick at 0.15 s: then it ends in the next.
+    told = r"its process ended by itself, exit code 0 in the step of agent-01 at t = 0\.\d+ s"
+    assert re.search(told, result["reason"])
 
 
 @pytest.mark.parametrize("evil", ["fork_exit", "fork_return"])
@@ -180,7 +183,7 @@ def test_an_agent_that_is_killed_in_a_call_is_told_with_the_call(tmp_path):
     result = run(tmp_path, "crash", "agents.per_process=2")
 
     assert result["exit_code"] == 1
-    # A busy machine may miss the tick at 0.15 s: then it is killed in the next.
+    # As above.
     told = r"killed by SIGSEGV in the step of agent-01 at t = 0\.\d+ s"
     assert re.search(told, result["reason"])
 
@@ -199,8 +202,9 @@ def test_a_call_that_holds_the_host_is_told_with_its_time(tmp_path):
 
     told = result["host_calls"]["methods"]["H.timer"]
     assert told["longest_s"] >= 0.3
-    assert told["longest_t_s"] == pytest.approx(0.3, abs=0.2)
-    assert any("the longest H.timer for 0.3" in remark for remark in result["remarks"])
+    assert told["longest_t_s"] >= 0.3
+    words = f"the longest H.timer for {told['longest_s']:.3g} s"
+    assert any(words in remark for remark in result["remarks"])
 
 
 def test_no_page_of_a_host_is_left(tmp_path):
@@ -251,5 +255,5 @@ def run(tmp_path, evil, *settings):
     (tmp_path / "evil.py").write_text(PLUGIN, "utf-8")
     (tmp_path / "evil.yaml").write_text(SCENARIO, "utf-8")
     scenario = tmp_path / "evil.yaml"
-    _, result = CosmosCommand(tmp_path).run(scenario, f"parameters.evil={evil}", *settings)
+    _, result = CosmosCommand(tmp_path).run(scenario, f"parameters.evil={evil}", *LOOSE, *settings)
     return result

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import orjson
 import pytest
+from harness.cosmos_command import LOOSE
 
 pytestmark = pytest.mark.process
 
@@ -55,7 +56,7 @@ def run(folder, *settings, code=0, plugin=None, change=("", "", "")):
     (folder / "ring_road.yaml").write_text(SCENARIO + own)
     command = [sys.executable, "-m", "cosmos_cli.app", "run", str(folder / "ring_road.yaml")]
     command += ["--json", "--quiet", "--no-report", "--runs", str(folder / "runs")]
-    for setting in ("time.rtf_tolerance=1", *settings):
+    for setting in (*LOOSE, *settings):
         command += ["--set", setting]
     done = subprocess.run(
         command,

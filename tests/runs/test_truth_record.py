@@ -8,7 +8,7 @@ import numpy as np
 import orjson
 import pyarrow.parquet as pq
 import pytest
-from harness.cosmos_command import CosmosCommand
+from harness.cosmos_command import LOOSE, CosmosCommand
 from harness.waiting import wait_until
 
 pytestmark = pytest.mark.process
@@ -83,7 +83,7 @@ def states(table, agent):
 @pytest.mark.nightly
 def test_a_killed_agent_takes_nothing_of_its_satellites_truth_with_it(tmp_path):
     place = Place(tmp_path)
-    process = place.begin()
+    process = place.begin(*LOOSE)
     # Its burn is in truth: from now on the host needs it no more.
     wait_until(
         lambda: any(
@@ -98,7 +98,7 @@ def test_a_killed_agent_takes_nothing_of_its_satellites_truth_with_it(tmp_path):
     os.kill(next(e["pid"] for e in entries if e["name"] == "agent-02"), signal.SIGKILL)
     out, err = process.communicate(timeout=PATIENCE_S)
     killed = json.loads(out)
-    out, err = place.begin().communicate(timeout=PATIENCE_S)
+    out, err = place.begin(*LOOSE).communicate(timeout=PATIENCE_S)
     control = json.loads(out)
 
     assert (killed["agents"]["lost"], control["agents"]["lost"]) == (["agent-02"], []), err

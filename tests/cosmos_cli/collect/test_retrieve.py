@@ -3,6 +3,7 @@
 import contextlib
 import os
 import shutil
+import signal
 import socket
 import threading
 from pathlib import Path
@@ -11,11 +12,13 @@ import orjson
 import pytest
 from harness.split_run import CutConnection, SplitRun, hashes
 
-from cosmos_cli.collect import retrieve
+from cosmos_cli.collect import machine_retrieval, retrieve
+from cosmos_cli.collect.machine_retrieval import PATIENCE_S
 from cosmos_cli.collect.retrieve import PARTS, problems_of
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.local import LocalConnection
+from madns_runtime.health.sampler import SAMPLER_TIMEOUT_S
 
 pytestmark = pytest.mark.process
 
@@ -164,7 +167,28 @@ def test_lines_are_packed_on_the_way_and_noise_is_not(tmp_path):
     assert 2_000_000 < noise.packed_bytes < noise.fetched_bytes + 1
 
 
-def test_living_processes_of_the_run_are_named_and_nothing_is_touched(tmp_path):
+def test_what_ends_there_at_this_moment_is_waited_for(tmp_path, monkeypatch):
+    split = SplitRun(tmp_path, machines=1)
+    parts = Helper.parts
+
+    with split.living("pi01", "sampler", "pi01") as pid:
+        end = threading.Timer(0.3, os.kill, [pid, signal.SIGKILL])
+
+        def ask(board, verb, *arguments, **more):
+            if verb == "sizes":
+                end.start()
+            return parts(board, verb, *arguments, **more)
+
+        monkeypatch.setattr(Helper, "parts", ask)
+        outcome = split.retrieve()["pi01"]
+        end.join()
+
+    assert outcome.is_ok, outcome.failure
+    assert PATIENCE_S > SAMPLER_TIMEOUT_S
+
+
+def test_living_processes_of_the_run_are_named_and_nothing_is_touched(tmp_path, monkeypatch):
+    monkeypatch.setattr(machine_retrieval, "PATIENCE_S", 1.0)
     split = SplitRun(tmp_path)
     before = split.there("pi02")
     with split.living("pi02", "agent", "agent-02") as pid:

@@ -18,7 +18,7 @@ from harness.waiting import is_alive, wait_until
 from cosmos_cli.app import run as cosmos
 from cosmos_cli.commands.ps import age_words
 from cosmos_cli.launch.living_processes import LivingRun, is_called, living_runs
-from cosmos_cli.onboard.processes import end_entries
+from cosmos_cli.onboard.processes import HOST_LEAD_S, end_entries
 
 pytestmark = pytest.mark.process
 
@@ -36,12 +36,12 @@ else:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
 if manner == "with-worker":
     # A worker of an executor is in the group, not in the register, and does not heed SIGTERM.
-    code = "import signal, time; signal.signal(15, signal.SIG_IGN); print(1, flush=True); time.sleep(60)"
+    code = "import signal, time; signal.signal(15, signal.SIG_IGN); print(1, flush=True); time.sleep(600)"
     worker = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
     worker.stdout.readline()
     print(worker.pid, flush=True)
 print("ready", flush=True)
-time.sleep(60)
+time.sleep(600)
 """
 
 Start = Callable[..., subprocess.Popen[str]]
@@ -182,13 +182,31 @@ def test_down_kills_what_does_not_heed_sigterm_and_says_so(start: Start) -> None
     assert any(f"agent-01 (pid {agent.pid})" in line for line in said if "killing" in line)
 
 
+def test_down_gives_the_parts_of_a_hanging_operator_the_time_for_a_clean_shutdown(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start("0001-a", "operator", "operator", "stubborn")
+    start("0001-a", "host", "host")
+    (run,) = living_runs()
+    waits: list[tuple[list[str], float]] = []
+    monkeypatch.setattr(
+        "cosmos_cli.onboard.processes._wait",
+        lambda entries, timeout_s: waits.append((sorted(e.role for e in entries), timeout_s)),
+    )
+
+    end_entries(run.processes, directory=run.directory, clean_s=30.0, forced_s=5.0)
+
+    assert waits[:3] == [(["host", "operator"], 30.0), (["host"], HOST_LEAD_S), (["host"], 30.0)]
+
+
 def test_down_ends_workers_that_are_not_in_the_register(start: Start) -> None:
     host = start("0001-a", "host", "host", "with-worker")
     worker_pid = host.worker_pid  # type: ignore[attr-defined]
     (run,) = living_runs()
 
+    # Its worker lets all of it pass: enough for the host to end on a busy machine.
     ending = end_entries(
-        run.processes, directory=run.directory, clean_s=0.3, forced_s=PATIENCE_S, say=lambda _: None
+        run.processes, directory=run.directory, clean_s=4.0, forced_s=PATIENCE_S, say=lambda _: None
     )
 
     assert [entry.pid for entry in ending.killed] == [worker_pid]

@@ -282,7 +282,7 @@ def test_plan_without_a_latency_measures_loopback(cosmos):
 
     resources = json.loads(out)["resources"]
     assert resources["latency_source"] == "measured on loopback"
-    assert 0 < resources["latency_s"] < 0.05
+    assert resources["latency_s"] > 0
 
 
 @pytest.mark.process

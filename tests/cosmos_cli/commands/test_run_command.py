@@ -31,6 +31,7 @@ name: tiny
 simulation: counter
 agents: {count: 2, tick_hz: 20}
 time: {duration_s: 1}
+timeouts: {agents_ready_s: 120, silence_s: 30, complete_s: 60}
 """
 
 

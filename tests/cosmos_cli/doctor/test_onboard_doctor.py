@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from harness.waiting import wait_until
 
 from cosmos_cli.doctor.case import Case, Wants
 from cosmos_cli.doctor.finding import HERE
@@ -164,7 +165,15 @@ def test_smallest_quota_on_the_way_up_counts(
 NONCE = b"n" * 16
 
 
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for answers longer than a busy computer lets the thread wait that gives them."""
+    monkeypatch.setattr(udp_probe, "ANSWER_TIMEOUT_S", 5.0)
+    monkeypatch.setattr(udp_probe, "UNASKED_TIMEOUT_S", 60.0)
+
+
 @pytest.mark.process
+@pytest.mark.usefixtures("patient")
 def test_round_trips_are_measured_both_ways() -> None:
     with Responder() as responder:
         told = udp_probe.round_trips("127.0.0.1", responder.port, responder.nonce, 10)
@@ -179,13 +188,13 @@ def test_nobody_answers_a_stranger() -> None:
     with Responder() as responder:
         told = udp_probe.round_trips("127.0.0.1", responder.port, NONCE, 50)
 
-        assert responder.ignored == SILENCE_COUNT_MAX
+        wait_until(lambda: responder.ignored == SILENCE_COUNT_MAX, lambda: str(responder.ignored))
     assert (told["sent"], told["answered"], told["p50_ms"]) == (SILENCE_COUNT_MAX, 0, None)
 
 
 @pytest.fixture
-def deaf_every_fifth_time() -> Iterator[int]:
-    """Answers, but not every fifth datagram."""
+def deaf_once() -> Iterator[int]:
+    """Answers, but not the fifth datagram."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("127.0.0.1", 0))
 
@@ -195,7 +204,7 @@ def deaf_every_fifth_time() -> Iterator[int]:
                 asked = Datagram.decode(data)
                 if asked is None:
                     return
-                if asked.sequence % 5 != 4:
+                if asked.sequence != 4:
                     reply = Datagram(nonce=asked.nonce, kind=ANSWER, sequence=asked.sequence)
                     listener.sendto(reply.encode(), where)
 
@@ -209,10 +218,11 @@ def deaf_every_fifth_time() -> Iterator[int]:
 
 
 @pytest.mark.process
-def test_losses_are_counted(deaf_every_fifth_time: int) -> None:
-    told = udp_probe.round_trips("127.0.0.1", deaf_every_fifth_time, NONCE, 10)
+@pytest.mark.usefixtures("patient")
+def test_losses_are_counted(deaf_once: int) -> None:
+    told = udp_probe.round_trips("127.0.0.1", deaf_once, NONCE, 10)
 
-    assert (told["sent"], told["answered"]) == (10, 8)
+    assert (told["sent"], told["answered"]) == (10, 9)
 
 
 def test_address_that_cannot_be_sent_to_is_an_error() -> None:

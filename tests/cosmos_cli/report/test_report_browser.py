@@ -15,7 +15,7 @@ from madns_runtime.recording.records import LOG, Field, StreamSchema
 CHROMIUM = (
     shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 )
-TIMEOUT_S = 120
+TIMEOUT_S = 240
 FLAGS = (
     "--headless",
     "--no-sandbox",

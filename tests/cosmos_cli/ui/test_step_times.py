@@ -18,6 +18,7 @@ simulation: counter
 agents: {count: 1, tick_hz: 10}
 time: {duration_s: 1, rtf_tolerance: 1}
 deadline: {max_miss_ratio: 1}
+timeouts: {agents_ready_s: 120, silence_s: 30, complete_s: 60}
 """
 LINE = re.compile(r" +\d+\.\d{3} s  ([^:]+): (.+)")
 
