@@ -17,7 +17,7 @@ from cosmos_cli.fleet.open_connection import connect
 
 pytestmark = pytest.mark.process
 
-WAIT_S = 20.0
+WAIT_S = 60.0
 """A bound, not an expectation."""
 
 
