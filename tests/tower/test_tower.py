@@ -115,7 +115,9 @@ def test_nothing_private_of_this_computer_shows(tower):
 
 def test_processes_of_boards_are_their_own(tower):
     assert read(tower, "pi01", "ps -o comm= -p 1") == "init"
-    assert str(os.getpid()) not in read(tower, "pi01", "ls /proc").split()
+    own = Path("/proc/self/cmdline").read_text().replace("\0", " ").strip()
+    assert own not in read(tower, "pi01", "ps -ww -eo args=")
+    assert read(tower, "pi01", "sudo readlink /proc/1/ns/pid") != os.readlink("/proc/self/ns/pid")
 
 
 def test_boards_reach_operator_and_each_other_and_nothing_else(tower):
