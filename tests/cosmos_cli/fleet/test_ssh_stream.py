@@ -54,6 +54,12 @@ def test_output_ends_with_empty_bytes_and_a_status(connection):
     stream.close()
 
 
+def test_status_that_comes_long_after_the_end_of_the_output_is_waited_for(connection):
+    done = connection.run("echo one; exec >&- 2>&-; sleep 2; exit 7", timeout_s=WAIT_S)
+
+    assert (done.exit_status, done.stdout) == (7, b"one\n")
+
+
 def test_status_is_unknown_while_it_runs(connection):
     stream = connection.open("cat")
 
