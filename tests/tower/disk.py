@@ -18,7 +18,7 @@ from pathlib import Path
 
 from . import kernel
 
-PATIENCE_S = 10.0
+PATIENCE_S = 60.0
 POLL_S = 0.01
 MOUNT_ATTEMPTS = 5
 UPPER = "upper"

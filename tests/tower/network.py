@@ -22,7 +22,7 @@ from . import kernel
 
 FIRST_NETWORK = 77
 NETWORK_PREFIX_BITS = 16
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 LOSS_SCALE = 10_000
 """Loss is set in hundredths of a percent."""
 
