@@ -54,7 +54,8 @@ def list_traces(places: Places) -> list[str]:
     """Return what is left of a tower, in words."""
     traces = [f"process {pid}" for pid, _ in list_processes(str(places.folder))]
     if places.folder.exists():
-        traces.append(f"{places.folder}: {sorted(p.name for p in places.folder.rglob('*'))[:5]}")
+        names = sorted(name for _, *found in os.walk(places.folder) for name in sum(found, []))
+        traces.append(f"{places.folder}: {names[:5]}")
     if Path(f"/sys/class/net/{places.uplink}").exists():
         traces.append(places.uplink)
     if str(places.folder) in Path("/proc/self/mountinfo").read_text():
@@ -81,7 +82,8 @@ def list_groups(places: Places) -> list[str]:
             kernel.unshare(kernel.CLONE_NEWNS)
             kernel.make_mounts_private()
             kernel.mount("cgroup2", "/mnt", "cgroup2")
-            found = [str(path) for path in Path("/mnt").rglob(places.cgroup)]
+            # Groups of others may vanish meanwhile, which a walk bears.
+            found = [top for top, _, _ in os.walk("/mnt") if Path(top).name == places.cgroup]
             os.write(write, json.dumps(found).encode())
         finally:
             os._exit(0)
