@@ -20,6 +20,7 @@ from paramiko.pkey import PKey
 from paramiko.ssh_exception import ChannelException, SSHException
 
 from cosmos_cli.fleet.connection import (
+    EXIT_STATUS_TIMEOUT_S,
     OUTPUT_BYTES_MAX,
     SAID_BYTES_MAX,
     Completed,
@@ -54,9 +55,6 @@ OPEN_TIMEOUT_S = 20.0
 INPUT_POLL_S = 0.005
 QUIET_S = 5.0
 """After so long without output of a command its machine is asked for a sign of life."""
-STATUS_TIMEOUT_S = 20.0
-"""For a command's exit status, once its output has ended: a shell closes that first, and may have to wait for a
-processor before it has ended itself."""
 LIMITS_POLL_S = 0.25
 """Between looks at the limits of a command that writes to standard error alone, or nothing."""
 
@@ -128,7 +126,7 @@ class SshConnection:
                 limits,
                 gives_sign=self.transport.gives_sign,
             )
-            status = stream.ending(timeout_s=STATUS_TIMEOUT_S).exit_status
+            status = stream.ending(timeout_s=EXIT_STATUS_TIMEOUT_S).exit_status
         finally:
             stream.close()
         if status is None:
