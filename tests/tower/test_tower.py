@@ -122,7 +122,7 @@ def test_processes_of_boards_are_their_own(tower):
 
 def test_boards_reach_operator_and_each_other_and_nothing_else(tower):
     def connect(address: str) -> str:
-        code = f"import socket; socket.create_connection(('{address}', 22), 2)"
+        code = f"import socket; socket.create_connection(('{address}', 22), 20)"
         return tower.run("pi01", f'python3 -c "{code}"', check=False).stderr
 
     assert connect(tower.boards["pi02"].address) == ""
