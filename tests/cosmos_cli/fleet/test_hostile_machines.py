@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 from paramiko.ssh_exception import SSHException
-from ssh_harness import needs_sshd, target_of
+from ssh_harness import needs_sshd, target_of, write_configuration
 from sshd import Sshd
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
@@ -62,7 +62,9 @@ def servers(tmp_path_factory):
 
 
 @pytest.fixture
-def inventory(servers, tmp_path, known_hosts, monkeypatch):
+def inventory(servers, tmp_path, known_hosts, monkeypatch, home):
+    # Several logins at once take a busy computer long.
+    write_configuration(home / ".ssh" / "config", "Host *", "  ConnectTimeout 60")
     monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))  # where no other run is known
     known_hosts.write_text("".join(server.known_hosts_line() for server in servers.values()))
     hosts = {

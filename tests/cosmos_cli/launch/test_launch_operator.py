@@ -424,15 +424,15 @@ def test_host_that_goes_on_without_agents_is_told_to_stop(launched: Launched) ->
     launched.start(
         host={"runs_s": 60, "ignores_exits": True},
         agents={"killed_after_s": 0.1},
-        timeouts={"silence_s": 0.25, "complete_s": 0.25, "shutdown_s": 1},
-        constants={"host_limits.MARGIN_S": 1},
+        timeouts={"silence_s": 0.25, "complete_s": 0.25, "shutdown_s": 2},
+        constants={"host_limits.MARGIN_S": 2},
     )
 
     outcome = launched.outcome()
 
-    # silence_s, complete_s, shutdown_s and the margin are 2.5 s.
+    # silence_s, complete_s, shutdown_s and the margin are 4.5 s.
     assert outcome["host_result"]["status"] == "failed"
-    assert outcome["host_result"]["reason"] == "the host has gone on without agents for 2.5 s"
+    assert outcome["host_result"]["reason"] == "the host has gone on without agents for 4.5 s"
 
 
 def test_closed_standard_error_does_not_end_the_run(launched: Launched) -> None:
