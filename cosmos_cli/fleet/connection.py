@@ -17,8 +17,9 @@ OUTPUT_BYTES_MAX = 4 * 1024 * 1024
 """Bytes that `Connection.run` keeps of each output: one half of its begin, one of its end."""
 SAID_BYTES_MAX = 1024 * 1024 * 1024
 """Bytes that a command may write at all before it is ended."""
-EXIT_STATUS_TIMEOUT_S = 1.0
-"""Wait for a program's exit status, once its output has ended."""
+EXIT_STATUS_TIMEOUT_S = 20.0
+"""Wait for a program's exit status, once its output has ended: it closes that first, and may have to wait for a
+processor before it has ended itself."""
 SMALL_BYTES_MAX = 1024 * 1024
 """Bytes for a command that has next to nothing to say; a start-up file there may talk."""
 

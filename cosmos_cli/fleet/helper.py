@@ -41,6 +41,10 @@ CALL_TIMEOUT_S = 30.0
 WHOLE_TIMEOUT_S = 3600.0
 """For an answer in pieces, beside what its bytes are worth."""
 
+LAST_WORDS_S = 5.0
+LAST_WORDS_BYTES_MAX = 4 * 1024 * 1024
+"""For what comes of a start that has failed."""
+
 _BOOT = (
     "import marshal,sys,zlib;PACKAGE=sys.stdin.buffer.read(int(sys.argv[1]));"
     "SENT=marshal.loads(zlib.decompress(PACKAGE));exec(SENT['opening'])"
@@ -164,7 +168,7 @@ class Helper:
     def _last_words(self, expected: ExpectedAnswer) -> MachineFailure | None:
         """Return what one that has ended said instead of a greeting, which tells more than that it has; None for nothing."""
         try:
-            self._read_answer(expected, timeout_s=EXIT_STATUS_TIMEOUT_S)
+            self._read_answer(expected, timeout_s=LAST_WORDS_S)
         except MachineFailure as failure:
             return failure if failure.kind in (FailureKind.DATA, FailureKind.PYTHON) else None
         return None
@@ -288,12 +292,15 @@ class Helper:
         return failure
 
     def _read_to_its_end(self) -> None:
-        """Read what else comes, which is of no use, so that the exit status is known if there is one by then."""
-        until_s = time.monotonic() + EXIT_STATUS_TIMEOUT_S
+        """Let it end and read what else comes, which is of no use, so that the exit status is known if there is one by then."""
+        until_s, left_bytes = time.monotonic() + LAST_WORDS_S, LAST_WORDS_BYTES_MAX
+        self._stream.close_writing()
         with contextlib.suppress(MachineFailure):
-            while (left_s := until_s - time.monotonic()) > 0:
-                if not self._link.read_some(READ_BYTES, timeout_s=left_s):
+            while left_bytes > 0 and (left_s := until_s - time.monotonic()) > 0:
+                data = self._link.read_some(READ_BYTES, timeout_s=left_s)
+                if not data:
                     return
+                left_bytes -= len(data)
 
 
 NO_PYTHON_STATUS = 127

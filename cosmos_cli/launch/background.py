@@ -44,6 +44,8 @@ class BackgroundTasks:
         os.set_blocking(self._write_fd, False)
         self._threads = 0
         self._is_closed = False
+        self._waking = threading.Lock()
+        """Held from a report to the word of it: the pipe's number may be another file's once it is closed."""
         self.pending = 0
         """Tasks whose end has not been told yet."""
         selector.register(self._read_fd, selectors.EVENT_READ, self._news)
@@ -81,15 +83,18 @@ class BackgroundTasks:
             return False
         for _ in range(self._threads):
             self._tasks.put(None)
-        os.close(self._read_fd)
-        os.close(self._write_fd)
+        with self._waking:
+            os.close(self._read_fd)
+            os.close(self._write_fd)
         return True
 
     def _work(self) -> None:
         while (task := self._tasks.get()) is not None:
-            self._reports.append(task())
-            with contextlib.suppress(OSError):  # full: the loop will be woken anyway
-                os.write(self._write_fd, b"!")
+            report = task()
+            with self._waking:
+                self._reports.append(report)
+                with contextlib.suppress(OSError):  # full: the loop will be woken anyway
+                    os.write(self._write_fd, b"!")
 
     def _news(self, mask: int) -> None:
         with contextlib.suppress(BlockingIOError):

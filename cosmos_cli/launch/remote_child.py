@@ -15,7 +15,7 @@ from typing import Any
 
 import orjson
 
-from cosmos_cli.fleet.connection import EXIT_STATUS_TIMEOUT_S, Stream
+from cosmos_cli.fleet.connection import Stream
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.liveness import BlockingStream
 from cosmos_cli.launch.background import BackgroundTasks
@@ -42,6 +42,7 @@ from madns_runtime.config import RELAY_CONNECTED, RELAY_NOBODY
 from madns_runtime.plugin.host_calls import interrupted_call, page_path
 
 STATUS_TRIES = 10
+STATUS_TIMEOUT_S = 1.0
 STATUS_PAUSE_S = 0.1
 """A program's exit status comes a moment after the end of its output."""
 KILL_TIMEOUT_S = 4.0
@@ -368,7 +369,7 @@ def _reattach(machine: RemoteMachine, command: str, attach: bytes) -> tuple[Stre
 def _fate(stream: Stream, machine: RemoteMachine) -> tuple[int | None, bool]:
     """Return the exit status of a program whose output has ended, and whether its machine answers."""
     for _ in range(STATUS_TRIES):
-        status = stream.ending(timeout_s=EXIT_STATUS_TIMEOUT_S).exit_status
+        status = stream.ending(timeout_s=STATUS_TIMEOUT_S).exit_status
         if status is not None:
             return status, True
         if not machine.is_alive():

@@ -21,8 +21,8 @@ from cosmos_cli.onboard.request_loop import HelperRefusal, PlainValue, VerbReque
 
 LOOK, FULL = "look", "full"
 RUNTIME = "madns_runtime"
-ECHO_TRIES = 3
-ECHO_WAIT_S = 0.3
+ECHO_WAITS_S = (0.3, 1.0, 4.0)
+"""For the answer to each of the questions: a datagram may be lost, and who answers may have to wait for a processor."""
 ECHO_BYTES_MAX = 256
 VARIABLES = {"OPENBLAS_NUM_THREADS": "1", "PYTHONNOUSERSITE": "1"}
 """Variables of a run's programs: one thread per process, and nothing of the user's own packages."""
@@ -134,10 +134,10 @@ def round_trip_ms(udp: Mapping[str, PlainValue]) -> float:
     try:
         family, _, _, _, where = _socket.getaddrinfo(address, port, 0, _socket.SOCK_DGRAM)[0]
         with contextlib.closing(_socket.socket(family, _socket.SOCK_DGRAM)) as link:
-            for attempt in range(ECHO_TRIES):
+            for attempt, wait_s in enumerate(ECHO_WAITS_S):
                 sent_s = time.monotonic()
                 link.sendto(nonce + bytes([attempt]), where)
-                if _comes_back(link, nonce, sent_s + ECHO_WAIT_S):
+                if _comes_back(link, nonce, sent_s + wait_s):
                     return round((time.monotonic() - sent_s) * 1000, 3)
     except OSError as error:
         said = f" ({error.strerror or error})"

@@ -68,8 +68,8 @@ def test_lost_board_comes_back_with_its_emulator(tower: RunTower, fault: str) ->
         assert lost["worst"] == f"{AGENT}/mcu"
     assert len(emulators) == 1, emulators
     assert_returned(tower.directory, AGENT)
-    assert_untouched(tower.directory, WITH_COMPUTER, DURATION_S, has_computer=True)
-    assert_untouched(tower.directory, WITHOUT, DURATION_S, has_computer=False)
+    assert_untouched(tower.directory, WITH_COMPUTER, AGENT, has_computer=True)
+    assert_untouched(tower.directory, WITHOUT, AGENT, has_computer=False)
     for name in tower.boards:
         assert tower.tower.run(name, EMULATORS).stdout == "", name
     assert tower.living() == {}, tower.talk

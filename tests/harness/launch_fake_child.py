@@ -1,7 +1,8 @@
 """
 A stand-in for host and supervisor that speaks the operator's protocol and misbehaves as told.
 
-How it behaves stands in COSMOS_FAKE, a JSON object: {"host": {...}, "agents": {...}}.
+How it behaves stands in COSMOS_FAKE, a JSON object: {"host": {...}, "agents": {...}}. A host runs for runs_s, or
+until something is noted in COSMOS_FAKE_NOTES (runs_until): what must have happened by then takes as long as it takes.
 """
 
 from __future__ import annotations
@@ -56,6 +57,15 @@ def note(text: str) -> None:
         notes.write(f"{ROLE} {os.getpid()} {text}\n")
 
 
+def is_noted(text: str) -> bool:
+    with open(os.environ["COSMOS_FAKE_NOTES"]) as notes:
+        return text in notes.read()
+
+
+def is_over(t_s: float) -> bool:
+    return is_noted(FAKE["runs_until"]) if "runs_until" in FAKE else t_s >= FAKE.get("runs_s", 0.3)
+
+
 def host(line: Line) -> int:
     launch, pending = line.launch()
     note(f"launched {launch['directory']}")
@@ -74,7 +84,7 @@ def host(line: Line) -> int:
     os.write(line.write_fd, FAKE.get("raw", "").encode())
     started_s = time.monotonic()
     status, reason = "complete", None
-    while time.monotonic() - started_s < FAKE.get("runs_s", 0.3):
+    while not is_over(time.monotonic() - started_s):
         t_s = time.monotonic() - started_s
         if not FAKE.get("is_silent"):
             line.say("progress", t_s=t_s, rtf=1.0, running=2, ticks=int(100 * t_s))

@@ -53,6 +53,7 @@ class Power(Enum):
     OFF = "off"
     BOOTING = "booting"
     ON = "on"
+    ENDING = "ending"  # its processes have been killed, and may live for a moment
     AWAY = "away"  # between two boots
 
 
@@ -211,6 +212,7 @@ class Board:
             self._plugged = None
         kill_group(self.surroundings.cgroup)
         if self.supply is not None:
+            self.power = Power.ENDING
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.supply, signal.SIGKILL)
 

@@ -22,7 +22,8 @@ from .places import Places
 
 GROUPS = "groups"
 LOOP_PATIENCE_S = 2.0
-"""A killed board lets its disk go a moment after its end; another tower's disk stays in use."""
+KILLED_LOOP_PATIENCE_S = 15.0
+"""A killed board lets its disk go a moment after its end, on a busy machine later; another tower's disk stays in use."""
 
 
 def mount_groups(places: Places) -> Path:
@@ -47,14 +48,14 @@ def unmount(places: Places) -> None:
             kernel.unmount(path, kernel.MNT_DETACH)
 
 
-def clean(places: Places) -> None:
+def clean(places: Places, loop_patience_s: float = LOOP_PATIENCE_S) -> None:
     """Remove every trace of a tower. The caller owns its index."""
     _in_child(lambda: _clean_groups(places))
     if Path(f"/sys/class/net/{places.uplink}").exists():
         remove_interface(places.uplink)
     with contextlib.suppress(FileNotFoundError, json.JSONDecodeError):
         before = json.loads(places.loops.read_text())
-        remove_loop_devices(list_loop_devices() - set(before), LOOP_PATIENCE_S)
+        remove_loop_devices(list_loop_devices() - set(before), loop_patience_s)
     places.remove()
 
 
@@ -89,7 +90,7 @@ def start_guardian(places: Places, lock: int) -> int:
         os.read(read, 1)
         with contextlib.suppress(FileNotFoundError):  # cleaned by the supervisor itself
             if os.path.samestat(os.fstat(lock), places.folder.stat()):
-                clean(places)
+                clean(places, KILLED_LOOP_PATIENCE_S)
     finally:
         os._exit(0)
 

@@ -191,8 +191,9 @@ def _down(arguments: argparse.Namespace) -> None:
     if running and not arguments.all:
         running = [_find(arguments)]
     for places in running:
+        key = places.key.read_bytes() if places.key.exists() else b""
         ask(places, {"verb": "stop"})
-        wait_until_gone(places)
+        wait_until_gone(places, key)
         say(f"tower {places.index}: down")
 
 

@@ -115,12 +115,14 @@ def test_nothing_private_of_this_computer_shows(tower):
 
 def test_processes_of_boards_are_their_own(tower):
     assert read(tower, "pi01", "ps -o comm= -p 1") == "init"
-    assert str(os.getpid()) not in read(tower, "pi01", "ls /proc").split()
+    own = Path("/proc/self/cmdline").read_text().replace("\0", " ").strip()
+    assert own not in read(tower, "pi01", "ps -ww -eo args=")
+    assert read(tower, "pi01", "sudo readlink /proc/1/ns/pid") != os.readlink("/proc/self/ns/pid")
 
 
 def test_boards_reach_operator_and_each_other_and_nothing_else(tower):
     def connect(address: str) -> str:
-        code = f"import socket; socket.create_connection(('{address}', 22), 2)"
+        code = f"import socket; socket.create_connection(('{address}', 22), 20)"
         return tower.run("pi01", f'python3 -c "{code}"', check=False).stderr
 
     assert connect(tower.boards["pi02"].address) == ""

@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 SSHD = shutil.which("sshd", path=os.environ.get("PATH", "") + ":/usr/sbin:/sbin")
-START_TIMEOUT_S = 10.0
-END_TIMEOUT_S = 10.0
+START_TIMEOUT_S = 60.0
+END_TIMEOUT_S = 30.0
 PR_SET_CHILD_SUBREAPER = 36
 KINDS = ("ed25519", "ecdsa", "rsa")
 
@@ -139,7 +139,7 @@ class Sshd:
 
     def _end(self) -> None:
         assert self._keeper is not None
-        self._keeper.communicate(timeout=END_TIMEOUT_S)
+        self._keeper.communicate(timeout=2 * END_TIMEOUT_S)
 
     def sessions(self) -> list[int]:
         """Pids of the server's children, and theirs: one tree a connection."""

@@ -43,7 +43,7 @@ def test_lock_is_held_by_one_until_it_ends(connection, tmp_path):
         assert "first" in caught.value.text
         first.close()
 
-        until_s = time.monotonic() + 20.0
+        until_s = time.monotonic() + 60.0
         while True:
             try:
                 second.call("lock", {"path": path, "holder": "second"})
@@ -103,6 +103,25 @@ def test_start_up_file_that_talks_is_told(own_sshd, known_hosts):
 
     assert caught.value.kind is FailureKind.DATA
     assert "must be silent" in caught.value.advice
+
+
+@pytest.mark.parametrize("ends", ["sleep 2; exit 1", "exec >&- 2>&-; sleep 2; exit 1"])
+def test_account_without_commands_on_a_busy_board_is_told_though_it_ends_late(
+    tmp_path, known_hosts, ends
+):
+    needs_sshd()
+    says = "This account is currently not available."
+    with Sshd(tmp_path / "nologin", extra=f"ForceCommand echo {says}; {ends}") as server:
+        known_hosts.write_text(server.known_hosts_line())
+        connection = connect(target_of(server))
+        try:
+            with pytest.raises(MachineFailure, match=says) as caught:
+                Helper.start(connection)
+        finally:
+            connection.close()
+
+    assert caught.value.kind is FailureKind.AUTHENTICATION
+    assert "exit status 1" in caught.value.text
 
 
 class LateStream:

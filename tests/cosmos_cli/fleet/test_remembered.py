@@ -171,6 +171,6 @@ def test_oldest_is_forgotten(tmp_path, monkeypatch):
     now_ns = time.time_ns()
     for age, key in enumerate("abc"):
         remember(key, [Target(name="pi", address="x")])
-        os.utime(tmp_path / "targets" / key, ns=(now_ns, now_ns + age * 10**9))
+        os.utime(tmp_path / "targets" / key, ns=(now_ns, now_ns + (age - 9) * 10**9))
 
     assert [key for key in "abc" if recall(key)] == ["b", "c"]

@@ -84,7 +84,9 @@ def test_deadline_holds_for_a_machine_that_lives():
     assert failure.value.kind is FailureKind.TIMEOUT
 
 
-def test_what_comes_at_once_asks_for_no_sign():
+def test_what_comes_before_the_silence_is_long_asks_for_no_sign(monkeypatch):
+    monkeypatch.setattr(liveness, "SILENCE_S", 60.0)
+
     assert read(Watchable(alive=[]), "echo here", 60.0) == b"here\n"
 
 

@@ -17,7 +17,7 @@ from cosmos_cli.fleet.open_connection import connect
 
 pytestmark = pytest.mark.process
 
-WAIT_S = 20.0
+WAIT_S = 60.0
 """A bound, not an expectation."""
 
 
@@ -52,6 +52,12 @@ def test_output_ends_with_empty_bytes_and_a_status(connection):
     assert stream.read(10) == b""
     assert stream.ending(timeout_s=WAIT_S).exit_status == 7
     stream.close()
+
+
+def test_status_that_comes_long_after_the_end_of_the_output_is_waited_for(connection):
+    done = connection.run("echo one; exec >&- 2>&-; sleep 2; exit 7", timeout_s=WAIT_S)
+
+    assert (done.exit_status, done.stdout) == (7, b"one\n")
 
 
 def test_status_is_unknown_while_it_runs(connection):

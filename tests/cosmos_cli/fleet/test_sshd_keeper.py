@@ -12,7 +12,7 @@ from ssh_harness import needs_sshd
 
 pytestmark = pytest.mark.process
 
-PATIENCE_S = 15
+PATIENCE_S = 60
 STARTER = """
 import subprocess, sys, time
 from pathlib import Path

@@ -16,7 +16,7 @@ from cosmos_cli.fleet.target import Target
 
 pytestmark = pytest.mark.process
 
-WAIT_S = 20.0
+WAIT_S = 60.0
 
 
 @pytest.fixture
@@ -104,7 +104,7 @@ def test_command_is_asked_to_end_before_it_is_made_to(here, tmp_path):
 
 def test_local_command_has_a_deadline_that_its_children_keep(here, tmp_path):
     with pytest.raises(MachineFailure) as caught:
-        here.run(f"echo $$ > {tmp_path}/group; sleep 60 & sleep 61", timeout_s=0.3)
+        here.run(f"echo $$ > {tmp_path}/group; sleep 60 & sleep 61", timeout_s=5.0)
 
     assert caught.value.kind is FailureKind.TIMEOUT
     assert group_is_gone(int((tmp_path / "group").read_text()))

@@ -22,6 +22,7 @@ simulation: counter
 agents: {count: 2, tick_hz: 10}
 time: {duration_s: 1, rtf_tolerance: 1}
 deadline: {max_miss_ratio: 1, overrun_ms: 5000}
+timeouts: {agents_ready_s: 120, silence_s: 30, complete_s: 60, shutdown_s: 60}
 """
 MODES = {"private": (0o700, 0o600), "group": (0o750, 0o640), "all": (0o755, 0o644)}
 

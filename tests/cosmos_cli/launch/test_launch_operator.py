@@ -58,7 +58,7 @@ class Launched:
             "COSMOS_FAKE": json.dumps({"host": host or {}, "agents": agents or {}}),
             "COSMOS_FAKE_NOTES": str(self.notes_file),
             "COSMOS_CONSTANTS": json.dumps({**QUICK, **(constants or {})}),
-            "COSMOS_TIMEOUTS": json.dumps(timeouts or {}),
+            "COSMOS_TIMEOUTS": json.dumps({"shutdown_s": PATIENCE_S, **(timeouts or {})}),
             "COSMOS_MANUAL": manual,
             # Reversed, so that a search of environments for the key finds only a leak.
             "COSMOS_TEST_KEY_REVERSED": self.key[::-1],
@@ -94,6 +94,11 @@ class Launched:
         words = [line.split() for line in self.notes.splitlines()]
         workers = [int(line[3]) for line in words if line[2] == "worker"]
         return sorted({int(line[1]) for line in words} | set(workers))
+
+    def note(self, text: str) -> None:
+        assert self.process is not None
+        with self.notes_file.open("a") as notes:
+            notes.write(f"test {self.process.pid} {text}\n")
 
     def wait_for(self, condition: Callable[[], bool], what: str) -> None:
         until_s = time.monotonic() + PATIENCE_S
@@ -199,7 +204,10 @@ def test_killed_agent_is_told_to_the_host(launched: Launched) -> None:
 def test_killed_supervisor_is_reported_and_each_of_its_agents_told_to_the_host(
     launched: Launched,
 ) -> None:
-    launched.start(host={"runs_s": 2, "ignores_exits": True}, agents={"killed_after_s": 0.1})
+    launched.start(
+        host={"runs_until": '"agent_exited", "agent": "agent-02"', "ignores_exits": True},
+        agents={"killed_after_s": 0.1},
+    )
 
     outcome = launched.outcome()
 
@@ -247,7 +255,8 @@ def test_children_that_heed_neither_stop_nor_sigterm_are_killed_and_named(
     launched: Launched,
 ) -> None:
     launched.start(
-        host={"stays": True, "ignores_sigterm": True},
+        # A process that is just starting would heed SIGTERM.
+        host={"runs_until": 'launched ["agent-01"', "stays": True, "ignores_sigterm": True},
         agents={"ignores_stop": True, "ignores_life_line": True, "ignores_sigterm": True},
         timeouts={"shutdown_s": 0.3},
     )
@@ -336,11 +345,12 @@ def test_second_ctrl_c_kills_at_once(launched: Launched) -> None:
 
 
 def test_second_hangup_of_a_closing_terminal_is_no_second_word(launched: Launched) -> None:
-    launched.start(host={"runs_s": 3, "ignores_stop": True})
+    launched.start(host={"runs_until": "second hangup", "ignores_stop": True})
     launched.wait_for_note("launched [")
     launched.signal(signal.SIGHUP)
     launched.wait_for_note("told")
     launched.signal(signal.SIGHUP)
+    launched.note("second hangup")
 
     outcome = launched.outcome()
 
@@ -414,15 +424,15 @@ def test_host_that_goes_on_without_agents_is_told_to_stop(launched: Launched) ->
     launched.start(
         host={"runs_s": 60, "ignores_exits": True},
         agents={"killed_after_s": 0.1},
-        timeouts={"silence_s": 0.25, "complete_s": 0.25, "shutdown_s": 1},
-        constants={"host_limits.MARGIN_S": 1},
+        timeouts={"silence_s": 0.25, "complete_s": 0.25, "shutdown_s": 2},
+        constants={"host_limits.MARGIN_S": 2},
     )
 
     outcome = launched.outcome()
 
-    # silence_s, complete_s, shutdown_s and the margin are 2.5 s.
+    # silence_s, complete_s, shutdown_s and the margin are 4.5 s.
     assert outcome["host_result"]["status"] == "failed"
-    assert outcome["host_result"]["reason"] == "the host has gone on without agents for 2.5 s"
+    assert outcome["host_result"]["reason"] == "the host has gone on without agents for 4.5 s"
 
 
 def test_closed_standard_error_does_not_end_the_run(launched: Launched) -> None:

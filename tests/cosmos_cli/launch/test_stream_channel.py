@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import selectors
 import threading
 import time
@@ -12,6 +13,7 @@ import pytest
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.local import LocalStream
+from cosmos_cli.launch import background as background_module
 from cosmos_cli.launch.background import THREADS_MAX, BackgroundTasks
 from cosmos_cli.launch.channel import StreamChannel
 
@@ -96,6 +98,32 @@ def test_closing_waits_for_what_is_under_way_but_not_for_ever(
     gate.set()
     with pytest.raises(RuntimeError, match="no more tasks"):
         quick.submit(lambda: 1)
+
+
+def test_pipe_is_open_until_the_last_thread_has_told_of_its_end(
+    selector: selectors.BaseSelector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file that was opened in the meantime would have its number, and what was written to it."""
+    tasks, is_told, is_closed = BackgroundTasks(selector), threading.Event(), threading.Event()
+    written: list[bool] = []
+    close, write = os.close, os.write
+
+    def write_late(descriptor: int, data: bytes) -> int:
+        is_told.wait(PATIENCE_S)
+        written.append(not is_closed.wait(0.5))
+        return write(descriptor, data) if written[-1] else 0
+
+    def note(descriptor: int) -> None:
+        close(descriptor)
+        if descriptor == tasks._write_fd:
+            is_closed.set()
+
+    monkeypatch.setattr(background_module.os, "write", write_late)
+    monkeypatch.setattr(background_module.os, "close", note)
+    tasks.submit(lambda: 1, lambda value, failure: is_told.set())
+
+    assert tasks.close(PATIENCE_S)
+    assert written == [True]
 
 
 @pytest.mark.process

@@ -76,14 +76,14 @@ name: odd
 simulation: ./odd.py:simulation
 agents: {count: 2}
 time: {duration_s: 1}
-timeouts: {loading_s: 2, agents_ready_s: 20}
+timeouts: {loading_s: 2, agents_ready_s: 120}
 """
 FLIGHT = """
 name: odd
 simulation: constellation
 agents: {count: 1}
 time: {duration_s: 1, mode: lockstep}
-timeouts: {loading_s: 2}
+timeouts: {loading_s: 2, agents_ready_s: 120}
 parameters:
   satellites: {elements: one.tle}
   flight: ./odd.py:Flight

@@ -90,7 +90,7 @@ def test_a_device_is_driven_and_its_records_are_brought(board, tmp_path):
     os.utime(old, (0, 0))
 
     told, _ = read_answer(
-        board.parts(VERB, asked(tmp_path, seconds=1, has_records=True), whole_s=PATIENCE_S),
+        board.parts(VERB, asked(tmp_path, seconds=3, has_records=True), whole_s=PATIENCE_S),
         tmp_path / "records",
     )
 

@@ -17,7 +17,7 @@ from cosmos_cli.fleet.local import LocalConnection
 from cosmos_cli.fleet.target import Target
 from cosmos_cli.onboard.apt_words import changes_between, kept_back, planned_changes, trouble_of
 
-PATIENCE_S = 30.0
+PATIENCE_S = 120.0
 PARTS = ("files", "links", "facts", "system", "apt_words", "apt")
 
 SAID = {
@@ -126,7 +126,7 @@ action=$1; shift
 if [ -f "$PACKAGES/../say-$action" ]; then
     cat "$PACKAGES/../say-$action"; rm "$PACKAGES/../say-$action"; exit 100
 fi
-if [ -f "$PACKAGES/../slow" ]; then sleep "$(cat "$PACKAGES/../slow")"; fi
+while [ -f "$PACKAGES/../held-up" ]; do sleep 0.05; done
 if [ $what = simulated ]; then for name; do echo "Inst $name (1.0 x)"; done; exit 0; fi
 case $action in
     install) for name; do echo 1.0 > "$PACKAGES/$name"; done ;;
@@ -156,8 +156,11 @@ class PlayedApt:
     def says_once(self, action: str, word: str) -> None:
         (self.folder / f"say-{action}").write_text(SAID[word])
 
-    def takes(self, duration_s: float) -> None:
-        (self.folder / "slow").write_text(str(duration_s))
+    def hold_up(self) -> None:
+        (self.folder / "held-up").touch()
+
+    def go_on(self) -> None:
+        (self.folder / "held-up").unlink()
 
     def wait_for(self, name: str) -> None:
         until_s = time.monotonic() + PATIENCE_S
@@ -316,24 +319,26 @@ def test_lock_is_waited_for_a_bounded_time(apt: PlayedApt, packages: Packages) -
 
 @pytest.mark.process
 def test_apt_goes_on_to_its_end_when_its_time_is_over(apt: PlayedApt, packages: Packages) -> None:
-    apt.takes(3)
+    apt.hold_up()
 
     with pytest.raises(MachineFailure, match="apt-get still works there") as failure:
         packages("install", "foo", timeout_s=0.5)
 
     assert failure.value.kind is FailureKind.TIMEOUT
+    apt.go_on()
     apt.wait_for("foo")
 
 
 @pytest.mark.process
 def test_apt_goes_on_to_its_end_when_nobody_listens_any_more(apt: PlayedApt) -> None:
-    apt.takes(3)
+    apt.hold_up()
     target = Target(name="pi01", address="127.0.0.1", connection="local")
     board = Helper.start(LocalConnection(target), PARTS)
     parts = board.parts("packages", {"action": "install", "names": ["foo"]})
 
     assert "doing" in next(parts).value
     board.close()
+    apt.go_on()
 
     apt.wait_for("foo")
 

@@ -8,7 +8,6 @@ import shutil
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -208,9 +207,12 @@ def test_helper_killed_at_any_moment_leaves_nothing_half(machine, house, tmp_pat
         wheel = make_wheel(tmp_path / f"m{delay_ms}", "bulk", f"{delay_ms}.0", files=files)
         environment = house.environment(wheel)
         with contextlib.suppress(MachineFailure), machine.board() as board:
-            threading.Timer(delay_ms / 1000, machine.kill, [board]).start()
-            install_environment(board, machine.layout, environment)
-            time.sleep(0.2)
+            killer = threading.Timer(delay_ms / 1000, machine.kill, [board])
+            killer.start()
+            try:
+                install_environment(board, machine.layout, environment)
+            finally:
+                killer.join()
         killed += not is_whole(machine, environment)
         install(machine, environment)
         assert is_whole(machine, environment)
