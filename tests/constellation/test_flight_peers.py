@@ -311,8 +311,9 @@ def test_one_that_is_well_beside_all_others_has_every_answer(flown):
 def test_ticks_that_nobody_answers_are_counted_and_no_more_are_sent(flown, name):
     flight, interface, faults, ticks = told(flown, name)
 
-    assert (flight["answers"], flight["unanswered"]) == (0, 64)
-    assert flight["ticks_skipped"] == ticks - 64
+    sent = min(ticks, 64)  # an agent that has to wait for a processor misses ticks
+    assert (flight["answers"], flight["unanswered"]) == (0, sent)
+    assert flight["ticks_skipped"] == ticks - sent
     check = next(c for c in flown[1]["checks"] if c["name"] == "constellation.flight_answers_late")
     assert check["got"] >= flight["ticks_skipped"] and not check["passed"]
     if name == "flooding":

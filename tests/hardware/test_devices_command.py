@@ -48,12 +48,14 @@ def inventory(folder: Path, *devices: str, connection: str = "local") -> Path:
 
 def line_device(terminal: Terminal, **parameters: str) -> str:
     values = ", ".join(f"{k}: {v}" for k, v in {"port": terminal.port, **parameters}.items())
-    return f"{{name: line, kind: './line.py:Line', rate_hz: 50, outputs: true, parameters: {{{values}}}}}"
+    return f"{{name: line, kind: './line.py:Line', rate_hz: {RATE_HZ}, outputs: true, parameters: {{{values}}}}}"
 
 
 SECONDS = 3
 """For a device to be read and written: a busy machine lets its process wait for a second or two."""
-WAVE = "{name: wave, kind: synthetic, rate_hz: 50}"
+RATE_HZ = 3
+"""At which a device is lost, and its test ends with 1, after 3.3 s without a sample."""
+WAVE = f"{{name: wave, kind: synthetic, rate_hz: {RATE_HZ}}}"
 
 
 def test_every_kind_is_listed_with_its_summary_and_parameters(told: Told) -> None:
