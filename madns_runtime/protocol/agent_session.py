@@ -105,6 +105,8 @@ class AgentSession:
         self._machine = agent_machine()
         self._events: deque[AgentSessionEvent] = deque()
         self._heard_s: float | None = None
+        self.answered_s = self.answer_heard_s = -math.inf
+        """When the newest ping was sent that the host has answered, and when the answer came."""
         self._wakefulness = Wakefulness(timeouts.silence_s, now_s)
         self._pings = pings
         self.ping_due_s = now_s if pings.brings_clock_up else now_s + pings.delay_s
@@ -282,6 +284,7 @@ class AgentSession:
             case _ if isinstance(message, messages.WITH_DATA):
                 self._take_data(message)
             case messages.Pong(t_agent_s, t_host_received_s, t_host_sent_s):
+                self.answered_s, self.answer_heard_s = max(self.answered_s, t_agent_s), now_s
                 self.clock.add_exchange(t_agent_s, t_host_received_s, t_host_sent_s, now_s)
                 if self._is_clock_unused(now_s):
                     self.clock.settle(now_s, is_unused=True)

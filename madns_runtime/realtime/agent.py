@@ -30,6 +30,7 @@ from madns_runtime.realtime.agent_faults import AgentFaults
 from madns_runtime.realtime.agent_link import AgentPort
 from madns_runtime.realtime.agent_report import AgentOutcome, AgentReport
 from madns_runtime.realtime.device_time import DeviceTime
+from madns_runtime.realtime.last_answers import LastAnswers
 from madns_runtime.realtime.loop_account import Span
 from madns_runtime.realtime.ordered_actions import OrderedActions
 from madns_runtime.realtime.packs import Pack
@@ -45,8 +46,6 @@ from madns_runtime.timing.late_causes import Cause
 
 PING_SLACK_S_MAX = 0.1
 """For so long at most a ping waits for a tick's wake-up."""
-DRAIN_S = 0.1
-"""After the last tick's period an agent listens this much longer for what is still under way."""
 
 
 class AgentRunner:
@@ -132,8 +131,10 @@ class AgentRunner:
             columns=NewestValues(recorder, program.columns),
             devices=seat.hardware if launch.is_detached else NO_HARDWARE,
         )
-        # Infinite is never: each timer is made once and moved.
-        self._end_timer = reactor.call_at(math.inf, self._finish_run)
+        self._last_answers = LastAnswers(
+            reactor, self._port, self._config.timeouts, pump=self._pump, finish=self._finish_run
+        )
+        # Infinite is never: the timer is made once and moved.
         self._usage_timer = reactor.call_at(math.inf, self._record_usage)
         self._outcome = AgentOutcome(as_ordered=False, reason="did not end")
         self._is_closed = False
@@ -286,8 +287,7 @@ class AgentRunner:
         self._usage_timer.reschedule(self._records.usage_due_s + self._session.ping_slack_s)
 
     def _ticks_over(self) -> None:
-        end_s = self._ticks.duration_s + DRAIN_S
-        self._end_timer.reschedule(self._port.local_s(end_s))
+        self._last_answers.begin(self._port.local_s(self._ticks.duration_s))
 
     def _step_failed(self, error: BaseException) -> None:
         self._fail(self.half.failure("step", error))
@@ -331,8 +331,6 @@ class AgentRunner:
         return True
 
     def _finish_run(self) -> None:
-        if self._session.state is not AgentState.RUN_SIMULATION:
-            return
         self._ticks.finish(self._port.now_s())
         self._takes_data = False  # what comes from now on is too late for the summary
         summary = self._call("finish")
@@ -366,7 +364,7 @@ class AgentRunner:
         self._on_ended(self.name, self._outcome)
 
     def _cancel_timers(self) -> None:
-        for timer in (self._end_timer, self._usage_timer):
+        for timer in (self._last_answers, self._usage_timer):
             timer.cancel()
 
     # Telling -----------------------------------------------------------------------------------

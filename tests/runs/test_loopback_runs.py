@@ -113,3 +113,55 @@ def test_two_runs_at_once_do_not_meet(tmp_path):
 
     assert [r["exit_code"] for r in results] == [0, 0]
     assert len({r["run"].partition("-")[0] for r in results}) == 2
+
+
+ECHO = """
+import time
+from dataclasses import dataclass
+from madns_runtime.plugin.api import HOST, AgentSimulation, HostSimulation, Simulation
+
+@dataclass(frozen=True)
+class Parameters:
+    pass
+
+class Host(HostSimulation):
+    is_held_up = False
+
+    def setup(self, context):
+        self.context = context
+
+    def receive(self, agent, message):
+        if message >= 15 and not self.is_held_up:  # of 20, in two seconds
+            self.is_held_up = True
+            time.sleep(1.5)
+        self.context.send(agent, message)
+
+class Agent(AgentSimulation):
+    def setup(self, context, initial):
+        self.context, self.sent, self.returned = context, 0, 0
+
+    def step(self, tick):
+        self.sent += 1
+        self.context.send(HOST, tick.index)
+
+    def receive(self, message):
+        self.returned += 1
+
+    def finish(self):
+        return {"sent": self.sent, "returned": self.returned}
+
+simulation = Simulation(name="echo", parameters=Parameters, host=":Host", agent=":Agent")
+"""
+
+
+def test_answers_of_a_host_that_is_held_up_at_the_end_are_waited_for(tmp_path):
+    (tmp_path / "echo.py").write_text(ECHO)
+    (tmp_path / "echo.yaml").write_text(
+        "name: echo\nsimulation: ./echo.py:simulation\nagents: {count: 2, tick_hz: 10}\n"
+        "time: {duration_s: 2}\n"
+    )
+
+    result, _ = run(tmp_path, tmp_path / "echo.yaml")
+
+    for agent in result["simulation"]["agents"].values():
+        assert agent["returned"] == agent["sent"] > 0

@@ -122,6 +122,8 @@ agents: {count: 2, tick_hz: 20}
 time: {duration_s: 1, rtf_tolerance: 1}
 deadline: {max_miss_ratio: 1}
 """
+LONG = "time.duration_s=30"
+"""For what ends a run in one of its first ticks, whichever of them a busy machine has missed."""
 
 
 FAULTS = [
@@ -146,7 +148,8 @@ def in_both_modes(faults):
 
 @pytest.mark.parametrize(("evil", "who", "expected", "mode"), list(in_both_modes(FAULTS)))
 def test_the_verdict_names_the_call_in_both_modes(tmp_path, evil, who, expected, mode):
-    result = run(tmp_path, evil, f"time.mode={mode}")
+    length = (LONG,) if evil == "text" else ()
+    result = run(tmp_path, evil, f"time.mode={mode}", *length)
 
     assert result["exit_code"] == 1
     assert result["who"].startswith(who)
@@ -155,11 +158,11 @@ def test_the_verdict_names_the_call_in_both_modes(tmp_path, evil, who, expected,
 
 
 def test_an_agent_that_ends_its_process_is_named(tmp_path):
-    result = run(tmp_path, "exit")
+    result = run(tmp_path, "exit", LONG)
 
     assert (result["exit_code"], result["who"]) == (1, "agent-01")
     # A busy machine may miss the tick at 0.15 s: then it ends in the next.
-    told = r"its process ended by itself, exit code 0 in the step of agent-01 at t = 0\.\d+ s"
+    told = r"its process ended by itself, exit code 0 in the step of agent-01 at t = \d+(\.\d+)? s"
     assert re.search(told, result["reason"])
 
 
@@ -180,11 +183,11 @@ def test_an_agent_goes_on_alone_whose_fork_comes_back_as_it_is_made(tmp_path):
 
 
 def test_an_agent_that_is_killed_in_a_call_is_told_with_the_call(tmp_path):
-    result = run(tmp_path, "crash", "agents.per_process=2")
+    result = run(tmp_path, "crash", "agents.per_process=2", LONG)
 
     assert result["exit_code"] == 1
     # As above.
-    told = r"killed by SIGSEGV in the step of agent-01 at t = 0\.\d+ s"
+    told = r"killed by SIGSEGV in the step of agent-01 at t = \d+(\.\d+)? s"
     assert re.search(told, result["reason"])
 
 
@@ -245,7 +248,7 @@ def test_broken_sync_deadline_breaks_its_check(tmp_path):
 
 @pytest.mark.parametrize("mode", ["realtime", "lockstep"])
 def test_a_half_that_hears_something_can_ask_for_its_timer(tmp_path, mode):
-    result = run(tmp_path, "wake", f"time.mode={mode}")
+    result = run(tmp_path, "wake", f"time.mode={mode}", "time.duration_s=4")
 
     assert result["simulation"]["host"] == {"woken": True}
     assert result["exit_code"] == 0
