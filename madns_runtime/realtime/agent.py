@@ -134,8 +134,7 @@ class AgentRunner:
         self._last_answers = LastAnswers(
             reactor, self._port, self._config.timeouts, pump=self._pump, finish=self._finish_run
         )
-        # Infinite is never: the timer is made once and moved.
-        self._usage_timer = reactor.call_at(math.inf, self._record_usage)
+        self._usage_timer = reactor.call_at(math.inf, self._record_usage)  # at no time, as yet
         self._outcome = AgentOutcome(as_ordered=False, reason="did not end")
         self._is_closed = False
         self._takes_data = True
