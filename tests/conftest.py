@@ -24,10 +24,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-# A busy machine takes longer than Hypothesis' 0.2 s for an example now and then, which is no fault of the code.
-settings.register_profile(
-    "any_machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]
-)
+# A busy machine takes longer than Hypothesis' 0.2 s for an example now and then, which is no fault of the code. A change
+# is judged by the same examples as the one before; `.ci/nightly` looks for new ones, by --hypothesis-profile=search.
+settings.register_profile("search", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("any_machine", settings.get_profile("search"), derandomize=True)
 settings.load_profile("any_machine")
 
 SLOWNESS = {"slow": 6, "root": 6, "browser": 3, "process": 1}
