@@ -546,7 +546,8 @@ def test_proxy_jump_leads_through_other_machines(sshd, own_sshd, home, known_hos
 
     assert str(sshd.port).encode() == said[3]
     assert len(own_sshd.log.read_text().split("Accepted publickey")) == 2
-    assert not own_sshd.log.read_text().count("error")
+    # What it could not do; that the last end came by a reset is none of it.
+    assert "error: " not in own_sshd.log.read_text()
 
 
 def test_failure_of_a_jump_host_names_it(known, home):
