@@ -112,7 +112,7 @@ def test_step_of_50_ms_on_one_tick_costs_accounted_ticks(laboratory, max_miss_ra
 @pytest.mark.nightly
 def test_step_of_10_s_aborts_the_run_and_names_the_agent(laboratory):
     run = laboratory.start(
-        *("--set", "time.duration_s=5", "--set", "timeouts.shutdown_s=3"),
+        *("--set", "time.duration_s=5", "--set", "timeouts.shutdown_s=1"),
         *("--set", "timeouts.silence_s=2.5"),
         faults={"side": "agent", "method": "step", "action": "sleep", "sleep_s": 10.0},
     )
