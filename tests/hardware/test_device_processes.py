@@ -217,8 +217,10 @@ def unhurried(monkeypatch):
 
 
 @pytest.mark.usefixtures("unhurried")
-def test_a_driver_that_raises_at_writing_and_making_safe_leaves_the_rest_to_the_guardian(tmp_path):
-    with line_bench(tmp_path, raises="make_safe") as (bench, terminal):
+@pytest.mark.parametrize("ending", ["make_safe", "alarm"])
+def test_a_driver_that_fails_while_it_makes_safe_leaves_it_to_the_guardian(tmp_path, ending):
+    """By an exception, or by an alarm of its own that ends its process."""
+    with line_bench(tmp_path, raises=ending) as (bench, terminal):
         bench.until(lambda: bench.hardware["line"].status == "ok")
         bench.hardware["line"].write("valve", 1.0)
         bench.until(lambda: "VALVE 1" in terminal.heard())
@@ -229,33 +231,7 @@ def test_a_driver_that_raises_at_writing_and_making_safe_leaves_the_rest_to_the_
     assert bench.events[-1]["text"].startswith("pi22/line: could not be made safe")
 
     whys = [event["why"] for event in records(tmp_path, "events") if event["event"] == "error"]
-    assert any("Line.make_safe raised ValueError" in why for why in whys)
-
-
-@pytest.mark.usefixtures("unhurried")
-def test_a_driver_that_an_alarm_of_its_own_ends_while_it_makes_safe_is_not_taken_for_safe(tmp_path):
-    with line_bench(tmp_path, raises="alarm") as (bench, terminal):
-        bench.until(lambda: bench.hardware["line"].status == "ok")
-        bench.hardware["line"].write("valve", 1.0)
-        bench.until(lambda: "VALVE 1" in terminal.heard())
-        result = bench.close()["pi22/line"]
-        assert terminal.heard().count("SAFE") == 1 + ATTEMPTS_MAX
-    assert result["unsafe"] == 1
-    assert "could not be made safe" in result["why"]
-
-
-def test_a_device_is_not_taken_for_safe_while_the_guardian_is_still_at_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(guardian, "ATTEMPT_S", 2.0)
-    monkeypatch.setattr(manager, "END_S", 0.6)
-    with line_bench(tmp_path, raises="nothing") as (bench, terminal):
-        guardian_pid = bench.manager._guardian_pid
-        bench.until(lambda: bench.hardware["line"].status == "ok")
-        bench.hardware["line"].write("valve", 1.0)
-        bench.until(lambda: "VALVE 1" in terminal.heard())
-        result = bench.close()["pi22/line"]  # make_safe has not returned in either process
-        wait_until(lambda: not is_alive(guardian_pid), "the guardian has ended")
-    assert result["unsafe"] == 1
-    assert "could not be made safe" in result["why"]
+    assert any("Line.make_safe raised ValueError" in why for why in whys) == (ending == "make_safe")
 
 
 def test_another_device_in_its_place_is_a_fault(tmp_path):
