@@ -96,7 +96,11 @@ def device_remarks(
     agents: Mapping[str, Any], devices: Mapping[str, Mapping[str, Any]]
 ) -> tuple[str, ...]:
     """Return all remarks on devices; arguments as of `device_loss_remarks`."""
-    return (*device_loss_remarks(agents, devices), *silent_input_remarks(devices))
+    return (
+        *device_loss_remarks(agents, devices),
+        *silent_input_remarks(devices),
+        *refusal_remarks(devices),
+    )
 
 
 def device_loss_remarks(
@@ -136,6 +140,18 @@ def silent_input_remarks(devices: Mapping[str, Mapping[str, Any]]) -> tuple[str,
     ]
     rest = len(found) - LOSSES_TOLD_MAX
     more = [f"{counted(rest, 'more device')} with an input of which no value ever came"]
+    return (*found[:LOSSES_TOLD_MAX], *(more if rest > 0 else ()))
+
+
+def refusal_remarks(devices: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
+    """Return a remark per device that refused something; at most LOSSES_TOLD_MAX, then how many more."""
+    found = [
+        f"device {device}: {counted(refused, 'time')} something was refused; its events.jsonl says what and why"
+        for device, account in devices.items()
+        if (refused := int(mapping_at(account, "counts").get("refused", 0)))
+    ]
+    rest = len(found) - LOSSES_TOLD_MAX
+    more = [f"{counted(rest, 'more device')} that refused something"]
     return (*found[:LOSSES_TOLD_MAX], *(more if rest > 0 else ()))
 
 

@@ -14,8 +14,6 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Literal
 
-from madns_runtime.errors import PluginError
-
 __all__ = ["Channel", "Device", "DeviceKind", "Needs", "Sample", "Value"]
 
 Value = float | Sequence[float] | bytes
@@ -192,8 +190,12 @@ class Device:
         Args:
             values: Of outputs.
             due_s: When they were due, on this machine's monotonic clock, s.
+
+        Raises:
+            PluginError: The device takes no such value, or has no room for it now: it is refused and counted, and
+                the device stays open. Whatever else is raised closes it, and it is opened anew.
         """
-        raise PluginError(f"{type(self).__name__} has outputs and no write(values, due_s)")
+        raise NotImplementedError(f"{type(self).__name__} has outputs and no write(values, due_s)")
 
     def health(self) -> Mapping[str, float | int | str | bool | None]:
         """Return what else is known of its state, such as a supply voltage; asked once per second at most."""

@@ -187,7 +187,15 @@ class InlineDevice:
     def _put_out(self, output: DueOutput, now_s: float) -> None:
         self._page.header[page.MOVED] = 1.0
         values = {output.channel.name: output.value}
-        self._call("write", self._device.write, values, output.due_s)
+        try:
+            self._call("write", self._device.write, values, output.due_s)
+        except BlamedError as error:
+            if not isinstance(error.__cause__, PluginError):
+                raise
+            self._outputs.note_refused(output)
+            why = f"{output.channel.name}: {error.__cause__}"
+            self._intake.event("refused", now_s, why=why)
+            return
         self._records.written(output.channel.name, output.due_s, now_s, output.told)
         if output.point is not None and not output.point.is_underrun:
             self._outputs.note_played(output.point, now_s - output.due_s)

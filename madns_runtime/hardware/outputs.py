@@ -193,6 +193,14 @@ class DeviceOutputs:
         elif not output.point.is_underrun:
             self._count(count_name("lost", output.channel.name), 1)
 
+    def note_refused(self, output: DueOutput | None = None) -> None:
+        """Take note that something is refused; a value that was due by the driver."""
+        point = output.point if output is not None else None
+        if point is None:
+            self._count("refused", 1)
+        elif not point.is_underrun:
+            self._count(count_name("refused", point.channel.name), 1)
+
     def clear_writes(self) -> int:
         """Forget all writes, and return how many: what was to come belongs to what is over."""
         return self._pending.clear()

@@ -145,8 +145,7 @@ class DeviceRunner:
     def _check_memory(self) -> None:
         grown_bytes = resident_bytes() - self._first_bytes
         if self._first_bytes and grown_bytes > GROWTH_BYTES_MAX and not self.gave_up:
-            name, grown = type(self._device).__name__, f"{grown_bytes >> 20} MiB"
-            why = f"{name} leaks memory: {grown} since it was opened"
+            why = f"{type(self._device).__name__} leaks memory: {grown_bytes >> 20} MiB since it was opened"
             self._give_up(f"{why}, so it gets a process anew")
 
     def _blame(self, driver: str, method: str, error: BaseException) -> str:
@@ -213,10 +212,8 @@ class DeviceRunner:
         self._late_us_max = max(self._late_us_max, int((now_s - self._due_s) * 1e6))
         if not self._read():
             return
-        if (
-            isinstance(self._device, SimulatedDevice)
-            and (next_s := self._device.next_s()) is not None
-        ):
+        device = self._device
+        if isinstance(device, SimulatedDevice) and (next_s := device.next_s()) is not None:
             time = self._records.time
             wait_s = time.until(next_s) if time.is_known else self._period_s
             self._due_s = monotonic() + min(max(wait_s, 0.0), STATE_PERIOD_S)
@@ -320,6 +317,9 @@ class DeviceRunner:
         self._header[page.MOVED] = 1.0
         try:
             device.write({name: output.value}, output.due_s)
+        except PluginError as error:
+            self._refuse(f"{name}: {error}", output)
+            return True
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything
             self._outputs.note_lost(output)
             self._fail("write", error)
@@ -395,6 +395,6 @@ class DeviceRunner:
         self._header[page.ACTIVE_S] = now_s = monotonic()
         self._alive_timer.reschedule(now_s + self._hang_s / 4)
 
-    def _refuse(self, why: str) -> None:
-        self._intake.count("refused", 1)
+    def _refuse(self, why: str, output: DueOutput | None = None) -> None:
+        self._outputs.note_refused(output)
         self._intake.event("refused", monotonic(), why=why)

@@ -29,6 +29,7 @@ DRIVER = """
 import os, signal, time, tty
 from dataclasses import dataclass
 
+from madns_runtime.errors import PluginError
 from madns_runtime.hardware.contract import Channel, Device, DeviceKind, Sample
 
 
@@ -40,6 +41,7 @@ class Parameters:
     gone_file: str = ""
     close_s: float = 0.0
     raises: str = ""
+    takes_no: float = 2.0
 
 
 class Line(Device):
@@ -73,6 +75,8 @@ class Line(Device):
 
     def write(self, values, due_s):
         self._raise("write")
+        if values["valve"] == self.parameters.takes_no:
+            raise PluginError(f"expected none of {values['valve']:g}")
         self.say(f"VALVE {values['valve']:g}")
 
     def health(self):

@@ -49,13 +49,16 @@ def kernel(monkeypatch):
     """Ends of a pair that keeps the borders of messages, as a CAN socket does."""
     own, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     options = []
-    state = {"error": 0, "lost": 0}
+    state = {"error": 0, "lost": 0, "without_room": []}
 
     class Raw:
         def __init__(self, *family):
-            self.__dict__.update(
-                {n: getattr(own, n) for n in ("send", "setblocking", "fileno", "close")}
-            )
+            self.__dict__.update({n: getattr(own, n) for n in ("setblocking", "fileno", "close")})
+
+        def send(self, raw):
+            if state["without_room"] and (number := state["without_room"].pop()):
+                raise OSError(number, "No buffer space available")
+            return own.send(raw)
 
         def recvmsg(self, size, ancillary_size):
             raw, _, flags, address = own.recvmsg(size)
@@ -115,6 +118,71 @@ def test_frames_on_the_wire_are_the_kernels(kernel):
             PluginError, match="one of 29 with bit 31 set beside them; got 0x00001abc"
         ):
             device.write({"sent": frame(0x1ABC, b"")}, 0.0)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that goes on only where somebody waits; it holds how long, s."""
+    slept_s = []
+    monkeypatch.setattr(driver, "sleep", slept_s.append)
+    monkeypatch.setattr(driver, "monotonic", lambda: sum(slept_s))
+    return slept_s
+
+
+@pytest.mark.parametrize("number", [errno.ENOBUFS, errno.EAGAIN])
+def test_a_full_queue_is_waited_for(kernel, clock, number):
+    other, _, state = kernel
+    with opened("can", safe_frames_hex=["123#00FF"]) as device:
+        state["without_room"] = [number] * 3
+        device.write({"sent": frame(ENGINE, b"ab")}, 0.0)
+        state["without_room"] = [number] * 2
+        device.make_safe()
+
+    assert [other.recv(100)[8:10] for _ in range(2)] == [b"ab", b"\x00\xff"]
+    assert len(clock) == 5
+
+
+def test_a_queue_that_stays_full_refuses_frames_and_is_waited_for_once(kernel, clock):
+    other, _, state = kernel
+    with opened("can", safe_frames_hex=["123#00FF"]) as device:
+        state["without_room"] = [errno.ENOBUFS] * 10_000
+        with pytest.raises(PluginError, match="sent: can0: its queue is full"):
+            device.write({"sent": frame(ENGINE, b"1")}, 0.0)
+        assert sum(clock) == pytest.approx(driver.SEND_S, abs=driver.SEND_PAUSE_S)
+        waits = len(clock)
+        with pytest.raises(PluginError, match="sent: can0: its queue is full"):
+            device.write({"sent": frame(ENGINE, b"2")}, 0.0)
+        assert len(clock) == waits, "no wait before each frame of a dead bus"
+        with pytest.raises(MachineError, match="its queue is full"):
+            device.make_safe()
+        assert len(clock) == 2 * waits, "but before one that makes safe"
+        state["without_room"] = []
+        device.write({"sent": frame(ENGINE, b"3")}, 0.0)
+        assert other.recv(100)[8:9] == b"3"
+        state["without_room"] = [errno.ENETDOWN]
+        with pytest.raises(MachineError, match="the interface is down"):
+            device.write({"sent": frame(ENGINE, b"4")}, 0.0)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        lambda can: can.CanOperationError("Failed to transmit", errno.ENOBUFS),
+        lambda can: can.CanOperationError("Transmit buffer full"),
+        lambda can: OSError(errno.ENOBUFS, "No buffer space available"),
+    ],
+)
+def test_python_cans_words_for_a_full_queue_are_known(clock, monkeypatch, error):
+    can = pytest.importorskip("can")
+
+    def send(*_):
+        raise error(can)
+
+    shared = {"library": "python-can", "python_can_interface": "virtual", "interface": "bus-2"}
+    with opened("can", **shared) as device:
+        monkeypatch.setattr(device._bus._bus, "send", send)
+        with pytest.raises(PluginError, match="sent: bus-2: its queue is full"):
+            device.write({"sent": frame(ENGINE, b"")}, 0.0)
 
 
 def test_an_interface_that_is_not_there(kernel):

@@ -105,6 +105,24 @@ def test_nothing_moves_where_it_may_not(tmp_path):
     assert "the scenario is not armed" in why
 
 
+def test_a_value_that_the_driver_does_not_take_is_refused_and_the_device_stays_open(tmp_path):
+    with line_bench(tmp_path, takes_no=0.5) as (bench, terminal):
+        line = bench.hardware["line"]
+        bench.until(lambda: line.status == "ok")
+        counts = bench.manager.page_of("pi22/line").counts
+        line.write("valve", 0.5)
+        bench.until(lambda: counts.read().get("refused") == 1)
+        line.write("valve", 0.25)
+        bench.until(lambda: "VALVE 0.25" in terminal.heard())
+        result = bench.close()["pi22/line"]
+        assert terminal.heard() == ["OPEN", "VALVE 0.25", "SAFE"]
+
+    assert (result["errors"], result["report"]["refused"]) == (0, 1)
+    assert "writes_lost" not in {name for name, n in result["report"].items() if n}
+    [why] = [event["why"] for event in records(tmp_path, "events") if event["event"] == "refused"]
+    assert why == "valve: expected none of 0.5"
+
+
 @pytest.mark.parametrize(
     ("channel", "value", "text"),
     [

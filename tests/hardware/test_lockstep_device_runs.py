@@ -113,6 +113,36 @@ def rows(path):
     return [row for row in lines if isinstance(row, list) or "event" in row]
 
 
+def test_what_the_driver_does_not_take_in_lockstep_is_refused_and_told(tmp_path):
+    picky = VALVE.replace(
+        "        pass\n",
+        "        if 0.15 < values['duty'] < 0.35:\n            raise PluginError('stuck')\n",
+    )
+    picky = "from madns_runtime.errors import PluginError\n" + picky.replace(
+        'self.count("lost_bytes", 2)', "pass"
+    )
+    untouched = MOVED[: MOVED.index("timeline:")]
+    for name, text in (("valve.py", picky), ("mover.py", MOVER), ("moved.yaml", untouched)):
+        (tmp_path / name).write_text(text)
+    cosmos = CosmosCommand(tmp_path)
+
+    code, run = cosmos.run(tmp_path / "moved.yaml", *LOOSE)
+
+    assert code == 0, run["verdict"]
+    told = run["devices"]["agent-01/valve"]
+    assert (told["counts"]["refused"], told["errors"], told["lost"]) == (19, 0, 0)
+    remark = (
+        "device agent-01/valve: 19 times something was refused; its events.jsonl says what and why"
+    )
+    assert remark in run["remarks"]
+    folder = cosmos.directory(run)
+    events = rows(next(folder.glob("devices/*/valve/events.jsonl")))
+    assert {e["why"] for e in events if e["event"] == "refused"} == {"duty: stuck"}
+    put_out = [row[2] for row in rows(next(folder.glob("devices/*/valve/duty.jsonl")))]
+    assert len(put_out) == 40
+    assert not [value for value in put_out if 0.15 < value < 0.35]
+
+
 def test_a_device_that_is_disconnected_in_lockstep_takes_nothing_and_is_lost_at_once(tmp_path):
     for name, text in (("valve.py", VALVE), ("mover.py", MOVER), ("moved.yaml", MOVED)):
         (tmp_path / name).write_text(text)

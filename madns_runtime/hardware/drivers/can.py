@@ -7,11 +7,12 @@ import os
 import socket
 import struct
 from collections.abc import Mapping
-from time import monotonic
-from typing import Final, Protocol
+from time import monotonic, sleep
+from typing import Final
 
 from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.hardware.contract import Device, Sample, Value
+from madns_runtime.hardware.drivers.can_bus import FULL, BusIsFullError, CanBus
 from madns_runtime.hardware.kinds.can import (
     DATA_BYTES_MAX,
     EXTENDED,
@@ -37,25 +38,9 @@ SO_RXQ_OVFL: Final = 40
 LOST: Final = struct.Struct("=I")
 
 
-class CanBus(Protocol):
-    """A bus, opened."""
-
-    frames_lost: int
-    """Frames that came faster than they were read."""
-    frames_left_out: int
-    """Requests and reports of errors."""
-
-    def fileno(self) -> int | None:
-        """Return a descriptor that becomes readable when a frame has come; None if it has none."""
-
-    def receive(self) -> tuple[int, bytes] | None:
-        """Return the next frame that has come (identifier with bit 31 for 29 bits, data), or None."""
-
-    def send(self, identifier: int, data: bytes) -> None:
-        """Send a frame."""
-
-    def close(self) -> None:
-        """Let go of the bus."""
+SEND_S: Final = 0.05
+"""So long a full queue is waited for, with a frame, or with all that make the bus safe."""
+SEND_PAUSE_S: Final = 0.001
 
 
 class CanDevice(Device):
@@ -70,6 +55,7 @@ class CanDevice(Device):
         """
         self._bus: CanBus | None = None
         self._lost = 0
+        self._is_full = False
         p = self.parameters
         self._bus = _open_bus(p)
         return str(p.interface)
@@ -96,7 +82,7 @@ class CanDevice(Device):
         Send a frame.
 
         Raises:
-            PluginError: It is none.
+            PluginError: It is none, or the bus has no room for it now.
             MachineError: The bus does not take it.
         """
         frame = values["sent"]
@@ -111,7 +97,14 @@ class CanDevice(Device):
             raise PluginError(
                 f"sent: expected an identifier of 11 bits, or one of 29 with bit 31 set beside them; got 0x{identifier:08x}"
             )
-        self._send(identifier, frame[HEAD_BYTES:])
+        # A bus that took nothing for so long is not waited for with each frame.
+        until_s = monotonic() + (0.0 if self._is_full else SEND_S)
+        try:
+            self._send(identifier, frame[HEAD_BYTES:], until_s)
+        except BusIsFullError as error:
+            self._is_full = True
+            raise PluginError(f"sent: {error}") from None
+        self._is_full = False
 
     def health(self) -> Mapping[str, float | int | str | bool | None]:
         """Return what was not handed on."""
@@ -125,17 +118,25 @@ class CanDevice(Device):
     def make_safe(self) -> None:
         """Send the frames that the parameters name."""
         if self._bus is not None:
+            until_s = monotonic() + SEND_S
             for text in self.parameters.safe_frames_hex:
-                self._send(*frame_of(text))
+                self._send(*frame_of(text), until_s)
 
     def close(self) -> None:
         """Close the bus."""
         if self._bus is not None:
             self._bus.close()
 
-    def _send(self, identifier: int, data: bytes) -> None:
+    def _send(self, identifier: int, data: bytes, until_s: float) -> None:
         assert self._bus is not None
-        self._bus.send(identifier, data)
+        while True:
+            try:
+                self._bus.send(identifier, data)
+                return
+            except BusIsFullError:
+                if monotonic() >= until_s:
+                    raise
+            sleep(SEND_PAUSE_S)  # no descriptor tells when a queue has room again
 
 
 class SocketBus:
@@ -196,10 +197,18 @@ class SocketBus:
             self.frames_left_out += 1
 
     def send(self, identifier: int, data: bytes) -> None:
-        """Send a frame."""
+        """
+        Send a frame.
+
+        Raises:
+            BusIsFullError: The interface's queue has no room.
+            MachineError: The interface takes none.
+        """
         try:
             self._socket.send(FRAME.pack(identifier, len(data), data))
         except OSError as error:
+            if error.errno in FULL:
+                raise BusIsFullError(self._where) from None
             raise self._fault(error) from None
 
     def close(self) -> None:

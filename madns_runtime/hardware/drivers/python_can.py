@@ -11,6 +11,7 @@ from typing import Any, Final
 import can
 
 from madns_runtime.errors import MachineError
+from madns_runtime.hardware.drivers.can_bus import FULL, BusIsFullError
 from madns_runtime.hardware.kinds.can import EXTENDED, CanParameters
 
 WAITING_MAX: Final = 10_000
@@ -83,7 +84,8 @@ class PythonCanBus:
         Send a frame.
 
         Raises:
-            MachineError: The bus does not take it.
+            BusIsFullError: It takes none now.
+            MachineError: It takes none any more.
         """
         message = can.Message(
             arbitration_id=identifier & ~EXTENDED,
@@ -93,6 +95,9 @@ class PythonCanBus:
         try:
             self._bus.send(message)
         except (can.CanError, OSError) as error:
+            number = error.errno if isinstance(error, OSError) else error.error_code
+            if number in FULL or "buffer full" in str(error):
+                raise BusIsFullError(self._where) from None
             raise MachineError(f"{self._where}: {error}") from None
 
     def close(self) -> None:

@@ -15,6 +15,7 @@ from cosmos_cli.evidence.devices import (
     device_checks,
     device_loss_remarks,
     read_devices,
+    refusal_remarks,
     silent_input_remarks,
 )
 from cosmos_cli.evidence.run_directory import RunDirectory
@@ -225,6 +226,16 @@ def test_an_input_that_gave_nothing_in_any_life_is_remarked_where_its_device_gav
     assert silent_input_remarks({f"pi{n}/a": {"silent_inputs": ["x"]} for n in range(25)})[-1] == (
         "5 more devices with an input of which no value ever came"
     )
+
+
+def test_what_devices_refused_is_told_by_device_and_bounded() -> None:
+    refused = {f"pi{n}/a": {"counts": {"refused": n}} for n in range(25)}
+
+    first, *_, last = refusal_remarks(refused)
+
+    assert first == "device pi1/a: 1 time something was refused; its events.jsonl says what and why"
+    assert last == "4 more devices that refused something"
+    assert refusal_remarks({"pi1/a": {"counts": {}}, "pi2/a": {}}) == ()
 
 
 def test_remarks_on_losses_are_bounded() -> None:
