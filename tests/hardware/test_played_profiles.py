@@ -118,6 +118,24 @@ def test_outputs_that_may_not_move_play_nothing_and_every_point_is_counted(tmp_p
     assert report["refused"] == 1
 
 
+def test_in_lockstep_points_that_the_driver_does_not_take_are_counted_as_refused(tmp_path):
+    bench = InlineBench(tmp_path)
+
+    def write(values, due_s):
+        if values["coil"] == 0.5:
+            raise PluginError("stuck")
+
+    bench.device._device.write = write
+    bench.port.play("coil", [(0.1, 0.25), (0.2, 0.5), (0.3, 0.5), (0.4, 0.75)])
+    bench.advance(0.45)
+    report = bench.device.close()
+
+    assert bench.played() == [(0.1, 0, 0.25), (0.4, 0, 0.75)]
+    told = report["stimulus"]["coil"]
+    assert (told["points"], told["played"], told["refused"], told["lost"]) == (4, 2, 2, 0)
+    assert not report.get("refused")
+
+
 def test_what_no_output_can_play_is_refused_at_once(tmp_path):
     port = InlineBench(tmp_path).port
 
