@@ -1,5 +1,5 @@
 """
-Actuators of a vehicle: the real change of a command, errors and failures included, or why there is none.
+Actuators of a vehicle: what it lacks for a command, the real change, errors and failures included, or why there is none.
 
 Pure. Chance is drawn for a name, (seed, agent, number of the command), not in turn: what one command gets
 never depends on when, or after which others, the host heard of it.
@@ -20,6 +20,7 @@ from madns_runtime.simulations.constellation.equipment import (
     Thruster,
     Vehicle,
 )
+from madns_runtime.simulations.constellation.messages import Command
 from madns_runtime.simulations.constellation.thrust import Vector
 from madns_runtime.simulations.constellation.truth.maneuvers.effects import scaled
 
@@ -31,6 +32,10 @@ TORQUE_N_M_MIN = 1e-15
 """Less than wheels can give is nothing."""
 DIPOLE_A_M2_MIN = 1e-12
 """Less turns nothing."""
+ARC_S_MIN = 0.01
+"""A burn that is over sooner is an impulse; a torque or a dipole is not given for less, s."""
+COMMANDS_MAX = 2**31
+"""Numbers of commands are below it."""
 WHEELS_FAILED = "the wheels have failed"
 
 
@@ -80,6 +85,51 @@ class Tank:
         """Take propellant off; less than 0 gives back what was not burnt."""
         self.mass_kg -= propellant_kg
         self.propellant_kg = max(0.0, self.propellant_kg - propellant_kg)
+
+
+def number_fault(command: Command) -> str:
+    """Return which of a command's numbers is none that a command can have; empty if they can be."""
+    times_s = (command.commanded_s, command.phase_s, command.at_s, command.duration_s)
+    numbers = (*times_s, *command.vector)
+    if not all(map(math.isfinite, numbers)):
+        return f"expected finite numbers, got {numbers}"
+    if not 0 <= command.number < COMMANDS_MAX:
+        return f"expected a number from 0 on, got {command.number}"
+    return ""
+
+
+def vehicle_fault(command: Command, vehicle: Vehicle) -> str:
+    """Return what a vehicle lacks for a command, or what of it is out of bounds; empty if it can be carried out."""
+    if command.kind == "delta_v":
+        return _burn_fault(command, vehicle)
+    if command.kind == "ballistic":
+        return _ballistic_fault(command, vehicle)
+    attitude = vehicle.attitude
+    if attitude is None:
+        return f"a {command.kind} on a vehicle without attitude"
+    if command.kind == "dipole" and attitude.magnetorquers is None:
+        return "the vehicle has no magnetorquers"
+    if command.duration_s < ARC_S_MIN:
+        return f"expected a duration of at least {ARC_S_MIN} s, got {command.duration_s:g} s"
+    return ""
+
+
+def _burn_fault(command: Command, vehicle: Vehicle) -> str:
+    if vehicle.thruster is None:
+        return "the vehicle has no thruster"
+    if command.frame == "body" and vehicle.attitude is None:
+        return "body axes of a vehicle without attitude"
+    return ""
+
+
+def _ballistic_fault(command: Command, vehicle: Vehicle) -> str:
+    allowed, value = vehicle.ballistic_m2_kg_range, command.vector[0]
+    if allowed is None:
+        return "the vehicle's ballistic coefficient cannot be changed"
+    low, high = allowed
+    if not low <= value <= high:
+        return f"expected {low:g} to {high:g} m^2/kg, got {value:g}"
+    return ""
 
 
 def chance_of(seed: int, agent: str, number: int) -> np.random.Generator:

@@ -21,6 +21,7 @@ from madns_runtime.simulations.constellation.truth.maneuvers.account import (
     Times,
 )
 from madns_runtime.simulations.constellation.truth.maneuvers.actuators import (
+    ARC_S_MIN,
     ActuatorFailures,
     ActuatorRefusal,
     Burn,
@@ -30,12 +31,9 @@ from madns_runtime.simulations.constellation.truth.maneuvers.actuators import (
     chance_of,
     fire,
     magnetise,
+    number_fault,
     propellant_of,
     turn,
-)
-from madns_runtime.simulations.constellation.truth.maneuvers.command_faults import (
-    ARC_S_MIN,
-    number_fault,
     vehicle_fault,
 )
 from madns_runtime.simulations.constellation.truth.maneuvers.effects import (

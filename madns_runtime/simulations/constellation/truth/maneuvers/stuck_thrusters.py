@@ -15,8 +15,11 @@ from typing import Literal
 from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.messages import Command, CommandFrame
 from madns_runtime.simulations.constellation.thrust import Vector
-from madns_runtime.simulations.constellation.truth.maneuvers.actuators import Tank, exhaust_m_s
-from madns_runtime.simulations.constellation.truth.maneuvers.command_faults import ARC_S_MIN
+from madns_runtime.simulations.constellation.truth.maneuvers.actuators import (
+    ARC_S_MIN,
+    Tank,
+    exhaust_m_s,
+)
 from madns_runtime.simulations.constellation.truth.maneuvers.effects import (
     Effect,
     Timeline,
