@@ -290,7 +290,9 @@ def _evidence(
         interrupted=end.interrupted,
         problems=end.problems,
         scans=gathered.scans,
-        ticks=tick_statistics(tables.get("ticks")),
+        ticks=tick_statistics(
+            tables.get("ticks"), config.deadline.overrun_ms if config is not None else None
+        ),
         recorded_causes=recorded_causes(tables.get("late_ticks")),
         round_trip_ms=round_trip_statistics(tables),
         clock=clock_statistics(tables.get("clock")),

@@ -16,6 +16,9 @@ from madns_runtime.recording.newest_values import told_columns
 
 SERVICES = ("best", "reliable", "sync")
 
+_Ends = tuple[Mapping[str, Any], Mapping[str, Any] | None]
+"""Counters of a link as its two ends told them: the host, and the agent, None of one that gave no word."""
+
 
 @dataclass(slots=True)
 class HostReport:
@@ -184,9 +187,9 @@ def _messages(
     Deadlines that an end on purpose broke are told apart: nothing else could become of them.
     """
     host_side: Mapping[str, Any] = peer.link.counters.to_mapping() if peer.link else {}
-    joined: dict[str, Any] = {
-        service: _joined(service, host_side, agent_side) for service in SERVICES
-    }
+    earlier = zip(peer.retired_counters, peer.retired_records, strict=False)
+    ends = [*((host, told.get("messages")) for host, told in earlier), (host_side, agent_side)]
+    joined: dict[str, Any] = {service: _joined(service, ends) for service in SERVICES}
     lives = (*peer.retired_counters, host_side)
     broken = [side.get("deadlines_broken", 0) for side in lives]
     excused = [count for life, count in enumerate(broken, start=1) if life in ended_on_purpose]
@@ -207,7 +210,15 @@ def _messages(
     return joined
 
 
-def _joined(
+def _joined(service: str, ends: Sequence[_Ends]) -> dict[str, int | None]:
+    """Return what became of one class of service over all lives of an agent; what is lost of a stream is the last one's."""
+    lives = [_of_life(service, host_side, agent_side) for host_side, agent_side in ends]
+    names = ("sent", "received", "lost", "resent", "late")
+    joined: dict[str, int | None] = {name: sum(life[name] or 0 for life in lives) for name in names}
+    return joined if service == "best" else {**joined, "lost": lives[-1]["lost"]}
+
+
+def _of_life(
     service: str, host_side: Mapping[str, Any], agent_side: Mapping[str, Any] | None
 ) -> dict[str, int | None]:
     up: Mapping[str, Any] = (agent_side or {}).get(service, {})
@@ -219,6 +230,8 @@ def _joined(
     if service == "best":
         # Gaps between what came; one that is pushed out of the sender's queue leaves a gap as well.
         lost = up.get("lost", 0) + down.get("lost", 0)
+        if agent_side is not None:
+            lost += _behind_newest(up, down) + _behind_newest(down, up)
     elif agent_side is not None:
         lost = max(0, sent_up - down.get("received", 0)) + max(0, sent_down - up.get("received", 0))
     return {
@@ -228,6 +241,11 @@ def _joined(
         "resent": up.get("resent", 0) + down.get("resent", 0),
         "late": up.get("late", 0) + down.get("late", 0),
     }
+
+
+def _behind_newest(sender: Mapping[str, Any], receiver: Mapping[str, Any]) -> int:
+    """Return how many BEST messages a half sent after the newest that came: the last ones, or all, were lost."""
+    return max(0, int(sender.get("of_half", 0)) - int(receiver.get("reached", 0)))
 
 
 def _totals(agents: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, int | None]]:
