@@ -221,8 +221,10 @@ def _joined(service: str, ends: Sequence[_Ends]) -> dict[str, int | None]:
 def _of_life(
     service: str, host_side: Mapping[str, Any], agent_side: Mapping[str, Any] | None
 ) -> dict[str, int | None]:
-    up: Mapping[str, Any] = (agent_side or {}).get(service, {})
     down: Mapping[str, Any] = host_side.get(service, {})
+    up: Mapping[str, Any] = (
+        _of_silent(service, down) if agent_side is None else agent_side.get(service, {})
+    )
     # AgentStopped, in SYNC, is sent after the agent has counted.
     last_word = 1 if service == "sync" and agent_side is not None else 0
     sent_up, sent_down = up.get("sent", 0) + last_word, down.get("sent", 0)
@@ -241,6 +243,13 @@ def _of_life(
         "resent": up.get("resent", 0) + down.get("resent", 0),
         "late": up.get("late", 0) + down.get("late", 0),
     }
+
+
+def _of_silent(service: str, down: Mapping[str, Any]) -> dict[str, int]:
+    """Return what the host knows of the counts of an agent that gave no word: what came of it, and what it acknowledged."""
+    if service == "best":
+        return {"sent": sum(down.get(name, 0) for name in ("received", "lost", "late"))}
+    return {"sent": down.get("received", 0), "received": down.get("acknowledged", 0)}
 
 
 def _behind_newest(sender: Mapping[str, Any], receiver: Mapping[str, Any]) -> int:

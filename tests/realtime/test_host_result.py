@@ -133,3 +133,34 @@ def test_messages_of_earlier_incarnations_stay_counted():
 
     best = result["messages"]["best"]
     assert (best["sent"], best["received"], best["lost"]) == (18, 14, 4)
+
+
+def test_of_a_killed_incarnation_counts_what_came_of_it_and_what_it_acknowledged():
+    agent, host = ends()
+    agent.send(b"a", Service.RELIABLE, 1.0)
+    for number in range(3):
+        host.send(b"h", Service.RELIABLE, 1.0)
+        for datagram in host.datagrams_to_send(1.0) if number < 2 else ():
+            agent.receive_datagram(datagram, 1.0)
+    for datagram in agent.datagrams_to_send(1.0):
+        host.receive_datagram(datagram, 1.0)
+    send_best(agent, host, sent=10, lost={2})
+    later_agent, later_host = ends()
+    host.abandon()
+    peer = Peer(
+        name="agent-01",
+        index=1,
+        phase=Phase.STOPPED,
+        link=later_host,
+        records={"messages": later_agent.counters.to_mapping()},
+        retired_counters=[host.counters.to_mapping()],
+        retired_records=[{}],
+    )
+    session: Any = SimpleNamespace(peers={"agent-01": peer}, refused={}, malformed_count=0)
+
+    messages = HostReport(10.0).result(session, network={}, intended=IntendedLosses())["messages"]
+
+    reliable, best = messages["reliable"], messages["best"]
+    assert (reliable["sent"], reliable["received"], reliable["to_lost_agents"]) == (4, 3, 1)
+    assert (best["sent"], best["received"], best["lost"]) == (10, 9, 1)
+    assert reliable["lost"] == 0
