@@ -37,6 +37,8 @@ def test_a_value_below_zero_is_a_value(ordered, value):
         (("last", "here/load", "freeze", "--lst"), "no such option: --lst; see `cosmos inject --h"),
         (("last", "-x"), "no such option: -x"),
         (("--lst", "last"), "no such option: --lst"),
+        (("last", "run", "annotate", "text=.nan"), "^text: expected a finite number, got .nan"),
+        (("last", "run", "annotate", f"text={2**70}"), "^text: expected a whole number from"),
     ],
 )
 def test_what_is_neither_value_nor_option_is_refused(ordered, words, told):
