@@ -13,6 +13,7 @@ from madns_runtime.protocol.events import Phase
 from madns_runtime.protocol.host_peers import Peer
 from madns_runtime.protocol.host_session import HostSession
 from madns_runtime.recording.newest_values import told_columns
+from madns_runtime.recording.records import DEVICE_LOSSES
 
 SERVICES = ("best", "reliable", "sync")
 
@@ -154,7 +155,8 @@ def _agent_result(
 ) -> dict[str, Any]:
     summary = dict(peer.summary)
     simulation = summary.pop("simulation", {})
-    records = dict(peer.records)
+    lives = (*peer.retired_records, peer.records)
+    records = {**peer.records, **_device_losses(lives)}
     return {
         "state": peer.phase.value,
         "reason": loss_reason,
@@ -163,12 +165,24 @@ def _agent_result(
         "messages": _messages(
             peer,
             records.pop("messages", None),
-            records.get("held_dropped", 0),
+            sum(told.get("held_dropped", 0) for told in lives),
             ended_on_purpose=ended_on_purpose,
         ),
         "records": records,
         "simulation": simulation,
     }
+
+
+def _device_losses(lives: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return what found no room between an agent and its devices in all its lives, by device and kind; nothing of none."""
+    total: dict[str, dict[str, int]] = {}
+    for records in lives:
+        for device, counts in records.get(DEVICE_LOSSES, {}).items():
+            joined = total.setdefault(device, {})
+            for name, count in counts.items():
+                # A device's process counts what was missed in all lives of an agent.
+                joined[name] = count + (0 if name == "frames_missed" else joined.get(name, 0))
+    return {DEVICE_LOSSES: total} if total else {}
 
 
 def _messages(

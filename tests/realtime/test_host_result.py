@@ -164,3 +164,24 @@ def test_of_a_killed_incarnation_counts_what_came_of_it_and_what_it_acknowledged
     assert (reliable["sent"], reliable["received"], reliable["to_lost_agents"]) == (4, 3, 1)
     assert (best["sent"], best["received"], best["lost"]) == (10, 9, 1)
     assert reliable["lost"] == 0
+
+
+def test_what_found_no_room_in_earlier_incarnations_stays_counted():
+    def words(held_dropped: int, **losses: int) -> dict[str, Any]:
+        return {"held_dropped": held_dropped, "device_losses": {"pi22/imu": losses}, "messages": {}}
+
+    peer = Peer(
+        name="agent-01",
+        index=1,
+        phase=Phase.STOPPED,
+        records=words(2, writes_lost=1, frames_missed=7),
+        retired_records=[words(3, writes_lost=10, frames_dropped=4, frames_missed=5), {}],
+    )
+    session: Any = SimpleNamespace(peers={"agent-01": peer}, refused={}, malformed_count=0)
+
+    result = HostReport(10.0).result(session, network={}, intended=IntendedLosses())
+
+    assert result["messages"]["reliable"]["lost"] == 5
+    assert result["agents"]["agent-01"]["records"]["device_losses"] == {
+        "pi22/imu": {"writes_lost": 11, "frames_dropped": 4, "frames_missed": 7}
+    }
