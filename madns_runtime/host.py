@@ -21,6 +21,7 @@ from madns_runtime.errors import MadnsError
 from madns_runtime.plugin.api import HOST
 from madns_runtime.plugin.context import describe_exception
 from madns_runtime.processes import register
+from madns_runtime.reactor.descriptors import allow_descriptors
 from madns_runtime.reactor.operator_link import read_launch
 from madns_runtime.reactor.scheduling import die_with_parent
 from madns_runtime.reactor.watchdog import tell_stack_on
@@ -56,6 +57,8 @@ def _run(launch: HostLaunch, fds: tuple[int, int], pending: bytes) -> int:
         return LockstepHost(launch, fds, pending).run()
     # As above.
     from madns_runtime.realtime.host import HostRuntime
+
+    allow_descriptors()  # its half may record a stream of each agent
 
     return HostRuntime(launch, fds, pending).run()
 

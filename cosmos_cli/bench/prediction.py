@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from cosmos_cli.launch.capacity import predict_capacity
 from cosmos_cli.launch.capacity_view import computers_of
@@ -24,13 +24,16 @@ class CapacityPrediction:
     """What limits it, in a few words."""
 
 
-def predict(scenario: ScenarioFile, machines: Sequence[Machine]) -> CapacityPrediction | None:
+def predict(
+    scenario: ScenarioFile, machines: Sequence[Machine], *, per_process: int
+) -> CapacityPrediction | None:
     """
     Return what `cosmos plan` predicts for a scenario's agents on machines; None if the simulation has no demand.
 
     Args:
         scenario: Its number of agents does not matter.
         machines: Those of the inventory, or this computer alone.
+        per_process: Agents in one process, where there are so many.
     """
     plan = make_plan(scenario.scenario, machines, fault_at=scenario.fault, labels=scenario.labels)
     demand = demand_of(scenario)
@@ -38,6 +41,9 @@ def predict(scenario: ScenarioFile, machines: Sequence[Machine]) -> CapacityPred
         return None
     latency_s, _ = latency_of(plan, given_ms=scenario.scenario.plan.latency_ms)
     resources = resources_of(scenario, latency_s)
-    found = predict_capacity(scenario.scenario, demand, computers_of(plan), resources)
-    agents = None if math.isinf(found.agents) else int(found.agents)
-    return CapacityPrediction(agents=agents, source=found.binding.name)
+    # The scenario has those of a first trial, of few agents, who fill no process.
+    agents = replace(scenario.scenario.agents, per_process=per_process)
+    filled = scenario.scenario.model_copy(update={"agents": agents})
+    found = predict_capacity(filled, demand, computers_of(plan), resources)
+    most = None if math.isinf(found.agents) else int(found.agents)
+    return CapacityPrediction(agents=most, source=found.binding.name)

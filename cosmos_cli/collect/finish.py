@@ -14,6 +14,7 @@ import contextlib
 import dataclasses
 import datetime
 import errno
+import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ from cosmos_cli.evidence.devices import expected_devices, read_devices
 from cosmos_cli.evidence.expectations.of_run import judge_run, planned_expectations
 from cosmos_cli.evidence.manifest import build_manifest, pack_run
 from cosmos_cli.evidence.remarks import declared_streams
-from cosmos_cli.evidence.run_directory import RunDirectory, write_json
+from cosmos_cli.evidence.run_directory import RESERVE_BYTES, RunDirectory, write_json
 from cosmos_cli.evidence.run_documents import (
     MISSING,
     Problem,
@@ -45,6 +46,7 @@ from cosmos_cli.evidence.tables import open_tables
 from cosmos_cli.evidence.tabulate import Gathered, Progress, gather
 from cosmos_cli.evidence.tick_causes import recorded_causes
 from cosmos_cli.evidence.timeline_remarks import timeline_remarks
+from cosmos_cli.evidence.told_counts import with_told_counts
 from cosmos_cli.evidence.verdict import Verdict
 from cosmos_cli.onboard.processes import words_of
 from cosmos_cli.report.html import write_report
@@ -134,6 +136,7 @@ def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; five a
         labels=TableLabels.of(config, result, run.read_json(run.plan_json)),
         without=unread,
     )
+    gathered = dataclasses.replace(gathered, scans=with_told_counts(gathered.scans, result))
     changed |= earlier.changed_streams(run, gathered.by_path(), unread)
     fault = fault_of_plan(run.plan_json)
     if fault is not None:
@@ -290,7 +293,9 @@ def _evidence(
         interrupted=end.interrupted,
         problems=end.problems,
         scans=gathered.scans,
-        ticks=tick_statistics(tables.get("ticks")),
+        ticks=tick_statistics(
+            tables.get("ticks"), config.deadline.overrun_ms if config is not None else None
+        ),
         recorded_causes=recorded_causes(tables.get("late_ticks")),
         round_trip_ms=round_trip_statistics(tables),
         clock=clock_statistics(tables.get("clock")),
@@ -327,6 +332,7 @@ def _conclude(
         evidence = _with_report(run, evidence, document)
     # From here on what matters most is written, and the reserve makes room for it.
     run.free_reserve()
+    _keep_result(run, evidence.result)
     summary = _write_summary(run, gathered, evidence)
     progress("packing", 0.0)
     pack = partial(pack_run, run, _start_s(document), without=gathered.unread)
@@ -335,6 +341,16 @@ def _conclude(
         summary = _write_summary(run, gathered, packed)
         return dataclasses.replace(summary, is_packed=False)
     return summary
+
+
+def _keep_result(run: RunDirectory, result: Mapping[str, Any] | None) -> None:
+    """Write the host's result if no disk took it before: whoever collects again would take its host for killed."""
+    if result is None or run.result_json.exists():
+        return
+    if len(json.dumps(result, default=str)) > RESERVE_BYTES // 4:  # the verdict needs room, too
+        return
+    with contextlib.suppress(OSError):
+        write_json(run.result_json, result)
 
 
 def _with_report(run: RunDirectory, evidence: Evidence, document: Mapping[str, Any]) -> Evidence:

@@ -134,7 +134,7 @@ def capacity(
     _refuse_own_settings(settings, trials)
     own = trials.overrides(first)
     checked = load_scenario(scenario or SCENARIO, [*settings, *own], warn=console.warn)
-    predicted = predict(checked, machines)
+    predicted = predict(checked, machines, per_process=per_process)
     options = run_arguments(inventory=inventory, limit=limit, host=host, settings=settings)
     options += ["--runs", str(runs_root(runs))]
     found = find_capacity(trials, checked.path, options, console.say)

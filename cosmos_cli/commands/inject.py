@@ -144,7 +144,10 @@ def _parameters(values: Sequence[str]) -> dict[str, Any]:
     for each in values:
         if "=" not in each:
             raise InputError(f"expected KEY=VALUE, such as for_s=20, got {each!r}")
-        key, path, value = parse_override(each)
+        try:
+            key, path, value = parse_override(each)
+        except InputError as error:  # there is no --set here
+            raise InputError(str(error).removeprefix("--set ")) from None
         if len(path) > 1 or key in found:
             raise InputError(f"expected each parameter once, and no dots, got {each!r}")
         found[key] = value

@@ -7,6 +7,7 @@ where it came from.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -36,6 +37,8 @@ class AgentTicks:
     missed: int
     lateness_ms: Mapping[str, float]
     margin_ms: Mapping[str, float]
+    overrun_errors: int = 0
+    """Steps that ended later than is tolerated, as far as whole microseconds tell."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,8 +50,15 @@ class TickStatistics:
     margin_ms: Mapping[str, float]
 
 
-def tick_statistics(table: RecordedTable | None) -> TickStatistics:
-    """Return lateness and margin over all ticks of all agents, and by agent."""
+def tick_statistics(table: RecordedTable | None, overrun_ms: float | None = None) -> TickStatistics:
+    """
+    Return lateness and margin over all ticks of all agents, and by agent.
+
+    Args:
+        table: Of the ticks.
+        overrun_ms: Overrun that is tolerated; None if it is not known.
+    """
+    limit_us = -math.inf if overrun_ms is None else -overrun_ms * US_PER_MS
     agents: dict[str, AgentTicks] = {}
     lateness, margin = Distribution(), Distribution()
     if table is not None and table.has("lateness_us", "margin_us", "missed"):
@@ -62,6 +72,7 @@ def tick_statistics(table: RecordedTable | None) -> TickStatistics:
                 missed=int(np.nansum(columns["missed"])),
                 lateness_ms=_high_ms(late),
                 margin_ms=_low_ms(left),
+                overrun_errors=int(np.count_nonzero(columns["margin_us"] < limit_us)),
             )
     return TickStatistics(agents=agents, lateness_ms=_high_ms(lateness), margin_ms=_low_ms(margin))
 
@@ -164,10 +175,12 @@ def tick_totals(
     for name in agents:
         own, seen = counters.get(name, {}), recorded.get(name)
         seen_run, seen_missed = (seen.run, seen.missed) if seen else (0, 0)
+        # A summary is of the last life alone; records are of all.
+        seen_overruns = seen.overrun_errors if seen else 0
         totals[name] = TickTotals(
             due=max(_due(own, due_each, is_excused=name in excused), seen_run + seen_missed),
             run=max(whole_count(own.get("run")), seen_run),
-            overrun_errors=max(whole_count(own.get("overrun_errors")), 0),
+            overrun_errors=max(whole_count(own.get("overrun_errors")), seen_overruns),
         )
     return TickTotals(
         due=sum(of.due for of in totals.values()),

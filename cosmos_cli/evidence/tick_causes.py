@@ -36,6 +36,10 @@ class CauseWords:
 
 
 WORDS: Final[Mapping[str, CauseWords]] = {
+    Cause.CLOCK: CauseWords(
+        "what the agent takes for the host's time leapt ahead: its clock was put wrong, or its estimate was far off",
+        "nothing where a timeline's `step_clock` did it; else see the stream `clock`, and what sets clocks there",
+    ),
     Cause.START: CauseWords(
         "the order to start came after the first deadlines, or the loop was still setting up",
         "raise timeouts.start_lead_s",

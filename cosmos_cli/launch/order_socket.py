@@ -17,7 +17,7 @@ from cosmos_cli.errors import InputError, RunFailedError
 from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime import private_socket
 from madns_runtime.hardware.action_socket import SOCKET_NAME as ACTIONS_SOCKET
-from madns_runtime.hardware.order_socket import SOCKET_NAME, Fault
+from madns_runtime.hardware.order_socket import LINE_BYTES_MAX, SOCKET_NAME, Fault, overlong
 
 ANSWER_BYTES_MAX = 1 << 20
 ANSWER_S = 10.0
@@ -49,7 +49,7 @@ def order_fault(folder: Path, name: str, fault: Fault) -> str:
         fault: Target, action and value.
 
     Raises:
-        InputError: Nobody of this run listens.
+        InputError: Nobody of this run listens, or the order is too long.
         RunFailedError: It does not answer in time.
     """
     order = dict(zip(("target", "action", "value"), fault, strict=True))
@@ -67,7 +67,7 @@ def order_action(folder: Path, name: str, order: Mapping[str, Any]) -> Mapping[s
         order: target, action, parameters and for_s, or list.
 
     Raises:
-        InputError: Nobody of this run listens.
+        InputError: Nobody of this run listens, or the order is too long.
         RunFailedError: It does not answer in time.
     """
     why_not = "it has not begun, has ended, or its host runs on another computer"
@@ -75,29 +75,46 @@ def order_action(folder: Path, name: str, order: Mapping[str, Any]) -> Mapping[s
 
 
 def _knock(door: Path, name: str, order: Mapping[str, Any], why_not: str) -> Mapping[str, Any]:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as line:
-        line.settimeout(ANSWER_S)
+    line = _line_of(order, name)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as visit:
+        visit.settimeout(ANSWER_S)
         try:
             with private_socket.socket_address(door.parent.resolve(), door.name) as path:
                 if not stat.S_ISSOCK(os.lstat(path).st_mode):
                     raise FileNotFoundError(path)
-                line.connect(path)
+                visit.connect(path)
         except OSError:
             raise InputError(f"{name}: nobody of this run listens: {why_not}") from None
         try:
-            return _ask(line, order)
+            return _ask(visit, line)
         except OSError as error:
             why = str(error.strerror or error)
             raise RunFailedError(f"{name}: it took no order: {why}") from None
 
 
-def _ask(line: socket.socket, order: Mapping[str, Any]) -> Mapping[str, Any]:
+def _line_of(order: Mapping[str, Any], name: str) -> bytes:
+    """
+    Return an order as its line.
+
+    Raises:
+        InputError: It is too long, or holds what has no line.
+    """
+    try:
+        line = orjson.dumps(order) + b"\n"
+    except TypeError as error:  # a whole number of more than 64 bits
+        raise InputError(f"{name}: no order: {error}") from None
+    if len(line) > LINE_BYTES_MAX:  # who refuses it may not be heard over what is still written
+        raise InputError(f"{name}: {overlong(len(line))}")
+    return line
+
+
+def _ask(visit: socket.socket, line: bytes) -> Mapping[str, Any]:
     deadline_s = monotonic() + ANSWER_S
-    line.sendall(orjson.dumps(order) + b"\n")
+    visit.sendall(line)
     heard = b""
     while not heard.endswith(b"\n"):
-        line.settimeout(max(0.001, deadline_s - monotonic()))
-        data = line.recv(ANSWER_BYTES_MAX)
+        visit.settimeout(max(0.001, deadline_s - monotonic()))
+        data = visit.recv(ANSWER_BYTES_MAX)
         heard += data
         if not data or len(heard) > ANSWER_BYTES_MAX:
             raise ConnectionResetError("it closed the line; the run may be ending")

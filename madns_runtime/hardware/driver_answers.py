@@ -1,4 +1,4 @@
-"""What a driver's methods return beside samples, looked at before it is used."""
+"""What a driver's methods return beside samples, looked at before it is used, and what they raise, in words."""
 
 from __future__ import annotations
 
@@ -7,8 +7,17 @@ import stat
 from collections.abc import Mapping
 from typing import Any
 
-from madns_runtime.errors import PluginError
-from madns_runtime.plugin.context import clean_text
+from madns_runtime.errors import MachineError, PluginError
+from madns_runtime.plugin.context import clean_text, describe_exception
+
+
+def describe_fault(error: BaseException, where: str) -> str:
+    """Return in words what a driver's method raised, or that what it returned was refused; *where* names the method."""
+    if isinstance(error, MachineError):
+        return clean_text(str(error))
+    if isinstance(error, PluginError):
+        return f"{where}: {clean_text(str(error))}"
+    return describe_exception(error, where)
 
 
 def identity_of(told: Any) -> str:

@@ -18,6 +18,7 @@ from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.profiles import PREFIX, counts_by_channel
 from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.values import are_finite, hold_to_limits, to_frame, to_numbers
+from madns_runtime.plain_values import is_real
 
 FROZEN: Final = "frozen:"
 """Before an input's name: how often it stood still."""
@@ -95,11 +96,7 @@ class Intake:
         """
         if not isinstance(sample, Sample):
             raise PluginError(f"expected a Sample or None, got {type(sample).__name__}")
-        if not math.isfinite(sample.taken_s) or sample.taken_s > now_s + ahead_s:
-            raise PluginError(
-                f"taken_s: expected a time until now, {now_s:.6f} s of time.monotonic() (in lockstep simulated), got"
-                f" {sample.taken_s!r}"
-            )
+        _check_times(sample, now_s + ahead_s, now_s)
         sample = self._checked(sample)
         self._page.header[page.ACTIVE_S] = now_s
         if sample.device_s is not None:
@@ -145,8 +142,11 @@ class Intake:
         Raises:
             PluginError: A value is none of an input of this device.
         """
+        given: Any = sample.values
+        if not isinstance(given, Mapping):
+            raise PluginError(f"expected values by channel in a Sample, got {given!r:.80}")
         values: dict[str, Any] = {}
-        for name, value in sample.values.items():
+        for name, value in given.items():
             channel = self._inputs.get(name)
             if channel is None:
                 raise PluginError(f"a sample holds {name!r}, which is no input of the device")
@@ -204,6 +204,26 @@ class Intake:
 
     def _send(self, message: list[Any]) -> None:
         self.count("frames_missed", self._pass_on(message))
+
+
+def _check_times(sample: Sample, latest_s: float, now_s: float) -> None:
+    """
+    Refuse a sample whose times are none, or still to come.
+
+    Raises:
+        PluginError: They are.
+    """
+    taken_s: Any = sample.taken_s
+    if not is_real(taken_s) or not math.isfinite(taken_s) or taken_s > latest_s:
+        raise PluginError(
+            f"taken_s: expected a time until now, {now_s:.6f} s of time.monotonic() (in lockstep simulated), got"
+            f" {taken_s!r:.80}"
+        )
+    device_s: Any = sample.device_s
+    if device_s is not None and not is_real(device_s):
+        raise PluginError(
+            f"device_s: expected a time of the device's own clock, s, or None; got {device_s!r:.80}"
+        )
 
 
 def counts_of(device_page: DevicePage) -> dict[str, Any]:

@@ -20,7 +20,8 @@ from madns_runtime.errors import MadnsError
 from madns_runtime.hardware.fault_actions import check_fault
 
 SOCKET_NAME: Final = ".orders.sock"
-LINE_BYTES_MAX: Final = 4096
+LINE_BYTES_MAX: Final = 65_536
+"""Of an order: the longest text that an action takes fits in several times."""
 VISITORS_MAX: Final = 8
 """Who knocks beyond them closes the door behind the one that has waited longest."""
 
@@ -102,8 +103,10 @@ class LineSocket:
         except OSError:
             data = b""
         heard = self._heard[number] = self._heard[number] + data
-        if not data or len(heard) > LINE_BYTES_MAX:
+        if not data:
             self._dismiss(number)
+        elif len(heard) > LINE_BYTES_MAX:
+            self.tell(number, {"refusal": overlong(len(heard))})
         elif heard.endswith(b"\n"):
             self._stop_hearing(number)
             self._on_line(number, heard)
@@ -117,6 +120,13 @@ class LineSocket:
         if number in self._hearing:
             self._hearing.remove(number)
             self._loop.remove_reader(self._visitors[number].fileno())
+
+
+def overlong(size_bytes: int) -> str:
+    """Return why an order of so many bytes, as far as they have come, is refused."""
+    return (
+        f"expected an order of at most {LINE_BYTES_MAX} bytes, got {size_bytes}; shorten its texts"
+    )
 
 
 class OrderSocket(LineSocket):

@@ -28,3 +28,16 @@ def resident_bytes() -> int:
             return int(file.read().split()[1]) * PAGE_BYTES
     except (OSError, IndexError, ValueError):
         return 0
+
+
+def leak_of(first_bytes: int) -> str:
+    """
+    Return in words what this process has taken beyond what is borne; empty if it is less, or nobody knows.
+
+    Args:
+        first_bytes: What it had when the device was opened first; 0 if that is not known.
+    """
+    grown_bytes = resident_bytes() - first_bytes
+    if not first_bytes or grown_bytes <= GROWTH_BYTES_MAX:
+        return ""
+    return f"leaks memory: {grown_bytes >> 20} MiB since it was opened"

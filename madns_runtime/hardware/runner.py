@@ -10,23 +10,17 @@ from time import monotonic
 from typing import Any, Final
 
 from madns_runtime.errors import MachineError, MadnsError, PluginError
-from madns_runtime.hardware import messages, page
+from madns_runtime.hardware import driver_answers, messages, page
 from madns_runtime.hardware.contract import Device, SimulatedDevice
 from madns_runtime.hardware.descriptor import DriverDescriptor
-from madns_runtime.hardware.driver_answers import descriptor_of, details_of, identity_of
 from madns_runtime.hardware.intake import Intake
 from madns_runtime.hardware.outbox import UserOutbox
 from madns_runtime.hardware.outputs import DeviceOutputs, DueOutput
-from madns_runtime.hardware.process_resources import (
-    GROWTH_BYTES_MAX,
-    has_descriptors,
-    resident_bytes,
-)
+from madns_runtime.hardware.process_resources import has_descriptors, leak_of, resident_bytes
 from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.seat import DeviceSeat
-from madns_runtime.hardware.simulated import pass_over, samples_by_now
+from madns_runtime.hardware.simulated import next_of, pass_over, samples_by_now
 from madns_runtime.hardware.status import StatusLimits, back_off_s
-from madns_runtime.plugin.context import clean_text, describe_exception
 from madns_runtime.reactor.reactor import Reactor
 
 BURST_MAX: Final = 256
@@ -77,6 +71,7 @@ class DeviceRunner:
         self._period_s = 1.0 / launch.rate_hz
         self._hang_s = StatusLimits.of(self._period_s, launch.hang_s).hang_s
         self._due_s = math.inf
+        self._next_s: float | None = None  # of a device that follows simulated time
         # Infinite is never: each timer is made once and moved.
         self._read_timer = reactor.call_at(math.inf, self._read_due)
         self._open_timer = reactor.call_at(math.inf, self.open)
@@ -101,11 +96,12 @@ class DeviceRunner:
             self._device = device = self._seat.make()
             device.may_move, device.place = self._launch.may_move, self._launch.place
             self._intake.serve(device)
-            identity = identity_of(device.open())
+            identity = driver_answers.identity_of(device.open())
+            self._reactor.end_if_forked()
             self._seat.check_identity(identity)
             self._is_own = True
             self._intake.count("passed_while_closed", pass_over(device, self._records.time, header))
-            if (fd := descriptor_of(device.fileno())) is not None:
+            if (fd := driver_answers.descriptor_of(device.fileno())) is not None:
                 intake, readable = self._intake, self._readable
                 self._descriptor = DriverDescriptor(fd, self._reactor, readable, intake.event)
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything
@@ -125,11 +121,10 @@ class DeviceRunner:
         """Note what a driver raised, close the device, and open it anew after a while."""
         if isinstance(error, KeyboardInterrupt | GeneratorExit):
             raise error
+        name = type(self._device).__name__ if self._device is not None else self._launch.kind
+        self.tell_error(self._blame(name, method, error))
         self._failures += 1
         self._header[page.ERRORS] += 1
-        name = type(self._device).__name__ if self._device is not None else self._launch.kind
-        text = self._blame(name, method, error)
-        self.tell_error(text)
         self._close_device()
         if not has_descriptors():
             self._give_up(f"{name} leaks descriptors: none is left, so it gets a process anew")
@@ -143,15 +138,13 @@ class DeviceRunner:
         self._reactor.stop()
 
     def _check_memory(self) -> None:
-        grown_bytes = resident_bytes() - self._first_bytes
-        if self._first_bytes and grown_bytes > GROWTH_BYTES_MAX and not self.gave_up:
-            why = f"{type(self._device).__name__} leaks memory: {grown_bytes >> 20} MiB since it was opened"
-            self._give_up(f"{why}, so it gets a process anew")
+        if not self.gave_up and (leak := leak_of(self._first_bytes)):
+            self._give_up(f"{type(self._device).__name__} {leak}, so it gets a process anew")
 
     def _blame(self, driver: str, method: str, error: BaseException) -> str:
         """Record what a driver's method raised, and return its words."""
-        where, is_told = f"{driver}.{method}", isinstance(error, MachineError)
-        text = clean_text(str(error)) if is_told else describe_exception(error, where)
+        self._reactor.end_if_forked()  # by sys.exit, say: whoever forked it goes on
+        text = driver_answers.describe_fault(error, f"{driver}.{method}")
         self._intake.event("error", monotonic(), why=text)
         return text
 
@@ -183,6 +176,7 @@ class DeviceRunner:
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything
             self._blame(type(device).__name__, "make_safe", error)
             return False
+        self._reactor.end_if_forked()
         self._header[page.MOVED] = 0.0
         self._header[page.SAFE_COUNT] += 1
         self._records.event("made_safe", monotonic())
@@ -212,10 +206,9 @@ class DeviceRunner:
         self._late_us_max = max(self._late_us_max, int((now_s - self._due_s) * 1e6))
         if not self._read():
             return
-        device = self._device
-        if isinstance(device, SimulatedDevice) and (next_s := device.next_s()) is not None:
+        if self._next_s is not None:
             time = self._records.time
-            wait_s = time.until(next_s) if time.is_known else self._period_s
+            wait_s = time.until(self._next_s) if time.is_known else self._period_s
             self._due_s = monotonic() + min(max(wait_s, 0.0), STATE_PERIOD_S)
             self._read_timer.reschedule(self._due_s)
             return
@@ -246,6 +239,7 @@ class DeviceRunner:
             if isinstance(device, SimulatedDevice):
                 for given in samples_by_now(device, self._records.time, BURST_MAX):
                     self._take(given)
+                self._next_s = next_of(device)
             elif (sample := device.read()) is not None:
                 self._take(sample)
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything
@@ -254,6 +248,7 @@ class DeviceRunner:
         return True
 
     def _take(self, sample: Any) -> None:
+        self._reactor.end_if_forked()  # a driver's copy gives none
         self._intake.take(sample, monotonic(), ahead_s=self._period_s)
         self._failures = 0
         if (due_s := self._intake.faults.next_due_s()) != math.inf:
@@ -278,8 +273,7 @@ class DeviceRunner:
                 self._refuse(f"{agent}: {error}")
 
     def _take_time(self) -> None:
-        told = self._seat.page.time.read()
-        if told is not None:
+        if (told := self._seat.page.time.read()) is not None:
             self._records.set_time(*told)
             self._schedule_write()
 
@@ -324,6 +318,7 @@ class DeviceRunner:
             self._outputs.note_lost(output)
             self._fail("write", error)
             return False
+        self._reactor.end_if_forked()
         done_s = monotonic()
         self._records.written(name, output.due_s, done_s, output.told)
         if output.point is not None and not output.point.is_underrun:
@@ -374,7 +369,7 @@ class DeviceRunner:
             self._fail("read", MachineError(f"no sample within {self._hang_s:g} s"))
         if self._device is not None:
             try:
-                details = details_of(self._device.health())
+                details = driver_answers.details_of(self._device.health())
             except BaseException as error:  # noqa: BLE001 - a driver may raise anything
                 self._fail("health", error)
         counts = int(self._header[page.SAMPLES]), int(self._header[page.ERRORS])
@@ -396,5 +391,6 @@ class DeviceRunner:
         self._alive_timer.reschedule(now_s + self._hang_s / 4)
 
     def _refuse(self, why: str, output: DueOutput | None = None) -> None:
+        self._reactor.end_if_forked()
         self._outputs.note_refused(output)
         self._intake.event("refused", monotonic(), why=why)

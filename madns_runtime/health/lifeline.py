@@ -24,6 +24,8 @@ from madns_runtime.reactor import libc
 REPORT_BYTES_MAX = 32_768
 """A report must fit a pipe, so that writing it never waits for a reader."""
 _KILL_WAIT_S = 2.0
+WAIT_S_MAX = 86_400.0
+"""Longest wait at once: the system takes none of a month."""
 
 
 class Lifeline:
@@ -36,7 +38,12 @@ class Lifeline:
 
     def has_ended(self, wait_s: float = 0.0) -> bool:
         """Wait up to *wait_s*, and return whether the parent is gone or has said stop."""
-        return bool(self._poll.poll(max(0.0, wait_s) * 1e3))
+        left_s = max(0.0, wait_s)
+        while left_s > WAIT_S_MAX:
+            if self._poll.poll(WAIT_S_MAX * 1e3):
+                return True
+            left_s -= WAIT_S_MAX
+        return bool(self._poll.poll(left_s * 1e3))
 
 
 ChildMain = Callable[[Lifeline], Mapping[str, Any]]

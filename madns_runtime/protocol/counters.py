@@ -39,6 +39,10 @@ class ClassCounters:
     """BEST only: overtaken by a newer one and dropped; not counted as lost."""
     dropped: int = 0
     """BEST only: pushed out of a full queue on this side by newer ones."""
+    of_half: int = 0
+    """BEST only: messages of this side's half taken for sending."""
+    reached: int = 0
+    """BEST only: how many the other side's half had sent with the newest of its messages that came: no gap tells of later ones."""
 
 
 @dataclass(slots=True)

@@ -223,6 +223,10 @@ class Incoming:
         self.streams_told = b""
         """Our headers' word on the peer's streams; empty when `tell_streams` must say it anew."""
 
+    def best_reached(self, channel: int) -> int:
+        """Return how many BEST messages of a channel the peer had sent with the newest that came."""
+        return self._best.newest.get(channel, -1) + 1
+
     def tell_streams(self) -> bytes:
         """Return how far each stream is and what is granted, for this header and those to come."""
         reliable, sync = self.streams

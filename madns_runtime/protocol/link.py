@@ -31,7 +31,7 @@ from madns_runtime.protocol.datagram import (
 )
 from madns_runtime.protocol.deadlines import BrokenDeadline
 from madns_runtime.protocol.incoming import Incoming, Received
-from madns_runtime.protocol.link_settings import LinkLimits, SendQueueFull
+from madns_runtime.protocol.link_settings import PLUGIN_CHANNEL, LinkLimits, SendQueueFull
 from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.outgoing import Outgoing
 from madns_runtime.protocol.packets import Packets
@@ -132,6 +132,8 @@ class Link:
         # What their numbers tell is not counted again with every tick.
         counters.datagrams_sent = self._packets.newest
         counters.best.sent = sum(self._outgoing.best.numbers.values())
+        counters.best.of_half = self._outgoing.best.numbers.get(PLUGIN_CHANNEL, 0)
+        counters.best.reached = self._incoming.best_reached(PLUGIN_CHANNEL)
         return counters
 
     @property

@@ -11,6 +11,7 @@ from typing import Any
 
 from madns_runtime.config import AgentLaunch
 from madns_runtime.plugin.half import RoleProgram
+from madns_runtime.reactor.descriptors import allow_descriptors
 from madns_runtime.reactor.operator_link import OPERATOR_SIDE_GONE
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import apply as apply_scheduling
@@ -72,6 +73,7 @@ class AgentProcess:
 
     def run(self) -> dict[str, AgentOutcome]:
         """Run every agent to its end, and return how each ended."""
+        allow_descriptors()  # a file per stream and agent: a usual limit of 1024 would hold some hundred agents
         reactor = self._reactor
         reactor.on_signal(signal.SIGTERM, lambda: self._end("SIGTERM"))
         reactor.on_signal(signal.SIGINT, lambda: None)

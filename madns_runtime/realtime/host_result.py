@@ -13,8 +13,12 @@ from madns_runtime.protocol.events import Phase
 from madns_runtime.protocol.host_peers import Peer
 from madns_runtime.protocol.host_session import HostSession
 from madns_runtime.recording.newest_values import told_columns
+from madns_runtime.recording.records import DEVICE_LOSSES
 
 SERVICES = ("best", "reliable", "sync")
+
+_Ends = tuple[Mapping[str, Any], Mapping[str, Any] | None]
+"""Counters of a link as its two ends told them: the host, and the agent, None of one that gave no word."""
 
 
 @dataclass(slots=True)
@@ -151,7 +155,8 @@ def _agent_result(
 ) -> dict[str, Any]:
     summary = dict(peer.summary)
     simulation = summary.pop("simulation", {})
-    records = dict(peer.records)
+    lives = (*peer.retired_records, peer.records)
+    records = {**peer.records, **_device_losses(lives)}
     return {
         "state": peer.phase.value,
         "reason": loss_reason,
@@ -160,12 +165,24 @@ def _agent_result(
         "messages": _messages(
             peer,
             records.pop("messages", None),
-            records.get("held_dropped", 0),
+            sum(told.get("held_dropped", 0) for told in lives),
             ended_on_purpose=ended_on_purpose,
         ),
         "records": records,
         "simulation": simulation,
     }
+
+
+def _device_losses(lives: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return what found no room between an agent and its devices in all its lives, by device and kind; nothing of none."""
+    total: dict[str, dict[str, int]] = {}
+    for records in lives:
+        for device, counts in records.get(DEVICE_LOSSES, {}).items():
+            joined = total.setdefault(device, {})
+            for name, count in counts.items():
+                # A device's process counts what was missed in all lives of an agent.
+                joined[name] = count + (0 if name == "frames_missed" else joined.get(name, 0))
+    return {DEVICE_LOSSES: total} if total else {}
 
 
 def _messages(
@@ -184,9 +201,9 @@ def _messages(
     Deadlines that an end on purpose broke are told apart: nothing else could become of them.
     """
     host_side: Mapping[str, Any] = peer.link.counters.to_mapping() if peer.link else {}
-    joined: dict[str, Any] = {
-        service: _joined(service, host_side, agent_side) for service in SERVICES
-    }
+    earlier = zip(peer.retired_counters, peer.retired_records, strict=False)
+    ends = [*((host, told.get("messages")) for host, told in earlier), (host_side, agent_side)]
+    joined: dict[str, Any] = {service: _joined(service, ends) for service in SERVICES}
     lives = (*peer.retired_counters, host_side)
     broken = [side.get("deadlines_broken", 0) for side in lives]
     excused = [count for life, count in enumerate(broken, start=1) if life in ended_on_purpose]
@@ -207,11 +224,21 @@ def _messages(
     return joined
 
 
-def _joined(
+def _joined(service: str, ends: Sequence[_Ends]) -> dict[str, int | None]:
+    """Return what became of one class of service over all lives of an agent; what is lost of a stream is the last one's."""
+    lives = [_of_life(service, host_side, agent_side) for host_side, agent_side in ends]
+    names = ("sent", "received", "lost", "resent", "late")
+    joined: dict[str, int | None] = {name: sum(life[name] or 0 for life in lives) for name in names}
+    return joined if service == "best" else {**joined, "lost": lives[-1]["lost"]}
+
+
+def _of_life(
     service: str, host_side: Mapping[str, Any], agent_side: Mapping[str, Any] | None
 ) -> dict[str, int | None]:
-    up: Mapping[str, Any] = (agent_side or {}).get(service, {})
     down: Mapping[str, Any] = host_side.get(service, {})
+    up: Mapping[str, Any] = (
+        _of_silent(service, down) if agent_side is None else agent_side.get(service, {})
+    )
     # AgentStopped, in SYNC, is sent after the agent has counted.
     last_word = 1 if service == "sync" and agent_side is not None else 0
     sent_up, sent_down = up.get("sent", 0) + last_word, down.get("sent", 0)
@@ -219,6 +246,8 @@ def _joined(
     if service == "best":
         # Gaps between what came; one that is pushed out of the sender's queue leaves a gap as well.
         lost = up.get("lost", 0) + down.get("lost", 0)
+        if agent_side is not None:
+            lost += _behind_newest(up, down) + _behind_newest(down, up)
     elif agent_side is not None:
         lost = max(0, sent_up - down.get("received", 0)) + max(0, sent_down - up.get("received", 0))
     return {
@@ -228,6 +257,18 @@ def _joined(
         "resent": up.get("resent", 0) + down.get("resent", 0),
         "late": up.get("late", 0) + down.get("late", 0),
     }
+
+
+def _of_silent(service: str, down: Mapping[str, Any]) -> dict[str, int]:
+    """Return what the host knows of the counts of an agent that gave no word: what came of it, and what it acknowledged."""
+    if service == "best":
+        return {"sent": sum(down.get(name, 0) for name in ("received", "lost", "late"))}
+    return {"sent": down.get("received", 0), "received": down.get("acknowledged", 0)}
+
+
+def _behind_newest(sender: Mapping[str, Any], receiver: Mapping[str, Any]) -> int:
+    """Return how many BEST messages a half sent after the newest that came: the last ones, or all, were lost."""
+    return max(0, int(sender.get("of_half", 0)) - int(receiver.get("reached", 0)))
 
 
 def _totals(agents: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, int | None]]:

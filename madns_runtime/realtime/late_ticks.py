@@ -35,13 +35,14 @@ class LateTicks:
         self._counts: Counter[Cause] = Counter()
         self._missed = 0
 
-    def explain(self, timing: TickTiming, began_s: float) -> None:
+    def explain(self, timing: TickTiming, began_s: float, leapt_s: float) -> None:
         """
         Count and record a tick that began late, and those missed before it, under one cause.
 
         Args:
             timing: Of the tick.
             began_s: When it began, s of the local clock.
+            leapt_s: By how much simulated time has leapt ahead of that clock since the tick before, s.
         """
         index, _, _, lateness_s, missed = timing
         late = LateTick(
@@ -50,13 +51,14 @@ class LateTicks:
             began_s,
             self.started_s,
             self._period_s,
+            leapt_s,
         )
         cause = self._account.explain(late)
         self._counts[cause] += missed or 1
         self._missed += missed
         self._recorder.record(LATE_TICKS.name, (index, int(lateness_s * 1e6), missed, cause.value))
 
-    def never_run(self, pacer: Pacer, t_s: float, now_s: float) -> None:
+    def never_run(self, pacer: Pacer, t_s: float, now_s: float, leapt_s: float) -> None:
         """
         Count and record the ticks missed that no other followed, at the end of the run, as before the tick that is next.
 
@@ -64,13 +66,14 @@ class LateTicks:
             pacer: Of the agent.
             t_s: The simulated time, s.
             now_s: Now, s of the local clock.
+            leapt_s: As of `explain`.
         """
         new = pacer.missed - self._missed
         if new <= 0:
             return
         index = pacer.next_index
         due_s = now_s - (t_s - pacer.deadline_of(index - new))
-        late = LateTick(self._seat, due_s, now_s, self.started_s, self._period_s)
+        late = LateTick(self._seat, due_s, now_s, self.started_s, self._period_s, leapt_s)
         cause = self._account.explain(late)
         self._counts[cause] += new
         self._missed = pacer.missed

@@ -48,6 +48,8 @@ class LateTick(NamedTuple):
     started_s: float
     """When the agent began to run, s of the local clock."""
     period_s: float
+    leapt_s: float = 0.0
+    """By how much simulated time has leapt ahead of the local clock since the agent's tick before, s."""
 
 
 class _Steps(NamedTuple):
@@ -173,7 +175,8 @@ class LoopAccount:
         filled_s[Cause.OTHER_AGENT] = others + since_s
         start_s = overlap_s(late.due_s, late.started_s, (late.due_s, late.began_s))
         filled_s[Cause.START] = start_s
-        together_s = looked.together_s + since_s + start_s
+        filled_s[Cause.CLOCK] = leapt_s = max(0.0, late.leapt_s)
+        together_s = looked.together_s + since_s + start_s + leapt_s
         return name_cause(late.began_s - late.due_s, filled_s, together_s=together_s)
 
     def _look_at(self, late: LateTick) -> _Looked:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -174,16 +174,17 @@ class Supervisor:
             code = 0 if all(outcome.as_ordered for outcome in outcomes.values()) else 1
             self._write_outcomes(outcomes)
         except MadnsError as error:
-            self._write_failure(agents, str(error))
+            self._write_failure(str(error))
         except BaseException as error:  # noqa: BLE001 - the last frame of a process; it is told below
-            self._write_failure(agents, f"{type(error).__name__}: {error}")
+            self._write_failure(f"{type(error).__name__}: {error}")
             sys.excepthook(type(error), error, error.__traceback__)
         finally:
             end_child(code)
 
-    def _write_failure(self, agents: Sequence[str], reason: str) -> None:
+    def _write_failure(self, reason: str) -> None:
+        """Leave word of what ended the process of all its agents: it is none's in particular."""
         outcome = AgentOutcome(as_ordered=False, reason=reason, may_restart=True)
-        self._write_outcomes(dict.fromkeys(agents, outcome))
+        self._write_outcomes({"": outcome})
 
     def _write_outcomes(self, outcomes: Mapping[str, AgentOutcome]) -> None:
         for agent, outcome in outcomes.items():
@@ -222,8 +223,8 @@ class Supervisor:
                 continue
             child.may_restart = child.may_restart and bool(told["may_restart"])
             if child.reason is None:
-                is_alone = len(child.agents) == 1
-                child.reason = told["reason"] if is_alone else f"{told['agent']}: {told['reason']}"
+                is_ones = len(child.agents) > 1 and told["agent"]
+                child.reason = f"{told['agent']}: {told['reason']}" if is_ones else told["reason"]
 
     def _reap(self) -> None:
         for child in list(self._children.values()):

@@ -90,12 +90,15 @@ class PacedTicks:
         self._faults = StepFaults()
         self.say_how_it_is = calls.say_how_it_is
         self._look = port.conditions.look if port.conditions.must_look else None
+        self._ahead_s = 0.0
+        """Simulated time minus the local clock, as the newest tick began, s."""
 
     def begin(self, now_s: float) -> None:
         """Take note that the agent runs from simulated time *now_s* on, s: ticks that are over were never its own."""
         if now_s > 0:
             self.pacer.skip_to(now_s)
-        self.late.started_s = monotonic()
+        self.late.started_s = local_s = monotonic()
+        self._ahead_s = now_s - local_s
         if self.pacer.is_over:
             self._calls.ended()
 
@@ -110,7 +113,8 @@ class PacedTicks:
     def finish(self, now_s: float) -> None:
         """Close the account at simulated time *now_s*, s."""
         self.pacer.finish(now_s)
-        self.late.never_run(self.pacer, now_s, monotonic())
+        local_s = monotonic()
+        self.late.never_run(self.pacer, now_s, local_s, now_s - local_s - self._ahead_s)
 
     def hinder(self, order: AgentFault) -> StepFaults | None:
         """
@@ -156,9 +160,10 @@ class PacedTicks:
         pacer, port = self.pacer, self._port
         local_s = monotonic()
         began_s = port.at(local_s)
+        ahead_s, self._ahead_s = self._ahead_s, began_s - local_s
         timing = pacer.begin(began_s)
         if timing is None:
-            self.late.never_run(pacer, began_s, local_s)
+            self.late.never_run(pacer, began_s, local_s, self._ahead_s - ahead_s)
         else:
             index, t_s, deadline_s, lateness_s, missed = timing
             self.factor.add(t_s, began_s)
@@ -188,6 +193,6 @@ class PacedTicks:
             # Before the account of a late tick, which is a span of its own: spans end one after the other.
             self._add_span(Span(Cause.STEP, self._seat, local_s, ended_s))
             if missed or lateness_s > self._late_s:
-                self.late.explain(timing, local_s)
+                self.late.explain(timing, local_s, began_s - local_s - ahead_s)
         if pacer.is_over:
             self._calls.ended()

@@ -8,6 +8,7 @@ rest. Under that rule no lock is needed: appending to a list and cutting off its
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -24,6 +25,10 @@ LINES_PER_WRITE_MAX = 1024
 LINE_OVERHEAD_BYTES = 56
 """Bytes that a waiting line costs beside its text: the bytes object and its place in the list."""
 FILES_MAX = 10_000
+NO_DESCRIPTOR_CURE = (
+    "; `ulimit -Hn` tells how many files a process may have open here, and each agent takes one per stream:"
+    " raise it, or lower agents.per_process"
+)
 
 
 def create_file(directory: Path, name: str, first: int) -> tuple[Path, int, int]:
@@ -49,7 +54,8 @@ def create_file(directory: Path, name: str, first: int) -> tuple[Path, int, int]
         except FileExistsError:
             continue
         except OSError as error:
-            raise MachineError(f"{path}: cannot record there: {error.strerror}") from error
+            cure = NO_DESCRIPTOR_CURE if error.errno == errno.EMFILE else ""
+            raise MachineError(f"{path}: cannot record there: {error.strerror}{cure}") from error
     raise MachineError(f"{directory}: holds {FILES_MAX} files of stream {name}; clear it out")
 
 

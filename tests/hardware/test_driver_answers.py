@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 
 import pytest
 
@@ -79,11 +80,17 @@ def settled(folder):
 @pytest.mark.parametrize(
     ("wrong", "told"),
     [
-        ({"identity": "5"}, "Probe.open raised PluginError: expected a text as the device's identity"),
+        ({"identity": "5"}, "Probe.open: expected a text as the device's identity"),
         ({"fileno": "-1"}, "expected an open descriptor (a number), or None; got -1"),
         ({"fileno": "self.file"}, "expected an open descriptor (a number), or None; got <_io"),
         ({"fileno": "self.file.fileno()"}, "got a regular file's, which always is: return None"),
         ({"health": "[1]"}, "expected a mapping of what is known of its state, got [1]"),
+        ({"read": "return Sample(values={'level': 1.0}, taken_s=None)"},
+         "Probe.read: taken_s: expected a time until now, "),
+        ({"read": "return Sample(values={'level': 1.0}, taken_s=1.0, device_s='1')"},
+         "Probe.read: device_s: expected a time of the device's own clock, s, or None; got '1'"),
+        ({"read": "return Sample(values=[1.0], taken_s=1.0)"},
+         "Probe.read: expected values by channel in a Sample, got [1.0]"),
         ({"read": "return Sample(values={'level': float('nan')}, taken_s=time.monotonic())", "lost_s": LOST_S},
          "no sample for 3 s, where rate_hz (50) promises one every 0.02 s; so far level_not_finite "),
     ],
@@ -116,6 +123,28 @@ def test_nothing_is_an_identity_and_a_health_and_what_json_does_not_carry_is_ref
     [*_, why] = [event["why"] for event in events if event["event"] == "refused"]
     assert "health: " in why
     assert "object has no JSON form" in why
+
+
+@pytest.mark.parametrize("then", ["pass", "raise SystemExit(0)", "raise ValueError('copy')"])
+def test_a_copy_of_the_process_that_a_driver_forks_gives_no_samples_and_closes_nothing(
+    tmp_path, monkeypatch, then
+):
+    # Pytest's own lies on a descriptor that a device's process closes, and uses again for a file of records.
+    monkeypatch.setattr(sys, "stderr", sys.__stderr__)
+    read = f"""self.reads = getattr(self, 'reads', 0) + 1
+        if self.reads % 3 == 0 and os.fork() == 0:
+            {then}
+        return Sample(values={{'level': float(self.reads)}}, taken_s=time.monotonic())"""
+    bench = probe(tmp_path, read=read)
+    try:
+        bench.until(lambda: bench.hardware["probe"]["level"].number >= 30)
+    finally:
+        result = bench.close()["pi22/probe"]
+
+    assert (result["errors"], result["lost"], result["restarts"]) == (0, 0, 0)
+    taken = [(row[1], row[3]) for row in records(tmp_path, "level", "pi22/probe")]
+    assert taken == [(number, float(number)) for number, _ in taken]
+    assert len(taken) >= 20
 
 
 def test_a_descriptor_that_is_readable_for_nothing_is_told_once_and_takes_no_processor(tmp_path):

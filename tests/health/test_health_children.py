@@ -10,7 +10,7 @@ import pytest
 from harness.waiting import is_alive, wait_until
 
 from madns_runtime.config import Health, Recording
-from madns_runtime.health.lifeline import fork_child
+from madns_runtime.health.lifeline import Lifeline, fork_child
 from madns_runtime.health.sampler import start_sampler
 from madns_runtime.health.stress import factorise, start_stress, stop_stress
 from madns_runtime.recording.reader import read_columns, read_stream
@@ -40,6 +40,17 @@ def start(directory):
     return start_sampler(
         directory, run="r", machine="pi07", settings=Health(period_s=0.1), recording=settings
     )
+
+
+@pytest.mark.parametrize("wait_s", [0.0, 60.0, 1e7, 1e12])
+def test_the_end_is_felt_however_long_the_next_sample_is_away(wait_s):
+    (life_fd, parent_fd), (signal_fd, signalling_fd) = os.pipe(), os.pipe()
+    os.close(parent_fd)
+
+    assert Lifeline(life_fd, signal_fd).has_ended(wait_s)
+
+    for fd in (life_fd, signal_fd, signalling_fd):
+        os.close(fd)
 
 
 @pytest.mark.process

@@ -236,3 +236,24 @@ def test_ticks_at_the_end_that_no_other_followed_are_recorded_with_their_cause(m
     assert agent.pacer.is_over
     assert rows(loop.records[0], "late_ticks") == [(last + 1, 0, 6, "step")]
     assert agent.late.counts() == {"step": 6}
+
+
+@pytest.mark.parametrize(("leap_s", "missed"), [(0.055, 5), (-0.055, 0), (100.0, 290)])
+def test_ticks_that_a_leap_of_the_clock_has_skipped_are_its_own(monkeypatch, leap_s, missed):
+    loop = Loop(monkeypatch, 0)
+    agent = loop.agents[0]
+    agent._step = lambda tick: None
+    agent.begin(0.0)
+    ahead_s = 0.0
+    agent._port.at = lambda local_s: local_s + ahead_s
+    for turn in range(20):
+        if turn == 10:  # behind the wake-up, which was set by the clock before
+            ahead_s = leap_s
+        loop.account.begin_ticks(loop.clock.now_s)
+        agent.tick()
+        due_s = agent.pacer.next_deadline_s()
+        if due_s is not None:
+            loop.clock.now_s = max(loop.clock.now_s, due_s - ahead_s)
+
+    assert agent.pacer.missed == missed
+    assert agent.late.counts() == ({"clock": missed} if missed else {})

@@ -10,6 +10,7 @@ import pytest
 
 from madns_runtime.config import Agents
 from madns_runtime.realtime.agent_calls import AgentCalls
+from madns_runtime.realtime.agent_report import AgentOutcome
 from madns_runtime.realtime.supervisor import SupervisedProcess, Supervisor, make_reason_pipe
 
 
@@ -48,3 +49,29 @@ def test_ends_on_purpose_are_no_failures_after_which_an_agent_is_not_started_aga
     )
 
     assert supervisor._may_restart(child) is may
+
+
+@pytest.mark.parametrize(
+    ("agents", "who", "told"),
+    [
+        (("agent-01", "agent-02"), "agent-02", "agent-02: no room"),
+        (("agent-01",), "agent-01", "no room"),
+        (("agent-01", "agent-02"), None, "no room"),
+    ],
+)
+def test_what_ended_a_process_is_told_as_nobodys_in_particular(agents, who, told):
+    supervisor = Supervisor.__new__(Supervisor)
+    child = SupervisedProcess(agents, os.getpid(), 1, AgentCalls())
+    supervisor._children = {os.getpid(): child}
+    supervisor._reason_read_fd, supervisor._reason_write_fd = make_reason_pipe()
+    outcome = AgentOutcome(as_ordered=False, reason="no room", may_restart=True)
+    if who is None:
+        supervisor._write_failure("no room")
+    else:
+        supervisor._write_outcomes({who: outcome})
+
+    supervisor._read_outcomes()
+
+    assert (child.reason, child.may_restart) == (told, True)
+    os.close(supervisor._reason_read_fd)
+    os.close(supervisor._reason_write_fd)

@@ -1,11 +1,12 @@
 """Whole runs on loopback agents: what they count, record and show, not how fast the machine was."""
 
 import json
+import resource
 
 import orjson
 import pyarrow.parquet as pq
 import pytest
-from harness.cosmos_command import LOOSE, CosmosCommand
+from harness.cosmos_command import LOOSE, SCENARIOS, CosmosCommand
 
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
 
@@ -51,6 +52,23 @@ def test_recorded_states_follow_the_recorded_energy(tmp_path):
         # Specific orbital energy includes the potential: about -27.9 MJ/kg at 780 km.
         assert -mu / (2 * 7_080_000) < energy_j_kg < -mu / (2 * 7_230_000)
     assert len(table["x_teme_m"]) == result["timing"]["ticks"] - result["timing"]["missed"]
+
+
+def test_agents_of_one_process_record_more_files_than_it_may_have_open_at_first(tmp_path):
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    few = 160  # 1024 on most computers, and some hundred agents
+    together = ("agents.count=40", "agents.per_process=40", "agents.tick_hz=2", "time.duration_s=1")
+    settings = [word for each in (*LOOSE, *together) for word in ("--set", each)]
+    cosmos = CosmosCommand(tmp_path)
+
+    ended = cosmos(
+        *("run", SCENARIOS / "counter24.yaml", "--no-report", "--json", "--quiet", *settings),
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (few, hard)),
+    )
+
+    result = json.loads(ended.stdout)
+    assert ended.returncode == 0, result["verdict"]
+    assert len(list(cosmos.directory(result).glob("agents/*/*.jsonl"))) >= 7 * 40 > few
 
 
 def test_sgp4_truth_serves_any_tick_rate(tmp_path):

@@ -47,6 +47,7 @@ def answer_to(order, folder, in_force=(), begin=lambda _: ""):
         in_force=lambda: in_force,
     )
     with socket.socket(socket.AF_UNIX) as visitor:
+        visitor.settimeout(60.0)
         visitor.connect(str(folder / SOCKET_NAME))
         visitor.sendall(orjson.dumps(order) + b"\n")
         loop.turn()  # it is let in
@@ -100,3 +101,17 @@ def test_a_fault_of_a_device_that_no_agent_would_carry_out_is_refused(tmp_path, 
 
     assert answer == {"refusal": refusal}
     assert len(ordered) == (not refusal)
+
+
+def test_a_long_order_is_judged_as_any_other(tmp_path):
+    ordered = []
+    word = "Δ" * 4000  # as long as a telecommand may be
+
+    answer = answer_to(
+        {"action": "annotate", "target": "run", "parameters": {"text": word[:200]}, "spare": word},
+        tmp_path,
+        begin=lambda action: ordered.append(action) or "",
+    )
+
+    assert answer == {"refusal": ""}
+    assert len(ordered) == 1

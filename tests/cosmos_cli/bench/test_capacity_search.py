@@ -1,14 +1,19 @@
 """Doubling and bisection, and what ends a search; no run is started."""
 
+import dataclasses
+import json
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from cosmos_cli.bench.capacity import SCENARIO, CapacityTrials, find_capacity
+from cosmos_cli.app import run as cosmos
+from cosmos_cli.bench.capacity import SCENARIO, CapacityFound, CapacityTrials, find_capacity
 from cosmos_cli.bench.child_run import ChildRunOutcome
+from cosmos_cli.bench.prediction import predict
 from cosmos_cli.bench.search import CapacitySearch
 from cosmos_cli.errors import ExitCode
+from cosmos_cli.models.inventory.machine import LOOPBACK
 from cosmos_cli.models.loading import load_scenario
 
 
@@ -173,3 +178,19 @@ def test_no_trial_begins_when_the_time_is_over():
         "nothing is known yet",
     )
     assert found.exit_code == ExitCode.OK
+
+
+@pytest.mark.parametrize("per_process", [1, 8, 50])
+@pytest.mark.parametrize("first", [1, 8])
+def test_the_prediction_is_of_full_processes_however_few_agents_a_first_trial_has(
+    monkeypatch, capsys, first, per_process
+):
+    nothing = CapacityFound(search=CapacitySearch(first=1, largest=1))
+    monkeypatch.setattr("cosmos_cli.commands.bench_capacity.find_capacity", lambda *given: nothing)
+    words = ("--hz", "1000", "--first", str(first), "--per-process", str(per_process))
+    cosmos(["bench", "capacity", *words, "--json", "--quiet"])
+    told = json.loads(capsys.readouterr().out)
+
+    settings = ["agents.count=50", "agents.tick_hz=1000", f"agents.per_process={per_process}"]
+    plan = predict(load_scenario(SCENARIO, settings), (LOOPBACK,), per_process=per_process)
+    assert told["predicted"] == dataclasses.asdict(plan)

@@ -162,6 +162,40 @@ def test_records_that_the_recorder_dropped_make_data_incomplete_and_say_why(tmp_
     assert summary.document["records"]["dropped"] == 17
 
 
+@pytest.mark.parametrize(("told_of", "dropped"), [("ticks.jsonl", 17), ("ticks.2.jsonl", 0)])
+def test_records_whose_end_line_found_no_room_are_counted_as_the_host_was_told(
+    tmp_path, told_of, dropped
+):
+    made = SyntheticRun(tmp_path).write()
+    path = made.stream("agent-01", "ticks")
+    path.write_bytes(b"\n".join([*path.read_bytes().split(b"\n")[:-2], b""]))
+    told = made.records["agent-01"]["streams"]["ticks"]
+    made.records["agent-01"]["streams"]["ticks"] = told | {"file": told_of, "dropped": 17}
+
+    summary = finish(made)
+
+    assert summary.exit_code == 5
+    assert summary.document["records"]["dropped"] == dropped
+    entry = read(made.run.manifest_json)["files"]["agents/agent-01/ticks.jsonl"]
+    assert (entry["dropped"], entry["truncated"]) == (dropped, True)
+
+
+def test_result_that_found_no_room_before_the_reserve_was_freed_is_there_to_collect_again(
+    tmp_path, monkeypatch
+):
+    made = SyntheticRun(tmp_path).write()
+    write_json = finish_module.write_json
+
+    def write(path, *value, **more):
+        if path == made.run.result_json and made.run.reserve.exists():
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write_json(path, *value, **more)
+
+    monkeypatch.setattr(finish_module, "write_json", write)
+
+    assert finish(made).exit_code == collect_run(made.run).exit_code == 0
+
+
 def test_host_that_ended_without_a_result_fails_the_run_and_collect_says_data_incomplete(tmp_path):
     made = SyntheticRun(tmp_path).write()
     for path in (made.run.path / "host").iterdir():

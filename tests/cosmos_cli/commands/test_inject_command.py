@@ -1,4 +1,4 @@
-"""`cosmos inject`: values below zero, and words that are no options."""
+"""`cosmos inject`: values below zero, words that are no options, orders that have no line."""
 
 import pytest
 
@@ -6,6 +6,7 @@ from cosmos_cli.commands import inject as module
 from cosmos_cli.commands.command_group import load_command
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.launch.order_socket import order_action
 
 
 @pytest.fixture
@@ -36,9 +37,23 @@ def test_a_value_below_zero_is_a_value(ordered, value):
         (("last", "here/load", "freeze", "--lst"), "no such option: --lst; see `cosmos inject --h"),
         (("last", "-x"), "no such option: -x"),
         (("--lst", "last"), "no such option: --lst"),
+        (("last", "run", "annotate", "text=.nan"), "^text: expected a finite number, got .nan"),
+        (("last", "run", "annotate", f"text={2**70}"), "^text: expected a whole number from"),
     ],
 )
 def test_what_is_neither_value_nor_option_is_refused(ordered, words, told):
     with pytest.raises(InputError, match=told):
         inject(*words)
     assert ordered == []
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("x" * 70_000, "0007-tiny: expected an order of at most 65536 bytes, got 700"),
+        (2**70, "0007-tiny: no order: Integer exceeds 64-bit range"),
+    ],
+)
+def test_an_order_that_has_no_line_is_refused_before_anybody_is_asked(tmp_path, text, told):
+    with pytest.raises(InputError, match=told):
+        order_action(tmp_path, "0007-tiny", {"target": "run", "parameters": {"text": text}})

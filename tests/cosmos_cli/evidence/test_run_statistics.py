@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from cosmos_cli.evidence.statistics import AgentTicks, TickTotals, tick_totals
+from cosmos_cli.evidence.statistics import AgentTicks, TickTotals, tick_statistics, tick_totals
 from madns_runtime.analysis.distribution import Distribution, summarise
 
 
@@ -71,6 +71,29 @@ def test_rejoined_agent_has_missed_the_time_between():
     totals = tick_totals({"a": agent(80)}, counters, agents=("a",), due_each=100)
 
     assert totals.missed == 20
+
+
+class Ticks:
+    """The ticks of one agent, of all its incarnations, as a table."""
+
+    margin_us = np.array([100, -4_000, -6_000, -7_000])
+
+    def has(self, *names):
+        return True
+
+    def each(self, names):
+        zeros = np.zeros_like(self.margin_us)
+        yield "a", {"lateness_us": zeros, "margin_us": self.margin_us, "missed": zeros}
+
+
+@pytest.mark.parametrize(("overrun_ms", "errors"), [(5.0, 2), (6.0, 1), (None, 0)])
+def test_steps_that_overran_before_a_restart_stay_counted(overrun_ms, errors):
+    recorded = tick_statistics(Ticks(), overrun_ms).agents
+    last_life = {"a": {"due": 2, "run": 2, "overrun_errors": 0}}
+
+    totals = tick_totals(recorded, last_life, agents=("a",), due_each=4)
+
+    assert totals.overrun_errors == totals.agents["a"].overrun_errors == errors
 
 
 def test_ratio_of_nothing_is_not_measured():

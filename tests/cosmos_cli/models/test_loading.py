@@ -216,6 +216,10 @@ MISTAKES = [
         "a.yaml:4:20: time.duration_s: expected <= 315576000, got 4e8",
     ),
     (
+        "agents: {count: 3}\ntimeouts: {shutdown_s: 1e10}",
+        "a.yaml:4:24: timeouts.shutdown_s: expected <= 300000000, got 1e10",
+    ),
+    (
         "agents: {count: 3, tick_hz: .nan}",
         "a.yaml:3:29: agents.tick_hz: expected a finite number, got .nan",
     ),
