@@ -47,38 +47,35 @@ class Custom:
                 raised, or leaves out a thrust.
         """
         found = _call(states, t0_s, knots_s, parameters)
-        if parameters.thrust_m_s2 is not None:
-            self._check_thrust(found, states, t0_s, knots_s, parameters)
+        thrust_m_s2 = parameters.thrust_m_s2
+        if thrust_m_s2 is not None and len(thrust_m_s2):
+            key = _implementation(parameters), parameters.base_directory
+            most_m_s2 = float(np.abs(thrust_m_s2).max())
+            if key not in self._heeding and most_m_s2 * (knots_s[-1] - t0_s) >= GAIN_M_S_MIN:
+                coasting = replace(parameters, thrust_m_s2=None)
+                _check_thrust(found, _call(states, t0_s, knots_s, coasting), key[0], most_m_s2)
+                self._heeding.add(key)
         return found
 
-    def _check_thrust(
-        self,
-        found: NDArray[np.float64],
-        states: NDArray[np.float64],
-        t0_s: float,
-        knots_s: NDArray[np.float64],
-        parameters: PropagationParameters,
-    ) -> None:
-        """
-        See once of each class that it follows a thrust: a burn that it leaves out would be booked, and not be in truth.
 
-        Raises:
-            BlamedError: It returns the same as without.
-        """
-        implementation = _implementation(parameters)
-        key = implementation, parameters.base_directory
-        thrust_m_s2 = float(np.abs(parameters.thrust_m_s2).max(initial=0.0))
-        if key in self._heeding or thrust_m_s2 * (knots_s[-1] - t0_s) < GAIN_M_S_MIN:
-            return
-        if np.array_equal(
-            found, _call(states, t0_s, knots_s, replace(parameters, thrust_m_s2=None))
-        ):
-            raise BlamedError(
-                f"{implementation}.propagate returns the same with parameters.thrust_m_s2 of {thrust_m_s2:.3g} m/s^2"
-                " as without: expected it to be added to the accelerations; or leave out thrust_n of thrusters, whose"
-                " burns are impulses then, or say can_maneuver: false of the propagator"
-            )
-        self._heeding.add(key)
+def _check_thrust(
+    found: NDArray[np.float64],
+    coasting: NDArray[np.float64],
+    implementation: str,
+    thrust_m_s2: float,
+) -> None:
+    """
+    See that a class follows a thrust: a burn that it leaves out would be booked, and not be in truth.
+
+    Raises:
+        BlamedError: It returns the same as without.
+    """
+    if np.array_equal(found, coasting):
+        raise BlamedError(
+            f"{implementation}.propagate returns the same with parameters.thrust_m_s2 of {thrust_m_s2:.3g} m/s^2"
+            " as without: expected it to be added to the accelerations; or leave out thrust_n of thrusters, whose"
+            " burns are impulses then, or say can_maneuver: false of the propagator"
+        )
 
 
 def _implementation(parameters: PropagationParameters) -> str:
