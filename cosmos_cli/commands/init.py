@@ -14,7 +14,9 @@ from typing import Annotated
 import typer
 
 from cosmos_cli.errors import InputError
+from cosmos_cli.models.yaml_source import resolve_scalar
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
+from madns_runtime.plugin.kept_names import name_faults
 from madns_runtime.plugin.registry import registered_names
 
 TEMPLATES = Path(__file__).parent.parent / "templates"
@@ -79,6 +81,12 @@ def _check_module(name: str, template: Template) -> None:
     module = _module(name) if is_package else name
     if is_package and (not module.isidentifier() or keyword.iskeyword(module)):
         raise InputError(f"NAME: expected what Python can import, such as my-cars, got {name!r}")
+    if is_package and name.endswith("-"):
+        raise InputError(
+            f"NAME: expected a letter or digit at the end, as pip wants it, got {name!r}"
+        )
+    if template in (Template.package, Template.plugin) and name_faults(name):
+        raise InputError(f"NAME: no simulation can be called {name!r}; choose another")
     if is_package and name in registered_names():
         raise InputError(f"NAME: {name!r} is taken by an installed simulation; choose another")
     if template not in (Template.package, Template.plugin, Template.device):
@@ -92,11 +100,22 @@ def _module(name: str) -> str:
     return name.replace("-", "_")
 
 
+def _in_yaml(name: str) -> str:
+    """Return a name as YAML reads it as a text: 2024 and 1e3 alone are numbers there, null is nothing."""
+    try:
+        is_text = isinstance(resolve_scalar(name), str)
+    except ValueError:  # a number too large
+        is_text = False
+    return name if is_text else f'"{name}"'
+
+
 def render(template: str, name: str) -> dict[Path, str]:
     """Return the template's files, by their path within the target folder, with the name filled in."""
     root = TEMPLATES / template
+    value = f": {PLACEHOLDER}\n"
 
     def filled(text: str) -> str:
+        text = text.replace(value, value.replace(PLACEHOLDER, _in_yaml(name)))
         return text.replace(PLACEHOLDER, name).replace(MODULE_PLACEHOLDER, _module(name))
 
     return {

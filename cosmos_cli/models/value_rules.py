@@ -70,7 +70,10 @@ class BoundsRule:
         if not given:
             yield (), f"expected a limit: one of {', '.join(BOUND_WORDS)}"
         for word in given[1:]:
-            yield (word,), f"expected one limit, got {given[0]} as well: write two checks"
+            cure = (
+                "a range is within: [low, high]" if given == ["below", "above"] else "leave one out"
+            )
+            yield (word,), f"expected one limit, got {given[0]} as well: {cure}"
         if self.within is not None and self.within[0] > self.within[1]:
             low, high = self.within
             yield ("within",), f"expected the lesser bound first, got [{low:g}, {high:g}]"

@@ -56,7 +56,14 @@ _FLOW_MARKS = re.compile(r"""\$\{|["'\[\]{},:]""")
 """In a line of a flow mapping or list: what begins or ends a plain text, and a variable."""
 _UNPRINTABLE = re.compile("[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
+_ESCAPE = (
+    'expected an escape such as \\n after the backslash: within "..." write \\\\ for a backslash itself,'
+    " or put the text in '...'"
+)
+_NO_KEY = "expected a key at the indentation of its neighbours; behind a quoted text stands nothing more on its line"
 _MEANINGS = (
+    ("quoted scalar", "escape", False, _ESCAPE),
+    ("quoted scalar", "hexdecimal", False, _ESCAPE),
     ("quoted scalar", "", True, "this quoted text is never closed"),
     ("flow sequence", "", True, "this list is never closed: expected ',' or ']'"),
     ("flow mapping", "", True, "this mapping is never closed: expected ',' or '}}'"),
@@ -75,7 +82,8 @@ _MEANINGS = (
     ("", "could not find expected ':'", True, "expected `key: value`, got no ':' after the key"),
     ("", "cannot start any token", False, "{} cannot start a value: put it in quotes"),
     ("", "maximum nesting depth", False, f"expected at most {DEPTH_MAX} levels of nesting"),
-    ("block mapping", "block end", False, "expected a key at the indentation of its neighbours"),
+    ("block mapping", "block end", False, _NO_KEY),
+    ("block mapping", "expected key", False, _NO_KEY),
 )
 """The parser's terms: within what, which problem, whether the fault is where that began, and what it means."""
 
@@ -319,10 +327,21 @@ def _syntax_fault(source: YamlSource, error: yaml.MarkedYAMLError) -> Fault:
     else:
         for in_context, in_problem, is_at_start, meaning in _MEANINGS:
             if in_context in context and in_problem in problem:
-                mark = (error.context_mark or mark) if is_at_start else mark
                 text = meaning.format(repr(line[mark.column : mark.column + 1]))
+                begin = error.context_mark or mark
+                if in_context.startswith("flow") and line[mark.column :].strip():  # more follows
+                    text, is_at_start = _without_comma(text, begin.line, mark.line)
+                mark = begin if is_at_start else mark
                 break
     return source.fault(text, line=mark.line + 1, column=mark.column + 1)
+
+
+def _without_comma(text: str, begin: int, line: int) -> tuple[str, bool]:
+    """Return what a flow list or mapping lacks that *text* calls never closed though more follows, and whether the fault is at its begin."""
+    never, _, expected = text.partition(": ")
+    if line == begin:
+        return f"{expected} before this", False
+    return f"{never}, or has no comma before line {line + 1}: {expected}", True
 
 
 def _bare_variable(line: str) -> int | None:

@@ -52,6 +52,8 @@ class StepFaults:
 
     def withholds(self, tick: int) -> bool:
         """Tell whether the step of *tick* is withheld where steps take no time, and count it; a slow agent takes one in so many."""
-        is_withheld = self.is_hung or tick % math.ceil(self.factor) != 0
+        factor = self.factor
+        # Tick n is the next whole multiple of the factor, or the first after it: ten of eleven at 1.1.
+        is_withheld = self.is_hung or tick // factor == (tick - 1) // factor
         self.withheld += is_withheld
         return is_withheld

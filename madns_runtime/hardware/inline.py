@@ -63,6 +63,8 @@ class InlineDevice:
         self._launch = launch
         self._why = ""
         """What its driver raised at the end."""
+        self._failure: PluginError | None = None
+        """What it raised while its agent took no step."""
         self._handed_s = 0.0
         """When agents handed over what is heard next, simulated, s."""
         self._own_end, other_end = messages.make_pair()
@@ -108,8 +110,11 @@ class InlineDevice:
         What is put out at the time of a sample comes first.
 
         Raises:
-            PluginError: The driver gave what is no sample, or lets time stand still.
+            PluginError: The driver gave what is no sample, or lets time stand still; now, or in `follow`.
         """
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
         self._hear()
         for _ in range(SAMPLES_MAX):
             next_s = self._call("next_s", next_of, self._device)
@@ -136,6 +141,17 @@ class InlineDevice:
         self._intake.tell_held(t_s)
         self._account.observe(self._page.status(self._limits, t_s), t_s)
         self._handed_s = t_s
+
+    def follow(self, t_s: float) -> None:
+        """Go on to simulated time *t_s* while its agent takes no step: what it raises is told in the agent's next, if there is one."""
+        if self._failure is not None:  # nothing comes any more
+            self._account.observe(self._page.status(self._limits, t_s), t_s)
+            return
+        try:
+            self.advance(t_s)
+        except PluginError as error:
+            self._failure = error
+            self._note_error(str(error))
 
     def insert_fault(self, action: str, value: float | None) -> None:
         """
@@ -246,11 +262,14 @@ class InlineDevice:
         try:
             self._call(method, call)
         except BlamedError as error:
-            self._why = str(error)
-            self._page.header[page.ERRORS] += 1
-            self._records.event("error", self._now_s(), why=self._why)
+            self._note_error(str(error))
             return False
         return True
+
+    def _note_error(self, why: str) -> None:
+        self._why = why
+        self._page.header[page.ERRORS] += 1
+        self._records.event("error", self._now_s(), why=why)
 
     def _pass_on(self, message: list[Any]) -> int:
         if messages.send(self._own_end, message):

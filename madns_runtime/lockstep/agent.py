@@ -155,6 +155,13 @@ class LockstepAgent:
         self._outbox.append(Sent(self.index, int(service), body))
         return None
 
+    def rest(self, t_s: float) -> None:
+        """Let the tick at *t_s* pass without a step: the devices go on, and what was recorded last still holds."""
+        if self.has_devices:
+            self.devices.follow(t_s)
+        if self.look is not None:
+            self.look(t_s)
+
     def _condition_met(self, number: int, agent: str, t_s: float) -> None:
         del agent  # this one
         body = encode_message(ConditionMet(number, t_s))
@@ -221,6 +228,11 @@ class AgentDevices:
         for device in self._devices:
             _with_blame(device.name, "sample_at", device.advance, t_s)
         return self.hardware.changes()
+
+    def follow(self, t_s: float) -> None:
+        """Take all samples up to *t_s* while their agent takes no step; what a driver raises is raised at its next."""
+        for device in self._devices:
+            device.follow(t_s)
 
     def take_fault(self, order: ActionOrder) -> None:
         """

@@ -150,8 +150,6 @@ class Worker:
         if self._line.is_terminated:
             raise AgentFailed(self._assignment.agents[0], TERMINATED)
 
-    # Orders -----------------------------------------------------------------------------------------
-
     def _load(self) -> bytes:
         config, index = self._assignment.config, self._assignment.agents[0]
         self._position[0] = index * POSITIONS + frames.LOADING
@@ -199,6 +197,7 @@ class Worker:
         agents = self._unhindered(number, t_s) if self._faults else iter(self._agents)
         while not self._step_all(agents, tick):
             pass  # one of them is lost; the next have their turn
+        self._losses.follow_devices(t_s)
         if monotonic() - self._flushed_s <= self._flush_interval_s:
             return self._done()
         self._flush()
@@ -238,8 +237,9 @@ class Worker:
             faults = self._faults.get(agent.index)
             if faults is None or not faults.withholds(number):
                 yield agent
-            elif agent.look is not None:
-                agent.look(t_s)
+            else:
+                self._position[0] = agent.stepping
+                agent.rest(t_s)
 
     def _hear(self, agent: LockstepAgent, heard: Sequence[Delivery]) -> None:
         for delivery in heard:

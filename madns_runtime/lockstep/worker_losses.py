@@ -51,6 +51,11 @@ class WorkerLosses:
         """Return the open devices of an agent that returns; None if this worker never had them."""
         return self._devices.pop(index, None)
 
+    def follow_devices(self, t_s: float) -> None:
+        """Let the devices of lost agents go on to simulated time *t_s*."""
+        for devices in self._devices.values():
+            devices.follow(t_s)
+
     def close_devices(self) -> dict[int, dict[str, Any]]:
         """Close those of agents that did not return, and return what the run came to, by agent."""
         counts = {index: devices.close() for index, devices in self._devices.items() if devices}

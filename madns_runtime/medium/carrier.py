@@ -80,9 +80,12 @@ class Carrier:
         sender: str,
         transmission: Transmission,
         outcomes: Sequence[LinkOutcome],
-    ) -> None:
+    ) -> Sequence[LinkOutcome]:
         """
         See to what becomes of a message, of an agent or of a place such as a ground station.
+
+        Returns:
+            What becomes of it in the end, with the faults that are in force.
 
         Raises:
             PluginError: There is no outcome, or one is impossible.
@@ -105,6 +108,7 @@ class Carrier:
                 number, to, sent_s = transmission.number, transmission.to, transmission.sent_s
                 refusal = TransmissionRefusal(number, to, sent_s, outcome.outcome)
                 self._untold += not self._send(sender, refusal)
+        return outcomes
 
     def hand_over(self) -> None:
         """Send on what arrives up to LEAD_S from now on, in order of arrival."""

@@ -38,7 +38,12 @@ class LinkOutcome:
 
 
 class Medium(Protocol):
-    """Medium of a simulation's messages between agents."""
+    """
+    Medium of a simulation's messages between agents.
+
+    One that has a method `settled(sender, transmission, outcomes)` as well is told after `carry` what became of the message
+    in the end: faults of a timeline lose what the medium let pass, delay it or deliver it twice.
+    """
 
     def carry(self, sender: str, transmission: Transmission) -> Sequence[LinkOutcome]:
         """

@@ -183,11 +183,12 @@ class HostContext(Context, Protocol):
 
     def enter(
         self, sender: str, transmission: Transmission, outcomes: Sequence[LinkOutcome]
-    ) -> None:
+    ) -> Sequence[LinkOutcome]:
         """
         See to a message of *sender*, a place that is no agent, such as a ground station.
 
-        It is delivered to those of its *outcomes* that are agents, and counted, as what `Medium.carry` returns.
+        It is delivered to those of its *outcomes* that are agents, and counted, as what `Medium.carry` returns. Returned
+        is what becomes of it in the end: faults of a timeline may lose it, delay it or deliver it twice.
 
         Raises:
             PluginError: There is no outcome, one is impossible or arrives no later than it was sent, or the

@@ -148,7 +148,9 @@ class JobContext(RunContext):
         self.wake = wake
         self.account = half.carrier.account
 
-    def enter(self, sender: Any, transmission: Any, outcomes: Sequence[LinkOutcome]) -> None:
+    def enter(
+        self, sender: Any, transmission: Any, outcomes: Sequence[LinkOutcome]
+    ) -> Sequence[LinkOutcome]:
         """See to a message of a place that is no agent; see `plugin.api.HostContext.enter`."""
         if not isinstance(sender, str) or not isinstance(transmission, Transmission):
             raise PluginError(
@@ -157,7 +159,7 @@ class JobContext(RunContext):
             )
         # Whoever sent it may go on to change it; what a message cannot carry is told here.
         payload = unpack(pack(transmission.payload))
-        self._half.carrier.enter(
+        return self._half.carrier.enter(
             sender, dataclasses.replace(transmission, payload=payload), outcomes
         )
 

@@ -303,14 +303,15 @@ class HostHalf(Half):
         if self.carrier.medium is not None:
             outcomes = self.run("medium.carry", self.carrier.medium.carry, agent, message)
         try:
-            self.carrier.enter(agent, message, outcomes)
+            settled = self.carrier.enter(agent, message, outcomes)
         except PluginError as error:
-            raise HalfFailed(
-                f"{self.name}.medium.carry returned {clean_text(str(error))}"
-            ) from error
+            text = clean_text(str(error))
+            raise HalfFailed(f"{self.name}.medium.carry returned {text}") from error
         except Exception as error:  # of a value's own class, while it was looked at
             text = describe_exception(error, "looking at it")
             raise HalfFailed(f"{self.name}.medium.carry returned an outcome: {text}") from error
+        if (tell := getattr(self.carrier.medium, "settled", None)) is not None:
+            self.run("medium.settled", tell, agent, message, settled)
         self.carrier.hand_over()
 
     def run(self, name: str, function: Callable[..., Any] | None, *arguments: Any) -> Any:
@@ -366,8 +367,7 @@ class HostHalf(Half):
             self._repeats += 1
         if self._repeats > REPEATS_MAX:
             raise HalfFailed(
-                f"{self.name}.timer asked {REPEATS_MAX} times in a row for t = {t_s:g} s: simulated"
-                " time stands"
+                f"{self.name}.timer asked {REPEATS_MAX} times in a row for t = {t_s:g} s: simulated time stands"
             )
         self._timer_s, self.next_s = t_s, None
         self.lateness_s = max(0.0, now_s - t_s)

@@ -149,6 +149,8 @@ class HostTimeline:
         self._post(agent, ActionOrder(-1, STOP.word, {}, end_s, None, is_end=False))
 
     def _post(self, agent: str, order: ActionOrder) -> bool:
+        if self.faults.intended.is_coming(agent):  # it is being killed, and would not hear it
+            return False
         try:
             self._port.must_pump = True
             return self._port.session.send(agent, order, Service.RELIABLE, self._port.monotonic_s())

@@ -1,5 +1,7 @@
 """A propagator of one's own."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from propagator_kinds import OWN, make_kind, orbits
@@ -91,3 +93,39 @@ def test_what_is_no_array_of_states_is_refused(folder, made, got):
 
     with pytest.raises(ConfigurationError, match=rf"shape \(4, 1, 6\) of float64, got {got}$"):
         propagate(orbits(), 0.0, np.array([1.0]), make_kind("custom", folder).parameters())
+
+
+PUSHED = """import numpy as np
+
+
+class Mine:
+    def propagate(self, states, t0_s, knots_s, parameters):
+        after_s = (knots_s - t0_s)[None, :, None]
+        push = parameters.thrust_m_s2 if {heeds} else None
+        v = states[:, None, 3:] + (0.0 if push is None else push[:, None] * after_s)
+        return np.concatenate((states[:, None, :3] + v * after_s, v + 0.0 * after_s), axis=2)
+"""
+
+
+@pytest.mark.parametrize("heeds", [True, False])
+def test_a_propagator_of_ones_own_that_leaves_out_a_thrust_is_refused(tmp_path, heeds):
+    (tmp_path / "own.py").write_text(PUSHED.format(heeds=heeds))
+    parameters = make_kind("custom", tmp_path).parameters()
+    pushed = replace(parameters, thrust_m_s2=np.full((4, 3), 0.01))
+    knots_s = np.array([8.0, 9.0])
+
+    assert propagate(orbits(), 7.0, knots_s, parameters).shape == (4, 2, 6)
+    if heeds:
+        gained = propagate(orbits(), 7.0, knots_s, pushed)[:, -1, 3:] - orbits()[:, 3:]
+        assert gained == pytest.approx(0.02)
+        return
+    with pytest.raises(BlamedError, match=r"^own.py:Mine.propagate returns the same .* 0.01 m/s"):
+        propagate(orbits(), 7.0, knots_s, pushed)
+
+
+def test_a_thrust_too_small_to_be_seen_is_no_fault_of_a_propagator(tmp_path):
+    (tmp_path / "own.py").write_text(PUSHED.format(heeds=False))
+    parameters = make_kind("custom", tmp_path).parameters()
+    pushed = replace(parameters, thrust_m_s2=np.full((4, 3), 1e-9))
+
+    assert propagate(orbits(), 7.0, np.array([8.0]), pushed).shape == (4, 1, 6)

@@ -175,6 +175,16 @@ def test_one_may_stick_in_the_moment_in_which_another_is_mended(fly):
     assert [stuck[name][0]["ended"] for name in ("agent-02", "agent-03")] == ["mended", "open"]
 
 
+def test_a_burn_that_the_runs_end_forestalls_ends_no_sooner_than_it_begins(fly):
+    star = fly()
+    star.run(10.0)
+    star.host.begin_action(action())
+
+    (burn,) = star.host.finish()["maneuvers"]["stuck_thrusters"]["agent-02"]
+
+    assert (burn["to_s"], burn["delta_v_m_s"]) == (burn["from_s"], 0.0)
+
+
 def test_a_thruster_without_thrust_needs_one_and_a_point_has_no_body_axes(fly):
     star = fly(thruster={"isp_s": 220.0, "propellant_kg": 2.0})
     star.run(1.0)

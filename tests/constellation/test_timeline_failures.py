@@ -3,6 +3,7 @@
 import json
 import shutil
 import time
+from collections import Counter
 
 import pytest
 import yaml
@@ -272,3 +273,36 @@ def test_a_telecommand_that_nobody_can_hear_is_refused_on_record(cosmos, tmp_pat
     assert [each for each in result["remarks"] if each.startswith("timeline")] == [
         "timeline: telecommand was refused 1 time by host: nobody hears it at present: agent-02"
     ]
+
+
+def test_the_record_of_links_holds_what_faults_made_of_messages_as_the_account_does(
+    cosmos, tmp_path
+):
+    faults = [
+        {"at_s": 5, "action": "lose_messages", "agents": ["agent-01"], "for_s": 10},
+        {"at_s": 20, "action": "delay_messages", "agents": ["agent-02"], "delay_s": 5, "for_s": 10},
+        {"at_s": 35, "action": "duplicate_messages", "agents": ["agent-03"], "for_s": 5},
+    ]
+    path = write(tmp_path, "touched", [entry | {"traffic": "between_agents"} for entry in faults])
+    shutil.copytree(SCENARIOS / "flight", tmp_path / "flight")
+    beacon = "flight: {software: 'flight/beacon.py:Beacon', settings: {status_s: 100, beacon_s: 1}}"
+
+    code, result = cosmos.run(
+        path,
+        "agents.count=3",
+        "parameters.satellites.walker='86.4:66/1/0'",
+        "parameters.crosslinks={range_km_max: 6000}",
+        f"parameters.{beacon.replace(': ', '=', 1)}",
+    )
+
+    links = named(cosmos.directory(result) / "host" / "links.jsonl")
+    told = Counter(row["outcome"] for row in links)
+    account = result["simulation"]["host"]["links"]
+    counts = result["faults"]["between_agents"]
+    assert code == 0
+    assert (told["lost"], told["delivered"]) == (account["lost"], account["delivered"])
+    assert told["lost"] == counts["lost"] > 0
+    late = [row for row in links if row["arrives_s"] and row["arrives_s"] - row["sent_s"] > 5]
+    assert len(late) == counts["late"] > 0
+    pairs = Counter((row["sender"], row["number"], row["to"]) for row in links)
+    assert sum(count - 1 for count in pairs.values()) == counts["doubled"] > 0

@@ -379,6 +379,16 @@ def test_a_slow_agent_steps_in_one_of_so_many_ticks_and_a_hung_one_in_none():
     assert faults.withheld == 6 + 9
 
 
+@pytest.mark.parametrize("factor", [1.1, 1.5, 2.5, 7.0, 999.5])
+def test_an_agent_that_is_slow_by_no_whole_factor_steps_in_one_of_so_many_ticks_too(factor):
+    faults = StepFaults()
+    faults.begin(1, "slow", factor)
+
+    stepped = [tick for tick in range(100_000) if not faults.withholds(tick)]
+    assert stepped[0] == 0
+    assert len(stepped) == pytest.approx(100_000 / factor, abs=1)
+
+
 def test_the_end_of_a_fault_that_an_earlier_start_had_leaves_the_one_of_now_in_force():
     faults = StepFaults()
     faults.begin(7, "hang")

@@ -424,3 +424,51 @@ def test_what_an_agent_did_not_take_of_a_queue_before_it_was_lost_is_told(tmp_pa
     assert dropped == [901, 1401], "of those up to its last tick all but 10,000"
     told = [text for text in run["remarks"] if "there was no room for all" in text]
     assert [text.partition(":")[0] for text in told] == ["agent-01", "agent-02"]
+
+
+def test_devices_go_on_while_their_agents_take_no_step_or_are_away(tmp_path):
+    scenario = tmp_path / "even.yaml"
+    scenario.write_text(
+        SCENARIO
+        + "on_agent_loss: continue\n"
+        + "timeline:\n"
+        + "  - {at_s: 0, action: kill, agents: [agent-01], for_s: 1}\n"
+        + "  - {at_s: 2, action: kill, agents: [agent-01]}\n"
+        + "  - {at_s: 0, action: hang, agents: [agent-02]}\n"
+    )
+
+    code, result = CosmosCommand(tmp_path).run(scenario, *LOOSE)
+
+    assert code == 0, result["verdict"]
+    told = {each: result["devices"][f"{each}/gps"] for each in ("agent-01", "agent-02")}
+    assert {each: (of["samples"], of["stale_ratio"]) for each, of in told.items()} == {
+        "agent-01": (60, 0.0),
+        "agent-02": (60, 0.0),
+    }
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_what_a_driver_raises_while_its_agent_hangs_is_told(tmp_path, ends):
+    raising = VALVE.replace(
+        "        self.count",
+        "        if t_s > 2.0:\n            raise OSError('it leaks')\n        self.count",
+    )
+    (tmp_path / "valve.py").write_text(raising)
+    (tmp_path / "mover.py").write_text(MOVER)
+    scenario = tmp_path / "moved.yaml"
+    length = ", for_s: 2" if ends else ""
+    hang = f'  - {{at_s: 1, action: hang, agents: ["*"]{length}}}\n'
+    scenario.write_text(MOVED.partition("timeline:")[0] + "timeline:\n" + hang)
+
+    code, result = CosmosCommand(tmp_path).run(scenario, *LOOSE)
+
+    if ends:
+        assert code == 1
+        assert "Valve.sample_at raised OSError: it leaks (valve.py:19)" in result["verdict"]
+        assert "agent-01" in result["verdict"]
+        return
+    assert code == 4
+    device = result["devices"]["agent-01/valve"]
+    assert (device["errors"], device["status"]) == (1, "lost")
+    assert "it leaks (valve.py:19)" in device["why"]
+    assert device["stale_ratio"] > 0.5

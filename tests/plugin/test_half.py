@@ -346,6 +346,50 @@ def test_what_a_medium_may_not_answer_is_told(logged, answer, words):
         half.take("a", Transmission(to="b", number=0, sent_s=1.0, payload=None))
 
 
+class Telling(Air):
+    """A medium that is told what becomes of messages in the end."""
+
+    def __init__(self, answer: Any, error: Exception | None = None) -> None:
+        super().__init__(answer)
+        self.told: list[Any] = []
+        self.error = error
+
+    def settled(self, sender: str, transmission: Transmission, outcomes: Any) -> None:
+        self.told.append((sender, transmission.number, list(outcomes)))
+        if self.error is not None:
+            raise self.error
+
+
+class Losing:
+    """Faults that lose all."""
+
+    def ways(self, sender: str, transmission: Transmission, outcomes: Any) -> list[LinkOutcome]:
+        return [dataclasses.replace(each, outcome="lost", arrives_s=None) for each in outcomes]
+
+
+def test_a_medium_is_told_what_faults_made_of_what_it_let_pass(logged):
+    medium = Telling([LinkOutcome(to="b", outcome="delivered", arrives_s=1.0)])
+    half = made(Base, logged, HostHalf, lambda host, context: medium)
+    half.set_up(None)
+    half.take("a", Transmission("b", 0, 0.5, None))
+    half.carrier.faults = Losing()
+    half.take("a", Transmission("b", 1, 0.6, None))
+
+    assert [(number, [each.outcome for each in found]) for _, number, found in medium.told] == [
+        (0, ["delivered"]),
+        (1, ["lost"]),
+    ]
+
+
+def test_what_a_medium_raises_when_it_is_told_has_its_own_name(logged):
+    medium = Telling([LinkOutcome(to="b", outcome="lost")], KeyError("b"))
+    half = made(Base, logged, HostHalf, lambda host, context: medium)
+    half.set_up(None)
+
+    with pytest.raises(HalfFailed, match=r"Base.medium.settled raised KeyError: 'b'"):
+        half.take("a", Transmission("b", 0, 0.5, None))
+
+
 @pytest.mark.parametrize("medium", [3, "air", object()])
 def test_what_is_no_medium_is_told(logged, medium):
     half = made(Base, logged, HostHalf, lambda host, context: medium)

@@ -115,6 +115,27 @@ def test_after_a_stop_nobody_waits_for_who_would_have_returned_behind_it() -> No
     assert session.awaited == [True, False]
 
 
+def test_who_is_being_killed_is_not_there_for_what_is_ordered_behind_it() -> None:
+    session, events = Session(), Events()
+    session.away.clear()
+    fault = {"device": "gps", "fault": "freeze", "value": None}
+    timeline, _ = a_timeline(
+        session,
+        ScheduledEntry(action="kill", at_s=1.0, for_s=30.0, agents=("a",)),
+        ScheduledEntry(action="device_fault", at_s=1.0, agents=("a", "b"), parameters=fault),
+        ScheduledEntry(action="device_fault", at_s=1.0, agents=("a",), parameters=fault),
+        events=events,
+    )
+
+    timeline._due()
+
+    assert [(agent, word) for agent, word, _ in session.heard] == [
+        ("a", "kill"),
+        ("b", "device_fault"),
+    ]
+    assert events.words == ["action_began", "action_began", "action_refused"]
+
+
 @pytest.mark.parametrize("t0_s", [None, 102.5])
 def test_what_waits_for_a_condition_that_is_met_in_set_up_takes_place_at_time_zero(
     t0_s: float | None,

@@ -25,7 +25,7 @@ class SensorFault:
     sensor: SensorName
     """The sensor; it must be one that the vehicle models, not a device's."""
     fault: Literal["stuck", "biased", "dead"]
-    """stuck: its measurements repeat the last one; biased: `bias` is added to them; dead: none come."""
+    """stuck: its measurements repeat the first one since then; biased: `bias` is added to them; dead: none come."""
     bias: tuple[Annotated[float, Ge(-BIAS_MAX), Le(BIAS_MAX)], ...] = ()
     """Of biased: added to the first values of each measurement, in the unit of its stream."""
 

@@ -337,6 +337,15 @@ def test_templates_validate_as_they_are(cosmos, template):
     assert cosmos("validate", "new/my-sim.yaml")[0] == 0
 
 
+@pytest.mark.parametrize("name", ["2024", "1e3", "0x1f", "null", "true", "9" * 40])
+def test_a_name_that_yaml_takes_for_no_text_is_a_name_all_the_same(cosmos, name):
+    assert cosmos("init", name, "-d", "new")[0] == 0
+
+    code, out, err = cosmos("validate", f"new/{name}.yaml")
+    assert (code, err) == (0, "")
+    assert out.startswith(f"new/{name}.yaml: ok: {name}, 4 agents of counter")
+
+
 @pytest.mark.parametrize("template", (*TEMPLATES, "package"))
 def test_templates_leave_no_placeholder(template):
     files = render(template, "my-sim")
@@ -355,6 +364,8 @@ def test_templates_leave_no_placeholder(template):
         ("counter", "is taken"),
         ("numpy", "is taken by a module of Python or of an installed package"),
         ("madns-runtime", "is taken"),
+        ("cars-", "expected a letter or digit at the end"),
+        ("streams", "no simulation can be called"),
     ],
 )
 def test_package_has_a_name_that_can_be_imported_and_is_free(cosmos, name, text):

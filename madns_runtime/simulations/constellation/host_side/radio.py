@@ -8,7 +8,7 @@ from datetime import datetime
 from typing import Any
 
 from madns_runtime.errors import PluginError
-from madns_runtime.plugin.api import HostContext
+from madns_runtime.plugin.api import HostContext, LinkOutcome
 from madns_runtime.protocol.messages import Transmission
 from madns_runtime.simulations.constellation.messages import is_for_ground
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters, Uplink
@@ -76,7 +76,7 @@ class RadioMedium:
 
     def carry(self, sender: str, transmission: Transmission) -> Sequence[LinkEvent]:
         """
-        Return, and record, what becomes of a message that a vehicle sent; see `plugin.api.Medium`.
+        Return what becomes of a message that a vehicle sent; see `plugin.api.Medium`.
 
         Raises:
             PluginError: The scenario has no crosslinks and it is not for the ground.
@@ -89,16 +89,19 @@ class RadioMedium:
         else:
             to = transmission.to
             raise PluginError(f"constellation: {to!r} cannot be reached without crosslinks")
-        events = self._unheard(events)
-        self._record(events)
-        return events
+        return self._unheard(events)
+
+    def settled(
+        self, sender: str, transmission: Transmission, outcomes: Sequence[LinkOutcome]
+    ) -> None:
+        """Record what became of a message that a vehicle sent, faults of the timeline included."""
+        self._record(outcomes)
 
     def timer(self, t_s: float) -> float | None:
         """Have uplinks sent, record passes, and return when to come back."""
         for transmission, sent in self._ground.uplinks(t_s):
             (event,) = self._unheard((sent,))
-            self._record((event,))
-            self._context.enter(event.sender, transmission, (event,))
+            self._record(self._context.enter(event.sender, transmission, (event,)))
         for contact in self._ground.contacts(t_s):
             self._context.record("contacts", contact.to_record())
         next_s = self._ground.next_s()
@@ -130,6 +133,7 @@ class RadioMedium:
             for event in events
         ]
 
-    def _record(self, events: Sequence[LinkEvent]) -> None:
-        for event in events:
+    def _record(self, outcomes: Sequence[LinkOutcome]) -> None:
+        for event in outcomes:
+            assert isinstance(event, LinkEvent)  # as this medium made them all
             self._context.record("links", event.to_record())

@@ -127,7 +127,7 @@ class StuckBurns:
             summary.setdefault(agent, []).append(
                 {
                     "from_s": burn.begins_s,
-                    "to_s": min(burn.ends_s, now_s),
+                    "to_s": max(burn.begins_s, min(burn.ends_s, now_s)),
                     "ended": burn.state(now_s),
                     "delta_v_m_s": self._stuck.delta_v_m_s(burn, now_s),
                     "propellant_left_kg": left_kg,

@@ -121,7 +121,8 @@ class Propagator(Protocol):
             states: At t0_s, shape (N, 6), m and m/s, TEME.
             t0_s: Simulated time of *states*, s.
             knots_s: Times, shape (K,), s, ascending, none before t0_s.
-            parameters: Settings and constants.
+            parameters: Settings and constants. One that `can_maneuver` adds `thrust_m_s2` to its accelerations: the
+                burns of thrusters with `thrust_n`.
 
         Returns:
             Shape (N, K, 6), m and m/s, TEME.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -18,9 +19,16 @@ from madns_runtime.simulations.constellation.truth.propagation import (
     Propagator,
 )
 
+GAIN_M_S_MIN = 1e-6
+"""Less that a thrust gives may be lost in the digits of a velocity."""
+
 
 class Custom:
     """Hands over to the class that the settings name."""
+
+    def __init__(self) -> None:
+        self._heeding: set[tuple[str, str]] = set()
+        """Classes, with their folders, that were seen to follow a thrust."""
 
     def propagate(
         self,
@@ -36,18 +44,61 @@ class Custom:
 
         Raises:
             PluginError: The class cannot be found, made without arguments, or has no propagate; or that
-                raised.
+                raised, or leaves out a thrust.
         """
-        settings = parameters.settings
-        assert isinstance(settings, CustomPropagator)
-        propagator = load_custom(settings.implementation, parameters.base_directory)
-        try:
-            return propagator.propagate(states.copy(), t0_s, knots_s.copy(), parameters)
-        except BaseException as error:  # a class of one's own may raise anything
-            if is_from_outside(error):
-                raise
-            doing = f"{settings.implementation}.propagate at {t0_s:g} s"
-            raise BlamedError(describe_exception(error, doing)) from error
+        found = _call(states, t0_s, knots_s, parameters)
+        thrust_m_s2 = parameters.thrust_m_s2
+        if thrust_m_s2 is not None and len(thrust_m_s2):
+            key = _implementation(parameters), parameters.base_directory
+            most_m_s2 = float(np.abs(thrust_m_s2).max())
+            if key not in self._heeding and most_m_s2 * (knots_s[-1] - t0_s) >= GAIN_M_S_MIN:
+                coasting = replace(parameters, thrust_m_s2=None)
+                _check_thrust(found, _call(states, t0_s, knots_s, coasting), key[0], most_m_s2)
+                self._heeding.add(key)
+        return found
+
+
+def _check_thrust(
+    found: NDArray[np.float64],
+    coasting: NDArray[np.float64],
+    implementation: str,
+    thrust_m_s2: float,
+) -> None:
+    """
+    See that a class follows a thrust: a burn that it leaves out would be booked, and not be in truth.
+
+    Raises:
+        BlamedError: It returns the same as without.
+    """
+    if np.array_equal(found, coasting):
+        raise BlamedError(
+            f"{implementation}.propagate returns the same with parameters.thrust_m_s2 of {thrust_m_s2:.3g} m/s^2"
+            " as without: expected it to be added to the accelerations; or leave out thrust_n of thrusters, whose"
+            " burns are impulses then, or say can_maneuver: false of the propagator"
+        )
+
+
+def _implementation(parameters: PropagationParameters) -> str:
+    settings = parameters.settings
+    assert isinstance(settings, CustomPropagator)
+    return settings.implementation
+
+
+def _call(
+    states: NDArray[np.float64],
+    t0_s: float,
+    knots_s: NDArray[np.float64],
+    parameters: PropagationParameters,
+) -> NDArray[np.float64]:
+    implementation = _implementation(parameters)
+    propagator = load_custom(implementation, parameters.base_directory)
+    try:
+        return propagator.propagate(states.copy(), t0_s, knots_s.copy(), parameters)
+    except BaseException as error:  # a class of one's own may raise anything
+        if is_from_outside(error):
+            raise
+        doing = f"{implementation}.propagate at {t0_s:g} s"
+        raise BlamedError(describe_exception(error, doing)) from error
 
 
 @lru_cache(maxsize=4)
