@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from madns_runtime.conditions.condition import HOST, Condition, ValueBounds
+from madns_runtime.units import converted
 
 TIMES_MAX: Final = 2**53
 """Records that a condition counts: no run has so many, and every whole number up to it travels as it is."""
@@ -124,5 +125,7 @@ def owner_of(name: str) -> str:
 
 def scaled(bounds: ValueBounds, factor: float) -> ValueBounds:
     """Return the bounds of values in another unit, *factor* of which make one of these."""
-    low, high = (None if each is None else each * factor for each in (bounds.low, bounds.high))
+    low, high = (
+        None if each is None else converted(each, factor) for each in (bounds.low, bounds.high)
+    )
     return replace(bounds, low=low, high=high)

@@ -35,7 +35,7 @@ from cosmos_cli.models.expectation import Expectation, scaled
 from cosmos_cli.models.known_streams import REAL_TIME_ONLY
 from madns_runtime.analysis.tables import Tables
 from madns_runtime.conditions.condition import HOST, ValueBounds
-from madns_runtime.units import conversion
+from madns_runtime.units import conversion, converted
 
 RATE_UNIT = "1/s"
 _Earlier = tuple[str, Mapping[str, ExpectationOutcome]]
@@ -278,7 +278,7 @@ class _Followed:
         bounds = self._bounds()
         passed = got == 0.0 if bounds.text is not None else bounds.holds(got)
         is_value = expectation.statistic not in (*OF_NUMBERS, *OF_TIMES)
-        shown = got / self._factor if is_value and bounds.text is None else got
+        shown = converted(got, 1.0 / self._factor) if is_value and bounds.text is None else got
         place = accumulator.place if isinstance(accumulator, FirstTime) else None
         return ExpectationOutcome(got=shown, t_s=t_s, passed=passed, place=place)
 

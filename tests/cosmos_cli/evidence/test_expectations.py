@@ -180,6 +180,22 @@ def test_the_worst_agent_is_told_with_its_time_in_the_unit_of_the_check():
     assert result.agents_broken == 2
 
 
+@pytest.mark.parametrize(("limit_ms", "value_us"), [(1.005, 1005), (4.35, 4350), (2.3, 2300)])
+def test_a_value_at_a_limit_in_another_unit_is_at_it(limit_ms, value_us):
+    columns = {"t_s": np.array([0.0, 1.0]), "x_us": np.array([0, value_us])}
+    table = FakeTable("trips", (Field("t_s", "s"), Field("x_us", "us", "int")), {"a": columns})
+    common = {"stream": "trips", "field": "x_us", "unit": "ms", "agents": ("a",)}
+
+    closed, strict = judge(
+        expect(bounds=ValueBounds.within(0.0, limit_ms), **common),
+        expect(bounds=ValueBounds.below(limit_ms), **common),
+        tables={"trips": table},
+    ).results
+
+    assert (closed.passed, strict.passed) == (True, False)
+    assert (closed.got, strict.got) == (0.0, limit_ms) or closed.got == limit_ms == strict.got
+
+
 def test_a_limit_is_compared_as_strictly_as_it_says():
     top = float(DATA["a"].max())
 
