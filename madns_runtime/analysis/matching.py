@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from madns_runtime.analysis.values import Floats
+from madns_runtime.recording.columns import joined_column
 
 Indices = NDArray[np.int64]
 Columns = dict[str, NDArray[Any]]
@@ -192,7 +193,7 @@ def _join(parts: Sequence[Rows]) -> Rows:
     return Rows(
         keys=np.concatenate([part.keys for part in parts]),
         who=np.concatenate([part.who for part in parts]),
-        columns={name: np.concatenate([p.columns[name] for p in parts]) for name in names},
+        columns={name: joined_column([p.columns[name] for p in parts]) for name in names},
     )
 
 
