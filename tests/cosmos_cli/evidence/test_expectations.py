@@ -180,6 +180,43 @@ def test_the_worst_agent_is_told_with_its_time_in_the_unit_of_the_check():
     assert result.agents_broken == 2
 
 
+@pytest.mark.parametrize("rows", [1, 3, 65_536])
+def test_the_first_time_is_the_earliest_in_whatever_order_records_come(monkeypatch, rows):
+    monkeypatch.setattr(records, "BATCH_RECORDS", rows)
+    columns = {"t_s": np.array([9.0, 4.0, 6.0, 2.0, 5.0]), "x_m": np.array([1.0, 1.0, 1, 0, 1])}
+    table = FakeTable("jobs", (Field("t_s", "s"), Field("x_m", "m")), {"a": columns})
+    when, bounds = ValueBounds.above(0.5), ValueBounds.below(5.0)
+    first = expect(stream="jobs", statistic="first_time", when=when, bounds=bounds, agents=("a",))
+
+    (result,) = judge(first, tables={"jobs": table}).results
+
+    assert (result.got, result.passed) == (4.0, True)
+
+
+@pytest.mark.parametrize("told", ["of its own", "[1]", "3", '{"other": 1}', "", None])
+def test_a_field_called_details_that_holds_no_event_has_no_values_beside(told):
+    columns = {"t_s": np.array([1.0, 2.0]), "details": objects([told, '{"x_m": 4}'])}
+    fields = (Field("t_s", "s"), Field("details", "", "str"))
+    table = FakeTable("told", fields, {"a": columns})
+    count = expect(stream="told", statistic="count", bounds=ValueBounds.equals(1), agents=("a",))
+
+    (result,) = judge(count, tables={"told": table}).results
+
+    assert (result.got, result.passed) == (1.0, True)
+
+
+@pytest.mark.parametrize("words", [["noon", "later"], [[1], {}], [None, "1.5"]])
+def test_a_time_that_is_no_number_is_none(words):
+    columns = {"t_s": objects(words), "x_m": np.array([1.0, 3.0])}
+    fields = (Field("t_s", "", "str"), Field("x_m", "m"))
+    table = FakeTable("told", fields, {"a": columns})
+    largest = expect(stream="told", statistic="max", bounds=ValueBounds.below(5.0), agents=("a",))
+
+    (result,) = judge(largest, tables={"told": table}).results
+
+    assert (result.got, result.t_s, result.passed) == (3.0, None, True)
+
+
 @pytest.mark.parametrize(("limit_ms", "value_us"), [(1.005, 1005), (4.35, 4350), (2.3, 2300)])
 def test_a_value_at_a_limit_in_another_unit_is_at_it(limit_ms, value_us):
     columns = {"t_s": np.array([0.0, 1.0]), "x_us": np.array([0, value_us])}
