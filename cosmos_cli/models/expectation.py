@@ -63,6 +63,13 @@ class Expectation:
     unit_factor: float = 1.0
     """Values in the field's declared unit that one of `unit` makes: for conditions in the run."""
 
+    @property
+    def is_timed(self) -> bool:
+        """Whether it is about the times of records."""
+        times = (self.from_s, self.to_s, self.meanwhile, self.within_s, self.after or None)
+        is_of_times = self.statistic in ("first_time", "settled")
+        return is_of_times or any(each is not None for each in times)
+
     def is_judged_in(self, *, is_lockstep: bool) -> bool:
         """Tell whether runs of a time mode record what it is about."""
         return not (self.only_realtime and is_lockstep)

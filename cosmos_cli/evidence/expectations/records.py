@@ -100,6 +100,10 @@ class RecordSource:
         fields = (each for table in self.tables_of(stream) for each in table.fields)
         return next((each.unit for each in fields if each.name == field), "")
 
+    def may_have(self, stream: str, field: str) -> bool:
+        """Tell whether records of a stream have a field, or may: an event carries more than its stream's fields."""
+        return any(table.has(field) or table.has(DETAILS) for table in self.tables_of(stream))
+
     def has_time(self, stream: str) -> bool:
         """Tell whether records of a stream tell when they are of."""
         tables = self.tables_of(stream)

@@ -217,6 +217,40 @@ def test_a_time_that_is_no_number_is_none(words):
     assert (result.got, result.t_s, result.passed) == (3.0, None, True)
 
 
+NO_TIME = FakeTable(
+    "untimed",
+    (Field("x_m", "m"), Field("s", "", "str")),
+    {"a": {"x_m": np.ones(3), "s": objects(["u"] * 3)}},
+)
+BOO = {"event": "boo", "must": "not_occur"}
+NONE = {"statistic": "count", "bounds": ValueBounds.equals(0)}
+
+
+@pytest.mark.parametrize(
+    ("values", "why"),
+    [
+        ({"stream": "state", "field": "y_m", **NONE}, "stream state has no field y_m"),
+        ({"stream": "state", "field": "evnt", **BOO}, "stream state has no field evnt"),
+        ({"stream": "untimed", "field": "s", "from_s": 2.0, **BOO}, "tell no time"),
+        ({"stream": "untimed", "field": "x_m", "to_s": 2.0, **NONE}, "tell no time"),
+        ({"stream": "slots", "field": "error_deg", **NONE}, "by the host's half alone"),
+    ],
+)
+def test_what_no_record_could_tell_does_not_hold_for_want_of_records(values, why):
+    tables = {**TABLES, "untimed": NO_TIME}
+
+    (result,) = judge(expect(agents=("a",), **values), tables=tables).results
+
+    assert (result.got, result.passed) == (None, False)
+    assert why in result.expected
+
+
+def test_what_events_carry_beside_their_fields_may_be_in_none_of_them():
+    result = result_of(stream="events", field="never", agents=("a",), **NONE)
+
+    assert (result.got, result.passed) == (0.0, True)
+
+
 @pytest.mark.parametrize(("limit_ms", "value_us"), [(1.005, 1005), (4.35, 4350), (2.3, 2300)])
 def test_a_value_at_a_limit_in_another_unit_is_at_it(limit_ms, value_us):
     columns = {"t_s": np.array([0.0, 1.0]), "x_us": np.array([0, value_us])}
