@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, TypeGuard
@@ -19,7 +19,7 @@ from cosmos_cli.models.overrides import parse_override
 from cosmos_cli.testing.check_lines import shown
 from madns_runtime.analysis.distribution import Distribution
 from madns_runtime.analysis.sampling import as_array
-from madns_runtime.conditions.condition import ValueBounds
+from madns_runtime.conditions.condition import HOST, ValueBounds
 
 ROWS_MAX = 200_000
 """Records that are read at a time."""
@@ -50,6 +50,8 @@ class ComparedFigure:
 
     def reason(self) -> str:
         """Return why it does not pass."""
+        if self.expected is None and self.got is None and self.why_none:
+            return f"{self.name}: {self.why_none}"
         if self.expected is None:
             return (
                 f"{self.name}: has no expected value: write it with cosmos test --update-baselines"
@@ -84,11 +86,14 @@ def compare_figures(
         document: Its run.json.
     """
     tables = open_tables(run.tables)
-    labels = run_labels(run)
+    labels, config = run_labels(run), run.read_config()
+    names = () if config is None else (HOST, *config.agents.resolved_names())
     compared = []
     for name, figure in baseline.figures.items():
         got, why_none = (
-            _at_path(document, figure.path) if figure.path else _of_stream(figure, tables, labels)
+            _at_path(document, figure.path)
+            if figure.path
+            else _of_stream(figure, tables, labels, names)
         )
         expected = figure.expected
         share = figure.relative * abs(expected) if _is_number(expected) else 0.0
@@ -123,7 +128,10 @@ def _at_path(document: Mapping[str, Any], path: str) -> tuple[FigureValue, str]:
 
 
 def _of_stream(
-    figure: BaselineFigure, tables: Mapping[str, TableReader], labels: AgentLabels
+    figure: BaselineFigure,
+    tables: Mapping[str, TableReader],
+    labels: AgentLabels,
+    agents: Sequence[str],
 ) -> tuple[FigureValue, str]:
     table = tables.get(figure.stream)
     if table is None:
@@ -132,12 +140,14 @@ def _of_stream(
     if figure.field not in known:
         return None, f"no field {figure.field} in {figure.stream}; there are {', '.join(known)}"
     meant = {*figure.agents, *labels.labelled(figure.agents)}
-    sources = [
-        name for name in table.sources if any(fnmatchcase(name, pattern) for pattern in meant)
-    ]
-    if not sources:
+    sources = _named(table.sources, meant)
+    if not sources and not (figure.statistic == "count" and _named(agents, meant)):
         return None, f"nobody of {', '.join(figure.agents)} recorded {figure.stream}"
     return _statistic(figure, table, sources)
+
+
+def _named(names: Iterable[str], patterns: Collection[str]) -> list[str]:
+    return [name for name in names if any(fnmatchcase(name, pattern) for pattern in patterns)]
 
 
 def _statistic(

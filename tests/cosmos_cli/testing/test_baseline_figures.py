@@ -104,6 +104,25 @@ def test_records_are_counted_by_a_field_of_any_kind_that_they_have(baseline, tmp
     assert {each.name: each.got for each in compared} == dict.fromkeys(kinds, 2)
 
 
+def test_no_record_of_an_agent_that_there_is_counts_as_0_and_has_no_other_figure(
+    baseline, tmp_path
+):
+    made = SyntheticRun(tmp_path / "runs").write()
+    made.recorder("agents/agent-01", "agent-01", StreamSchema("x", (Field("x_m", "m"),))).close()
+    gather(made.run, 10.0, lambda *told: None)
+    of_x = "stream: x, field: x_m"
+    text = (
+        f"figures:\n  all: {{{of_x}, statistic: count}}\n  other: {{{of_x}, statistic: count, agents: ['*-02']}}\n"
+        f"  nobody: {{{of_x}, statistic: count, agents: [agent-9]}}\n  mean: {{{of_x}, statistic: mean}}\n"
+    )
+
+    compared = {each.name: each for each in compare_figures(baseline(text), made.run, {})}
+
+    assert (compared["all"].got, compared["other"].got) == (0, 0)
+    assert compared["nobody"].reason() == "nobody: nobody of agent-9 recorded x"
+    assert compared["mean"].reason() == "mean: nobody of * recorded x"
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("statistic", ["mean", "rms", "sd"])
 def test_a_statistic_of_values_that_diverged_never_passes_and_is_no_number(
