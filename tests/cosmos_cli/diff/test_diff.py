@@ -360,6 +360,30 @@ def test_terminal_tells_where_and_how_much(make, capsys):
     assert "comparing agent-02/state" in err
 
 
+def record_ranks(made, *, others=0):
+    """Record of the host without a time; *others* are of another agent, before those of each."""
+    fields = (Field("agent", "", "str"), Field("rank", "", "int"))
+    recorder = made.recorder("host", "host", StreamSchema("ranks", fields))
+    for number in range(20):
+        for _ in range(others):
+            recorder.record("ranks", ("agent-03", number))
+        recorder.record("ranks", ("agent-01", number))
+    recorder.close()
+
+
+def test_records_without_a_time_are_matched_among_those_of_the_agents_that_are_chosen(make, capsys):
+    make(record_ranks), make(lambda made: record_ranks(made, others=2))
+
+    code, document = diff(
+        capsys, "1", "2", "--streams", "ranks", "--agents", "agent-01", "--expect-same"
+    )
+
+    assert code == 0
+    ranks = streams_of(document)["host_ranks"]
+    assert (ranks["matched"], ranks["only_b"]["count"]) == (20, 0)
+    assert diff(capsys, "1", "2", "--streams", "ranks", "--expect-same")[0] == 1
+
+
 def test_run_that_is_not_collected_is_bad_input_with_advice(make, tmp_path, capsys):
     make()
     SyntheticRun(tmp_path / "runs")
