@@ -395,7 +395,8 @@ def _field(column: pa.Field) -> Field:
 def _to_numpy(column: pa.Array, is_exact: bool) -> NDArray[Any]:
     if is_exact and column.null_count and pa.types.is_int64(column.type):
         return column_of(column.to_pylist(), "int")
-    return column.to_numpy(zero_copy_only=False)
+    values: NDArray[Any] = column.to_numpy(zero_copy_only=False)
+    return values
 
 
 def _join(parts: list[NDArray[Any] | None], held: list[Columns], count: int) -> NDArray[Any]:

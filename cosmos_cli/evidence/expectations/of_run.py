@@ -83,7 +83,7 @@ def recorded_streams(tables: Tables) -> tuple[DeclaredStream, ...]:
     for table in tables.values():
         name = table.name.removeprefix(f"{HOST}_") if table.role == HOST else table.name
         if table.role in (HOST, AGENT) and name not in FRAMEWORK_STREAMS:
-            role: Literal["host", "agent"] = HOST if table.role == HOST else AGENT
+            role: Literal["host", "agent"] = "host" if table.role == HOST else "agent"
             found.append(DeclaredStream(role=role, name=name, fields=table.fields))
     return tuple(found)
 
