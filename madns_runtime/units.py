@@ -11,6 +11,7 @@ import functools
 import math
 import re
 from collections.abc import Mapping
+from decimal import Decimal
 from typing import Final
 
 _BASE: Final = ("m", "kg", "s", "A", "K", "mol", "cd", "rad", "B", "degC")
@@ -125,6 +126,27 @@ def conversion(unit: str, wanted: str) -> float | None:
         f"{exact:.12g}"
     )  # 5 ms are 5000 us, not 5000.000000000001; a degree is what it is
     return rounded if math.isclose(rounded, exact, rel_tol=1e-15) else exact
+
+
+def converted(value: float, factor: float) -> float:
+    """
+    Return a number in another unit, *factor* of which make one of its own.
+
+    Both are taken for the decimal numbers that they are read from where the factor, or what it divides by, is one of
+    few digits: 1.005 ms are 1005 us and 5 us are 0.000005 s, which in binary numbers they miss by their last digit.
+    """
+    if factor == 1.0 or not math.isfinite(value):
+        return value * factor
+    if _is_short(factor):
+        return float(Decimal(repr(float(value))) * Decimal(repr(factor)))
+    divisor = 1.0 / factor
+    if math.isfinite(divisor) and _is_short(divisor):
+        return float(Decimal(repr(float(value))) / Decimal(repr(divisor)))
+    return value * factor
+
+
+def _is_short(number: float) -> bool:
+    return float(f"{number:.12g}") == number
 
 
 def _symbol(symbol: str) -> tuple[float, Dimensions] | None:

@@ -15,7 +15,7 @@ from typing import Any
 from cosmos_cli.collect.disk import size_words
 from cosmos_cli.collect.previous_manifest import Earlier
 from cosmos_cli.collect.size_bound import recordable_bytes
-from cosmos_cli.evidence.manifest import run_files
+from cosmos_cli.evidence.manifest import run_files, unreadable_places
 from cosmos_cli.evidence.run_directory import RunDirectory
 
 BLOCK_BYTES = 512
@@ -43,6 +43,7 @@ def find_unread(
         for path in run_files(run)
         if not _is_text(str(path))
     }
+    found |= {path: f"not read: {error.strerror}" for path, error in unreadable_places(run).items()}
     for path in sorted(sizes, key=lambda path: (-sizes[path], path)):
         if total <= bytes_max:
             break

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,7 +20,7 @@ from cosmos_cli.evidence.expectations.of_run import (
 )
 from cosmos_cli.evidence.manifest import file_entry
 from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
-from cosmos_cli.evidence.run_documents import fault_of, fault_of_summary
+from cosmos_cli.evidence.run_documents import fault_of, fault_of_plan, fault_of_summary
 from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.evidence.tables import open_tables
 from cosmos_cli.evidence.verdict import conclusion_of_expectations
@@ -94,17 +94,30 @@ def _collected(run: RunDirectory) -> Mapping[str, Any]:
         raise InputError(
             f"{run.name} is not collected yet; do that with: cosmos collect {run.shell_path}"
         )
-    fault = fault_of_summary(document)
-    if fault is not None or run.read_config() is None:
-        what = f"{run.run_json}: {fault}" if fault else f"{run.plan_json}: not to be read"
-        raise InputError(f"{what}; make it anew with: cosmos collect {run.shell_path}")
+    if fault := fault_of_summary(document):
+        raise InputError(
+            f"{run.run_json}: {fault}; make it anew with: cosmos collect {run.shell_path}"
+        )
+    # A check that cannot be read would be one that is not judged.
+    if fault := fault_of_plan(run.plan_json):
+        raise InputError(
+            f"{run.plan_json}: {fault}; put it back as it was: what was expected stands there alone"
+        )
     # Without it, a table that is gone would be one without records.
     fault = fault_of(run.manifest_json)
     if fault is not None:
         raise InputError(
             f"{run.manifest_json}: {fault}; make it anew with: cosmos collect {run.shell_path}"
         )
-    cut = [name for name, entry in _listed_tables(run) if not _is_as(entry, run.path / name)]
+    files = _listed_files(run)
+    plan = files.get(run.plan_json.name)
+    if plan is not None and not _is_as(plan, run.plan_json):
+        raise InputError(
+            f"{run.plan_json}: changed since the run was collected, and what was expected with it; put it back as it"
+            f" was, or have the change noted with: cosmos collect {run.shell_path}"
+        )
+    tables = {n: entry for n, entry in files.items() if n.startswith(f"{run.tables.name}/")}
+    cut = [name for name, entry in tables.items() if not _is_as(entry, run.path / name)]
     if cut:
         what = f"{run.path / cut[0]}" + (f" and {len(cut) - 1} more" if cut[1:] else "")
         text = "missing, or not as it was collected"
@@ -112,12 +125,11 @@ def _collected(run: RunDirectory) -> Mapping[str, Any]:
     return document
 
 
-def _listed_tables(run: RunDirectory) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield the tables that the manifest lists, below the run's directory, and the entry of each."""
+def _listed_files(run: RunDirectory) -> dict[str, Mapping[str, Any]]:
+    """Return the entries of the manifest by the names of files below the run's directory."""
     files = (run.read_json(run.manifest_json) or {}).get("files")
-    for name, entry in files.items() if isinstance(files, dict) else ():
-        if name.startswith(f"{run.tables.name}/") and isinstance(entry, dict):
-            yield name, entry
+    listed = files.items() if isinstance(files, dict) else ()
+    return {name: entry for name, entry in listed if isinstance(entry, dict)}
 
 
 def _is_as(entry: Mapping[str, Any], path: Path) -> bool:

@@ -110,7 +110,7 @@ def test(
     or none is meant, 130 if interrupted.
     """
     console = Console(json=json, quiet=quiet, instead=_instead(junit))
-    if update_baselines and (seeds or full_length):
+    if update_baselines and (seeds is not None or full_length):
         raise InputError(
             "--update-baselines writes figures of the test as it stands: leave out --seeds and"
             " --full-length"
@@ -174,7 +174,7 @@ def _seeds_of(
     console: Console, found: FoundScenarios, text: str | None, *, last_failed: bool
 ) -> Callable[[Path], Sequence[int | None]]:
     """Return the function that tells a scenario's seeds; none for one that did not fail last time."""
-    given: Sequence[int | None] = parse_seeds(text) if text else (None,)
+    given: Sequence[int | None] = (None,) if text is None else parse_seeds(text)
     known = {str(real_path(outline.path)) for outline in found.outlines}
     # Other folders' failures are remembered, too.
     failed = [each for each in read_failed() if each[0] in known] if last_failed else []

@@ -8,7 +8,7 @@ from fnmatch import fnmatchcase
 from typing import Any
 
 from cosmos_cli.collect.unread_files import find_unread, told_unread
-from cosmos_cli.diff.recorded import Key, Recorded
+from cosmos_cli.diff.recorded import Key, Lines, Recorded
 from cosmos_cli.diff.side import Side, check_comparable
 from cosmos_cli.diff.stream import (
     StreamDifference,
@@ -191,8 +191,9 @@ def _compare_streams(
         pairing = choose_pairing(of_a[key].fields, of_b[key].fields, (a.tick_hz, b.tick_hz))
         # The same numbers under other names, or in another unit, are others.
         is_alike = of_a[key].fields == of_b[key].fields
-        lines = of_a[key].lines() if is_alike else None
-        if lines is not None and lines == of_b[key].lines():
+        lines, other = (one[key].lines() if is_alike else None for one in (of_a, of_b))
+        _note_changes(result, lines, other)
+        if lines is not None and other is not None and lines.is_same(other):
             identical[key] = lines.records
             found = identical_stream(of_a[key], pairing.by, lines.records)
         else:
@@ -204,6 +205,15 @@ def _compare_streams(
         _compare_by_simulation(result, of_a, of_b, identical)
     except PluginError as error:
         result.remarks.append(f"{a.simulation} compared nothing itself: {error}")
+
+
+def _note_changes(result: Comparison, *lines: Lines | None) -> None:
+    """Enter files whose hash is not what it was: their length may be, which was looked at before."""
+    for side, own in zip((result.a, result.b), lines, strict=True):
+        for path in own.changed if own is not None else ():
+            name = f"{side.run.name}: {path.relative_to(side.run.path).as_posix()}: "
+            if not any(line.startswith(name) for line in result.missing):
+                result.missing.append(f"{name}changed since the run was collected")
 
 
 def _compare_by_simulation(

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import hashlib
 import re
+import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from cosmos_cli.collect.previous_manifest import Earlier
 from cosmos_cli.collect.unread_files import find_unread
+from cosmos_cli.errors import InputError
+from cosmos_cli.evidence.completeness import mapping_at
+from cosmos_cli.evidence.manifest import file_entry
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import (
     DETAILS,
@@ -40,6 +47,12 @@ class Lines:
     sha256: str
     """Of all records, without the lines that name the run and its time."""
     records: int
+    changed: tuple[Path, ...] = ()
+    """Files that are no longer what they were when the run was collected."""
+
+    def is_same(self, other: Lines) -> bool:
+        """Tell whether others hold the same records."""
+        return (self.sha256, self.records) == (other.sha256, other.records)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,6 +67,8 @@ class Recorded:
     """In the order of incarnations; empty if only the table is left."""
     reader: TableReader | None
     """None if there is no table, or one that is older than the lines."""
+    collected: Mapping[Path, str]
+    """Hashes of the run's files when it was collected, as far as they are known."""
 
     @property
     def stream(self) -> str:
@@ -72,8 +87,8 @@ class Recorded:
             MachineError: A file cannot be read.
         """
         wanted = list(names)
-        if self.reader is not None and self.reader.has(*wanted):
-            yield from self.reader.batches(self.source, wanted, ROWS_READ_MAX)
+        if self.reader is not None and self.reader.has(*wanted) and self._is_sound(self.reader):
+            yield from self.reader.batches(self.source, wanted, ROWS_READ_MAX, is_exact=True)
             return
         for file in self.files:
             for columns, _ in read_batches(file, StreamReading(file.path)):
@@ -88,35 +103,81 @@ class Recorded:
         """
         if not self.files:
             return None
-        digest, records = hashlib.sha256(), 0
+        digest, records, changed = hashlib.sha256(), 0, []
         for file in self.files:
-            for block in _record_blocks(file.path):
+            whole = hashlib.sha256()
+            for block in _record_blocks(file.path, whole):
                 has_control = any(key in block for key in CONTROL_KEYS)
                 told = CONTROL_LINE.sub(b"", block) if has_control else block
                 digest.update(told)
                 records += told.count(b"\n")
-        return Lines(sha256=digest.hexdigest(), records=records)
+            if self.collected.get(file.path, whole.hexdigest()) != whole.hexdigest():
+                changed.append(file.path)
+        return Lines(sha256=digest.hexdigest(), records=records, changed=tuple(changed))
+
+    def _is_sound(self, reader: TableReader) -> bool:
+        """
+        Tell whether a table is what was collected: one of other records would be taken for these.
+
+        Raises:
+            InputError: It is not, and there are no lines to read instead.
+        """
+        expected = self.collected.get(reader.path)
+        with contextlib.suppress(OSError):  # it is gone meanwhile
+            mtime_ns = reader.path.stat().st_mtime_ns
+            if expected is None or expected == _hash_of(reader.path, mtime_ns):
+                return True
+        if self.files:
+            return False
+        run = shlex.quote(str(reader.path.parent.parent))
+        raise InputError(
+            f"{reader.path}: not as it was collected, and the lines that it was made of are gone; put it back,"
+            f" or have it noted with: cosmos collect {run}"
+        )
 
 
 def recorded_streams(run: RunDirectory) -> dict[Key, Recorded]:
     """Return every stream of a run that has a schema, by table and source."""
     files: dict[Key, list[RecordFile]] = {}
-    unread = find_unread(run)
+    unread, collected = find_unread(run), _collected(run)
     for file in find_streams(run.path):
         if file.fields and file.path not in unread:
             files.setdefault((file.table, file.source), []).append(file)
     tables = open_tables(run.tables)
     found = {
-        key: _from_lines(key, group, _fresh(tables.get(key[0]), group))
+        key: _from_lines(key, group, _fresh(tables.get(key[0]), group), collected)
         for key, group in files.items()
     }
     for reader in tables.values():
         for source in reader.sources:
-            found.setdefault((reader.name, source), _from_table(reader, source))
+            found.setdefault((reader.name, source), _from_table(reader, source, collected))
     return found
 
 
-def _from_lines(key: Key, files: Sequence[RecordFile], reader: TableReader | None) -> Recorded:
+def _collected(run: RunDirectory) -> dict[Path, str]:
+    """Return the hashes of a run's streams when it was collected first, and of its tables when they were made."""
+    made = mapping_at(run.read_json(run.manifest_json), "files")
+    tables = {name: made[name] for name in made if name.startswith(f"{run.tables.name}/")}
+    hashes = {
+        run.path / name: entry.get("sha256")
+        for name, entry in {**tables, **Earlier.read(run).entries}.items()
+        if isinstance(entry, Mapping)
+    }
+    return {path: each for path, each in hashes.items() if isinstance(each, str)}
+
+
+@functools.lru_cache(maxsize=256)
+def _hash_of(path: Path, _mtime_ns: int) -> str:
+    """Return the hash of a table, which several streams are read from."""
+    return str(file_entry(path)["sha256"])
+
+
+def _from_lines(
+    key: Key,
+    files: Sequence[RecordFile],
+    reader: TableReader | None,
+    collected: Mapping[Path, str],
+) -> Recorded:
     fields: dict[str, Field] = {}
     for file in files:
         for field in (*file.fields, *(() if file.is_array else (DETAILS,))):
@@ -133,10 +194,11 @@ def _from_lines(key: Key, files: Sequence[RecordFile], reader: TableReader | Non
         fields=tuple(fields.values()),
         files=tuple(files),
         reader=reader if reader is not None and key[1] in reader.sources else None,
+        collected=collected,
     )
 
 
-def _from_table(reader: TableReader, source: str) -> Recorded:
+def _from_table(reader: TableReader, source: str, collected: Mapping[Path, str]) -> Recorded:
     role: Mapping[str, Role] = {"host": "host", "machine": "machine", "device": "device"}
     return Recorded(
         table=reader.name,
@@ -145,6 +207,7 @@ def _from_table(reader: TableReader, source: str) -> Recorded:
         fields=reader.recorded_fields,
         files=(),
         reader=reader,
+        collected=collected,
     )
 
 
@@ -159,13 +222,14 @@ def _fresh(reader: TableReader | None, files: Sequence[RecordFile]) -> TableRead
         return None
 
 
-def _record_blocks(path: Path) -> Iterator[bytes]:
-    """Give all lines but the schema's, in blocks that end with a line."""
+def _record_blocks(path: Path, whole: hashlib._Hash) -> Iterator[bytes]:
+    """Give all lines but the schema's, in blocks that end with a line; *whole* takes all of the file."""
     try:
         with path.open("rb") as file:
-            file.readline()
+            whole.update(file.readline())
             held = b""
             while block := file.read(BLOCK_BYTES):
+                whole.update(block)
                 end = block.rfind(b"\n") + 1
                 if end:
                     yield held + block[:end]

@@ -232,17 +232,12 @@ def _rows(
 
     def rows_of(columns: Mapping[str, Any]) -> Rows:
         nonlocal counted
+        if agents and owner is not None:
+            columns = _chosen(columns, owner, agents, chosen)
         count = len(columns[names[0]])
         keys = _keys(columns, pairing, counted, count) * scale
         counted += count
-        rows = Rows(keys=keys, who=_who(columns, pairing.identity, count), columns=dict(columns))
-        if not agents or owner is None:
-            return rows
-        owners = columns[owner].tolist()
-        for name in owners:
-            if name not in chosen:
-                chosen[name] = any(fnmatchcase(str(name), glob) for glob in agents)
-        return rows.take(np.array([chosen[name] for name in owners], dtype=bool))
+        return Rows(keys=keys, who=_who(columns, pairing.identity, count), columns=dict(columns))
 
     batches = (rows_of(columns) for columns in recorded.batches(names))
     is_empty = True
@@ -252,6 +247,18 @@ def _rows(
     if is_empty:
         nothing = {name: np.empty(0, dtype=object) for name in names}
         yield Rows(keys=np.empty(0), who=np.empty(0, dtype=object), columns=nothing)
+
+
+def _chosen(
+    columns: Mapping[str, Any], owner: str, agents: Sequence[str], known: dict[str, bool]
+) -> Mapping[str, Any]:
+    """Return the records whose owner a glob fits; *known* keeps which do."""
+    owners = columns[owner].tolist()
+    for name in owners:
+        if name not in known:
+            known[name] = any(fnmatchcase(str(name), glob) for glob in agents)
+    is_chosen = np.array([known[name] for name in owners], dtype=bool)
+    return {name: values[is_chosen] for name, values in columns.items()}
 
 
 def _keys(columns: Mapping[str, Any], pairing: Pairing, counted: int, count: int) -> Floats:

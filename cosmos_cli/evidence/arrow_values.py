@@ -94,4 +94,7 @@ def _convert(value: Any, kind: Kind) -> Any:
         return int(value) if is_int64 else None
     if kind == "bool":
         return value if isinstance(value, bool) else None
-    return value if isinstance(value, str) else json.dumps(value)
+    try:
+        return value if isinstance(value, str) else json.dumps(value)
+    except RecursionError:  # orjson reads what is nested deeper than Python goes
+        return None

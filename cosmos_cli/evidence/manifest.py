@@ -6,6 +6,7 @@ The package is one .tar.zst beside the run's directory, the same bytes for the s
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import tarfile
@@ -21,15 +22,42 @@ from madns_runtime.partial_file import partial_file
 from madns_runtime.recording.access import file_mode
 
 MANIFEST_NAME = "manifest.json"
+PATH_BYTES_MAX = 4096
+"""Of a path that the system takes, its end mark included."""
 COMPRESSION_LEVEL = 3
 
 
 def run_files(run: RunDirectory, without: Container[Path] = ()) -> Iterator[Path]:
     """Yield the files that are evidence, in the order of their names; no reserve, nothing half-written."""
-    for path in sorted(run.path.rglob("*")):
+    for path in sorted(path for path, error in _below(run.path) if error is None):
         is_left_out = path in without or path.name == RESERVE_NAME or path.name.endswith(".part")
         if path.is_file() and not path.is_symlink() and not is_left_out:
             yield path
+
+
+def unreadable_places(run: RunDirectory) -> dict[Path, OSError]:
+    """Return the folders of a run that cannot be listed, files whose names are too long, and of each why."""
+    return {path: error for path, error in _below(run.path) if error is not None}
+
+
+def _below(folder: Path) -> Iterator[tuple[Path, OSError | None]]:
+    """Yield what lies below and is no folder, and what cannot be looked at; however deep, and through no link."""
+    waiting = [folder]
+    while waiting:
+        here = waiting.pop()
+        try:
+            with os.scandir(here) as entries:
+                for entry in entries:
+                    path = Path(entry.path)
+                    is_long = len(os.fsencode(path)) >= PATH_BYTES_MAX
+                    if entry.is_dir(follow_symlinks=False) and not is_long:
+                        waiting.append(path)
+                    elif is_long:
+                        yield path, OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
+                    else:
+                        yield path, None
+        except OSError as error:
+            yield here, error
 
 
 def build_manifest(

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import orjson
 
+from cosmos_cli.models.expectation import Expectation
 from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.bounded_files import read_regular_file
 from madns_runtime.config import RunConfig, from_mapping
@@ -75,11 +76,16 @@ def fault_of_plan(path: Path) -> str | None:
     fault = fault_of(path)
     if fault is not None:
         return fault
-    config = read_object(path).get("config")
+    plan = read_object(path)
+    config, listed = plan.get("config"), plan.get(EXPECTATIONS, [])
     if not isinstance(config, Mapping):
         return "cannot be used: expected the run's configuration under config"
+    if not isinstance(listed, list):
+        return f"cannot be used: expected a list of checks under {EXPECTATIONS}"
     try:
         from_mapping(RunConfig, config, "config")
+        for number, item in enumerate(listed):
+            from_mapping(Expectation, item, f"{EXPECTATIONS}[{number}]")
     except ConfigurationError as error:
         return f"cannot be used: {error}"
     return None

@@ -29,6 +29,7 @@ from cosmos_cli.evidence.streams import DETAILS, Columns, RecordFile
 from cosmos_cli.evidence.table_labels import NEVER_US, TableLabels
 from madns_runtime.analysis.tables import RecordedRun
 from madns_runtime.partial_file import create_partial
+from madns_runtime.recording.columns import column_of, joined_column
 from madns_runtime.recording.records import Field
 
 ROWS_PER_GROUP = 128 * 1024
@@ -287,8 +288,14 @@ class TableReader:
             table = self._file.read_row_groups(self._groups.get(source, []), columns=wanted)
             return {name: table.column(name).to_numpy() for name in wanted}
 
-    def batches(self, source: str, names: Iterable[str], rows_max: int) -> Iterator[Columns]:
-        """Yield columns of one source as `read` returns them, at most *rows_max* records at a time."""
+    def batches(
+        self, source: str, names: Iterable[str], rows_max: int, *, is_exact: bool = False
+    ) -> Iterator[Columns]:
+        """
+        Yield columns of one source as `read` returns them, at most *rows_max* records at a time.
+
+        Whole numbers that no float is come as objects where others are null, if *is_exact*.
+        """
         wanted = list(names)
         for group in self._groups.get(source, []):
             # One group after the other: given all at once, pyarrow reads ahead without bound.
@@ -298,7 +305,7 @@ class TableReader:
                     batch = next(batches, None)
                     if batch is None:
                         break
-                    columns = {name: batch.column(name).to_numpy(False) for name in wanted}
+                    columns = {name: _to_numpy(batch.column(name), is_exact) for name in wanted}
                 yield columns
 
     def each(self, names: Iterable[str]) -> Iterator[tuple[str, Columns]]:
@@ -385,11 +392,16 @@ def _field(column: pa.Field) -> Field:
     )
 
 
+def _to_numpy(column: pa.Array, is_exact: bool) -> NDArray[Any]:
+    if is_exact and column.null_count and pa.types.is_int64(column.type):
+        return column_of(column.to_pylist(), "int")
+    values: NDArray[Any] = column.to_numpy(zero_copy_only=False)
+    return values
+
+
 def _join(parts: list[NDArray[Any] | None], held: list[Columns], count: int) -> NDArray[Any]:
     """Return one column of all held batches; a field that an incarnation lacks is null."""
     whole = [part for part in parts if part is not None]
     if len(whole) < len(parts):
         return np.empty(count, dtype=object)
-    if len({part.dtype for part in whole}) > 1 and any(p.dtype == object for p in whole):
-        whole = [part.astype(object) for part in whole]
-    return np.concatenate(whole)
+    return joined_column(whole)

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import yaml
-
 from cosmos_cli.errors import CosmosError, ExitCode, InputError
 from cosmos_cli.evidence.run_directory import (
     RunDirectory,
@@ -47,6 +45,7 @@ from cosmos_cli.models.agent_labels import AgentLabels
 from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.inventory.machine import LOOPBACK
 from cosmos_cli.models.loading import ScenarioFile
+from cosmos_cli.models.yaml_source import yaml_text
 from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.ui.name_ranges import compact
 from cosmos_cli.ui.plural import counted
@@ -284,7 +283,7 @@ def scenario_text(scenario: ScenarioFile) -> str:
         return scenario.text
     changes = "".join(f"\n#   extends {file}" for file in scenario.files[1:])
     changes += "".join(f"\n#   --set {override}" for override in scenario.overrides)
-    resolved = yaml.safe_dump(scenario.to_written(), sort_keys=False, allow_unicode=True)
+    resolved = yaml_text(scenario.to_written())
     return f"# {scenario.path.name}, with its defaults and:{changes}\n{resolved}"
 
 

@@ -7,8 +7,6 @@ import ipaddress
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-import yaml
-
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.fleet.connection import Connection, ConnectOptions, address_here
 from cosmos_cli.fleet.failure import MachineFailure
@@ -19,6 +17,7 @@ from cosmos_cli.launch.plan import LaunchPlan
 from cosmos_cli.launch.request import MachineConfig
 from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.loading import ScenarioFile
+from cosmos_cli.models.yaml_source import yaml_text
 from cosmos_cli.provision import STORE_PARTS
 from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.ui.plural import counted
@@ -189,7 +188,7 @@ def plan_mapping(
 def inventory_text(plan: LaunchPlan) -> str:
     """Return the machines of a run as an inventory of their own, groups resolved."""
     hosts = {name: _kept(machine.raw_variables) for name, machine in plan.involved.items()}
-    text = yaml.safe_dump({"all": {"hosts": hosts}}, sort_keys=False, allow_unicode=True)
+    text = yaml_text({"all": {"hosts": hosts}})
     return INVENTORY_HEAD + text
 
 

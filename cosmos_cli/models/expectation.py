@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from madns_runtime.conditions.condition import HOST, Condition, ValueBounds
+from madns_runtime.units import converted
 
 TIMES_MAX: Final = 2**53
 """Records that a condition counts: no run has so many, and every whole number up to it travels as it is."""
@@ -61,6 +62,13 @@ class Expectation:
     stop_when_broken: bool = False
     unit_factor: float = 1.0
     """Values in the field's declared unit that one of `unit` makes: for conditions in the run."""
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether it is about the times of records."""
+        times = (self.from_s, self.to_s, self.meanwhile, self.within_s, self.after or None)
+        is_of_times = self.statistic in ("first_time", "settled")
+        return is_of_times or any(each is not None for each in times)
 
     def is_judged_in(self, *, is_lockstep: bool) -> bool:
         """Tell whether runs of a time mode record what it is about."""
@@ -124,5 +132,7 @@ def owner_of(name: str) -> str:
 
 def scaled(bounds: ValueBounds, factor: float) -> ValueBounds:
     """Return the bounds of values in another unit, *factor* of which make one of these."""
-    low, high = (None if each is None else each * factor for each in (bounds.low, bounds.high))
+    low, high = (
+        None if each is None else converted(each, factor) for each in (bounds.low, bounds.high)
+    )
     return replace(bounds, low=low, high=high)

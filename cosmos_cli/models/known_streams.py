@@ -225,7 +225,7 @@ class KnownStreams:
         return not found or any(
             each.is_open
             or any(
-                field.name == TIME
+                (field.name == TIME and field.kind in ("float", "int"))
                 or (field.name == TICK and each.role == "agent")
                 or (field.unit == "s" and field.kind == "float")
                 for field in each.fields

@@ -12,6 +12,7 @@ from annotated_types import Ge
 from cosmos_cli.models.text_forms import NonBlank
 from madns_runtime.conditions.condition import ValueBounds
 from madns_runtime.config import FORBID_EXTRA
+from madns_runtime.units import converted
 
 BOUND_WORDS = ("below", "above", "within", "equals")
 RulePath = tuple[str | int, ...]
@@ -44,14 +45,15 @@ class BoundsRule:
     def bounds(self, factor: float = 1.0) -> ValueBounds:
         """Return the bounds of values in a unit, of which *factor* make one of the rule's."""
         if self.below is not None:
-            return ValueBounds.below(self.below * factor)
+            return ValueBounds.below(converted(self.below, factor))
         if self.above is not None:
-            return ValueBounds.above(self.above * factor)
+            return ValueBounds.above(converted(self.above, factor))
         if self.within is not None:
-            return ValueBounds.within(self.within[0] * factor, self.within[1] * factor)
+            return ValueBounds.within(*(converted(each, factor) for each in self.within))
         if isinstance(self.equals, str):
             return ValueBounds.equals(self.equals)
-        return ValueBounds.equals(float(self.equals or 0.0) * factor, self.tolerance * factor)
+        value = converted(float(self.equals or 0.0), factor)
+        return ValueBounds.equals(value, converted(self.tolerance, factor))
 
     def words(self, unit: str = "") -> str:
         """Return the rule in words, such as `below 0.5 m`."""

@@ -309,6 +309,25 @@ def _whole_number(digits: str, base: int, has_64_bits: bool) -> int:
     return number
 
 
+def yaml_text(value: Any) -> str:
+    """Return plain values as YAML that means the same here: PyYAML's own takes 1e5 for a text and leaves it unquoted."""
+    text: str = yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+    return text
+
+
+class _Dumper(yaml.SafeDumper):
+    def represent_text(self, text: str) -> Any:
+        """Return the node of a text, in quotes where it would be something else without them."""
+        try:
+            is_text = isinstance(resolve_scalar(text), str)
+        except ValueError:
+            is_text = False
+        return self.represent_scalar(f"{_TAG}str", text, style=None if is_text else "'")
+
+
+_Dumper.add_representer(str, _Dumper.represent_text)
+
+
 def _syntax_fault(source: YamlSource, error: yaml.MarkedYAMLError) -> Fault:
     """Say in plain words what the parser's terms mean."""
     context, problem = error.context or "", error.problem or "not understood"

@@ -22,6 +22,8 @@ from madns_runtime.plain_values import mapping_at
 from madns_runtime.recording.reader import read_stream
 
 FAULTS_SHOWN_MAX: Final = 10
+TICK_FIELDS: Final = 4
+"""Of a record of ticks: tick, lateness, margin, missed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,12 +160,14 @@ def _read_agent(folder: Path, config: RunConfig) -> RecordedAgent:
         )
     try:
         stream = read_stream(ticks)
-        rows = [row for row in stream.records() if len(row) >= 4]
+        rows = [row for row in stream.records() if len(row) >= TICK_FIELDS]
         phase_s = _phase_of(folder)
     except (MadnsError, OSError, ValueError, TypeError) as error:
         raise InputError(f"{name}: its ticks cannot be read: {error}") from error
     if not rows:
         raise InputError(f"{name}: {ticks}: expected its ticks, found none")
+    if not all(map(_is_tick, rows)):
+        raise InputError(f"{name}: {ticks}: expected whole numbers in every record")
     last_s = rows[-1][0] / config.agents.tick_hz
     return RecordedAgent(
         ticks=ticks,
@@ -173,6 +177,10 @@ def _read_agent(folder: Path, config: RunConfig) -> RecordedAgent:
         missed=sum(row[3] for row in rows),
         under_way=tuple(_under_way(rows, config.agents.tick_hz, phase_s)),
     )
+
+
+def _is_tick(row: object) -> bool:
+    return isinstance(row, list) and all(type(value) is int for value in row[:TICK_FIELDS])
 
 
 def _under_way(
@@ -186,8 +194,8 @@ def _under_way(
 def _phase_of(folder: Path) -> float:
     """Return by how much an agent's ticks were due behind their nominal times, s."""
     for event in read_stream(folder / "events.jsonl").records():
-        if event.get("event") == "phase":
-            return float(event["phase_s"])
+        if isinstance(event, Mapping) and event.get("event") == "phase":
+            return float(event.get("phase_s", 0.0))
     return 0.0
 
 

@@ -10,13 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-import yaml
-
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.device_kinds import DeviceQuestion, KindAnswer, ask_kinds
 from cosmos_cli.models.loading import ScenarioFile, check_scenario
 from cosmos_cli.models.scenario import Scenario
 from cosmos_cli.models.separate_process import SeparateDefect, SeparateFailure, work_separately
+from cosmos_cli.models.yaml_source import yaml_text
 from cosmos_cli.rerun.carried_over import ATTEMPTS_MAX, CarriedOver, carried_over
 from cosmos_cli.rerun.early_ends import early_ends
 from cosmos_cli.rerun.recorded_run import FlownRun, UsedDevice
@@ -90,7 +89,7 @@ def _checked(recorded: FlownRun, values: Mapping[str, Any], carried: CarriedOver
     path = recorded.folder / f"{recorded.run.name}-rerun.yaml"
     for _ in range(ATTEMPTS_MAX):
         whole = {**values, **carried.values()}
-        text = yaml.safe_dump(whole, sort_keys=False, allow_unicode=True)
+        text = yaml_text(whole)
         try:
             return check_scenario(head + text, path)
         except InputError as refused:

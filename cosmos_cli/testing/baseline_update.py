@@ -32,7 +32,11 @@ def update_baseline(baseline: Baseline, compared: Sequence[ComparedFigure]) -> i
     ]
     if missing:
         raise InputError(faults=missing)
-    changed = {figure.name: figure.got for figure in compared if not figure.passed}
+    changed = {
+        figure.name: _written(figure, baseline.figures[figure.name].relative)
+        for figure in compared
+        if not figure.passed
+    }
     if not changed:
         return 0
     text = edited(baseline.document, changed)
@@ -89,10 +93,20 @@ def _unwritable(baseline: Baseline, changed: Mapping[str, FigureValue]) -> Itera
         yield baseline.fault(name, f"no value can be put into what stands here: {text}")
 
 
+def _written(figure: ComparedFigure, relative: float) -> FigureValue:
+    """Return what is written of a value: in few digits where that is within its tolerance of what came, else in all."""
+    got = figure.got
+    if not isinstance(got, float):
+        return got
+    short = float(f"{got:.10g}")
+    return short if abs(short - got) <= max(figure.allowed, relative * abs(short)) else got
+
+
 def _scalar(value: FigureValue) -> str:
     if not isinstance(value, float):
         return json.dumps(value)
-    mantissa, mark, power = f"{value:.10g}".partition("e")
+    text = f"{value:.10g}"
+    mantissa, mark, power = (text if float(text) == value else repr(value)).partition("e")
     # Readers of YAML 1.1 take 1e-07 for a text.
     return f"{mantissa}{'' if '.' in mantissa or not mark else '.0'}{mark}{power}"
 

@@ -55,11 +55,18 @@ def find_scenarios(paths: Sequence[Path]) -> FoundScenarios:
         raise InputError(f"{told}: no such file or folder; name scenarios or folders of them")
     seen: set[Path] = set()
     for path in paths or (next(each for each in DEFAULT_FOLDERS if each.is_dir()),):
-        for file, is_named in [(path, True)] if os.path.isfile(path) else _files_below(path):
+        for file, is_named in [(path, True)] if os.path.isfile(path) else _all_below(path):
             if real_path(file) not in seen:
                 seen.add(real_path(file))
                 _add(found, file, is_named=is_named)
     return found
+
+
+def _all_below(folder: Path) -> list[tuple[Path, bool]]:
+    try:
+        return _files_below(folder)
+    except RecursionError:
+        raise InputError(f"{folder}: folders nest too deeply there; name folders of it") from None
 
 
 def _files_below(folder: Path) -> list[tuple[Path, bool]]:

@@ -102,7 +102,10 @@ def with_figures(
         figures: The baseline's, with what came.
         why_not_written: Why the baseline could not be written, which was to be; empty if it was, or was not to be.
     """
-    told = [each.reason() for each in figures if not each.passed]
+    # That one is to be written is no news where it could not be.
+    is_new = bool(why_not_written)
+    failed = [each for each in figures if not each.passed]
+    told = [e.reason() for e in failed if not (is_new and e.expected is None and e.got is not None)]
     reasons = [f"baseline: {text}" for text in (*told, why_not_written) if text]
     return replace(
         outcome,

@@ -29,7 +29,8 @@ def parse_seeds(text: str) -> tuple[int, ...]:
             raise InputError(f"--seeds: expected a range that goes up, got {part.strip()}")
         if last > SEED_MAX:
             raise InputError(f"--seeds: expected seeds of at most {SEED_MAX}, got {last}")
-        if last - first >= SEEDS_MAX - len(found):
+        is_short = last - first < SEEDS_MAX
+        found |= dict.fromkeys(range(first, last + 1) if is_short else ())
+        if not is_short or len(found) > SEEDS_MAX:
             raise InputError(f"--seeds: expected at most {SEEDS_MAX} seeds")
-        found |= dict.fromkeys(range(first, last + 1))
     return tuple(found)

@@ -165,7 +165,7 @@ class _Suite:
         if not (updates and self.options.updates_baselines):
             return compared, ""
         if any(each.got is None for each in compared):
-            return compared, ""
+            return compared, "nothing is written while a figure has no value"
         try:
             self.result.written[baseline.path] = update_baseline(baseline, compared)
         except InputError as error:

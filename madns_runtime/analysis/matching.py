@@ -15,9 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from madns_runtime.analysis.values import Floats
+from madns_runtime.recording.columns import joined_column
 
 Indices = NDArray[np.int64]
 Columns = dict[str, NDArray[Any]]
+FINEST = 1e-3
+"""Share of the tolerance that keys have to be told apart by, however far some of them are away."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -159,12 +162,25 @@ def _on_one_line(
     code = np.zeros(len(keys), dtype=np.int64)
     if len(who) and (who != who[0]).any():
         code = np.unique(who.astype(str), return_inverse=True)[1].astype(np.int64)
-    low = float(keys.min())
-    span = float(keys.max()) - low + 4.0 * tolerance + 1.0
     repeated = np.concatenate((_repetition(a[0], code[:count]), _repetition(b[0], code[count:])))
     code = code * (int(repeated.max(initial=0)) + 1) + repeated
-    line = keys - low + code * span
+    low, apart = float(keys.min()), 4.0 * tolerance + 1.0
+    length = (float(keys.max()) - low + apart) * (float(code.max()) + 1.0)
+    if np.isfinite(length) and np.spacing(length) <= FINEST * tolerance:
+        keys = keys - low
+    else:
+        keys = _drawn_together(keys, apart)
+    line = keys + code * (float(keys.max()) + apart)
     return line[:count], line[count:]
+
+
+def _drawn_together(keys: Floats, gap_max: float) -> Floats:
+    """Return keys with the same distances up to *gap_max* from one to the next, and no larger ones."""
+    different, place = np.unique(keys, return_inverse=True)
+    with np.errstate(over="ignore"):  # as far apart as numbers go
+        gaps = np.minimum(np.diff(different), gap_max)
+    together: Floats = np.concatenate(([0.0], np.cumsum(gaps)))[place]
+    return together
 
 
 def _repetition(keys: Floats, code: Indices) -> Indices:
@@ -192,7 +208,7 @@ def _join(parts: Sequence[Rows]) -> Rows:
     return Rows(
         keys=np.concatenate([part.keys for part in parts]),
         who=np.concatenate([part.who for part in parts]),
-        columns={name: np.concatenate([p.columns[name] for p in parts]) for name in names},
+        columns={name: joined_column([p.columns[name] for p in parts]) for name in names},
     )
 
 

@@ -194,7 +194,8 @@ class BinnedRms:
         t_s, values = _told(t_s, values)
         bins = np.clip(np.searchsorted(self._edges_s, t_s, "right") - 1, 0, self._bins - 1)
         self._counts += np.bincount(bins, minlength=self._bins)
-        self._squares += np.bincount(bins, weights=values * values, minlength=self._bins)
+        with np.errstate(over="ignore"):  # what diverged has no mean square
+            self._squares += np.bincount(bins, weights=values * values, minlength=self._bins)
         np.maximum.at(self._largest, bins, np.abs(values))
 
     def rows(self) -> list[Stretch]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from decimal import Decimal
 
 TIME = "t_s"
 TICK = "tick"
@@ -49,10 +50,10 @@ class ValueBounds:
 
     @classmethod
     def equals(cls, value: float | str, tolerance: float = 0.0) -> ValueBounds:
-        """Return the bounds of one text, or of numbers that differ from *value* by at most *tolerance*."""
+        """Return the bounds of one text, or of numbers that differ from *value* by at most *tolerance*, as they are written."""
         if isinstance(value, str):
             return cls(text=value)
-        return cls(low=value - tolerance, high=value + tolerance)
+        return cls(low=_sum(value, -tolerance), high=_sum(value, tolerance))
 
     def overlap(self, first: float, last: float) -> bool:
         """Tell whether some number from *first* to *last*, these included, lies within."""
@@ -87,6 +88,13 @@ class ValueBounds:
             and (self.high is None or number < self.high)
         )
         return is_within is not self.is_negated
+
+
+def _sum(first: float, second: float) -> float:
+    """Return a sum of decimal numbers: 0.8 - 0.1 is 0.7, which is less than it in binary numbers."""
+    if not second or not math.isfinite(first + second):
+        return float(first + second)
+    return float(Decimal(repr(float(first))) + Decimal(repr(float(second))))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

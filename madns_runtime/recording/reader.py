@@ -11,15 +11,14 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import NoneType
 from typing import Any, BinaryIO
 
 import numpy as np
 import orjson
-from numpy.typing import NDArray
 
 from madns_runtime.bounded_files import open_regular_file
 from madns_runtime.errors import MachineError
+from madns_runtime.recording.columns import Columns, column_of, joined_column
 from madns_runtime.recording.stream_rules import CONTROL_KEYS
 
 BLOCK_BYTES = 1 << 17
@@ -29,8 +28,6 @@ LINE_BYTES_MAX = 64 << 20
 END_COUNTS = ("records", "dropped", "not_finite")
 _COMMA = ord(",")
 _NEWLINE = ord("\n")
-
-Columns = dict[str, NDArray[Any]]
 
 
 @dataclass(slots=True, kw_only=True)
@@ -123,7 +120,7 @@ class StreamReading:
             else:
                 rows = decoder.decode(block, is_last=is_last)
                 raw = _transpose(rows, tuple(kinds), is_array=self.is_array)
-            yield {name: _column(values, kinds[name]) for name, values in raw.items()}
+            yield {name: column_of(values, kinds[name]) for name, values in raw.items()}
         self._state = decoder.state
 
     def _blocks(self) -> Iterator[tuple[bytes, bool]]:
@@ -153,9 +150,8 @@ def read_columns(path: Path) -> Columns:
     """
     Return a stream by columns: field name -> array, shape (records,).
 
-    Floats are float64 with null as NaN; ints int64, or float64 where some are null or broken; bools bool;
-    all else, and a field that a record lacks, is object. Lines that are cut or damaged are skipped;
-    `read_stream(path).state` counts them.
+    Kinds are those of `column_of`; a field that a record lacks is None. Lines that are cut or damaged are
+    skipped; `read_stream(path).state` counts them.
 
     Raises:
         MachineError: The file cannot be opened.
@@ -163,7 +159,7 @@ def read_columns(path: Path) -> Columns:
     reading = StreamReading(path)
     chunks = list(reading.column_chunks())
     return {
-        name: np.concatenate([chunk[name] for chunk in chunks]) if chunks else _column([], kind)
+        name: joined_column([chunk[name] for chunk in chunks]) if chunks else column_of([], kind)
         for name, kind in reading.kinds.items()
     }
 
@@ -313,36 +309,3 @@ def _transpose(rows: list[Any], names: tuple[str, ...], *, is_array: bool) -> di
         columns = zip(*rows, strict=True) if rows else ((),) * len(names)
         return {name: list(column) for name, column in zip(names, columns, strict=True)}
     return {name: [row.get(name) for row in rows] for name in names}
-
-
-_NUMBERS = frozenset({float, int, bool, NoneType})
-
-
-def _column(values: list[Any], kind: str) -> NDArray[Any]:
-    try:
-        if kind in ("float", "int"):
-            return _number_column(values, np.float64 if kind == "float" else np.int64)
-        if kind == "bool" and all(type(value) is bool for value in values):
-            return np.array(values, dtype=np.bool_)
-    except (TypeError, ValueError, OverflowError):
-        pass  # Not what the schema says: kept as it is.
-    column = np.empty(len(values), dtype=object)
-    column[:] = values
-    return column
-
-
-def _number_column(values: list[Any], wanted: type[np.float64 | np.int64]) -> NDArray[Any]:
-    """
-    Return numbers as an array, whole ones as floats where there are others among them, or none in a place.
-
-    Raises:
-        ValueError: A value is no number: NumPy would take a text for its number, and a list for a row.
-    """
-    if not values:
-        return np.empty(0, dtype=wanted)
-    column = np.array(values)
-    if column.ndim == 1 and column.dtype.kind in ("ib" if wanted is np.int64 else "fib"):
-        return column.astype(wanted, copy=False)
-    if not _NUMBERS.issuperset(map(type, values)):
-        raise ValueError("a value is no number")
-    return np.array(values, dtype=np.float64)

@@ -33,6 +33,8 @@ def condition(**values):
         (ValueBounds.above(2.0), (2.1, np.int64(3)), (2.0, 1, False)),
         (ValueBounds.within(-1.0, 1.0), (-1.0, 0, 1.0), (-1.1, 1.1)),
         (ValueBounds.equals(3.0, 0.5), (2.5, 3, 3.5), (2.4, 3.6)),
+        (ValueBounds.equals(0.8, 0.1), (0.7, 0.9), (0.6999999, 0.9000001)),
+        (ValueBounds.equals(1.1, 0.1), (1.0, 1.2), (0.9999999, 1.2000001)),
         (ValueBounds.equals("lost"), ("lost",), ("found", 3)),
         (ValueBounds.within(-1.0, 1.0).negated(), (-1.1, 2), (0.5, 1.0)),
         (ValueBounds.equals("lost").negated(), ("found",), ("lost", 3)),

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from madns_runtime.units import conversion
+from madns_runtime.units import conversion, converted
 
 
 @pytest.mark.parametrize(
@@ -26,6 +26,25 @@ def test_a_value_at_a_limit_is_the_limit_in_another_unit_too(value, unit, wanted
 
     assert factor is not None
     assert value * factor == expected
+    assert converted(value, factor) == expected
+
+
+@pytest.mark.parametrize(
+    ("unit", "wanted", "per_one"), [("ms", "us", 1000), ("s", "ms", 1000), ("km/h", "m/h", 1000)]
+)
+def test_every_number_of_three_places_is_a_whole_one_of_the_unit_a_thousand_times_smaller(
+    unit, wanted, per_one
+):
+    there, back = conversion(unit, wanted), conversion(wanted, unit)
+
+    assert [n for n in range(5000) if converted(n / per_one, there) != n] == []
+    assert [n for n in range(5000) if converted(n, back) != n / per_one] == []
+
+
+def test_what_no_decimal_number_is_stays_the_product():
+    assert converted(45.0, conversion("deg", "rad")) == math.radians(45.0)
+    assert converted(math.inf, 1000.0) == math.inf
+    assert converted(1.7e308, 1000.0) == math.inf
 
 
 @pytest.mark.parametrize(

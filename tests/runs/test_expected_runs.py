@@ -178,6 +178,31 @@ def test_a_run_whose_manifest_is_gone_is_not_judged(run):
     assert "manifest.json: missing; make it anew with: cosmos collect" in refused.stderr
 
 
+def test_a_run_whose_plan_is_not_what_it_was_is_not_judged_by_it(run):
+    """A limit that was changed, or a check that cannot be read any more, would pass for what the run had."""
+    _, document = run("lockstep", LASTING, LASTING.replace("more", "again"))
+    path = run.cosmos.directory(document) / "plan.json"
+    whole = path.read_bytes()
+    plan = json.loads(whole)
+    plan["expectations"][1]["bounds"]["low"] = -1.0
+    path.write_text(json.dumps(plan))
+    changed = run.cosmos("judge", document["run"])
+    plan["expectations"][1]["bounds"] = "above 1"
+    path.write_text(json.dumps(plan))
+    unread = run.cosmos("judge", document["run"])
+    collected = run.cosmos("collect", document["run"])
+    noted = run.cosmos("judge", document["run"])
+    path.write_bytes(whole)
+    run.cosmos("collect", document["run"])
+    back = run.cosmos("judge", document["run"])
+
+    assert (changed.returncode, unread.returncode, noted.returncode) == (2, 2, 2)
+    assert "plan.json: changed since the run was collected" in changed.stderr
+    assert "plan.json: cannot be used: expectations[1].bounds: expected" in unread.stderr
+    assert (collected.returncode, "plan.json: changed since" in collected.stdout) == (5, True)
+    assert (back.returncode, "PASSED: 2 checks hold" in back.stdout) == (0, True)
+
+
 def test_a_run_without_checks_is_judged_by_none(run):
     _, document = run("lockstep")
 

@@ -241,8 +241,10 @@ class FirstTime(Accumulator):
 
     def _take(self, t_s: Floats, values: NDArray[Any], places: Places) -> None:
         held = np.flatnonzero(holds(self._when, values))
-        if len(held) and self._first_s is None:
-            at = held[np.argmin(t_s[held])]
+        if not len(held):
+            return
+        at = held[np.argmin(t_s[held])]
+        if self._first_s is None or t_s[at] < self._first_s:
             self._first_s, self.place = float(t_s[at]), int(places[at])
 
     def _found_now(self) -> Found:

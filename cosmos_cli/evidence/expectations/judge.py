@@ -35,7 +35,7 @@ from cosmos_cli.models.expectation import Expectation, scaled
 from cosmos_cli.models.known_streams import REAL_TIME_ONLY
 from madns_runtime.analysis.tables import Tables
 from madns_runtime.conditions.condition import HOST, ValueBounds
-from madns_runtime.units import conversion
+from madns_runtime.units import conversion, converted
 
 RATE_UNIT = "1/s"
 _Earlier = tuple[str, Mapping[str, ExpectationOutcome]]
@@ -155,7 +155,9 @@ class _Followed:
         self._has_stream = bool(source.tables_of(expectation.stream))
         recorded = source.unit_of(expectation.stream, expectation.field)
         factor = conversion(expectation.unit, recorded) if expectation.unit else 1.0
-        self._fault = None if factor is not None else f"{expectation.field} is in {recorded or '1'}"
+        self._fault = _fault_of(expectation, source)
+        if factor is None:
+            self._fault = f"{expectation.field} is in {recorded or '1'}"
         self._factor = factor or 1.0
         self.unit = self._unit(recorded)
         self._accumulators: dict[str, Accumulator] = {}
@@ -278,9 +280,28 @@ class _Followed:
         bounds = self._bounds()
         passed = got == 0.0 if bounds.text is not None else bounds.holds(got)
         is_value = expectation.statistic not in (*OF_NUMBERS, *OF_TIMES)
-        shown = got / self._factor if is_value and bounds.text is None else got
+        shown = converted(got, 1.0 / self._factor) if is_value and bounds.text is None else got
         place = accumulator.place if isinstance(accumulator, FirstTime) else None
         return ExpectationOutcome(got=shown, t_s=t_s, passed=passed, place=place)
+
+
+def _fault_of(expectation: Expectation, source: RecordSource) -> str | None:
+    """
+    Return why the records of a run cannot be judged; None if they can.
+
+    Of a simulation that declares its streams, all this is refused before a run. Of another, no record would count,
+    and what must not be would hold.
+    """
+    stream, field_ = expectation.stream, expectation.field
+    roles = {table.role for table in source.tables_of(stream)}
+    is_of_agents = not expectation.is_of_host and HOST not in expectation.agents
+    if roles == {HOST} and is_of_agents:
+        return f"stream {stream} is recorded by the host's half alone"
+    if roles and field_ and not source.may_have(stream, field_):
+        return f"stream {stream} has no field {field_}"
+    if roles and expectation.is_timed and not source.has_time(stream):
+        return f"records of stream {stream} tell no time"
+    return None
 
 
 def _text_of(expectation: Expectation) -> bool:

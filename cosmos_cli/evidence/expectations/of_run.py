@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.expectations.judge import JudgedExpectations, judge_expectations
@@ -17,8 +17,11 @@ from cosmos_cli.models.expectation import Expectation
 from cosmos_cli.models.known_streams import KnownDevice, KnownStreams
 from cosmos_cli.models.loading import ScenarioFile
 from madns_runtime.analysis.tables import RecordedTable, Tables
+from madns_runtime.conditions.condition import AGENT, HOST
 from madns_runtime.config import from_mapping
 from madns_runtime.errors import ConfigurationError
+from madns_runtime.plugin.api import DeclaredStream
+from madns_runtime.recording.records import FRAMEWORK_STREAMS
 
 
 def planned_expectations(plan: Mapping[str, Any] | None) -> tuple[Expectation, ...]:
@@ -74,6 +77,17 @@ def recorded_devices(tables: Tables) -> tuple[KnownDevice, ...]:
     )
 
 
+def recorded_streams(tables: Tables) -> tuple[DeclaredStream, ...]:
+    """Return the streams of a simulation that declares none, by what it recorded."""
+    found = []
+    for table in tables.values():
+        name = table.name.removeprefix(f"{HOST}_") if table.role == HOST else table.name
+        if table.role in (HOST, AGENT) and name not in FRAMEWORK_STREAMS:
+            role: Literal["host", "agent"] = "host" if table.role == HOST else "agent"
+            found.append(DeclaredStream(role=role, name=name, fields=table.fields))
+    return tuple(found)
+
+
 def expectations_for(
     run: RunDirectory, scenario: ScenarioFile, tables: Tables
 ) -> tuple[Expectation, ...]:
@@ -94,12 +108,11 @@ def expectations_for(
     if not scenario.scenario.checks:
         raise InputError(f"{scenario.path}: has no checks: nothing can be judged by it")
     declared = declared_streams(run.read_json(run.plan_json))
+    streams = recorded_streams(tables) if declared is None else tuple(declared.values())
     around = Surroundings(
         agents=config.agents.resolved_names(),
         labels=run_labels(run),
-        streams=KnownStreams(
-            None if declared is None else tuple(declared.values()), recorded_devices(tables)
-        ),
+        streams=KnownStreams(streams, recorded_devices(tables)),
         duration_s=config.time.duration_s,
     )
     resolved = resolve_checks(scenario.scenario.checks, around)

@@ -11,6 +11,7 @@ import orjson
 from numpy.typing import NDArray
 
 from cosmos_cli.evidence.expectations.accumulators import Floats, Places
+from cosmos_cli.evidence.streams import NUMBER_KINDS
 from madns_runtime.analysis.tables import RecordedTable, Tables
 from madns_runtime.conditions.condition import AGENT, HOST, TIME
 from madns_runtime.recording.records import HEALTH, Field
@@ -99,6 +100,10 @@ class RecordSource:
         fields = (each for table in self.tables_of(stream) for each in table.fields)
         return next((each.unit for each in fields if each.name == field), "")
 
+    def may_have(self, stream: str, field: str) -> bool:
+        """Tell whether records of a stream have a field, or may: an event carries more than its stream's fields."""
+        return any(table.has(field) or table.has(DETAILS) for table in self.tables_of(stream))
+
     def has_time(self, stream: str) -> bool:
         """Tell whether records of a stream tell when they are of."""
         tables = self.tables_of(stream)
@@ -156,7 +161,7 @@ def _split(whole: Batch) -> Iterator[Batch]:
 
 def _time_field(stream: str, fields: Sequence[Field]) -> str | None:
     """Return the field that tells a record's simulated time: t_s, or else the first one in seconds; None of health."""
-    if any(each.name == TIME for each in fields):
+    if any(each.name == TIME and each.kind in NUMBER_KINDS for each in fields):
         return TIME
     if stream == HEALTH.name:
         return None
@@ -188,7 +193,7 @@ def _times(
 
 
 def _floats(values: NDArray[Any]) -> Floats:
-    return np.array([np.nan if each is None else float(each) for each in values.tolist()])
+    return np.array([float(v) if isinstance(v, int | float) else np.nan for v in values.tolist()])
 
 
 def _with_details(
@@ -197,10 +202,19 @@ def _with_details(
     """Return columns with those of *fields* that events carry beside their stream's own."""
     if not fields:
         return columns
-    details = [orjson.loads(text) if text else {} for text in columns[DETAILS].tolist()]
+    details = [_mapping(text) for text in columns[DETAILS].tolist()]
     found = dict(columns)
     for name in fields:
         column = np.empty(len(details), dtype=object)
         column[:] = [each.get(name) for each in details]
         found[name] = column
     return found
+
+
+def _mapping(text: Any) -> Mapping[str, Any]:
+    """Return what an event carries beside its fields; nothing of a field of that name that holds something else."""
+    try:
+        found = orjson.loads(text or "{}")
+    except orjson.JSONDecodeError:
+        return {}
+    return found if isinstance(found, dict) else {}

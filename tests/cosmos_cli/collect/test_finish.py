@@ -589,6 +589,28 @@ def test_manifest_that_cannot_be_read_is_named(tmp_path, text, told):
     assert line.endswith("; what has changed since it was written is not known")
 
 
+@pytest.mark.parametrize(
+    ("listed", "told"),
+    [
+        ({"a": 1}, "expected a list of checks under expectations"),
+        ([3], "expectations[0]: expected"),
+        ([{"name": "a", "words": "a", "stream": "b", "agents": [], "newer": 1}], "newer"),
+    ],
+)
+def test_a_check_of_the_plan_that_cannot_be_read_is_missing_and_not_left_out(
+    tmp_path, listed, told
+):
+    made = SyntheticRun(tmp_path).write()
+    plan = read(made.run.plan_json) | {"expectations": listed}
+    made.run.plan_json.write_bytes(orjson.dumps(plan))
+
+    summary = finish(made)
+
+    assert summary.exit_code == 5
+    (line,) = summary.missing
+    assert line.startswith("plan.json: cannot be used: ") and told in line
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["plan.json", "scenario.yaml"])
 def test_input_that_was_deleted_is_named_and_limits_stay(tmp_path, name):

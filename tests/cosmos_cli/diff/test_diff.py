@@ -1,4 +1,5 @@
 import json
+import os
 import shutil
 
 import pytest
@@ -100,6 +101,32 @@ def test_lines_tell_the_same_as_tables(make, capsys):
     _, of_lines = diff(capsys, "1", "2")
 
     assert of_lines == of_tables
+
+
+def record_epochs(made, *, later_ns=0):
+    """Record nanoseconds of an epoch, some null: as floats, some hundred of them would be one."""
+    schema = StreamSchema("epochs", (Field("tick", "", "int"), Field("utc_ns", "ns", "int")))
+    recorder = made.recorder("agents/agent-01", "agent-01", schema)
+    for tick in range(100):
+        utc_ns = None if tick % 3 == 0 and tick > 50 else 1_700_000_000_000_000_000 + tick
+        recorder.record("epochs", (tick, utc_ns + later_ns if tick == 77 else utc_ns))
+    recorder.close()
+
+
+@pytest.mark.parametrize("is_of_lines", [False, True])
+def test_whole_numbers_that_no_float_tells_apart_differ_where_others_are_null(
+    make, capsys, is_of_lines
+):
+    a, b = make(record_epochs), make(lambda made: record_epochs(made, later_ns=3))
+    for made in (a, b) if is_of_lines else ():
+        shutil.rmtree(made.run.tables)
+
+    code, document = diff(capsys, "1", "2", "--streams", "epochs", "--expect-same")
+
+    utc_ns = streams_of(document)["epochs"]["fields"]["utc_ns"]
+    assert (code, document["same"]) == (1, False)
+    assert (utc_ns["different"], utc_ns["max"], utc_ns["first"]["key"]) == (1, 3.0, 77.0)
+    assert utc_ns["values"] == [1_700_000_000_000_000_077, 1_700_000_000_000_000_080]
 
 
 def test_a_table_older_than_its_lines_is_not_believed(make, capsys):
@@ -225,6 +252,43 @@ def test_data_that_went_after_the_collection_are_named_and_never_the_same(
     assert words in line
 
 
+def flip_digit(path):
+    """Change a digit of the last record as a disk does: neither length nor time tell."""
+    before = path.stat()
+    data = path.read_bytes()
+    at = data.rindex(b"]\n") - 1
+    path.write_bytes(data[:at] + (b"1" if data[at : at + 1] != b"1" else b"2") + data[at + 1 :])
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+def test_a_digit_that_changed_on_the_disk_is_named_and_never_the_same(make, capsys):
+    make()
+    flip_digit(make().stream("agent-03", "state"))
+
+    code, document = diff(capsys, "1", "2", "--expect-same")
+
+    assert (code, document["same"]) == (1, False)
+    assert document["missing"] == [
+        "0002-synthetic: agents/agent-03/state.jsonl: changed since the run was collected"
+    ]
+
+
+def test_tables_of_another_run_are_not_read_for_its_own(make, capsys):
+    first, second = make(), make(change_record)
+    shutil.rmtree(second.run.tables)
+    shutil.copytree(first.run.tables, second.run.tables, copy_function=shutil.copyfile)
+
+    code, document = diff(capsys, "1", "2", "--expect-same")
+
+    assert code == 1
+    assert streams_of(document)["state"]["fields"]["y_m"]["different"] == 1
+
+    for path in second.run.path.glob("agents/*/state.jsonl"):
+        path.unlink()
+    assert app.run(["diff", "1", "2"]) == 2
+    assert "state.parquet: not as it was collected, and the lines" in capsys.readouterr().err
+
+
 def test_what_the_framework_recorded_is_compared_when_it_is_named(make, capsys):
     make(), make(lambda made: change_record(made, stream="ticks", field=1))
 
@@ -294,6 +358,30 @@ def test_terminal_tells_where_and_how_much(make, capsys):
     assert "agent-02 tick 123 (12.3 s)" in out
     assert out.endswith("DIFFERENT: records differ in state\n")
     assert "comparing agent-02/state" in err
+
+
+def record_ranks(made, *, others=0):
+    """Record of the host without a time; *others* are of another agent, before those of each."""
+    fields = (Field("agent", "", "str"), Field("rank", "", "int"))
+    recorder = made.recorder("host", "host", StreamSchema("ranks", fields))
+    for number in range(20):
+        for _ in range(others):
+            recorder.record("ranks", ("agent-03", number))
+        recorder.record("ranks", ("agent-01", number))
+    recorder.close()
+
+
+def test_records_without_a_time_are_matched_among_those_of_the_agents_that_are_chosen(make, capsys):
+    make(record_ranks), make(lambda made: record_ranks(made, others=2))
+
+    code, document = diff(
+        capsys, "1", "2", "--streams", "ranks", "--agents", "agent-01", "--expect-same"
+    )
+
+    assert code == 0
+    ranks = streams_of(document)["host_ranks"]
+    assert (ranks["matched"], ranks["only_b"]["count"]) == (20, 0)
+    assert diff(capsys, "1", "2", "--streams", "ranks", "--expect-same")[0] == 1
 
 
 def test_run_that_is_not_collected_is_bad_input_with_advice(make, tmp_path, capsys):

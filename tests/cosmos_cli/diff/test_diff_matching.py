@@ -56,6 +56,21 @@ def test_several_records_of_one_tick_are_paired_in_their_order():
     assert [i.tolist() for i in pair_up(rows([7, 7, 7]), rows([7, 7]), 0.25)] == [[0, 1], [0, 1]]
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("far", [1e18, 1e300, 1.7e308, -1.7e308])
+@pytest.mark.parametrize("count", [1, 4])
+def test_one_key_that_is_far_away_costs_no_other_its_partner(far, count):
+    """A time that diverged, or that stands for never, leaves the others no room on one line."""
+    keys = [*np.linspace(0.0, 9.0, 91), far]
+    who = ["abcd"[place % count] for place in range(len(keys))]
+
+    same = [index.tolist() for index in pair_up(rows(keys, who), rows(keys, who), 0.05)]
+    others = pair_up(rows([0.0, far, 0.0, far], [*"aabb"]), rows([5.0, 50.0], [*"ab"]), 0.05)
+
+    assert same == [list(range(len(keys)))] * 2
+    assert [index.tolist() for index in others] == [[], []]
+
+
 def test_key_that_is_no_number_has_no_partner():
     found = settled(match([rows([0, np.nan, 2])], [rows([0, np.nan, 2])], tolerance=0.25))
 

@@ -4,8 +4,10 @@ import tarfile
 
 import pytest
 import zstandard
+from harness.nested_folders import nested_folders
 from harness.synthetic_run import SyntheticRun
 
+from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.evidence.manifest import pack_run
 
 MTIME_S = 1_700_000_000
@@ -40,6 +42,27 @@ def test_package_leaves_out_the_reserve_links_and_halves(tmp_path):
     names = members(made.run)
     assert f"{made.run.name}/plan.json" in names
     assert not [n for n in names if "reserve" in n or "link" in n or n.endswith(".part")]
+
+
+def test_files_of_folders_within_folders_are_packaged_however_deep(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    depth = min(1100, (4000 - len(str(made.run.path))) // 2)
+
+    with nested_folders(made.run.path, "a", depth):
+        summary = finish_run(made.run, made.result(), made.expected, has_report=False)
+
+    assert summary.exit_code == 0
+    assert f"{made.run.name}/{'a/' * depth}deep.txt" in members(made.run)
+
+
+def test_a_file_whose_path_is_too_long_is_named(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+
+    with nested_folders(made.run.path, "b" * 250, 17):
+        summary = finish_run(made.run, made.result(), made.expected, has_report=False)
+
+    (line,) = summary.missing
+    assert line.startswith("b" * 250) and line.endswith("not read: File name too long")
 
 
 def test_files_come_back_byte_by_byte(tmp_path):

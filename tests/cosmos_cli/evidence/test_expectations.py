@@ -180,6 +180,93 @@ def test_the_worst_agent_is_told_with_its_time_in_the_unit_of_the_check():
     assert result.agents_broken == 2
 
 
+@pytest.mark.parametrize("rows", [1, 3, 65_536])
+def test_the_first_time_is_the_earliest_in_whatever_order_records_come(monkeypatch, rows):
+    monkeypatch.setattr(records, "BATCH_RECORDS", rows)
+    columns = {"t_s": np.array([9.0, 4.0, 6.0, 2.0, 5.0]), "x_m": np.array([1.0, 1.0, 1, 0, 1])}
+    table = FakeTable("jobs", (Field("t_s", "s"), Field("x_m", "m")), {"a": columns})
+    when, bounds = ValueBounds.above(0.5), ValueBounds.below(5.0)
+    first = expect(stream="jobs", statistic="first_time", when=when, bounds=bounds, agents=("a",))
+
+    (result,) = judge(first, tables={"jobs": table}).results
+
+    assert (result.got, result.passed) == (4.0, True)
+
+
+@pytest.mark.parametrize("told", ["of its own", "[1]", "3", '{"other": 1}', "", None])
+def test_a_field_called_details_that_holds_no_event_has_no_values_beside(told):
+    columns = {"t_s": np.array([1.0, 2.0]), "details": objects([told, '{"x_m": 4}'])}
+    fields = (Field("t_s", "s"), Field("details", "", "str"))
+    table = FakeTable("told", fields, {"a": columns})
+    count = expect(stream="told", statistic="count", bounds=ValueBounds.equals(1), agents=("a",))
+
+    (result,) = judge(count, tables={"told": table}).results
+
+    assert (result.got, result.passed) == (1.0, True)
+
+
+@pytest.mark.parametrize("words", [["noon", "later"], [[1], {}], [None, "1.5"]])
+def test_a_time_that_is_no_number_is_none(words):
+    columns = {"t_s": objects(words), "x_m": np.array([1.0, 3.0])}
+    fields = (Field("t_s", "", "str"), Field("x_m", "m"))
+    table = FakeTable("told", fields, {"a": columns})
+    largest = expect(stream="told", statistic="max", bounds=ValueBounds.below(5.0), agents=("a",))
+
+    (result,) = judge(largest, tables={"told": table}).results
+
+    assert (result.got, result.t_s, result.passed) == (3.0, None, True)
+
+
+NO_TIME = FakeTable(
+    "untimed",
+    (Field("x_m", "m"), Field("s", "", "str")),
+    {"a": {"x_m": np.ones(3), "s": objects(["u"] * 3)}},
+)
+BOO = {"event": "boo", "must": "not_occur"}
+NONE = {"statistic": "count", "bounds": ValueBounds.equals(0)}
+
+
+@pytest.mark.parametrize(
+    ("values", "why"),
+    [
+        ({"stream": "state", "field": "y_m", **NONE}, "stream state has no field y_m"),
+        ({"stream": "state", "field": "evnt", **BOO}, "stream state has no field evnt"),
+        ({"stream": "untimed", "field": "s", "from_s": 2.0, **BOO}, "tell no time"),
+        ({"stream": "untimed", "field": "x_m", "to_s": 2.0, **NONE}, "tell no time"),
+        ({"stream": "slots", "field": "error_deg", **NONE}, "by the host's half alone"),
+    ],
+)
+def test_what_no_record_could_tell_does_not_hold_for_want_of_records(values, why):
+    tables = {**TABLES, "untimed": NO_TIME}
+
+    (result,) = judge(expect(agents=("a",), **values), tables=tables).results
+
+    assert (result.got, result.passed) == (None, False)
+    assert why in result.expected
+
+
+def test_what_events_carry_beside_their_fields_may_be_in_none_of_them():
+    result = result_of(stream="events", field="never", agents=("a",), **NONE)
+
+    assert (result.got, result.passed) == (0.0, True)
+
+
+@pytest.mark.parametrize(("limit_ms", "value_us"), [(1.005, 1005), (4.35, 4350), (2.3, 2300)])
+def test_a_value_at_a_limit_in_another_unit_is_at_it(limit_ms, value_us):
+    columns = {"t_s": np.array([0.0, 1.0]), "x_us": np.array([0, value_us])}
+    table = FakeTable("trips", (Field("t_s", "s"), Field("x_us", "us", "int")), {"a": columns})
+    common = {"stream": "trips", "field": "x_us", "unit": "ms", "agents": ("a",)}
+
+    closed, strict = judge(
+        expect(bounds=ValueBounds.within(0.0, limit_ms), **common),
+        expect(bounds=ValueBounds.below(limit_ms), **common),
+        tables={"trips": table},
+    ).results
+
+    assert (closed.passed, strict.passed) == (True, False)
+    assert (closed.got, strict.got) == (0.0, limit_ms) or closed.got == limit_ms == strict.got
+
+
 def test_a_limit_is_compared_as_strictly_as_it_says():
     top = float(DATA["a"].max())
 

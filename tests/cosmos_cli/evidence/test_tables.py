@@ -107,7 +107,7 @@ def test_values_keep_their_kinds_and_nulls(tmp_path):
     table = pq.read_table(made.run.tables / "mixed.parquet").to_pydict()
     assert table["t_s"] == [0.0, 1.0, 2.5]
     assert table["level"] == [1.0, None, 2.5]
-    assert table["count"][:2] == [1, None]
+    assert table["count"] == [1, None, 2**53 + 1]
     assert table["name"] == ["a", None, "ü"]
     assert table["is_on"] == [True, None, False]
     assert table["extra"] == ['{"k": [1, 2]}', None, "text"]
@@ -121,6 +121,34 @@ def test_large_integers_without_null_are_exact(tmp_path):
     record(made, "agent-01", schema, [(v,) for v in values])
 
     assert gathered_table(made, "big").read("agent-01", ("n",))["n"].tolist() == values
+
+
+def test_large_integers_are_exact_where_others_of_the_field_are_null(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        reader, "BLOCK_BYTES", 512
+    )  # so that some blocks have no null, some nothing else
+    made = SyntheticRun(tmp_path)
+    schema = StreamSchema("big", (Field("n", "", "int"), Field("name", "", "str")))
+    values = [2**60 + n for n in range(60)] + [None] * 60 + [None, -(2**53) - 1, 3, 2**53 + 1] * 9
+    record(made, "agent-01", schema, [(value, "x") for value in values])
+
+    found = gather(made.run, 10.0, quiet)
+
+    assert pq.read_table(made.run.tables / "big.parquet")["n"].to_pylist() == values
+    assert found.faults == ()
+
+
+def test_a_value_that_is_nested_too_deep_is_null_and_reported(tmp_path):
+    made = SyntheticRun(tmp_path)
+    schema = StreamSchema("odd", (Field("extra", "", "json"),))
+    record(made, "agent-01", schema, [([1],), ([2],)])
+    path = made.stream("agent-01", "odd")
+    path.write_bytes(path.read_bytes().replace(b"[[2]]", b"[" * 1000 + b"2" + b"]" * 1000))
+
+    found = gather(made.run, 10.0, quiet)
+
+    assert pq.read_table(made.run.tables / "odd.parquet")["extra"].to_pylist() == ["[1]", None]
+    assert found.faults[0].startswith("tables/odd.parquet: 1 recorded values")
 
 
 def test_value_that_is_not_of_its_kind_is_null_and_reported(tmp_path):

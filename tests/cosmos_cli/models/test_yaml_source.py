@@ -13,6 +13,7 @@ from cosmos_cli.models.yaml_source import (
     compose,
     read_source,
     resolve_scalar,
+    yaml_text,
 )
 
 
@@ -267,3 +268,28 @@ def test_scalar_without_a_value_does_not_stop_the_reading_of_the_rest():
     assert [(f.line, f.column, f.path, f.text) for f in document.faults] == [
         (1, 4, "a", "expected a finite number, got .inf")
     ]
+
+
+WRITTEN = (
+    "1e5", "-4E+1", "0o17", "0x1f", "010", "12:30", "no", "yes", "null", "~", "", ".5", "5.", "+.inf", "1_000",
+    "9" * 30, "a: b", "# a", "two\nlines", " ", "'", "=", "<<", "2026-11-26", "true", "1e400",
+)  # fmt: skip
+
+
+def test_what_is_written_is_read_as_the_same():
+    values = {text: text for text in WRITTEN[:-1] if text not in ("", "<<")}
+    value = {
+        "texts": list(WRITTEN),
+        "keys": values,
+        "numbers": [0, -3, 1e5, 1e-7, 1e300, 0.1, 2**60, 4e6],
+        "others": [True, None, [], {}],
+    }
+
+    assert read_document(YamlSource.of("a.yaml", yaml_text(value))).value == value
+
+
+@given(st.text(st.characters(codec="utf-8", exclude_categories=("Cc", "Cs")), max_size=12))
+def test_any_text_that_is_written_is_read_as_itself(text):
+    value = {"text": text}
+
+    assert read_document(YamlSource.of("a.yaml", yaml_text(value))).value == value

@@ -240,6 +240,22 @@ def test_a_run_that_cannot_be_flown_again_is_refused_in_words(braked, tmp_path, 
     assert len(list((tmp_path / "runs").iterdir())) == 1
 
 
+@pytest.mark.parametrize("value", ["null", '"late"', "1.5"])
+def test_ticks_that_are_no_whole_numbers_are_refused_in_words(braked, tmp_path, value):
+    cosmos, document = braked
+    copy = tmp_path / "runs" / document["run"]
+    shutil.copytree(cosmos.directory(document), copy)
+    path = copy / "agents/agent-02/ticks.jsonl"
+    *lines, last, end = path.read_text().splitlines()
+    path.write_text("\n".join([*lines, f"[{value}{last[last.index(',') :]}", end, ""]))
+
+    done = cosmos("rerun", str(copy), "--runs", tmp_path / "runs")
+
+    assert done.returncode == 2
+    assert "ticks.jsonl: expected whole numbers in every record" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_a_plan_that_names_devices_elsewhere_is_refused(braked, tmp_path):
     cosmos, document = braked
     copy = tmp_path / "runs" / document["run"]

@@ -87,6 +87,42 @@ def test_what_is_no_number_never_passes(got):
     assert not ComparedFigure(name="a", expected=1.0, got=got, allowed=1e9).passed
 
 
+def test_records_are_counted_by_a_field_of_any_kind_that_they_have(baseline, tmp_path):
+    made = SyntheticRun(tmp_path / "runs").write()
+    kinds = {"i": "int", "f": "float", "b": "bool", "s": "str", "j": "json"}
+    schema = StreamSchema("x", tuple(Field(name, "", kind) for name, kind in kinds.items()))
+    recorder = made.recorder("agents/agent-01", "agent-01", schema)
+    recorder.record("x", (2**60, 1.5, True, "a", [1]))
+    recorder.record("x", (None, None, None, None, None))
+    recorder.record("x", (3, 2.5, False, "", {}))
+    recorder.close()
+    gather(made.run, 10.0, lambda *told: None)
+    text = "".join(f"  {name}: {{stream: x, field: {name}, statistic: count}}\n" for name in kinds)
+
+    compared = compare_figures(baseline(f"figures:\n{text}"), made.run, {})
+
+    assert {each.name: each.got for each in compared} == dict.fromkeys(kinds, 2)
+
+
+def test_no_record_of_an_agent_that_there_is_counts_as_0_and_has_no_other_figure(
+    baseline, tmp_path
+):
+    made = SyntheticRun(tmp_path / "runs").write()
+    made.recorder("agents/agent-01", "agent-01", StreamSchema("x", (Field("x_m", "m"),))).close()
+    gather(made.run, 10.0, lambda *told: None)
+    of_x = "stream: x, field: x_m"
+    text = (
+        f"figures:\n  all: {{{of_x}, statistic: count}}\n  other: {{{of_x}, statistic: count, agents: ['*-02']}}\n"
+        f"  nobody: {{{of_x}, statistic: count, agents: [agent-9]}}\n  mean: {{{of_x}, statistic: mean}}\n"
+    )
+
+    compared = {each.name: each for each in compare_figures(baseline(text), made.run, {})}
+
+    assert (compared["all"].got, compared["other"].got) == (0, 0)
+    assert compared["nobody"].reason() == "nobody: nobody of agent-9 recorded x"
+    assert compared["mean"].reason() == "mean: nobody of * recorded x"
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("statistic", ["mean", "rms", "sd"])
 def test_a_statistic_of_values_that_diverged_never_passes_and_is_no_number(
@@ -139,6 +175,40 @@ def test_values_within_their_tolerance_are_left(baseline):
 
     assert update_baseline(found, [close]) == 0
     assert "expected: 1.0" in found.path.read_text()
+
+
+@pytest.mark.parametrize("got", [6878137.123456789, 1 / 3, 1e-7 / 3, float(2**60 + 1024), 12.5])
+@pytest.mark.parametrize("tolerance", ["", ", tolerance: 1e-17", ", relative: 1e-15"])
+def test_what_was_written_holds_for_the_same_value_however_small_the_tolerance(
+    baseline, run, got, tolerance
+):
+    found = baseline(f"figures: {{a: {{path: x{tolerance}}}}}")
+    compared = compare_figures(found, run, {"x": got})
+
+    assert update_baseline(found, compared) == 1
+    (again,) = compare_figures(read_baseline(found.path), run, {"x": got})
+    assert again.passed
+
+
+def test_what_is_written_has_few_digits_where_the_tolerance_lets_it(baseline, run):
+    found = baseline("figures: {a: {path: x, relative: 0.01}, b: {path: y, tolerance: 1e-6}}")
+
+    update_baseline(found, compare_figures(found, run, {"x": 1 / 3, "y": 2 / 3}))
+
+    assert "expected: 0.3333333333, path: x" in found.path.read_text()
+    assert "expected: 0.6666666667, path: y" in found.path.read_text()
+
+
+def test_values_that_differ_in_their_last_digits_alone_are_told_apart():
+    figure = ComparedFigure(name="a", expected=1.0, got=1.0 + 2**-50)
+
+    assert figure.reason() == "a: expected 1.0, got 1.0000000000000009"
+
+
+@pytest.mark.parametrize(("expected", "got"), [(0.8, 0.7), (0.3, 0.4), (1.1, 1.2)])
+def test_a_value_at_the_edge_of_its_tolerance_is_within(expected, got):
+    assert ComparedFigure(name="a", expected=expected, got=got, allowed=0.1).passed
+    assert not ComparedFigure(name="a", expected=expected, got=got, allowed=0.0999999).passed
 
 
 def test_a_figure_without_a_value_is_refused_at_its_place(baseline):

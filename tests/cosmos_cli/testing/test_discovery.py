@@ -1,6 +1,7 @@
 """Scenarios in files and folders, and the tests that are made of those that are meant."""
 
 import pytest
+from harness.nested_folders import nested_folders
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.testing.case import CaseSettings
@@ -99,6 +100,14 @@ def test_scenarios_lie_in_the_folder_of_that_name_or_here(folder, monkeypatch):
     assert len(find_scenarios([]).outlines) == 3
     (folder / "scenarios").mkdir()
     assert find_scenarios([]).outlines == []
+
+
+def test_folders_that_nest_too_deeply_are_told(folder):
+    with (
+        nested_folders(folder, "a", 1200),
+        pytest.raises(InputError, match=f"{folder}: folders nest too deeply there"),
+    ):
+        find_scenarios([folder])
 
 
 def test_missing_paths_are_told_together(folder):

@@ -76,6 +76,20 @@ def test_a_figure_out_of_tolerance_fails_and_says_what_was_expected():
     assert outcome.reasons == ("baseline: b: expected 1 within 0.1, got 1.2",)
 
 
+def test_a_figure_without_a_value_is_told_and_not_those_that_could_be_written():
+    none = ComparedFigure(name="a", expected=None, got=None, why_none="no stream x")
+    new = ComparedFigure(name="b", expected=None, got=1.0)
+
+    assert with_figures(judged(), [none, new]).reasons == (
+        "baseline: a: no stream x",
+        "baseline: b: has no expected value: write it with cosmos test --update-baselines",
+    )
+    assert with_figures(judged(), [none, new], why_not_written="nothing is written").reasons == (
+        "baseline: a: no stream x",
+        "baseline: nothing is written",
+    )
+
+
 def test_a_baseline_that_cannot_be_written_fails_its_test_alone():
     outcome = with_figures(judged(), [], why_not_written="b.yaml: cannot be written")
 

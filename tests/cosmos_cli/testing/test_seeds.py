@@ -20,3 +20,9 @@ def test_ranges_and_numbers_in_their_order_each_once(text, seeds):
 def test_others_are_refused(text):
     with pytest.raises(InputError, match="--seeds: expected"):
         parse_seeds(text)
+
+
+def test_ranges_that_overlap_count_each_seed_once():
+    assert parse_seeds("1..10000,1..10000,9000..10000") == tuple(range(1, 10_001))
+    with pytest.raises(InputError, match="at most 10000 seeds"):
+        parse_seeds("1..10000,2..10001")

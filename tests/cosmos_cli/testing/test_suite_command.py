@@ -190,6 +190,7 @@ def test_ctrl_c_ends_all_runs_cleanly_and_tells_what_was_found(cosmos, monkeypat
         (("-k", "nothing"), "no tests: none of 1 scenarios is meant"),
         (("-k", "and"), "-k:1:1: expected a word"),
         (("--seeds", "5..1"), "--seeds: expected a range that goes up"),
+        (("--seeds", ""), "--seeds: expected numbers or ranges such as 1..20, got ''"),
         (("none.yaml",), "none.yaml: no such file or folder"),
         (("--set", "agents.count=0"), "agents.count: expected >= 1"),
         (("--update-baselines", "--seeds", "1"), "leave out --seeds"),
