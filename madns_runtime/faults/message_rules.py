@@ -21,6 +21,8 @@ from madns_runtime.timeline import fault_kinds as words
 UP: Final = -1
 """From an agent to the host's half, where an index of a receiver would stand."""
 DOWN: Final = -2
+PLACE: Final = -3
+"""A sender or receiver that is no agent, such as a ground station."""
 RESEND_S: Final = 0.1
 """From a loss to the first resend, s; each further one waits twice as long as that before it."""
 RESEND_S_MAX: Final = 1.6
@@ -141,11 +143,12 @@ class MessageRules:
             number: The sender's own of the message.
         """
         fate = Fate()
-        ends = (self._index.get(sender, -3), self._index.get(receiver, -3))
+        ends = (self._index.get(sender, PLACE), self._index.get(receiver, PLACE))
         for rule in self._between:
             is_from, is_to = sender in rule.agents, receiver in rule.agents
             if rule.word == words.PARTITION:
-                fate.is_lost = fate.is_lost or is_from != is_to
+                # A place is on every side: which of two sides is named makes no difference.
+                fate.is_lost = fate.is_lost or (is_from != is_to and PLACE not in ends)
             elif is_from or is_to:
                 _apply(rule, fate, _Draws(self._key, (rule.chance, *ends, number)), left_s=None)
         return fate

@@ -137,6 +137,17 @@ def test_a_partition_parts_its_agents_from_all_others_and_touches_nothing_with_t
     assert not rules.concern("a")
 
 
+@pytest.mark.parametrize("side", [("a", "b"), ("c", "d")])
+def test_a_partition_parts_nobody_from_a_place_whichever_side_is_named(side):
+    rules = rules_of(rule("partition", side))
+
+    ways = [(agent, "ground:north") for agent in AGENTS]
+    ways += [(place, agent) for agent, place in ways]
+    assert not any(rules.of_way(*way, 1).is_lost for way in ways)
+    rules.add(rule("lose_messages", ("a",), number=2, probability=1.0))
+    assert [way for way in ways if rules.of_way(*way, 1).is_lost] == [ways[0], ways[4]]
+
+
 def test_two_partitions_make_three_sides():
     rules = rules_of(rule("partition", ("a",)), rule("partition", ("b",), number=2))
 
