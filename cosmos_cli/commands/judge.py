@@ -25,7 +25,7 @@ from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.evidence.tables import open_tables
 from cosmos_cli.evidence.verdict import conclusion_of_expectations
 from cosmos_cli.models.loading import load_scenario
-from cosmos_cli.report.cells import format_cell
+from cosmos_cli.report.cells import format_cell, format_measured
 from cosmos_cli.ui.console import Column, Console, JsonOption, QuietOption
 from madns_runtime.plain_values import mapping_at
 from madns_runtime.processes import list_processes
@@ -178,7 +178,7 @@ def _print(console: Console, judged: JudgedExpectations, missing: Sequence[str])
     rows = [
         [
             result.name,
-            "not measured" if result.got is None else format_cell(result.got),
+            format_measured(result.got, result.limit),
             format_cell(result.limit),
             result.unit or "",
             "holds" if result.passed else "BROKEN",

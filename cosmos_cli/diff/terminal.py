@@ -153,12 +153,12 @@ def _told_place(place: RecordPlace | None, by: By, found: Comparison) -> str:
         return "-"
     unit = " s" if by == "time" else ""
     hz = found.a.tick_hz
-    time = f" ({place.key / hz:g} s)" if by == "tick" and hz != 1.0 else ""
+    time = f" ({place.key / hz:.12g} s)" if by == "tick" and hz != 1.0 else ""
     return f"{_words(place, by)}{unit}{time}"
 
 
 def _words(place: RecordPlace, by: By) -> str:
-    return f"{place.who} {KEY_WORDS[by]}{place.key:g}".strip()
+    return f"{place.who} {KEY_WORDS[by]}{place.key:.12g}".strip()
 
 
 def _text_lines(found: Comparison, totals: Sequence[StreamDifference]) -> list[str]:

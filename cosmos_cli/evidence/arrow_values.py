@@ -11,6 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from cosmos_cli.evidence.streams import Kind
+from madns_runtime.recording.columns import column_of
 
 ARROW_TYPES: dict[Kind, pa.DataType] = {
     "float": pa.float64(),
@@ -64,6 +65,14 @@ def to_arrow(values: NDArray[Any], kind: Kind) -> tuple[pa.Array, int]:
         whole = np.where(is_null | is_unfit, 0, values).astype(np.int64)
         return pa.array(whole, mask=is_null | is_unfit), int(is_unfit.sum())
     return _convert_each(values.tolist(), kind)
+
+
+def to_numpy(column: pa.Array, *, is_exact: bool) -> NDArray[Any]:
+    """Return a column as numpy has it; if *is_exact*, objects of whole numbers that no float is and that would become one."""
+    if is_exact and column.null_count and pa.types.is_int64(column.type):
+        return column_of(column.to_pylist(), "int")
+    values: NDArray[Any] = column.to_numpy(zero_copy_only=False)
+    return values
 
 
 def as_floats(values: NDArray[Any]) -> NDArray[np.float64]:

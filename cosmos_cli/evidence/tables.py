@@ -23,13 +23,13 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cosmos_cli.errors import InputError
-from cosmos_cli.evidence.arrow_values import ARROW_TYPES, as_floats, to_arrow
+from cosmos_cli.evidence.arrow_values import ARROW_TYPES, as_floats, to_arrow, to_numpy
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import DETAILS, Columns, RecordFile
 from cosmos_cli.evidence.table_labels import NEVER_US, TableLabels
 from madns_runtime.analysis.tables import RecordedRun
 from madns_runtime.partial_file import create_partial
-from madns_runtime.recording.columns import column_of, joined_column
+from madns_runtime.recording.columns import joined_column
 from madns_runtime.recording.records import Field
 
 ROWS_PER_GROUP = 128 * 1024
@@ -291,11 +291,7 @@ class TableReader:
     def batches(
         self, source: str, names: Iterable[str], rows_max: int, *, is_exact: bool = False
     ) -> Iterator[Columns]:
-        """
-        Yield columns of one source as `read` returns them, at most *rows_max* records at a time.
-
-        Whole numbers that no float is come as objects where others are null, if *is_exact*.
-        """
+        """Yield columns of one source as `read` does, *rows_max* records at most at a time; *is_exact* as of `to_numpy`."""
         wanted = list(names)
         for group in self._groups.get(source, []):
             # One group after the other: given all at once, pyarrow reads ahead without bound.
@@ -305,7 +301,9 @@ class TableReader:
                     batch = next(batches, None)
                     if batch is None:
                         break
-                    columns = {name: _to_numpy(batch.column(name), is_exact) for name in wanted}
+                    columns = {
+                        name: to_numpy(batch.column(name), is_exact=is_exact) for name in wanted
+                    }
                 yield columns
 
     def each(self, names: Iterable[str]) -> Iterator[tuple[str, Columns]]:
@@ -390,13 +388,6 @@ def _field(column: pa.Field) -> Field:
     return Field(
         column.name, about.get(b"unit", b"").decode(), about.get(b"kind", b"float").decode()
     )
-
-
-def _to_numpy(column: pa.Array, is_exact: bool) -> NDArray[Any]:
-    if is_exact and column.null_count and pa.types.is_int64(column.type):
-        return column_of(column.to_pylist(), "int")
-    values: NDArray[Any] = column.to_numpy(zero_copy_only=False)
-    return values
 
 
 def _join(parts: list[NDArray[Any] | None], held: list[Columns], count: int) -> NDArray[Any]:

@@ -322,10 +322,12 @@ def conclusion_of_expectations(
 
 def _told(check: CheckResult) -> str:
     got = "not measured" if check.got is None else f"{check.got:g}"
+    if got == f"{check.limit:g}" and check.got != check.limit:  # broken by its later digits
+        got = f"{check.got}"
     whose = f" of {first_line(check.worst)}" if check.worst else ""
     if check.expected:
         unit = f" {check.unit}" if check.unit and check.got is not None else ""
-        when = "" if check.t_s is None else f" at {check.t_s:g} s"
+        when = "" if check.t_s is None else f" at {check.t_s:.10g} s"
         more = f" and {check.agents_broken - 1} more" if check.agents_broken > 1 else ""
         return (
             f"{check.name} {got}{unit}{whose}{more}{when} (expected {first_line(check.expected)})"

@@ -59,12 +59,12 @@ class BoundsRule:
         """Return the rule in words, such as `below 0.5 m`."""
         behind = f" {unit}" if unit else ""
         if self.within is not None:
-            return f"within {self.within[0]:g} and {self.within[1]:g}{behind}"
+            return f"within {self.within[0]:.10g} and {self.within[1]:.10g}{behind}"
         value = getattr(self, self.word or "below")
         if isinstance(value, bool | str) or value is None:
             return f"{self.word} {str(value).lower() if isinstance(value, bool) else value}"
-        around = f" within {self.tolerance:g}" if self.tolerance else ""
-        return f"{self.word} {value:g}{around}{behind}"
+        around = f" within {self.tolerance:.10g}" if self.tolerance else ""
+        return f"{self.word} {value:.10g}{around}{behind}"
 
     def bounds_faults(self) -> Iterator[RuleFault]:
         """Yield what is wrong with the bounds by themselves."""

@@ -16,6 +16,15 @@ def format_cell(value: object) -> str:
     return str(value)
 
 
+def format_measured(value: object, limit: object) -> str:
+    """Return what was measured as a cell beside its limit: in all digits where they would look the same and are not."""
+    if value is None:
+        return "not measured"
+    text = format_cell(value)
+    is_told_apart = text != format_cell(limit) or value == limit
+    return text if is_told_apart or not isinstance(value, float) else repr(value)
+
+
 def _format_float(value: float) -> str:
     if value != 0 and not 1e-3 <= abs(value) < 1e6:
         return f"{value:.3g}"

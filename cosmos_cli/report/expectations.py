@@ -9,6 +9,7 @@ from cosmos_cli.evidence.expectations.of_run import planned_expectations
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.verdict import is_number
 from cosmos_cli.models.expectation import Expectation, scaled
+from cosmos_cli.report.cells import format_measured
 from madns_runtime.analysis.lines import grouped_lines
 from madns_runtime.analysis.tables import RecordedRun, RecordedTable
 from madns_runtime.analysis.values import Axis, Block, Heading, LimitLine, Section, TableBlock
@@ -47,9 +48,10 @@ def expectation_sections(run: RunDirectory, recorded: RecordedRun) -> list[Secti
 
 
 def _row(check: Mapping[str, Any]) -> list[object]:
+    got = check.get("got")
     return [
         check.get("name"),
-        check.get("got") if is_number(check.get("got")) else "not measured",
+        format_measured(got if is_number(got) else None, check.get("limit")),
         check.get("limit"),
         check.get("unit") or "",
         "holds" if check.get("passed") is True else "BROKEN",

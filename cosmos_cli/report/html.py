@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.report.build import build_sections, figures_of
-from cosmos_cli.report.cells import format_cell
+from cosmos_cli.report.cells import format_cell, format_measured
 from cosmos_cli.report.plotly_figures import to_plotly
 from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.ui.foreign_text import clean_text
@@ -105,7 +105,11 @@ def _environment() -> jinja2.Environment:
         undefined=jinja2.StrictUndefined,
         finalize=lambda value: value if isinstance(value, Markup) else clean_text(str(value)),
     )
-    environment.filters |= {"cell": format_cell, "breakable": _breakable}
+    environment.filters |= {
+        "cell": format_cell,
+        "measured": format_measured,
+        "breakable": _breakable,
+    }
     return environment
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.report.build import figures_of
-from cosmos_cli.report.cells import format_cell
+from cosmos_cli.report.cells import format_cell, format_measured
 from cosmos_cli.ui.console import Column, Console
 from madns_runtime.analysis.values import ReportRemark, Section, TableBlock
 
@@ -56,7 +56,7 @@ def _check_row(check: Mapping[str, Any]) -> list[str]:
     got = check.get("got")
     return [
         str(check.get("name")),
-        "not measured" if got is None else format_cell(got),
+        format_measured(got, check.get("limit")),
         format_cell(check.get("limit")),
         "holds" if check.get("passed") is True else "BROKEN",
         str(check.get("worst") or ""),

@@ -214,5 +214,5 @@ def _told(field: FieldDifference) -> str:
     """Return how a field differs, and where first."""
     largest = f", at most {field.max:g} {field.field.unit}".rstrip() if field.is_number else ""
     place = field.first
-    where = f", first at {place.key:g} {place.who}".rstrip() if place is not None else ""
+    where = f", first at {place.key:.12g} {place.who}".rstrip() if place is not None else ""
     return f"{field.field.name} differs in {counted(field.different, 'record')}{largest}{where}"

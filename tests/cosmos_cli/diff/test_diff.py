@@ -360,6 +360,20 @@ def test_terminal_tells_where_and_how_much(make, capsys):
     assert "comparing agent-02/state" in err
 
 
+def test_a_late_tick_is_told_in_all_its_digits(make, capsys):
+    def record(made, *, by=0.0):
+        fields = (Field("tick", "", "int"), Field("x_m", "m"))
+        recorder = made.recorder("agents/agent-01", "agent-01", StreamSchema("late", fields))
+        for tick in range(8_639_000, 8_639_010):
+            recorder.record("late", (tick, 1.0 + by * (tick == 8_639_007)))
+        recorder.close()
+
+    make(record), make(lambda made: record(made, by=0.5))
+
+    assert app.run(["diff", "1", "2", "--streams", "late"]) == 0
+    assert "agent-01 tick 8639007 (863900.7 s)" in capsys.readouterr().out
+
+
 def record_ranks(made, *, others=0):
     """Record of the host without a time; *others* are of another agent, before those of each."""
     fields = (Field("agent", "", "str"), Field("rank", "", "int"))

@@ -296,3 +296,20 @@ def test_in_lockstep_nothing_is_late():
         "time.rtf, deadline.miss_ratio, deadline.overrun_ratio: not judged: in lockstep time waits",
     )
     assert judged(**changes).exit_code == 4
+
+
+@pytest.mark.parametrize(
+    ("got", "limit"), [(100000.4, 100000.0), (1000001, 1000000), (0.5000001, 0.5)]
+)
+def test_what_breaks_a_limit_by_its_later_digits_is_told_apart_from_it(got, limit):
+    check = CheckResult(name="a", limit=limit, got=got, passed=False)
+
+    assert judged(plugin_checks=(check,)).text == f"CHECK BROKEN: a {got} (limit {limit:g})"
+
+
+def test_the_time_of_a_broken_check_is_told_to_the_tick():
+    check = CheckResult(
+        name="a", limit=1.0, got=2.0, passed=False, t_s=86399.99, expected="each below 1"
+    )
+
+    assert judged(expectations=(check,)).text.endswith("a 2 at 86399.99 s (expected each below 1)")

@@ -9,7 +9,7 @@ from harness.synthetic_run import RECORDING, STATE, T0_UTC, SyntheticRun, make_c
 
 from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.report.build import MACHINE_CHAPTERS, build_sections, figures_of
-from cosmos_cli.report.cells import format_cell
+from cosmos_cli.report.cells import format_cell, format_measured
 from cosmos_cli.report.html import encode_array, render_page
 from cosmos_cli.report.plotly_figures import to_plotly
 from madns_runtime.analysis.chapters import Chapter
@@ -603,3 +603,19 @@ def test_packets_and_lost_of_a_foreign_summary_are_no_packets(tmp_path):
     assert document["packets"] == {}
     (figure, *_) = [b for b in sections["Stream net"] if b.title.startswith("size")]
     np.testing.assert_array_equal(figure.choices[0].marks[0].x, [0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("got", "limit", "text"),
+    [
+        (20.0004, 20.0, "20.0004"),
+        (20.0004, 20, "20.0004"),
+        (20.0, 20.0, "20"),
+        (20.0004, 21.0, "20"),
+        (3, 2, "3"),
+        (None, 2.0, "not measured"),
+        (1.0, None, "1"),
+    ],
+)
+def test_what_was_measured_is_told_apart_from_its_limit(got, limit, text):
+    assert format_measured(got, limit) == text
