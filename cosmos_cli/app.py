@@ -68,6 +68,10 @@ def cosmos(
         os.environ["COSMOS_DEBUG"] = "1"
 
 
+class AtOnce(int):
+    """Exit code of a process that is not taken down in order: a library that found no memory may crash at that."""
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and end the process with the exit code of DESIGN 9."""
     open_standard_streams()
@@ -78,10 +82,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     code = run(arguments)
     # At its end the interpreter would look through all objects for cycles, for 50 ms, and free them one by one.
     gc.freeze()
-    if arguments and arguments[0] in QUICK:
+    if isinstance(code, AtOnce) or (arguments and arguments[0] in QUICK):
         # What the system frees anyway is not freed here: nothing of a quick command is left to be done.
-        with contextlib.suppress(OSError, ValueError):
-            sys.stderr.flush()
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError):
+                stream.flush()
         os._exit(code)
     sys.exit(code)
 
@@ -146,9 +151,8 @@ def _report_usage(error: Any, wants_json: bool) -> int:
 
 def _report_unexpected(error: Exception, wants_json: bool) -> int:
     if is_out_of_memory(error):
-        return _report(
-            _plain("memory", memory_text(), int(ExitCode.MACHINES)), memory_text(), wants_json
-        )
+        told = _plain("memory", memory_text(), int(ExitCode.MACHINES))
+        return AtOnce(_report(told, memory_text(), wants_json))
 
     if isinstance(error, FileNotFoundError) and _is_here_gone():
         text = "the current folder is gone: it was deleted; change to another one with cd"

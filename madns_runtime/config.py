@@ -26,9 +26,7 @@ RATE_HZ_MAX = 10_000
 SEED_MAX = 2**63 - 1
 """A seed travels in messages as a signed integer of 64 bits."""
 DURATION_S_MAX = 10 * 365.25 * 86_400.0
-"""Ten years: a tick's number and every clock of a run stay exact far beyond it."""
-WAIT_S_MAX = 3e8
-"""Of one wait: more than nine years. The timers of a system bear the sum of all waits of a run, and not ten times that."""
+"""Ten years, of a run and of each wait: a tick's number, every clock and every timer of a run bear the sum of all."""
 FORBID_EXTRA = {"extra": "forbid"}
 
 
@@ -124,25 +122,25 @@ class Timeouts(ScenarioSection):
     In time.mode lockstep the time that a process waits for a processor does not count.
     """
 
-    host_start_s: Annotated[float, Gt(0), Le(WAIT_S_MAX)] = 60.0
+    host_start_s: Annotated[float, Gt(0), Le(DURATION_S_MAX)] = 60.0
     """From the start of the host's process until it listens: imports, workers of the executor."""
     loading_s: Annotated[float, Gt(0), Le(3600)] = 60.0
     """For each import of the simulation's code, and before the run for each question to it (check, demand); in the run at most 0.8 of host_start_s, of agents_ready_s. Waiting for a processor does not count."""
-    agents_ready_s: Annotated[float, Gt(0), Le(WAIT_S_MAX)] = 30.0
+    agents_ready_s: Annotated[float, Gt(0), Le(DURATION_S_MAX)] = 30.0
     """From the host's start until every agent has said hello."""
-    host_setup_s: Annotated[float, Gt(0), Le(WAIT_S_MAX)] = 120.0
+    host_setup_s: Annotated[float, Gt(0), Le(DURATION_S_MAX)] = 120.0
     """For the host's half of the simulation to set itself up."""
-    agent_setup_s: Annotated[float, Gt(0), Le(WAIT_S_MAX)] = 60.0
+    agent_setup_s: Annotated[float, Gt(0), Le(DURATION_S_MAX)] = 60.0
     """From sending the initial data until every agent is ready to run."""
-    start_lead_s: Annotated[float, Ge(0.05), Le(WAIT_S_MAX)] = 0.5
+    start_lead_s: Annotated[float, Ge(0.05), Le(DURATION_S_MAX)] = 0.5
     """From the order to start until T0."""
-    silence_s: Annotated[float, Gt(0.2), Le(WAIT_S_MAX)] = 2.5
+    silence_s: Annotated[float, Gt(0.2), Le(DURATION_S_MAX)] = 2.5
     """An agent or a host that says nothing for this long is lost."""
-    complete_s: Annotated[float, Gt(0), Le(WAIT_S_MAX)] = 10.0
+    complete_s: Annotated[float, Gt(0), Le(DURATION_S_MAX)] = 10.0
     """From the end of the simulated time until every agent has reported it complete."""
-    shutdown_s: Annotated[float, Gt(0), Le(WAIT_S_MAX)] = 10.0
+    shutdown_s: Annotated[float, Gt(0), Le(DURATION_S_MAX)] = 10.0
     """For shutdown: the last reports, and flushing of records."""
-    tick_s: Annotated[float, Gt(0), Le(WAIT_S_MAX)] = 30.0
+    tick_s: Annotated[float, Gt(0), Le(DURATION_S_MAX)] = 30.0
     """time.mode lockstep: for one tick of all agents of a process, or one call of the host's half."""
 
 

@@ -165,7 +165,14 @@ def _show(
         if outlook.demand is not None and capacity is not None:
             show_flows(console, outlook.demand, resources)
             show_capacity(console, capacity)
-        show_feasibility(console, feasibility, resources, outlook.latency_source, missing=missing)
+        show_feasibility(
+            console,
+            feasibility,
+            resources,
+            outlook.latency_source,
+            missing=missing,
+            capacity=capacity,
+        )
     source = {"latency_source": outlook.latency_source}
     console.print_json(
         {

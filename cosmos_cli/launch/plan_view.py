@@ -10,6 +10,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+from cosmos_cli.launch.capacity import Capacity
 from cosmos_cli.launch.feasibility import (
     BITS_PER_BYTE,
     Feasibility,
@@ -206,13 +207,14 @@ def demand_mapping(demand: Demand, resources: Resources) -> dict[str, Any]:
     }
 
 
-def show_feasibility(
+def show_feasibility(  # noqa: PLR0913 - what is printed, and two more by name
     console: Console,
     feasibility: Feasibility | None,
     resources: Resources,
     latency_source: str,
     *,
     missing: Sequence[str] = tuple(Planning().missing),
+    capacity: Capacity | None = None,
 ) -> None:
     """Print the four inequalities, and what comes of them; None for a simulation without a demand: what is *missing* then."""
     if feasibility is None:
@@ -228,14 +230,19 @@ def show_feasibility(
         f"N_p = {resources.workers}, T_n = {resources.latency_s * 1e3:.3g} ms ({latency_source}), "
         f"B_n = {resources.bandwidth_bytes_s * BITS_PER_BYTE / 1e6:g} Mbit/s, compute times {compute}"
     )
-    console.data(verdict_words(feasibility))
+    console.data(verdict_words(feasibility, capacity))
 
 
-def verdict_words(feasibility: Feasibility) -> str:
-    """Say whether the agents keep real time, and what limits their number."""
+def verdict_words(feasibility: Feasibility, capacity: Capacity | None = None) -> str:
+    """Say whether the agents keep real time, and what limits their number; *capacity* is the prediction that stands above."""
     agents, binding = counted(feasibility.agents, "agent"), feasibility.binding
     if not feasibility.holds:
         return f"{agents} cannot keep real time: {broken_words(feasibility)}"
+    if capacity is not None and feasibility.agents > capacity.agents:
+        return (
+            f"{agents} may not keep real time: the inequalities hold, but up to {capacity.agents:.0f} are predicted, by"
+            f" {capacity.binding.name}; `cosmos bench capacity` tells"
+        )
     limit = (
         "is the closest, and sets no limit in agents"
         if math.isinf(binding.breaks_at)

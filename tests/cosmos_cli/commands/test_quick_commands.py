@@ -206,6 +206,18 @@ def test_plan_of_an_impossible_run_ends_with_4(cosmos):
     assert out.splitlines()[-1] == "3 agents cannot keep real time: inequality 2.10 is broken"
 
 
+def test_plan_of_more_agents_than_it_predicts_does_not_say_that_they_keep_real_time(cosmos):
+    code, out, _ = cosmos(
+        "plan", "a.yaml", "--set", "agents.tick_hz=10000", "--latency-ms", "0.001"
+    )
+
+    *_, last = out.splitlines()
+    assert code == ExitCode.OK
+    assert last.startswith(
+        "3 agents may not keep real time: the inequalities hold, but up to 0 are predicted, by "
+    )
+
+
 def test_plan_names_several_broken_inequalities_in_the_plural():
     demand = Demand(
         flows=(),

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from cosmos_cli import app
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.ui.out_of_memory import is_out_of_memory
@@ -112,3 +113,21 @@ def test_memory_is_known_by_each_of_its_signs_and_through_what_it_led_to(error, 
             raise KeyError("x") from cause
     except KeyError as outer:
         assert (is_out_of_memory(error), is_out_of_memory(outer)) == (is_it, is_it)
+
+
+@pytest.mark.parametrize(("error", "at_once"), [(MemoryError(), [3]), (ValueError("x"), [])])
+def test_a_process_that_found_no_memory_is_not_taken_down_in_order(monkeypatch, error, at_once):
+    ended = []
+
+    def fail():
+        raise error
+
+    monkeypatch.setattr(app, "make_app", fail)
+    monkeypatch.setattr(app, "open_standard_streams", lambda: None)
+    monkeypatch.setattr(app.gc, "freeze", lambda: None)
+    monkeypatch.setattr(app.os, "_exit", ended.append)
+    with pytest.raises(SystemExit) as caught:
+        app.main(["run"])
+
+    assert ended == at_once
+    assert caught.value.code == (3 if at_once else 1)

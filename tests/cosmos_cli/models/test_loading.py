@@ -217,7 +217,7 @@ MISTAKES = [
     ),
     (
         "agents: {count: 3}\ntimeouts: {shutdown_s: 1e10}",
-        "a.yaml:4:24: timeouts.shutdown_s: expected <= 300000000, got 1e10",
+        "a.yaml:4:24: timeouts.shutdown_s: expected <= 315576000, got 1e10",
     ),
     (
         "agents: {count: 3, tick_hz: .nan}",
