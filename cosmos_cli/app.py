@@ -84,9 +84,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     gc.freeze()
     if isinstance(code, AtOnce) or (arguments and arguments[0] in QUICK):
         # What the system frees anyway is not freed here: nothing of a quick command is left to be done.
-        for stream in (sys.stdout, sys.stderr):
-            with contextlib.suppress(OSError, ValueError):
-                stream.flush()
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+        with contextlib.suppress(OSError, ValueError):
+            sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
 

@@ -103,8 +103,9 @@ def travelled(message):
 
 def carry(host, context, name, transmission):
     """Give the host's medium what an agent sent to others, as the runtime does."""
-    outcomes = radio_of(host, context).carry(name, transmission)
-    context.carrier.enter(name, transmission, outcomes)
+    radio = radio_of(host, context)
+    outcomes = radio.carry(name, transmission)
+    radio.settled(name, transmission, context.carrier.enter(name, transmission, outcomes))
     context.carrier.hand_over()
 
 
