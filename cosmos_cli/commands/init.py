@@ -14,7 +14,7 @@ from typing import Annotated
 import typer
 
 from cosmos_cli.errors import InputError
-from cosmos_cli.models.yaml_source import resolve_scalar
+from cosmos_cli.models.yaml_source import is_text_without_quotes
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
 from madns_runtime.plugin.kept_names import name_faults
 from madns_runtime.plugin.registry import registered_names
@@ -100,22 +100,13 @@ def _module(name: str) -> str:
     return name.replace("-", "_")
 
 
-def _in_yaml(name: str) -> str:
-    """Return a name as YAML reads it as a text: 2024 and 1e3 alone are numbers there, null is nothing."""
-    try:
-        is_text = isinstance(resolve_scalar(name), str)
-    except ValueError:  # a number too large
-        is_text = False
-    return name if is_text else f'"{name}"'
-
-
 def render(template: str, name: str) -> dict[Path, str]:
     """Return the template's files, by their path within the target folder, with the name filled in."""
     root = TEMPLATES / template
-    value = f": {PLACEHOLDER}\n"
+    in_yaml = name if is_text_without_quotes(name) else f'"{name}"'
 
     def filled(text: str) -> str:
-        text = text.replace(value, value.replace(PLACEHOLDER, _in_yaml(name)))
+        text = text.replace(f": {PLACEHOLDER}\n", f": {in_yaml}\n")
         return text.replace(PLACEHOLDER, name).replace(MODULE_PLACEHOLDER, _module(name))
 
     return {

@@ -309,6 +309,14 @@ def _whole_number(digits: str, base: int, has_64_bits: bool) -> int:
     return number
 
 
+def is_text_without_quotes(text: str) -> bool:
+    """Tell whether a plain scalar is a text here: 2024 and 1e3 are numbers, and null is nothing."""
+    try:
+        return isinstance(resolve_scalar(text), str)
+    except ValueError:  # a number too large
+        return False
+
+
 def yaml_text(value: Any) -> str:
     """Return plain values as YAML that means the same here: PyYAML's own takes 1e5 for a text and leaves it unquoted."""
     text: str = yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
@@ -318,11 +326,8 @@ def yaml_text(value: Any) -> str:
 class _Dumper(yaml.SafeDumper):
     def represent_text(self, text: str) -> Any:
         """Return the node of a text, in quotes where it would be something else without them."""
-        try:
-            is_text = isinstance(resolve_scalar(text), str)
-        except ValueError:
-            is_text = False
-        return self.represent_scalar(f"{_TAG}str", text, style=None if is_text else "'")
+        style = None if is_text_without_quotes(text) else "'"
+        return self.represent_scalar(f"{_TAG}str", text, style=style)
 
 
 _Dumper.add_representer(str, _Dumper.represent_text)

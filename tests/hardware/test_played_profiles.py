@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import os
 import signal
+from functools import partial
 
 import pytest
 
 from madns_runtime.config import Agents, DeviceLaunch, RunConfig
-from madns_runtime.errors import PluginError
+from madns_runtime.errors import BlamedError, PluginError
+from madns_runtime.hardware.contract import Device
 from madns_runtime.hardware.driven import DrivenDevice
 from madns_runtime.hardware.inline import InlineDevice
 from madns_runtime.hardware.kind_registry import prepare
@@ -134,6 +136,15 @@ def test_in_lockstep_points_that_the_driver_does_not_take_are_counted_as_refused
     told = report["stimulus"]["coil"]
     assert (told["points"], told["played"], told["refused"], told["lost"]) == (4, 2, 2, 0)
     assert not report.get("refused")
+
+
+def test_in_lockstep_a_driver_with_outputs_and_no_write_is_to_blame(tmp_path):
+    bench = InlineBench(tmp_path)
+    bench.device._device.write = partial(Device.write, bench.device._device)
+    bench.port.write("coil", 0.5, due_s=0.1)
+
+    with pytest.raises(BlamedError, match=r"has outputs and no write\(values, due_s\)"):
+        bench.advance(0.2)
 
 
 def test_what_no_output_can_play_is_refused_at_once(tmp_path):

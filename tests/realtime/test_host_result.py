@@ -113,11 +113,8 @@ def test_best_messages_that_never_came_are_lost_also_where_none_came_behind_them
     assert (best["sent"], best["received"], best["lost"]) == (10, 10 - len(lost), len(lost))
 
 
-def test_messages_of_earlier_incarnations_stay_counted():
-    (agent, host), (later_agent, later_host) = ends(), ends()
-    send_best(agent, host, sent=10, lost={2, 9})
-    send_best(host, agent, sent=5, lost={0})
-    send_best(later_agent, later_host, sent=3, lost={1})
+def messages_of_two_lives(host, told, later_host, later_agent):
+    """Return the account of messages of an agent that told so much in its first life, and all in its second."""
     peer = Peer(
         name="agent-01",
         index=1,
@@ -125,13 +122,22 @@ def test_messages_of_earlier_incarnations_stay_counted():
         link=later_host,
         records={"messages": later_agent.counters.to_mapping()},
         retired_counters=[host.counters.to_mapping()],
-        retired_records=[{"messages": agent.counters.to_mapping()}],
+        retired_records=[told],
     )
     session: Any = SimpleNamespace(peers={"agent-01": peer}, refused={}, malformed_count=0)
+    return HostReport(10.0).result(session, network={}, intended=IntendedLosses())["messages"]
 
-    result = HostReport(10.0).result(session, network={}, intended=IntendedLosses())
 
-    best = result["messages"]["best"]
+def test_messages_of_earlier_incarnations_stay_counted():
+    (agent, host), (later_agent, later_host) = ends(), ends()
+    send_best(agent, host, sent=10, lost={2, 9})
+    send_best(host, agent, sent=5, lost={0})
+    send_best(later_agent, later_host, sent=3, lost={1})
+    earlier = {"messages": agent.counters.to_mapping()}
+
+    messages = messages_of_two_lives(host, earlier, later_host, later_agent)
+
+    best = messages["best"]
     assert (best["sent"], best["received"], best["lost"]) == (18, 14, 4)
 
 
@@ -147,18 +153,8 @@ def test_of_a_killed_incarnation_counts_what_came_of_it_and_what_it_acknowledged
     send_best(agent, host, sent=10, lost={2})
     later_agent, later_host = ends()
     host.abandon()
-    peer = Peer(
-        name="agent-01",
-        index=1,
-        phase=Phase.STOPPED,
-        link=later_host,
-        records={"messages": later_agent.counters.to_mapping()},
-        retired_counters=[host.counters.to_mapping()],
-        retired_records=[{}],
-    )
-    session: Any = SimpleNamespace(peers={"agent-01": peer}, refused={}, malformed_count=0)
 
-    messages = HostReport(10.0).result(session, network={}, intended=IntendedLosses())["messages"]
+    messages = messages_of_two_lives(host, {}, later_host, later_agent)
 
     reliable, best = messages["reliable"], messages["best"]
     assert (reliable["sent"], reliable["received"], reliable["to_lost_agents"]) == (4, 3, 1)
