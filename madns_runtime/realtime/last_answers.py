@@ -19,7 +19,9 @@ class LastAnswers:
     """
     Asks the host for an answer behind what was sent last, and listens until it has come.
 
-    A host that was held up has not read what agents sent before their ends: what it answers to that is not lost.
+    A host that was held up has not read what agents sent before their ends: what it answers to that is not lost. It is
+    asked when the last tick's period is over: all agents' last ticks are due before, and a thousand that ask one by one
+    would hold them up.
 
     Args:
         reactor: The loop.
@@ -50,7 +52,7 @@ class LastAnswers:
     def begin(self, end_s: float) -> None:
         """Take note that the last tick is over; the run ends at *end_s* on this computer's clock."""
         self._end_s = end_s
-        self._timer.reschedule(monotonic())  # not in the midst of a tick
+        self._timer.reschedule(max(end_s, monotonic()))  # not in the midst of a tick
 
     def cancel(self) -> None:
         """Wait no more."""

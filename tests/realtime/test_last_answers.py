@@ -74,12 +74,28 @@ def rig(monkeypatch):
 
 
 def test_a_host_that_answers_at_once_is_listened_to_for_a_moment(rig):
-    rig.run_until(END_S - 0.9)
+    rig.run_until(END_S)
     rig.answer()
     rig.run_until(END_S + 5.0)
 
-    assert rig.pings == [END_S - 1.0]
+    assert rig.pings == [END_S]
     assert rig.finished_s == pytest.approx(END_S + DRAIN_S)
+
+
+def test_the_host_is_not_asked_while_last_ticks_of_others_are_due(rig):
+    rig.run_until(END_S - 1e-3)
+    assert rig.pings == []
+
+    rig.run_until(END_S)
+    assert rig.pings == [END_S]
+
+
+def test_an_agent_whose_last_tick_is_over_late_asks_at_once(rig):
+    rig.now_s = END_S + 2.0
+    rig.listening.begin(END_S)
+    rig.run_until(END_S + 2.0)
+
+    assert rig.pings == [END_S + 2.0]
 
 
 def test_a_host_that_was_held_up_is_waited_for_and_what_it_then_says(rig):
@@ -91,7 +107,7 @@ def test_a_host_that_was_held_up_is_waited_for_and_what_it_then_says(rig):
 
 
 def test_what_waits_in_the_socket_of_a_late_agent_is_heard_first(rig):
-    rig.run_until(END_S - 0.9)
+    rig.run_until(END_S)
     rig.waiting = rig.answer
     rig.now_s = END_S + 3.0
     rig.run_until(END_S + 3.0)
