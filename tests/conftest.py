@@ -24,6 +24,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
+# numpy's threads, one per processor, wait busily for work that no test has for them: workers of the suite have none.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # A busy machine takes longer than Hypothesis' 0.2 s for an example now and then, which is no fault of the code. A change
 # is judged by the same examples as the one before; `.ci/nightly` looks for new ones, by --hypothesis-profile=search.
 settings.register_profile("search", deadline=None, suppress_health_check=[HealthCheck.too_slow])
