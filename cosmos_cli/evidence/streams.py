@@ -117,7 +117,8 @@ class StreamScan:
         if self.records != self.promised:
             return f"{self.records} records where its end line counts {self.promised}"
         if self.dropped:
-            return f"{self.dropped} records were dropped while recording"
+            had = "had no room in recording.buffer_bytes or on the disk"
+            return f"{self.dropped} records were dropped while recording: they {had}"
         return None
 
 
