@@ -5,6 +5,7 @@ import re
 import shlex
 import shutil
 import subprocess
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -103,6 +104,13 @@ def test_demo_asks_before_it_makes_anything():
     assert "[dev]" not in done.stdout
 
 
+def told_by(tested):
+    """Return what a failed suite told: its commonest errors first, of which the last lines may name none."""
+    errors = Counter(line[:300] for line in tested.stdout.splitlines() if line.startswith("E  "))
+    commonest = "\n".join(f"{count} x {line}" for line, count in errors.most_common(20))
+    return f"{commonest}\n\n{tested.stdout[-6000:]}{tested.stderr[-1000:]}"
+
+
 @pytest.mark.nightly
 @pytest.mark.root
 @pytest.mark.timeout(4200)
@@ -130,4 +138,4 @@ def test_both_commands_of_the_readme_work_on_a_minimal_debian(tmp_path):
     assert (fresh.root / "home/student/cosmos/runs/0001-iridium10/report.html").is_file()
 
     tested = fresh.run("make test")
-    assert tested.returncode == 0, tested.stdout[-8000:] + tested.stderr[-1000:]
+    assert tested.returncode == 0, told_by(tested)
