@@ -30,7 +30,7 @@ def test_an_exact_thruster_gives_what_is_commanded_for_what_tsiolkovsky_says():
     full = tank()
 
     burn = fire(EXACT, full, (3.0, 0.0, 4.0), chance())
-    full.book(burn)
+    full.book(burn, 10.0, 10.0, now_s=5.0)
 
     assert burn.vector == (3.0, 0.0, 4.0)
     assert burn.duration_s == 0.0
@@ -45,7 +45,8 @@ def test_the_order_of_burns_changes_nothing_of_what_is_left():
     for order in ((50.0, 200.0), (200.0, 50.0), (250.0,)):
         full = tank()
         for delta_v in order:
-            full.book(fire(EXACT, full, (delta_v, 0.0, 0.0), chance()))
+            burn = fire(EXACT, full, (delta_v, 0.0, 0.0), chance())
+            full.book(burn, 10.0, 10.0, now_s=5.0)
         left.append(full.propellant_kg)
 
     assert left == pytest.approx([left[0]] * 3, abs=1e-12)

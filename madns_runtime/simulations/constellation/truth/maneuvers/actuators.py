@@ -71,15 +71,29 @@ class Tank:
 
     Burns are booked as they are accepted. The rocket equation makes the propellant of several depend on
     the sum of their changes of velocity alone, so that what is left is right in whatever order they burn.
+    Until a burn is over the tank holds what is booked for it: see `left_kg`.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
         self.mass_kg = vehicle.mass_kg
         self.propellant_kg = vehicle.thruster.propellant_kg if vehicle.thruster else 0.0
+        """What is not booked yet."""
+        self._booked: list[tuple[float, float, float]] = []
+        """Begin and end of each burn that may not be over, s, and its propellant, kg."""
 
-    def book(self, burn: Burn) -> None:
-        """Take a burn's propellant off."""
+    def book(self, burn: Burn, start_s: float, end_s: float, *, now_s: float) -> None:
+        """Take off the propellant of a burn between two times, and forget those that are over now."""
         self.burn(burn.propellant_kg)
+        self._booked = [each for each in self._booked if each[1] > now_s]
+        self._booked.append((start_s, end_s, burn.propellant_kg))
+
+    def left_kg(self, t_s: float) -> float:
+        """Return what the tank holds at *t_s*, not long ago or later: what burns booked until now have not burnt by then."""
+        held_kg = 0.0
+        for start_s, end_s, kg in self._booked:
+            if end_s > t_s:  # the flow of a burn is even
+                held_kg += kg if t_s <= start_s else kg * (end_s - t_s) / (end_s - start_s)
+        return self.propellant_kg + held_kg
 
     def burn(self, propellant_kg: float) -> None:
         """Take propellant off; less than 0 gives back what was not burnt."""

@@ -202,12 +202,14 @@ class ManeuverDesk:
         self.account.executed += 1
         self.account.delta_v_m_s += taken.delta_v_m_s
         self.account.propellant_kg += taken.used_kg
-        if is_closure(taken.command):
-            # What was burnt until its time was not known when it was accepted.
-            taken = replace(taken, propellant_kg=self._tanks[taken.vehicle].propellant_kg)
         attitude, effect = self._vehicles[taken.vehicle].attitude, taken.effect
+        if effect is None:
+            return taken
+        # Not what was left when it was accepted: others may have burnt since, or be booked and not have burnt.
+        left_kg = self.stuck.left_kg(taken.vehicle, effect.end_s)
+        taken = replace(taken, propellant_kg=left_kg)
         has_wheels = attitude is not None and attitude.wheels is not None
-        if effect is None or effect.kind != "torque" or not has_wheels:
+        if effect.kind != "torque" or not has_wheels:
             return taken
         momentum = self._timelines[taken.vehicle].wheels_at(effect.end_s)
         return replace(taken, wheels_n_m_s=momentum)
@@ -362,7 +364,9 @@ class ManeuverDesk:
             return taken
         tank, commanded_m_s = self._tanks[taken.vehicle], math.hypot(*taken.command.vector)
         expected_kg = tank.propellant_kg - propellant_of(thruster, tank.mass_kg, commanded_m_s)
-        tank.book(given)
+        effect, now_s = taken.effect, taken.heard_s - taken.command.phase_s
+        assert effect is not None
+        tank.book(given, effect.start_s, effect.end_s, now_s=now_s)
         return replace(
             taken,
             delta_v_m_s=given.magnitude_m_s,
