@@ -14,6 +14,7 @@ from madns_runtime.simulations.constellation.truth.element_set import (
     NUMBERS,
     ElementSet,
     range_fault,
+    theory_fault,
 )
 
 BOOKKEEPING = {
@@ -132,6 +133,8 @@ def _omm_set(fields: dict[str, str], at: str, faults: list[str]) -> Iterator[Ele
     for key, expected in FIXED_FIELDS.items():
         if fields.get(key, expected).strip().upper() != expected:
             faults.append(f"{at}: {key}: expected {expected}, got {fields[key]!r}")
+    if fault := theory_fault(fields.get("EPHEMERIS_TYPE", "")):
+        faults.append(f"{at}: {fault}")
     for key in NUMBERS:
         if fault := range_fault(key, fields.get(key)):
             faults.append(f"{at}: {fault}")
