@@ -130,6 +130,10 @@ FAULTS_OF_THE_BOARD = [
     ),
     ({"vehicles": [{}, {"agents": ["X*"]}]}, r"vehicles\[1\].agents: 'X\*' fits no agent"),
     (
+        {"vehicles": [{"agents": ["*-01"]}, {}, {"agents": ["agent-02"]}]},
+        r"vehicles\[2\].agents: expected .* that no entry before it fits, got those of parameters.vehicles\[1\]",
+    ),
+    (
         {"vehicles": [{"sensors": {"gyro": {}}}]},
         r"vehicles\[0\].sensors.gyro: needs a vehicle with attitude",
     ),
