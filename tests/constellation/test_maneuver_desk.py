@@ -307,6 +307,22 @@ def test_a_torque_fills_wheels_that_later_ones_find_full():
     assert third.reason == "the wheels are saturated"
 
 
+def test_a_torque_that_comes_before_others_leaves_them_room_in_the_wheels():
+    at = desk(RIGID)
+    torque = {"kind": "torque", "frame": "body", "duration_s": 10.0}
+
+    last = at.decide(0, command(60.0, 0, vector=(0.0, 0.0, 0.09), **torque), 10.0)
+    back = at.decide(0, command(20.0, 1, vector=(0.0, 0.0, -0.1), **torque), 10.0)
+    more = at.decide(0, command(35.0, 2, vector=(0.0, 0.0, -0.1), **torque), 10.0)
+    on = at.decide(0, command(46.0, 3, vector=(0.0, 0.0, 0.1), **torque), 10.0)
+
+    # Held at 30, 56 and 70 s: 1, 0 and -0.9 N m s. One more torque would have made it 1.9 at 45 s.
+    assert [each.effect and each.effect.vector[2] for each in (last, back, on)] == pytest.approx(
+        [0.09, -0.1, 0.1]
+    )
+    assert more.reason == "the wheels are saturated"
+
+
 def test_the_inequality_is_measured_in_the_agents_own_time():
     at = desk()
     taken = at.decide(0, command(10.1, phase_s=0.05), 10.052)

@@ -222,7 +222,7 @@ class WheelTurn:
 
 def turn(
     wheels: ReactionWheels | None,
-    momentum_n_m_s: Vector,
+    held_n_m_s: tuple[Vector, Vector],
     torque_n_m: Vector,
     duration_s: float,
     random: np.random.Generator,
@@ -232,7 +232,8 @@ def turn(
 
     Args:
         wheels: Of the vehicle; None for exact torques without limit.
-        momentum_n_m_s: What the wheels hold already, body axes; a torque takes up its opposite.
+        held_n_m_s: The least and the most that the wheels hold from the beginning of the torque on, by what was
+            commanded before, body axes; a torque takes up its opposite.
         torque_n_m: As commanded, body axes.
         duration_s: For how long, > 0.
         random: One number is drawn.
@@ -251,8 +252,8 @@ def turn(
         if torque != commanded:
             limits.append(f"{'xyz'[axis]}: {wheels.torque_n_m_max:g} N m at most")
         torque *= factor
-        held = momentum_n_m_s[axis]
-        low, high = held - wheels.momentum_n_m_s_max, held + wheels.momentum_n_m_s_max
+        least, most = held_n_m_s[0][axis], held_n_m_s[1][axis]
+        low, high = most - wheels.momentum_n_m_s_max, least + wheels.momentum_n_m_s_max
         possible = min(max(torque, min(0.0, low / duration_s)), max(0.0, high / duration_s))
         if possible != torque:
             limits.append(f"{'xyz'[axis]}: wheels saturate")

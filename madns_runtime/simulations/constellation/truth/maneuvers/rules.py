@@ -234,7 +234,7 @@ class ManeuverDesk:
         if fault:
             return replace(refused, reason=fault)
         is_stuck = command.kind == "delta_v" and vehicle in self.stuck.burns
-        given = None if is_stuck else self._given(vehicle, command)
+        given = None if is_stuck else self._given(refused)
         if isinstance(given, WheelTurn | Magnetisation):
             given = self._bearable(vehicle, command, given)
         if isinstance(given, ActuatorRefusal):
@@ -257,17 +257,20 @@ class ManeuverDesk:
             return f"{WAITING_MAX} commands are waiting already"
         return ""
 
-    def _given(self, vehicle: int, command: Command) -> Given | ActuatorRefusal | None:
-        """Return what the actuator makes of it; None if it needs none."""
+    def _given(self, heard: Taken) -> Given | ActuatorRefusal | None:
+        """Return what the actuator makes of a command; None if it needs none."""
+        vehicle, command = heard.vehicle, heard.command
         described = self._vehicles[vehicle]
         random = chance_of(self._rules.seed, self._agents[vehicle], command.number)
         if command.kind == "delta_v" and described.thruster is not None:
             share = self.failures.share(vehicle)
             return fire(described.thruster, self._tanks[vehicle], command.vector, random, share)
         if command.kind == "torque" and described.attitude is not None:
-            momentum = self._timelines[vehicle].wheels_at(math.inf)
+            # Torques of later times may have been commanded before: their wheels must not be overfilled.
+            from_s = max(command.at_s, heard.heard_s - command.phase_s)
+            held = self._timelines[vehicle].wheels_from(from_s)
             wheels = described.attitude.wheels
-            return turn(wheels, momentum, command.vector, command.duration_s, random)
+            return turn(wheels, held, command.vector, command.duration_s, random)
         if command.kind == "dipole" and described.attitude is not None:
             torquers = described.attitude.magnetorquers
             return None if torquers is None else magnetise(torquers, command.vector, random)
