@@ -66,6 +66,7 @@ def program(**rest):
         program(interface={"protocol": "guidance.py:G"}),
         # Who would fly the last one do not fly.
         [program(agents=["agent-01"]), program(agents=["agent-02"]), program()],
+        [program(agents=["agent-0[1-4]"]), program(agents=["agent-*"])],
     ],
 )
 def test_rules_without_fault_have_none(tmp_path, flight):

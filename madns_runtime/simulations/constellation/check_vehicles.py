@@ -85,7 +85,7 @@ def unreached_faults(
     """
     Return a fault for each entry that holds for nobody, since all that it fits are those of entries before it.
 
-    What holds for the rest, "*", may have none where few agents fly, if it is not that of an entry before it, too.
+    A pattern such as "agent-*" may find none left where few agents fly, if none before it is "*": that is no fault.
 
     Args:
         field: Dotted name of the list.
@@ -100,12 +100,11 @@ def unreached_faults(
     is_rest_taken = False
     faults = []
     for number, globs in enumerate(entries):
-        is_rest = EVERYBODY in globs
         plain = [agent for glob in globs for agent in bearers.get(glob, ())]
         patterns = tuple(filter(is_glob, globs))
         more = [agent for agent, other in names if fits(patterns, agent, other)] if patterns else []
         fitting = dict.fromkeys((*plain, *more))
-        if fitting and fitting.keys() <= taken.keys() and (is_rest_taken or not is_rest):
+        if fitting and fitting.keys() <= taken.keys() and (is_rest_taken or not patterns):
             first = taken[next(iter(fitting))]
             faults.append(
                 f"{field}[{number}].agents: expected agents or satellites that no entry before it fits, "
@@ -113,7 +112,7 @@ def unreached_faults(
             )
         for agent in fitting:
             taken.setdefault(agent, number)
-        is_rest_taken = is_rest_taken or is_rest
+        is_rest_taken = is_rest_taken or EVERYBODY in globs
     return faults
 
 
