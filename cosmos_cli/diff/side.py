@@ -56,9 +56,12 @@ class Side:
 
     @property
     def duration_s(self) -> float:
-        """Simulated time that the run was to have, s."""
-        value = mapping_at(self.settings, "time").get("duration_s")
-        return float(value) if is_number(value) else 0.0
+        """Simulated time that the run was to have, s: a stop shortens it."""
+        given = (
+            mapping_at(self.settings, "time").get("duration_s"),
+            self.document.get("duration_s"),
+        )
+        return min((float(value) for value in given if is_number(value)), default=0.0)
 
 
 def open_side(run: RunDirectory, given: str) -> Side:

@@ -110,8 +110,10 @@ class RecordedRun:
 
     @property
     def duration_s(self) -> float:
-        """Simulated time that the run was to have, s; 0 where its settings are lost."""
-        return 0.0 if self.config is None else self.config.time.duration_s
+        """Simulated time that the run was to have, s: a stop shortens it; 0 where nothing tells."""
+        planned_s = None if self.config is None else self.config.time.duration_s
+        told = (planned_s, self.document.get("duration_s"))
+        return min((float(each) for each in told if isinstance(each, int | float)), default=0.0)
 
     def agent_summary(self, name: str) -> Mapping[str, Any]:
         """Return what the agent's half of the simulation summed up; empty for one that died."""

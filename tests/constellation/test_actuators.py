@@ -30,7 +30,7 @@ def test_an_exact_thruster_gives_what_is_commanded_for_what_tsiolkovsky_says():
     full = tank()
 
     burn = fire(EXACT, full, (3.0, 0.0, 4.0), chance())
-    full.book(burn)
+    full.book(burn, 10.0, 10.0, now_s=5.0)
 
     assert burn.vector == (3.0, 0.0, 4.0)
     assert burn.duration_s == 0.0
@@ -45,7 +45,8 @@ def test_the_order_of_burns_changes_nothing_of_what_is_left():
     for order in ((50.0, 200.0), (200.0, 50.0), (250.0,)):
         full = tank()
         for delta_v in order:
-            full.book(fire(EXACT, full, (delta_v, 0.0, 0.0), chance()))
+            burn = fire(EXACT, full, (delta_v, 0.0, 0.0), chance())
+            full.book(burn, 10.0, 10.0, now_s=5.0)
         left.append(full.propellant_kg)
 
     assert left == pytest.approx([left[0]] * 3, abs=1e-12)
@@ -120,23 +121,25 @@ WHEELS = ReactionWheels(torque_n_m_max=0.1, momentum_n_m_s_max=1.0)
 
 
 def test_torques_are_limited_on_each_axis():
-    given = turn(WHEELS, (0.0, 0.0, 0.0), (0.05, -0.3, 0.0), 2.0, chance())
+    given = turn(WHEELS, ((0.0, 0.0, 0.0),) * 2, (0.05, -0.3, 0.0), 2.0, chance())
 
     assert given.torque_n_m == (0.05, -0.1, 0.0)
     assert given.limits == ("y: 0.1 N m at most",)
 
 
 def test_wheels_saturate_by_the_opposite_of_what_they_give():
-    nearly = turn(WHEELS, (-0.9, 0.0, 0.0), (0.1, 0.0, 0.0), 10.0, chance())
-    back = turn(WHEELS, (-0.9, 0.0, 0.0), (-0.1, 0.0, 0.0), 10.0, chance())
+    nearly = turn(WHEELS, ((-0.9, 0.0, 0.0),) * 2, (0.1, 0.0, 0.0), 10.0, chance())
+    back = turn(WHEELS, ((-0.9, 0.0, 0.0),) * 2, (-0.1, 0.0, 0.0), 10.0, chance())
 
     assert nearly.torque_n_m[0] == pytest.approx(0.01)
     assert nearly.limits == ("x: wheels saturate",)
     assert back.torque_n_m[0] == -0.1
-    full = turn(WHEELS, (-1.0, 0.0, 0.0), (0.1, 0.0, 0.0), 10.0, chance())
+    full = turn(WHEELS, ((-1.0, 0.0, 0.0),) * 2, (0.1, 0.0, 0.0), 10.0, chance())
     assert full == ActuatorRefusal(reason="the wheels are saturated")
 
 
 def test_a_vehicle_without_wheels_turns_exactly_as_commanded():
-    assert turn(None, (9.0, 0.0, 0.0), (5.0, 0.0, 0.0), 1.0, chance()).torque_n_m == (5.0, 0.0, 0.0)
-    assert isinstance(turn(None, (0.0,) * 3, (0.0, 0.0, 0.0), 1.0, chance()), ActuatorRefusal)
+    held, torque = ((9.0, 0.0, 0.0),) * 2, (5.0, 0.0, 0.0)
+
+    assert turn(None, held, torque, 1.0, chance()).torque_n_m == torque
+    assert isinstance(turn(None, held, (0.0, 0.0, 0.0), 1.0, chance()), ActuatorRefusal)

@@ -70,7 +70,10 @@ def faults(folder, **rest):
                 }
             ]
         },
-        {"vehicles": [{"ballistic_m2_kg_range": [0.01, 0.02]}]},
+        {
+            "propagator": {"kind": "scipy", "forces": ["two_body", "drag"]},
+            "vehicles": [{"ballistic_m2_kg_range": [0.01, 0.02]}],
+        },
     ],
     ids=str,
 )
@@ -130,6 +133,10 @@ FAULTS_OF_THE_BOARD = [
     ),
     ({"vehicles": [{}, {"agents": ["X*"]}]}, r"vehicles\[1\].agents: 'X\*' fits no agent"),
     (
+        {"vehicles": [{"agents": ["*-01"]}, {}, {"agents": ["agent-02"]}]},
+        r"vehicles\[2\].agents: expected .* that no entry before it fits, got those of parameters.vehicles\[1\]",
+    ),
+    (
         {"vehicles": [{"sensors": {"gyro": {}}}]},
         r"vehicles\[0\].sensors.gyro: needs a vehicle with attitude",
     ),
@@ -146,7 +153,10 @@ FAULTS_OF_THE_BOARD = [
         r"vehicles\[0\].thruster.propellant_kg: expected less than",
     ),
     (
-        {"vehicles": [{"ballistic_m2_kg_range": [0.02, 0.03]}]},
+        {
+            "propagator": {"kind": "scipy", "forces": ["two_body", "drag"]},
+            "vehicles": [{"ballistic_m2_kg_range": [0.02, 0.03]}],
+        },
         r"vehicles\[0\].ballistic_m2_kg_range: expected smallest and largest",
     ),
     (
@@ -219,6 +229,34 @@ def test_an_uplink_whose_time_never_comes_is_remarked(folder, duration_s, times_
         uplinks=[{"at_s": at_s, "to": "agent-01", "text": "x"} for at_s in times_s],
     )
     found = find_faults(given, 2, folder, names=AGENTS, duration_s=duration_s)
+
+    assert len(found) == (told is not None)
+    assert all(told in text for text in found)
+
+
+@pytest.mark.parametrize(
+    ("propagator", "vehicle", "told"),
+    [
+        (
+            {"kind": "scipy"},
+            {"ballistic_m2_kg": 0.5},
+            "].ballistic_m2_kg: changes nothing: drag is not",
+        ),
+        (
+            {"kind": "scipy"},
+            {"ballistic_m2_kg_range": [0.01, 0.1]},
+            "].ballistic_m2_kg_range: changes",
+        ),
+        ({"kind": "scipy"}, {"mass_kg": 5}, None),
+        ({"kind": "scipy", "forces": ["two_body", "drag"]}, {"ballistic_m2_kg": 0.5}, None),
+        ({"kind": "basilisk"}, {"ballistic_m2_kg": 0.5}, "basilisk knows no drag by it"),
+        ({"kind": "custom", "implementation": "json:loads"}, {"ballistic_m2_kg": 0.5}, None),
+    ],
+)
+def test_a_ballistic_coefficient_that_no_drag_heeds_is_remarked(folder, propagator, vehicle, told):
+    given = parameters(propagator=propagator, vehicles=[vehicle])
+
+    found = [fault for fault in find_faults(given, 2, folder) if fault.startswith("remark: ")]
 
     assert len(found) == (told is not None)
     assert all(told in text for text in found)

@@ -47,6 +47,26 @@ def tle(line, start, columns):
     return "\n".join(lines)
 
 
+@pytest.mark.parametrize("name", ["a.tle", "a.csv", "a.json", "a.xml"])
+def test_sets_that_are_none_of_sgp4_are_refused_by_their_ephemeris_type(tmp_path, name):
+    suffix = name[2:]
+    changes = {
+        "csv": (",0,U,", ",{},U,"),
+        "json": ('"EPHEMERIS_TYPE": 0,', '"EPHEMERIS_TYPE": {},'),
+        "xml": ("<EPHEMERIS_TYPE>0<", "<EPHEMERIS_TYPE>{}<"),
+    }
+
+    def found(kind):
+        if suffix == "tle":
+            return faults(tmp_path, name, tle(2, 62, kind))
+        before, after = changes[suffix]
+        return faults(tmp_path, name, TEXTS[suffix].replace(before, after.format(kind), 1))
+
+    assert [found(kind) for kind in "02"] == [[], []]
+    (fault,) = found("4")
+    assert "EPHEMERIS_TYPE: expected 0, a set of SGP4, got 4: SGP4-XP" in fault
+
+
 @pytest.mark.parametrize(
     ("line", "start", "columns", "fault"),
     [

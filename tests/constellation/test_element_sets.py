@@ -138,6 +138,14 @@ def test_broken_json_and_xml_are_named_with_their_place(tmp_path):
     assert faults_of(tmp_path / "a.xml", "<ndm>\n<omm></ndm>")[0].startswith("2:")
 
 
+def test_the_theory_may_be_written_as_the_standard_does(tmp_path):
+    path = tmp_path / "a.xml"
+    path.write_text(XML.replace("<MEAN_ELEMENT_THEORY>SGP4", "<MEAN_ELEMENT_THEORY>SGP/SGP4"))
+    (tmp_path / "b.xml").write_text(XML)
+
+    assert read_element_sets(path) == read_element_sets(tmp_path / "b.xml")
+
+
 def test_elements_of_another_theory_or_frame_are_refused(tmp_path):
     text = XML.replace("<MEAN_ELEMENT_THEORY>SGP4", "<MEAN_ELEMENT_THEORY>DSST", 1).replace(
         "<REF_FRAME>TEME", "<REF_FRAME>GCRF", 1

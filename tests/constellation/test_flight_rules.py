@@ -64,6 +64,9 @@ def program(**rest):
         {"interface": {"transport": {"kind": "tcp", "address": "127.0.0.1:400${index}"}}},
         program(interface={"transport": {"kind": "pty"}, "protocol": "space_packets"}),
         program(interface={"protocol": "guidance.py:G"}),
+        # Who would fly the last one do not fly.
+        [program(agents=["agent-01"]), program(agents=["agent-02"]), program()],
+        [program(agents=["agent-0[1-4]"]), program(agents=["agent-*"])],
     ],
 )
 def test_rules_without_fault_have_none(tmp_path, flight):
@@ -105,9 +108,17 @@ def read_scenario_faults(tmp_path, change, **rest):
 
 
 FAULTS_OF_FLIGHT = [
-    (["guidance.py:G", "none.py:G"], "parameters.flight[1]: no such file"),
+    (
+        [{"software": "guidance.py:G", "agents": ["agent-01"]}, "none.py:G"],
+        "parameters.flight[1]: no such file",
+    ),
     ([program(), program(agents=["x*"])], "parameters.flight[1].agents: 'x*' fits no agent"),
     (program(agents=["x*"]), "parameters.flight.agents: 'x*' fits no agent"),
+    (
+        ["guidance.py:G", program(agents=["agent-01"])],
+        "parameters.flight[1].agents: expected agents or satellites that no entry before it fits, "
+        "got those of parameters.flight[0]: the first that fits holds",
+    ),
     ([{"command": ["no-such"]}], "parameters.flight[0].command: no program 'no-such'"),
     (
         {"command": [sys.executable, "${nmae}"]},
@@ -329,7 +340,7 @@ def test_a_slip_in_a_transport_is_told_there(tmp_path):
 
 
 def test_a_clock_of_its_own_is_refused_in_lockstep(tmp_path):
-    flight = [program(), {"interface": {"transport": TCP, "clock": "own"}}]
+    flight = [program(agents=["agent-01"]), {"interface": {"transport": TCP, "clock": "own"}}]
 
     (fault,) = faults(tmp_path, flight, is_lockstep=True)
 

@@ -240,6 +240,35 @@ def test_what_was_burnt_counts_when_it_is_burnt_and_what_waits_is_told():
     assert second.used_kg > 0.0
 
 
+def test_the_tank_holds_what_is_booked_for_burns_that_wait():
+    at = desk()
+    last, first = (at.decide(0, command(at_s, number=n), 10.0) for n, at_s in ((0, 40), (1, 20)))
+    booked_kg = last.used_kg + first.used_kg
+    drag = at.decide(0, command(30.0, 2, kind="ballistic", vector=(0.02, 0.0, 0.0)), 10.0)
+
+    told = [at.execute(each).result(0, is_over=True) for each in (first, drag, last)]
+
+    assert first.propellant_kg == pytest.approx(20.0 - booked_kg)  # as if it came after the other
+    left_kg = [20.0 - first.used_kg, 20.0 - first.used_kg, 20.0 - booked_kg]
+    assert [each.propellant_kg for each in told] == pytest.approx(left_kg, abs=1e-12)
+
+
+def test_a_torque_that_ends_during_or_after_a_burn_tells_what_is_left_then():
+    slow = replace(RIGID, thruster=replace(THRUSTER, thrust_n=20.0))
+    torque = {"kind": "torque", "frame": "body", "vector": (0.0, 0.0, 0.01)}
+    at = desk(slow)
+    during = at.decide(0, command(30.0, 0, duration_s=10.0, **torque), 10.0)
+    after = at.decide(0, command(50.0, 1, duration_s=5.0, **torque), 10.0)
+    burn = at.decide(0, command(40.0, 2), 10.0)
+    assert burn.effect.start_s < 40.0 < burn.effect.end_s < 50.0
+
+    left_kg = [at.execute(each).propellant_kg for each in (during, burn, after)]
+
+    # T_m is the middle of a burn, whose flow is even.
+    half_kg, over_kg = 20.0 - burn.used_kg / 2.0, 20.0 - burn.used_kg
+    assert left_kg == pytest.approx([half_kg, over_kg, over_kg], abs=1e-12)
+
+
 def test_a_burn_tells_truth_how_much_lighter_it_makes_the_vehicle():
     slow = Vehicle(thruster=Thruster(isp_s=220.0, propellant_kg=20.0, thrust_n=20.0))
 
@@ -276,6 +305,22 @@ def test_a_torque_fills_wheels_that_later_ones_find_full():
     assert second.effect.vector[2] == pytest.approx(0.01)
     assert second.reason == "z: wheels saturate"
     assert third.reason == "the wheels are saturated"
+
+
+def test_a_torque_that_comes_before_others_leaves_them_room_in_the_wheels():
+    at = desk(RIGID)
+    torque = {"kind": "torque", "frame": "body", "duration_s": 10.0}
+
+    last = at.decide(0, command(60.0, 0, vector=(0.0, 0.0, 0.09), **torque), 10.0)
+    back = at.decide(0, command(20.0, 1, vector=(0.0, 0.0, -0.1), **torque), 10.0)
+    more = at.decide(0, command(35.0, 2, vector=(0.0, 0.0, -0.1), **torque), 10.0)
+    on = at.decide(0, command(46.0, 3, vector=(0.0, 0.0, 0.1), **torque), 10.0)
+
+    # Held at 30, 56 and 70 s: 1, 0 and -0.9 N m s. One more torque would have made it 1.9 at 45 s.
+    assert [each.effect and each.effect.vector[2] for each in (last, back, on)] == pytest.approx(
+        [0.09, -0.1, 0.1]
+    )
+    assert more.reason == "the wheels are saturated"
 
 
 def test_the_inequality_is_measured_in_the_agents_own_time():

@@ -35,6 +35,8 @@ class Guard:
             wait_s = self.context.settings.get("wait_s")
             if wait_s is not None:
                 self.context.delta_v((0.0, 0.0, 0.0), at_s=t_s + wait_s)
+        if self.context.settings.get("turn_s") == t_s:
+            self.context.torque((0.0, 0.0, 1e-4), at_s=t_s + 2.0, duration_s=1.0)
         if self.context.settings.get("burn_s") == t_s:
             self.context.delta_v((0.0, 0.01, 0.0), at_s=t_s + 1.0)
 
@@ -63,10 +65,11 @@ def action(agents=("agent-02",), for_s=None, **given):
 def fly(tmp_path):
     (tmp_path / "guard.py").write_text(GUARD)
 
-    def start(*, thruster=THRUSTER, **settings):
-        flight = {"software": "guard.py:Guard", "settings": settings}
+    def start(*, thruster=THRUSTER, rate_hz=None, attitude=None, **settings):
+        flight = {"software": "guard.py:Guard", "settings": settings, "rate_hz": rate_hz}
         sensors = {"accelerometer": {"rate_hz": 10.0}}
-        params = parameters(flight=flight, vehicles=[{"thruster": thruster, "sensors": sensors}])
+        vehicle = {"thruster": thruster, "sensors": sensors, "attitude": attitude}
+        params = parameters(flight=flight, vehicles=[vehicle])
         return Star(params, 3, base_directory=tmp_path)
 
     return start
@@ -132,6 +135,18 @@ def test_flight_software_feels_it_reads_its_tank_and_closes_it_off(fly):
     rows = star.context.records["stuck_thrusters"]
     assert [row[2] for row in rows] == ["open"] * (len(rows) - 1) + ["closed"]
     assert rows[-1][4] == pytest.approx(left_kg)
+
+
+def test_software_that_steps_seldom_reads_what_the_tank_holds_now(fly):
+    star = fly(rate_hz=0.1, turn_s=20.0, attitude={"inertia_kg_m2": [1.0, 1.0, 1.0]})
+
+    (told,) = stick(star, until_s=41.0)
+
+    # The torque is over at 23 s; since then the gauge was read seven times until the step at 30 s.
+    flight = star.summaries()["agent-02"]["flight"]
+    assert [line.split()[0] for line in flight["told"]] == ["accepted", "executed"]
+    burnt_s = [(2.0 - left_kg) * EXHAUST_M_S for left_kg in flight["masses"]]
+    assert burnt_s == pytest.approx([t_s - told["from_s"] for t_s in (20.0, 30.0, 40.0)], abs=1.01)
 
 
 def test_it_burns_until_the_propellant_is_gone(fly):

@@ -22,6 +22,8 @@ from madns_runtime.simulations.constellation.parameters import (
     ConstellationParameters,
     CustomPropagator,
     ElementSetSatellites,
+    NumbaPropagator,
+    ScipyPropagator,
     Sgp4Propagator,
 )
 from madns_runtime.simulations.constellation.place_uses import place_uses_of, uses_places
@@ -30,7 +32,7 @@ from madns_runtime.simulations.constellation.truth.satellite_selection import (
     SatelliteSelection,
     choose,
 )
-from madns_runtime.simulations.constellation.vehicles import rules_with_even_slots
+from madns_runtime.simulations.constellation.vehicles import DEFAULT, rules_with_even_slots
 
 FIELD = "parameters.satellites.elements"
 AGE_DAYS_MAX = 366.0
@@ -79,6 +81,7 @@ def find_faults(  # noqa: PLR0913 - what a scenario is, most by name; see plugin
     faults += rate_faults(parameters, tick_hz)
     faults += _slot_faults(parameters)
     faults += _late_uplinks(parameters, duration_s)
+    faults += _idle_coefficients(parameters)
     if parameters.recorded_agents is not None and not is_lockstep:
         faults.append(
             "parameters.recorded_agents: expected time.mode lockstep: in real time results come when they come"
@@ -163,6 +166,28 @@ def _late_uplinks(parameters: ConstellationParameters, duration_s: float) -> lis
         f"remark: parameters.uplinks[{late[0]}].at_s: {parameters.uplinks[late[0]].at_s:g} s is no time before the end"
         f" (time.duration_s, {duration_s:g} s): it never leaves{more}"
     ]
+
+
+def _idle_coefficients(parameters: ConstellationParameters) -> list[str]:
+    """Return remarks on ballistic coefficients that change nothing, as truth has no drag by them."""
+    propagator = parameters.propagator
+    if isinstance(propagator, CustomPropagator) or "drag" in propagator.forces:
+        return []
+    why = "drag is not among parameters.propagator.forces"
+    if not isinstance(propagator, ScipyPropagator | NumbaPropagator):
+        why = f"{propagator.kind} knows no drag by it; kind: scipy does, with drag among its forces"
+    remarks = []
+    for number, vehicle in enumerate(parameters.vehicles):
+        given = [
+            name
+            for name in ("ballistic_m2_kg", "ballistic_m2_kg_range")
+            if getattr(vehicle, name) != getattr(DEFAULT, name)
+        ]
+        remarks += [
+            f"remark: parameters.vehicles[{number}].{name}: changes nothing: {why}"
+            for name in given[:1]
+        ]
+    return remarks
 
 
 def _slot_faults(parameters: ConstellationParameters) -> list[str]:

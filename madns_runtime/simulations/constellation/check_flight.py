@@ -12,7 +12,12 @@ from pathlib import Path
 from typing import Final
 
 from madns_runtime.simulations.constellation.check_addresses import address_faults
-from madns_runtime.simulations.constellation.check_vehicles import WALL, code_faults, glob_faults
+from madns_runtime.simulations.constellation.check_vehicles import (
+    WALL,
+    code_faults,
+    glob_faults,
+    unreached_faults,
+)
 from madns_runtime.simulations.constellation.flight.programs import find_program
 from madns_runtime.simulations.constellation.flight_rates import flight_rate
 from madns_runtime.simulations.constellation.flight_settings import (
@@ -57,8 +62,9 @@ def flight_faults(
     given = parameters.flight
     if isinstance(given, str):
         return code_faults("parameters.flight", given, base_directory, forbidden=WALL)
-    faults: list[str] = []
-    for number, rule in enumerate(flight_rules(parameters)):
+    rules = flight_rules(parameters)
+    faults = unreached_faults("parameters.flight", [rule.agents for rule in rules], names)
+    for number, rule in enumerate(rules):
         field = f"parameters.flight[{number}]" if isinstance(given, tuple) else "parameters.flight"
         if isinstance(given, tuple) and isinstance(given[number], str):
             faults += code_faults(field, str(given[number]), base_directory, forbidden=WALL)

@@ -32,11 +32,13 @@ from madns_runtime.simulations.constellation.equipment import (
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
 from madns_runtime.simulations.constellation.sensor_channels import sensors_from_devices
 from madns_runtime.simulations.constellation.stimulus import stimulus_faults
-from madns_runtime.simulations.constellation.vehicles import is_glob
+from madns_runtime.simulations.constellation.vehicles import fits, is_glob
 
 _HERE = "madns_runtime.simulations.constellation"
 WALL = tuple(f"{_HERE}.{part}" for part in ("truth", "vehicle", "host_side", "host", "agent"))
 """Packages that flight software must not import: all that knows truth."""
+EVERYBODY = "*"
+"""The glob of all vehicles."""
 PENDING_MAX = 10_000
 """Measurements that a sensor may have under way: see vehicle.sensors.sensor."""
 
@@ -51,7 +53,8 @@ def board_faults(
         parameters: Of the scenario, within their bounds.
         names: Names of each agent and of its satellite; empty if they are not known.
     """
-    faults = []
+    globs = [vehicle.agents for vehicle in parameters.vehicles]
+    faults = unreached_faults("parameters.vehicles", globs, names)
     for number, vehicle in enumerate(parameters.vehicles):
         field = f"parameters.vehicles[{number}]"
         faults += glob_faults(f"{field}.agents", vehicle.agents, names)
@@ -74,6 +77,43 @@ def glob_faults(field: str, globs: Iterable[str], names: Sequence[tuple[str, str
         if glob not in known
         and not (is_glob(glob) and any(map(re.compile(fnmatch.translate(glob)).match, known)))
     ]
+
+
+def unreached_faults(
+    field: str, entries: Sequence[Sequence[str]], names: Sequence[tuple[str, str]]
+) -> list[str]:
+    """
+    Return a fault for each entry that holds for nobody, since all that it fits are those of entries before it.
+
+    A pattern such as "agent-*" may find none left where few agents fly, if none before it is "*": that is no fault.
+
+    Args:
+        field: Dotted name of the list.
+        entries: Globs of each entry.
+        names: Names of each agent and of its satellite; empty if they are not known.
+    """
+    bearers: dict[str, list[str]] = {}
+    for pair in names:
+        for name in dict.fromkeys(pair):
+            bearers.setdefault(name, []).append(pair[0])
+    taken: dict[str, int] = {}
+    is_rest_taken = False
+    faults = []
+    for number, globs in enumerate(entries):
+        plain = [agent for glob in globs for agent in bearers.get(glob, ())]
+        patterns = tuple(filter(is_glob, globs))
+        more = [agent for agent, other in names if fits(patterns, agent, other)] if patterns else []
+        fitting = dict.fromkeys((*plain, *more))
+        if fitting and fitting.keys() <= taken.keys() and (is_rest_taken or not patterns):
+            first = taken[next(iter(fitting))]
+            faults.append(
+                f"{field}[{number}].agents: expected agents or satellites that no entry before it fits, "
+                f"got those of {field}[{first}]: the first that fits holds"
+            )
+        for agent in fitting:
+            taken.setdefault(agent, number)
+        is_rest_taken = is_rest_taken or EVERYBODY in globs
+    return faults
 
 
 def _body_faults(field: str, vehicle: Vehicle) -> list[str]:

@@ -184,7 +184,7 @@ class CommandResult(Message):
     delta_v_m_s: float = 0.0
     """Magnitude really given."""
     propellant_kg: float = 0.0
-    """Propellant left after the command, kg."""
+    """Propellant left after the command and all accepted before it, kg; of one that was executed what the tank holds then."""
     wheels_n_m_s: Vector | None = None
     """Momentum of the wheels about body x, y, z after a torque that was executed, N m s; None for any other result."""
 

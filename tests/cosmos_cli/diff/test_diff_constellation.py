@@ -43,6 +43,7 @@ MANEUVERS = StreamSchema(
         Field("agent", "", "str"),
         Field("number", "", "int"),
         Field("commanded_s", "s"),
+        Field("executed_s", "s"),
         Field("dv_given_m_s", "m/s"),
     ),
     shape="object",
@@ -81,7 +82,7 @@ class Flown(SyntheticRun):
                 recorder.record("estimates", (tick, slot_error_deg))
             command = {"tick": 10, "number": 0, "kind": "delta_v", "x": 0.0, "y": delta_v_m_s}
             recorder.record("commands", command | {"z": 0.0})
-            given = {"agent": name, "number": 0, "commanded_s": 10.0}
+            given = {"agent": name, "number": 0, "commanded_s": 1.0, "executed_s": 10.0}
             host.record("maneuvers", given | {"dv_given_m_s": delta_v_m_s * 0.9})
             recorder.close()
         host.close()
@@ -92,14 +93,15 @@ def fly(tmp_path, monkeypatch):
     monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
     monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
 
-    def fly_run(*, frame="TEME", epoch="2017-03-07T12:00:00Z", **what):
+    def fly_run(*, frame="TEME", epoch="2017-03-07T12:00:00Z", result=None, **what):
         config = make_config(2, ticks=TICKS, tick_hz=TICK_HZ)
         made = Flown(tmp_path / "runs", dataclasses.replace(config, simulation="constellation"))
         flown = {"along_m": 0.0, "noise_m": 0.0, "slot_error_deg": 0.1, "delta_v_m_s": 0.5}
         made.fly(**flown | what)
         made.write()
         summary = {"frame": frame, "epoch_utc": epoch}
-        finish_run(made.run, made.result(simulation=summary), made.expected, has_report=False)
+        ended = made.result(simulation=summary, **result or {})
+        finish_run(made.run, ended, made.expected, has_report=False)
 
     return fly_run
 
@@ -168,6 +170,14 @@ def test_delta_v_commanded_and_given_stand_side_by_side(fly, capsys):
 
     assert [one["commanded_m_s"] for one in control["all"]] == [1.0, 1.5]
     assert [one["commands"] for one in control["agents"]["agent-01"]] == [1, 1]
+
+
+def test_delta_v_that_a_stop_came_before_was_not_given(fly, capsys):
+    fly(), fly(result={"duration_s": 9.0})
+
+    control = compared(capsys)["control"]
+
+    assert [one["given_m_s"] for one in control["all"]] == [0.9, 0.0]
 
 
 def test_slot_error_is_told_as_flight_software_believed_it(fly, capsys):

@@ -53,12 +53,14 @@ def written(
     dead=(),
     raan_deg=(),
     crosslinks=None,
+    rules=None,
     **more,
 ):
     """A run at 1/600 Hz: satellite i at places_deg[i](tick); *skipped* record nothing, *dead* no beliefs."""
     count = len(places_deg)
     settings = {"slots": slots, **more} if slots else {}
-    parameters = {"flight": {"settings": settings}, "crosslinks": crosslinks}
+    flight = rules or {"settings": settings}
+    parameters = {"flight": flight, "crosslinks": crosslinks}
     config = make_config(count, ticks=TICKS, tick_hz=1 / 600, parameters=parameters)
     config = dataclasses.replace(config, simulation="constellation")
     made = SyntheticRun(tmp_path, config).write()
@@ -115,6 +117,33 @@ def test_slot_error_is_what_truth_says_and_not_what_was_believed(tmp_path):
     assert rows[0].slot_error_deg_max == pytest.approx(0.3, abs=1e-3)
     assert {row.slot_error_estimated_deg_rms for row in rows} == {0.5}
     assert rows[0].height_km == pytest.approx(780.0, abs=0.02)
+
+
+EVEN = {"slots": "even", "spacing_deg": 90.0}
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ((EVEN, EVEN), [4] * TICKS),
+        (({}, EVEN), [4] * TICKS),
+        ((EVEN, {**EVEN, "spacing_deg": 60.0}), []),
+        (({}, {}), []),
+    ],
+)
+def test_slots_are_judged_by_what_the_rules_of_flight_software_agree_on(
+    tmp_path, settings, expected
+):
+    rules = [
+        "coasting.py:Coasting",
+        *({"software": f"{n}.py:Keeper", "settings": each} for n, each in enumerate(settings)),
+    ]
+    made, _ = written(tmp_path, [lambda tick, n=n: 90.0 * n for n in range(4)], rules=rules)
+
+    rows = rows_of(made)
+
+    assert [row.satellites for row in rows] == expected
+    assert [row.slot_error_deg_max for row in rows] == pytest.approx([0.0] * len(rows), abs=1e-3)
 
 
 def test_delta_v_counts_once_executed_and_messages_once_sent(tmp_path):

@@ -103,6 +103,10 @@ def made(tmp_path):
 
 @pytest.fixture
 def blocks(made):
+    return blocks_of(made)
+
+
+def blocks_of(made):
     document = made.run.read_json(made.run.run_json)
     sections = {s.title: s.blocks for s in build_sections(made.run, document)}
     return {
@@ -125,6 +129,20 @@ def test_delta_v_is_summed_up_over_executed_maneuvers(blocks):
     assert trace.x.tolist() == [0.0, 4.0, 5.5, 10.0]
     assert trace.y.tolist() == pytest.approx([0.0, 0.49, 0.75, 0.75])
     assert to_plotly(figure).choices[0][1][0]["line"]["shape"] == "hv"
+
+
+def test_delta_v_that_a_stop_came_before_was_not_given(tmp_path):
+    made = SyntheticRun(tmp_path / "runs", make_config(2, ticks=TICKS, tick_hz=TICK_HZ))
+    made.write(with_states=True)
+    record(made)
+    finish_run(made.run, made.result(duration_s=5.0), made.expected, has_report=False)
+
+    control = blocks_of(made)["Control"]
+
+    rows = cells(control["Maneuvers by agent"])
+    trace = control["Delta-v spent"].choices[0].marks[0]
+    assert (trace.x.tolist(), trace.y.tolist()) == ([0.0, 4.0, 5.0], [0.0, 0.49, 0.49])
+    assert [(one["commanded"], one["given, m/s"]) for one in rows] == [(3, 0.49)] * 2
 
 
 def test_a_broken_inequality_is_drawn_apart_and_counted(blocks):

@@ -59,6 +59,7 @@ ESTIMATES, COMMANDS, MANEUVERS = "estimates", "commands", "host_maneuvers"
 SLOT_ERROR = "slot_error_deg"
 SETTLED_SHARE = 0.1
 """The last part of a run, in which a controller has settled."""
+EXECUTED = "executed_s"
 GIVEN_FIELDS = ("delta_v_given_m_s", "dv_given_m_s", "given_m_s")
 
 
@@ -144,7 +145,7 @@ def compare_runs(a: ComparedRun, b: ComparedRun) -> ConstellationDifference:
         positions=positions,
         over_time=over_time,
         attitudes=compare_attitudes(a, b),
-        efforts=(efforts_of(a.streams), efforts_of(b.streams)),
+        efforts=(efforts_of(a), efforts_of(b)),
         slot_errors=(estimated[0][0], estimated[1][0]),
         slot_over_time=(estimated[0][1], estimated[1][1]),
         slots=_slots_of(a, b),
@@ -270,15 +271,15 @@ class SlotError:
     settled_squares: float
 
 
-def efforts_of(streams: Mapping[Key, ComparedStream]) -> dict[str, Effort]:
+def efforts_of(one: ComparedRun) -> dict[str, Effort]:
     """Return what each agent commanded and what its actuators gave."""
     commanded: dict[str, list[float]] = {}
     given: dict[str, float] = {}
-    for (table, source), recorded in streams.items():
+    for (table, source), recorded in one.streams.items():
         if table == COMMANDS and {"kind", "x", "y", "z"} <= set(recorded.names()):
             commanded[source] = _commanded(recorded)
         elif table == MANEUVERS:
-            _add_given(recorded, given)
+            _add_given(recorded, given, one.run.duration_s or math.inf)
     return {
         agent: Effort(
             commanded_m_s=math.fsum(commanded.get(agent, ())),
@@ -334,13 +335,16 @@ def _commanded(recorded: ComparedStream) -> list[float]:
     return sizes
 
 
-def _add_given(recorded: ComparedStream, given: dict[str, float]) -> None:
-    """Add what the host's account of maneuvers says was given."""
+def _add_given(recorded: ComparedStream, given: dict[str, float], end_s: float) -> None:
+    """Add what the host's account of maneuvers says was given by the end of the run, which may have come before some."""
     name = next((n for n in GIVEN_FIELDS if n in recorded.names()), None)
     if name is None or "agent" not in recorded.names():
         return
-    for columns in recorded.batches(("agent", name)):
+    times = [EXECUTED] if EXECUTED in recorded.names() else []
+    for columns in recorded.batches(("agent", name, *times)):
         values = np.nan_to_num(as_array(columns[name]))
+        if times:
+            values[as_array(columns[EXECUTED]) > end_s] = 0.0
         for agent, value in zip(columns["agent"].tolist(), values.tolist(), strict=True):
             given[str(agent)] = given.get(str(agent), 0.0) + value
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -60,6 +61,10 @@ def maneuver_blocks(table: RecordedTable, run: RecordedRun) -> list[Block]:
         for name, values in columns.items()
         if name not in ("agent", "status")
     }
+    # What was to be given after a stop of the run was not.
+    is_after = numbers["executed_s"] > (run.duration_s or math.inf)
+    numbers[GIVEN] = np.where(is_after, 0.0, numbers[GIVEN])
+    numbers["executed_s"] = np.where(is_after, np.nan, numbers["executed_s"])
     return [
         *_delta_v(numbers, by_agent, run),
         *_slack(numbers, by_agent),
@@ -99,14 +104,13 @@ def estimate_blocks(table: RecordedTable, run: RecordedRun) -> list[Block]:
 def _delta_v(
     numbers: Mapping[str, Floats], by_agent: Mapping[str, Rows], run: RecordedRun
 ) -> list[Block]:
-    end_s = run.document.get("duration_s")
     spent_by = {}
     for agent, rows in by_agent.items():
         rows = rows[np.isfinite(numbers["executed_s"][rows])]  # noqa: PLW2901 - of them those executed
         rows = rows[np.argsort(numbers["executed_s"][rows], kind="stable")]  # noqa: PLW2901 - in order
         t_s = numbers["executed_s"][rows]
         spent = np.concatenate(([0.0], np.cumsum(np.nan_to_num(numbers[GIVEN][rows]))))
-        until_s = [float(end_s)] if isinstance(end_s, int | float) else t_s[-1:].tolist()
+        until_s = [run.duration_s] if run.duration_s else t_s[-1:].tolist()
         x = np.concatenate(([0.0], t_s, until_s))
         spent_by[agent] = (x, np.concatenate((spent, spent[-1:]))[: len(x)])
     return grouped_lines(

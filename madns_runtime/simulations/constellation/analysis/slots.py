@@ -2,7 +2,7 @@
 Performance of a constellation under control: slot error by truth, delta-v given and messages sent, over time.
 
 The slot error is worked out here from the recorded truth, by mean elements; what flight software believed
-stands beside it and is never taken for it. The scenario says in flight.settings.slots what a slot is:
+stands beside it and is never taken for it. The scenario says in flight.settings.slots, of one rule of flight or of several alike, what a slot is:
 
     even   equal spacing of all agents in their order, all around or by flight.settings.spacing_deg, whatever
            the common phase
@@ -32,6 +32,9 @@ from madns_runtime.simulations.constellation.orbit.mean_elements import mean_fro
 from madns_runtime.simulations.constellation.orbit.visibility import have_line_of_sight
 from madns_runtime.simulations.constellation.parameters import Crosslinks
 
+SLOTS = ("even", "kept")
+MEANING = ("slots", "spacing_deg", "plane_deg", "sma_km")
+"""Settings that say what a slot is."""
 TIMES_MAX = 97
 """Times at which slots are judged: every quarter of an hour of a day."""
 TIME_S = 1e-6
@@ -77,9 +80,9 @@ def read_control(
     state, estimates = tables.get("state"), tables.get("estimates")
     if state is None or config is None or not state.has("t_s", *STATE) or not state.rows:
         return ()
-    settings = mapping_at(config.parameters, "flight", "settings")
+    settings = mapping_at(_keeping_rule(config.parameters), "settings")
     slots = settings.get("slots")
-    if slots not in ("even", "kept"):
+    if slots is None:
         return ()
     # By the run's agents, not by the table's: one that died early still has its place in the ring.
     agents = config.agents.resolved_names()
@@ -115,6 +118,21 @@ def read_control(
     )
 
 
+def _keeping_rule(parameters: Mapping[str, Any]) -> Mapping[str, Any]:
+    """
+    Return the rule of flight software whose settings say what a slot is, of several the first; empty without any.
+
+    Several that mean different slots tell of none that all could be judged by.
+    """
+    flight = parameters.get("flight")
+    rules = flight if isinstance(flight, list | tuple) else (flight,)
+    described = [rule for rule in rules if isinstance(rule, Mapping)]
+    found = [rule for rule in described if mapping_at(rule, "settings").get("slots") in SLOTS]
+    settings = [mapping_at(rule, "settings") for rule in found]
+    meant = {tuple(repr(one.get(key)) for key in MEANING) for one in settings}
+    return found[0] if len(meant) == 1 else {}
+
+
 def recorded_times_s(tables: Tables) -> Floats:
     """Return the times at which the first agent recorded its truth; none without truth on record."""
     state = tables.get("state")
@@ -128,7 +146,7 @@ def document(run: RecordedRun) -> dict[str, Any]:
     rows = read_control(run.tables, run.config)
     if not rows or run.config is None:
         return {}
-    flight = mapping_at(run.config.parameters, "flight")
+    flight = _keeping_rule(run.config.parameters)
     control = {
         "software": flight.get("software"),
         "slots": mapping_at(flight, "settings").get("slots"),

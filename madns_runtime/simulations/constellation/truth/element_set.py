@@ -22,6 +22,9 @@ NUMBERS = {
 }
 """OMM fields that SGP4 needs, with the range each must lie in; a TLE's columns of the same meaning, too. The last
 three of real objects are a thousand times smaller at least: what is beyond is garbage."""
+OTHER_THEORIES = {"4": "SGP4-XP or SGP8", "5": "SDP8", "6": "special perturbations"}
+"""Ephemeris types of sets that are no mean elements of SGP4, which would give states of them all the same.
+Source: CCSDS 502.0-B-3, EPHEMERIS_TYPE; Spacetrack Report No. 3. A TLE has the number in its column 63."""
 _MU_KM3_S2, _EQUATOR_KM = 398_600.8, 6378.135
 """WGS-72, which element sets are fitted with."""
 _NUMBER = re.compile(r"\s*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?\s*", re.ASCII)
@@ -64,6 +67,14 @@ def _number(text: str | None) -> float | None:
         return None
     value = float(text)
     return value if math.isfinite(value) else None
+
+
+def theory_fault(ephemeris_type: str) -> str | None:
+    """Return why SGP4 must not propagate sets of an ephemeris type; None if it may."""
+    theory = OTHER_THEORIES.get(ephemeris_type.strip())
+    if theory is None:
+        return None
+    return f"EPHEMERIS_TYPE: expected 0, a set of SGP4, got {ephemeris_type.strip()}: {theory}; take sets of type 0"
 
 
 def range_fault(key: str, text: str | None) -> str | None:

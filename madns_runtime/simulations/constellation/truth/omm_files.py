@@ -14,6 +14,7 @@ from madns_runtime.simulations.constellation.truth.element_set import (
     NUMBERS,
     ElementSet,
     range_fault,
+    theory_fault,
 )
 
 BOOKKEEPING = {
@@ -32,6 +33,9 @@ FIXED_FIELDS = {
     "MEAN_ELEMENT_THEORY": "SGP4",
 }
 """OMM metadata that must have this value where it is given: SGP4 knows no other."""
+
+OTHER_WORDS = {("MEAN_ELEMENT_THEORY", "SGP/SGP4"): "SGP4"}
+"""Other words for them. Source: CCSDS 502.0-B-3, whose own examples write the theory so."""
 
 
 def read_csv(text: str, where: str, faults: list[str]) -> Iterator[ElementSet]:
@@ -130,8 +134,11 @@ def _omm_set(fields: dict[str, str], at: str, faults: list[str]) -> Iterator[Ele
     before = len(faults)
     name = fields.get("OBJECT_NAME", "").strip() or fields.get("NORAD_CAT_ID", "").strip()
     for key, expected in FIXED_FIELDS.items():
-        if fields.get(key, expected).strip().upper() != expected:
+        given = fields.get(key, expected).strip().upper()
+        if OTHER_WORDS.get((key, given), given) != expected:
             faults.append(f"{at}: {key}: expected {expected}, got {fields[key]!r}")
+    if fault := theory_fault(fields.get("EPHEMERIS_TYPE", "")):
+        faults.append(f"{at}: {fault}")
     for key in NUMBERS:
         if fault := range_fault(key, fields.get(key)):
             faults.append(f"{at}: {fault}")

@@ -10,6 +10,7 @@ from madns_runtime.simulations.constellation.truth.element_set import (
     FIRST_YEAR,
     ElementSet,
     range_fault,
+    theory_fault,
 )
 
 TLE_NAME_COLUMNS = 24
@@ -67,6 +68,8 @@ def _tle_set(
     epoch = _tle_epoch(line1)
     if epoch is None:
         faults.append(f"{where}:{first[0]}: expected a day of its year, got {line1[18:32]}")
+    if fault := theory_fault(line1[62]):
+        faults.append(f"{where}:{first[0]}: {fault}")
     faults += _tle_number_faults(where, first, second)
     if len(faults) > before or epoch is None:
         return None

@@ -89,7 +89,8 @@ class Cockpit:
         self._is_truth_fed = is_truth_fed
         self._messages: list[Delivery] = []
         self._results: deque[CommandResult] = deque(maxlen=RESULTS_MAX)
-        self._gauges: deque[CommandResult] = deque(maxlen=RESULTS_MAX)
+        self._gauges: dict[str, tuple[float, ...]] = {}
+        """What gauges have shown since the step before, the newest of each."""
         self._results_dropped = 0
         self._news: dict[str, deque[Reading]] = {}
         """Measurements since the step before."""
@@ -154,12 +155,12 @@ class Cockpit:
             self._tell("receive", message)
 
     def _tell_results(self, tick: int, t_s: float, readings: StepReadings) -> None:
-        while self._gauges:
-            self._read_gauge(t_s, self._gauges.popleft(), readings)
+        gauges, self._gauges = self._gauges, {}
+        for name, values in gauges.items():
+            readings[name] = Reading(t_s, values)
         while self._results:
             result = self._results.popleft()
             self._board.desk.record_result(tick, result)
-            self._read_gauge(t_s, result, readings)
             self._tell("command_result", result)
 
     @property
@@ -190,20 +191,24 @@ class Cockpit:
         self._messages.append(message)
 
     def read_gauges(self, result: CommandResult) -> None:
-        """Let the next step read what a command of a device has changed."""
-        self._gauges.append(result)
+        """Let the next step read the gauges of what a command has changed, and not before it has."""
+        if result.wheels_n_m_s is not None:
+            self._gauges[WHEELS] = result.wheels_n_m_s
+        if result.status == "executed":
+            self.read_tank(result.propellant_kg)
 
     def read_tank(self, propellant_kg: float) -> None:
-        """Let the next step read the tank's gauge, which no command has changed."""
-        gauge = CommandResult(
-            number=-1, status="executed", at_s=math.nan, revision=-1, propellant_kg=propellant_kg
-        )
-        self._gauges.append(gauge)
+        """Let the next step read the tank's gauge: mass and propellant, kg."""
+        thruster = self._vehicle.thruster
+        if thruster is not None:
+            mass_kg = self._vehicle.mass_kg - (thruster.propellant_kg - propellant_kg)
+            self._gauges[MASS] = mass_kg, propellant_kg
 
     def tell(self, result: CommandResult) -> None:
         """Take what became of a command, to be told in the next tick."""
         self._results_dropped += len(self._results) == RESULTS_MAX
         self._results.append(result)
+        self.read_gauges(result)
 
     def abandon(self) -> None:
         """End flight software that is a program; a class ends with its vehicle."""
@@ -231,17 +236,6 @@ class Cockpit:
             "sends_refused": dict(self._board.refused),
             "flight": told,
         }
-
-    def _read_gauge(self, t_s: float, result: CommandResult, readings: dict[str, Reading]) -> None:
-        """Give mass and propellant, and the wheels' momentum, with what changed them, and not before it has."""
-        if result.wheels_n_m_s is not None:
-            readings[WHEELS] = Reading(t_s, result.wheels_n_m_s)
-        thruster = self._vehicle.thruster
-        if thruster is None or result.status != "executed":
-            return
-        left_kg = result.propellant_kg
-        mass_kg = self._vehicle.mass_kg - (thruster.propellant_kg - left_kg)
-        readings[MASS] = Reading(t_s, (mass_kg, left_kg))
 
     def _tell(self, method: str, news: CommandResult | Delivery | TransmissionRefusal) -> None:
         """Hand news to `receive`, `command_result` or `message_refused`, if it has that method."""

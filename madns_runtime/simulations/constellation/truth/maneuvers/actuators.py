@@ -71,15 +71,29 @@ class Tank:
 
     Burns are booked as they are accepted. The rocket equation makes the propellant of several depend on
     the sum of their changes of velocity alone, so that what is left is right in whatever order they burn.
+    Until a burn is over the tank holds what is booked for it: see `left_kg`.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
         self.mass_kg = vehicle.mass_kg
         self.propellant_kg = vehicle.thruster.propellant_kg if vehicle.thruster else 0.0
+        """What is not booked yet."""
+        self._booked: list[tuple[float, float, float]] = []
+        """Begin and end of each burn that may not be over, s, and its propellant, kg."""
 
-    def book(self, burn: Burn) -> None:
-        """Take a burn's propellant off."""
+    def book(self, burn: Burn, start_s: float, end_s: float, *, now_s: float) -> None:
+        """Take off the propellant of a burn between two times, and forget those that are over now."""
         self.burn(burn.propellant_kg)
+        self._booked = [each for each in self._booked if each[1] > now_s]
+        self._booked.append((start_s, end_s, burn.propellant_kg))
+
+    def left_kg(self, t_s: float) -> float:
+        """Return what the tank holds at *t_s*, not long ago or later: what burns booked until now have not burnt by then."""
+        held_kg = 0.0
+        for start_s, end_s, kg in self._booked:
+            if end_s > t_s:  # the flow of a burn is even
+                held_kg += kg if t_s <= start_s else kg * (end_s - t_s) / (end_s - start_s)
+        return self.propellant_kg + held_kg
 
     def burn(self, propellant_kg: float) -> None:
         """Take propellant off; less than 0 gives back what was not burnt."""
@@ -208,7 +222,7 @@ class WheelTurn:
 
 def turn(
     wheels: ReactionWheels | None,
-    momentum_n_m_s: Vector,
+    held_n_m_s: tuple[Vector, Vector],
     torque_n_m: Vector,
     duration_s: float,
     random: np.random.Generator,
@@ -218,7 +232,8 @@ def turn(
 
     Args:
         wheels: Of the vehicle; None for exact torques without limit.
-        momentum_n_m_s: What the wheels hold already, body axes; a torque takes up its opposite.
+        held_n_m_s: The least and the most that the wheels hold from the beginning of the torque on, by what was
+            commanded before, body axes; a torque takes up its opposite.
         torque_n_m: As commanded, body axes.
         duration_s: For how long, > 0.
         random: One number is drawn.
@@ -237,8 +252,8 @@ def turn(
         if torque != commanded:
             limits.append(f"{'xyz'[axis]}: {wheels.torque_n_m_max:g} N m at most")
         torque *= factor
-        held = momentum_n_m_s[axis]
-        low, high = held - wheels.momentum_n_m_s_max, held + wheels.momentum_n_m_s_max
+        least, most = held_n_m_s[0][axis], held_n_m_s[1][axis]
+        low, high = most - wheels.momentum_n_m_s_max, least + wheels.momentum_n_m_s_max
         possible = min(max(torque, min(0.0, low / duration_s)), max(0.0, high / duration_s))
         if possible != torque:
             limits.append(f"{'xyz'[axis]}: wheels saturate")

@@ -110,6 +110,13 @@ class Timeline:
                 taken.append(scaled(effect.vector, effect.start_s - min(t_s, effect.end_s)))
         return total(taken)
 
+    def wheels_from(self, t_s: float) -> tuple[Vector, Vector]:
+        """Return the least and the largest momentum that wheels take up at *t_s* and later, body axes, N m s."""
+        later = (e.end_s for e in self.effects if e.kind == "torque" and e.end_s > t_s)
+        held = [self.wheels_at(at_s) for at_s in (t_s, *later)]
+        x, y, z = zip(*held, strict=True)
+        return (min(x), min(y), min(z)), (max(x), max(y), max(z))
+
     def forget_before(self, t_s: float) -> None:
         """Drop what is over before *t_s*."""
         if not self.effects or self.effects[0].start_s >= t_s:

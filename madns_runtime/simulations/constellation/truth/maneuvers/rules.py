@@ -202,12 +202,14 @@ class ManeuverDesk:
         self.account.executed += 1
         self.account.delta_v_m_s += taken.delta_v_m_s
         self.account.propellant_kg += taken.used_kg
-        if is_closure(taken.command):
-            # What was burnt until its time was not known when it was accepted.
-            taken = replace(taken, propellant_kg=self._tanks[taken.vehicle].propellant_kg)
         attitude, effect = self._vehicles[taken.vehicle].attitude, taken.effect
+        if effect is None:
+            return taken
+        # Not what was left when it was accepted: others may have burnt since, or be booked and not have burnt.
+        left_kg = self.stuck.left_kg(taken.vehicle, effect.end_s)
+        taken = replace(taken, propellant_kg=left_kg)
         has_wheels = attitude is not None and attitude.wheels is not None
-        if effect is None or effect.kind != "torque" or not has_wheels:
+        if effect.kind != "torque" or not has_wheels:
             return taken
         momentum = self._timelines[taken.vehicle].wheels_at(effect.end_s)
         return replace(taken, wheels_n_m_s=momentum)
@@ -232,7 +234,7 @@ class ManeuverDesk:
         if fault:
             return replace(refused, reason=fault)
         is_stuck = command.kind == "delta_v" and vehicle in self.stuck.burns
-        given = None if is_stuck else self._given(vehicle, command)
+        given = None if is_stuck else self._given(refused)
         if isinstance(given, WheelTurn | Magnetisation):
             given = self._bearable(vehicle, command, given)
         if isinstance(given, ActuatorRefusal):
@@ -255,17 +257,20 @@ class ManeuverDesk:
             return f"{WAITING_MAX} commands are waiting already"
         return ""
 
-    def _given(self, vehicle: int, command: Command) -> Given | ActuatorRefusal | None:
-        """Return what the actuator makes of it; None if it needs none."""
+    def _given(self, heard: Taken) -> Given | ActuatorRefusal | None:
+        """Return what the actuator makes of a command; None if it needs none."""
+        vehicle, command = heard.vehicle, heard.command
         described = self._vehicles[vehicle]
         random = chance_of(self._rules.seed, self._agents[vehicle], command.number)
         if command.kind == "delta_v" and described.thruster is not None:
             share = self.failures.share(vehicle)
             return fire(described.thruster, self._tanks[vehicle], command.vector, random, share)
         if command.kind == "torque" and described.attitude is not None:
-            momentum = self._timelines[vehicle].wheels_at(math.inf)
+            # Torques of later times may have been commanded before: their wheels must not be overfilled.
+            from_s = max(command.at_s, heard.heard_s - command.phase_s)
+            held = self._timelines[vehicle].wheels_from(from_s)
             wheels = described.attitude.wheels
-            return turn(wheels, momentum, command.vector, command.duration_s, random)
+            return turn(wheels, held, command.vector, command.duration_s, random)
         if command.kind == "dipole" and described.attitude is not None:
             torquers = described.attitude.magnetorquers
             return None if torquers is None else magnetise(torquers, command.vector, random)
@@ -362,7 +367,9 @@ class ManeuverDesk:
             return taken
         tank, commanded_m_s = self._tanks[taken.vehicle], math.hypot(*taken.command.vector)
         expected_kg = tank.propellant_kg - propellant_of(thruster, tank.mass_kg, commanded_m_s)
-        tank.book(given)
+        effect, now_s = taken.effect, taken.heard_s - taken.command.phase_s
+        assert effect is not None
+        tank.book(given, effect.start_s, effect.end_s, now_s=now_s)
         return replace(
             taken,
             delta_v_m_s=given.magnitude_m_s,

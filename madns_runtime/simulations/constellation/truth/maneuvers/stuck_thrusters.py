@@ -181,10 +181,15 @@ class StuckThrusters:
         """Let the thruster be as it was; its burn is closed, or over."""
         self.burns.pop(vehicle, None)
 
+    def left_kg(self, vehicle: int, t_s: float) -> float:
+        """Return what is left in a vehicle's tank at *t_s*, whether its thruster is stuck open or not."""
+        burn = self.burns.get(vehicle)
+        return self._tanks[vehicle].left_kg(t_s) if burn is None else self.propellant_kg(burn, t_s)
+
     def propellant_kg(self, burn: StuckBurn, t_s: float) -> float:
         """Return what is left in the tank at *t_s*, of which arcs to come are taken off already."""
         ahead_s = sum(max(0.0, arc.end_s - max(arc.start_s, t_s)) for arc, _ in burn.arcs)
-        return self._tanks[burn.vehicle].propellant_kg + burn.flow_kg_s * ahead_s
+        return self._tanks[burn.vehicle].left_kg(t_s) + burn.flow_kg_s * ahead_s
 
     def delta_v_m_s(self, burn: StuckBurn, t_s: float) -> float:
         """Return what the burn has given by *t_s*."""
