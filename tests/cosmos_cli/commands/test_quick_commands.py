@@ -378,6 +378,8 @@ def test_templates_leave_no_placeholder(template):
         ("madns-runtime", "is taken"),
         ("cars-", "expected a letter or digit at the end"),
         ("streams", "no simulation can be called"),
+        ("test", "tests or those beside the package are called"),
+        ("tests", "tests or those beside the package are called"),
     ],
 )
 def test_package_has_a_name_that_can_be_imported_and_is_free(cosmos, name, text):
