@@ -49,7 +49,9 @@ def written(folder):
 
 def test_kind_null_is_named_as_the_guide_writes_it(tmp_path, capsys):
     written = 'kind: "null"'
-    text = "name: a\nsimulation: counter\nagents: {count: 1}\nhardware: {devices: [{name: d, %s}]}\n"
+    text = (
+        "name: a\nsimulation: counter\nagents: {count: 1}\nhardware: {devices: [{name: d, %s}]}\n"
+    )
     assert f"`{written}`" in GUIDE
 
     for kind, code, told in (
