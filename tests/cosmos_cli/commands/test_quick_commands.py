@@ -365,6 +365,7 @@ def test_templates_leave_no_placeholder(template):
     assert files
     for path, text in files.items():
         assert not [word for word in ("@NAME@", "@MODULE@") if word in text or word in str(path)]
+        assert "://" not in text, path  # what is written needs no page elsewhere
 
 
 @pytest.mark.parametrize(
