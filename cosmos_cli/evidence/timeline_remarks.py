@@ -31,9 +31,9 @@ def timeline_remarks(config: RunConfig | None, tables: Tables) -> tuple[str, ...
         tables: Of it.
     """
     host = tables.get(f"host_{EVENTS.name}")
-    if config is None or not (config.timeline or any(_events(host, BEGAN, REFUSED))):
+    if config is None or not (config.timeline or any(told_events(host, BEGAN, REFUSED))):
         return ()
-    met = {str(event.get("condition")) for _, event in _events(host, MET)}
+    met = {str(event.get("condition")) for _, event in told_events(host, MET)}
     never = [
         f"{config.conditions[entry.condition].name} ({entry.action}): its condition was never met"
         for entry in config.timeline
@@ -50,7 +50,7 @@ def _refusals(tables: Tables) -> Iterator[str]:
     counts: Counter[str] = Counter()
     first: dict[str, str] = {}
     for name in (f"host_{EVENTS.name}", EVENTS.name):
-        for source, event in _events(tables.get(name), REFUSED):
+        for source, event in told_events(tables.get(name), REFUSED):
             word = str(event.get("action"))
             counts[word] += 1
             first.setdefault(word, f"{source}: {event.get('reason')}")
@@ -59,7 +59,9 @@ def _refusals(tables: Tables) -> Iterator[str]:
         yield clean_line(f"timeline: {word} was refused {counted(count, 'time')}{by} {first[word]}")
 
 
-def _events(table: RecordedTable | None, *words: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
+def told_events(
+    table: RecordedTable | None, *words: str
+) -> Iterator[tuple[str, Mapping[str, Any]]]:
     """Yield the details of all events of some words, each with who recorded it."""
     if table is None or not table.has("event", "details"):
         return
