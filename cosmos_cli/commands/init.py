@@ -23,6 +23,8 @@ TEMPLATES = Path(__file__).parent.parent / "templates"
 PLACEHOLDER = "@NAME@"
 MODULE_PLACEHOLDER = "@MODULE@"
 """The name as Python imports it: with underscores."""
+NAMES_OF_TESTS = {"test", "tests"}
+"""Python's own tests, which `sys.stdlib_module_names` leaves out, and those that the template writes."""
 NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 
 
@@ -84,6 +86,10 @@ def _check_module(name: str, template: Template) -> None:
     if is_package and name.endswith("-"):
         raise InputError(
             f"NAME: expected a letter or digit at the end, as pip wants it, got {name!r}"
+        )
+    if is_package and module in NAMES_OF_TESTS:
+        raise InputError(
+            f"NAME: {name!r} is what Python's own tests or those beside the package are called; choose another"
         )
     if template in (Template.package, Template.plugin) and name_faults(name):
         raise InputError(f"NAME: no simulation can be called {name!r}; choose another")

@@ -108,7 +108,8 @@ def logs(
             printer.print(portion)
         console.say(f"{found.name} has ended")
     is_silent = not printer.count and lines != 0
-    _tell_rest(console, found, reading, level, is_silent=is_silent)
+    machine = sources.machine_of_agent.get(source or "")
+    _tell_rest(console, found, reading, level, is_silent=is_silent, machine=machine)
     return int(ExitCode.MACHINES if failed else ExitCode.OK)
 
 
@@ -200,12 +201,24 @@ def _expect_known(
 
 
 def _tell_rest(
-    console: Console, run: RunDirectory, reading: LogReading, level: LogLevel, *, is_silent: bool
+    console: Console,
+    run: RunDirectory,
+    reading: LogReading,
+    level: LogLevel,
+    *,
+    is_silent: bool,
+    machine: str | None,
 ) -> None:
+    """Tell what could not be read, and that nothing was said; *machine* is that of the one agent that is meant."""
     if reading.damaged:
         console.say(f"{counted(reading.damaged, 'line')} could not be read")
     if is_silent:
         config = run.read_config()
         loudness = f" at recording.verbosity {config.recording.verbosity}" if config else ""
         what = "nothing" if level is LogLevel.DEBUG else f"nothing as loud as {level.value}"
-        console.say(f"{run.name}: {what} was said{loudness}")
+        place = HOST if config is not None and config.time.is_lockstep else machine
+        # Agents may share a process: what it prints is nobody's own.
+        printed = f"; what its process printed: cosmos logs {run.shell_path} {place}"
+        console.say(
+            f"{run.name}: {what} was said{loudness}{printed if machine is not None else ''}"
+        )

@@ -30,7 +30,7 @@ def report(
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Show what a run recorded: verdict, checks, tables; with figures in report.html of the run."""
+    """Show what a run recorded: verdict, checks, tables; figures are in report.html of the run."""
     console = Console(json=as_json, quiet=quiet)
     found = find_run(runs_root(folder), run)
     document = found.read_json(found.run_json)
@@ -53,4 +53,9 @@ def report(
             raise InputError(f"{html}: cannot be written: {error.strerror or error}") from error
     elif not as_json:
         print_report(console, document, build_sections(found, document))
-        console.say(f"with figures: {found.report_html}")
+        if found.report_html.is_file():
+            console.say(f"with figures: {found.report_html}")
+        else:  # --no-report
+            console.say(
+                f"its figures were not drawn; cosmos report {found.shell_path} --html FILE draws them"
+            )

@@ -20,7 +20,12 @@ from cosmos_cli.rerun.actions import action_remarks
 from cosmos_cli.rerun.device_comparison import compare_devices
 from cosmos_cli.rerun.early_ends import leave_out_after_ends, leave_out_after_simulated_time
 from cosmos_cli.rerun.expectations import compare_expectations
-from cosmos_cli.rerun.flown_software import recorded_software, software_remarks, version_remarks
+from cosmos_cli.rerun.flown_software import (
+    installed_remarks,
+    recorded_software,
+    software_remarks,
+    version_remarks,
+)
 from cosmos_cli.rerun.outcome import RerunOutcome, print_outcome
 from cosmos_cli.rerun.recorded_run import (
     FlownRun,
@@ -80,6 +85,8 @@ def rerun(
         else:
             which = "today's" if software is None else f"{software}: the"
             remarks = software_remarks(found, recorded.folder, which)
+        if software is not None:
+            remarks += installed_remarks(recorded.config.simulation)
         outcome = _fly(recorded, console, root, given=run, remarks=remarks)
     console.print_json(outcome.to_mapping())
     print_outcome(console, outcome)

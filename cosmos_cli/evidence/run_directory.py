@@ -33,6 +33,8 @@ from cosmos_cli.system.ownership import check_own_folder
 from madns_runtime.config import RunConfig, from_mapping, to_mapping
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.partial_file import write_whole
+from madns_runtime.plugin.entry_points import distributions_of
+from madns_runtime.plugin.registry import GROUP
 from madns_runtime.processes import list_processes
 from madns_runtime.recording.access import (
     DEFAULT,
@@ -328,7 +330,7 @@ def starting_document(name: str, config: RunConfig, started_utc: str) -> dict[st
         "agents": {"count": config.agents.count, "lost": []},
         "started_utc": started_utc,
         "seed": config.seed,
-        "versions": dict(installed_versions()),
+        "versions": {**distributions_of(GROUP, config.simulation), **installed_versions()},
     }
 
 

@@ -73,7 +73,7 @@ class PluginAnswers:
     """Whole parameters of agents for which others hold."""
     streams: tuple[DeclaredStream, ...] | None = None
     """Streams as it declares them; None if it declares none, or nobody could be asked."""
-    labels: AgentLabels | None = NO_LABELS
+    labels: AgentLabels | None = None
     """Second names of agents; None if the simulation could not be asked for those it gives."""
     device_uses: tuple[DeviceUse, ...] = ()
     """Channels of devices that the parameters name; empty if nobody could be asked."""

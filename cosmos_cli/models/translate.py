@@ -241,6 +241,8 @@ def _fault(
         return document.fault(path, f"unknown key{hint}", at_key=True)
     value, written = item.error["input"], document.texts.get(path)
     got = written if written and not isinstance(value, str) else kind_of(value)
+    if kind == "string_type" and value is None and written:
+        got += f'; the text is written in quotes: "{written}"'  # a kind of device is called null
     return document.fault(path, _text(kind, context, item.error, got, has_hints=has_hints))
 
 

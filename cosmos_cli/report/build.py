@@ -19,7 +19,12 @@ from cosmos_cli.report.expectations import expectation_sections
 from cosmos_cli.report.health import health_blocks, process_blocks
 from cosmos_cli.report.second_names import with_second_names
 from cosmos_cli.report.tick_causes import cause_blocks
-from cosmos_cli.report.timeline import read_actions, timeline_sections, with_bands
+from cosmos_cli.report.timeline import (
+    note_agents_refusals,
+    read_actions,
+    timeline_sections,
+    with_bands,
+)
 from cosmos_cli.report.timing import clock_blocks, tick_blocks
 from madns_runtime.analysis import chapters
 from madns_runtime.analysis.chapters import Chapter
@@ -72,6 +77,7 @@ def build_sections(run: RunDirectory, document: Mapping[str, Any]) -> list[Secti
     }
     unknown = chapters.build_sections(others, recorded)
     actions = read_actions(run)
+    note_agents_refusals(actions, recorded.tables.get("events"))
     told = document.get("duration_s")
     duration_s = float(told) if isinstance(told, int | float) else 0.0
     found = with_bands((*before, *own, *unknown, *after), actions, duration_s)

@@ -11,6 +11,8 @@ import orjson
 
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import is_linked
+from cosmos_cli.evidence.timeline_remarks import told_events
+from madns_runtime.analysis.tables import RecordedTable
 from madns_runtime.analysis.values import (
     SIMULATED_TIME,
     EventBand,
@@ -35,6 +37,7 @@ INSTANT_SHARE: Final = 0.002
 class ActionTold:
     """One action as the events tell of it."""
 
+    number: int
     begin_s: float
     word: str
     agents: Sequence[str]
@@ -43,6 +46,8 @@ class ActionTold:
     lasts: bool = False
     end_s: float | None = None
     refusal: str = ""
+    refused_by: str = ""
+    """Agents that could not carry out their part, and the first one's reason."""
 
     @property
     def what(self) -> str:
@@ -70,6 +75,7 @@ def read_actions(run: RunDirectory) -> list[ActionTold]:
         elif event.get("event") in (BEGAN, REFUSED) and number not in found:
             agents, parameters = event.get("agents"), event.get("parameters")
             found[number] = ActionTold(
+                number=number,
                 begin_s=float(t_s),
                 word=str(event.get("action")),
                 agents=agents if isinstance(agents, list) else (),
@@ -79,6 +85,21 @@ def read_actions(run: RunDirectory) -> list[ActionTold]:
                 refusal=str(event.get("reason", "")),
             )
     return list(found.values())
+
+
+def note_agents_refusals(actions: Sequence[ActionTold], events: RecordedTable | None) -> None:
+    """Note in each action which of its agents refused it, as the table of the agents' events tells."""
+    if not actions:
+        return
+    refused: dict[int, dict[str, str]] = {}
+    for agent, event in told_events(events, REFUSED):
+        if isinstance(number := event.get("number"), int):
+            refused.setdefault(number, {}).setdefault(agent, str(event.get("reason")))
+    for action in actions:
+        by = refused.get(action.number, {})
+        for agent, reason in list(by.items())[:1]:
+            more = f" and {len(by) - 1} more" if len(by) > 1 else ""
+            action.refused_by = f"by {agent}{more}: {reason}"
 
 
 def _events(run: RunDirectory) -> Iterator[Mapping[str, Any]]:
@@ -137,7 +158,14 @@ def timeline_sections(actions: Sequence[ActionTold]) -> list[Section]:
         title="Actions",
         headings=[Heading(text=text, is_number=text.endswith(", s")) for text in heads],
         rows=[
-            [each.begin_s, each.what, each.whom, each.end_s, each.delay_s, each.refusal]
+            [
+                each.begin_s,
+                each.what,
+                each.whom,
+                each.end_s,
+                each.delay_s,
+                each.refusal or each.refused_by,
+            ]
             for each in actions[:ROWS_MAX]
         ],
         note=_note(len(actions)),

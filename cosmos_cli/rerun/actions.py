@@ -24,7 +24,7 @@ def action_remarks(
     recorded: RunDirectory, rerun: RunDirectory, left_out: Sequence[str] = ()
 ) -> tuple[str, ...]:
     """
-    Say which actions took place on record alone, and which in the rerun alone.
+    Say which actions took place on record alone, and which in the rerun alone; one that was refused did not take place.
 
     Args:
         recorded: The run.
@@ -36,7 +36,9 @@ def action_remarks(
         [
             each
             for each in read_actions(run)
-            if each.word not in skipped and not is_stand_in(each.word, each.parameters)
+            if each.word not in skipped
+            and not each.refusal
+            and not is_stand_in(each.word, each.parameters)
         ]
         for run in (recorded, rerun)
     )

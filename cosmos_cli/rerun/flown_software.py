@@ -12,6 +12,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import metadata
 from pathlib import Path
 from typing import Final
 
@@ -22,6 +23,7 @@ from cosmos_cli.evidence.run_directory import RunDirectory, installed_versions
 from cosmos_cli.launch.flown_copy import hashed_file, names_in
 from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.bounded_files import read_regular_file
+from madns_runtime.plugin.registry import is_file, is_shipped
 
 SHOWN_MAX: Final = 20
 FILE_MODE, PROGRAM_MODE = 0o444, 0o555
@@ -172,11 +174,28 @@ def differing_files(flown: FlownFiles, folder: Path) -> list[str]:
 
 def version_remarks(run: RunDirectory) -> tuple[str, ...]:
     """Say what is installed in another version than when a run was flown: no copy holds that."""
-    recorded, now = (run.read_json(run.run_json) or {}).get("versions"), installed_versions()
+    recorded = (run.read_json(run.run_json) or {}).get("versions")
     if not isinstance(recorded, dict):
         return ()
+    now = {package: _version(package) for package in recorded} | installed_versions()
     return tuple(
-        f"{package} is {now[package]}, was {clean_line(str(recorded[package]))}"
-        for package in sorted(set(recorded) & set(now))
-        if recorded[package] != now[package]
+        f"{clean_line(package)} is {now[package]}, was {clean_line(str(recorded[package]))}"
+        for package in sorted(recorded)
+        if now[package] not in (None, recorded[package])
+    )
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except (metadata.PackageNotFoundError, ValueError):  # as of the system, or no name at all
+        return None
+
+
+def installed_remarks(simulation: str) -> tuple[str, ...]:
+    """Say of a simulation that is neither shipped nor a file of the scenario's folder that no copy of it is flown."""
+    if is_shipped(simulation) or is_file(simulation):
+        return ()
+    return (
+        f"the simulation {simulation} is a package that is installed here, and flown as it is today: no run keeps a copy",
     )

@@ -20,6 +20,7 @@ from cosmos_cli.rerun.carried_over import ATTEMPTS_MAX, CarriedOver, carried_ove
 from cosmos_cli.rerun.early_ends import early_ends
 from cosmos_cli.rerun.recorded_run import FlownRun, UsedDevice
 from cosmos_cli.ui.foreign_text import clean_line
+from cosmos_cli.ui.plural import counted
 from madns_runtime.config import RunConfig, ScenarioDevice, to_mapping
 from madns_runtime.errors import MadnsError
 from madns_runtime.plugin.queries import ask_rerun
@@ -62,7 +63,7 @@ def make_rerun(recorded: FlownRun) -> RerunScenario:
         raise InputError(f"{recorded.run.name} cannot be flown again: {error}") from error
     remarks = list(told["remarks"])
     remarks += [
-        f"{name}: {agent.missed} ticks were missed; lockstep misses none"
+        f"{name}: {counted(agent.missed, 'tick')} missed; lockstep misses none"
         for name, agent in recorded.agents.items()
         if agent.missed
     ]

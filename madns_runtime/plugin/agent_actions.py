@@ -43,6 +43,8 @@ class AgentActions:
         self._own = own
         self._begun: set[int] = set()
         """Numbers of the simulation's actions that this start of the agent has begun, and that are to end."""
+        self._refused: set[int] = set()
+        """Numbers of those that it has refused to begin: told once, their ends ask for nothing."""
 
     def take(self, order: ActionOrder) -> None:
         """Carry out an order; one that cannot be is recorded as refused."""
@@ -61,9 +63,10 @@ class AgentActions:
     def _take(self, order: ActionOrder, kind: ActionKind) -> None:
         action = with_instance(self._action(order), kind)
         if not order.is_end:
-            self._call("begin_action", action)
-            if order.for_s is not None:
-                self._begun.add(order.number)
+            self._begin(order, action)
+            return
+        if order.number in self._refused:
+            self._refused.remove(order.number)
             return
         if order.number not in self._begun:
             raise ActionRefused(
@@ -71,6 +74,16 @@ class AgentActions:
             )
         self._begun.remove(order.number)
         self._call("end_action", action)
+
+    def _begin(self, order: ActionOrder, action: TimelineAction) -> None:
+        try:
+            self._call("begin_action", action)
+        except ActionRefused:
+            if order.for_s is not None:
+                self._refused.add(order.number)
+            raise
+        if order.for_s is not None:
+            self._begun.add(order.number)
 
     def _action(self, order: ActionOrder) -> TimelineAction:
         return TimelineAction(

@@ -10,7 +10,7 @@ from madns_runtime.plain_values import LINE_CHARACTERS_MAX, is_line, shown
 from madns_runtime.plugin.columns import shape_faults
 from madns_runtime.plugin.kept_names import name_faults
 from madns_runtime.plugin.parameter_kinds import kind_faults
-from madns_runtime.timeline.kinds import kind_texts
+from madns_runtime.timeline.kinds import ENTRY_KEYS, kind_texts
 
 COLUMNS_OF_TABLES: Final = ("agent", "agent_name", "host", "incarnation", "t_s", "simulated_utc")
 """Columns that tables add to records: second names need one of their own."""
@@ -70,4 +70,9 @@ def _parameter_texts(action: Any) -> list[str]:
         return [
             f"{getattr(action, 'word', shown(action))}.parameters: expected a dataclass (the class)"
         ]
-    return [f"{action.word}.parameters: {text}" for text in kind_faults(kind)]
+    texts = [
+        f"{field.name}: no parameter can be called so, for an entry of a timeline has that key itself"
+        for field in dataclasses.fields(kind)
+        if field.name in ENTRY_KEYS
+    ]
+    return [f"{action.word}.parameters: {text}" for text in (*texts, *kind_faults(kind))]

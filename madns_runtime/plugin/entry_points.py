@@ -39,6 +39,15 @@ def place_of_name(group: str, name: str) -> str:
     return places[0]
 
 
+def distributions_of(group: str, name: str) -> dict[str, str]:
+    """Return the versions of the distributions that register a name; nothing of one that is not registered."""
+    return {
+        entry.dist.name: entry.dist.version
+        for entry in _entries(group, tuple(sys.path))
+        if entry.name == name and entry.dist is not None
+    }
+
+
 @functools.lru_cache(maxsize=16)
 def _entries(group: str, path: tuple[str, ...]) -> tuple[metadata.EntryPoint, ...]:
     """Return all entries of a group; read once per path of imports, as that takes 8 ms."""

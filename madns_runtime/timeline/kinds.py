@@ -18,6 +18,8 @@ STEP_MS_MAX: Final = 10_000
 DRIFT_PPM_MAX: Final = 500
 """What an estimate of the host's clock follows: two crystals differ by less, and a time service slews by so much."""
 FORBID_EXTRA: Final = {"extra": "forbid"}
+ENTRY_KEYS: Final = ("action", "agents", "at_s", "every_s", "when", "rate_per_h", "from_s", "to_s", "for_s")  # fmt: skip
+"""Keys of a timeline's entry itself, beside which the action's parameters stand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,6 +13,7 @@ import pytest
 from guides import ROOT, blocks, row_keys
 from harness.waiting import wait_until
 
+from cosmos_cli import app
 from cosmos_cli.models.inventory.devices import MachineDevice
 from madns_runtime.config import HardwareSettings
 from madns_runtime.hardware import guardian, status
@@ -44,6 +45,22 @@ def written(folder):
     for text in scenarios:
         (folder / f"{text.split()[1]}.yaml").write_text(text)
     return [block.splitlines() for block in blocks(GUIDE, "sh")]
+
+
+def test_kind_null_is_named_as_the_guide_writes_it(tmp_path, capsys):
+    written = 'kind: "null"'
+    text = (
+        "name: a\nsimulation: counter\nagents: {count: 1}\nhardware: {devices: [{name: d, %s}]}\n"
+    )
+    assert f"`{written}`" in GUIDE
+
+    for kind, code, told in (
+        (written, 0, ""),
+        ("kind: null", 2, 'got null; the text is written in quotes: "null"'),
+    ):
+        (tmp_path / "a.yaml").write_text(text % kind)
+        assert app.run(["validate", str(tmp_path / "a.yaml")]) == code
+        assert told in capsys.readouterr().err
 
 
 def start(folder, line, *settings, stdout=subprocess.DEVNULL):

@@ -66,6 +66,18 @@ def test_test_of_the_package_fails_on_what_is_not_declared(installed):
         streams.write_text(text)
 
 
+def test_test_of_the_package_fails_where_no_run_comes_to_its_end(installed):
+    source, target = installed
+    host = target / "my_rovers" / "host.py"
+    text = host.read_text()
+    host.write_text(text.replace("def setup(self", "def set_up(self"))
+    try:
+        with pytest.raises(AssertionError, match="RoverHost"):
+            run("-m", "pytest", "-q", "-k", "repeats", cwd=source, path=target)
+    finally:
+        host.write_text(text)
+
+
 def test_plan_knows_its_demand(installed):
     source, target = installed
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytest
-
 from madns_runtime.plugin.agent_actions import AgentActions
 from madns_runtime.protocol.messages import ActionOrder
 from madns_runtime.timeline.action import ActionKind, ActionRefused
@@ -65,13 +63,20 @@ def test_each_action_ends_once() -> None:
     assert start.journal.refused == []
 
 
-@pytest.mark.parametrize("refusal", ["", "no brakes"])
-def test_what_this_start_of_the_agent_did_not_begin_it_does_not_end(refusal: str) -> None:
-    start = Start(refusal)
-    if refusal:
-        start.take(3)
+def test_what_this_start_of_the_agent_did_not_begin_it_does_not_end() -> None:
+    start = Start()
 
     start.take(3, is_end=True)
 
-    assert "end_action" not in [method for method, _ in start.called]
+    assert start.called == []
     assert start.journal.refused[-1].startswith("action_refused: to end: it was not begun here")
+
+
+def test_what_was_refused_is_told_once_and_has_no_end() -> None:
+    start = Start("no brakes")
+
+    for is_end in (False, True):
+        start.take(3, is_end=is_end)
+
+    assert start.called == [("begin_action", 3)]
+    assert start.journal.refused == ["action_refused: no brakes"]

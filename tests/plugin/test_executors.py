@@ -6,6 +6,7 @@ import functools
 import math
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -230,6 +231,18 @@ def test_an_address_without_a_scheduler_is_told_in_time(monkeypatch):
 
     with pytest.raises(ConfigurationError, match="expected a Dask scheduler at nonsense://x"):
         make_executor(ExecutorSettings(kind="dask", address="nonsense://x"))
+
+
+@pytest.mark.parametrize(
+    "words", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\x10" + bytes(7) + b"a" * 24]
+)
+def test_what_answers_and_is_no_scheduler_is_told_as_such(words):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        threading.Thread(target=lambda: server.accept()[0].sendall(words), daemon=True).start()
+
+        with pytest.raises(ConfigurationError, match=f"{address}, and what answers there is none"):
+            make_executor(ExecutorSettings(kind="dask", address=address))
 
 
 def test_a_scheduler_without_workers_is_told_in_time(monkeypatch):

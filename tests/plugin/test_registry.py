@@ -420,6 +420,10 @@ def test_columns_that_are_no_fields_of_streams_are_told(write, tmp_path, columns
         ("actions=(K(word=5, summary='x'),)", "actions: 5: word: expected a text, got 5"),
         ("actions=(K(word='x', summary='x', lasting='ever'),)", "'x': lasting: expected never,"),
         ("actions=(K(word='x', summary='x', modes='lockstep'),)", "'x': modes: expected a tuple"),
+        (
+            "actions=(K(word='x', summary='x', parameters=Taken),)",
+            "x.parameters: for_s: no parameter can be called so",
+        ),  # fmt: skip
         ("agent_parameters='gain'", "agent_parameters: expected a tuple of parameters' names"),
         ("agent_parameters=('gian',)", "agent_parameters: there is no parameter 'gian'"),
         ("placeholders={'gain': 'name'}", "placeholders: expected a mapping"),
@@ -436,7 +440,8 @@ def test_a_field_of_a_descriptor_that_is_no_such_value_is_told(write, tmp_path, 
     (tmp_path / "plugin.py").write_text(
         text.replace(
             "from dataclasses import dataclass",
-            "from dataclasses import dataclass\nfrom madns_runtime.timeline.action import ActionKind as K",
+            "from dataclasses import dataclass\nfrom madns_runtime.timeline.action import ActionKind as K"
+            "\n@dataclass(frozen=True)\nclass Taken:\n    for_s: float = 1.0",
         )
     )
 

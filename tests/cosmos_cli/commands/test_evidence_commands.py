@@ -103,6 +103,20 @@ def test_report_shows_verdict_checks_and_tables(made, capsys):
     assert "no temperature sensor" in out
 
 
+def test_report_names_the_page_with_figures_only_where_it_is(made, capsys):
+    finish(made)
+    made.run.report_html.unlink(missing_ok=True)  # as `cosmos run --no-report` leaves it
+
+    assert app.run(["report"]) == 0
+    err = capsys.readouterr().err
+    assert "with figures" not in err
+    assert "--html FILE draws them" in err
+
+    made.run.report_html.write_text("<html>")
+    assert app.run(["report"]) == 0
+    assert f"with figures: {made.run.report_html}" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_report_writes_html_where_it_is_told_to(made, tmp_path, capsys):
     finish(made)

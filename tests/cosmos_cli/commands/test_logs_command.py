@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
@@ -11,10 +12,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from harness.synthetic_run import MACHINE, SyntheticRun, make_config
 from harness.waiting import wait_until
 
 from cosmos_cli.app import run as cosmos
 from cosmos_cli.evidence import run_log
+from cosmos_cli.evidence.run_directory import begin_run
 from cosmos_cli.evidence.run_log import LogReading
 from cosmos_cli.onboard import log_tail
 from cosmos_cli.onboard.request_loop import VerbRequest
@@ -149,6 +152,24 @@ def test_run_that_said_nothing_says_so(made, capsys):
 
     assert cosmos(["logs"]) == 0
     assert "0001-x: nothing was said" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("mode", "place"), [("realtime", MACHINE), ("lockstep", "host")])
+def test_agent_that_said_nothing_is_told_with_where_its_process_prints(
+    tmp_path, monkeypatch, capsys, mode, place
+):
+    config = make_config()
+    config = dataclasses.replace(config, time=dataclasses.replace(config.time, mode=mode))
+    run = SyntheticRun(tmp_path / "runs", config).run
+    begin_run(run, config, {"machines": {MACHINE: {"agents": ["agent-01", "agent-02"]}}})
+    monkeypatch.chdir(tmp_path)
+
+    assert cosmos(["logs", "last", "agent-01"]) == 0
+    err = capsys.readouterr().err
+    assert err.endswith(f"; what its process printed: cosmos logs {run.shell_path} {place}\n")
+
+    assert cosmos(["logs"]) == 0
+    assert "its process" not in capsys.readouterr().err
 
 
 def test_run_that_said_something_is_not_called_silent(made, capsys):

@@ -365,6 +365,7 @@ def test_templates_leave_no_placeholder(template):
     assert files
     for path, text in files.items():
         assert not [word for word in ("@NAME@", "@MODULE@") if word in text or word in str(path)]
+        assert "://" not in text, path  # what is written needs no page elsewhere
 
 
 @pytest.mark.parametrize(
@@ -378,6 +379,8 @@ def test_templates_leave_no_placeholder(template):
         ("madns-runtime", "is taken"),
         ("cars-", "expected a letter or digit at the end"),
         ("streams", "no simulation can be called"),
+        ("test", "tests or those beside the package are called"),
+        ("tests", "tests or those beside the package are called"),
     ],
 )
 def test_package_has_a_name_that_can_be_imported_and_is_free(cosmos, name, text):

@@ -126,6 +126,19 @@ def test_agents_and_owner_of_a_use_exist(folder: Path) -> None:
     ]
 
 
+def test_agents_are_not_looked_for_while_the_simulation_that_gives_second_names_is_missing(
+    folder: Path,
+) -> None:
+    devices = "  devices: [{name: a, kind: synthetic, agents: [chief]}]\n"
+    action = (
+        "timeline: [{at_s: 1, action: device_fault, device: a, fault: freeze, agents: [chief]}]\n"
+    )
+
+    (found,) = faults_of(folder, f"{devices}{action}", "simulation=contre")
+
+    assert found[1].startswith("simulation: no simulation named 'contre', did you mean counter?")
+
+
 def test_a_file_of_ones_own_is_not_imported_here(folder: Path) -> None:
     faults_of(folder, "  devices: [{name: a, kind: ./driver.py:Valve}]\n")
     assert int((folder / "pid").read_text()) != os.getpid()

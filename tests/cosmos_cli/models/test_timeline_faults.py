@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
+from cosmos_cli.models.timeline_rules import RULE_KEYS
+from madns_runtime.timeline.kinds import ENTRY_KEYS, FRAMEWORK_ACTIONS
 
 HEAD = """\
 name: broken
@@ -258,3 +261,9 @@ def test_a_condition_travels_with_its_agents_and_in_the_unit_of_its_field(tmp_pa
         ("agent-02",),
     )
     assert (condition.bounds.low, condition.for_s) == (2000.0, 3.0)
+
+
+def test_no_action_has_a_parameter_that_a_timelines_entry_has_itself() -> None:
+    assert set(ENTRY_KEYS) == set(RULE_KEYS)
+    for kind in FRAMEWORK_ACTIONS:
+        assert not {field.name for field in fields(kind.parameters)} & set(RULE_KEYS), kind.word

@@ -4,9 +4,15 @@ import json
 import os
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
-from cosmos_cli.report.timeline import read_actions, timeline_sections, with_bands
+from cosmos_cli.report.timeline import (
+    note_agents_refusals,
+    read_actions,
+    timeline_sections,
+    with_bands,
+)
 from madns_runtime.analysis.values import (
     Axis,
     Figure,
@@ -80,6 +86,44 @@ def test_actions_are_rows_and_bands_in_figures_over_simulated_time_alone(tmp_pat
     assert [row[0] for row in table.rows] == [10.0, 40.0, 50.0]
     assert table.rows[0][2:5] == ["a, b", 30.0, 0.5]
     assert table.rows[2][-1] == "not there"
+
+
+class AgentEvents:
+    """Events of agents, as a table: each refused the action of a number, for a reason."""
+
+    def __init__(self, *refusals):
+        self._refusals = refusals
+        self.sources = tuple(agent for agent, _, _ in refusals)
+
+    def has(self, *names):
+        return True
+
+    def batches(self, source, names, rows_max):
+        (agent, number, reason) = next(one for one in self._refusals if one[0] == source)
+        details = json.dumps({"number": number, "action": "x", "reason": reason})
+        words = np.array(["start", "action_refused"], dtype=object)
+        yield {"event": words, "details": np.array([None, details], dtype=object)}
+
+
+def test_what_agents_refused_stands_beside_the_action_and_its_band_stays(tmp_path):
+    actions = read_actions(a_run(tmp_path, EVENTS))
+
+    refusals = [
+        ("a", 0, "no gnss"),
+        ("b", 0, "no gnss"),
+        ("c", 7, "of none"),
+        ("d", [0], "garbled"),
+    ]
+    note_agents_refusals(actions, AgentEvents(*refusals))
+
+    (section,) = timeline_sections(actions)
+    assert [row[-1] for row in section.blocks[0].rows] == [
+        "by a and 1 more: no gnss",
+        "",
+        "not there",
+    ]
+    (drawn,) = with_bands([Section(title="s", blocks=[a_figure()])], actions, 100.0)
+    assert [band.start for band in drawn.blocks[0].events] == [10.0, 40.0]
 
 
 def test_a_run_without_a_timeline_has_no_chapter_of_one(tmp_path):

@@ -33,4 +33,5 @@ def test_rovers_reach_their_marks_and_all_that_is_recorded_is_declared(tmp_path)
 def test_run_of_one_seed_repeats_to_the_bit(tmp_path):
     first, second = (run(tmp_path, "time.duration_s=2", "parameters.error_max_m=9") for _ in "ab")
 
+    assert (first[0], second[0]) == (0, 0), (first[1]["verdict"], second[1]["verdict"])
     assert first[1]["records_sha256"] == second[1]["records_sha256"]
