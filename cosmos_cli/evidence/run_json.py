@@ -238,13 +238,15 @@ class Evidence:
         """Return the ticks of each agent by the plan; None if it is lost."""
         if self.config is None:
             return None
-        return count_ticks(self._duration_s(self.config), self.config.agents.tick_hz)
+        duration_s = self._duration_s(self.config)
+        # Of a run that was stopped at its begin none was due.
+        return count_ticks(duration_s, self.config.agents.tick_hz) if duration_s > 0.0 else 0
 
     def _duration_s(self, config: RunConfig) -> float:
         """Return the simulated time that was to be run, s: a stop of the timeline, or live, shortens it."""
         told = (self.result or {}).get("duration_s")
         planned_s = config.time.duration_s
-        return min(float(told), planned_s) if is_number(told) and told > 0 else planned_s
+        return min(float(told), planned_s) if is_number(told) and told >= 0 else planned_s
 
     def _is_lockstep(self) -> bool:
         return self.config is not None and self.config.time.is_lockstep
