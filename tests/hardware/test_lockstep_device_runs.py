@@ -153,6 +153,7 @@ def test_a_device_that_is_disconnected_in_lockstep_takes_nothing_and_is_lost_at_
     assert code == 4
     told = run["devices"]["agent-01/valve"]
     assert (told["samples"], told["lost"]) == (45, 1)
+    assert told["why"] == "an inserted fault disconnects it"
     counts = told["counts"]
     assert counts["lost_bytes"] == 120, "what a driver counts by itself"
     assert "hardware.lost_bytes" in run["verdict"]
