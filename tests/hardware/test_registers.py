@@ -269,5 +269,7 @@ def test_a_map_whose_blocks_would_begin_beyond_the_last_register_is_refused():
     prepare("i2c", {"address": 0x19, "map": {"registers": [trace]}}, None)
 
     trace["count"] = 57
-    with pytest.raises(PluginError, match="trace: 228 bytes from register 0x20 on, in blocks of 32"):
+    with pytest.raises(
+        PluginError, match="trace: 228 bytes from register 0x20 on, in blocks of 32"
+    ):
         prepare("i2c", {"address": 0x19, "map": {"registers": [trace]}}, None)
