@@ -220,6 +220,9 @@ class InlineDevice:
     def close(self) -> dict[str, Any]:
         """Make it safe and close it, and return what the run came to."""
         self._hear()
+        # What came behind the last tick is no age of a sample, which nobody asked for since; a disconnection is a loss.
+        is_gone = self._page.header[page.STATE] == page.CLOSED
+        self._account.observe("lost" if is_gone else self._account.status, self._now_s())
         self._intake.count("writes_left", self._outputs.clear())
         self._make_safe(self._now_s())
         self._tried("close", self._device.close)
