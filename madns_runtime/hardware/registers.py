@@ -25,7 +25,7 @@ RegisterType = Literal[
 ]  # fmt: skip
 BYTES: Final = {"8": 1, "16": 2, "24": 3, "32": 4}
 ADDRESS_MAX: Final = 0xFF
-F32_MAX: Final = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
+F32_MAX: Final[float] = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
 """The largest number that a float of 32 bits holds."""
 
 
