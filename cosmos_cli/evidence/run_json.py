@@ -238,9 +238,7 @@ class Evidence:
         """Return the ticks of each agent by the plan; None if it is lost."""
         if self.config is None:
             return None
-        duration_s = self._duration_s(self.config)
-        # Of a run that was stopped at its begin none was due.
-        return count_ticks(duration_s, self.config.agents.tick_hz) if duration_s > 0.0 else 0
+        return count_ticks(self._duration_s(self.config), self.config.agents.tick_hz)
 
     def _duration_s(self, config: RunConfig) -> float:
         """Return the simulated time that was to be run, s: a stop of the timeline, or live, shortens it."""

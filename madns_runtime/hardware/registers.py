@@ -234,9 +234,8 @@ def decode_number(kind: RegisterType, data: bytes, shift: int = 0) -> float:
 def encode_number(kind: RegisterType, number: float, shift: int = 0) -> bytes:
     """Return the bytes of a number, held to what the register can hold."""
     order: Literal["little", "big"] = "big" if kind.endswith("_be") else "little"
-    held = min(
-        max(number, -F32_MAX), F32_MAX
-    )  # no integer of a register is larger, and infinity would be none
+    # No integer of a register is larger, and infinity would be none.
+    held = min(max(number, -F32_MAX), F32_MAX)
     if kind.startswith("f"):
         return struct.pack("<f" if order == "little" else ">f", held)
     width, is_signed = _width(kind), kind.startswith("i")
