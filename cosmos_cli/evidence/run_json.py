@@ -244,7 +244,7 @@ class Evidence:
         """Return the simulated time that was to be run, s: a stop of the timeline, or live, shortens it."""
         told = (self.result or {}).get("duration_s")
         planned_s = config.time.duration_s
-        return min(float(told), planned_s) if is_number(told) and told > 0 else planned_s
+        return min(float(told), planned_s) if is_number(told) and told >= 0 else planned_s
 
     def _is_lockstep(self) -> bool:
         return self.config is not None and self.config.time.is_lockstep

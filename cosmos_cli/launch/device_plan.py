@@ -237,6 +237,9 @@ class DevicePlanner:
         for machine, agents in self.agents_by_machine.items():
             for agent in agents:
                 if agent in chosen:
+                    if text := self._taken(machine, agent, device.name):
+                        self.faults.append(((*path, "name"), text))
+                        return
                     launch = DeviceLaunch(
                         name=device.name,
                         place=agent,
@@ -254,6 +257,16 @@ class DevicePlanner:
                         seed=zlib.crc32(agent.encode(), self.scenario.seed & 0xFFFF_FFFF),
                     )
                     self.found.setdefault(machine, {})[launch.full_name] = launch
+
+    def _taken(self, machine: str, agent: str, name: str) -> str:
+        """Return what has a name already that an agent's own device is to have; empty if nothing has."""
+        used = self.found.get(machine, {}).get(f"{machine}/{name}")
+        if used is not None and agent in used.users:
+            return f"{agent} uses {name} of {machine} already (hardware.use): name one otherwise"
+        # A machine may be called like an agent that runs elsewhere.
+        if any(f"{agent}/{name}" in devices for devices in self.found.values()):
+            return f"{name} of {agent} and of the machine {agent} have one name: name one otherwise"
+        return ""
 
     # Both ---------------------------------------------------------------------------------------------
 

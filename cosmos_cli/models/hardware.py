@@ -14,6 +14,7 @@ from cosmos_cli.models.document import Document, did_you_mean
 from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.known_streams import KnownDevice, channel_fields
 from cosmos_cli.models.scenario import Scenario, SectionFault
+from cosmos_cli.models.text_forms import DEVICE_NAME
 from madns_runtime.config import ScenarioDevice
 from madns_runtime.plugin.api import DeviceUse
 
@@ -59,6 +60,12 @@ def hardware_faults(
     faults = [fault for answer in answers for fault in answer.faults]
     found: list[SectionFault] = []
     for path, device, answer in zip(paths, devices, answers, strict=True):
+        if not DEVICE_NAME.fullmatch(device.name):
+            text = (
+                "expected a name such as sense_hat: at most 64 letters, digits, '.', '_' and '-', of which the first is a"
+                f" letter or a digit; got {device.name!r:.80}"
+            )
+            found.append(((*path, "name"), text))
         if not answer.faults:
             found += device_faults(path, device, answer, is_lockstep=scenario.time.is_lockstep)
             found += _missing_files(path, device, answer, base_directory)
@@ -143,8 +150,9 @@ def _agents(scenario: Scenario, labels: AgentLabels) -> Iterator[SectionFault]:
     for index, use in enumerate(scenario.hardware.use):
         path: ValuePath = ("hardware", "use", index)
         yield from agent_faults((*path, "agents"), use.agents, names, labels)
-        if use.owner and use.owner not in labels.like_any(use.agents, names):
-            hint = did_you_mean(use.owner, names)
+        users = labels.like_any(use.agents, names)
+        if use.owner and use.owner not in users:
+            hint = did_you_mean(use.owner, users)
             text = f"expected one of the agents that may use it, got {use.owner!r}{hint}"
             yield (*path, "owner"), text
     taken: dict[tuple[str, str], int] = {}

@@ -30,6 +30,8 @@ from madns_runtime.recording.records import (
 REAL_TIME_ONLY = tuple(schema.name for schema in (TICKS, LATE_TICKS, CLOCK, PROCESS, HEALTH))
 """Framework streams that no run in lockstep records: no time passes there that could be late."""
 NOT_A_VALUE = ("json", "packed")
+OF_DEVICES_OWN = (DEVICE_STATE, DEVICE_CLOCK, EVENTS, LOG)
+"""Streams of a device beside its channels: how it fares, not what it measures."""
 INPUT_HEAD = tuple(field.name for field in schema_of(Channel(name="any")).fields[:-1])
 FRAME_FIELDS = tuple(
     field.name for field in schema_of(Channel(name="any", is_frame=True)).fields[len(INPUT_HEAD) :]
@@ -69,7 +71,7 @@ class KnownDevice:
 
     def known_streams(self) -> list[KnownStream]:
         """Return all that it records: its channels, and its own state."""
-        own = {schema.name: schema.fields for schema in (DEVICE_STATE, DEVICE_CLOCK, EVENTS, LOG)}
+        own = {schema.name: schema.fields for schema in OF_DEVICES_OWN}
         own[EVENTS.name] = tuple(
             replace(field, words=DEVICE_EVENT_WORDS) if field.name == "event" else field
             for field in EVENTS.fields

@@ -97,7 +97,7 @@ MachinePath = Annotated[
 
 FileMode = Annotated[str, like(r"[0-7]{3,4}", 'an octal mode in quotes such as "0644"')]
 SystemUser = Annotated[str, like(r"[A-Za-z0-9_][A-Za-z0-9_.-]*\$?", "the name of a user or group")]
-DeviceName = Annotated[
-    str, like(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", "the name of a device such as sense_hat")
-]
+DEVICE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+"""A folder of records bears it, and what is ordered of a device: no path, and nothing hidden."""
+DeviceName = Annotated[str, like(DEVICE_NAME.pattern, "the name of a device such as sense_hat")]
 NonBlank = Annotated[str, like(r"(?s).*\S.*", "a text that is not blank")]

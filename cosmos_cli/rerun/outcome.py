@@ -13,6 +13,7 @@ from cosmos_cli.diff.compare import Comparison
 from cosmos_cli.diff.document import to_document
 from cosmos_cli.diff.fields import FieldDifference
 from cosmos_cli.diff.stream import StreamDifference
+from cosmos_cli.models.known_streams import OF_DEVICES_OWN
 from cosmos_cli.rerun.device_comparison import SAME_TIME_S, ChannelComparison
 from cosmos_cli.rerun.expectations import ExpectationComparison
 from cosmos_cli.ui.console import Column, Console
@@ -45,6 +46,7 @@ class RerunOutcome:
             for each in self.expectations
             if not each.is_same
             and not self._is_unlike(each.stream)
+            and not _is_of_devices_own(each.stream)
             and not self._is_unlike(f"{each.stream}.{each.field}")
             and not any(fnmatchcase(f"device.{each.stream}", glob) for glob in self.unlike)
         ]
@@ -154,6 +156,12 @@ class RerunOutcome:
             "not_compared": list(self.unlike),
             "diff": to_document(self.streams),
         }
+
+
+def _is_of_devices_own(stream: str) -> bool:
+    """Tell whether a check's stream tells how a device fares: another one plays it back."""
+    _, dot, name = stream.rpartition(".")
+    return bool(dot) and any(name == schema.name for schema in OF_DEVICES_OWN)
 
 
 def print_outcome(console: Console, found: RerunOutcome) -> None:

@@ -20,7 +20,7 @@ class ValueBounds:
     Bounds of a recorded value: of numbers, truth values counting as 0 and 1, or one text.
 
     A value that is not there, and one that is not a number where a number belongs, is neither within bounds nor
-    outside of them: it never holds.
+    outside of them: it never holds. Nor does one that is not finite, which is null on record.
     """
 
     low: float | None = None
@@ -79,7 +79,7 @@ class ValueBounds:
             number = float(value)  # type: ignore[arg-type]  # numpy's numbers are none of Python's
         except (TypeError, ValueError):
             return False
-        if math.isnan(number):
+        if not math.isfinite(number):
             return False
         is_within = (
             (self.low is None or number >= self.low) and (self.high is None or number <= self.high)

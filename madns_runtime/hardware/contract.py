@@ -9,6 +9,7 @@ device's own process, one at a time: none of them may hold up a tick, however lo
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -22,6 +23,9 @@ Value = float | Sequence[float] | bytes
 ELEMENTS_MAX = 4096
 """Numbers of one channel: a camera's picture is no sample."""
 FRAME_BYTES_MAX = 8192
+NAME_CHARACTERS_MAX = 40
+"""Of a channel: its file, and what is counted of it in a page of bounded size, bear its name."""
+NAME = re.compile(rf"[A-Za-z][A-Za-z0-9_]{{0,{NAME_CHARACTERS_MAX - 1}}}")
 COLUMNS_TAKEN: Mapping[str, tuple[str, ...]] = {
     "in": ("t_s", "number", "age_us"),
     "out": ("t_s", "lateness_us"),
@@ -71,8 +75,11 @@ class Channel:
     def faults(self) -> list[str]:
         """Return what is wrong with the declaration."""
         found = []
-        if not self.name.isidentifier():
-            found.append(f"expected a name such as gyro, got {self.name!r}")
+        if not NAME.fullmatch(self.name):
+            found.append(
+                f"expected a name such as gyro, a letter and then at most {NAME_CHARACTERS_MAX - 1} letters, digits and _,"
+                f" got {self.name!r:.80}"
+            )
         if any(length < 1 for length in self.shape) or self.size > ELEMENTS_MAX:
             found.append(
                 f"{self.name}: expected 1 to {ELEMENTS_MAX} elements, got the shape {self.shape}"

@@ -13,7 +13,7 @@ from madns_runtime.config import DeviceLaunch
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.count_table import NOT_FINITE
-from madns_runtime.hardware.fault_actions import check_fault_fits
+from madns_runtime.hardware.fault_actions import DISCONNECTED, check_fault_fits
 from madns_runtime.hardware.intake import counts_of, silent_inputs
 from madns_runtime.hardware.kind_declaration import CHANNELS_MAX
 from madns_runtime.hardware.kind_registry import DeviceProgram
@@ -111,7 +111,7 @@ class DrivenDevice:
                 f"no sample for {self.limits.lost_s:g} s, where rate_hz ({rate_hz:g}) promises one every {1 / rate_hz:g} s"
                 f"{'; so far ' if told else ''}{', '.join(told)}"
             )
-        return "it is closed"
+        return DISCONNECTED if "disconnect" in self.faults else "it is closed"
 
     def _counts(self) -> dict[str, Any]:
         """Return what its processes counted, where the last one ended without its report."""

@@ -18,7 +18,8 @@ WITH_VALUE: Final = {
     "delay": "the time by which samples come late, s",
 }
 
-
+DISCONNECTED: Final = "an inserted fault disconnects it"
+"""Why a device is lost that is closed on purpose."""
 ON_NUMBERS: Final = frozenset(("bias", "noise"))
 
 

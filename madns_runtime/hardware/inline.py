@@ -10,6 +10,7 @@ from madns_runtime.errors import BlamedError, PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.contract import SimulatedDevice
 from madns_runtime.hardware.driver_answers import identity_of
+from madns_runtime.hardware.fault_actions import DISCONNECTED
 from madns_runtime.hardware.intake import Intake, silent_inputs
 from madns_runtime.hardware.kind_registry import DeviceProgram
 from madns_runtime.hardware.outputs import DeviceOutputs, DueOutput
@@ -62,7 +63,7 @@ class InlineDevice:
         self._count = 0
         self._launch = launch
         self._why = ""
-        """What its driver raised at the end."""
+        """What its driver raised at the end, or why it was lost before."""
         self._failure: PluginError | None = None
         """What it raised while its agent took no step."""
         self._handed_s = 0.0
@@ -168,7 +169,7 @@ class InlineDevice:
         is_open = self._page.header[page.STATE] == page.OPEN
         if self._intake.faults.is_disconnected and is_open:
             self._make_safe(now_s)
-            self._page.header[page.STATE] = page.CLOSED
+            self._page.header[page.STATE], self._why = page.CLOSED, self._why or DISCONNECTED
             self._records.event("closed", now_s)
         elif not self._intake.faults.is_disconnected and not is_open:
             self._page.header[page.STATE], self._page.header[page.OPENED_S] = page.OPEN, now_s
@@ -219,6 +220,9 @@ class InlineDevice:
     def close(self) -> dict[str, Any]:
         """Make it safe and close it, and return what the run came to."""
         self._hear()
+        # What came behind the last tick is no age of a sample, which nobody asked for since; a disconnection is a loss.
+        is_gone = self._page.header[page.STATE] == page.CLOSED
+        self._account.observe("lost" if is_gone else self._account.status, self._now_s())
         self._intake.count("writes_left", self._outputs.clear())
         self._make_safe(self._now_s())
         self._tried("close", self._device.close)

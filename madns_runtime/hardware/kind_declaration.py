@@ -9,7 +9,9 @@ from typing import Any, Final, TypeVar
 
 from madns_runtime.errors import ConfigurationError, PluginError
 from madns_runtime.hardware.contract import Channel, DeviceKind, Needs
+from madns_runtime.hardware.stream_schemas import schema_of
 from madns_runtime.plain_values import from_mapping, to_mapping
+from madns_runtime.recording.stream_rules import check_schema
 
 T = TypeVar("T", Channel, Needs)
 CHANNELS_MAX: Final = 64
@@ -91,11 +93,22 @@ def _declared(cls: type[T], given: T, where: str) -> T:
         raise PluginError(str(error)) from None
 
 
+def _faults_of(channel: Channel) -> Iterator[str]:
+    """Yield what is wrong with one channel, by itself or as a stream of records."""
+    own = channel.faults()
+    yield from own
+    if not own:
+        try:
+            check_schema(schema_of(channel))
+        except PluginError as error:
+            yield str(error)
+
+
 def channel_faults(channels: tuple[Channel, ...]) -> list[str]:
     """Return what is wrong with the channels that a kind declares."""
     if not channels or len(channels) > CHANNELS_MAX:
         return [f"expected 1 to {CHANNELS_MAX} channels, got {len(channels)}"]
-    faults = [fault for channel in channels for fault in channel.faults()]
+    faults = [fault for channel in channels for fault in _faults_of(channel)]
     names = [channel.name for channel in channels]
     faults += [
         f"two channels are called {name}" for name in sorted(set(names)) if names.count(name) > 1

@@ -24,7 +24,8 @@ RegisterType = Literal[
     "u32_le", "u32_be", "i32_le", "i32_be", "f32_le", "f32_be",
 ]  # fmt: skip
 BYTES: Final = {"8": 1, "16": 2, "24": 3, "32": 4}
-F32_MAX: Final = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
+ADDRESS_MAX: Final = 0xFF
+F32_MAX: Final[float] = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
 """The largest number that a float of 32 bits holds."""
 
 
@@ -104,6 +105,11 @@ def map_channels(given: RegisterMap) -> tuple[Channel, ...]:
         if each.shift and each.type.startswith("f"):
             raise PluginError(f"{each.name}: shift is of integers, and {each.type} is none")
     return register_channels(given.registers)
+
+
+def bytes_of(register: Register) -> int:
+    """Return how many bytes the numbers of a register take."""
+    return _width(register.type) * register.count
 
 
 def register_channels(registers: Sequence[Register]) -> tuple[Channel, ...]:
@@ -228,14 +234,15 @@ def decode_number(kind: RegisterType, data: bytes, shift: int = 0) -> float:
 def encode_number(kind: RegisterType, number: float, shift: int = 0) -> bytes:
     """Return the bytes of a number, held to what the register can hold."""
     order: Literal["little", "big"] = "big" if kind.endswith("_be") else "little"
+    # No integer of a register is larger, and infinity would be none.
+    held = min(max(number, -F32_MAX), F32_MAX)
     if kind.startswith("f"):
-        held = min(max(number, -F32_MAX), F32_MAX)
         return struct.pack("<f" if order == "little" else ">f", held)
     width, is_signed = _width(kind), kind.startswith("i")
     bits = 8 * width
     low = -(1 << bits - 1) if is_signed else 0
     high = (1 << bits - int(is_signed)) - 1
-    raw = min(max(round(number) << shift, low), high)
+    raw = min(max(round(held) << shift, low), high)
     return raw.to_bytes(width, order, signed=is_signed)
 
 

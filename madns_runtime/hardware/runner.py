@@ -57,7 +57,7 @@ class DeviceRunner:
         self.tell_error: Callable[[str], object] = lambda text: None
         """Told what the driver raised, before the device is closed for it."""
         self.tell_fault: Callable[[str, float | None], object] = lambda action, value: None
-        """Told of an inserted fault that came from an agent."""
+        """Told of an inserted fault that came from an agent, before the device is closed for it."""
         self._device: Device | None = None
         self._descriptor: DriverDescriptor | None = None
         self._failures = 0
@@ -339,18 +339,18 @@ class DeviceRunner:
         self, end: socket.socket, number: int, action: str, value: float | None
     ) -> None:
         """Put a fault in force that an agent orders for the host, and answer."""
-        refusal = self.insert_fault(action, value)
-        if not refusal:
-            self.tell_fault(action, value)
+        refusal = self.insert_fault(action, value, is_known=False)
         messages.send(end, [messages.ANSWER, number, refusal])
 
-    def insert_fault(self, action: str, value: float | None) -> str:
-        """Put a fault in force, or clear all, and return why not, else ""; see `InsertedFaults`."""
+    def insert_fault(self, action: str, value: float | None, *, is_known: bool = True) -> str:
+        """Put a fault in force, or clear all, and return why not, else ""; the supervisor is told one that it does not know."""
         try:
             self._intake.insert_fault(action, value)
         except MadnsError as error:
             self._refuse(str(error))
             return str(error)
+        if not is_known:
+            self.tell_fault(action, value)
         self._records.event("fault", monotonic(), action=action, value=value)
         self._held_timer.reschedule(self._intake.faults.next_due_s())
         if self._intake.faults.is_disconnected:

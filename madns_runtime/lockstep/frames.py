@@ -23,7 +23,7 @@ TICK: Final = 2
 DRAIN: Final = 3
 """[DRAIN, simulated time, [[index, body], ...]]: that is over; hand out the last messages."""
 FINISH: Final = 4
-"""[FINISH]: ask every agent for its summary."""
+"""[FINISH, simulated time]: that is over, also where no message was left; ask every agent for its summary."""
 STOP: Final = 5
 """[STOP, reason]: close the records and end; the reason of an emergency, or None."""
 RETURN: Final = 6

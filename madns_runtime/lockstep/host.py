@@ -235,7 +235,7 @@ class LockstepHost:
         account.wall_s = monotonic() - (account.began_s or 0.0)
         self._fire(HostEvent.AGENTS_COMPLETE)
         for worker in self._crew.workers:
-            self._meeting.order(worker, frames.FINISH)
+            self._meeting.order(worker, frames.FINISH, self._clock.t_s)
         limit_s, setting = max((timeouts.tick_s, "tick_s"), (timeouts.complete_s, "complete_s"))
         self._meeting.await_all(limit_s, "has not summed itself up", setting)
         self._absences.take()

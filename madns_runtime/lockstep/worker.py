@@ -259,7 +259,8 @@ class Worker:
         self._hand_out(messages)
         return self._done()
 
-    def _finish(self) -> bytes:
+    def _finish(self, t_s: float) -> bytes:
+        self._clock.t_s = t_s
         summaries, outbox = [], self._mates.outbox
         for agent in self._agents:
             self._position[0] = agent.index * POSITIONS + frames.FINISHING

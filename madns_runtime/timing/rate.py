@@ -22,13 +22,13 @@ def count_ticks(duration_s: float, tick_hz: float) -> int:
     """
     Return how many ticks of *tick_hz* a run of *duration_s* has: one at 0 s, and all others before its end.
 
-    Neither 0.29 nor 0.7 is a float, so that a product is a little off: 0.29 * 100 is 28.999999999999996 and
+    A run that was stopped at its begin, of 0 s, has none. Neither 0.29 nor 0.7 is a float, so that a product is a little off: 0.29 * 100 is 28.999999999999996 and
     0.7 * 10 is 7.000000000000001. A share of a tick below COUNT_ROUNDING of the product is taken for such an error.
     """
     exact = duration_s * tick_hz
     nearest = round(exact)
     is_whole = abs(exact - nearest) <= COUNT_ROUNDING * max(1.0, exact)
-    return max(1, nearest if is_whole else math.ceil(exact))
+    return max(int(duration_s > 0.0), nearest if is_whole else math.ceil(exact))
 
 
 class TickTiming(NamedTuple):

@@ -45,7 +45,7 @@ def condition(**values):
 def test_bounds_hold_for_values_within_and_never_for_none_of_their_kind(bounds, held, not_held):
     assert [value for value in held if not bounds.holds(value)] == []
     assert [value for value in not_held if bounds.holds(value)] == []
-    assert not any(map(bounds.holds, (None, math.nan, np.nan, [1], {})))
+    assert not any(map(bounds.holds, (None, math.nan, np.nan, math.inf, -np.inf, [1], {})))
 
 
 def test_a_condition_is_met_once_at_the_record_that_meets_it():

@@ -212,7 +212,8 @@ def test_a_detached_run_takes_faults_and_ends_by_the_name_of_a_lost_device(tmp_p
     assert collected.returncode == 0, collected.stderr  # it was brought and judged
     assert document["exit_code"] == 3, collected.stderr
     assert document["who"] == "agent-02/tank"
-    assert document["verdict"].startswith("FAILED: agent-02/tank: lost: ")
+    lost = "FAILED: agent-02/tank: lost: an inserted fault disconnects it"
+    assert document["verdict"].startswith(lost)
     told = (folder / "host" / "events.jsonl").read_text()
     assert '"target":"agent-02/tank","action":"bias","value":1000000.0,"refusal":""' in told
     assert '"device":"agent-02/tank","status":"lost"' in told

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 
 import pytest
@@ -73,6 +75,21 @@ def test_analog_outputs_are_written_raw_and_made_safe(converter):
         with pytest.raises(MachineError, match="does not take '100'"):
             device.write({"volts": 50.0}, 0.0)
         assert not converter.exists()
+
+
+def test_a_value_that_the_converter_does_not_take_is_refused_and_it_stays_open(
+    converter, monkeypatch
+):
+    def refuse(fd, data):
+        raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+
+    volts = {"name": "volts", "file": "out_voltage0_raw", "is_output": True, "scale": 1e-9}
+    with opened("analog", root=str(converter.parent), inputs=[volts]) as device:
+        with pytest.raises(PluginError, match="expected a value that the converter can hold"):
+            device.write({"volts": 1e305}, 0.0)
+        monkeypatch.setattr(os, "write", refuse)
+        with pytest.raises(PluginError, match="does not take '6000000000': Invalid argument"):
+            device.write({"volts": 6.0}, 0.0)
 
 
 def test_an_unplugged_converter_and_one_that_says_no_number(converter):

@@ -48,6 +48,11 @@ hardware:
         (ONE[:-3] + ", direction='input'),)", "direction: expected one of .'in', 'out'."),
         (ONE[:-3] + ", unit=3),)", "unit: expected str, got 3"),
         (ONE[:-3] + ", shape=(2,), components=('x', 'x')),)", "distinct names, got a_x, a_x"),
+        ('channels=(Channel(name="_a"),)', "expected a name such as gyro, a letter and"),
+        ('channels=(Channel(name="länge"),)', "expected a name such as gyro, a letter and"),
+        (f'channels=(Channel(name="{"a" * 41}"),)', "at most 39 letters, digits and _, got 'a"),
+        ('channels=(Channel(name="incarnation"),)', "which tables add, got 'incarnation'"),
+        (ONE[:-3] + ", unit='m\\n'),)", r"stream a: expected the unit of a to be a text"),
         ('channels=(Channel(name="number"),)', "number: no number may be called number"),
         (
             'channels=(Channel(name="lateness_us", direction="out"),)',

@@ -153,6 +153,8 @@ def test_a_device_that_is_disconnected_in_lockstep_takes_nothing_and_is_lost_at_
     assert code == 4
     told = run["devices"]["agent-01/valve"]
     assert (told["samples"], told["lost"]) == (45, 1)
+    assert told["why"] == "an inserted fault disconnects it"
+    assert told["stale_ratio"] == pytest.approx(1.5 / 6.0), "of the whole run"
     counts = told["counts"]
     assert counts["lost_bytes"] == 120, "what a driver counts by itself"
     assert "hardware.lost_bytes" in run["verdict"]
@@ -169,8 +171,12 @@ def test_a_device_that_is_disconnected_in_lockstep_takes_nothing_and_is_lost_at_
         ("closed", 3.0),
         ("fault", 4.5),
         ("opened", 4.5),
-        ("made_safe", 5.9),
+        ("made_safe", 6.0),
     ]
+    (end,) = [
+        e for e in rows(folder / "agents" / "agent-01" / "events.jsonl") if e["event"] == "end"
+    ]
+    assert end["t_s"] == 6.0, "also where no message was left behind the last tick"
     result = json.loads((folder / "result.json").read_text())
     changes = result["agents"]["agent-01"]["simulation"]["changes"]
     assert [[round(t_s, 6), status] for t_s, status in changes] == [
@@ -445,6 +451,24 @@ def test_devices_go_on_while_their_agents_take_no_step_or_are_away(tmp_path):
         "agent-01": (60, 0.0),
         "agent-02": (60, 0.0),
     }
+
+
+@pytest.mark.parametrize(
+    ("duration_s", "lost", "stale_ratio"), [(6, 0, 0.0), (6, 1, 0.0), (0.05, 0, 0.0)]
+)
+def test_a_device_counts_up_to_the_end_of_the_run_behind_the_last_tick(
+    tmp_path, duration_s, lost, stale_ratio
+):
+    scenario = tmp_path / "even.yaml"
+    fault = "{at_s: 5.99, action: device_fault, agents: [agent-01], device: gps, fault: disconnect}"
+    scenario.write_text(SCENARIO + f"timeline: [{fault if lost else ''}]\n")
+    cosmos = CosmosCommand(tmp_path)
+
+    code, result = cosmos.run(scenario, *LOOSE, f"time.duration_s={duration_s}")
+
+    told = result["devices"]["agent-01/gps"]
+    assert (code, told["lost"], told["stale_ratio"]) == (4 * lost, lost, stale_ratio)
+    assert told["status"] == ("lost" if lost else "ok")
 
 
 @pytest.mark.parametrize("ends", [True, False])

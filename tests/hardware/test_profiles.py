@@ -9,10 +9,15 @@ import pytest
 
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware import profiles
-from madns_runtime.hardware.contract import Channel
+from madns_runtime.hardware.contract import NAME_CHARACTERS_MAX, Channel
+from madns_runtime.hardware.count_table import NAME_BYTES, NOT_FINITE
+from madns_runtime.hardware.intake import FROZEN
 from madns_runtime.hardware.profiles import (
+    POINT_COUNTS,
     POINTS_MAX,
+    UNDERRUNS,
     ChannelProfile,
+    count_name,
     counts_by_channel,
     pack_points,
     unpack_points,
@@ -148,6 +153,16 @@ def test_counts_are_told_by_output():
 
     assert (told["coil"]["points"], told["coil"]["late"], told["coil"]["underruns"]) == (5, 2, 0)
     assert set(told) == {"coil", "line"}
+
+
+def test_what_is_counted_of_the_longest_name_has_room_for_all_of_it():
+    """What is cut off would tell the points of one output under several names, and none of them as late."""
+    name = "a" * NAME_CHARACTERS_MAX
+    assert Channel(name=name).faults() == [] != Channel(name=f"{name}a").faults()
+
+    counted = [count_name(word, name) for word in (*POINT_COUNTS, UNDERRUNS)]
+
+    assert max(map(len, (*counted, f"{FROZEN}{name}", f"{name}{NOT_FINITE}"))) <= NAME_BYTES
 
 
 def test_a_kind_that_makes_safe_needs_a_safe_value():

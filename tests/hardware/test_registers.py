@@ -252,3 +252,24 @@ def test_a_number_beyond_what_a_float_of_32_bits_holds_is_held_to_it():
         device.write({"level": -1e300}, 0.0)
 
     assert bytes(CHIP[0x10:0x14]) == b"\xff\xff\x7f\xff"
+
+
+@pytest.mark.parametrize(("kind", "held"), [("i16_be", b"\x80\x00"), ("u16_be", b"\0\0")])
+def test_a_number_beyond_all_bounds_is_held_to_what_the_register_can_hold(kind, held):
+    register = {"name": "level", "address": 0x10, "type": kind, "direction": "out", "scale": 1e-9}
+    with opened("i2c", address=0x19, map={"registers": [register]}) as device:
+        device.write({"level": -1e305}, 0.0)
+
+    assert bytes(CHIP[0x10:0x12]) == held
+
+
+def test_a_map_whose_blocks_would_begin_beyond_the_last_register_is_refused():
+    """An address is one byte: beyond 0xff the bus would begin anew at 0x00."""
+    trace = {"name": "trace", "address": 0x20, "type": "u32_le", "count": 56}
+    prepare("i2c", {"address": 0x19, "map": {"registers": [trace]}}, None)
+
+    trace["count"] = 57
+    with pytest.raises(
+        PluginError, match="trace: 228 bytes from register 0x20 on, in blocks of 32"
+    ):
+        prepare("i2c", {"address": 0x19, "map": {"registers": [trace]}}, None)

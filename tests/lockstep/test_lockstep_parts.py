@@ -47,8 +47,8 @@ def test_agents_are_shared_out_in_order(count, per_process, processors, sizes):
 
 
 def test_frames_are_cut_wherever_the_stream_is():
-    data = encode_frame(frames.TICK, 7, [(1, b"x" * 300)]) + encode_frame(frames.FINISH)
-    whole = [[frames.TICK, 7, [[1, b"x" * 300]]], [frames.FINISH]]
+    data = encode_frame(frames.TICK, 7, [(1, b"x" * 300)]) + encode_frame(frames.FINISH, 0.8)
+    whole = [[frames.TICK, 7, [[1, b"x" * 300]]], [frames.FINISH, 0.8]]
 
     assert list(FrameReader().feed(data)) == whole
     reader = FrameReader()

@@ -63,6 +63,13 @@ def test_a_timeline_in_lockstep_repeats_to_the_bit_and_a_stop_completes_the_run(
     assert all(e["delay_s"] == 0.0 for e in found)
 
 
+def test_of_a_run_that_is_stopped_at_its_begin_no_tick_was_due(cosmos, tmp_path):
+    code, result = cosmos.run(written(tmp_path, [{"at_s": 0, "action": "stop"}]))
+
+    assert (code, result["status"], result["duration_s"]) == (0, "complete", 0.0)
+    assert (result["timing"]["ticks"], result["timing"]["missed"]) == (0, 0)
+
+
 def test_a_stop_in_real_time_ends_all_agents_with_the_same_tick(cosmos, tmp_path):
     path = written(
         tmp_path,

@@ -53,6 +53,10 @@ def test_tick_count_is_robust_to_rounding(tick_hz, duration_s, expected):
     assert make_pacer(tick_hz=tick_hz, duration_s=duration_s).tick_count == expected
 
 
+def test_a_run_that_is_stopped_at_its_begin_has_no_tick():
+    assert count_ticks(0.0, 10.0) == 0
+
+
 @given(
     rate=st.fractions(min_value=1, max_value=1000, max_denominator=60),
     count=st.integers(min_value=1, max_value=100_000),

@@ -61,7 +61,7 @@ def holds(bounds: ValueBounds, values: NDArray[Any]) -> Flags:
         within &= numbers >= bounds.low if bounds.is_closed else numbers > bounds.low
     if bounds.high is not None:
         within &= numbers <= bounds.high if bounds.is_closed else numbers < bounds.high
-    held: Flags = (within != bounds.is_negated) & ~np.isnan(numbers)
+    held: Flags = (within != bounds.is_negated) & np.isfinite(numbers)
     return held
 
 

@@ -31,7 +31,7 @@ from cosmos_cli.evidence.expectations.outcomes import (
 from cosmos_cli.evidence.expectations.records import Batch, RecordSource
 from cosmos_cli.evidence.expectations.seen_words import SeenWords
 from cosmos_cli.evidence.verdict import CheckResult
-from cosmos_cli.models.expectation import Expectation, scaled
+from cosmos_cli.models.expectation import Expectation, HeldBounds, scaled
 from cosmos_cli.models.known_streams import REAL_TIME_ONLY
 from madns_runtime.analysis.tables import Tables
 from madns_runtime.conditions.condition import HOST, ValueBounds
@@ -91,7 +91,8 @@ def judge_expectations(
         duration_s: Its simulated time, s.
     """
     source = RecordSource(tables)
-    judged = [each for each in expectations if each.is_judged_in(is_lockstep=is_lockstep)]
+    not_judged = _not_judged(expectations, is_lockstep=is_lockstep)
+    judged = [each for each in expectations if each.name not in not_judged]
     followed = [_Followed(each, source, duration_s) for each in judged]
     by_stream: dict[str, list[_Followed]] = {}
     for each in followed:
@@ -111,9 +112,20 @@ def judge_expectations(
         )
     return JudgedExpectations(
         results=tuple(results),
-        not_judged={each.name: _of_other_mode(each) for each in expectations if each not in judged},
+        not_judged=not_judged,
         unseen=tuple(filter(None, (each.words.remark() for each in followed))),
     )
+
+
+def _not_judged(expectations: Sequence[Expectation], *, is_lockstep: bool) -> dict[str, str]:
+    """Return why expectations are not judged, by name: of a stream that is not recorded, or after one of these."""
+    found: dict[str, str] = {}
+    for each in expectations:
+        if not each.is_judged_in(is_lockstep=is_lockstep):
+            found[each.name] = _of_other_mode(each)
+        elif each.after in found:
+            found[each.name] = f"it comes after {each.after}, which is not judged"
+    return found
 
 
 def _of_other_mode(expectation: Expectation) -> str:
@@ -301,6 +313,21 @@ def _fault_of(expectation: Expectation, source: RecordSource) -> str | None:
         return f"stream {stream} has no field {field_}"
     if roles and expectation.is_timed and not source.has_time(stream):
         return f"records of stream {stream} tell no time"
+    return None if expectation.meanwhile is None else _held_fault(expectation.meanwhile, source)
+
+
+def _held_fault(held: HeldBounds, source: RecordSource) -> str | None:
+    """Return why it is not known when a condition under `while` holds; None if it is."""
+    stream, field_ = held.stream, held.field
+    if not source.tables_of(stream):
+        return f"nobody recorded stream {stream}"
+    if not source.may_have(stream, field_):
+        return f"stream {stream} has no field {field_}"
+    if not source.has_time(stream):
+        return f"records of stream {stream} tell no time"
+    recorded = source.unit_of(stream, field_)
+    if held.unit and conversion(held.unit, recorded) is None:
+        return f"{stream}.{field_} is in {recorded or '1'}"
     return None
 
 

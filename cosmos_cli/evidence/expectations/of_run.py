@@ -56,7 +56,7 @@ def judge_run(
         expectations,
         tables,
         is_lockstep=config.time.is_lockstep,
-        duration_s=min(float(ran_s), planned_s) if is_number(ran_s) and ran_s > 0 else planned_s,
+        duration_s=min(float(ran_s), planned_s) if is_number(ran_s) and ran_s >= 0 else planned_s,
     )
 
 

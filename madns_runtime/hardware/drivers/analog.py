@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
 from time import monotonic
 from typing import Any
 
+from madns_runtime.errors import PluginError
 from madns_runtime.hardware.contract import Device, Sample, Value
-from madns_runtime.hardware.drivers.kernel_files import read_number, read_text, write_text
+from madns_runtime.hardware.drivers.kernel_files import (
+    ValueRefused,
+    read_number,
+    read_text,
+    write_text,
+)
 
 
 class AnalogDevice(Device):
@@ -49,11 +56,23 @@ class AnalogDevice(Device):
         return Sample(values=values, taken_s=taken_s)
 
     def write(self, values: Mapping[str, Value], due_s: float) -> None:
-        """Write outputs, by name."""
+        """
+        Write outputs, by name.
+
+        Raises:
+            PluginError: The converter takes no such value.
+            MachineError: It is gone.
+        """
         number: Any
         for name, number in values.items():
             path, scale, offset = self._lines[name]
-            write_text(path, str(round(number / scale - offset)))
+            raw = number / scale - offset
+            if not math.isfinite(raw):
+                raise PluginError(f"expected a value that the converter can hold, got {number:g}")
+            try:
+                write_text(path, str(round(raw)))
+            except ValueRefused as error:
+                raise PluginError(str(error)) from None
 
     def make_safe(self) -> None:
         """Write the safe value of each output that has one."""

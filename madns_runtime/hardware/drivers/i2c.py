@@ -7,13 +7,11 @@ import errno
 import smbus2
 
 from madns_runtime.errors import MachineError
+from madns_runtime.hardware.kinds.i2c import BLOCK_BYTES
 from madns_runtime.hardware.registers import (
     RegisterBus,
     RegisterDevice,
 )
-
-BLOCK_BYTES = 32
-"""A block of the system management bus is no longer."""
 
 
 class I2cDevice(RegisterDevice):

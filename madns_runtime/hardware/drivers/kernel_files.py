@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 
 from madns_runtime.errors import MachineError
 
 TEXT_BYTES_MAX = 64
+REFUSALS = (errno.EINVAL, errno.ERANGE, errno.EDOM, errno.EOVERFLOW)
+"""Errors by which a driver of the kernel says that it takes no such value."""
+
+
+class ValueRefused(MachineError):
+    """The kernel's driver is there, and does not take this value."""
 
 
 def read_text(path: Path) -> str:
@@ -43,7 +50,8 @@ def write_text(path: Path, text: str) -> None:
     Write to a file of the kernel.
 
     Raises:
-        MachineError: It does not take it.
+        ValueRefused: Its driver takes no such value.
+        MachineError: It does not take it for another reason.
     """
     try:
         # Not made where it is missing: what is not there has been unplugged.
@@ -53,4 +61,5 @@ def write_text(path: Path, text: str) -> None:
         finally:
             os.close(fd)
     except OSError as error:
-        raise MachineError(f"{path}: does not take {text!r}: {error.strerror}") from None
+        kind = ValueRefused if error.errno in REFUSALS else MachineError
+        raise kind(f"{path}: does not take {text!r:.80}: {error.strerror}") from None

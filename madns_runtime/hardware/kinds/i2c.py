@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Final
 
 from annotated_types import Ge, Le
 
+from madns_runtime.errors import PluginError
 from madns_runtime.hardware.contract import Channel, DeviceKind, Needs
 from madns_runtime.hardware.registers import (
+    ADDRESS_MAX,
     RegisterMap,
+    bytes_of,
     map_channels,
 )
+
+BLOCK_BYTES: Final = 32
+"""A block of the system management bus is no longer."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,8 +32,22 @@ class I2cParameters:
 
 
 def channels_of(parameters: I2cParameters) -> tuple[Channel, ...]:
-    """Return a channel per register."""
-    return map_channels(parameters.map)
+    """
+    Return a channel per register.
+
+    Raises:
+        PluginError: As `map_channels`, or a block of one begins where there is no register.
+    """
+    channels = map_channels(parameters.map)
+    for each in parameters.map.registers:
+        size = bytes_of(each)
+        if each.address + (size - 1) // BLOCK_BYTES * BLOCK_BYTES > ADDRESS_MAX:
+            # The bus would take such an address modulo 256, and other registers would be read or written.
+            raise PluginError(
+                f"{each.name}: {size} bytes from register 0x{each.address:02x} on, in blocks of {BLOCK_BYTES}, go beyond"
+                f" register 0x{ADDRESS_MAX:02x}"
+            )
+    return channels
 
 
 def needs_of(parameters: I2cParameters) -> Needs:

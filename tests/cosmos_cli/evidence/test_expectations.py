@@ -508,6 +508,28 @@ def test_a_text_under_while_where_a_number_is_meant_holds_nothing():
     assert result.passed
 
 
+@pytest.mark.parametrize(
+    ("held", "why"),
+    [
+        ({"stream": "nowhere"}, "nobody recorded stream nowhere"),
+        ({"field": "y_m"}, "stream state has no field y_m"),
+        ({"unit": "s"}, "state.x_m is in m"),
+        ({"stream": "timeless", "field": "y"}, "records of stream timeless tell no time"),
+    ],
+)
+def test_a_count_while_what_nobody_can_tell_holds_is_broken_with_the_reason(held, why):
+    timeless = FakeTable("timeless", (Field("y", "m"),), {"a": {"y": T_S}})
+    given = {"stream": "state", "field": "x_m", "bounds": ValueBounds.above(-1e9), **held}
+
+    (result,) = judge(
+        expect(statistic="count", bounds=ValueBounds.below(1), meanwhile=HeldBounds(**given)),
+        tables={**TABLES, "timeless": timeless},
+    ).results
+
+    assert (result.got, result.passed) == (None, False)
+    assert result.expected == f"x ({why})"
+
+
 def test_what_events_carry_beside_their_fields_is_a_value_too():
     result = result_of(
         stream="events", field="dv_m_s", bounds=ValueBounds.below(2.0), agents=("a",)
@@ -575,6 +597,22 @@ def test_a_stream_of_the_other_time_mode_is_not_judged_and_a_run_without_any_jud
     assert [each.name for each in both.results] == ["x"]
     assert both.gaps() == ()
     assert both.remarks()[0].startswith("ticks: not judged: ")
+
+
+def test_what_comes_after_a_check_that_is_not_judged_is_not_judged_either():
+    late = expect(name="late", stream="ticks", statistic="first_time", only_realtime=True)
+    after = {"stream": "events", "field": "event", "event": "done"}
+
+    found = judge(
+        late,
+        expect(name="then", after="late", **after),
+        expect(name="last", after="then", **after),
+        expect(name="ever", **after),
+    )
+
+    assert [each.name for each in found.results] == ["ever"]
+    assert found.not_judged["then"] == "it comes after late, which is not judged"
+    assert found.not_judged["last"] == "it comes after then, which is not judged"
 
 
 GYRO = FakeTable(

@@ -87,6 +87,9 @@ def faults_of(folder: Path, hardware: str, *overrides: str) -> list[tuple[int | 
         ("{name: a, kind: synthetic, rate_hz: 5000}", "rate_hz: expected <= 1000"),
         ("{name: a, kind: synthetic, agents: [chief]}", "agents[0]: no agent is named chief"),
         ("{name: a, kind: ./driver.py:Valve, parameters: {gain: 3}}", "gain: expected <= 2, got 3"),
+        ("{name: .., kind: synthetic}", "name: expected a name such as sense_hat"),
+        ("{name: ../../a, kind: synthetic}", "is a letter or a digit; got '../../a'"),
+        ("{name: '', kind: synthetic}", "devices[0].name: expected"),
         ("{name: a, kind: ./driver.py:Valve}", "is bound to a machine: list it in cosmos_devices"),
         ("{name: a, kind: ./hang.py:Valve}", "was not done within 1 s"),
     ],
@@ -137,6 +140,12 @@ def test_agents_are_not_looked_for_while_the_simulation_that_gives_second_names_
     (found,) = faults_of(folder, f"{devices}{action}", "simulation=contre")
 
     assert found[1].startswith("simulation: no simulation named 'contre', did you mean counter?")
+
+
+def test_an_owner_that_does_not_use_the_device_is_not_guessed_again(folder: Path) -> None:
+    use = "  use: [{devices: [imu], agents: [agent-02], owner: agent-01}]\n"
+    (found,) = faults_of(folder, use)
+    assert "got 'agent-01', did you mean agent-02?" in found[1]
 
 
 def test_a_file_of_ones_own_is_not_imported_here(folder: Path) -> None:
@@ -216,6 +225,19 @@ def test_what_only_the_inventory_can_tell_is_told_by_the_plan(folder: Path) -> N
     fast = inventory(folder, "{name: valve, kind: ./driver.py:Valve, rate_hz: 80}")
     (told,) = plan_faults(folder, fast, USE)
     assert "pi22/valve: expected a rate_hz <= 50" in told
+
+
+def test_an_agents_own_device_has_another_name_than_one_that_it_uses(folder: Path) -> None:
+    own = "  devices: [{name: valve, kind: synthetic, agents: [agent-01]}]\n"
+    machines = inventory(folder, VALVE)
+    (told,) = plan_faults(folder, machines, f"{USE}{own}")
+    assert "agent-01 uses valve of pi22 already (hardware.use): name one otherwise" in told
+    other = "  use: [{devices: [valve], agents: [agent-02]}]\n"
+    assert len(plan(folder, machines, f"{other}{own}")["pi22"]) == 2
+
+    machines.write_text(machines.read_text().replace("pi22", "agent-01"))
+    (told,) = plan_faults(folder, machines, f"{other}{own}")
+    assert "valve of agent-01 and of the machine agent-01 have one name" in told
 
 
 def test_a_driver_that_would_not_be_sent_is_refused(folder: Path, tmp_path: Path) -> None:
