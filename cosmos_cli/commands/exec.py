@@ -32,6 +32,7 @@ from cosmos_cli.ui.plural import counted
 CONTEXT_SETTINGS = {"allow_interspersed_args": False}
 """All words after the command's first belong to it, with or without -- before."""
 TIMEOUT_S = 600.0
+LEFT_OPEN = "what it left running there holds its output, and is not waited for"
 
 
 def exec(  # noqa: A001 - the verb's name is the function's
@@ -134,6 +135,8 @@ def _print(console: Console, outcome: Outcome[Completed], width: int) -> None:
         if text:
             lines = clean_text(text.decode(errors="replace")).removesuffix("\n").split("\n")
             tell("\n".join(f"{head} | {line}" for line in lines))
+    if done.is_left_open:
+        console.say(f"{head} ! {LEFT_OPEN}")
     if status := done.exit_status:
         words = f"ended by signal {-status}" if status < 0 else f"exit status {status}"
         console.say(f"{head} ! {words}")
@@ -141,12 +144,19 @@ def _print(console: Console, outcome: Outcome[Completed], width: int) -> None:
 
 def _mapping(done: Completed | None) -> dict[str, Any]:
     if done is None:
-        return {"exit_status": None, "stdout": None, "stderr": None, "cut_bytes": 0}
+        return {
+            "exit_status": None,
+            "stdout": None,
+            "stderr": None,
+            "cut_bytes": 0,
+            "left_running": False,
+        }
     return {
         "exit_status": done.exit_status,
         "stdout": done.stdout.decode(errors="replace"),
         "stderr": done.stderr.decode(errors="replace"),
         "cut_bytes": done.cut_bytes,
+        "left_running": done.is_left_open,
     }
 
 

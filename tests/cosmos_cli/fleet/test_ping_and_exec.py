@@ -199,7 +199,7 @@ def test_exec_tells_scripts_all_of_it(inventory, capsys):
     (machine,) = told["machines"]
     assert (machine["machine"], machine["ok"]) == ("pi2", True)
     assert (machine["exit_status"], machine["stdout"], machine["stderr"]) == (4, "2\n", "e\n")
-    assert machine["cut_bytes"] == 0
+    assert (machine["cut_bytes"], machine["left_running"]) == (0, False)
 
 
 def test_exec_shows_output_as_soon_as_its_machine_is_done(inventory):
@@ -218,6 +218,27 @@ def test_exec_beyond_its_time_is_ended_there_too(inventory, capsys, tmp_path):
 
     assert "did not end in 10 s" in capsys.readouterr().err
     assert all(is_gone(tmp_path / str(n)) for n in (1, 2, 3))
+
+
+@pytest.mark.parametrize("name", ["pi1", "here"])
+def test_exec_does_not_wait_for_what_a_command_leaves_running(inventory, capsys, tmp_path, name):
+    """Such as a server in the background: its command has ended, though the output is still open."""
+    file = inventory(here={"ansible_connection": "local"})
+    command = f"sleep 300 & echo $! > {tmp_path}/left; echo begun; exit 4"
+
+    status = run(["exec", "-i", file, "--json", "-l", name, "--timeout", "120", command])
+
+    (machine,) = json.loads(capsys.readouterr().out)["machines"]
+    os.kill(int((tmp_path / "left").read_text()), signal.SIGKILL)
+    assert (status, machine["exit_status"], machine["stdout"]) == (1, 4, "begun\n")
+    assert machine["left_running"] is True
+
+
+def test_exec_says_that_something_was_left_running(inventory, capsys, tmp_path):
+    assert run(["exec", "-i", inventory(), "-l", "pi1", f"sleep 300 & echo $! > {tmp_path}/1"]) == 0
+
+    os.kill(int((tmp_path / "1").read_text()), signal.SIGKILL)
+    assert "pi1 ! what it left running there holds its output" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
