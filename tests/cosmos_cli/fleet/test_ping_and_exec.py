@@ -291,10 +291,18 @@ def test_interrupted_command_says_so_to_people_and_to_scripts(inventory, argumen
     assert any(b" of 2 machines done" in line for line in before) == (arguments == ["up"])
 
 
-def test_host_that_is_no_machine_of_the_inventory_is_bad_input(inventory, capsys):
-    assert run(["up", "-i", inventory(), "-l", "pi1,pi2", "--host", "pi9"]) == 2
+@pytest.mark.parametrize(
+    ("host", "told"),
+    [
+        ("pi9", "--host pi9: no machine is named pi9, did you mean pi2?"),
+        ("pi3", "--host pi3: pi3 is in the inventory, but --limit leaves it out"),
+        ("all", "--host all: all is a group; name one machine"),
+    ],
+)
+def test_host_that_is_no_machine_of_the_fleet_is_bad_input(inventory, capsys, host, told):
+    assert run(["up", "-i", inventory(), "-l", "pi1,pi2", "--host", host]) == 2
 
-    assert "--host pi9: expected one of the machines pi1, pi2" in capsys.readouterr().err
+    assert told in capsys.readouterr().err
 
 
 def test_exec_as_root_where_the_inventory_forbids_it_is_refused(inventory, capsys, servers):
