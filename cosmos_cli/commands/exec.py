@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import shlex
 from collections.abc import Callable
@@ -21,10 +22,10 @@ from cosmos_cli.commands.fleet_command import (
 )
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.fleet.connection import Completed, Connection
-from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure, runs_no_commands
 from cosmos_cli.fleet.outcome import Outcome, failed
 from cosmos_cli.fleet.retry_file import offer_retry
-from cosmos_cli.fleet.shell import NO_SUDO_MARK, watched
+from cosmos_cli.fleet.shell import NO_SUDO_MARK, watched, without_mark
 from cosmos_cli.ui.console import WORK_GOES_ON, Console, JsonOption, QuietOption
 from cosmos_cli.ui.foreign_text import clean_text
 from cosmos_cli.ui.plural import counted
@@ -100,12 +101,17 @@ def exec(  # noqa: A001 - the verb's name is the function's
 
 
 def _task(line: str, *, is_root: bool, timeout_s: float) -> Callable[[Connection], Completed]:
-    shell_line = watched(line, is_root=is_root)
+    shell_line = watched(line, is_root=is_root, has_mark=True)
 
     def task(connection: Connection) -> Completed:
         if is_root:
             require_root(connection.target, "leave out --sudo, or that machine with --limit")
         done = connection.run(shell_line, stdin=None, timeout_s=timeout_s)
+        errors = without_mark(done.stderr)
+        if errors is None:
+            said = (done.stderr or done.stdout).decode(errors="replace")
+            raise runs_no_commands(done.exit_status, said)
+        done = dataclasses.replace(done, stderr=errors)
         if is_root and done.stderr.rstrip().endswith(NO_SUDO_MARK.encode()):
             said = done.stderr.decode(errors="replace").replace(NO_SUDO_MARK, "").strip()
             raise MachineFailure(

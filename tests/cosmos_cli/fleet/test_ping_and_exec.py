@@ -97,6 +97,8 @@ NO_LOGIN = (
         ("ping", *NO_LOGIN),
         ("facts", *NO_LOGIN),
         ("ping", "true", ("exit status 0",)),  # as a login shell /bin/true has it
+        ("exec", *NO_LOGIN),
+        ("exec", "true", ("exit status 0",)),
     ],
 )
 def test_user_who_may_run_no_commands_is_a_failure(
@@ -106,7 +108,8 @@ def test_user_who_may_run_no_commands_is_a_failure(
         file = inventory(none=entry(server))
         with known_hosts.open("a") as known:
             known.write(server.known_hosts_line())
-        assert run([command, "-i", file, "--json", "--limit", "none"]) == 3
+        what = ["id"] if command == "exec" else []
+        assert run([command, "-i", file, "--json", "--limit", "none", *what]) == 3
 
     failure = json.loads(capsys.readouterr().out)["machines"][0]["failure"]
     assert failure["kind"] == "authentication"
