@@ -342,7 +342,8 @@ class MachineRetrieval:
                 FailureKind.DATA,
                 f"nothing of this run is there: {self._source.directory} does not exist,"
                 " and was not retrieved from here before",
-                "if its agents never started there, nothing is lost",
+                "if its agents never started there, nothing is lost, else a power cut or a deletion took it: give it up"
+                f" with: cosmos collect {self._run.shell_path} --forget {self._source.machine}",
             )
         return self._released(note)
 

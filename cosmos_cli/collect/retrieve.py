@@ -59,6 +59,15 @@ def problems_of(outcomes: Sequence[Outcome[Retrieved]]) -> tuple[Problem, ...]:
     )
 
 
+def kept_copies(outcomes: Sequence[Outcome[Retrieved]]) -> list[str]:
+    """Say of each machine that brought everything and could not let go of its copy, why, as on a card that turned read-only."""
+    return [
+        f"{outcome.machine}: its records are here, but the copy stays: {outcome.value.remark}"
+        for outcome in outcomes
+        if outcome.value is not None and outcome.value.remark
+    ]
+
+
 class Retrieval:
     """
     One visit to the machines of a run. Use it as a context manager.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import shlex
 from collections.abc import Callable
@@ -21,10 +22,10 @@ from cosmos_cli.commands.fleet_command import (
 )
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.fleet.connection import Completed, Connection
-from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure, runs_no_commands
 from cosmos_cli.fleet.outcome import Outcome, failed
 from cosmos_cli.fleet.retry_file import offer_retry
-from cosmos_cli.fleet.shell import NO_SUDO_MARK, watched
+from cosmos_cli.fleet.shell import NO_SUDO_MARK, watched, without_mark
 from cosmos_cli.ui.console import WORK_GOES_ON, Console, JsonOption, QuietOption
 from cosmos_cli.ui.foreign_text import clean_text
 from cosmos_cli.ui.plural import counted
@@ -32,6 +33,7 @@ from cosmos_cli.ui.plural import counted
 CONTEXT_SETTINGS = {"allow_interspersed_args": False}
 """All words after the command's first belong to it, with or without -- before."""
 TIMEOUT_S = 600.0
+LEFT_OPEN = "what it left running there holds its output, and is not waited for"
 
 
 def exec(  # noqa: A001 - the verb's name is the function's
@@ -99,12 +101,17 @@ def exec(  # noqa: A001 - the verb's name is the function's
 
 
 def _task(line: str, *, is_root: bool, timeout_s: float) -> Callable[[Connection], Completed]:
-    shell_line = watched(line, is_root=is_root)
+    shell_line = watched(line, is_root=is_root, has_mark=True)
 
     def task(connection: Connection) -> Completed:
         if is_root:
             require_root(connection.target, "leave out --sudo, or that machine with --limit")
         done = connection.run(shell_line, stdin=None, timeout_s=timeout_s)
+        errors = without_mark(done.stderr)
+        if errors is None:
+            said = (done.stderr or done.stdout).decode(errors="replace")
+            raise runs_no_commands(done.exit_status, said)
+        done = dataclasses.replace(done, stderr=errors)
         if is_root and done.stderr.rstrip().endswith(NO_SUDO_MARK.encode()):
             said = done.stderr.decode(errors="replace").replace(NO_SUDO_MARK, "").strip()
             raise MachineFailure(
@@ -134,6 +141,8 @@ def _print(console: Console, outcome: Outcome[Completed], width: int) -> None:
         if text:
             lines = clean_text(text.decode(errors="replace")).removesuffix("\n").split("\n")
             tell("\n".join(f"{head} | {line}" for line in lines))
+    if done.is_left_open:
+        console.say(f"{head} ! {LEFT_OPEN}")
     if status := done.exit_status:
         words = f"ended by signal {-status}" if status < 0 else f"exit status {status}"
         console.say(f"{head} ! {words}")
@@ -141,12 +150,19 @@ def _print(console: Console, outcome: Outcome[Completed], width: int) -> None:
 
 def _mapping(done: Completed | None) -> dict[str, Any]:
     if done is None:
-        return {"exit_status": None, "stdout": None, "stderr": None, "cut_bytes": 0}
+        return {
+            "exit_status": None,
+            "stdout": None,
+            "stderr": None,
+            "cut_bytes": 0,
+            "left_running": False,
+        }
     return {
         "exit_status": done.exit_status,
         "stdout": done.stdout.decode(errors="replace"),
         "stderr": done.stderr.decode(errors="replace"),
         "cut_bytes": done.cut_bytes,
+        "left_running": done.is_left_open,
     }
 
 

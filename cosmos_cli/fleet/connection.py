@@ -15,6 +15,8 @@ from cosmos_cli.fleet.target import Target
 
 OUTPUT_BYTES_MAX = 4 * 1024 * 1024
 """Bytes that `Connection.run` keeps of each output: one half of its begin, one of its end."""
+LEFT_OPEN_S = 1.0
+"""Silence after a command's end for which its output is still waited for: what it left running may hold that for ever."""
 SAID_BYTES_MAX = 1024 * 1024 * 1024
 """Bytes that a command may write at all before it is ended."""
 EXIT_STATUS_TIMEOUT_S = 20.0
@@ -44,6 +46,8 @@ class Completed:
     stderr: bytes
     cut_bytes: int = 0
     """Number of bytes of both that were too many to keep; a line in their midst says so."""
+    is_left_open: bool = False
+    """Whether something that it left running still holds its output: what that says later is not waited for."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

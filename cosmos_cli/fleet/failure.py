@@ -63,10 +63,14 @@ class MachineFailure(Exception):
         return {"kind": self.kind.value, "text": self.text, "advice": self.advice}
 
 
-def ended_early(said: str) -> MachineFailure:
+class EndedEarly(MachineFailure):
+    """A program that ended by itself before it was told to; its kind is LOST."""
+
+
+def ended_early(said: str) -> EndedEarly:
     """Return the failure of a program that ended before it was told to, with what it wrote to standard error."""
     said = said.strip()
-    return MachineFailure(
+    return EndedEarly(
         FailureKind.LOST, "what worked there ended early" + (f": {said}" if said else "")
     )
 

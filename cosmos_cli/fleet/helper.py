@@ -27,7 +27,7 @@ from cosmos_cli.fleet.answers.parts import greeting
 from cosmos_cli.fleet.answers.reader import READ_BYTES, AnswerReader, ExpectedAnswer
 from cosmos_cli.fleet.answers.verbs import BODY_BYTES_MAX, answer_shape, failure_of
 from cosmos_cli.fleet.connection import EXIT_STATUS_TIMEOUT_S, Connection, Stream
-from cosmos_cli.fleet.failure import FailureKind, MachineFailure, runs_no_commands
+from cosmos_cli.fleet.failure import EndedEarly, FailureKind, MachineFailure, runs_no_commands
 from cosmos_cli.fleet.liveness import BlockingStream, SilenceWatch, SilentMachine
 from cosmos_cli.fleet.shell import for_login_shell
 from cosmos_cli.fleet.transfer_limits import Patience, duration_words
@@ -289,6 +289,8 @@ class Helper:
             )
         if failure.kind is FailureKind.DATA and status is not None and status > 0:
             return runs_no_commands(status, failure.text)
+        if isinstance(failure, EndedEarly) and status is not None and status >= 0:
+            return _ended_at_once(failure, status)
         return failure
 
     def _read_to_its_end(self) -> None:
@@ -304,6 +306,15 @@ class Helper:
 
 
 NO_PYTHON_STATUS = 127
+
+
+def _ended_at_once(failure: MachineFailure, status: int) -> MachineFailure:
+    """Say of one that ended by itself before it had begun what may be amiss there."""
+    return MachineFailure(
+        FailureKind.LOST,
+        f"{failure.text} (exit status {status})",
+        "is it a Python that ansible_python_interpreter names, and does that user's login shell run commands?",
+    )
 
 
 def start_command(python: str | None, package_bytes: int) -> str:

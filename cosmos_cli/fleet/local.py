@@ -11,7 +11,13 @@ import subprocess
 import tempfile
 import time
 
-from cosmos_cli.fleet.connection import OUTPUT_BYTES_MAX, SAID_BYTES_MAX, Completed, StreamEnd
+from cosmos_cli.fleet.connection import (
+    LEFT_OPEN_S,
+    OUTPUT_BYTES_MAX,
+    SAID_BYTES_MAX,
+    Completed,
+    StreamEnd,
+)
 from cosmos_cli.fleet.failure import ended_early
 from cosmos_cli.fleet.target import Target
 from cosmos_cli.fleet.transfer_limits import BoundedOutput, OutputLimits, not_ended
@@ -19,6 +25,8 @@ from cosmos_cli.fleet.transfer_limits import BoundedOutput, OutputLimits, not_en
 LOOPBACK = "127.0.0.1"
 ERROR_BYTES_MAX = 4096
 END_TIMEOUT_S = 5.0
+END_POLL_S = 0.25
+"""Between looks whether a command that says nothing has ended."""
 READ_BYTES = 262_144
 
 
@@ -62,7 +70,7 @@ class LocalConnection:
             start_new_session=True,
         ) as process:
             try:
-                _converse(process, pending, (output, errors), limits)
+                is_left_open = _converse(process, pending, (output, errors), limits)
             finally:
                 if process.poll() is None:  # with its children
                     with contextlib.suppress(ProcessLookupError):
@@ -72,6 +80,7 @@ class LocalConnection:
             stdout=output.data,
             stderr=errors.data,
             cut_bytes=output.cut_bytes + errors.cut_bytes,
+            is_left_open=is_left_open,
         )
 
     def is_alive(self, *, timeout_s: float = 2.0) -> bool:
@@ -164,10 +173,16 @@ def _converse(
     pending: memoryview | None,
     outputs: tuple[BoundedOutput, BoundedOutput],
     limits: OutputLimits,
-) -> None:
-    """Feed a command, unless *pending* is None, and read what it says until both its outputs have ended."""
+) -> bool:
+    """
+    Feed a command, unless *pending* is None, and read what it says until both its outputs have ended.
+
+    Returns:
+        Whether one of them is still open, though it has ended: what it left running holds that.
+    """
     assert process.stdin is not None and process.stdout is not None and process.stderr is not None
     until_s = time.monotonic() + limits.timeout_s
+    heard_s = time.monotonic()
     with selectors.DefaultSelector() as selector:
         for pipe, output in zip((process.stdout, process.stderr), outputs, strict=True):
             selector.register(pipe, selectors.EVENT_READ, output)
@@ -177,7 +192,11 @@ def _converse(
         while process.stdout in selector.get_map() or process.stderr in selector.get_map():
             remaining_s = until_s - time.monotonic()
             limits.check(remaining_s, outputs)
-            ready = selector.select(remaining_s)
+            ready = selector.select(min(END_POLL_S, remaining_s))
+            if ready or process.poll() is None:
+                heard_s = time.monotonic()
+            elif time.monotonic() - heard_s >= LEFT_OPEN_S:
+                return True
             for key, _ in ready:
                 if key.data is None:
                     pending = _feed(key.fd, pending or memoryview(b""))
@@ -192,6 +211,7 @@ def _converse(
         process.wait(max(0.0, until_s - time.monotonic()))
     except subprocess.TimeoutExpired:
         raise not_ended(limits.timeout_s) from None
+    return False
 
 
 def _feed(descriptor: int, pending: memoryview) -> memoryview:

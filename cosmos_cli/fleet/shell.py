@@ -13,6 +13,7 @@ import re
 import shlex
 
 NO_SUDO_MARK = "cosmos: no sudo"
+BEGIN_MARK = "cosmos: the command begins"
 FORCED_AFTER_S = 2
 
 # $1 is the command. `read` returns at the end of standard input only; sshd and LocalConnection start each
@@ -41,7 +42,7 @@ def for_login_shell(script: str) -> str:
     return f"exec /bin/sh -c {quoted}"
 
 
-def watched(command: str, *, is_root: bool = False) -> str:
+def watched(command: str, *, is_root: bool = False, has_mark: bool = False) -> str:
     """
     Return a shell command that does the same and is ended, with its children, when standard input ends.
 
@@ -49,9 +50,19 @@ def watched(command: str, *, is_root: bool = False) -> str:
         command: Quoted once, however it is sent on: each level makes five of a quotation mark, and Linux takes
             128 KiB as one argument.
         is_root: Whether it is root's; NO_SUDO_MARK is the last that is said where the user may not.
+        has_mark: Whether BEGIN_MARK is written to standard error first, for `without_mark`.
     """
+    begin = f"echo {shlex.quote(BEGIN_MARK)} >&2; " if has_mark else ""
     root = (
         f'if [ "$(id -u)" != 0 ]; then sudo -n true || {{ echo {shlex.quote(NO_SUDO_MARK)} >&2; exit 1; }};'
         f' exec sudo -n /bin/sh -c {shlex.quote(_WATCH)} sh "$1"; fi; '
     )
-    return for_login_shell(f"set -- {shlex.quote(command)}; {root if is_root else ''}{_WATCH}")
+    return for_login_shell(
+        f"{begin}set -- {shlex.quote(command)}; {root if is_root else ''}{_WATCH}"
+    )
+
+
+def without_mark(errors: bytes) -> bytes | None:
+    """Return a command's standard error without its BEGIN_MARK; None for one that never began, as where a start-up file exits."""
+    before, mark, after = errors.partition(f"{BEGIN_MARK}\n".encode())
+    return before + after if mark else None

@@ -43,7 +43,7 @@ class ChildRecord:
     group_until_s: float = math.inf
 
     def __str__(self) -> str:
-        return f"{self.name} (pid {self.pid})"
+        return self.name if self.pid is None else f"{self.name} (pid {self.pid})"
 
     @property
     def meanwhile(self) -> str:

@@ -324,7 +324,7 @@ def _retrieve(
         return tuple(Problem(text=text, machine=name, step="collect") for name in prepared.remote)
     # Imported late: agents run meanwhile on the same processors, and a run on this computer needs none of it.
     with IMPORT_TURN:
-        from cosmos_cli.collect.retrieve import Retrieval, problems_of
+        from cosmos_cli.collect.retrieve import Retrieval, kept_copies, problems_of
 
     retrieval = Retrieval(
         prepared.run,
@@ -336,7 +336,10 @@ def _retrieve(
         say=lambda text: view.say(text, "warning"),
     )
     with retrieval:
-        problems = problems_of(retrieval.fetch())
+        outcomes = retrieval.fetch()
+    for remark in kept_copies(outcomes):
+        view.say(remark, "warning")
+    problems = problems_of(outcomes)
     for problem in problems:
         view.say(f"{problem.machine}: {problem.text}", "error")
     return problems

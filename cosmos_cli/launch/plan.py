@@ -16,8 +16,8 @@ from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.fleet.target import target_of
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
 from cosmos_cli.models.document import Path as ValuePath
-from cosmos_cli.models.document import did_you_mean, dotted
-from cosmos_cli.models.inventory import Machine
+from cosmos_cli.models.document import dotted
+from cosmos_cli.models.inventory import Machine, no_machine_words
 from cosmos_cli.models.inventory.devices import device_label, device_words
 from cosmos_cli.models.inventory.machine import LOOPBACK
 from cosmos_cli.models.limit import PatternError, matching_machines
@@ -324,8 +324,7 @@ def _host_of(machines: Sequence[Machine], name: str | None) -> Machine | None:
     for machine in machines:
         if machine.name == name:
             return machine
-    hint = did_you_mean(name, [machine.name for machine in machines])
-    raise InputError(f"host: no machine is named {name}{hint}")
+    raise InputError(f"host: {no_machine_words(machines, name)}")
 
 
 def fault_without_place(path: ValuePath, text: str) -> Fault:

@@ -51,6 +51,9 @@ RELAY_TIMEOUT_S = 5.0
 RELAY_TALK_BYTES_MAX = 65_536
 """A start-up file there may talk before the relay does."""
 NO_STATUS = "ended, and nobody knows how"
+ENDED_CUT = "ended as the connection to it broke"
+SAID_CHARACTERS_MAX = 300
+"""Of a last line that tells why it could not be started."""
 STARTED_ANEW = "it has started anew"
 
 
@@ -100,6 +103,7 @@ class RemoteChild:
         self.loss: str | None = None
         """Why nobody knows how it ended, if its machine was lost."""
         self._status: int | None = None
+        self._no_status = NO_STATUS
         self._members: list[int] = []
         self._is_asking = False
         background.submit(
@@ -150,7 +154,16 @@ class RemoteChild:
             return "is still running"
         if self.loss is not None:
             return f"was lost: {self.loss}"
-        return NO_STATUS if self._status is None else describe_exit(self._status)
+        if self._status is None:
+            return self._no_status
+        return self._no_start() or describe_exit(self._status)
+
+    def _no_start(self) -> str:
+        """Return why it never began, as on a disk without room for its folder; empty if it did, or nothing was said."""
+        said = "" if self._stream is None else self._stream.ending().errors.strip()
+        if self.pid is not None or not said:
+            return ""
+        return f"could not be started ({said.splitlines()[-1][:SAID_CHARACTERS_MAX]})"
 
     def members(self) -> list[int]:
         """Return who of its group lived when that was asked last, and ask again."""
@@ -252,6 +265,7 @@ class RemoteChild:
         elif failure is not None:
             self._tell(ReattachFailed(self.name))
         elif found is None:
+            self._no_status = ENDED_CUT
             self._end(loss=None)
         else:
             self._close_stream()

@@ -19,7 +19,7 @@ from cosmos_cli.onboard.processes import (
     wait_for_end,
     words_of,
 )
-from cosmos_cli.onboard.records import is_folder, measured, remove
+from cosmos_cli.onboard.records import RELEASED_PREFIX, is_folder, measured, remove
 from cosmos_cli.onboard.request_loop import HelperRefusal, PlainValue, VerbRequest, verb
 
 RUNS, STATE = "runs", "state"
@@ -33,13 +33,18 @@ GOING = ".going-"
 
 @verb("discard")
 def discard(request: VerbRequest) -> None:
-    """Delete one run's directory, if it holds what was shown of it and nothing of it lives."""
+    """
+    Delete one run's directory, if it holds what was shown of it and nothing of it lives.
+
+    Of one that was released nobody has more to want: it may be less by now, for who released it deletes it still.
+    """
     directory = path_of(request, "directory")
     wait_for_end(directory, path_of(request, "state"), 0.0)
     if not is_folder(directory):
         return
     shown = {name: request.arguments["shown"].get(name) for name in ("bytes", "files", "newest_s")}
-    if measured(directory) != shown:
+    is_released = os.path.basename(directory).startswith(RELEASED_PREFIX)
+    if not is_released and measured(directory) != shown:
         raise HelperRefusal(
             "data", f"{directory} has changed since it was listed", "repeat the command"
         )

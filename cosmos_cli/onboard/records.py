@@ -7,6 +7,7 @@ nor anything that holds one of its files open for writing.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -38,6 +39,8 @@ LEVEL = 1
 PACKED_SHARE_MAX = 0.9
 """Share above which packed bytes are sent unpacked."""
 LISTINGS_MAX = 8
+DELETE_TRIES_MAX = 100
+"""Each ends where somebody else had deleted something first."""
 RELEASED_PREFIX = ".released-"
 """Begins the name of a folder that may go: its copy is verified."""
 
@@ -162,16 +165,25 @@ def inventory_runs(request: VerbRequest) -> list[Entry]:
     found = []
     for name in sorted(os.listdir(folder)):
         directory = os.path.join(folder, name)
-        if stat.S_ISDIR(os.lstat(directory).st_mode):
-            living = find_living(directory, state)
-            found.append({"name": name, **measured(directory), "living": living})
+        with contextlib.suppress(FileNotFoundError):  # another operator has just collected it
+            if stat.S_ISDIR(os.lstat(directory).st_mode):
+                living = find_living(directory, state)
+                found.append({"name": name, **measured(directory), "living": living})
     return found
 
 
 def measured(directory: str) -> Entry:
-    """Return how much a directory holds, and when it was last changed, s since 1970."""
-    stamps = [stamp for _, stamp in walk(directory)]
-    newest_ns = max((stamp[3] for stamp in stamps), default=os.stat(directory).st_mtime_ns)
+    """
+    Return how much a directory holds, and when it was last changed, s since 1970.
+
+    Others may delete from it meanwhile: what is gone counts no more.
+
+    Raises:
+        FileNotFoundError: It is gone itself.
+    """
+    stamps = [stamp for _, stamp in walk(directory, passes_gone=True)]
+    itself_ns = os.stat(directory).st_mtime_ns
+    newest_ns = max((stamp[3] for stamp in stamps), default=itself_ns)
     return {
         "bytes": sum(stamp[2] for stamp in stamps),
         "files": len(stamps),
@@ -199,7 +211,9 @@ def is_folder(path: str) -> bool:
     )
 
 
-def walk(directory: str, *, unread: dict[str, str] | None = None) -> Iterator[tuple[str, Stamp]]:
+def walk(
+    directory: str, *, unread: dict[str, str] | None = None, passes_gone: bool = False
+) -> Iterator[tuple[str, Stamp]]:
     """
     Yield whatever is no directory below one, in the order of names, and its stamp.
 
@@ -208,9 +222,12 @@ def walk(directory: str, *, unread: dict[str, str] | None = None) -> Iterator[tu
     Args:
         directory: Where to begin.
         unread: Takes what cannot be read, with the reason; None: such an error is raised.
+        passes_gone: Whether what has gone since its folder was read is passed over, and no error.
     """
 
     def skip(error: OSError, mark: str = "/") -> None:
+        if passes_gone and isinstance(error, FileNotFoundError):
+            return
         if unread is None:
             raise error
         path = os.path.relpath(error.filename or directory, directory)
@@ -236,10 +253,15 @@ def walk(directory: str, *, unread: dict[str, str] | None = None) -> Iterator[tu
 
 
 def remove(directory: str) -> None:
-    """Delete a directory so that it is there in full or not at all under its name, also after a power cut."""
+    """
+    Delete a directory so that it is there in full or not at all under its name, also after a power cut.
+
+    One that is gone already, as by another operator's wiping, is no error.
+    """
     parent, name = os.path.split(directory.rstrip("/"))
     away = os.path.join(parent, f"{RELEASED_PREFIX}{name}-{os.getpid()}")
-    os.rename(directory, away)
+    with contextlib.suppress(FileNotFoundError):
+        os.rename(directory, away)
     sync_folder(parent)
     sweep(directory)
 
@@ -249,7 +271,19 @@ def sweep(directory: str) -> None:
     parent, name = os.path.split(directory.rstrip("/"))
     for left in os.listdir(parent) if os.path.isdir(parent) else ():
         if left.startswith(f"{RELEASED_PREFIX}{name}-"):
-            shutil.rmtree(os.path.join(parent, left))
+            _delete(os.path.join(parent, left))
+
+
+def _delete(path: str) -> None:
+    """Delete a folder, from which somebody else may delete as well."""
+    for tries_left in reversed(range(DELETE_TRIES_MAX)):
+        try:
+            shutil.rmtree(path)
+        except FileNotFoundError:
+            if tries_left == 0 and os.path.lexists(path):
+                raise
+        if not os.path.lexists(path):
+            return
 
 
 def kind_of(mode: int) -> str:

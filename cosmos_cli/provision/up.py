@@ -24,7 +24,7 @@ from cosmos_cli.fleet.connection import SMALL_BYTES_MAX, Connection
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.fleet import Fleet
 from cosmos_cli.fleet.helper import Helper
-from cosmos_cli.models.inventory import Machine
+from cosmos_cli.models.inventory import Machine, no_machine_words
 from cosmos_cli.models.machine_facts import MachineFacts
 from cosmos_cli.provision.apply import REPEAT, Applier
 from cosmos_cli.provision.desired import DesiredState, desired_state
@@ -281,8 +281,8 @@ class FleetUp:
     ) -> None:
         self._machines = {machine.name: machine for machine in fleet.machines}
         if options.host is not None and options.host not in self._machines:
-            known = ", ".join(self._machines)
-            raise InputError(f"--host {options.host}: expected one of the machines {known}")
+            words = no_machine_words(fleet.machines, options.host)
+            raise InputError(f"--host {options.host}: {words}")
         self._options = options
         self._view = view
         self.scenarios = tuple(_load(scenarios, view))

@@ -110,7 +110,7 @@ class UdpSocket:
             handle.close()
             raise MachineError(
                 f"{_name(address, port)}: cannot be reached from here: {error.strerror};"
-                " check network.address in the scenario and the routes of this machine"
+                " check network.address in the scenario, cosmos_host_address in the inventory and the routes of this machine"
             ) from error
         return cls(handle, receive_buffer_bytes)
 

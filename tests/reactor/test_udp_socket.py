@@ -206,7 +206,10 @@ def test_peer_without_a_route_is_named(connect, monkeypatch):
 
     monkeypatch.setattr(udp.socket, "socket", Routeless)
 
-    with pytest.raises(MachineError, match=r"192\.0\.2\.1:7: cannot be reached.*unreachable"):
+    expected = (
+        r"192\.0\.2\.1:7: cannot be reached.*unreachable.*network\.address.*cosmos_host_address"
+    )
+    with pytest.raises(MachineError, match=expected):
         connect("192.0.2.1", 7)
 
 

@@ -21,6 +21,7 @@ from paramiko.ssh_exception import ChannelException, SSHException
 
 from cosmos_cli.fleet.connection import (
     EXIT_STATUS_TIMEOUT_S,
+    LEFT_OPEN_S,
     OUTPUT_BYTES_MAX,
     SAID_BYTES_MAX,
     Completed,
@@ -119,7 +120,7 @@ class SshConnection:
         stream = self.open(command, errors)
         limits = OutputLimits(timeout_s=timeout_s, said_bytes_max=said_bytes_max)
         try:
-            _converse(
+            is_left_open = _converse(
                 stream,
                 None if stdin is None else memoryview(stdin),
                 (output, errors),
@@ -136,6 +137,7 @@ class SshConnection:
             stdout=output.data,
             stderr=errors.data,
             cut_bytes=output.cut_bytes + errors.cut_bytes,
+            is_left_open=is_left_open,
         )
 
     def is_alive(self, *, timeout_s: float = 2.0) -> bool:
@@ -182,15 +184,18 @@ def _converse(
     limits: OutputLimits,
     *,
     gives_sign: Callable[..., bool],
-) -> None:
+) -> bool:
     """
     Feed a command, unless *pending* is None, and read what it says until it has ended.
 
     It may be silent as long as it likes, a machine may not: *gives_sign* asks that.
+
+    Returns:
+        Whether its output is still open, though it has ended: what it left running holds that.
     """
     until_s = time.monotonic() + limits.timeout_s
     heard_s = time.monotonic()
-    is_dead = False
+    is_dead = is_over = False
     while True:
         remaining_s = until_s - time.monotonic()
         limits.check(remaining_s, outputs)
@@ -203,14 +208,20 @@ def _converse(
         except BlockingIOError:
             if is_dead:  # and nothing came while it was asked
                 raise SilentMachine from None
-            if pending is None and time.monotonic() - heard_s >= QUIET_S:
-                is_dead = remaining_s > SIGN_S and not gives_sign(timeout_s=SIGN_S)
+            if is_over:  # what it had said before it ended came before the sign
+                return True
+            has_exited = stream.has_exited()
+            quiet_s = LEFT_OPEN_S if has_exited else QUIET_S
+            if pending is None and time.monotonic() - heard_s >= quiet_s:
+                gave_sign = gives_sign(timeout_s=min(SIGN_S, remaining_s))
+                is_dead = remaining_s > SIGN_S and not gave_sign
+                is_over = has_exited and gave_sign
                 heard_s = time.monotonic()
             continue
         if not data:
-            return
+            return False
         outputs[0].add(data)
-        heard_s, is_dead = time.monotonic(), False
+        heard_s, is_dead, is_over = time.monotonic(), False, False
 
 
 def _feed(stream: SshStream, pending: memoryview) -> memoryview:

@@ -154,6 +154,10 @@ class SshStream:
                 self._errors.add(channel.recv_stderr(READ_BYTES))
         return StreamEnd(exit_status=self._status(), errors=self._errors.text())
 
+    def has_exited(self) -> bool:
+        """Tell whether its exit status has come; its output may be open still, held by what it left running."""
+        return self._status() is not None
+
     def close(self) -> None:
         """Close the channel: its program's standard input ends."""
         if self._is_open:

@@ -10,7 +10,7 @@ from cosmos_cli.models.inventory.load import (
     load_machines,
     read_inventory,
 )
-from cosmos_cli.models.inventory.machine import LOOPBACK, Machine, Variables
+from cosmos_cli.models.inventory.machine import LOOPBACK, Machine, Variables, no_machine_words
 from cosmos_cli.models.inventory.names import MACHINES_MAX, expand
 
 __all__ = [
@@ -21,5 +21,6 @@ __all__ = [
     "Variables",
     "expand",
     "load_machines",
+    "no_machine_words",
     "read_inventory",
 ]

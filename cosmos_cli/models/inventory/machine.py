@@ -11,7 +11,7 @@ import dataclasses
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -181,6 +181,16 @@ class Machine:
     """Folder from which its devices' files are found: that of the inventory that lists them."""
     inventory_names: frozenset[str] = field(default=frozenset(), compare=False, repr=False)
     """Machines and groups of its inventory, those without machines and those that --limit leaves out as well."""
+
+
+def no_machine_words(machines: Sequence[Machine], name: str) -> str:
+    """Say that *name* is none of *machines*: a group, one that --limit leaves out, or nobody's."""
+    if any(name in machine.groups for machine in machines):
+        return f"{name} is a group; name one machine"
+    if any(name in machine.inventory_names for machine in machines):
+        return f"{name} is in the inventory, but --limit leaves it out; let that mean it as well"
+    hint = did_you_mean(name, [machine.name for machine in machines])
+    return f"no machine is named {name}{hint}"
 
 
 LOOPBACK = Machine(name="loopback", address="127.0.0.1", connection="local")

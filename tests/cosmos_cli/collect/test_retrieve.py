@@ -110,6 +110,8 @@ def test_machine_whose_records_vanished_is_a_failure(tmp_path):
 
     assert outcome.failure.kind is FailureKind.DATA
     assert str(split.directory("pi01")) in str(outcome.failure)
+    cure = f"a power cut or a deletion took it: give it up with: cosmos collect {split.run.shell_path} --forget pi01"
+    assert outcome.failure.advice.endswith(cure)
 
 
 def test_directory_that_was_released_before_the_note_of_it_was_written_is_no_failure(tmp_path):

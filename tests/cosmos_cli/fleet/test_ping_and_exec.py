@@ -97,6 +97,8 @@ NO_LOGIN = (
         ("ping", *NO_LOGIN),
         ("facts", *NO_LOGIN),
         ("ping", "true", ("exit status 0",)),  # as a login shell /bin/true has it
+        ("exec", *NO_LOGIN),
+        ("exec", "true", ("exit status 0",)),
     ],
 )
 def test_user_who_may_run_no_commands_is_a_failure(
@@ -106,7 +108,8 @@ def test_user_who_may_run_no_commands_is_a_failure(
         file = inventory(none=entry(server))
         with known_hosts.open("a") as known:
             known.write(server.known_hosts_line())
-        assert run([command, "-i", file, "--json", "--limit", "none"]) == 3
+        what = ["id"] if command == "exec" else []
+        assert run([command, "-i", file, "--json", "--limit", "none", *what]) == 3
 
     failure = json.loads(capsys.readouterr().out)["machines"][0]["failure"]
     assert failure["kind"] == "authentication"
@@ -199,7 +202,7 @@ def test_exec_tells_scripts_all_of_it(inventory, capsys):
     (machine,) = told["machines"]
     assert (machine["machine"], machine["ok"]) == ("pi2", True)
     assert (machine["exit_status"], machine["stdout"], machine["stderr"]) == (4, "2\n", "e\n")
-    assert machine["cut_bytes"] == 0
+    assert (machine["cut_bytes"], machine["left_running"]) == (0, False)
 
 
 def test_exec_shows_output_as_soon_as_its_machine_is_done(inventory):
@@ -218,6 +221,27 @@ def test_exec_beyond_its_time_is_ended_there_too(inventory, capsys, tmp_path):
 
     assert "did not end in 10 s" in capsys.readouterr().err
     assert all(is_gone(tmp_path / str(n)) for n in (1, 2, 3))
+
+
+@pytest.mark.parametrize("name", ["pi1", "here"])
+def test_exec_does_not_wait_for_what_a_command_leaves_running(inventory, capsys, tmp_path, name):
+    """Such as a server in the background: its command has ended, though the output is still open."""
+    file = inventory(here={"ansible_connection": "local"})
+    command = f"sleep 300 & echo $! > {tmp_path}/left; echo begun; exit 4"
+
+    status = run(["exec", "-i", file, "--json", "-l", name, "--timeout", "120", command])
+
+    (machine,) = json.loads(capsys.readouterr().out)["machines"]
+    os.kill(int((tmp_path / "left").read_text()), signal.SIGKILL)
+    assert (status, machine["exit_status"], machine["stdout"]) == (1, 4, "begun\n")
+    assert machine["left_running"] is True
+
+
+def test_exec_says_that_something_was_left_running(inventory, capsys, tmp_path):
+    assert run(["exec", "-i", inventory(), "-l", "pi1", f"sleep 300 & echo $! > {tmp_path}/1"]) == 0
+
+    os.kill(int((tmp_path / "1").read_text()), signal.SIGKILL)
+    assert "pi1 ! what it left running there holds its output" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
@@ -270,10 +294,18 @@ def test_interrupted_command_says_so_to_people_and_to_scripts(inventory, argumen
     assert any(b" of 2 machines done" in line for line in before) == (arguments == ["up"])
 
 
-def test_host_that_is_no_machine_of_the_inventory_is_bad_input(inventory, capsys):
-    assert run(["up", "-i", inventory(), "-l", "pi1,pi2", "--host", "pi9"]) == 2
+@pytest.mark.parametrize(
+    ("host", "told"),
+    [
+        ("pi9", "--host pi9: no machine is named pi9, did you mean pi2?"),
+        ("pi3", "--host pi3: pi3 is in the inventory, but --limit leaves it out"),
+        ("all", "--host all: all is a group; name one machine"),
+    ],
+)
+def test_host_that_is_no_machine_of_the_fleet_is_bad_input(inventory, capsys, host, told):
+    assert run(["up", "-i", inventory(), "-l", "pi1,pi2", "--host", host]) == 2
 
-    assert "--host pi9: expected one of the machines pi1, pi2" in capsys.readouterr().err
+    assert told in capsys.readouterr().err
 
 
 def test_exec_as_root_where_the_inventory_forbids_it_is_refused(inventory, capsys, servers):

@@ -438,3 +438,12 @@ def test_missing_interpreter_is_told_however_soon_its_shell_ends(place):
         with pytest.raises(MachineFailure, match="no such interpreter") as caught:
             Helper.start(LocalConnection(target), HELPER_PARTS)
         assert caught.value.kind is FailureKind.PYTHON
+
+
+def test_what_is_no_python_is_told_with_what_to_look_at(place):
+    target = dataclasses.replace(connection_to(place).target, python="/bin/true")
+
+    with pytest.raises(MachineFailure, match=r"\(exit status 0\)") as caught:
+        Helper.start(LocalConnection(target), HELPER_PARTS)
+
+    assert "a Python that ansible_python_interpreter names" in caught.value.advice

@@ -1,0 +1,114 @@
+"""How a program on another machine ended, in words: one that never began, and one that ended with its connection."""
+
+from __future__ import annotations
+
+import contextlib
+import selectors
+from collections.abc import Iterator
+from types import SimpleNamespace
+
+import pytest
+from harness.waiting import wait_until
+
+from cosmos_cli.fleet.local import LocalConnection
+from cosmos_cli.fleet.target import Target
+from cosmos_cli.launch.background import BackgroundTasks
+from cosmos_cli.launch.child import RemoteProgram
+from cosmos_cli.launch.machines import MachinePaths
+from cosmos_cli.launch.remote_child import RemoteChild
+from cosmos_cli.launch.run_events import LineBroke, RunEvent
+
+pytestmark = pytest.mark.process
+
+LAUNCH = {"session_hex": "00" * 16, "reattach_s": 2.5}
+
+
+class Started:
+    """A program that is started on this computer as on a machine, and the operator's loop around it."""
+
+    def __init__(self, run_directory: str, root: str) -> None:
+        self.selector = selectors.DefaultSelector()
+        self.background = BackgroundTasks(self.selector)
+        self.connection = LocalConnection(Target(name="pi01", address="127.0.0.1"))
+        self.told: list[RunEvent] = []
+        paths = MachinePaths(
+            root=root, state=root, python="/bin/echo", variables={}, base_directory=root
+        )
+        machine = SimpleNamespace(
+            name="pi01",
+            paths=paths,
+            connection=self.connection,
+            is_alive=lambda: True,
+            connect_again=lambda: None,
+            has_started_anew=lambda: False,
+        )
+        self.child = RemoteChild(
+            RemoteProgram(
+                name="agents@pi01",
+                module="madns_runtime.agent",
+                run_directory=run_directory,
+                stderr="stderr.txt",
+            ),
+            machine,
+            self.background,
+            launch=LAUNCH,
+            on_line=lambda line: None,
+            tell=self.told.append,
+        )
+
+    def turn(self) -> None:
+        for key, mask in self.selector.select(0.05):
+            key.data(mask)
+
+    def close(self) -> None:
+        self.child.close()
+        self.background.close(timeout_s=60.0)
+        self.selector.close()
+
+
+@pytest.fixture
+def started(tmp_path) -> Iterator:
+    with contextlib.ExitStack() as stack:
+
+        def start(run_directory: str) -> Started:
+            made = Started(run_directory, str(tmp_path))
+            stack.callback(made.close)
+            return made
+
+        yield start
+
+
+def wait_for(started: Started, condition) -> None:
+    def is_so() -> bool:
+        started.turn()
+        return condition()
+
+    wait_until(is_so, "nothing happened")
+
+
+def test_program_that_never_began_is_told_with_the_reason(started, tmp_path):
+    """As on a disk that has no room for the run's folder: nothing of it is on record, so nothing else tells."""
+    (tmp_path / "file").touch()
+    made = started(str(tmp_path / "file" / "runs" / "0001-c"))
+
+    wait_for(made, made.child.has_exited)
+
+    assert made.child.pid is None
+    assert made.child.describe_exit().startswith("could not be started (mkdir: ")
+    assert made.child.describe_exit().endswith("Not a directory)")
+
+
+def test_program_that_is_gone_behind_a_broken_connection_is_told_as_such(
+    started, tmp_path, monkeypatch
+):
+    made = started(str(tmp_path / "runs" / "0001-c"))
+    monkeypatch.setattr(
+        "cosmos_cli.launch.remote_child._fate", lambda stream, machine: (None, False)
+    )
+    wait_for(made, lambda: any(isinstance(event, LineBroke) for event in made.told))
+    monkeypatch.setattr("cosmos_cli.launch.remote_child._reattach", lambda *_: None)
+
+    made.child.reattach()
+    wait_for(made, made.child.has_exited)
+
+    assert made.child.describe_exit() == "ended as the connection to it broke"
