@@ -34,6 +34,8 @@ CALLS_BATCH_MAX = 64
 """Calls from other threads run in a row."""
 CALLS_MAX = 100_000
 """Calls from other threads that may wait; more means that the loop hangs."""
+SLEEPS_KEPT = 32
+"""So many last waits are known one by one."""
 WAKE_BYTES = (1).to_bytes(8, sys.byteorder)
 """Bytes that an eventfd takes; a pipe does not mind."""
 
@@ -126,8 +128,8 @@ class Reactor:
         """How often it has waited for something to do."""
         self.slept_s = 0.0
         """Time that it has waited for something to do, s."""
-        self.last_sleep = (-math.inf, -math.inf)
-        """When it waited last: from, to, on its clock, s."""
+        self.sleeps = deque([(-math.inf, -math.inf)], maxlen=SLEEPS_KEPT)
+        """When it waited, the newest last: from, to, on its clock, s."""
         self.add_reader(self._wake_read_fd, self._run_calls)
 
     def now_s(self) -> float:
@@ -256,7 +258,7 @@ class Reactor:
         woken_s = monotonic()
         self.waits += 1
         self.slept_s += woken_s - now_s
-        self.last_sleep = (now_s, woken_s)
+        self.sleeps.append((now_s, woken_s))
         self._run_readers(ready)
 
     def _run_timers(self) -> None:

@@ -6,6 +6,7 @@ import gc
 import math
 from collections import deque
 from collections.abc import Mapping
+from itertools import islice
 from time import monotonic, thread_time
 from typing import Any, NamedTuple
 
@@ -23,6 +24,8 @@ WAITED_INTERVAL_S = 0.001
 WAITED_EVERY_S = 0.02
 STOLEN_EVERY_S = 0.1
 """How often they are read at least, where something is ever stolen: what they grew by long before is no late tick's."""
+MARKS_KEPT = 64
+"""Begins of ticks before a late one: other packs' come between its deadline and it, once what held all of them up is over."""
 TOGETHER_S = 1e-6
 """Deadlines of one pack differ by roundings."""
 NOBODY = -1
@@ -121,8 +124,7 @@ class LoopAccount:
         self._spans: deque[Span] = deque(maxlen=max(SPANS_MIN, SPANS_PER_AGENT * agents))
         self.add = self._spans.append
         self._collection_began_s = math.nan
-        self._mark = _Mark.now(reactor)
-        self._before = self._mark
+        self._marks = deque([_Mark.now(reactor)], maxlen=MARKS_KEPT)
         self._looked: _Looked | None = None
         """What the newest late tick of those begun together has met."""
         self._files = KernelFile.of_stolen_time(), KernelFile.of_waiting()
@@ -141,7 +143,7 @@ class LoopAccount:
         """Note how much of its time the loop has slept and computed until now, as ticks are begun."""
         if now_s >= self._read_waited_at_s:
             self._read_at(now_s)
-        self._before, self._mark = self._mark, _Mark(now_s, thread_time(), self._reactor.slept_s)
+        self._marks.append(_Mark(now_s, thread_time(), self._reactor.slept_s))
         self._looked = None
 
     def _read_at(self, now_s: float) -> None:
@@ -203,12 +205,13 @@ class LoopAccount:
                 )
             else:
                 filled_s[cause] = filled_s.get(cause, 0.0) + within_s
-        overslept_s = overlap_s(*self._reactor.last_sleep, window)
+        overslept_s = sum(overlap_s(*sleep, window) for sleep in self._reactor.sleeps)
         awake_s = late.began_s - late.due_s - overslept_s
-        kept_off_s = min(self._kept_off_s(looking_s - late.began_s), awake_s)
+        mark = self._mark_before(late.due_s)
+        kept_off_s = min(self._kept_off_s(mark, looking_s - late.began_s), awake_s)
         self.look()
-        stolen_since_s = self._stolen.grown_since(self._before.at_s)
-        waited_since_s = self._waited.grown_since(self._before.at_s)
+        stolen_since_s = self._stolen.grown_since(mark.at_s)
+        waited_since_s = self._waited.grown_since(mark.at_s)
         absent_s = overslept_s + kept_off_s
         filled_s[Cause.WAKE_UP] = overslept_s + min(kept_off_s, waited_since_s)
         if stolen_since_s > waited_since_s or math.isinf(waited_since_s):
@@ -220,16 +223,19 @@ class LoopAccount:
         self.add(Span(Cause.HOUSEKEEPING, NOBODY, looking_s, monotonic()))
         return _Looked(late.due_s, late.began_s, filled_s, steps, timed_s + kept_s)
 
-    def _kept_off_s(self, own_step_s: float) -> float:
+    def _mark_before(self, due_s: float) -> _Mark:
+        """Return the mark of the ticks begun last by a deadline, s, or the oldest there is; the newest is of late ones themselves."""
+        earlier = islice(reversed(self._marks), 1, None)
+        return next((mark for mark in earlier if mark.at_s <= due_s), self._marks[0])
+
+    def _kept_off_s(self, before: _Mark, own_step_s: float) -> float:
         """
         Return for how long the loop was neither asleep nor on a processor before a step that has just ended, s.
 
-        Counted since the ticks before these were begun. What the step itself may have met is left out.
+        Counted since *before*. What the step itself may have met is left out.
         """
-        now = _Mark.now(self._reactor)
-        return self._mark.kept_off_since_s(self._before) + max(
-            0.0, now.kept_off_since_s(self._mark) - own_step_s
-        )
+        now, begun = _Mark.now(self._reactor), self._marks[-1]
+        return begun.kept_off_since_s(before) + max(0.0, now.kept_off_since_s(begun) - own_step_s)
 
     def _collecting(self, phase: str, info: Mapping[str, Any]) -> None:
         now_s = monotonic()

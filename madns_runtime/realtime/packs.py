@@ -117,7 +117,7 @@ class Pack:
     def _wait_for_deadline(self) -> None:
         """Wait for what is left until the deadline, WAIT_S_MAX at most, and learn from a wake-up out of sleep."""
         ordered_s, now_s = self._timer.when_s, monotonic()
-        slept_from_s, slept_to_s = self._reactor.last_sleep
+        slept_from_s, slept_to_s = self._reactor.sleeps[-1]
         if slept_from_s <= ordered_s <= slept_to_s:
             self._lead.learn(now_s - ordered_s)
         if self._next is None:

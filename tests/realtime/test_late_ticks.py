@@ -50,7 +50,7 @@ class Loop:
             monkeypatch.setattr(loop_account.KernelFile, of, Nothing)
         self.lived = []
         """Cause, agent, begin and end of all that is timed."""
-        self.reactor = SimpleNamespace(slept_s=0.0, last_sleep=(-math.inf, -math.inf))
+        self.reactor = SimpleNamespace(slept_s=0.0, sleeps=[(-math.inf, -math.inf)])
         writer = SimpleNamespace(computed_within_s=lambda window: 0.0)
         self.account = LoopAccount(self.reactor, writer, agents=2)
         self.records = {0: [], 1: []}
@@ -122,7 +122,7 @@ class Loop:
                 overslept_s = self.chance.choice((50e-6, 50e-6, 50e-6, 0.004, 0.02))
                 self.clock.now_s = due_s + overslept_s
                 self.reactor.slept_s += self.clock.now_s - slept_from_s
-                self.reactor.last_sleep = (slept_from_s, self.clock.now_s)
+                self.reactor.sleeps.append((slept_from_s, self.clock.now_s))
                 self.lived.append(Span(Cause.WAKE_UP, NOBODY, slept_from_s, self.clock.now_s))
             for seat, agent in enumerate(self.agents):  # a pack each
                 if agent.next_deadline_s() <= self.clock.now_s:

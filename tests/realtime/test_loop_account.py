@@ -37,7 +37,7 @@ def loop(monkeypatch):
         monkeypatch.setattr(loop_account.KernelFile, of, lambda name=name: Counted(kernel, name))
     # Whatever keeps this test off its processor keeps no loop off its own.
     monkeypatch.setattr(loop_account, "thread_time", monotonic)
-    reactor = SimpleNamespace(slept_s=0.0, last_sleep=(-9.0, -9.0))
+    reactor = SimpleNamespace(slept_s=0.0, sleeps=[(-9.0, -9.0)])
     writer = SimpleNamespace(computed_s=0.0)
     writer.computed_within_s = lambda window: min(writer.computed_s, window[1] - window[0])
     account = LoopAccount(reactor, writer, agents=2)
@@ -71,14 +71,46 @@ def test_what_the_loop_did_is_the_cause(loop, cause, agent, lasted_s, named):
 
 def test_a_loop_that_slept_over_its_deadline_was_woken_late(loop):
     late = late_by(0.008)
-    loop.reactor.last_sleep = (late.due_s - 0.001, late.began_s)
+    loop.reactor.sleeps.append((late.due_s - 0.001, late.began_s))
 
     assert loop.account.explain(late) is Cause.WAKE_UP
 
 
+def test_a_loop_that_was_woken_late_and_waited_once_more_for_what_had_come_was_woken_late(loop):
+    late = late_by(0.008)
+    loop.reactor.sleeps.append((late.due_s - 0.001, late.due_s + 0.007))
+    loop.reactor.sleeps.append((late.due_s + 0.0071, late.due_s + 0.0072))
+
+    assert loop.account.explain(late) is Cause.WAKE_UP
+
+
+def test_what_held_up_two_packs_is_the_cause_of_both(loop, monkeypatch):
+    clock = SimpleNamespace(now_s=monotonic(), computed_s=0.0)
+    monkeypatch.setattr(loop_account, "monotonic", lambda: clock.now_s)
+    monkeypatch.setattr(loop_account, "thread_time", lambda: clock.computed_s)
+    for each in (loop.account._waited, loop.account._stolen):
+        monkeypatch.setattr(each, "_now_s", lambda: clock.now_s)
+    for _ in range(3):  # when all was well
+        clock.now_s += PERIOD_S
+        loop.reactor.slept_s += PERIOD_S
+        loop.account.begin_ticks(clock.now_s)
+    due_s = clock.now_s + 0.001
+    clock.now_s += 0.020
+    loop.kernel["waited"] += 0.020
+    causes = []
+    for agent in (ME, OTHER):
+        loop.account.begin_ticks(clock.now_s)
+        began_s, clock.now_s = clock.now_s, clock.now_s + 0.0005
+        clock.computed_s += 0.0005
+        loop.account.add(Span(Cause.STEP, agent, began_s, clock.now_s))
+        causes.append(loop.account.explain(LateTick(agent, due_s, began_s, 0.0, PERIOD_S)))
+
+    assert causes == [Cause.WAKE_UP, Cause.WAKE_UP]
+
+
 def test_a_writer_that_computed_while_the_loop_was_to_wake_is_the_cause(loop):
     late = late_by(0.008)
-    loop.reactor.last_sleep = (late.due_s - 0.001, late.began_s)
+    loop.reactor.sleeps.append((late.due_s - 0.001, late.began_s))
     loop.writer.computed_s = 0.006
 
     assert loop.account.explain(late) is Cause.RECORDING
@@ -167,7 +199,7 @@ def test_agents_of_a_pack_are_looked_at_once_and_each_has_its_own_cause(loop, mo
 
 def test_what_a_pack_did_since_its_first_is_of_other_agents(loop):
     first = late_by(0.001)
-    loop.reactor.last_sleep = (first.due_s - 0.001, first.began_s)
+    loop.reactor.sleeps.append((first.due_s - 0.001, first.began_s))
     loop.account.begin_ticks(first.began_s)
     after_a_step = first._replace(agent=OTHER, began_s=first.began_s + 0.005)
 
@@ -218,7 +250,7 @@ def test_a_collection_at_any_allocation_ends_no_look(loop):
 
 
 def test_collections_are_noted_until_the_account_is_closed():
-    reactor = SimpleNamespace(slept_s=0.0, last_sleep=(-9.0, -9.0))
+    reactor = SimpleNamespace(slept_s=0.0, sleeps=[(-9.0, -9.0)])
     gc.disable()  # but for this test's own
     try:
         account = LoopAccount(reactor, SimpleNamespace(), agents=1)
