@@ -16,7 +16,7 @@ EXIT_CODE_MACHINES = 3
 def main() -> None:
     """Run the command line and end the process with its exit code."""
     gc.disable()  # imports make many objects and no garbage; the command itself is collected again
-    # numpy's pool starts a thread per processor, which waits busily: a tenth of what a short run computes, for nothing.
+    # numpy's pool starts a thread per processor, which waits busily: a tenth of what this process of a short run computes.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         _import_app().main()

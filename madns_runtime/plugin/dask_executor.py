@@ -180,8 +180,7 @@ def _client(where: Any, address: str) -> Client:
             f"executor.address: expected a Dask scheduler at {address}, none answered in"
             f" {CONNECT_S:g} s ({_first_line(error)}); is it started (`dask scheduler`), its port open?"
         ) from error
-    except Exception as error:
-        # Words of another protocol are read as a length: MemoryError, struct.error.
+    except Exception as error:  # of words of another protocol, read as a length: MemoryError, ...
         raise ConfigurationError(
             f"executor.address: expected a Dask scheduler at {address}, and what answers there is none"
             f" ({_first_line(error)}); is it the port that `dask scheduler` tells, not that of its dashboard?"
