@@ -1,9 +1,15 @@
-"""Recorded values as Arrow arrays, each as its field's kind wants it."""
+"""
+Recorded values as Arrow arrays, each as its field's kind wants it.
+
+Here and in tables nothing of pyarrow is called that computes (cast, dictionary_encode, filter, ...): the first such
+call imports pyarrow.compute, a tenth of what a short run's command costs.
+"""
 
 from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -54,17 +60,74 @@ _leave_pandas_out()
 def to_arrow(values: NDArray[Any], kind: Kind) -> tuple[pa.Array, int]:
     """Return a column as its field's kind wants it, and how many values did not fit and became null."""
     if kind == "float" and values.dtype.kind in "fi":
-        return pa.array(values.astype(np.float64, copy=False), from_pandas=True), 0
+        return floats_array(values), 0
     if kind == "int" and values.dtype.kind == "i":
-        return pa.array(values), 0
+        return numbers_array(values.astype(np.int64, copy=False)), 0
     if kind == "bool" and values.dtype.kind == "b":
-        return pa.array(values), 0
+        return _of_buffer(pa.bool_(), len(values), _bits(values), None), 0
     if kind == "int" and values.dtype.kind == "f":
         is_null = np.isnan(values)
         is_unfit = ~is_null & ((values != np.floor(values)) | (np.abs(values) >= 2.0**63))
         whole = np.where(is_null | is_unfit, 0, values).astype(np.int64)
-        return pa.array(whole, mask=is_null | is_unfit), int(is_unfit.sum())
+        return numbers_array(whole, is_null=is_null | is_unfit), int(is_unfit.sum())
     return _convert_each(values.tolist(), kind)
+
+
+def floats_array(values: NDArray[Any]) -> pa.Array:
+    """Return numbers as floats; NaN is null."""
+    floats = values.astype(np.float64, copy=False)
+    is_null = np.isnan(floats)
+    return numbers_array(floats, is_null=is_null if is_null.any() else None)
+
+
+def numbers_array(
+    values: NDArray[Any],
+    kind: pa.DataType | None = None,
+    *,
+    is_null: NDArray[np.bool_] | None = None,
+) -> pa.Array:
+    """Return numbers of an array as they lie in memory, as numpy's type or another of that size; some may be null."""
+    return _of_buffer(
+        kind or pa.from_numpy_dtype(values.dtype),
+        len(values),
+        np.ascontiguousarray(values),
+        None if is_null is None else _bits(~is_null),
+    )
+
+
+def _of_buffer(
+    kind: pa.DataType, count: int, values: NDArray[Any], is_known: NDArray[np.uint8] | None
+) -> pa.Array:
+    """Return *count* values from memory; `pa.array` would look whether they are masked, and import numpy.ma for that."""
+    known = None if is_known is None else pa.py_buffer(is_known)
+    return pa.Array.from_buffers(kind, count, [known, pa.py_buffer(values)])
+
+
+def _bits(values: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    return np.packbits(values, bitorder="little")
+
+
+def to_codes(texts: Iterable[str | None]) -> pa.DictionaryArray:
+    """Return texts, or nulls, as numbers of the texts that occur."""
+    numbers: dict[str, int] = {}
+    codes = [None if text is None else numbers.setdefault(text, len(numbers)) for text in texts]
+    return pa.DictionaryArray.from_arrays(
+        pa.array(codes, pa.int32()), pa.array(list(numbers), pa.string())
+    )
+
+
+def one_code(text: str | None, count: int) -> pa.DictionaryArray:
+    """Return a text, or null, that all of *count* records have, likewise."""
+    if text is None:
+        return to_codes([None] * count)
+    return pa.DictionaryArray.from_arrays(
+        numbers_array(np.zeros(count, np.int32)), pa.array([text], pa.string())
+    )
+
+
+def to_times(utc_us: NDArray[np.int64], *, never_us: int) -> pa.Array:
+    """Return UTC times, us, as such; *never_us* is null."""
+    return numbers_array(utc_us, pa.timestamp("us", tz="UTC"), is_null=utc_us == never_us)
 
 
 def to_numpy(column: pa.Array, *, is_exact: bool) -> NDArray[Any]:

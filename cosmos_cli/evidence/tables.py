@@ -23,7 +23,17 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cosmos_cli.errors import InputError
-from cosmos_cli.evidence.arrow_values import ARROW_TYPES, as_floats, to_arrow, to_numpy
+from cosmos_cli.evidence.arrow_values import (
+    ARROW_TYPES,
+    as_floats,
+    floats_array,
+    numbers_array,
+    one_code,
+    to_arrow,
+    to_codes,
+    to_numpy,
+    to_times,
+)
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import DETAILS, Columns, RecordFile
 from cosmos_cli.evidence.table_labels import NEVER_US, TableLabels
@@ -187,10 +197,8 @@ class TableWriter:
 
     def _table(self, file: RecordFile) -> pa.Table:
         count, layout = self._held_count, self._layout
-        arrays: list[Any] = [
-            pa.DictionaryArray.from_arrays(np.zeros(count, np.int32), [file.source]),
-            pa.array(np.full(count, file.incarnation, np.int32)),
-        ]
+        incarnation = np.full(count, file.incarnation, np.int32)
+        arrays: list[Any] = [one_code(file.source, count), numbers_array(incarnation)]
         joined = {
             field.name: _join([batch.get(field.name) for batch in self._held], self._held, count)
             for field in layout.fields
@@ -198,12 +206,9 @@ class TableWriter:
         t_s = joined.get(TIME)
         if layout.tick_hz is not None:
             t_s = as_floats(joined["tick"]) / layout.tick_hz
-            arrays.append(pa.array(t_s, from_pandas=True))
+            arrays.append(floats_array(t_s))
         if layout.has_utc and t_s is not None:
-            utc_us = layout.labels.utc_us(as_floats(t_s))
-            arrays.append(
-                pa.array(utc_us, mask=utc_us == NEVER_US).cast(pa.timestamp("us", tz="UTC"))
-            )
+            arrays.append(to_times(layout.labels.utc_us(as_floats(t_s)), never_us=NEVER_US))
         if layout.label:
             arrays.append(self._labels(file, joined.get(AGENT), count))
         for field in layout.fields:
@@ -217,12 +222,9 @@ class TableWriter:
     ) -> pa.DictionaryArray:
         """Return the second name of each record's agent: of the one that it tells of, else of who recorded it."""
         names = self._layout.labels.agents.names
-        if agents is None and file.source in names:
-            return pa.DictionaryArray.from_arrays(np.zeros(count, np.int32), [names[file.source]])
         if agents is None:
-            return pa.nulls(count, pa.string()).dictionary_encode()
-        told = pa.array([names.get(str(agent)) for agent in agents.tolist()], pa.string())
-        return told.dictionary_encode()
+            return one_code(names.get(file.source), count)
+        return to_codes(names.get(str(agent)) for agent in agents.tolist())
 
 
 class TableReader:

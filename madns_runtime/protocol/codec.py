@@ -207,7 +207,8 @@ def _encode_array(array: np.ndarray[Any, Any]) -> msgpack.ExtType:
         raise UnencodableValue(
             f"an array has at most {ARRAY_DIMENSIONS_MAX} dimensions, got {array.ndim}"
         )
-    if isinstance(array, np.ma.MaskedArray):
+    # Not asked of an array of numpy's own: the first such question imports numpy.ma, in the middle of a tick.
+    if type(array) is not np.ndarray and isinstance(array, np.ma.MaskedArray):
         raise UnencodableValue("an array with a mask would travel without it; send its filled(nan)")
     kind, size = array.dtype.kind, array.dtype.itemsize
     if not (kind in "fiu" and size <= 8):

@@ -55,7 +55,9 @@ def count_not_finite(value: Any) -> int:
 
 def _count_in_array(array: NDArray[Any]) -> int:
     """Return the same of an array; one whose numbers stand in objects, in rows or under a mask is taken apart."""
-    if array.dtype.kind in "OV" or isinstance(array, np.ma.MaskedArray):
+    # Not asked of an array of numpy's own: the first such question imports numpy.ma, in the middle of a tick.
+    is_masked = type(array) is not np.ndarray and isinstance(array, np.ma.MaskedArray)
+    if array.dtype.kind in "OV" or is_masked:
         return count_not_finite(array.tolist())
     is_float = np.issubdtype(array.dtype, np.floating)
     return int(np.count_nonzero(~np.isfinite(array))) if is_float else 0
