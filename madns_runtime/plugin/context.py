@@ -10,7 +10,8 @@ from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
+# By its name: imported once, before agents are forked, not in each of them.
+from numpy.random import default_rng
 
 from madns_runtime.config import RunConfig
 from madns_runtime.errors import (
@@ -89,7 +90,7 @@ class RunContext:
         self.tick_hz = config.agents.tick_hz
         self.duration_s = config.time.duration_s
         self.base_directory = Path(config.base_directory)
-        self.random = np.random.default_rng([config.seed, zlib.crc32(name.encode())])
+        self.random = default_rng([config.seed, zlib.crc32(name.encode())])
         self.now_s = now_s
         # The framework's own methods, without a layer between: they are called every tick.
         recorder = journal.recorder

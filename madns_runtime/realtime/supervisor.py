@@ -6,6 +6,7 @@ The parent holds the write end of a life line; every child polls its read end an
 
 from __future__ import annotations
 
+import encodings.idna  # noqa: F401 - what a first connection imports, here for all that are forked
 import os
 import signal
 import sys
