@@ -89,6 +89,7 @@ def inject(
         parameters = _parameters(values or ())
         for_s = parameters.pop(FOR_S, None)
         order = {"target": target, "action": action, "parameters": parameters, FOR_S: for_s}
+        order["texts"] = _texts(values or (), parameters)
         refusal = clean_line(str(order_action(found.path, found.name, order)["refusal"]))
     code = ExitCode.RUN_FAILED if refusal else ExitCode.OK
     console.data(f"{target} {action}: {f'refused: {refusal}' if refusal else 'in force'}")
@@ -152,6 +153,16 @@ def _parameters(values: Sequence[str]) -> dict[str, Any]:
             raise InputError(f"expected each parameter once, and no dots, got {each!r}")
         found[key] = value
     return found
+
+
+def _texts(values: Sequence[str], parameters: Mapping[str, Any]) -> dict[str, str]:
+    """Return as they were written the values that YAML took for something else: an action may want a text."""
+    written = (each.partition("=") for each in values)
+    return {
+        key.strip(): text
+        for key, _, text in written
+        if not isinstance(parameters.get(key.strip(), ""), str)
+    }
 
 
 def _list(console: Console, path: Path, name: str) -> int:
