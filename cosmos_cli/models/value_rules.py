@@ -17,6 +17,8 @@ from madns_runtime.recording.records import Field
 from madns_runtime.units import conversion, converted
 
 BOUND_WORDS = ("below", "above", "within", "equals")
+EXACT_MAX = 2**53
+"""From here on two whole numbers may be one float."""
 UNIT_CURE = "leave out unit, or write one that converts"
 RulePath = tuple[str | int, ...]
 RuleFault = tuple[RulePath, str]
@@ -130,6 +132,14 @@ def kind_faults(rule: BoundsRule, field: Field | None) -> Iterator[RuleFault]:
         yield ("equals",), f"{field.name} holds no texts: expected {kind}, got {rule.equals!r}"
     elif field.kind in ("float", "int") and isinstance(rule.equals, bool):
         yield ("equals",), f"{field.name} holds numbers, got {str(rule.equals).lower()}"
+    elif field.kind == "int" and _is_blurred(rule):
+        text = "whole numbers from 2^53 on are compared as floats, to which neighbours are one"
+        yield ("equals",), f"{text}: expected within: [low, high], or a tolerance"
+
+
+def _is_blurred(rule: BoundsRule) -> bool:
+    is_number = isinstance(rule.equals, int | float)
+    return is_number and not rule.tolerance and abs(float(rule.equals or 0.0)) >= EXACT_MAX
 
 
 def unit_faults(unit: str, field: Field | None, *, must_know: bool = False) -> Iterator[RuleFault]:

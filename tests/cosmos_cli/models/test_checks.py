@@ -68,6 +68,7 @@ BROKEN = [
     (f"{PACKET}, within: [2, 1]", "[2", "the lesser bound first"),
     (f"{PACKET}, within: [2]", "within", ""),
     (f"{PACKET}, equals: three", "three", "holds no texts: expected a number"),
+    (f"{PACKET}, equals: 9007199254740993", "9007", "from 2^53 on are compared as floats"),
     (f"{PACKET}, equals: true", "true", "holds numbers, got true"),
     (f"{PACKET}, below: 3, tolerance: 1", "1}", "goes with equals and a number"),
     (f"{PACKET}, equals: 3, tolerance: -1", "-1", "expected >= 0"),
