@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
+import signal
 import sys
 import tempfile
 import traceback
@@ -29,6 +30,8 @@ from cosmos_cli.ui.out_of_memory import is_out_of_memory, memory_text
 from madns_runtime import __version__
 from madns_runtime.errors import MadnsError
 
+EXIT_CODE_UNREAD = 128 + signal.SIGPIPE
+"""As a shell tells of a program that wrote to a reader which has gone: no failure, and nothing that is whole."""
 QUICK = ("ping", "exec", "up")
 """Commands whose every millisecond is told, and which leave nothing to be done here."""
 CLICK_ERROR: Any = USAGE_ERROR.__mro__[1]
@@ -118,6 +121,10 @@ def run(arguments: list[str]) -> int:
         )
     except BrokenPipeError:
         return _leave_quietly()
+    except SystemExit as ended:
+        if not isinstance(ended.__context__, BrokenPipeError):  # typer's answer to one is 1
+            raise
+        return _leave_quietly()
     except OutputLost as error:
         tell_lost_output(error)
         return int(ExitCode.RUN_FAILED)
@@ -206,7 +213,7 @@ def _flushed(code: int) -> int:
 def _leave_quietly() -> int:
     """Whoever read our output has gone, as `head` does; the interpreter must not complain at exit."""
     let_go_of_output()
-    return int(ExitCode.RUN_FAILED)
+    return EXIT_CODE_UNREAD
 
 
 if __name__ == "__main__":

@@ -247,7 +247,7 @@ class HardwareSettings:
     armed: bool = False
     """Outputs move only with this, and where the inventory permits it (outputs: true of the device)."""
     on_device_loss: Literal["abort", "continue"] = "abort"
-    """abort: the run ends (exit code 3) when a device is lost; continue: the checks below tell."""
+    """abort: a run in real time ends (exit code 3) when a device is lost; continue, and in lockstep always: the checks below tell."""
     stale_ratio: Annotated[float, Ge(0), Le(1)] = 1e-2
     """Largest share of the run in which a device's newest sample may be stale or missing."""
     lost: Annotated[int, Ge(0)] = 0

@@ -21,6 +21,7 @@ from madns_runtime.errors import ConfigurationError
 from madns_runtime.hardware.fault_actions import check_fault
 
 FOR_S = "for_s"
+WHOLE_RUN = "run"
 CONTEXT_SETTINGS = {"ignore_unknown_options": True}
 """A value below zero is none; what else looks like one is refused by `_refuse_options`."""
 
@@ -82,6 +83,7 @@ def inject(
         )
     value: float | None = None
     parameters: dict[str, Any] = {}
+    became = "in force"
     if "/" in target:
         value = _value(action, values or ())
         refusal = order_fault(found.path, found.name, (target, action, value))
@@ -89,9 +91,13 @@ def inject(
         parameters = _parameters(values or ())
         for_s = parameters.pop(FOR_S, None)
         order = {"target": target, "action": action, "parameters": parameters, FOR_S: for_s}
+        order["texts"] = _texts(values or (), parameters)
         refusal = clean_line(str(order_action(found.path, found.name, order)["refusal"]))
+        became = "begun"  # it may last for no time, and an agent may refuse its part
+        if not refusal and target != WHOLE_RUN:
+            console.say("an agent that cannot carry out its part tells so in its own events")
     code = ExitCode.RUN_FAILED if refusal else ExitCode.OK
-    console.data(f"{target} {action}: {f'refused: {refusal}' if refusal else 'in force'}")
+    console.data(f"{target} {action}: {f'refused: {refusal}' if refusal else became}")
     console.print_json(
         {
             "run": found.name,
@@ -152,6 +158,16 @@ def _parameters(values: Sequence[str]) -> dict[str, Any]:
             raise InputError(f"expected each parameter once, and no dots, got {each!r}")
         found[key] = value
     return found
+
+
+def _texts(values: Sequence[str], parameters: Mapping[str, Any]) -> dict[str, str]:
+    """Return as they were written the values that YAML took for something else: an action may want a text."""
+    written = (each.partition("=") for each in values)
+    return {
+        key.strip(): text
+        for key, _, text in written
+        if not isinstance(parameters.get(key.strip(), ""), str)
+    }
 
 
 def _list(console: Console, path: Path, name: str) -> int:

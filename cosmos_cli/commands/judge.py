@@ -122,6 +122,12 @@ def _collected(run: RunDirectory) -> Mapping[str, Any]:
         what = f"{run.path / cut[0]}" + (f" and {len(cut) - 1} more" if cut[1:] else "")
         text = "missing, or not as it was collected"
         raise InputError(f"{what}: {text}; make it anew with: cosmos collect {run.shell_path}")
+    for path in sorted(run.tables.glob("*.parquet")):
+        if f"{run.tables.name}/{path.name}" not in tables:
+            text = "no collection made it, and its values would be judged as the run's"
+            raise InputError(
+                f"{path}: {text}; remove it, or have it noted with: cosmos collect {run.shell_path}"
+            )
     return document
 
 

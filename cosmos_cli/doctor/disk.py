@@ -37,8 +37,8 @@ def disk_space(case: Case) -> Iterator[CheckRemark]:
         level=level,
         found="free disk space" if level == Severity.OK else "little free disk space",
         cure="" if level == Severity.OK else _room_cure(case),
-        figure=free_bytes / 1024**3,
-        unit="GiB",
+        figure=free_bytes / (1024**2 if level == Severity.ERROR else 1024**3),
+        unit="MiB" if level == Severity.ERROR else "GiB",
         detail=case.facts.disk.path if level != Severity.OK else "",
     )
 

@@ -40,13 +40,12 @@ from cosmos_cli.evidence.verdict import (
     Verdict,
     is_number,
     judge,
+    why_no_rate,
 )
 from cosmos_cli.models.inventory.machine import LOOPBACK
 from madns_runtime.config import HardwareSettings, RunConfig
 from madns_runtime.recording.newest_values import clean_values
 from madns_runtime.timing.rate import count_ticks
-
-TICKS_OF_A_RATE = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,7 +167,7 @@ class Evidence:
             miss_ratio=totals.miss_ratio,
             overrun_ratio=totals.overrun_ratio,
             rtf=_number(result.get("rtf")),
-            has_rate=ticks_due is None or ticks_due >= TICKS_OF_A_RATE,
+            no_rate=why_no_rate(result, ticks_due),
             is_lockstep=self._is_lockstep(),
             reliable_lost=_count(messages, "reliable", "lost"),
             sync_lost=_count(messages, "sync", "lost"),

@@ -65,7 +65,8 @@ WORDS: Final[Mapping[str, CauseWords]] = {
     ),
     Cause.STEP: CauseWords(
         "the agent's own step before took longer than its period",
-        "make the plug-in's step quicker than 1 / agents.tick_hz, or lower agents.tick_hz",
+        "nothing where a timeline's `slow` did it; else make the plug-in's step quicker than 1 / agents.tick_hz, or"
+        " lower agents.tick_hz",
     ),
     Cause.TICK_BEFORE: CauseWords(
         "the agent's tick before was itself late and still under way",

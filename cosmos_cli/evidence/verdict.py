@@ -15,6 +15,7 @@ from typing import Any, TypeGuard
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.ui.plural import counted
 from madns_runtime.conditions.reports import BROKEN
+from madns_runtime.plain_values import mapping_at
 
 ORDER = (
     "interrupted 130, ended by a lost machine 3, failed 1, a machine failed 3, data incomplete 5,"
@@ -23,6 +24,7 @@ ORDER = (
 """Order of endings: of several that are true the first is told. README and docs/fleet.md hold the same words."""
 OF_TICKS = "deadline."
 """Begins the names of the checks that late and missed ticks break."""
+TICKS_OF_A_RATE = 2
 WAKE_UP_LATE_S = 0.02
 """A single wake-up may be late by this much on an idle machine; lateness has checks of its own."""
 
@@ -110,8 +112,8 @@ class RunFacts:
     miss_ratio: float | None = None
     overrun_ratio: float | None = None
     rtf: float | None = None
-    has_rate: bool = True
-    """Whether there were ticks enough to tell a real-time factor: two."""
+    no_rate: str = ""
+    """Why there is no real-time factor to be told; empty if there is one to be."""
     is_lockstep: bool = False
     """Whether simulated time waited for everybody: nothing can be late then, whatever the clock shows."""
     reliable_lost: int | None = None
@@ -180,7 +182,6 @@ def judge(facts: RunFacts, limits: CheckLimits) -> Verdict:
     )
 
 
-NO_RATE = "time.rtf: not judged: a single tick has no rate"
 LOCKSTEP = (
     "time.rtf, deadline.miss_ratio, deadline.overrun_ratio: not judged: in lockstep time waits"
 )
@@ -189,11 +190,29 @@ LOCKSTEP = (
 def _unjudged(facts: RunFacts) -> tuple[str, ...]:
     if facts.is_lockstep:
         return (LOCKSTEP,)
-    return () if _is_rate_judged(facts) else (NO_RATE,)
+    return () if _is_rate_judged(facts) else (f"time.rtf: not judged: {facts.no_rate}",)
 
 
 def _is_rate_judged(facts: RunFacts) -> bool:
-    return facts.has_rate or facts.rtf is not None
+    return not facts.no_rate or facts.rtf is not None
+
+
+def why_no_rate(result: Mapping[str, Any], ticks_due: int | None) -> str:
+    """
+    Return why a run has no real-time factor, which agents tell at its end; empty if it is to have one.
+
+    Args:
+        result: The host's.
+        ticks_due: Of each agent; None if that is not known.
+    """
+    if ticks_due is not None and ticks_due < TICKS_OF_A_RATE:
+        return "a single tick has no rate"
+    agents, lost = mapping_at(result, "agents"), result.get("lost_on_purpose")
+    on_purpose = frozenset(map(str, lost)) if isinstance(lost, list) else frozenset()
+    are_away = all(mapping_at(agents, name).get("state") == "lost" for name in agents)
+    if agents and are_away and on_purpose.issuperset(agents) and not result.get("lost"):
+        return "all agents were away on purpose at the end"
+    return ""
 
 
 def run_status(facts: RunFacts) -> str:

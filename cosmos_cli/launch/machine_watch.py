@@ -17,7 +17,13 @@ from functools import partial
 from cosmos_cli.launch.actions import Agenda, AskMachine, ReachMachine, Reattach, Send
 from cosmos_cli.launch.child_commands import ping
 from cosmos_cli.launch.children import HOST, ChildRecord, Children
-from cosmos_cli.launch.run_events import LineBroke, MachineAsked, Reattached, ReattachFailed
+from cosmos_cli.launch.run_events import (
+    LineBroke,
+    MachineAsked,
+    MachineReached,
+    Reattached,
+    ReattachFailed,
+)
 from madns_runtime.config import Timeouts
 
 REATTACH_INTERVAL_S = 0.2
@@ -125,6 +131,8 @@ class _Watched:
     """Whether a try to reach it is under way."""
     is_waiting: bool = False
     """Whether the next try is due later."""
+    why_not: str = ""
+    """Why no connection could be made anew, the last time that this was tried."""
 
     @property
     def supervisors(self) -> list[tuple[str, Pulse]]:
@@ -246,13 +254,21 @@ class MachineWatch:
         watched.pulses.pop(child.name, None)
         watched.cut.add(child.name)
         self._agenda.after(
-            f"cut {child.name}", self._wait_s, partial(self._lost, child.machine or "", event.why)
+            f"cut {child.name}", self._wait_s, partial(self._stayed_cut, child, event.why)
         )
         self._agenda.do(Reattach(child.name))
 
+    def _stayed_cut(self, child: ChildRecord, why: str) -> None:
+        """Give up a machine to one of whose children no line could be made anew in time."""
+        machine = child.machine or ""
+        why_not = self._watched[machine].why_not
+        self._lost(machine, f"{why}, and none could be made anew: {why_not}" if why_not else why)
+
     def reattach_failed(self, event: ReattachFailed) -> None:
         """Let the next try follow after a moment."""
-        if not self._children[event.name].has_exited:
+        child = self._children[event.name]
+        self._watched[child.machine or ""].why_not = event.why
+        if not child.has_exited:
             self._agenda.after(
                 f"again {event.name}",
                 REATTACH_INTERVAL_S,
@@ -266,6 +282,7 @@ class MachineWatch:
             return
         self.forget_line(child)
         self.add(child.machine, child.name)
+        self._watched[child.machine or ""].why_not = ""
         text = f"the connection to {child.machine} broke; {child.name} goes on over another one"
         self._agenda.say(text, "warning")
 
@@ -291,14 +308,18 @@ class MachineWatch:
         self._agenda.do(ReachMachine(machine))
 
     def reach_later(self, machine: str) -> None:
-        """Let the next try follow after a while."""
-        self._watched[machine].is_waiting = True
+        """Let the next try follow after a while; say why the first one failed."""
+        watched = self._watched[machine]
+        if watched.tries == 1 and watched.why_not:
+            text = f"{machine} is tried again every {RETURN_INTERVAL_S:g} s: {watched.why_not}"
+            self._agenda.say(text, "warning")
+        watched.is_waiting = True
         self._agenda.after(f"return {machine}", RETURN_INTERVAL_S, partial(self.reach, machine))
 
-    def reached(self, machine: str) -> bool:
+    def reached(self, event: MachineReached) -> bool:
         """Note the end of a try; True if another one may follow."""
-        watched = self._watched[machine]
-        watched.is_tried = False
+        watched = self._watched[event.machine]
+        watched.is_tried, watched.why_not = False, event.why
         return self._is_seeking and watched.tries < RETURN_TRIES_MAX
 
     def revive(self, machine: str) -> None:
@@ -332,4 +353,6 @@ class MachineWatch:
         if machine not in self._unreachable:
             self._unreachable.add(machine)
             text = f"{machine} cannot be reached; its agents end by themselves within"
-            self._agenda.say(f"{text} {math.ceil(self._end_s)} s", "warning")
+            why_not = self._watched[machine].why_not
+            why = f" (the last try: {why_not})" if why_not else ""
+            self._agenda.say(f"{text} {math.ceil(self._end_s)} s{why}", "warning")

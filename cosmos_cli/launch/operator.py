@@ -352,7 +352,11 @@ class Operator:
                 clean_s=CLEAN_S,
                 forced_s=FORCED_S,
             ),
-            lambda _, failure: self._post(happened.MachineReached(action.machine, failure is None)),
+            lambda _, failure: self._post(
+                happened.MachineReached(
+                    action.machine, failure is None, "" if failure is None else str(failure)
+                )
+            ),
         )
 
     def _open_seat(self, action: actions.OpenSeat) -> None:

@@ -263,7 +263,7 @@ class RemoteChild:
         elif failure is not None and failure.text == STARTED_ANEW:
             self._end(loss=STARTED_ANEW)
         elif failure is not None:
-            self._tell(ReattachFailed(self.name))
+            self._tell(ReattachFailed(self.name, str(failure)))
         elif found is None:
             self._no_status = ENDED_CUT
             self._end(loss=None)

@@ -85,6 +85,7 @@ class ReattachFailed:
     """No new line to a child could be made."""
 
     name: str
+    why: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +131,8 @@ class MachineReached:
 
     machine: str
     is_reached: bool
+    why: str = ""
+    """Why it was not."""
 
 
 @dataclass(frozen=True, slots=True)

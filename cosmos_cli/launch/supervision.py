@@ -322,7 +322,7 @@ class Supervision:
         self._watch.reach(machine)
 
     def _machine_reached(self, event: happened.MachineReached) -> None:
-        may_try_again = self._watch.reached(event.machine)
+        may_try_again = self._watch.reached(event)
         if event.is_reached:
             self._machine_back(event.machine)
         elif may_try_again and self._is_wanted(event.machine):

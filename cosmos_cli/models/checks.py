@@ -14,13 +14,20 @@ from cosmos_cli.models.expectation import Expectation, HeldBounds, owner_of
 from cosmos_cli.models.known_streams import REAL_TIME_ONLY, KnownStreams
 from cosmos_cli.models.plugin_answers import PluginAnswers
 from cosmos_cli.models.scenario import Scenario
-from cosmos_cli.models.value_rules import BoundsRule, FieldRule, RuleFault, words_at
+from cosmos_cli.models.value_rules import (
+    BoundsRule,
+    FieldRule,
+    RuleFault,
+    kind_faults,
+    range_faults,
+    unit_faults,
+    words_at,
+)
 from madns_runtime.conditions.condition import HOST, ValueBounds
 from madns_runtime.recording.records import EVENTS, Field
 from madns_runtime.units import conversion
 
 EVENT_FIELD = "event"
-UNIT_CURE = "leave out unit, or write one that converts"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -239,6 +246,7 @@ class _Placing:
             yield ("equals",), f"a {rule.kind} is a number, got {rule.equals!r}"
         if bounded is not None:
             yield from words_at(below, kind_faults(bounded, field))
+            yield from words_at(below, range_faults(bounded, rule.unit, field))
             if fault := streams.word_fault(stream, self._field, bounded.equals, rule.agents):
                 yield (*below, "equals"), fault
         if not is_statistic and isinstance(rule.equals, str) and rule.kind not in ("each", "last"):
@@ -265,6 +273,7 @@ class _Placing:
             field = streams.field(stream, name)
             yield from kind_faults(rule, field)
             yield from unit_faults(rule.unit, field)
+            yield from range_faults(rule, rule.unit, field)
             if fault := streams.word_fault(stream, name, rule.equals, self._rule.agents):
                 yield ("equals",), fault
 
@@ -339,35 +348,6 @@ class _Placing:
 
 def _earliest(*times_s: float | None) -> float | None:
     return min((each for each in times_s if each is not None), default=None)
-
-
-def kind_faults(rule: BoundsRule, field: Field | None) -> Iterator[RuleFault]:
-    """Yield what does not fit between bounds and the kind of a field."""
-    if field is None:
-        return
-    if field.kind == "str" and rule.word and not isinstance(rule.equals, str):
-        yield (rule.word,), f"{field.name} holds texts: expected equals and one of them"
-    elif field.kind != "str" and isinstance(rule.equals, str):
-        kind = "true or false" if field.kind == "bool" else "a number"
-        yield ("equals",), f"{field.name} holds no texts: expected {kind}, got {rule.equals!r}"
-    elif field.kind in ("float", "int") and isinstance(rule.equals, bool):
-        yield ("equals",), f"{field.name} holds numbers, got {str(rule.equals).lower()}"
-
-
-def unit_faults(unit: str, field: Field | None, *, must_know: bool = False) -> Iterator[RuleFault]:
-    """Yield what does not fit between a unit that is given and a field's; *must_know* if it is needed in the run."""
-    if not unit:
-        return
-    if field is None:
-        if must_know:
-            yield (
-                ("unit",),
-                "with stop_when_broken the field's unit must be declared: leave out unit",
-            )
-        return
-    if conversion(unit, field.unit) is None:
-        has = f"is in {field.unit}" if field.unit else "has no unit"
-        yield ("unit",), f"{field.name} {has}, got {unit!r:.40}: {UNIT_CURE}"
 
 
 def _words(rule: CheckRule, stream: str, field: str, unit: str) -> str:

@@ -15,6 +15,7 @@ from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
 from cosmos_cli.models.checks import scenario_checks
 from cosmos_cli.models.document import Document, read_document
 from cosmos_cli.models.document import Path as ValuePath
+from cosmos_cli.models.executor_answer import EXECUTOR_KIND, ask_executor
 from cosmos_cli.models.expectation import Expectation, conditions_of_checks
 from cosmos_cli.models.extending import ScenarioSource, read_scenario_source
 from cosmos_cli.models.fault_place import fault_found_at
@@ -232,6 +233,9 @@ def _check(
         document.fault(where, text)
         for where, text in cross_faults(scenario, skip=broken, labels=answers.labels)
     ]
+    wrong, odd = ("", "") if broken else ask_executor(scenario)
+    faults += [document.fault(EXECUTOR_KIND, wrong)] if wrong else []
+    remarks = (*answers.remarks, *([document.fault(EXECUTOR_KIND, odd)] if odd else []))
     streams = KnownStreams(answers.streams, devices)
     timeline = NO_TIMELINE
     if not broken - {"timeline"}:
@@ -257,7 +261,7 @@ def _check(
         place_uses=answers.place_uses,
         timeline=timeline,
         placeholders=answers.placeholders,
-        remarks=answers.remarks,
+        remarks=remarks,
         expectations=checks.expectations,
     )
 

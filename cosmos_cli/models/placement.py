@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import Annotated
 
-from annotated_types import Ge
+from annotated_types import Ge, MinLen
 
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
 from cosmos_cli.models.document import did_you_mean, may_guess
@@ -24,7 +24,7 @@ class PlacementRule:
 
     __pydantic_config__ = FORBID_EXTRA
 
-    agents: tuple[NonBlank, ...] = ()
+    agents: Annotated[tuple[NonBlank, ...], MinLen(1)] | None = None
     """Names of agents, or globs such as sat-0*; without them and `count`, all that are left."""
     count: Annotated[int, Ge(1)] | None = None
     """Number of agents, instead of names: the next ones that no earlier rule has taken."""

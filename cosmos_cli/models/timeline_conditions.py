@@ -6,10 +6,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from cosmos_cli.models.agent_labels import AgentLabels
-from cosmos_cli.models.checks import kind_faults, unit_faults
 from cosmos_cli.models.document import did_you_mean
 from cosmos_cli.models.known_streams import REAL_TIME_ONLY, KnownStreams
-from cosmos_cli.models.value_rules import AwaitedRule, RuleFault
+from cosmos_cli.models.value_rules import (
+    AwaitedRule,
+    RuleFault,
+    kind_faults,
+    range_faults,
+    unit_faults,
+)
 from madns_runtime.conditions.condition import HOST, Condition
 from madns_runtime.units import conversion
 
@@ -49,6 +54,7 @@ class AwaitedCondition:
             yield ("unit",), "the field's unit is not declared: leave out unit"
         else:
             yield from unit_faults(rule.unit, field)
+            yield from range_faults(rule, rule.unit, field)
 
     def _agent_faults(self) -> Iterator[RuleFault]:
         rule, roles = self.rule, self.streams.roles(self.rule.stream)

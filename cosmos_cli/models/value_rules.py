@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated
@@ -12,9 +13,13 @@ from annotated_types import Ge
 from cosmos_cli.models.text_forms import NonBlank
 from madns_runtime.conditions.condition import ValueBounds
 from madns_runtime.config import FORBID_EXTRA
-from madns_runtime.units import converted
+from madns_runtime.recording.records import Field
+from madns_runtime.units import conversion, converted
 
 BOUND_WORDS = ("below", "above", "within", "equals")
+EXACT_MAX = 2**53
+"""From here on two whole numbers may be one float."""
+UNIT_CURE = "leave out unit, or write one that converts"
 RulePath = tuple[str | int, ...]
 RuleFault = tuple[RulePath, str]
 """The path within the rule, and what is wrong there."""
@@ -114,3 +119,52 @@ def words_at(path: RulePath, faults: Iterator[RuleFault]) -> Iterator[RuleFault]
 def field_names(kind: type) -> tuple[str, ...]:
     """Return the names of a rule's fields."""
     return tuple(item.name for item in dataclasses.fields(kind))
+
+
+def kind_faults(rule: BoundsRule, field: Field | None) -> Iterator[RuleFault]:
+    """Yield what does not fit between bounds and the kind of a field."""
+    if field is None:
+        return
+    if field.kind == "str" and rule.word and not isinstance(rule.equals, str):
+        yield (rule.word,), f"{field.name} holds texts: expected equals and one of them"
+    elif field.kind != "str" and isinstance(rule.equals, str):
+        kind = "true or false" if field.kind == "bool" else "a number"
+        yield ("equals",), f"{field.name} holds no texts: expected {kind}, got {rule.equals!r}"
+    elif field.kind in ("float", "int") and isinstance(rule.equals, bool):
+        yield ("equals",), f"{field.name} holds numbers, got {str(rule.equals).lower()}"
+    elif field.kind == "int" and _is_blurred(rule):
+        text = "whole numbers from 2^53 on are compared as floats, to which neighbours are one"
+        yield ("equals",), f"{text}: expected within: [low, high], or a tolerance"
+
+
+def _is_blurred(rule: BoundsRule) -> bool:
+    is_number = isinstance(rule.equals, int | float)
+    return is_number and not rule.tolerance and abs(float(rule.equals or 0.0)) >= EXACT_MAX
+
+
+def unit_faults(unit: str, field: Field | None, *, must_know: bool = False) -> Iterator[RuleFault]:
+    """Yield what does not fit between a unit that is given and a field's; *must_know* if it is needed in the run."""
+    if not unit:
+        return
+    if field is None:
+        if must_know:
+            yield (
+                ("unit",),
+                "with stop_when_broken the field's unit must be declared: leave out unit",
+            )
+        return
+    if conversion(unit, field.unit) is None:
+        has = f"is in {field.unit}" if field.unit else "has no unit"
+        yield ("unit",), f"{field.name} {has}, got {unit!r:.40}: {UNIT_CURE}"
+
+
+def range_faults(rule: BoundsRule, unit: str, field: Field | None) -> Iterator[RuleFault]:
+    """Yield that bounds in *unit* are no finite numbers in the field's: to a condition in the run they would be none."""
+    factor = None if field is None else conversion(unit or field.unit, field.unit)
+    if field is None or factor is None:
+        return
+    for word in (*BOUND_WORDS, "tolerance"):
+        value = getattr(rule, word)
+        for each in value if isinstance(value, tuple) else (value,):
+            if isinstance(each, int | float) and math.isinf(converted(each, factor)):
+                yield (word,), f"{each:g} {unit} is more than a number in {field.unit} can tell"

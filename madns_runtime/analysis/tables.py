@@ -6,9 +6,10 @@ Who reads the files stands elsewhere: nothing here knows their format.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,8 @@ from madns_runtime.recording.records import Field
 
 AGENT = "agent"
 INCARNATION = "incarnation"
+HOST_EVENTS: Final = "host_events"
+SHUTDOWN_STATES: Final = ("BEGIN_SHUTDOWN", "EMERGENCY_SHUTDOWN")
 Columns = Mapping[str, NDArray[Any]]
 """By the fields' names, shape (N,) each: numbers as float64 with null as NaN or as int64, the rest as objects."""
 
@@ -114,6 +117,24 @@ class RecordedRun:
         planned_s = None if self.config is None else self.config.time.duration_s
         told = (planned_s, self.document.get("duration_s"))
         return min((float(each) for each in told if isinstance(each, int | float)), default=0.0)
+
+    @property
+    def end_s(self) -> float:
+        """Simulated time at which it ended, s: its duration if it was complete, else the begin of its shutdown."""
+        told = self.duration_s or math.inf
+        table = self.tables.get(HOST_EVENTS)
+        if self.document.get("status") == "complete" or not (
+            table is not None and table.has("t_s", "event", "details")
+        ):
+            return told
+        for _, columns in table.each(("t_s", "event", "details")):
+            is_state = columns["event"] == "state"
+            for t_s, details in zip(
+                as_array(columns["t_s"])[is_state], columns["details"][is_state], strict=True
+            ):
+                if any(state in str(details) for state in SHUTDOWN_STATES) and t_s < told:
+                    told = float(t_s)
+        return told
 
     def agent_summary(self, name: str) -> Mapping[str, Any]:
         """Return what the agent's half of the simulation summed up; empty for one that died."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Final
 
 from madns_runtime.timing.clocksync import ClockEstimate
@@ -26,6 +27,8 @@ class FaultableClock(ClockEstimate):
         self._rate = 0.0
         """By how much it runs faster."""
         self._rates: dict[int, float] = {}
+        self._holders: Counter[int] = Counter()
+        """By fault, how many agents of the process it is a fault of."""
         self._steps: set[int] = set()
 
     def step(self, fault: int, by_s: float, now_s: float) -> bool:
@@ -40,7 +43,8 @@ class FaultableClock(ClockEstimate):
         return True
 
     def drift(self, fault: int, ppm: float, now_s: float) -> bool:
-        """Let the clock run faster, or slower; False if it does already."""
+        """Let the clock run faster, or slower; False if it does already, by another agent of the process."""
+        self._holders[fault] += 1
         if fault in self._rates:
             return False
         self._settle_error(now_s)
@@ -49,8 +53,9 @@ class FaultableClock(ClockEstimate):
         return True
 
     def end_drift(self, fault: int, now_s: float) -> bool:
-        """Let it run as it did; what it has gained stays. False if it does already."""
-        if fault not in self._rates:
+        """Let it run as it did; what it has gained stays. False while it is a fault of others of the process, too."""
+        self._holders[fault] -= 1
+        if self._holders[fault] > 0 or fault not in self._rates:
             return False
         self._settle_error(now_s)
         del self._rates[fault]

@@ -173,19 +173,21 @@ class MessageFaults:
             fate = self._rules.of_host(agent, direction, service, now_s)
         counts = self._counts.setdefault(agent, Counter())
         counts["seen"] += 1
+        if fate.is_lost:  # and not twice either
+            counts["lost"] += 1
+            return 0
         if fate.is_doubled and service == int(Service.BEST):
             counts["doubled"] += 1
         elif fate.is_doubled:
             counts["double_discarded"] += 1  # the other classes promise exactly once
             fate.is_doubled = False
-        if fate.is_lost:
-            counts["lost"] += 1
-            return 0
         if fate.is_held or fate.late_s or must_wait:
             due_s = math.inf if fate.is_held else now_s + fate.late_s
             is_kept = self._late.put(message._replace(copies=1 + fate.is_doubled), due_s)
             counts["late" if is_kept else "lost"] += 1
             counts["no_room"] += not is_kept
+            if fate.is_doubled and not is_kept:
+                counts["doubled"] -= 1
             self._ends.held()
             return 0
         counts["passed"] += 1

@@ -11,7 +11,7 @@ import fnmatch
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_type_hints
 
 import orjson
 
@@ -137,6 +137,7 @@ class ActionSocket:
             )
         parameters = order.get("parameters")
         given = dict(parameters) if isinstance(parameters, dict) else {}
+        _take_texts(kind, given, order.get("texts"))
         made: Any = from_mapping(kind.parameters, given, word)
         if faults := bound_faults(made, word):
             raise ConfigurationError("; ".join(faults))
@@ -176,6 +177,14 @@ class ActionSocket:
             shown = ", ".join(self._agents[:AGENTS_TOLD_MAX])
             raise ConfigurationError(f"no agent is named {target}; there are {shown}")
         return chosen
+
+
+def _take_texts(kind: ActionKind, given: dict[str, Any], texts: Any) -> None:
+    """Take values as they were written on a command line, such as `text=5`, where the action wants a text."""
+    wanted = get_type_hints(kind.parameters)
+    for name, text in texts.items() if isinstance(texts, dict) else ():
+        if wanted.get(name) is str and name in given and isinstance(text, str):
+            given[name] = text
 
 
 def _first_of(in_force: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

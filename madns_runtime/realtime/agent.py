@@ -343,6 +343,7 @@ class AgentRunner:
         self._cancel_timers()
         self._journal.event("emergency", reason=reason)
         self._journal.say("critical", f"emergency shutdown: {reason}")
+        self._actions.leave_clock()
         self.half.abandon()
         self._reactor.end_if_forked()
         self._close_records()

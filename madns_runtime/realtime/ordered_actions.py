@@ -65,6 +65,8 @@ class OrderedActions(AgentActions):
         self._clock = clock
         self._stress: dict[int, tuple[subprocess.Popen[bytes], ...]] = {}
         self._ended: list[subprocess.Popen[bytes]] = []
+        self._drifts: dict[int, float] = {}
+        """By number those of the clock that this agent takes part in, 1e-6."""
         own: Mapping[str, OwnAction] = {
             STOP.word: lambda order: self._end_at(order.t_s),
             STRESS.word: self._load,
@@ -73,6 +75,11 @@ class OrderedActions(AgentActions):
             DEVICE_FAULT.word: self._device_fault,
         }
         super().__init__(seat.name, declared, call=call, journal=journal, own=own)
+
+    def leave_clock(self) -> None:
+        """End the drifts of the clock that were this agent's alone: it is lost, and hears of no end."""
+        for number in list(self._drifts):
+            self._end_drift(number)
 
     def close(self) -> None:
         """End what goes on beside the agent."""
@@ -104,10 +111,16 @@ class OrderedActions(AgentActions):
     def _drift_clock(self, order: ActionOrder) -> None:
         ppm = from_mapping(ClockDrift, order.parameters).ppm
         if order.is_end:
-            if self._clock.end_drift(order.number, monotonic()):
-                self._journal.event("clock_drift_ends", number=order.number, ppm=ppm)
-        elif self._clock.drift(order.number, ppm, monotonic()):
-            self._journal.event("clock_drift_begins", number=order.number, ppm=ppm)
+            self._end_drift(order.number)
+        elif order.number not in self._drifts:
+            self._drifts[order.number] = ppm
+            if self._clock.drift(order.number, ppm, monotonic()):
+                self._journal.event("clock_drift_begins", number=order.number, ppm=ppm)
+
+    def _end_drift(self, number: int) -> None:
+        ppm = self._drifts.pop(number, None)
+        if ppm is not None and self._clock.end_drift(number, monotonic()):
+            self._journal.event("clock_drift_ends", number=number, ppm=ppm)
 
     def _device_fault(self, order: ActionOrder) -> None:
         fault = from_mapping(DeviceFault, order.parameters)

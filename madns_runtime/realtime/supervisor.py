@@ -35,7 +35,7 @@ from madns_runtime.reactor.reattachment import way_back_of
 from madns_runtime.reactor.scheduling import freeze_garbage, outlive_parent
 from madns_runtime.realtime.agent_calls import AgentCalls, LoopSeat
 from madns_runtime.realtime.agent_process import AgentProcess
-from madns_runtime.realtime.agent_report import AgentOutcome
+from madns_runtime.realtime.agent_report import AgentOutcome, how_ended, make_reason_pipe
 
 RESTART_DELAY_S = 0.2
 KILL_GRACE_S = 3.0
@@ -246,7 +246,7 @@ class Supervisor:
         del self._children[child.pid]
         self._devices.agents_ended(child.agents)
         signal_name = signal.Signals(-code).name if code < 0 else None
-        how = _how(code, signal_name, child.reason, where=where)
+        how = how_ended(code, signal_name, child.reason, where=where)
         has_failed = code != 0 or not child.has_ended_well
         will_restart = has_failed and not self._is_ending and self._may_restart(child)
         self._failed = self._failed or (has_failed and not child.is_killed)
@@ -292,9 +292,22 @@ class Supervisor:
         elif self._operator.is_cut:  # it comes back first, or all is over
             self._restart_soon(child)
         else:
-            anew = self._fork(child.agents, incarnation=child.incarnation + 1)
+            try:
+                anew = self._fork(child.agents, incarnation=child.incarnation + 1)
+            except MachineError as error:  # such as of memory: the machine's other agents go on
+                self._put_off(child, str(error))
+                return
             anew.killed_before = child.killed_before + child.is_killed
             self._tell_started(anew)
+
+    def _put_off(self, child: SupervisedProcess, why: str) -> None:
+        """Try again in a moment, as long as the run goes on; say why once."""
+        if child.reason != why:
+            child.reason = why
+            text = f"{why}; it is tried again every {RESTART_DELAY_S:g} s"
+            self._operator.emit({"event": "log", "level": "warning", "text": text})
+        child.returns_after_s = RESTART_DELAY_S
+        self._restart_soon(child)
 
     def _tell_started(self, child: SupervisedProcess) -> None:
         if child.agents in self._to_fork:
@@ -377,23 +390,3 @@ class Supervisor:
         except OSError as error:
             text = f"the account of the devices cannot be written: {path}: {error.strerror}"
             self._operator.emit({"event": "log", "level": "error", "text": text})
-
-
-def make_reason_pipe() -> tuple[int, int]:
-    """
-    Return the ends of the pipe by which children tell how they ended.
-
-    Reaping empties it, too: the loop's reader, called afterwards in the same turn, finds nothing and does not wait.
-    """
-    read_fd, write_fd = os.pipe()
-    os.set_blocking(read_fd, False)
-    return read_fd, write_fd
-
-
-def _how(code: int, signal_name: str | None, reason: str | None, *, where: str) -> str:
-    """Return how a process ended; one that gave no reason, also in which call of the plug-in."""
-    if signal_name is not None:
-        return f"killed by {signal_name}{where}"
-    if reason is not None:
-        return reason
-    return "ended" if code == 0 else f"exit code {code}{where}"

@@ -262,6 +262,37 @@ def test_a_ballistic_coefficient_that_no_drag_heeds_is_remarked(folder, propagat
     assert all(told in text for text in found)
 
 
+@pytest.mark.parametrize(
+    ("epoch_utc", "vehicle", "told"),
+    [
+        ("2029-12-31T00:00:00Z", {"sensors": {"magnetometer": {}}}, None),
+        ("2031-07-01T00:00:00Z", {}, None),
+        (
+            "2031-07-01T00:00:00Z",
+            {"sensors": {"magnetometer": {}}},
+            "is that of 2030, not of the epoch",
+        ),
+        (
+            "1975-07-01T00:00:00Z",
+            {"sensors": {"magnetometer": {}}},
+            "is that of 1980, not of the epoch",
+        ),
+        (
+            "2031-07-01T00:00:00Z",
+            {"stimuli": [{"source": "magnetic_field", "channel": "mcu.field"}]},
+            "parameters.vehicles[0].stimuli[0].field: the Earth's field is that of 2030",
+        ),
+    ],
+)
+def test_a_field_of_the_earth_beyond_its_coefficients_is_remarked(folder, epoch_utc, vehicle, told):
+    given = parameters(vehicles=[vehicle], epoch_utc=epoch_utc)
+
+    found = [fault for fault in find_faults(given, 2, folder) if fault.startswith("remark: ")]
+
+    assert len(found) == (told is not None)
+    assert all(told in text for text in found)
+
+
 def test_without_names_globs_are_not_judged(folder):
     params = parameters(vehicles=[{"agents": ["X*"]}])
 

@@ -11,6 +11,7 @@ from constellation_fakes import IRIDIUM, Star, parameters, state_rows
 
 from madns_runtime.errors import PluginError
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
+from madns_runtime.simulations.constellation.streams import ELEMENTS
 from madns_runtime.simulations.constellation.truth.initial_states import load_fleet
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
@@ -284,6 +285,22 @@ def test_elements_are_recorded_at_their_own_rate():
 
     ticks = [row[0] for row in star.contexts["agent-01"].records["elements"]]
     assert ticks == list(range(0, 100, 5))
+
+
+def test_angles_of_elements_are_below_a_whole_turn_on_record():
+    orbit = {"name": "a", "altitude_km": 550, "e": 0.01, "i_deg": 56}
+    two_body = {"kind": "scipy", "forces": ["two_body"]}
+    star = Star(parameters({"keplerian": [orbit]}, propagator=two_body), 1)
+
+    star.run(60.0)
+
+    rows = star.contexts["agent-01"].records["elements"]
+    digits = [field.digits for field in ELEMENTS]
+    recorded = [list(map(round, row[4:], digits[4:])) for row in rows]
+    assert len(recorded) == 60
+    assert max(map(max, recorded)) < 360.0
+    # Of an orbit whose perigee lies at its node: rounding errors fall to both sides of 0.
+    assert max(min(row[1], 360.0 - row[1]) for row in recorded) < 1e-6
 
 
 def test_initial_data_name_satellite_frame_and_epoch():

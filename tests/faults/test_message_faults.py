@@ -228,6 +228,20 @@ def test_a_doubled_message_comes_twice_unless_its_class_promises_once():
     assert (rig.counts()["doubled"], rig.counts()["double_discarded"]) == (2, 1)
 
 
+def test_a_message_that_is_lost_does_not_count_as_doubled():
+    rig = Rig()
+    rig.faults.begin(action("duplicate_messages", probability=1.0))
+    rig.faults.begin(action("lose_messages", number=2, probability=0.5))
+
+    for value in range(100):
+        rig.faults.take("a", value, BEST)
+
+    counts = rig.counts()
+    assert 20 < counts["lost"] < 80
+    assert counts["doubled"] == counts["passed"] == 100 - counts["lost"]
+    assert len(rig.received) == 2 * counts["doubled"]
+
+
 def test_a_doubled_message_that_is_late_is_one_in_the_account_and_comes_twice():
     rig = Rig()
     rig.faults.begin(action("duplicate_messages", probability=1.0))

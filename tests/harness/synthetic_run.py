@@ -67,7 +67,13 @@ class SyntheticRun:
         self.expected = ExpectedRecords.of(self.config, (MACHINE,))
         self.records: dict[str, dict] = {}
 
-    def write(self, *, with_states: bool = False, health_count: int = 5) -> SyntheticRun:
+    def write(
+        self,
+        *,
+        with_states: bool = False,
+        health_count: int = 5,
+        shutdown_s: float | None = None,
+    ) -> SyntheticRun:
         if with_states:
             self.config = dataclasses.replace(self.config, simulation="constellation")
             begin_run(self.run, self.config, {"machines": {MACHINE: list(self.names)}})
@@ -75,6 +81,9 @@ class SyntheticRun:
         host.record(
             "events", {"t_s": 0.0, "utc": T0_UTC, "event": "SIMULATION_START", "why": "all"}
         )
+        if shutdown_s is not None:
+            ended = {"t_s": shutdown_s, "utc": T0_UTC, "event": "state"}
+            host.record("events", {**ended, "state": "EMERGENCY_SHUTDOWN"})
         self.records["host"] = host.close().to_mapping()
         for name in self.names:
             self.write_agent(name, with_states=with_states)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 from types import SimpleNamespace
@@ -10,8 +11,8 @@ import pytest
 
 from madns_runtime.config import Agents
 from madns_runtime.realtime.agent_calls import AgentCalls
-from madns_runtime.realtime.agent_report import AgentOutcome
-from madns_runtime.realtime.supervisor import SupervisedProcess, Supervisor, make_reason_pipe
+from madns_runtime.realtime.agent_report import AgentOutcome, make_reason_pipe
+from madns_runtime.realtime.supervisor import SupervisedProcess, Supervisor
 
 
 def test_a_reader_that_finds_nothing_after_reaping_does_not_wait():
@@ -49,6 +50,40 @@ def test_ends_on_purpose_are_no_failures_after_which_an_agent_is_not_started_aga
     )
 
     assert supervisor._may_restart(child) is may
+
+
+def test_a_process_that_cannot_be_started_anew_is_tried_again_and_costs_no_other(monkeypatch):
+    said, due, forks = [], [], []
+    supervisor = Supervisor.__new__(Supervisor)
+    supervisor._operator = SimpleNamespace(is_cut=False, emit=said.append)
+    supervisor._reactor = SimpleNamespace(now_s=lambda: 5.0, call_at=lambda *call: due.append(call))
+    supervisor._is_ending = False
+    child = SupervisedProcess(
+        ("agent-01",), 1, 1, AgentCalls(), is_killed=True, returns_after_s=9.0
+    )
+    supervisor._to_fork, supervisor._children = [child.agents], {}
+    supervisor._devices = SimpleNamespace(agents_started=lambda *started: None)
+
+    def fork():
+        forks.append(1)
+        if len(forks) <= 2:
+            raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+        return 77
+
+    monkeypatch.setattr(os, "fork", fork)
+
+    supervisor._restart(child)
+    for _ in range(2):
+        assert due[-1][0] == pytest.approx(5.2)
+        due[-1][1]()
+
+    told = (
+        "cannot start the process of agent-01: Resource temporarily unavailable; it is tried again"
+    )
+    assert [each["event"] for each in said] == ["log", "started"]
+    assert told in said[0]["text"]
+    assert said[1]["incarnation"] == 2
+    assert supervisor._to_fork == []
 
 
 @pytest.mark.parametrize(

@@ -167,6 +167,18 @@ def test_a_run_whose_tables_are_cut_is_not_judged_by_what_is_left(run):
     assert (anew.returncode, "PASSED" in anew.stdout) == (0, True)
 
 
+def test_a_table_that_no_collection_made_is_not_judged(run):
+    _, document = run("lockstep", LASTING)
+    tables = run.cosmos.directory(document) / "tables"
+    (table,) = tables.glob("round_trips*")
+    (tables / "foreign.parquet").write_bytes(table.read_bytes())
+
+    refused = run.cosmos("judge", document["run"])
+
+    assert refused.returncode == 2
+    assert "foreign.parquet: no collection made it" in refused.stderr
+
+
 def test_a_run_whose_manifest_is_gone_is_not_judged(run):
     """A table that is gone, too, would be one without records: no event of it occurred, and its count is 0."""
     _, document = run("lockstep", LASTING)

@@ -41,6 +41,7 @@ def test_orders_are_taken_listed_refused_and_recorded_and_a_stop_completes_the_r
     with cosmos.start_run(path) as run:
         wait_until(lambda: list(cosmos.runs.glob("*/.actions.sock")), "the run's door", process=run)
         assert inject("run", "annotate", "text=hello", "for_s=1e7")[0] == 0
+        assert inject("run", "annotate", "text=5", "for_s=1e7")[0] == 0
         code, listed = inject("--list")
         refusals = [(inject(*arguments), words) for arguments, words in REFUSED]
         slowed = inject("agent-0*", "slow", "factor=2", "for_s=10")
@@ -54,7 +55,7 @@ def test_orders_are_taken_listed_refused_and_recorded_and_a_stop_completes_the_r
     assert [e["parameters"] for e in listed["actions"] if e["action"] == "slow"] == [["factor"]]
     # Of real time alone.
     assert not {"stress", "step_clock", "drift_clock"} & {e["action"] for e in listed["actions"]}
-    assert [each["parameters"] for each in listed["in_force"]] == [{"text": "hello"}]
+    assert [each["parameters"] for each in listed["in_force"]] == [{"text": "hello"}, {"text": "5"}]
     for (code, answer), words in refusals:
         assert code == 1, answer
         assert words in answer["refusal"]
@@ -63,7 +64,7 @@ def test_orders_are_taken_listed_refused_and_recorded_and_a_stop_completes_the_r
     assert result["duration_s"] < 1e7
     lines = (cosmos.directory(result) / "host" / "events.jsonl").read_text().splitlines()
     found = [e["action"] for e in map(json.loads, lines) if e.get("event") == "action_began"]
-    assert found == ["annotate", "slow", "stop"]
+    assert found == ["annotate", "annotate", "slow", "stop"]
     assert not list(cosmos.runs.glob("*/.actions.sock"))
 
 

@@ -123,6 +123,29 @@ def test_a_clock_that_is_stepped_is_found_again_and_recorded(cosmos, tmp_path):
     assert offsets_us[-1] - offsets_us[0] == pytest.approx(-150_000 - 300, abs=20_000)
 
 
+def test_a_clock_that_drifts_for_an_agent_that_is_lost_is_right_for_those_that_share_it(
+    cosmos, tmp_path
+):
+    entries = [
+        {"at_s": 0.5, "action": "drift_clock", "agents": ["agent-01"], "ppm": 300},
+        {"at_s": 1.5, "action": "kill", "agents": ["agent-01"]},
+    ]
+    path = written(tmp_path, entries, mode="realtime", duration_s=3)
+
+    code, result = cosmos.run(path, "agents.per_process=2", "on_agent_loss=continue", *LOOSE)
+
+    assert (code, result["status"]) == (0, "complete")
+    text = (cosmos.directory(result) / "agents" / "agent-01" / "events.jsonl").read_text()
+    told = [json.loads(line).get("event") for line in text.splitlines()]
+    assert [
+        each for each in told if each in ("clock_drift_begins", "killed", "clock_drift_ends")
+    ] == [
+        "clock_drift_begins",
+        "killed",
+        "clock_drift_ends",
+    ]
+
+
 AWAITED = [
     {
         "when": {"stream": "round_trips", "field": "packet", "above": 20},

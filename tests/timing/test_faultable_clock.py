@@ -74,9 +74,19 @@ def test_a_drift_is_followed_and_its_end_leaves_what_was_gained(clock):
 def test_one_action_puts_the_clock_of_agents_that_share_a_process_wrong_once(clock):
     assert [clock.step(7, 0.1, 20.0), clock.step(7, 0.1, 20.0)] == [True, False]
     assert [clock.drift(8, 100.0, 20.0), clock.drift(8, 100.0, 20.0)] == [True, False]
-    assert [clock.end_drift(8, 20.0), clock.end_drift(8, 20.0)] == [True, False]
+    assert [clock.end_drift(8, 20.0), clock.end_drift(8, 20.0)] == [False, True]
 
     assert clock.wrong_s(30.0) == pytest.approx(30.1)
+
+
+def test_a_drift_goes_on_while_it_is_a_fault_of_another_agent_of_the_process(clock):
+    clock.drift(8, 100.0, 20.0)
+    clock.drift(8, 100.0, 20.0)
+
+    assert not clock.end_drift(8, 30.0)  # one of them was killed
+    assert clock.wrong_s(40.0) == pytest.approx(40.0 + 20.0 * 100e-6)
+    assert clock.end_drift(8, 40.0)
+    assert clock.wrong_s(90.0) == pytest.approx(90.0 + 20.0 * 100e-6)
 
 
 def test_a_clock_that_nobody_put_wrong_shows_the_time(clock):

@@ -56,6 +56,9 @@ from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBu
 from madns_runtime.simulations.constellation.vehicles import flight_of, vehicle_of
 
 EARTH_POLAR_RADIUS_M2 = EARTH_POLAR_RADIUS_M**2
+TURN_DIGITS = tuple(field.digits for field in ELEMENTS[-3:])
+"""Decimals on record of those elements that go round: raan, argp and mean anomaly."""
+NEARLY_TURN_DEG = 359.9
 
 
 class ConstellationAgent(AgentSimulation):
@@ -367,4 +370,11 @@ class ConstellationAgent(AgentSimulation):
             a_m, e, *angles_rad = element_numbers(state[:6], self._mu_m3_s2)
         except ValueError:
             return  # an escape orbit has none of these
-        self._context.record("elements", (tick, a_m, e, *map(math.degrees, angles_rad)))
+        i_deg, *turns_deg = map(math.degrees, angles_rad)
+        around = map(_within_turn, turns_deg, TURN_DIGITS)
+        self._context.record("elements", (tick, a_m, e, i_deg, *around))
+
+
+def _within_turn(angle_deg: float, digits: int | None) -> float:
+    """Return an angle below 360 deg, or 0 if *digits* decimals on record would make it a whole turn."""
+    return 0.0 if angle_deg > NEARLY_TURN_DEG and round(angle_deg, digits) >= 360.0 else angle_deg

@@ -15,7 +15,11 @@ from pathlib import Path
 from madns_runtime.errors import ConfigurationError, MissingExtraError
 from madns_runtime.plugin.api import DeviceUse, PlaceUse
 from madns_runtime.simulations.constellation.check_flight import flight_faults, rate_faults
-from madns_runtime.simulations.constellation.check_vehicles import board_faults, code_faults
+from madns_runtime.simulations.constellation.check_vehicles import (
+    board_faults,
+    code_faults,
+    field_year_remarks,
+)
 from madns_runtime.simulations.constellation.device_uses import uses_devices, uses_of
 from madns_runtime.simulations.constellation.parameters import (
     KNOTS_MAX,
@@ -70,6 +74,7 @@ def find_faults(  # noqa: PLR0913 - what a scenario is, most by name; see plugin
         chosen = choose(parameters, agents, folder)
         pairs = list(zip(names, chosen.names, strict=False))
         faults += set_faults(parameters, chosen, duration_s)
+        faults += field_year_remarks(parameters, chosen.epoch_utc)
     except ConfigurationError as error:
         faults += str(error).splitlines()
     faults += _propagator_faults(parameters, folder)

@@ -13,6 +13,7 @@ import importlib.util
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from madns_runtime.bounded_files import FileRefused, read_regular_file
@@ -29,6 +30,7 @@ from madns_runtime.simulations.constellation.equipment import (
     StarTrackerDevice,
     Vehicle,
 )
+from madns_runtime.simulations.constellation.orbit.magnetic import IGRF_14_DIPOLE_NT, decimal_year
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
 from madns_runtime.simulations.constellation.sensor_channels import sensors_from_devices
 from madns_runtime.simulations.constellation.stimulus import stimulus_faults
@@ -39,6 +41,12 @@ WALL = tuple(f"{_HERE}.{part}" for part in ("truth", "vehicle", "host_side", "ho
 """Packages that flight software must not import: all that knows truth."""
 EVERYBODY = "*"
 """The glob of all vehicles."""
+J2000 = datetime(2000, 1, 1, 12, tzinfo=UTC)
+FIELD_YEARS = {
+    "dipole": (min(IGRF_14_DIPOLE_NT), max(IGRF_14_DIPOLE_NT)),
+    "igrf": (1900.0, 2030.0),
+}
+"""First and last year of each model of the Earth's field; of the IGRF's 14th generation."""
 PENDING_MAX = 10_000
 """Measurements that a sensor may have under way: see vehicle.sensors.sensor."""
 
@@ -157,14 +165,7 @@ def _sensor_faults(field: str, vehicle: Vehicle) -> list[str]:
             )
     for name, settings in sensors_from_devices(vehicle):
         faults += _device_faults(f"{field}.sensors.{name}", settings)
-    magnetometer, inner = sensors.magnetometer, ""
-    if isinstance(magnetometer, MagnetometerDevice):
-        magnetometer, inner = magnetometer.model, ".model"
-    torquers = None if vehicle.attitude is None else vehicle.attitude.magnetorquers
-    models = {
-        f"sensors.magnetometer{inner}": magnetometer and magnetometer.field,
-        "attitude.magnetorquers": torquers and torquers.field,
-    }
+    models = _field_models(vehicle)
     if "igrf" in models.values() and importlib.util.find_spec("ppigrf") is None:
         faults += [
             f"{field}.{name}.field: ppigrf is not installed here; "
@@ -173,6 +174,45 @@ def _sensor_faults(field: str, vehicle: Vehicle) -> list[str]:
             if model == "igrf"
         ]
     return faults
+
+
+def _field_models(vehicle: Vehicle) -> dict[str, str]:
+    """Return the model of the Earth's field that sensors and magnetorquers take, by their place in a vehicle."""
+    magnetometer, inner = vehicle.sensors.magnetometer, ""
+    if isinstance(magnetometer, MagnetometerDevice):
+        magnetometer, inner = magnetometer.model, ".model"
+    torquers = None if vehicle.attitude is None else vehicle.attitude.magnetorquers
+    return {
+        name: user.field
+        for name, user in (
+            (f"sensors.magnetometer{inner}", magnetometer),
+            ("attitude.magnetorquers", torquers),
+        )
+        if user is not None and user.field is not None
+    }
+
+
+def field_year_remarks(parameters: ConstellationParameters, epoch_utc: datetime) -> list[str]:
+    """Return a remark that the Earth's field at the epoch is that of another year: the models' coefficients end before."""
+    year = decimal_year((epoch_utc - J2000) / timedelta(days=1))
+    for number, vehicle in enumerate(parameters.vehicles):
+        models = {
+            **_field_models(vehicle),
+            **{
+                f"stimuli[{place}]": stimulus.field
+                for place, stimulus in enumerate(vehicle.stimuli)
+                if stimulus.source == "magnetic_field"
+            },
+        }
+        for name, model in models.items():
+            first, last = FIELD_YEARS[model]
+            if not first <= year <= last:
+                return [
+                    f"remark: parameters.vehicles[{number}].{name}.field: the Earth's field is that of"
+                    f" {min(max(year, first), last):g}, not of the epoch ({epoch_utc:%Y-%m-%d}): {model} is known"
+                    f" from {first:g} to {last:g}"
+                ]
+    return []
 
 
 def _actuation_faults(field: str, vehicle: Vehicle) -> list[str]:

@@ -18,10 +18,29 @@ def ordered(monkeypatch, tmp_path):
     return found
 
 
-def inject(*words):
+def inject(*words, options=("--quiet",)):
     command = load_command("inject")
-    with command.make_context("inject", [*words, "--quiet"]) as context:
+    with command.make_context("inject", [*words, *options]) as context:
         return command.invoke(context)
+
+
+@pytest.mark.parametrize(
+    ("words", "line", "is_carried_out_by_agents"),
+    [
+        (("run", "annotate", "text=hello"), "run annotate: begun", False),
+        (("agent-01", "sensor_fault", "sensor=gnss"), "agent-01 sensor_fault: begun", True),
+        (("here/load", "freeze"), "here/load freeze: in force", False),
+    ],
+)
+def test_what_an_agent_may_yet_refuse_is_not_told_as_in_force(
+    ordered, monkeypatch, capsys, words, line, is_carried_out_by_agents
+):
+    monkeypatch.setattr(module, "order_action", lambda path, name, order: {"refusal": ""})
+
+    assert inject("last", *words, options=()) == 0
+    out, err = capsys.readouterr()
+    assert out == f"{line}\n"
+    assert ("tells so in its own events" in err) is is_carried_out_by_agents
 
 
 @pytest.mark.parametrize("value", ["-5", "-0.5", "-1e-3", "-.25", "5"])

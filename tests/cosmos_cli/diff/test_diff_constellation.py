@@ -93,12 +93,14 @@ def fly(tmp_path, monkeypatch):
     monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
     monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
 
-    def fly_run(*, frame="TEME", epoch="2017-03-07T12:00:00Z", result=None, **what):
+    def fly_run(
+        *, frame="TEME", epoch="2017-03-07T12:00:00Z", result=None, shutdown_s=None, **what
+    ):
         config = make_config(2, ticks=TICKS, tick_hz=TICK_HZ)
         made = Flown(tmp_path / "runs", dataclasses.replace(config, simulation="constellation"))
         flown = {"along_m": 0.0, "noise_m": 0.0, "slot_error_deg": 0.1, "delta_v_m_s": 0.5}
         made.fly(**flown | what)
-        made.write()
+        made.write(shutdown_s=shutdown_s)
         summary = {"frame": frame, "epoch_utc": epoch}
         ended = made.result(simulation=summary, **result or {})
         finish_run(made.run, ended, made.expected, has_report=False)
@@ -178,6 +180,15 @@ def test_delta_v_that_a_stop_came_before_was_not_given(fly, capsys):
     control = compared(capsys)["control"]
 
     assert [one["given_m_s"] for one in control["all"]] == [0.9, 0.0]
+
+
+@pytest.mark.parametrize(("shutdown_s", "given_m_s"), [(9.5, 0.0), (10.5, 0.9)])
+def test_delta_v_that_a_failure_came_before_was_not_given(fly, capsys, shutdown_s, given_m_s):
+    fly(), fly(result={"status": "failed", "reason": "no fuel"}, shutdown_s=shutdown_s)
+
+    control = compared(capsys)["control"]
+
+    assert [one["given_m_s"] for one in control["all"]] == [0.9, given_m_s]
 
 
 def test_slot_error_is_told_as_flight_software_believed_it(fly, capsys):

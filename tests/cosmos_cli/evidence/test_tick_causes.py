@@ -38,6 +38,11 @@ def test_ticks_that_no_agent_told_of_are_those_of_one_that_was_absent():
     assert totals.causes == {"step": 1, ABSENT: 12}
 
 
+def test_a_cure_of_what_a_timeline_may_have_done_on_purpose_says_so():
+    assert "a timeline's `slow`" in WORDS["step"].cure
+    assert "a timeline's `step_clock`" in WORDS["clock"].cure
+
+
 def test_the_dominant_cause_is_told_with_share_and_cure():
     totals = cause_totals(
         {"a": AgentCauses(causes={"wake_up": 3, "garbage": 1}, missed=4)}, {"a": 4}

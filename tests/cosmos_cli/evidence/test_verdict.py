@@ -13,6 +13,7 @@ from cosmos_cli.evidence.verdict import (
     CheckResult,
     RunFacts,
     judge,
+    why_no_rate,
 )
 
 TOP = Path(__file__).parents[3]
@@ -272,11 +273,34 @@ def test_one_late_wake_up_does_not_decide_the_real_time_factor_of_a_short_run():
 
 
 def test_real_time_factor_of_a_single_tick_is_not_judged_and_that_is_said():
-    verdict = judged(rtf=None, has_rate=False)
+    verdict = judged(rtf=None, no_rate=why_no_rate({}, 1))
 
     assert verdict.exit_code == 0
     assert "time.rtf" not in [check.name for check in verdict.checks]
     assert verdict.remarks == ("time.rtf: not judged: a single tick has no rate",)
+
+
+@pytest.mark.parametrize(
+    ("states", "on_purpose", "lost", "is_judged"),
+    [
+        (("lost", "lost"), ["a", "b"], [], False),
+        (("lost", "complete"), ["a", "b"], [], True),
+        (("lost", "lost"), ["a"], ["b"], True),
+        (("lost", "lost"), ["a", "b"], ["b"], True),
+        ((), [], [], True),
+    ],
+)
+def test_real_time_factor_of_agents_that_are_all_away_on_purpose_is_not_judged(
+    states, on_purpose, lost, is_judged
+):
+    agents = {name: {"state": state} for name, state in zip("ab", states, strict=False)}
+    result = {"agents": agents, "lost_on_purpose": on_purpose, "lost": lost}
+
+    verdict = judged(rtf=None, no_rate=why_no_rate(result, 40))
+
+    assert ("time.rtf" in [check.name for check in verdict.checks]) is is_judged
+    told = "time.rtf: not judged: all agents were away on purpose at the end"
+    assert (told in verdict.remarks) is not is_judged
 
 
 def test_reason_of_several_lines_is_one_in_the_verdict():

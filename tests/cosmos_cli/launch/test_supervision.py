@@ -560,6 +560,28 @@ def test_machine_that_is_not_wanted_any_more_is_reached_for_once(there: Table) -
     assert of_kind(there.wait(10.0), actions.ReachMachine) == []
 
 
+WHY_NOT = "the host key is not the one that is known; see known_hosts"
+
+
+def test_why_a_lost_machine_cannot_be_reached_is_told_during_the_run() -> None:
+    table = Table(on_agent_loss="continue", agents=Agents(count=2, restarts_max=1))
+    table.answers = {AGENTS}
+    table.run()
+    table.play((1, ChildLost(AGENTS, "the connection broke")))
+
+    first = table.play((0, MachineReached("pi01", is_reached=False, why=WHY_NOT)))
+    table.wait(RETURN_INTERVAL_S)
+    second = table.play((0, MachineReached("pi01", is_reached=False, why="no answer in 5 s")))
+    given_up = table.supervision.stop_seeking()
+
+    assert first == [
+        actions.Say(f"pi01 is tried again every {RETURN_INTERVAL_S:g} s: {WHY_NOT}", "warning")
+    ]
+    assert second == []
+    text = "pi01 cannot be reached; its agents end by themselves within 40 s (the last try: no answer in 5 s)"
+    assert given_up == [actions.Say(text, "warning")]
+
+
 def test_child_of_a_lost_machine_is_lost_once(there: Table) -> None:
     there.play((1, ChildLost(AGENTS, "the connection broke")))
 
@@ -624,6 +646,16 @@ def test_line_that_does_not_come_back_in_time_loses_the_machine(there: Table) ->
     assert of_kind(lost, actions.CloseChild) == [actions.CloseChild(AGENTS)]
     assert late == []
     assert of_kind(there.wait(5.0), actions.Reattach) == []
+
+
+def test_why_no_line_could_be_made_anew_is_told_with_the_loss(there: Table) -> None:
+    there.play((1, LineBroke(AGENTS, "the connection broke")))
+    there.play((0.1, ReattachFailed(AGENTS, WHY_NOT)))
+
+    lost = there.wait(TIMEOUTS.silence_s)
+
+    text = f"machine pi01 is lost: the connection broke, and none could be made anew: {WHY_NOT}"
+    assert problems(lost) == [text]
 
 
 def test_process_that_is_gone_when_its_line_is_made_anew_has_ended(there: Table) -> None:

@@ -1,5 +1,6 @@
 """Golden texts: what a person sees for each kind of mistake, to the letter."""
 
+import re
 import textwrap
 from pathlib import Path
 
@@ -546,6 +547,37 @@ def test_a_remark_of_the_simulation_is_no_fault_and_told_at_its_place(see, capsy
     assert told.out.startswith("a.yaml: ok: ")
     assert told.err.count("note: a.yaml:4:33: parameters.spare: odd") == 2
     assert see(scenario, "parameters.mass_kg=3").count("odd") == 0
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("kind", "code", "told"),
+    [
+        ("concurrent.futures:ThreadPoolExecutor", 0, ""),
+        (
+            "json:dumpz",
+            2,
+            "a.yaml:4:18: executor.kind: json:dumpz: .* has no 'dumpz', did you mean dump",
+        ),
+        ("json:__all__", 2, "executor.kind: json:__all__: expected a function, got list"),
+        (
+            "json.nothing:make",
+            2,
+            "executor.kind: json.nothing:make: No module named 'json.nothing'",
+        ),
+        (
+            "nosuch.pool:make",
+            0,
+            "note: a.yaml:4:18: executor.kind: no module nosuch.pool is found here: the run needs it",
+        ),
+    ],
+)
+def test_an_executor_of_ones_own_is_looked_for(see, capsys, kind, code, told):
+    Path("a.yaml").write_text(MINIMAL + f'executor: {{kind: "{kind}"}}\n')
+
+    assert app.run(["validate", "a.yaml"]) == code
+
+    assert re.search(told, capsys.readouterr().err)
 
 
 @pytest.mark.process

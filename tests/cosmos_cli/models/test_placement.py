@@ -54,6 +54,7 @@ def test_scenario_without_rules_has_none(read):
     ("rules", "expected"),
     [
         ("[{agents: [d]}]", [(4, 23, "placement[0].agents[0]", "no agent is named d; there are a, b, c1, c2")]),
+        ("[{agents: []}]", [(4, 22, "placement[0].agents", "expected at least 1 items, got a list")]),
         ("[{agents: ['d*']}]", [(4, 23, "placement[0].agents[0]", "no agent is like d*; there are a, b, c1, c2")]),
         ("[{agents: [a, a]}]",
          [(4, 26, "placement[0].agents[1]", "expected each agent once, a is taken above in this rule")]),

@@ -159,6 +159,13 @@ def test_other_commands_end_with_1_and_one_line(redirection: str) -> None:
 
 
 @pytest.mark.process
+def test_a_reader_that_has_gone_is_told_as_by_a_shell_and_not_as_a_failure() -> None:
+    ended = shell(f"{COSMOS} schema | true; exit ${{PIPESTATUS[0]}}")
+
+    assert (ended.returncode, ended.stderr) == (141, "")
+
+
+@pytest.mark.process
 def test_commands_work_without_any_standard_stream(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text("name: a\nsimulation: counter\nagents: {count: 3}\nsed: 1\n")
 

@@ -279,7 +279,7 @@ def efforts_of(one: ComparedRun) -> dict[str, Effort]:
         if table == COMMANDS and {"kind", "x", "y", "z"} <= set(recorded.names()):
             commanded[source] = _commanded(recorded)
         elif table == MANEUVERS:
-            _add_given(recorded, given, one.run.duration_s or math.inf)
+            _add_given(recorded, given, one.run.end_s)
     return {
         agent: Effort(
             commanded_m_s=math.fsum(commanded.get(agent, ())),

@@ -61,12 +61,13 @@ def maneuver_blocks(table: RecordedTable, run: RecordedRun) -> list[Block]:
         for name, values in columns.items()
         if name not in ("agent", "status")
     }
-    # What was to be given after a stop of the run was not.
-    is_after = numbers["executed_s"] > (run.duration_s or math.inf)
+    # What was to be given after the run had ended was not.
+    end_s = run.end_s
+    is_after = numbers["executed_s"] > end_s
     numbers[GIVEN] = np.where(is_after, 0.0, numbers[GIVEN])
     numbers["executed_s"] = np.where(is_after, np.nan, numbers["executed_s"])
     return [
-        *_delta_v(numbers, by_agent, run),
+        *_delta_v(numbers, by_agent, end_s),
         *_slack(numbers, by_agent),
         _maneuver_table(numbers, by_agent, status),
     ]
@@ -102,7 +103,7 @@ def estimate_blocks(table: RecordedTable, run: RecordedRun) -> list[Block]:
 
 
 def _delta_v(
-    numbers: Mapping[str, Floats], by_agent: Mapping[str, Rows], run: RecordedRun
+    numbers: Mapping[str, Floats], by_agent: Mapping[str, Rows], end_s: float
 ) -> list[Block]:
     spent_by = {}
     for agent, rows in by_agent.items():
@@ -110,7 +111,7 @@ def _delta_v(
         rows = rows[np.argsort(numbers["executed_s"][rows], kind="stable")]  # noqa: PLW2901 - in order
         t_s = numbers["executed_s"][rows]
         spent = np.concatenate(([0.0], np.cumsum(np.nan_to_num(numbers[GIVEN][rows]))))
-        until_s = [run.duration_s] if run.duration_s else t_s[-1:].tolist()
+        until_s = [end_s] if math.isfinite(end_s) else t_s[-1:].tolist()
         x = np.concatenate(([0.0], t_s, until_s))
         spent_by[agent] = (x, np.concatenate((spent, spent[-1:]))[: len(x)])
     return grouped_lines(
