@@ -12,6 +12,7 @@ from cosmos_cli.collect.host_tables import NAME, layout_with, tabulated, times_o
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import alone, runs_root
+from cosmos_cli.evidence.run_documents import fault_of_plan
 from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.evidence.table_labels import TableLabels
 from cosmos_cli.models.agent_labels import AgentLabels
@@ -59,9 +60,14 @@ def tabulate(
         )
     found = find_run(runs_root(folder), run)
     config, document = found.read_config(), found.read_json(found.run_json)
-    if config is None or document is None or document.get("status") == "running":
+    if document is None or document.get("status") == "running":
         raise InputError(
             f"{found.name} is not collected yet; do that with: cosmos collect {shlex.quote(run)}"
+        )
+    if config is None:
+        fault = fault_of_plan(found.plan_json) or "cannot be used"
+        raise InputError(
+            f"{found.plan_json}: {fault}; put it back as it was: how its records are read stands there alone"
         )
     ran_s = document.get("duration_s")
     times_s = times_of(config, ran_s if isinstance(ran_s, int | float) else None, rate_hz)

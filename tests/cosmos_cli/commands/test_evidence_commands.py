@@ -222,6 +222,19 @@ def test_table_is_not_written_under_the_suffix_of_another_format(made, tmp_path,
     assert not (tmp_path / name).exists()
 
 
+def test_table_of_a_run_whose_plan_is_lost_is_refused_for_that_and_not_for_want_of_a_collection(
+    made, capsys
+):
+    finish(made)
+    made.run.plan_json.unlink()
+
+    assert app.run(["tabulate", "1"]) == 2
+
+    told = capsys.readouterr().err
+    assert f"{made.run.plan_json}: missing; put it back as it was" in told
+    assert "cosmos collect" not in told
+
+
 @pytest.mark.slow
 def test_linked_run_is_neither_collected_nor_written_into(made, tmp_path, capsys):
     finish(made)
