@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 
 import pytest
 from harness.synthetic_run import SyntheticRun
@@ -249,6 +250,32 @@ def test_linked_run_is_neither_collected_nor_written_into(made, tmp_path, capsys
     assert "0099-evil: a link, which is not followed" in capsys.readouterr().err
     assert [path.name for path in victim.iterdir()] == ["run.json"]
     assert (victim / "run.json").read_text() == "precious"
+
+
+@pytest.mark.parametrize("which", ["1", "0001-synthetic", "0001-synthetic.tar.zst", "last"])
+def test_run_of_which_only_the_package_is_left_is_named_with_the_way_to_unpack_it(
+    made, capsys, which
+):
+    finish(made)
+    shutil.rmtree(made.run.path)
+
+    assert app.run(["report", which]) == 2
+
+    root = made.run.path.parent
+    told = capsys.readouterr().err
+    assert (
+        f"0001-synthetic: packed, its folder is gone; unpack it with: tar -xf {made.run.bundle}"
+        in told
+    )
+    assert f" -C {root}" in told
+
+
+def test_package_that_is_named_by_its_path_is_told_from_a_folder_that_is_not_there(made, capsys):
+    finish(made)
+
+    assert app.run(["diff", "1", str(made.run.bundle)]) == 2
+
+    assert "a packed run; unpack it with: tar -xf " in capsys.readouterr().err
 
 
 def test_unknown_run_is_bad_input(made, capsys):
