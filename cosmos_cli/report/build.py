@@ -166,8 +166,10 @@ def _load_sections(document: Mapping[str, Any]) -> list[Section]:
 
 
 def _datagram_tables(account: Mapping[str, Any]) -> Iterator[TableBlock]:
-    processes = {"host": mapping_at(account, "host"), **mapping_at(account, "agents")}
-    refusing = {name: entry for name, entry in processes.items() if entry and entry.get("refused")}
+    agents = mapping_at(account, "agents")
+    processes = {"host": mapping_at(account, "host")}
+    processes |= {name: mapping_at(agents, name) for name in agents}
+    refusing = {name: entry for name, entry in processes.items() if entry.get("refused")}
     if not refusing:
         return
     seen = {reason for entry in refusing.values() for reason in mapping_at(entry, "by_reason")}

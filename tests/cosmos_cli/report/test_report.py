@@ -293,6 +293,25 @@ def test_failed_run_is_red_and_names_who_why_and_what_is_missing(tmp_path):
     assert "agent-02: " in page
 
 
+@pytest.mark.parametrize(
+    "account",
+    [
+        {"datagrams": {"agents": {"agent-01": 3}}},
+        {"datagrams": {"host": [1], "agents": {"agent-01": {"refused": 2, "by_reason": [1]}}}},
+        {"devices": {"imu": {"counts": {"reads": "many"}}}},
+    ],
+    ids=str,
+)
+def test_account_of_a_run_json_that_was_changed_costs_no_report(tmp_path, account):
+    made = SyntheticRun(tmp_path).write()
+    document, _ = build(made)
+
+    sections = build_sections(made.run, document | account)
+
+    assert "Real time" in [section.title for section in sections]
+    assert render_page(document | account, sections)
+
+
 def test_run_that_recorded_nothing_still_has_a_report(tmp_path):
     made = SyntheticRun(tmp_path)
 
