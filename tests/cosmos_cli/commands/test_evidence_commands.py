@@ -7,6 +7,7 @@ from harness.synthetic_run import SyntheticRun
 
 from cosmos_cli import app
 from cosmos_cli.collect.finish import finish_run
+from cosmos_cli.evidence.run_documents import Problem
 
 
 @pytest.fixture(autouse=True)
@@ -163,6 +164,21 @@ def test_commands_to_be_copied_name_a_folder_with_a_space_as_a_shell_takes_it(
     assert app.run([verb, str(run.path), *([str(run.path)] if verb == "diff" else [])]) == 2
 
     assert f"cosmos collect '{run.path}'" in capsys.readouterr().err
+
+
+def test_report_on_the_terminal_tells_all_that_did_not_go_as_it_should_as_the_page_does(
+    made, capsys
+):
+    made.kill("agent-01")
+    problems = [Problem(text=f"agent-0{n} (pid {n}) had to be killed") for n in range(1, 6)]
+    finish_run(made.run, made.result(), made.expected, problems=problems)
+
+    assert app.run(["report", "1"]) == 0
+
+    told = capsys.readouterr().out.splitlines()
+    assert [f"problem: {problem.text}" for problem in problems] == [
+        line for line in told if line.startswith("problem: ")
+    ]
 
 
 def test_verdict_that_is_not_there_is_said_to_be_none(made, capsys):
