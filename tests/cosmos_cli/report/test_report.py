@@ -186,6 +186,20 @@ def test_tables_that_cannot_be_read_are_named_and_the_others_shown(tmp_path):
     assert "Real time" in [section.title for section in others]
 
 
+def test_report_without_the_plan_says_why_the_simulation_tells_nothing(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    document, sections = build(made)
+    assert "Round trips" in sections
+    made.run.plan_json.unlink()
+
+    after = {section.title: section.blocks for section in build_sections(made.run, document)}
+
+    assert "Round trips" not in after
+    assert remarks(after["Figures of the simulation"]) == [
+        f"{made.run.plan_json}: missing; which simulation it was stands there, and its own figures are not drawn"
+    ]
+
+
 def test_machine_without_a_sensor_is_told_plainly(tmp_path):
     _, sections = build(SyntheticRun(tmp_path).write())
 
