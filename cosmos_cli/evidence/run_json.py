@@ -286,7 +286,9 @@ class Evidence:
             "timing": self._timing(totals, causes),
             "messages": self._messages(),
             "between_agents": dict(mapping_at(result, "between_agents")),
-            "packets": packet_counts(mapping_at(self.result, "agents")),
+            "packets": packet_counts(
+                mapping_at(self.result, "agents"), mapping_at(self.result, "faults", "agents")
+            ),
             "datagrams": datagram_account(result),
             "faults": dict(mapping_at(result, "faults")),
             "host_calls": dict(mapping_at(result, "host_calls")),
