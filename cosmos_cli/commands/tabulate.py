@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from cosmos_cli.collect.finished_run import collected_document
 from cosmos_cli.collect.host_tables import NAME, layout_with, tabulated, times_of, write_table
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
@@ -59,11 +59,7 @@ def tabulate(
             f"--output {output}: the table is a Parquet file; expected a name such as {output.stem}.parquet"
         )
     found = find_run(runs_root(folder), run)
-    config, document = found.read_config(), found.read_json(found.run_json)
-    if document is None or document.get("status") == "running":
-        raise InputError(
-            f"{found.name} is not collected yet; do that with: cosmos collect {shlex.quote(run)}"
-        )
+    document, config = collected_document(found, run), found.read_config()
     if config is None:
         fault = fault_of_plan(found.plan_json) or "cannot be used"
         raise InputError(

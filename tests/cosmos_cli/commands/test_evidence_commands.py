@@ -8,6 +8,7 @@ from harness.synthetic_run import SyntheticRun
 from cosmos_cli import app
 from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.evidence.run_documents import Problem
+from madns_runtime.processes import ProcessEntry
 
 
 @pytest.fixture(autouse=True)
@@ -153,6 +154,31 @@ def test_report_of_a_run_that_is_not_collected_says_what_to_do(made, capsys):
     assert app.run(["report", "1"]) == 2
 
     assert "cosmos collect 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("verb", ["report", "judge", "tabulate", "rerun", "diff"])
+def test_run_that_lives_is_to_be_waited_for_as_collecting_it_would_be_refused_too(
+    made, capsys, monkeypatch, verb
+):
+    living = ProcessEntry(
+        run=made.run.name,
+        role="agent",
+        name="agent-02",
+        pid=4242,
+        start_ticks=1,
+        boot_id="x",
+        node="n",
+        run_directory=str(made.run.path),
+        utc="",
+    )
+    monkeypatch.setattr("cosmos_cli.collect.finished_run.list_processes", lambda: [living])
+    monkeypatch.setattr("cosmos_cli.commands.judge.list_processes", lambda: [living])
+
+    assert app.run([verb, "1", *(["1"] if verb == "diff" else [])]) == 2
+
+    told = capsys.readouterr().err
+    assert "is still running: agent agent-02 (pid 4242); wait for its end" in told
+    assert "not collected" not in told
 
 
 @pytest.mark.parametrize("verb", ["report", "judge", "tabulate", "rerun", "diff"])
