@@ -50,8 +50,8 @@ def packet_counts(
         agents: The host's result by agent: "messages" of its link, "simulation" as it summed up.
         faults: Its account of the messages that inserted faults were shown, by agent.
 
-    An agent that died summed nothing up: of it what the link lost and what a fault took is told, None if the link counted
-    nothing. A packet that came behind a newer one counts as out of order, and as lost too, for it never reached the simulation.
+    An agent that died summed nothing up, and one that came back its last life alone: of them what the link lost and what a
+    fault took is told, None if the link counted nothing. A packet that came behind a newer one counts as out of order, and as lost too, for it never reached the simulation.
     """
     own = {name: mapping_at(agents, name, "simulation") for name in agents}
     used = {
@@ -67,6 +67,7 @@ def packet_counts(
             mapping_at(agents, name, "messages"),
             own[name],
             services,
+            has_returned=whole_count(mapping_at(agents, name).get("incarnations")) > 1,
             taken=whole_count(mapping_at(faults, name).get("lost")),
         )
         for name in own
@@ -88,12 +89,13 @@ def _packets_of(
     own: Mapping[str, Any],
     services: tuple[str, ...],
     *,
+    has_returned: bool,
     taken: int,
 ) -> dict[str, int | None]:
     of_link = [mapping_at(messages, service).get("lost") for service in services]
     link_lost = None if None in of_link else sum(map(whole_count, of_link)) + taken
     return {
-        "lost": whole_count(own["lost"]) if "lost" in own else link_lost,
+        "lost": whole_count(own["lost"]) if "lost" in own and not has_returned else link_lost,
         "duplicated": whole_count(own.get("duplicated")) + _sum(messages, services, "duplicates"),
         "out_of_order": whole_count(own.get("out_of_order")) + _sum(messages, services, "late"),
     }
