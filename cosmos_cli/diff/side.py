@@ -55,6 +55,16 @@ class Side:
         return frozenset(name for one in self.streams.values() for name in (one.stream, one.table))
 
     @property
+    def status(self) -> str:
+        """How the run ended, as run.json tells it."""
+        return str(self.document.get("status"))
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether it came to its end: of another run nobody knows how much simulated time it had."""
+        return self.status == "complete"
+
+    @property
     def duration_s(self) -> float:
         """Simulated time that the run was to have, s: a stop shortens it."""
         given = (
